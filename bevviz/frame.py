@@ -1,0 +1,331 @@
+"""What flows through bevviz: small frozen dataclasses of arrays, free of ROS and Rerun.
+
+Conventions, everywhere in the project:
+
+- a rigid transform is a (4, 4) float64 matrix named ``a_from_b``: ``p_a = a_from_b @ p_b``;
+- body frames are FLU (x forward, y left, z up), optical frames RDF (x right, y down, z forward);
+- stamps are int nanoseconds, durations float seconds, lengths metres, angles radians, pixels float;
+- pixel (0, 0) is the centre of the top left pixel; image boxes are x0, y0, x1, y1;
+- images are (H, W, 3) uint8 BGR; points are (N, 3) float32.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from enum import IntEnum
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Bool = NDArray[np.bool_]
+F32 = NDArray[np.float32]
+F64 = NDArray[np.float64]
+I32 = NDArray[np.int32]
+I64 = NDArray[np.int64]
+U8 = NDArray[np.uint8]
+
+# --- input -------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class Cloud:
+    """One LiDAR scan as received: only finite points are kept, ``dropped`` counts the others."""
+
+    stamp: int
+    frame_id: str
+    xyz: F32  # (N, 3), C-contiguous, in frame_id
+    fields: Mapping[str, NDArray[Any]] = field(default_factory=dict)  # extra (N,) fields by name
+    topic: str = ""
+    received: int = 0
+    dropped: int = 0  # points of the message that were NaN or infinite
+
+
+@dataclass(frozen=True, slots=True)
+class Intrinsics:
+    """Pinhole or fisheye camera model (ROS CameraInfo conventions)."""
+
+    width: int
+    height: int
+    K: F64  # (3, 3)
+    distortion_model: str = ""  # "", plumb_bob, rational_polynomial or equidistant
+    D: F64 = field(default_factory=lambda: np.zeros(0))  # coefficients in ROS order
+    assumed: bool = False  # True: no CameraInfo was seen, these are the configured defaults
+
+
+@dataclass(frozen=True, slots=True)
+class Image:
+    """One camera image. ``encoded`` is the untouched JPEG or PNG, where the source had one."""
+
+    stamp: int
+    frame_id: str
+    bgr: U8  # (H, W, 3)
+    encoded: bytes | None = None
+    media_type: str = ""
+    topic: str = ""
+    received: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Camera:
+    """A camera as one frame sees it. Whatever is missing is None and named in ``problems``."""
+
+    name: str
+    image: Image | None
+    intrinsics: Intrinsics | None
+    camera_from_points: F64 | None  # (4, 4): frame of Frame.points at its stamp -> optical frame at the image's
+    world_from_camera: F64 | None  # (4, 4)
+    sync_error: float = float("nan")  # seconds, image stamp - cloud stamp
+    tf_age: float = float("nan")  # seconds between the asked stamp and the nearest TF sample used
+    motion_compensated: bool = False
+    problems: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Boxes3D:
+    """K upright boxes: turned by ``yaw`` about z (zero for axis-aligned ones)."""
+
+    center: F32  # (K, 3)
+    size: F32  # (K, 3) full lengths along the box's own x, y, z
+    yaw: F32  # (K,)
+
+    def __len__(self) -> int:
+        return len(self.center)
+
+    @staticmethod
+    def empty() -> Boxes3D:
+        return Boxes3D(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.float32), np.zeros(0, np.float32))
+
+
+@dataclass(frozen=True, slots=True)
+class LabelledBoxes3D:
+    """Boxes somebody else states: the robot's own results, or ground truth. In ``frame_id``."""
+
+    topic: str
+    stamp: int
+    frame_id: str
+    boxes: Boxes3D
+    labels: tuple[str, ...]
+    scores: F32  # (K,), 1 where not given
+    world_from_boxes: F64 | None = None
+    received: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class LabelledBoxes2D:
+    """Image boxes that the robot itself published."""
+
+    topic: str
+    stamp: int
+    frame_id: str
+    xyxy: F32  # (K, 4)
+    labels: tuple[str, ...]
+    scores: F32  # (K,)
+    camera: str = ""  # name of the camera they belong to, where known
+    received: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Frame:
+    """One LiDAR scan with all that belongs to its time.
+
+    ``points`` are the points of every LiDAR in ``points_frame``: the LiDAR's own frame where there is
+    one LiDAR, the base frame where several are merged.
+    """
+
+    index: int
+    stamp: int
+    received: int
+    lidar: str  # entity name: that of the LiDAR, or "lidars" for merged ones
+    points: F32  # (N, 3)
+    points_frame: str
+    fields: Mapping[str, NDArray[Any]] = field(default_factory=dict)  # extra fields common to all clouds
+    world_frame: str = ""  # name of the fixed frame; equal to points_frame where there is none
+    world_from_points: F64 | None = None  # None: no TF to the fixed frame (identity is assumed)
+    clouds: tuple[Cloud, ...] = ()
+    points_from_clouds: tuple[F64, ...] = ()
+    cameras: tuple[Camera, ...] = ()
+    robot_boxes: tuple[LabelledBoxes3D, ...] = ()
+    robot_detections: tuple[LabelledBoxes2D, ...] = ()
+    truth: LabelledBoxes3D | None = None
+    tf_age: float = float("nan")
+    problems: tuple[str, ...] = ()  # one clear sentence each
+
+
+# --- results -----------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class Voxels:
+    """Points after the voxel grid. ``inverse[i]`` is the row of ``points`` that raw point i went to."""
+
+    points: F32  # (M, 3)
+    inverse: I32  # (N,)
+
+
+@dataclass(frozen=True, slots=True)
+class Ground:
+    mask: Bool  # (M,) True: ground
+    height: F32  # (M,) metres above the local ground
+    plane: F64 | None = None  # (4,) a, b, c, d of the single plane, for the methods that fit one
+
+
+class ClusterState(IntEnum):
+    KEPT = 0
+    TOO_SMALL = 1  # fewer points than clustering.min_cluster_points
+    TOO_LARGE = 2  # more points than clustering.max_cluster_points
+
+
+@dataclass(frozen=True, slots=True)
+class Clusters:
+    """DBSCAN clusters of the obstacle points. Row k of each array is the cluster with label k."""
+
+    labels: I32  # (P,) over the obstacle points, -1 noise
+    state: I32  # (K,) ClusterState
+    count: I32  # (K,) points
+    centroid: F32  # (K, 3)
+    aabb: Boxes3D  # axis-aligned
+    obb: Boxes3D  # oriented about z
+
+    def __len__(self) -> int:
+        return len(self.count)
+
+
+class DetectionState(IntEnum):
+    KEPT = 0
+    BELOW_THRESHOLD = 1
+    SUPPRESSED = 2  # by NMS
+
+
+@dataclass(frozen=True, slots=True)
+class Detections:
+    """2D detections in pixels of the camera's image, best score first, however weak.
+
+    Only those with state KEPT go on to the fusion; the others are there to be explained.
+    """
+
+    xyxy: F32  # (D, 4)
+    score: F32  # (D,)
+    class_id: I32  # (D,)
+    names: tuple[str, ...]  # (D,) class names
+    state: I32  # (D,) DetectionState
+    suppressed_by: I32  # (D,) row of the detection that suppressed it, else -1
+    overlap: F32  # (D,) IoU with that one, else 0
+
+    def __len__(self) -> int:
+        return len(self.score)
+
+    @staticmethod
+    def empty() -> Detections:
+        f, i = np.zeros(0, np.float32), np.zeros(0, np.int32)
+        return Detections(np.zeros((0, 4), np.float32), f, i, (), i, i, f)
+
+
+class Decision(IntEnum):
+    """What became of a detection or a cluster in the fusion."""
+
+    MATCHED = 0
+    NO_CLUSTER = 1  # detection: no cluster has points in its frustum (or, reference: near its centre)
+    TOO_FEW_POINTS = 2  # there is a cluster in the frustum, but with too few points in it
+    LOW_OVERLAP = 3  # projected cluster and 2D box overlap too little
+    TAKEN = 4  # another detection has the cluster / another cluster has the detection
+    OUT_OF_VIEW = 5  # cluster: outside the image, or behind the camera
+    NO_DETECTION = 6  # cluster: in view, but under no detection
+    NOT_KEPT = 7  # detection below threshold or suppressed; cluster outside the size limits
+    TOO_FAR = 8  # reference: nearest 2D box centre is beyond match_radius; default: beyond fusion.max_depth
+
+
+@dataclass(frozen=True, slots=True)
+class Pairs:
+    """The evidence: one row for each (detection, cluster) pair that was looked at."""
+
+    detection: I32  # (Q,)
+    cluster: I32  # (Q,)
+    points: I32  # (Q,) points of the cluster inside the frustum (reference: 0)
+    depth: F32  # (Q,) metres along the optical axis to those points (median), reference: centroid
+    iou: F32  # (Q,) IoU of the 2D box and the box around the projected cluster
+    distance: F32  # (Q,) pixels between the centres
+    cost: F32  # (Q,) what the assignment minimises; inf where a rule forbids the pair
+
+
+@dataclass(frozen=True, slots=True)
+class Fusion:
+    """Result for one camera. Row d belongs to detection d, row k to cluster k."""
+
+    detection_decision: I32  # (D,) Decision
+    detection_cluster: I32  # (D,) matched cluster, or the best candidate that was refused, else -1
+    detection_points: I32  # (D,) obstacle points inside the frustum, whatever their cluster
+    cluster_decision: I32  # (K,) Decision
+    cluster_detection: I32  # (K,) matched detection, or the best candidate that was refused, else -1
+    pairs: Pairs
+    cluster_uv: F32  # (K, 4) x0, y0, x1, y1 around the projected cluster, NaN where not in view
+
+
+@dataclass(frozen=True, slots=True)
+class CameraResult:
+    camera: Camera
+    detections: Detections | None  # None: not run or failed
+    fusion: Fusion | None
+    uv: F32 | None = None  # (P, 2) obstacle points in pixels, NaN where not in the image
+    depth: F32 | None = None  # (P,) metres along the optical axis
+
+
+@dataclass(frozen=True, slots=True)
+class Objects:
+    """Fused boxes: one row for each named object, in Frame.points_frame."""
+
+    boxes: Boxes3D
+    names: tuple[str, ...]
+    score: F32  # (J,)
+    cluster: I32  # (J,)
+    camera: tuple[str, ...]
+    detection: I32  # (J,) row in that camera's detections
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+
+@dataclass(frozen=True, slots=True)
+class Bev:
+    """Bird's-eye view. Channels are (rows, columns); row 0 is range_x ahead, column 0 range_y to the left."""
+
+    resolution: float
+    range_x: float
+    range_y: float
+    image: U8  # (rows, columns, 3) BGR with boxes and labels on top
+    channels: Mapping[str, NDArray[Any]] = field(default_factory=dict)  # density, height, intensity, occupancy
+
+
+@dataclass(frozen=True, slots=True)
+class Failure:
+    stage: str
+    reason: str  # one clear sentence
+
+
+@dataclass(frozen=True, slots=True)
+class FrameResult:
+    """Everything that the pipeline saw, made and decided for one frame. None: not run, see ``failures``."""
+
+    frame: Frame
+    voxels: Voxels | None
+    ground: Ground | None
+    obstacles: F32 | None  # (P, 3) the voxels that are not ground
+    clusters: Clusters | None
+    cameras: tuple[CameraResult, ...]
+    objects: Objects | None
+    bev: Bev | None
+    explanations: tuple[Explanation, ...] = ()
+    timings: Mapping[str, float] = field(default_factory=dict)  # stage -> seconds
+    failures: tuple[Failure, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Explanation:
+    """One decision in words. ``state`` is the lower-case name of the Decision or DetectionState."""
+
+    subject: str  # "detection" or "cluster"
+    camera: str  # "" where no camera is involved
+    row: int
+    state: str
+    text: str

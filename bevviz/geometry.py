@@ -1,0 +1,192 @@
+"""Rigid transforms, camera projection, boxes and their overlap. Plain functions of arrays."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bevviz.frame import F32, F64, Boxes3D, Intrinsics
+
+FloatArray = NDArray[Any]
+
+# --- rigid transforms --------------------------------------------------------------------------
+
+
+def transform(translation: FloatArray, quaternion_xyzw: FloatArray) -> F64:
+    """The (4, 4) matrix of a translation in metres and a rotation as quaternion x, y, z, w.
+
+    The quaternion need not be of unit length, as published ones seldom are to the last digit.
+
+    Raises:
+        ValueError: quaternion of zero length or not finite.
+    """
+    q = np.asarray(quaternion_xyzw, np.float64)
+    norm = np.linalg.norm(q)
+    if not np.isfinite(norm) or norm < 1e-9:
+        raise ValueError(f"{tuple(float(v) for v in q)} is no rotation")
+    x, y, z, w = q / norm
+    m = np.eye(4)
+    m[:3, :3] = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+    ]
+    m[:3, 3] = translation
+    return m
+
+
+def inverse(a_from_b: F64) -> F64:
+    """b_from_a of a rigid (4, 4) a_from_b."""
+    rotation = a_from_b[:3, :3].T
+    m = np.eye(4)
+    m[:3, :3] = rotation
+    m[:3, 3] = -rotation @ a_from_b[:3, 3]
+    return m
+
+
+def quaternion(a_from_b: F64) -> F64:
+    """(4,) unit quaternion x, y, z, w, w >= 0, of a (4, 4) transform (Shepperd 1978)."""
+    r = a_from_b[:3, :3]
+    trace = float(np.trace(r))
+    squared = np.array([2 * r[0, 0] - trace, 2 * r[1, 1] - trace, 2 * r[2, 2] - trace, trace]) + 1.0
+    largest = int(np.argmax(squared))
+    if largest == 3:
+        q = np.array([r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1], squared[3]])
+    else:
+        i, j, k = largest, (largest + 1) % 3, (largest + 2) % 3
+        q = np.zeros(4)
+        q[i], q[j], q[k], q[3] = squared[i], r[j, i] + r[i, j], r[k, i] + r[i, k], r[k, j] - r[j, k]
+    q /= np.linalg.norm(q)
+    return q if q[3] >= 0 else -q
+
+
+def interpolate(a_from_b0: F64, a_from_b1: F64, t: float) -> F64:
+    """The pose between two: translation linear, rotation by slerp (Shoemake 1985), t in [0, 1]."""
+    q0, q1 = quaternion(a_from_b0), quaternion(a_from_b1)
+    dot = float(q0 @ q1)
+    if dot < 0:
+        q1, dot = -q1, -dot
+    angle = float(np.arccos(min(dot, 1.0)))
+    if angle < 1e-6:
+        q = q0 + t * (q1 - q0)
+    else:
+        q = (np.sin((1 - t) * angle) * q0 + np.sin(t * angle) * q1) / np.sin(angle)
+    return transform(a_from_b0[:3, 3] * (1 - t) + a_from_b1[:3, 3] * t, q)
+
+
+def apply(a_from_b: F64, points: FloatArray) -> F32:
+    """(N, 3) float32 points of frame b in frame a."""
+    m = np.asarray(a_from_b, np.float32)
+    moved: F32 = np.asarray(points, np.float32) @ m[:3, :3].T
+    moved += m[:3, 3]
+    return moved
+
+
+def yaw(a_from_b: F64) -> float:
+    """Turn about z, in radians."""
+    return float(np.arctan2(a_from_b[1, 0], a_from_b[0, 0]))
+
+
+# --- cameras -----------------------------------------------------------------------------------
+
+
+def project(points: FloatArray, intrinsics: Intrinsics) -> tuple[F32, F32]:
+    """Project points of the optical frame into the image.
+
+    Models as in OpenCV and ROS: plumb_bob (Brown-Conrady), rational_polynomial, equidistant
+    (Kannala-Brandt 2006).
+
+    Args:
+        points: (N, 3) metres in the optical frame.
+        intrinsics: the camera.
+
+    Returns:
+        uv: (N, 2) float32 pixels; NaN behind the camera and where the distortion polynomial has
+            folded over (far outside the calibrated field of view), not clipped to the image.
+        depth: (N,) float32 metres along the optical axis.
+    """
+    p = np.asarray(points)
+    depth = np.asarray(p[:, 2], np.float32)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        inv = np.where(p[:, 2] > 1e-3, 1.0 / p[:, 2], np.nan)
+    x, y = p[:, 0] * inv, p[:, 1] * inv
+    if intrinsics.D.size and np.any(intrinsics.D):
+        x, y = _distort(x, y, intrinsics)
+    k = intrinsics.K
+    uv = np.empty((len(p), 2), np.float32)
+    uv[:, 0] = k[0, 0] * x + k[0, 1] * y + k[0, 2]
+    uv[:, 1] = k[1, 1] * y + k[1, 2]
+    return uv, depth
+
+
+def _distort(x: FloatArray, y: FloatArray, intrinsics: Intrinsics) -> tuple[FloatArray, FloatArray]:
+    d = np.zeros(8)
+    d[: min(8, intrinsics.D.size)] = intrinsics.D[:8]
+    r2 = x * x + y * y
+    if intrinsics.distortion_model in ("equidistant", "fisheye"):
+        r = np.sqrt(r2)
+        theta = np.arctan(r)
+        t2 = theta * theta
+        turned = theta * (1 + t2 * (d[0] + t2 * (d[1] + t2 * (d[2] + t2 * d[3]))))
+        slope = 1 + t2 * (3 * d[0] + t2 * (5 * d[1] + t2 * (7 * d[2] + t2 * 9 * d[3])))
+        scale = np.where(slope > 0, np.where(r > 1e-8, turned / np.maximum(r, 1e-8), 1.0), np.nan)
+        return x * scale, y * scale
+    k1, k2, p1, p2, k3, k4, k5, k6 = d
+    numerator = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    denominator = 1 + r2 * (k4 + r2 * (k5 + r2 * k6))
+    radial = numerator / denominator
+    # Beyond its calibrated field of view the polynomial folds back: such points would land in the image.
+    slope_n = k1 + r2 * (2 * k2 + r2 * 3 * k3)
+    slope_d = k4 + r2 * (2 * k5 + r2 * 3 * k6)
+    grows = radial + 2 * r2 * (slope_n * denominator - numerator * slope_d) / denominator**2
+    radial = np.where(grows > 0, radial, np.nan)
+    return (
+        x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
+        y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
+    )
+
+
+def rays(uv: FloatArray, intrinsics: Intrinsics) -> F64:
+    """(N, 3) directions in the optical frame, z = 1, of (N, 2) pixels: the inverse of ``project``."""
+    import cv2
+
+    points = np.ascontiguousarray(uv, np.float64).reshape(-1, 1, 2)
+    d = np.asarray(intrinsics.D, np.float64)
+    if d.size and np.any(d):
+        if intrinsics.distortion_model in ("equidistant", "fisheye"):
+            flat = cv2.fisheye.undistortPoints(points, intrinsics.K, d[:4])
+        else:
+            flat = cv2.undistortPointsIter(
+                points, intrinsics.K, d, None, None, (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 1e-12)
+            )
+    else:
+        flat = cv2.undistortPoints(points, intrinsics.K, np.zeros(5))
+    return np.column_stack([flat.reshape(-1, 2), np.ones(len(points))])
+
+
+# --- boxes -------------------------------------------------------------------------------------
+
+
+def iou(a: FloatArray, b: FloatArray) -> F32:
+    """(A, B) intersection over union of (A, 4) and (B, 4) image boxes x0, y0, x1, y1."""
+    low = np.maximum(a[:, None, :2], b[None, :, :2])
+    high = np.minimum(a[:, None, 2:], b[None, :, 2:])
+    inter = np.prod(np.clip(high - low, 0, None), axis=2)
+    area_a = np.prod(np.clip(a[:, 2:] - a[:, :2], 0, None), axis=1)
+    area_b = np.prod(np.clip(b[:, 2:] - b[:, :2], 0, None), axis=1)
+    union = area_a[:, None] + area_b[None, :] - inter
+    return np.divide(inter, union, out=np.zeros_like(inter, np.float32), where=union > 0, casting="unsafe")
+
+
+def corners(boxes: Boxes3D) -> F32:
+    """(K, 8, 3) corners: the lower four counter-clockwise seen from above, then the upper four."""
+    unit = np.array(
+        [[1, 1, -1], [-1, 1, -1], [-1, -1, -1], [1, -1, -1], [1, 1, 1], [-1, 1, 1], [-1, -1, 1], [1, -1, 1]],
+        np.float32,
+    )
+    local = unit[None] * (boxes.size[:, None] / 2)
+    c, s = np.cos(boxes.yaw)[:, None], np.sin(boxes.yaw)[:, None]
+    turned = np.stack([c * local[..., 0] - s * local[..., 1], s * local[..., 0] + c * local[..., 1], local[..., 2]], -1)
+    return np.asarray(turned + boxes.center[:, None], np.float32)
