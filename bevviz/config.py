@@ -7,12 +7,12 @@ computes. The tutorial's own parameter names (``cluster_tolerance`` ...) are acc
 from __future__ import annotations
 
 import difflib
-import io
+import json
 import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_args
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
 from pydantic_core import PydanticCustomError
@@ -67,7 +67,9 @@ class Section(BaseModel):
 class SourceConfig(Section):
     """Which topics play which role. Empty: found by type, name and frame (see ``bevviz info``)."""
 
-    lidar_topics: tuple[str, ...] = Field((), description="PointCloud2 topics; several are merged in base_frame")
+    lidar_topics: tuple[str, ...] = Field(
+        (), description="PointCloud2 topics; several are merged in base_frame"
+    )
     camera_topics: tuple[str, ...] = Field((), description="Image or CompressedImage topics")
     camera_info_topics: Mapping[str, str] = Field({}, description="camera topic -> its CameraInfo topic")
     odometry_topic: str = Field("", description="nav_msgs/Odometry used where /tf has no fixed frame")
@@ -86,21 +88,27 @@ class SyncConfig(Section):
 
     tolerance: Seconds = Field(0.1, gt=0, le=10, description="largest |image stamp - cloud stamp|")
     tf_tolerance: Seconds = Field(0.2, ge=0, le=60, description="how far past its samples TF is held")
-    motion_compensation: bool = Field(True, description="move the cloud to the image's time before projection")
+    motion_compensation: bool = Field(
+        True, description="move the cloud to the image's time before projection"
+    )
     max_wait: Seconds = Field(0.5, gt=0, le=60, description="how long a cloud waits for its image and TF")
     queue: int = Field(10, ge=1, le=1000, description="clouds that may wait; the oldest goes on first")
 
 
 class VoxelConfig(Section):
     size: Metres = Field(0.1, ge=0, le=10, description="edge of a voxel; 0 keeps every point")
-    average: bool = Field(False, description="mean of a voxel's points (as Open3D) instead of its first point")
+    average: bool = Field(
+        False, description="mean of a voxel's points (as Open3D) instead of its first point"
+    )
 
 
 class GroundConfig(Section):
     method: Literal["polar", "ransac"] = Field(
         "polar", description="polar: line fits in sectors (Himmelsbach 2010); ransac: one plane"
     )
-    distance_threshold: Metres = Field(0.2, gt=0, le=5, description="height above the ground still called ground")
+    distance_threshold: Metres = Field(
+        0.2, gt=0, le=5, description="height above the ground still called ground"
+    )
     iterations: int = Field(100, ge=1, le=100_000, description="ransac: samples of three points")
     seed: int = Field(0, ge=0, description="ransac: random seed")
     sensor_height: Metres | None = Field(
@@ -114,15 +122,21 @@ class GroundConfig(Section):
 
 class ClusteringConfig(Section):
     eps: Metres = Field(0.5, gt=0, le=20, description="DBSCAN neighbourhood radius")
-    min_points: int = Field(10, ge=1, le=100_000, description="DBSCAN neighbours (itself included) of a core point")
+    min_points: int = Field(
+        10, ge=1, le=100_000, description="DBSCAN neighbours (itself included) of a core point"
+    )
     min_cluster_points: int = Field(10, ge=1, description="smaller clusters are set aside, with the reason")
     max_cluster_points: int | None = Field(None, ge=1, description="larger ones too; empty: no limit")
     boxes: Literal["oriented", "axis_aligned"] = Field("oriented", description="box used downstream")
 
 
 class DetectorConfig(Section):
-    model: str = Field("", description="ONNX file, or 'demo' for the simulator's own network; empty: no detector")
-    names: str = Field("", description="file with one class name a line; empty: the model's metadata, else COCO")
+    model: str = Field(
+        "", description="ONNX file, or 'demo' for the simulator's own network; empty: no detector"
+    )
+    names: str = Field(
+        "", description="file with one class name a line; empty: the model's metadata, else COCO"
+    )
     conf_threshold: float = Field(0.25, gt=0, le=1, description="lowest score of a detection")
     iou_threshold: float = Field(0.45, gt=0, le=1, description="class-wise NMS")
     explain_threshold: float = Field(0.05, gt=0, le=1, description="weaker candidates are not even explained")
@@ -146,7 +160,9 @@ class BevConfig(Section):
     range_x: Metres = Field(40.0, gt=0, le=500, description="range ahead and behind")
     range_y: Metres = Field(40.0, gt=0, le=500, description="range to the left and right")
     resolution: Metres = Field(0.1, gt=0, le=10, description="edge of a cell")
-    style: Literal["rich", "reference"] = Field("rich", description="reference: the tutorial's image, pixel for pixel")
+    style: Literal["rich", "reference"] = Field(
+        "rich", description="reference: the tutorial's image, pixel for pixel"
+    )
     channels: tuple[Literal["density", "height", "intensity", "occupancy"], ...] = Field(
         ("density", "height", "intensity", "occupancy"), description="channels that are computed and logged"
     )
@@ -248,20 +264,25 @@ def load(
         where = origin.get(key, "configuration")
         given = f" (given: {first['input']!r})" if first["type"] != "wrong_unit" else ""
         about = keys().get(key, "")
-        hint = f"; {key}: {about}" if about and first["type"] != "wrong_unit" else ""
-        raise UserError(f"{where}: {key} {_lower(first['msg'])}{given}{_unit_hint(key)}{hint}") from None
+        hint = f"; it is: {about}" if about else ""
+        unit = f", in {_unit(key)}" if _unit(key) and first["type"] != "wrong_unit" else ""
+        raise UserError(f"{where}: {key} {_lower(first['msg'])}{unit}{given}{hint}") from None
 
 
 def dump(config: Config) -> str:
-    """The configuration as YAML, readable back by ``load``."""
-    from ruamel.yaml import YAML
-
-    stream = io.StringIO()
-    yaml = YAML(typ="safe", pure=True)
-    yaml.default_flow_style = False
-    yaml.representer.sort_base_mapping_type_on_output = False  # keep the order of the models
-    yaml.dump(config.model_dump(mode="json"), stream)
-    return stream.getvalue()
+    """The configuration as YAML with each parameter's unit and meaning, readable back by ``load``."""
+    about = keys()
+    lines = []
+    for section, values in config.model_dump(mode="json").items():
+        if not isinstance(values, dict):
+            lines.append(f"{section}: {json.dumps(values)}")
+            continue
+        lines.append(f"{section}:")
+        for name, value in values.items():
+            unit = _unit(f"{section}.{name}")
+            note = (f"in {unit}; " if unit else "") + about[f"{section}.{name}"]
+            lines.append(f"  {name}: {json.dumps(value)}  # {note}")
+    return "\n".join(lines) + "\n"
 
 
 def _lower(message: str) -> str:
@@ -269,15 +290,19 @@ def _lower(message: str) -> str:
     return message[0].lower() + message[1:]
 
 
-def _unit_hint(key: str) -> str:
+def _unit(key: str) -> str:
+    """Name of the unit that the value of a dotted key is in; empty where it has none."""
     section, _, name = key.partition(".")
     model = Config.model_fields[section].annotation if section in Config.model_fields else None
     if not (isinstance(model, type) and issubclass(model, BaseModel)) or name not in model.model_fields:
         return ""
-    for extra in model.model_fields[name].metadata:
-        parse = getattr(extra, "func", None)
-        if isinstance(getattr(parse, "__self__", None), Unit):
-            return f", in {parse.__self__.name}"
+    info = model.model_fields[name]
+    # An optional quantity carries its unit inside the union.
+    inner = [extra for part in get_args(info.annotation) for extra in getattr(part, "__metadata__", ())]
+    for extra in [*info.metadata, *inner]:
+        owner = getattr(getattr(extra, "func", None), "__self__", None)
+        if isinstance(owner, Unit):
+            return owner.name
     return ""
 
 
