@@ -74,7 +74,7 @@ class Camera:
     name: str
     image: Image | None
     intrinsics: Intrinsics | None
-    camera_from_points: F64 | None  # (4, 4): frame of Frame.points at its stamp -> optical frame at the image's
+    camera_from_points: F64 | None  # (4, 4), from Frame.points at its stamp to the camera at the image's
     world_from_camera: F64 | None  # (4, 4)
     sync_error: float = float("nan")  # seconds, image stamp - cloud stamp
     tf_age: float = float("nan")  # seconds between the asked stamp and the nearest TF sample used
@@ -294,7 +294,7 @@ class Bev:
     range_x: float
     range_y: float
     image: U8  # (rows, columns, 3) BGR with boxes and labels on top
-    channels: Mapping[str, NDArray[Any]] = field(default_factory=dict)  # density, height, intensity, occupancy
+    channels: Mapping[str, NDArray[Any]] = field(default_factory=dict)  # by name, see BevConfig.channels
 
 
 @dataclass(frozen=True, slots=True)
