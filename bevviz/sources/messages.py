@@ -1,0 +1,482 @@
+"""ROS messages into arrays.
+
+Only attributes are read, never types, so that what rosbags deserialises and what rclpy delivers are
+both welcome, whichever the ROS version. Every function raises MessageError and nothing else.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from bevviz import geometry
+from bevviz.errors import UserError
+from bevviz.frame import F32, F64, U8, Boxes3D, Cloud, Image, Intrinsics, LabelledBoxes2D, LabelledBoxes3D
+
+
+class MessageError(UserError):
+    """A message that cannot be used: its topic, what is wrong with it, and what would be accepted."""
+
+
+@dataclass(frozen=True, slots=True)
+class StampedTransform:
+    """One edge of the transform tree at one time."""
+
+    stamp: int  # nanoseconds
+    parent: str
+    child: str
+    parent_from_child: F64  # (4, 4)
+
+
+def stamp_ns(stamp: Any) -> int:
+    """Nanoseconds of a builtin_interfaces/Time."""
+    return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
+
+
+def _frame(name: str) -> str:
+    return name.removeprefix("/")  # ROS 1 knew both spellings
+
+
+# --- point clouds ------------------------------------------------------------------------------
+
+_AXES = ("x", "y", "z")
+_POINT_FIELD = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
+
+
+def decode_cloud(msg: Any, topic: str, received: int) -> Cloud:
+    """Points and extra fields of a sensor_msgs/PointCloud2.
+
+    Any field types, offsets, padding and byte order; organised clouds are flattened row by row. Points
+    with a coordinate that is NaN or infinite are dropped, and so are those that the header announces
+    but cut data no longer holds; both are counted in ``Cloud.dropped``. A field of several elements
+    becomes one field for each: ``name_0``, ``name_1`` ...
+
+    Raises:
+        MessageError: x, y or z is missing, or a field does not fit into its point.
+    """
+    layout = _point_layout(msg, topic)
+    grid = _point_grid(msg, layout)
+    xyz = np.empty((*grid.shape, 3), np.float32)
+    with np.errstate(over="ignore"):  # a float64 beyond float32 becomes infinite, and is dropped
+        for axis, name in enumerate(_AXES):
+            xyz[..., axis] = grid[name]
+    xyz = xyz.reshape(-1, 3)
+    with np.errstate(invalid="ignore"):
+        finite = np.isfinite(xyz[:, 0] + xyz[:, 1] + xyz[:, 2])
+    kept = None if finite.all() else np.flatnonzero(finite)
+    fields: dict[str, NDArray[Any]] = {}
+    for name in layout.fields or ():
+        if name not in _AXES:
+            values = grid[name].reshape(-1)
+            # Copied: a view would be unaligned, read-only, and keep the whole message in memory.
+            values = values.copy() if kept is None else values.take(kept)
+            fields[name] = np.asarray(values, values.dtype.newbyteorder("="))
+    if kept is not None:
+        xyz = xyz.take(kept, axis=0)
+    return Cloud(
+        stamp=stamp_ns(msg.header.stamp),
+        frame_id=_frame(msg.header.frame_id),
+        xyz=xyz,
+        fields=fields,
+        topic=topic,
+        received=received,
+        dropped=int(msg.height) * int(msg.width) - len(xyz),
+    )
+
+
+def _point_layout(msg: Any, topic: str) -> np.dtype[np.void]:
+    """The structured dtype of one point; ``itemsize`` is point_step."""
+    order = ">" if msg.is_bigendian else "<"
+    formats: dict[str, str] = {}
+    offsets: dict[str, int] = {}
+    for field in msg.fields:
+        if field.datatype not in _POINT_FIELD:
+            raise MessageError(f"{topic}: field '{field.name}' has the unknown datatype {field.datatype}")
+        scalar = np.dtype(order + _POINT_FIELD[field.datatype])
+        count = max(int(field.count), 1)  # old drivers leave it at 0
+        if field.offset + count * scalar.itemsize > msg.point_step:
+            raise MessageError(
+                f"{topic}: field '{field.name}' ends at byte {field.offset + count * scalar.itemsize} "
+                f"of a point, but point_step is {msg.point_step}"
+            )
+        for i in range(count):
+            name = field.name if count == 1 else f"{field.name}_{i}"
+            formats.setdefault(name, scalar.str)
+            offsets.setdefault(name, field.offset + i * scalar.itemsize)
+    if missing := [name for name in _AXES if name not in formats]:
+        raise MessageError(
+            f"{topic}: the cloud has no field {', '.join(missing)}; "
+            f"its fields are {', '.join(formats) or 'none'}"
+        )
+    return np.dtype(
+        {
+            "names": list(formats),
+            "formats": list(formats.values()),
+            "offsets": list(offsets.values()),
+            "itemsize": int(msg.point_step),
+        }
+    )
+
+
+def _point_grid(msg: Any, layout: np.dtype[np.void]) -> NDArray[np.void]:
+    """(rows, columns) view of the points that are whole in the data."""
+    data = np.frombuffer(msg.data, np.uint8)
+    rows, columns, step = int(msg.height), int(msg.width), layout.itemsize
+    row_bytes = columns * step
+    row_step = max(int(msg.row_step), row_bytes)  # some drivers leave it at 0
+    if row_step == row_bytes or rows == 1:
+        rows, columns = 1, min(rows * columns, data.size // step)
+    else:
+        rows = min(rows, max(data.size - row_bytes, -row_step) // row_step + 1)
+    return np.ndarray((rows, columns), layout, data, strides=(row_step, step))
+
+
+# --- images ------------------------------------------------------------------------------------
+
+
+class _Encoding(NamedTuple):
+    to_bgr: int | None  # OpenCV's conversion
+    channels: int = 1
+    scalar: str = "u1"
+    rows: float = 1.0  # rows of data for each row of pixels
+
+
+_ENCODINGS: Mapping[str, _Encoding] = {
+    "bgr8": _Encoding(None, 3),
+    "rgb8": _Encoding(cv2.COLOR_RGB2BGR, 3),
+    "bgra8": _Encoding(cv2.COLOR_BGRA2BGR, 4),
+    "rgba8": _Encoding(cv2.COLOR_RGBA2BGR, 4),
+    "mono8": _Encoding(cv2.COLOR_GRAY2BGR),
+    "mono16": _Encoding(cv2.COLOR_GRAY2BGR, scalar="u2"),
+    "8UC1": _Encoding(cv2.COLOR_GRAY2BGR),
+    "8UC3": _Encoding(None, 3),
+    "8UC4": _Encoding(cv2.COLOR_BGRA2BGR, 4),
+    "16UC1": _Encoding(cv2.COLOR_GRAY2BGR, scalar="u2"),
+    "bayer_rggb8": _Encoding(cv2.COLOR_BayerRGGB2BGR),
+    "bayer_bggr8": _Encoding(cv2.COLOR_BayerBGGR2BGR),
+    "bayer_gbrg8": _Encoding(cv2.COLOR_BayerGBRG2BGR),
+    "bayer_grbg8": _Encoding(cv2.COLOR_BayerGRBG2BGR),
+    "bayer_rggb16": _Encoding(cv2.COLOR_BayerRGGB2BGR, scalar="u2"),
+    "bayer_bggr16": _Encoding(cv2.COLOR_BayerBGGR2BGR, scalar="u2"),
+    "bayer_gbrg16": _Encoding(cv2.COLOR_BayerGBRG2BGR, scalar="u2"),
+    "bayer_grbg16": _Encoding(cv2.COLOR_BayerGRBG2BGR, scalar="u2"),
+    "yuv422": _Encoding(cv2.COLOR_YUV2BGR_UYVY, 2),
+    "uyvy": _Encoding(cv2.COLOR_YUV2BGR_UYVY, 2),
+    "yuv422_yuy2": _Encoding(cv2.COLOR_YUV2BGR_YUY2, 2),
+    "yuyv": _Encoding(cv2.COLOR_YUV2BGR_YUY2, 2),
+    "nv12": _Encoding(cv2.COLOR_YUV2BGR_NV12, rows=1.5),
+    "nv21": _Encoding(cv2.COLOR_YUV2BGR_NV21, rows=1.5),
+}
+
+
+def decode_image(msg: Any, topic: str, received: int) -> Image:
+    """A sensor_msgs/Image as BGR; bgr8 without row padding is a view of the message's data.
+
+    Images of 16 bits are reduced to 8 as ``to_8_bits`` says.
+
+    Raises:
+        MessageError: unknown encoding, no pixels, or less data than the size asks for.
+    """
+    encoding = _ENCODINGS.get(msg.encoding)
+    if encoding is None:
+        raise MessageError(
+            f"{topic}: image encoding '{msg.encoding}' is not supported; "
+            f"supported are {', '.join(_ENCODINGS)}"
+        )
+    width, height = int(msg.width), int(msg.height)
+    if not width or not height:
+        raise MessageError(f"{topic}: the image is {width} x {height} and has no pixels")
+    data = np.frombuffer(msg.data, np.uint8)
+    scalar = np.dtype((">" if msg.is_bigendian else "<") + encoding.scalar)
+    rows, pixel_bytes = int(height * encoding.rows), encoding.channels * scalar.itemsize
+    step = int(msg.step) or width * pixel_bytes
+    needed = (rows - 1) * step + width * pixel_bytes
+    if step < width * pixel_bytes or data.size < needed:
+        raise MessageError(
+            f"{topic}: a {width} x {height} {msg.encoding} image needs {rows} rows of "
+            f"{width * pixel_bytes} bytes, but step is {step} and there are {data.size} bytes of data"
+        )
+    pixels = np.ndarray(
+        (rows, width, encoding.channels), scalar, data, strides=(step, pixel_bytes, scalar.itemsize)
+    )
+    if scalar.itemsize == 2:
+        pixels = to_8_bits(pixels.astype(np.uint16))
+    try:
+        bgr = (
+            np.ascontiguousarray(pixels) if encoding.to_bgr is None else cv2.cvtColor(pixels, encoding.to_bgr)
+        )
+    except cv2.error as error:
+        raise MessageError(
+            f"{topic}: a {width} x {height} image cannot be {msg.encoding}: {error.err}"
+        ) from None
+    return Image(
+        stamp=stamp_ns(msg.header.stamp),
+        frame_id=_frame(msg.header.frame_id),
+        bgr=bgr,
+        topic=topic,
+        received=received,
+    )
+
+
+def to_8_bits(pixels: NDArray[np.uint16]) -> U8:
+    """16 bit pixels as 8 bit ones, by the bit depth that the brightest pixel asks for.
+
+    Sensors of 10, 12 and 14 bits are published in 16, mostly unshifted: the full scale is taken as the
+    smallest of 8, 10, 12, 14 and 16 bits that holds every pixel.
+    """
+    brightest = int(pixels.max())
+    depth = next(bits for bits in (8, 10, 12, 14, 16) if brightest < 1 << bits)
+    scaled: U8 = cv2.convertScaleAbs(pixels, alpha=255.0 / ((1 << depth) - 1))
+    return scaled
+
+
+_MEDIA_TYPES = {b"\xff\xd8\xff": "image/jpeg", b"\x89PNG\r\n\x1a\n": "image/png"}
+
+
+def decode_compressed_image(msg: Any, topic: str, received: int) -> Image:
+    """A JPEG or PNG in a sensor_msgs/CompressedImage, decoded, with the encoded bytes untouched beside.
+
+    The kind is taken from the data, as the format field has many spellings. A PNG of 16 bits is reduced
+    as ``to_8_bits`` says, and the encoded one, which would look different, is not kept.
+
+    Raises:
+        MessageError: depth images, other kinds, and data that is damaged or cut.
+    """
+    if "compressedDepth" in msg.format:
+        raise MessageError(f"{topic}: '{msg.format}' is a depth image; choose a topic with colour images")
+    data = np.frombuffer(msg.data, np.uint8)
+    encoded = data.tobytes()
+    media_type = next((kind for magic, kind in _MEDIA_TYPES.items() if encoded.startswith(magic)), "")
+    if not media_type:
+        raise MessageError(
+            f"{topic}: compressed image of format '{msg.format}' holds neither JPEG nor PNG data "
+            f"({len(encoded)} bytes)"
+        )
+    cut = media_type == "image/jpeg" and b"\xff\xd9" not in encoded  # decoders fill the rest with grey
+    # Orientation: the calibration belongs to the pixels as they are stored, not as EXIF would turn them.
+    flags = cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
+    try:
+        bgr = None if cut else cv2.imdecode(data, flags)
+    except cv2.error:
+        bgr = None
+    if bgr is None:
+        raise MessageError(f"{topic}: the {media_type} data ({len(encoded)} bytes) is damaged or cut")
+    deep = bgr.dtype == np.uint16
+    return Image(
+        stamp=stamp_ns(msg.header.stamp),
+        frame_id=_frame(msg.header.frame_id),
+        bgr=to_8_bits(bgr) if deep else bgr,
+        encoded=None if deep else encoded,
+        media_type="" if deep else media_type,
+        topic=topic,
+        received=received,
+    )
+
+
+# --- camera models -----------------------------------------------------------------------------
+
+_DISTORTION = {
+    "": "",
+    "none": "",
+    "plumb_bob": "plumb_bob",
+    "rational_polynomial": "rational_polynomial",
+    "equidistant": "equidistant",
+    "fisheye": "equidistant",
+}
+
+
+def decode_camera_info(msg: Any, rectified: bool, topic: str = "camera_info") -> Intrinsics:
+    """The camera model of a sensor_msgs/CameraInfo, for images as they are published.
+
+    The region of interest and binning are applied as image_geometry does: first the offset, then the
+    scale. K of a message is for the full sensor.
+
+    Args:
+        msg: ROS 1 (upper-case K, D, P) or ROS 2.
+        rectified: the images are rectified: the left 3 x 3 of P and no distortion. Without P, K.
+        topic: for the error messages.
+
+    Raises:
+        MessageError: an uncalibrated camera, or a distortion model that is not known.
+    """
+    K, D, P = (np.asarray(_either(msg, n, n.lower()), np.float64) for n in "KDP")
+    matrix = K.reshape(3, 3)
+    if rectified and P[0]:
+        matrix = P.reshape(3, 4)[:, :3]
+    if not np.isfinite(matrix).all() or matrix[0, 0] <= 0 or matrix[1, 1] <= 0:
+        raise MessageError(f"{topic}: the camera is uncalibrated (K is zero or not finite); calibrate it")
+    model = ""
+    if not rectified and np.any(D):
+        model = _distortion(msg.distortion_model, D, topic)
+    matrix = matrix.copy()
+    matrix[0, 2] -= msg.roi.x_offset
+    matrix[1, 2] -= msg.roi.y_offset
+    binning = np.array([max(int(msg.binning_x), 1), max(int(msg.binning_y), 1)])
+    matrix[:2] /= binning[:, None]
+    width, height = np.array([msg.roi.width or msg.width, msg.roi.height or msg.height], int) // binning
+    return Intrinsics(int(width), int(height), matrix, model, D if model else np.zeros(0))
+
+
+def _distortion(name: str, D: F64, topic: str) -> str:
+    model = _DISTORTION.get(name.lower())
+    if model is None:
+        raise MessageError(
+            f"{topic}: distortion model '{name}' is not supported; supported are "
+            f"{', '.join(filter(None, _DISTORTION))}"
+        )
+    if not np.isfinite(D).all() or np.any(D[8:]) or (model == "equidistant" and len(D) < 4):
+        raise MessageError(f"{topic}: {list(D)} are no coefficients of the distortion model '{name}'")
+    return model or "plumb_bob"  # coefficients without a name
+
+
+def _either(msg: Any, *names: str) -> Any:
+    """The first attribute that exists: message definitions differ between versions of ROS."""
+    for name in names:
+        if hasattr(msg, name):
+            return getattr(msg, name)
+    raise MessageError(f"message {type(msg).__name__} has no field {' or '.join(names)}")
+
+
+# --- transforms --------------------------------------------------------------------------------
+
+
+def decode_transforms(msg: Any, topic: str = "/tf") -> list[StampedTransform]:
+    """The transforms of a tf2_msgs/TFMessage; one that is no rigid transform is left out.
+
+    Raises:
+        MessageError: none of them is one.
+    """
+    transforms, problems = [], []
+    for item in msg.transforms:
+        moved = item.transform
+        try:
+            transforms.append(
+                _stamped(item.header, item.child_frame_id, moved.translation, moved.rotation, topic)
+            )
+        except MessageError as error:
+            problems.append(error)
+    if problems and not transforms:
+        raise problems[0]
+    return transforms
+
+
+def decode_odometry(msg: Any, topic: str = "odometry") -> StampedTransform:
+    """The pose of a nav_msgs/Odometry: header.frame_id from child_frame_id.
+
+    Raises:
+        MessageError: no rigid transform, or no frame names.
+    """
+    pose = msg.pose.pose
+    return _stamped(msg.header, msg.child_frame_id, pose.position, pose.orientation, topic)
+
+
+def _stamped(header: Any, child: str, translation: Any, rotation: Any, topic: str) -> StampedTransform:
+    parent, child = _frame(header.frame_id), _frame(child)
+    if not parent or not child or parent == child:
+        raise MessageError(f"{topic}: '{parent}' and '{child}' cannot be parent and child frame")
+    xyz = np.array([translation.x, translation.y, translation.z], np.float64)
+    try:
+        matrix = geometry.transform(xyz, _xyzw(rotation))
+    except ValueError as error:
+        raise MessageError(f"{topic}: rotation from '{child}' to '{parent}': {error}") from None
+    if not np.isfinite(xyz).all():
+        raise MessageError(f"{topic}: the translation from '{child}' to '{parent}' is not finite")
+    return StampedTransform(stamp_ns(header.stamp), parent, child, matrix)
+
+
+def _xyzw(rotation: Any) -> F64:
+    return np.array([rotation.x, rotation.y, rotation.z, rotation.w], np.float64)
+
+
+# --- detections --------------------------------------------------------------------------------
+
+
+def decode_detections_2d(msg: Any, topic: str, received: int) -> LabelledBoxes2D:
+    """The image boxes of a vision_msgs/Detection2DArray, of ROS 1 or any version of ROS 2.
+
+    A turned box becomes the upright one around it. Boxes that are not finite are left out.
+
+    Raises:
+        MessageError: not laid out as any known version of the message.
+    """
+
+    def row(detection: Any) -> tuple[float, ...]:
+        center, box = detection.bbox.center, detection.bbox
+        position = getattr(center, "position", center)  # flat up to ROS 2 Galactic
+        return position.x, position.y, center.theta, box.size_x, box.size_y
+
+    values, labels, scores = _rows(msg, row, 5, topic)
+    x, y, theta, w, h = values.T
+    cos, sin = np.abs(np.cos(theta)), np.abs(np.sin(theta))
+    dx, dy = (w * cos + h * sin) / 2, (w * sin + h * cos) / 2
+    return LabelledBoxes2D(
+        topic=topic,
+        stamp=stamp_ns(msg.header.stamp),
+        frame_id=_frame(msg.header.frame_id),
+        xyxy=np.stack([x - dx, y - dy, x + dx, y + dy], axis=1).astype(np.float32),
+        labels=labels,
+        scores=scores,
+        received=received,
+    )
+
+
+def decode_detections_3d(msg: Any, topic: str, received: int) -> LabelledBoxes3D:
+    """The boxes of a vision_msgs/Detection3DArray, of ROS 1 or any version of ROS 2.
+
+    Only the turn about z is kept of an orientation; one left at zero is none. Boxes that are not finite
+    are left out.
+
+    Raises:
+        MessageError: not laid out as any known version of the message.
+    """
+
+    def row(detection: Any) -> tuple[float, ...]:
+        center, size = detection.bbox.center, detection.bbox.size
+        p, q = center.position, center.orientation
+        return p.x, p.y, p.z, size.x, size.y, size.z, q.x, q.y, q.z, q.w
+
+    values, labels, scores = _rows(msg, row, 10, topic)
+    x, y, z, w = values[:, 6:].T
+    yaw = np.arctan2(2 * (w * z + x * y), w * w + x * x - y * y - z * z)  # holds at any length, zero too
+    center, size = values[:, :3].astype(np.float32), values[:, 3:6].astype(np.float32)
+    return LabelledBoxes3D(
+        topic=topic,
+        stamp=stamp_ns(msg.header.stamp),
+        frame_id=_frame(msg.header.frame_id),
+        boxes=Boxes3D(center, size, yaw.astype(np.float32)),
+        labels=labels,
+        scores=scores,
+        received=received,
+    )
+
+
+def _rows(
+    msg: Any, row: Callable[[Any], tuple[float, ...]], width: int, topic: str
+) -> tuple[F64, tuple[str, ...], F32]:
+    """(K, width) numbers, labels and scores of the detections whose numbers are all finite."""
+    try:
+        rows = [(row(d), *_hypothesis(d.results)) for d in msg.detections]
+    except AttributeError as error:
+        raise MessageError(f"{topic}: unknown version of vision_msgs: {error}") from None
+    rows = [r for r in rows if np.isfinite(r[0]).all()]
+    values = np.array([r[0] for r in rows], np.float64).reshape(-1, width)
+    return values, tuple(r[1] for r in rows), np.nan_to_num(np.array([r[2] for r in rows], np.float32))
+
+
+def _hypothesis(results: Iterable[Any]) -> tuple[str, float]:
+    """Label and score of the best result.
+
+    Fusion nodes append the class to the hypotheses of the cluster, whose own ``cluster_<i>`` has score 1:
+    such a name counts only where there is no other.
+    """
+    hypotheses = [getattr(result, "hypothesis", result) for result in results]  # flat up to ROS 2 Foxy
+    if not hypotheses:
+        return "", 0.0
+    labels = [(str(_either(h, "class_id", "id")), float(h.score)) for h in hypotheses]
+    named = [item for item in labels if not item[0].startswith("cluster_")]
+    return max(named, key=lambda item: np.nan_to_num(item[1])) if named else labels[0]
