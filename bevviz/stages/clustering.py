@@ -1,0 +1,369 @@
+"""DBSCAN on a grid, and boxes around its clusters."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from bevviz.config import ClusteringConfig
+from bevviz.frame import F32, F64, I32, I64, Boxes3D, Clusters, ClusterState
+from bevviz.stages.kernel import kernel
+from bevviz.stages.voxel import cell_keys, group
+
+MIN_SIZE = 0.01  # metres: no box is thinner, so that each has a volume and can be drawn and hit
+
+
+def cluster(points: F32, config: ClusteringConfig) -> Clusters:
+    """DBSCAN clusters of the obstacle points, each with its size verdict and its boxes.
+
+    Args:
+        points: (P, 3) float32 finite points.
+        config: DBSCAN's parameters and the size limits.
+
+    Returns:
+        Clusters in the order of their first points. Clusters outside the size limits are there too, with
+        their state. The oriented boxes have size x >= size y and yaw in (-pi/2, pi/2]. No side of a box is
+        shorter than ``MIN_SIZE``.
+    """
+    labels = dbscan(points, config.eps, config.min_points)
+    order, start = _sort_by(labels + 1, int(labels.max(initial=-1)) + 2)
+    centroid, low, high, oriented = _boxes(points, order, start[1:])
+    count = np.diff(start[1:])
+    state = np.full(len(count), ClusterState.KEPT, np.int32)
+    state[count < config.min_cluster_points] = ClusterState.TOO_SMALL
+    if config.max_cluster_points is not None:
+        state[count > config.max_cluster_points] = ClusterState.TOO_LARGE
+    aligned = Boxes3D((low + high) / 2, np.maximum(high - low, MIN_SIZE), np.zeros(len(count), np.float32))
+    return Clusters(labels, state, count, centroid, aligned, _upright(oriented))
+
+
+def dbscan(points: F32, eps: float, min_points: int) -> I32:
+    """Exact DBSCAN (Ester et al. 1996) in time linear in the occupied cells.
+
+    Points are binned in cells whose diagonal is shorter than ``eps`` (Gunawan 2013): a cell with
+    ``min_points`` points has core points only, and the core points of a cell belong together without any
+    distance being measured. Cells are then joined by union-find. Distances are compared as Open3D does:
+    in double precision and strictly, two points exactly ``eps`` apart are no neighbours.
+
+    Args:
+        points: (N, 3) float32 finite points.
+        eps: radius of the neighbourhood in metres.
+        min_points: neighbours, the point itself included, that make a core point.
+
+    Returns:
+        (N,) int32 labels, numbered in the order of each cluster's first point; -1 is noise. A border point
+        goes to the cluster of the nearest core point.
+    """
+    if len(points) == 0:
+        return np.zeros(0, np.int32)
+    # A hair less than eps / sqrt(3), so that rounding never puts points eps apart into one cell.
+    keys, strides = cell_keys(points, eps / math.sqrt(3) * (1 - 1e-6), reach=2)
+    cell, first = group(keys)
+    keys = keys[first]
+    by_key = np.argsort(keys)
+    rank = np.empty(len(by_key), np.int32)
+    rank[by_key] = np.arange(len(by_key), dtype=np.int32)
+    order, start = _sort_by(rank[cell], len(rank))
+    x, y, z = np.ascontiguousarray(points[order].T)
+    box = _cell_boxes(x, y, z, start)
+    near, neighbours = _adjacent(keys[by_key], strides, box, eps * eps)
+    cores = _core_points(x, y, z, order, start, box, near, neighbours, eps * eps, min_points)
+    parent = _join(x, y, z, start, cores, box, near, neighbours, eps * eps)
+    return _label(x, y, z, order, start, cores, parent, near, neighbours, eps * eps)
+
+
+# --- DBSCAN ------------------------------------------------------------------------------------
+# Points are sorted by cell: those of cell c are start[c]:start[c + 1], its core points come first. The cells
+# that may hold neighbours of c's points are neighbours[near[c]:near[c + 1]].
+
+
+@kernel
+def _sort_by(number: I32, count: int) -> tuple[I32, I32]:
+    """Stable counting sort: the order, and the start of each number in it."""
+    start = np.zeros(count + 1, np.int32)
+    for i in range(len(number)):
+        start[number[i] + 1] += 1
+    for k in range(count):
+        start[k + 1] += start[k]
+    end = start[:-1].copy()
+    order = np.empty(len(number), np.int32)
+    for i in range(len(number)):
+        order[end[number[i]]] = i
+        end[number[i]] += 1
+    return order, start
+
+
+@kernel
+def _cell_boxes(x: F32, y: F32, z: F32, start: I32) -> F64:
+    box = np.empty((len(start) - 1, 6))
+    for c in range(len(box)):
+        a, b = start[c], start[c + 1]
+        box[c, 0], box[c, 1], box[c, 2] = x[a:b].min(), y[a:b].min(), z[a:b].min()
+        box[c, 3], box[c, 4], box[c, 5] = x[a:b].max(), y[a:b].max(), z[a:b].max()
+    return box
+
+
+@kernel
+def _gap(low: float, high: float, other_low: float, other_high: float) -> float:
+    """Distance between two intervals, 0 where they overlap."""
+    return max(low - other_high, other_low - high, 0.0)
+
+
+@kernel
+def _adjacent(keys: I64, strides: I64, box: F64, eps2: float) -> tuple[I32, I32]:
+    """Other cells whose points may be nearer than eps, as (C + 1,) starts into one list.
+
+    Cells come sorted by key. The neighbours of a cell lie in 25 columns along z, each of which moves
+    forward with the cell, so that pointers find them without a search.
+    """
+    cells = len(keys)
+    near = np.zeros(cells + 1, np.int32)
+    found = np.empty(32 * cells, np.int32)
+    used = 0
+    column = np.zeros(25, np.int64)
+    for c in range(cells):
+        if used + 125 > len(found):
+            larger = np.empty(2 * len(found) + 125, np.int32)
+            larger[:used] = found[:used]
+            found = larger
+        for k in range(25):
+            middle = keys[c] + (k // 5 - 2) * strides[0] + (k % 5 - 2) * strides[1]
+            while column[k] < cells and keys[column[k]] < middle - 2:
+                column[k] += 1
+            other = column[k]
+            while other < cells and keys[other] <= middle + 2:
+                dx = _gap(box[c, 0], box[c, 3], box[other, 0], box[other, 3])
+                dy = _gap(box[c, 1], box[c, 4], box[other, 1], box[other, 4])
+                dz = _gap(box[c, 2], box[c, 5], box[other, 2], box[other, 5])
+                if other != c and dx * dx + dy * dy + dz * dz < eps2:
+                    found[used] = other
+                    used += 1
+                other += 1
+        near[c + 1] = used
+    return near, found[:used]
+
+
+@kernel
+def _core_points(
+    x: F32,
+    y: F32,
+    z: F32,
+    order: I32,
+    start: I32,
+    box: F64,
+    near: I32,
+    neighbours: I32,
+    eps2: float,
+    min_points: int,
+) -> I32:
+    """Number of core points of each cell. Moves them to the front of their cell, in every array."""
+    cells = len(start) - 1
+    cores = np.zeros(cells, np.int32)
+    for c in range(cells):
+        own = start[c + 1] - start[c]
+        if own >= min_points:
+            cores[c] = own
+            continue
+        around = own
+        for k in range(near[c], near[c + 1]):
+            around += start[neighbours[k] + 1] - start[neighbours[k]]
+        if around < min_points:
+            continue
+        for i in range(start[c], start[c + 1]):
+            px, py, pz = np.float64(x[i]), np.float64(y[i]), np.float64(z[i])
+            count = own
+            for k in range(near[c], near[c + 1]):
+                o = neighbours[k]
+                dx = _gap(px, px, box[o, 0], box[o, 3])
+                dy = _gap(py, py, box[o, 1], box[o, 4])
+                dz = _gap(pz, pz, box[o, 2], box[o, 5])
+                if dx * dx + dy * dy + dz * dz >= eps2:
+                    continue
+                for j in range(start[o], start[o + 1]):
+                    dx, dy, dz = px - x[j], py - y[j], pz - z[j]
+                    count += dx * dx + dy * dy + dz * dz < eps2
+                if count >= min_points:
+                    break
+            if count >= min_points:
+                j = start[c] + cores[c]
+                x[i], x[j] = x[j], x[i]
+                y[i], y[j] = y[j], y[i]
+                z[i], z[j] = z[j], z[i]
+                order[i], order[j] = order[j], order[i]
+                cores[c] += 1
+    return cores
+
+
+@kernel
+def _root(parent: I32, c: int) -> int:
+    while parent[c] != c:
+        parent[c] = parent[parent[c]]
+        c = parent[c]
+    return c
+
+
+@kernel
+def _join(
+    x: F32, y: F32, z: F32, start: I32, cores: I32, box: F64, near: I32, neighbours: I32, eps2: float
+) -> I32:
+    """Union-find over the cells: parents, cells with core points nearer than eps in one tree."""
+    parent = np.arange(len(cores)).astype(np.int32)
+    for c in range(len(cores)):
+        for k in range(near[c], near[c + 1]):
+            o = neighbours[k]
+            if o < c or cores[c] == 0 or cores[o] == 0:
+                continue
+            a, b = _root(parent, c), _root(parent, o)
+            if a == b:
+                continue
+            touch = False
+            for i in range(start[c], start[c] + cores[c]):
+                px, py, pz = np.float64(x[i]), np.float64(y[i]), np.float64(z[i])
+                dx = _gap(px, px, box[o, 0], box[o, 3])
+                dy = _gap(py, py, box[o, 1], box[o, 4])
+                dz = _gap(pz, pz, box[o, 2], box[o, 5])
+                if dx * dx + dy * dy + dz * dz >= eps2:
+                    continue
+                for j in range(start[o], start[o] + cores[o]):
+                    dx, dy, dz = px - x[j], py - y[j], pz - z[j]
+                    if dx * dx + dy * dy + dz * dz < eps2:
+                        touch = True
+                        break
+                if touch:
+                    parent[b] = a
+                    break
+    return parent
+
+
+@kernel
+def _label(
+    x: F32,
+    y: F32,
+    z: F32,
+    order: I32,
+    start: I32,
+    cores: I32,
+    parent: I32,
+    near: I32,
+    neighbours: I32,
+    eps2: float,
+) -> I32:
+    root = np.full(len(order), -1, np.int32)  # of the cloud's points, in the order of the cloud
+    for c in range(len(cores)):
+        for i in range(start[c], start[c + 1]):
+            if i < start[c] + cores[c]:
+                root[order[i]] = _root(parent, c)
+                continue
+            px, py, pz = np.float64(x[i]), np.float64(y[i]), np.float64(z[i])
+            nearest = eps2
+            for k in range(near[c] - 1, near[c + 1]):
+                o = c if k < near[c] else neighbours[k]
+                for j in range(start[o], start[o] + cores[o]):
+                    dx, dy, dz = px - x[j], py - y[j], pz - z[j]
+                    d2 = dx * dx + dy * dy + dz * dz
+                    if d2 < nearest:
+                        nearest = d2
+                        root[order[i]] = _root(parent, o)
+    number = np.full(len(cores), -1, np.int32)
+    found = 0
+    for i in range(len(root)):
+        if root[i] >= 0:
+            if number[root[i]] < 0:
+                number[root[i]] = found
+                found += 1
+            root[i] = number[root[i]]
+    return root
+
+
+# --- boxes -------------------------------------------------------------------------------------
+
+
+def _upright(oriented: F32) -> Boxes3D:
+    """Boxes from rows of centre, size and yaw in [0, pi/2), the longer side turned to x."""
+    size, yaw = np.maximum(oriented[:, 3:6], np.float32(MIN_SIZE)), oriented[:, 6].copy()
+    wide = size[:, 1] > size[:, 0]
+    size[wide, :2] = size[wide, 1::-1]
+    yaw[wide] -= np.float32(np.pi / 2)
+    # -pi/2 and pi/2 are the same box; the interval is open below.
+    yaw[yaw <= -np.float32(np.pi / 2)] += np.float32(np.pi)
+    return Boxes3D(oriented[:, :3], size, yaw)
+
+
+@kernel
+def _closeness(x: F64, y: F64, angle: float) -> float:
+    """Zhang's closeness: how near the points lie to the sides of the tightest rectangle at this angle."""
+    c, s = math.cos(angle), math.sin(angle)
+    low_u = low_v = np.inf
+    high_u = high_v = -np.inf
+    for i in range(len(x)):
+        u, v = c * x[i] + s * y[i], c * y[i] - s * x[i]
+        low_u, high_u = min(low_u, u), max(high_u, u)
+        low_v, high_v = min(low_v, v), max(high_v, v)
+    # Of two opposite sides, the one that the points lie along is the one that the sensor saw.
+    far_low_u = far_high_u = far_low_v = far_high_v = 0.0
+    for i in range(len(x)):
+        u, v = c * x[i] + s * y[i], c * y[i] - s * x[i]
+        far_low_u += (u - low_u) ** 2
+        far_high_u += (high_u - u) ** 2
+        far_low_v += (v - low_v) ** 2
+        far_high_v += (high_v - v) ** 2
+    score = 0.0
+    for i in range(len(x)):
+        u, v = c * x[i] + s * y[i], c * y[i] - s * x[i]
+        du = u - low_u if far_low_u < far_high_u else high_u - u
+        dv = v - low_v if far_low_v < far_high_v else high_v - v
+        score += 1 / max(min(du, dv), 0.01)
+    return score
+
+
+@kernel
+def _heading(x: F64, y: F64) -> float:
+    """Angle in [0, pi/2) of the best rectangle: every 3 degrees, then every 0.25 about the best."""
+    best, heading = -1.0, 0.0
+    for k in range(30):
+        angle = math.radians(3.0 * k)
+        score = _closeness(x, y, angle)
+        if score > best:
+            best, heading = score, angle
+    coarse = heading
+    for k in range(-11, 12):
+        angle = coarse + math.radians(0.25 * k)
+        score = _closeness(x, y, angle)
+        if score > best:
+            best, heading = score, angle
+    return heading % (math.pi / 2)
+
+
+@kernel
+def _boxes(points: F32, order: I32, start: I32) -> tuple[F32, F32, F32, F32]:
+    """Centroid, lowest and highest corner, and oriented box (centre, size, yaw) of each cluster.
+
+    The heading is found by L-shape fitting with the closeness criterion (Zhang et al. 2017), on at most
+    about 256 points of a cluster spread evenly over it; the extent is that of all of them.
+    """
+    clusters = len(start) - 1
+    centroid = np.empty((clusters, 3), np.float32)
+    low = np.empty((clusters, 3), np.float32)
+    high = np.empty((clusters, 3), np.float32)
+    oriented = np.empty((clusters, 7), np.float32)
+    for k in range(clusters):
+        own = points[order[start[k] : start[k + 1]]]
+        for axis in range(3):
+            centroid[k, axis] = own[:, axis].astype(np.float64).mean()
+            low[k, axis], high[k, axis] = own[:, axis].min(), own[:, axis].max()
+        # About the centroid, so that a box far from the origin loses no digits.
+        x = own[:, 0].astype(np.float64) - centroid[k, 0]
+        y = own[:, 1].astype(np.float64) - centroid[k, 1]
+        step = (len(own) + 255) // 256
+        yaw = _heading(x[::step], y[::step])
+        c, s = math.cos(yaw), math.sin(yaw)
+        u, v = c * x + s * y, c * y - s * x
+        mid_u, mid_v = (u.min() + u.max()) / 2, (v.min() + v.max()) / 2
+        oriented[k, 0] = centroid[k, 0] + c * mid_u - s * mid_v
+        oriented[k, 1] = centroid[k, 1] + s * mid_u + c * mid_v
+        oriented[k, 2] = (low[k, 2] + high[k, 2]) / 2
+        oriented[k, 3], oriented[k, 4] = u.max() - u.min(), v.max() - v.min()
+        oriented[k, 5] = high[k, 2] - low[k, 2]
+        oriented[k, 6] = yaw
+    return centroid, low, high, oriented
