@@ -1,0 +1,310 @@
+"""Bird's-eye view: a raster of the points seen from above, with boxes and labels on top."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import lru_cache
+from typing import Any
+
+import cv2
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from bevviz.colors import class_color, turbo
+from bevviz.config import BevConfig
+from bevviz.frame import F32, I32, U8, Bev, Bool, Boxes3D, Clusters, ClusterState, Objects
+from bevviz.geometry import corners
+
+UNKNOWN, FREE, OCCUPIED = -1, 0, 100  # values of the occupancy channel, as in nav_msgs/OccupancyGrid
+
+# BGR
+_POINT = (200, 200, 200)
+_RED, _GREEN = (0, 0, 255), (0, 255, 0)
+_BACKGROUND, _RING, _CAPTION = (26, 20, 18), (58, 48, 44), (130, 118, 110)
+_GROUND, _UNNAMED = (120, 106, 92), (150, 150, 150)
+_HEIGHT_SPAN = 3.0  # metres above the ground that the colour map of the rich style spans
+
+
+def bev(
+    points: F32,
+    intensity: NDArray[Any] | None,
+    ground: Bool | None,
+    objects: Objects | None,
+    clusters: Clusters | None,
+    config: BevConfig,
+) -> Bev:
+    """Raster the points from above: row 0 is ``range_x`` ahead, column 0 is ``range_y`` to the left.
+
+    Column ``floor((range_y - y) / resolution)`` and row ``floor((range_x - x) / resolution)``, computed in
+    float32 as the points are; what falls on no pixel is left out.
+
+    Styles: ``reference`` paints the points grey on black, each object's axis-aligned box red and its label
+    green. ``rich`` shades ground by density and obstacles by height above it, with range rings, the oriented
+    boxes of the clusters in grey and those of the objects in the colour of their class, heading and label.
+
+    Channels, only those that are asked for and whose input is there:
+
+    - density: int32, points in the cell;
+    - height: float32, metres, highest z in the cell, NaN where it is empty;
+    - intensity: float32, mean in the cell, NaN where it is empty;
+    - occupancy: int8, 100 with an obstacle point, 0 with ground points only, -1 unknown.
+
+    Args:
+        points: (N, 3) metres, x forward, y left, z up.
+        intensity: (N,) of any number type, or None.
+        ground: (N,) True where the point is ground, or None.
+        objects: named boxes.
+        clusters: boxes to show in the rich style.
+        config: ranges, resolution, style and channels.
+
+    Raises:
+        ValueError: intensity or ground are not as long as points.
+    """
+    for name, array in (("intensity", intensity), ("ground", ground)):
+        if array is not None and len(array) != len(points):
+            raise ValueError(f"{name} has {len(array)} values for {len(points)} points")
+    rows, columns = int(2 * config.range_x / config.resolution), int(2 * config.range_y / config.resolution)
+    scale = np.array([config.range_x, config.range_y, config.resolution], np.float32)
+    points = np.ascontiguousarray(points, np.float32)
+
+    missing = {"intensity"} if intensity is None else set()
+    if ground is None:
+        missing.add("occupancy")
+    channels = [name for name in config.channels if name not in missing]
+    shaded = ("density", "height", "occupancy") if config.style == "rich" else ()
+    grids = _rasterise(points, intensity, ground, scale, (rows, columns), {*channels, *shaded})
+
+    if config.style == "reference":
+        image = np.zeros((rows, columns, 3), np.uint8)
+        _paint(points, scale, image, np.array(_POINT, np.uint8))
+        if objects is not None:
+            _draw_reference(image, objects, scale)
+    else:
+        image = _background(rows, columns, config.range_x, config.range_y, config.resolution).copy()
+        bottom = _ground_level(points, ground)
+        _shade(
+            grids["density"],
+            grids["height"],
+            grids["occupancy"],
+            _obstacle_shades(),
+            _ground_shades(),
+            bottom,
+            _HEIGHT_SPAN,
+            image,
+        )
+        _draw_rich(image, objects, clusters, config)
+
+    return Bev(
+        resolution=config.resolution,
+        range_x=config.range_x,
+        range_y=config.range_y,
+        image=image,
+        channels={name: grids[name] for name in channels},
+    )
+
+
+# --- raster ------------------------------------------------------------------------------------
+
+
+def _rasterise(
+    points: F32,
+    intensity: NDArray[Any] | None,
+    ground: Bool | None,
+    scale: F32,
+    shape: tuple[int, int],
+    wanted: set[str],
+) -> dict[str, NDArray[Any]]:
+    if not wanted:
+        return {}
+    none = np.zeros((0, 0), np.float32)
+    density = np.zeros(shape, np.int32)
+    height = np.full(shape, np.nan, np.float32) if "height" in wanted else none
+    total = np.zeros(shape, np.float32) if "intensity" in wanted else none
+    occupancy = np.full(shape if "occupancy" in wanted else (0, 0), UNKNOWN, np.int8)
+    _fill(
+        points,
+        np.zeros(0, np.float32) if total.size == 0 else np.ascontiguousarray(intensity, np.float32),
+        np.zeros(0, np.bool_) if ground is None else ground,
+        scale,
+        density,
+        height,
+        total,
+        occupancy,
+    )
+    grids: dict[str, NDArray[Any]] = {"density": density, "height": height, "occupancy": occupancy}
+    if "intensity" in wanted:
+        with np.errstate(invalid="ignore"):
+            grids["intensity"] = np.divide(total, density, out=total, dtype=np.float32, casting="unsafe")
+    return grids
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def _fill(
+    points: F32,
+    intensity: F32,
+    ground: Bool,
+    scale: F32,
+    density: I32,
+    height: F32,
+    total: F32,
+    occupancy: NDArray[np.int8],
+) -> None:
+    rows, columns = density.shape
+    with_height, with_total, with_occupancy = height.size > 0, total.size > 0, occupancy.size > 0
+    for i in range(len(points)):
+        row = np.floor((scale[0] - points[i, 0]) / scale[2])
+        column = np.floor((scale[1] - points[i, 1]) / scale[2])
+        if not (0 <= row < rows and 0 <= column < columns):
+            continue
+        v, u = int(row), int(column)
+        density[v, u] += 1
+        if with_height and not points[i, 2] <= height[v, u]:
+            height[v, u] = points[i, 2]
+        if with_total:
+            total[v, u] += intensity[i]
+        if with_occupancy:
+            if len(ground) > 0 and ground[i]:
+                occupancy[v, u] = max(occupancy[v, u], FREE)
+            else:
+                occupancy[v, u] = OCCUPIED
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def _paint(points: F32, scale: F32, image: U8, color: U8) -> None:
+    rows, columns, _ = image.shape
+    for i in range(len(points)):
+        row = np.floor((scale[0] - points[i, 0]) / scale[2])
+        column = np.floor((scale[1] - points[i, 1]) / scale[2])
+        if 0 <= row < rows and 0 <= column < columns:
+            image[int(row), int(column)] = color
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def _shade(
+    density: I32,
+    height: F32,
+    occupancy: NDArray[np.int8],
+    heights: U8,
+    ground: U8,
+    bottom: float,
+    span: float,
+    image: U8,
+) -> None:
+    """Ground by density, obstacles by their height above ``bottom``. Empty cells keep the background."""
+    rows, columns = density.shape
+    for v in range(rows):
+        for u in range(columns):
+            if density[v, u] == 0:
+                continue
+            if occupancy[v, u] == OCCUPIED:
+                level = (height[v, u] - bottom) / span * len(heights)
+                color = heights[max(0, min(len(heights) - 1, int(level)))]
+                image[v, u] = color
+            else:
+                image[v, u] = ground[min(density[v, u], len(ground)) - 1]
+
+
+# --- drawing -----------------------------------------------------------------------------------
+
+
+def _draw_reference(image: U8, objects: Objects, scale: F32) -> None:
+    center = np.floor((scale[:2] - objects.boxes.center[:, :2]) / scale[2]).astype(int)
+    half = (objects.boxes.size[:, :2] / scale[2]).astype(int) // 2
+    for name, (v, u), (h, w) in zip(objects.names, center.tolist(), half.tolist(), strict=True):
+        cv2.rectangle(image, (u - w, v - h), (u + w, v + h), _RED, 2)
+        cv2.putText(image, f"ID:{name}", (u - w, v - h - 5), cv2.FONT_HERSHEY_SIMPLEX, 0.4, _GREEN, 1)
+
+
+def _draw_rich(image: U8, objects: Objects | None, clusters: Clusters | None, config: BevConfig) -> None:
+    named = set() if objects is None else set(objects.cluster.tolist())
+    if clusters is not None:
+        rows = [k for k in np.flatnonzero(clusters.state == ClusterState.KEPT).tolist() if k not in named]
+        outlines = _pixels(corners(clusters.obb)[rows, :4, :2], config)
+        cv2.polylines(image, list(outlines), True, _UNNAMED, 1, cv2.LINE_AA, _SHIFT)
+    if objects is None:
+        return
+    for name, score, color, outline, front in zip(
+        objects.names,
+        objects.score.tolist(),
+        [class_color(name)[::-1] for name in objects.names],
+        _pixels(corners(objects.boxes)[:, :4, :2], config),
+        _pixels(_headings(objects.boxes), config),
+        strict=True,
+    ):
+        cv2.polylines(image, [outline], True, color, 2, cv2.LINE_AA, _SHIFT)
+        cv2.polylines(image, [front], False, color, 2, cv2.LINE_AA, _SHIFT)
+        u, v = outline[:, 0].max() >> _SHIFT, outline[:, 1].min() >> _SHIFT
+        _caption(image, f"{name} {score:.2f}", (int(u) + 4, int(v) + 4), color)
+
+
+def _headings(boxes: Boxes3D) -> F32:
+    """(K, 2, 2) from each centre to the middle of the front side."""
+    ahead = np.stack([np.cos(boxes.yaw), np.sin(boxes.yaw)], 1) * (boxes.size[:, :1] / 2)
+    center = boxes.center[:, :2]
+    return np.asarray(np.stack([center, center + ahead], 1), np.float32)
+
+
+_SHIFT = 3  # fractional bits of the pixel coordinates that are given to OpenCV
+
+
+def _pixels(xy: F32, config: BevConfig) -> I32:
+    """(..., 2) metres -> (..., 2) u, v in fixed point, for OpenCV's ``shift``."""
+    uv = (np.array([config.range_y, config.range_x]) - xy[..., ::-1]) / config.resolution - 0.5
+    fixed: I32 = np.round(np.clip(uv, -4e4, 4e4) * (1 << _SHIFT)).astype(np.int32)
+    return fixed
+
+
+def _caption(image: U8, text: str, at: tuple[int, int], color: Sequence[int]) -> None:
+    for width, shade in ((3, _BACKGROUND), (1, color)):
+        cv2.putText(image, text, at, cv2.FONT_HERSHEY_SIMPLEX, 0.45, shade, width, cv2.LINE_AA)
+
+
+@lru_cache(maxsize=2)
+def _background(rows: int, columns: int, range_x: float, range_y: float, resolution: float) -> U8:
+    """Range rings with their metres, axes, and the robot as an arrow head."""
+    image = np.full((rows, columns, 3), _BACKGROUND, np.uint8)
+    u, v = range_y / resolution, range_x / resolution
+    center = (int(u), int(v))
+    longest = min(range_x, range_y)
+    step = next(s for s in (1, 2, 5, 10, 20, 50, 100) if longest / s <= 6)
+    cv2.line(image, (center[0], 0), (center[0], rows - 1), _RING, 1)
+    cv2.line(image, (0, center[1]), (columns - 1, center[1]), _RING, 1)
+    for metres in range(step, int(longest) + 1, step):
+        radius = metres / resolution
+        cv2.circle(image, center, round(radius), _RING, 1, cv2.LINE_AA)
+        cv2.putText(
+            image,
+            f"{metres} m",
+            (round(u + radius * 0.7071) + 3, round(v - radius * 0.7071) - 3),
+            cv2.FONT_HERSHEY_SIMPLEX,
+            0.4,
+            _CAPTION,
+            1,
+            cv2.LINE_AA,
+        )
+    arrow = np.array([[0, -9], [6, 7], [0, 3], [-6, 7]]) + center
+    cv2.fillPoly(image, [arrow.astype(np.int32)], (255, 255, 255), cv2.LINE_AA)
+    image.flags.writeable = False
+    return image
+
+
+def _ground_level(points: F32, ground: Bool | None) -> float:
+    """Median z of the ground, else the height that a sensor on a car stands at."""
+    sample = slice(None, None, 1 + len(points) // 10_000)
+    below = points[sample, 2][ground[sample]] if ground is not None else points[:0, 2]
+    return float(np.median(below)) if len(below) else -1.7
+
+
+@lru_cache(maxsize=1)
+def _ground_shades(steps: int = 16) -> U8:
+    """(steps, 3) BGR by number of points in the cell, logarithmic."""
+    share = np.log1p(np.arange(1, steps + 1)) / np.log1p(steps)
+    shades: U8 = np.round(np.array(_GROUND) * (0.45 + 0.55 * share[:, None])).astype(np.uint8)
+    return shades
+
+
+@lru_cache(maxsize=1)
+def _obstacle_shades() -> U8:
+    """(256, 3) BGR by height, without the near-black end of the map."""
+    return np.ascontiguousarray(turbo(300)[44:, ::-1])
