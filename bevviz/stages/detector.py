@@ -1,0 +1,380 @@
+"""2D object detection with any YOLO-like ONNX file, through onnxruntime."""
+
+from __future__ import annotations
+
+import ast
+import difflib
+from collections.abc import Mapping, Sequence
+from enum import StrEnum
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import onnxruntime as ort
+
+from bevviz.config import DetectorConfig
+from bevviz.errors import UserError
+from bevviz.frame import F32, I32, U8, Detections, DetectionState
+from bevviz.geometry import iou
+
+DEMO_MODEL = Path(__file__).parents[1] / "data" / "demo_detector.onnx"
+DEFAULT_SIZE = 640  # of models that leave their input size open, as Ultralytics and Megvii train them
+MAX_CANDIDATES = 3000  # that enter the NMS, best first: bounds the time a nonsense model can take
+GREY = 114  # of the letterbox's border, the same in all these families
+
+COCO = (
+    "person", "bicycle", "car", "motorcycle", "airplane", "bus", "train", "truck", "boat", "traffic light",
+    "fire hydrant", "stop sign", "parking meter", "bench", "bird", "cat", "dog", "horse", "sheep", "cow",
+    "elephant", "bear", "zebra", "giraffe", "backpack", "umbrella", "handbag", "tie", "suitcase", "frisbee",
+    "skis", "snowboard", "sports ball", "kite", "baseball bat", "baseball glove", "skateboard", "surfboard",
+    "tennis racket", "bottle", "wine glass", "cup", "fork", "knife", "spoon", "bowl", "banana", "apple",
+    "sandwich", "orange", "broccoli", "carrot", "hot dog", "pizza", "donut", "cake", "chair", "couch",
+    "potted plant", "bed", "dining table", "toilet", "tv", "laptop", "mouse", "remote", "keyboard",
+    "cell phone", "microwave", "oven", "toaster", "sink", "refrigerator", "book", "clock", "vase", "scissors",
+    "teddy bear", "hair drier", "toothbrush",
+)  # fmt: skip
+
+# From the fastest down. DirectML and others that are not named here are used when asked for.
+PREFERRED_PROVIDERS = ("Tensorrt", "CUDA", "MIGraphX", "ROCM", "OpenVINO", "CoreML", "CPU")
+
+
+class Layout(StrEnum):
+    """How the rows of a model's output are to be read."""
+
+    YOLOV8 = "YOLOv8"  # [1, 4 + classes, N]: centre, size, class scores
+    YOLOV5 = "YOLOv5"  # [1, N, 5 + classes], 3 anchors a cell: centre, size, objectness, class scores
+    YOLOX = "YOLOX"  # the same with 1 anchor a cell, centre and size still relative to the cell
+    END_TO_END = "end-to-end"  # [1, N, 6], as YOLOv10 and YOLO26 export: corners, score, class; no NMS
+
+
+SUPPORTED = (
+    "[1, 4 + classes, N] (YOLOv8, 11), [1, N, 5 + classes] (YOLOv5, YOLOX raw grid), "
+    "[1, N, 6] (end-to-end YOLOv10, 26)"
+)
+
+
+class Detector:
+    """An ONNX detector: BGR image in, 2D boxes in that image's pixels out.
+
+    What the model wants (input size, type, colour order, letterbox) and how its output is to be read
+    (``layout``) comes from the model itself: its inputs, its metadata, and the shape that one run on a
+    grey image returns.
+
+    Attributes:
+        names: class names by class id.
+        layout: how the output is read.
+        provider: onnxruntime execution provider in use, such as ``CPU``.
+        input_size: height, width of the network's input; the largest one where the model leaves it open.
+        description: all of this in one line.
+
+    Raises:
+        UserError: no such file, no ONNX file, no detector, wrong class names, or no such provider.
+    """
+
+    def __init__(self, config: DetectorConfig) -> None:
+        self._config = config
+        path = DEMO_MODEL if config.model == "demo" else Path(config.model)
+        self._session, self.provider = _open(path, config)
+        inputs = self._session.get_inputs()
+        where = f"detector.model {path}"
+        shape = inputs[0].shape
+        batch = shape[0] if isinstance(shape[0], int) else 1
+        if len(inputs) != 1 or len(shape) != 4 or (batch, shape[1]) != (1, 3):
+            found = ", ".join(f"{i.name} {i.shape}" for i in inputs)
+            raise UserError(
+                f"{where}: no detector of one colour image [1, 3, height, width]; its inputs: {found}"
+            )
+        types = {"tensor(float)": np.float32, "tensor(float16)": np.float16}
+        if inputs[0].type not in types:
+            raise UserError(f"{where}: its input is {inputs[0].type}; supported: {', '.join(types)}")
+        self._input, self._dtype = inputs[0].name, types[inputs[0].type]
+
+        metadata = self._session.get_modelmeta().custom_metadata_map
+        self._stride = int(_literal(metadata.get("stride"), int) or 32)
+        sizes = _literal(metadata.get("imgsz"), list) or [DEFAULT_SIZE, DEFAULT_SIZE]
+        self._open_axes = tuple(not isinstance(n, int) for n in shape[2:])
+        self.input_size = tuple(
+            n if isinstance(n, int) else int(s) for n, s in zip(shape[2:], sizes, strict=True)
+        )
+        names = _read_names(Path(config.names)) if config.names else _metadata_names(metadata)
+        self._output, self.layout, count = self._probe(where, len(names) if names else None)
+        self.names = names or _default_names(count)
+        self._wanted = self._wanted_classes()
+        size = f"{self.input_size[1]} x {self.input_size[0]}"
+        classes = f"{len(self.names) or 'unnamed'} classes"
+        self.description = f"{path.name}: {self.layout}, {size}, {classes}, {self.provider}"
+
+    def __call__(self, bgr: U8) -> Detections:
+        """Detect in an (H, W, 3) uint8 BGR image.
+
+        Returns:
+            Candidates with a score of ``detector.explain_threshold`` or more, best first: every one that
+            is KEPT, and the best of the others up to ``detector.max_candidates`` in all. Those
+            BELOW_THRESHOLD are exactly what a lower ``detector.conf_threshold`` would keep: a weak
+            candidate that overlaps a stronger one of its class is SUPPRESSED.
+        """
+        config = self._config
+        height, width = bgr.shape[:2]
+        if height == 0 or width == 0:
+            return Detections.empty()
+        blob, scale, offset = self._letterbox(bgr)
+        output = self._session.run([self._output], {self._input: blob})[0][0]
+        xyxy, score, class_id = self._decode(output, blob.shape[2:])
+        # Networks count from the corner of the first pixel, bevviz from its centre.
+        xyxy = (xyxy - np.tile(offset, 2)) / np.tile(scale, 2) - np.float32(0.5)
+        xyxy = np.clip(xyxy, np.float32(-0.5), np.array([width, height, width, height], np.float32) - 0.5)
+        sound = np.isfinite(xyxy).all(axis=1) & (xyxy[:, 2] > xyxy[:, 0]) & (xyxy[:, 3] > xyxy[:, 1])
+        if self._wanted is not None:
+            sound &= np.isin(class_id, self._wanted)
+        order = np.flatnonzero(sound)
+        order = order[np.argsort(-score[order], kind="stable")[:MAX_CANDIDATES]]
+        xyxy, score, class_id = xyxy[order].astype(np.float32), score[order], class_id[order]
+
+        if self.layout is Layout.END_TO_END:
+            suppressor, overlap = np.full(len(order), -1, np.int32), np.zeros(len(order), np.float32)
+        else:
+            suppressor, overlap = nms(xyxy, class_id, config.iou_threshold)
+        state = np.where(score >= config.conf_threshold, DetectionState.KEPT, DetectionState.BELOW_THRESHOLD)
+        state[suppressor >= 0] = DetectionState.SUPPRESSED
+        room = max(config.max_candidates - np.count_nonzero(state == DetectionState.KEPT), 0)
+        others = np.flatnonzero(state != DetectionState.KEPT)
+        row = np.delete(np.arange(len(order)), others[room:])
+        # A suppressor is stronger than what it suppresses and so is never cut off before it.
+        suppressor = np.where(suppressor[row] >= 0, np.searchsorted(row, suppressor[row]), -1)
+        return Detections(
+            xyxy=xyxy[row],
+            score=score[row],
+            class_id=class_id[row],
+            names=tuple(self._name(c) for c in class_id[row].tolist()),
+            state=state[row].astype(np.int32),
+            suppressed_by=suppressor.astype(np.int32),
+            overlap=overlap[row],
+        )
+
+    def _letterbox(self, bgr: U8) -> tuple[Any, F32, F32]:
+        """The network's input, with the scale and offset (x, y) that took the image there."""
+        size = np.array(bgr.shape[:2])
+        ratio = np.min(np.array(self.input_size) / size)
+        yolox = self.layout is Layout.YOLOX
+        # Megvii cuts the resized image's fraction of a pixel off, Ultralytics rounds it.
+        inner = np.maximum((size * ratio).astype(int) if yolox else np.rint(size * ratio).astype(int), 1)
+        padded = -(-inner // self._stride) * self._stride
+        outer = np.where(self._open_axes, padded, self.input_size)
+        top, left = (0, 0) if yolox else (outer - inner) // 2
+        bottom, right = outer - inner - (top, left)
+        resized = bgr if np.array_equal(inner, size) else cv2.resize(bgr, (int(inner[1]), int(inner[0])))
+        canvas = cv2.copyMakeBorder(
+            resized,
+            int(top),
+            int(bottom),
+            int(left),
+            int(right),
+            cv2.BORDER_CONSTANT,
+            value=(GREY, GREY, GREY),
+        )
+        blob = cv2.dnn.blobFromImage(canvas, 1.0 if yolox else 1 / 255, swapRB=not yolox)
+        scale = (inner / size)[::-1].astype(np.float32)
+        return blob.astype(self._dtype, copy=False), scale, np.array([left, top], np.float32)
+
+    def _decode(self, output: Any, size: Sequence[int]) -> tuple[F32, F32, I32]:
+        """Boxes x0, y0, x1, y1 in pixels of the network's input, scores and classes above the threshold."""
+        least = self._config.explain_threshold
+        if self.layout is Layout.END_TO_END:
+            rows = output[output[:, 4] >= least].astype(np.float32)
+            return rows[:, :4], rows[:, 4], rows[:, 5].astype(np.int32)
+        if self.layout is Layout.YOLOV8:
+            scores = output[4 : 4 + len(self.names)]
+            row = np.flatnonzero(scores.max(axis=0) >= least)
+            boxes, scores = output[:4, row].T.astype(np.float32), scores[:, row].T
+        else:
+            row = np.flatnonzero(output[:, 4] >= least)  # no product with a class score exceeds objectness
+            boxes = output[row, :4].astype(np.float32)
+            scores = output[row, 5 : 5 + len(self.names)] * output[row, 4:5]
+        class_id = scores.argmax(axis=1).astype(np.int32)
+        score = np.take_along_axis(scores, class_id[:, None], axis=1)[:, 0].astype(np.float32)
+        if self.layout is Layout.YOLOX:
+            cell, stride = _grid(size, _cells(size)[len(output)])
+            boxes[:, :2] = (boxes[:, :2] + cell[row]) * stride[row]
+            boxes[:, 2:] = np.exp(boxes[:, 2:]) * stride[row]
+        half = boxes[:, 2:] / 2
+        strong = score >= least
+        xyxy = np.hstack([boxes[:, :2] - half, boxes[:, :2] + half])
+        return xyxy[strong], score[strong], class_id[strong]
+
+    def _probe(self, where: str, classes: int | None) -> tuple[str, Layout, int | None]:
+        """Run once on grey; name of the detections' output, its layout and the count of classes.
+
+        This also pays the first run's allocations before the first real image.
+        """
+        grey = np.full((1, 3, *self.input_size), 0.5, self._dtype)
+        try:
+            outputs = self._session.run(None, {self._input: grey})
+        except Exception as error:  # onnxruntime's errors have no common base class
+            raise UserError(
+                f"{where}: fails on an input of {list(grey.shape)}: {_first_line(error)}"
+            ) from None
+        names = [o.name for o in self._session.get_outputs()]
+        shapes = [list(np.shape(o)) for o in outputs]
+        for name, output, shape in zip(names, outputs, shapes, strict=True):
+            layout, count = find_layout(shape, self.input_size, classes)
+            if layout is Layout.YOLOX and np.median(np.abs(output[0, :, :2])) > 8:
+                raise UserError(
+                    f"{where}: one box a cell {shape} with boxes decoded already; export the raw grid"
+                )
+            if layout is not None:
+                return name, layout, count
+        found = ", ".join(f"{name} {shape}" for name, shape in zip(names, shapes, strict=True))
+        named = f" for {classes} class names" if classes else ""
+        raise UserError(f"{where}: no detector{named}; its outputs: {found}; supported: {SUPPORTED}")
+
+    def _wanted_classes(self) -> I32 | None:
+        for name in self._config.classes:
+            if name not in self.names:
+                near = difflib.get_close_matches(name, self.names, 1)
+                hint = f"; did you mean '{near[0]}'?" if near else ""
+                raise UserError(f"detector.classes: the model has no class '{name}'{hint}")
+        if not self._config.classes:
+            return None
+        return np.array([self.names.index(name) for name in self._config.classes], np.int32)
+
+    def _name(self, class_id: int) -> str:
+        return self.names[class_id] if 0 <= class_id < len(self.names) else f"class_{class_id}"
+
+
+def nms(xyxy: F32, class_id: I32, threshold: float) -> tuple[I32, F32]:
+    """Greedy class-wise non-maximum suppression (Neubeck and Van Gool 2006).
+
+    Args:
+        xyxy: (N, 4) boxes, best score first.
+        class_id: (N,) classes; only boxes of the same one suppress each other.
+        threshold: IoU above which the weaker box goes.
+
+    Returns:
+        suppressor: (N,) row of the surviving box that suppressed this one, -1 for survivors.
+        overlap: (N,) IoU with it, 0 for survivors.
+    """
+    suppressor = np.full(len(xyxy), -1, np.int32)
+    overlap = np.zeros(len(xyxy), np.float32)
+    for i in range(len(xyxy)):
+        if suppressor[i] >= 0:
+            continue
+        rival = i + 1 + np.flatnonzero((suppressor[i + 1 :] < 0) & (class_id[i + 1 :] == class_id[i]))
+        value = iou(xyxy[i : i + 1], xyxy[rival])[0]
+        hit = value > threshold
+        suppressor[rival[hit]] = i
+        overlap[rival[hit]] = value[hit]
+    return suppressor, overlap
+
+
+def find_layout(
+    shape: Sequence[int], input_size: Sequence[int], classes: int | None = None
+) -> tuple[Layout | None, int | None]:
+    """Layout and count of classes of an output's shape, given the network's input height and width.
+
+    One box a cell, summed over neighbouring strides, tells a grid from a list of boxes: 8400 for 640 x 640
+    and strides 8, 16, 32, three times that with YOLOv5's anchors. ``classes``, where known, lets the
+    columns that segmentation and pose models append be told from class scores.
+    """
+    if len(shape) != 3 or shape[0] != 1:
+        return None, None
+    _, rows, columns = shape
+    cells = _cells(input_size)
+    found: tuple[tuple[bool, Layout, int], ...] = (
+        (columns in cells, Layout.YOLOV8, rows - 4),
+        (rows in cells, Layout.YOLOX, columns - 5),
+        (rows % 3 == 0 and rows // 3 in cells, Layout.YOLOV5, columns - 5),
+    )
+    for fits, layout, count in found:
+        if fits and count >= (classes or 1):
+            return layout, classes or count
+    return (Layout.END_TO_END, classes) if columns == 6 else (None, None)
+
+
+def _cells(size: Sequence[int]) -> dict[int, tuple[int, ...]]:
+    """Count of grid cells -> strides, for every run of neighbouring strides that divide the input."""
+    height, width = size
+    whole = [s for s in (4, 8, 16, 32, 64) if height % s == 0 and width % s == 0]
+    runs = [tuple(whole[i:j]) for i in range(len(whole)) for j in range(i + 1, len(whole) + 1)]
+    return {sum((height // s) * (width // s) for s in run): run for run in runs}
+
+
+def _grid(size: Sequence[int], strides: Sequence[int]) -> tuple[F32, F32]:
+    """(N, 2) column and row, and (N, 1) stride, of each cell in the order of YOLOX's output."""
+    cell, stride = [], []
+    for s in strides:
+        rows, columns = np.indices((size[0] // s, size[1] // s), np.float32)
+        cell.append(np.column_stack([columns.ravel(), rows.ravel()]))
+        stride.append(np.full((columns.size, 1), s, np.float32))
+    return np.concatenate(cell), np.concatenate(stride)
+
+
+def _open(path: Path, config: DetectorConfig) -> tuple[Any, str]:
+    """The session of an ONNX file and the short name of the execution provider it runs on."""
+    if not path.is_file():
+        raise UserError(f"detector.model {path}: no such file")
+    if path.suffix == ".pt":
+        raise UserError(
+            f"detector.model {path}: PyTorch weights; export them: yolo export model={path} format=onnx"
+        )
+    available = {name.removesuffix("ExecutionProvider"): name for name in ort.get_available_providers()}
+    chosen = [name for name in PREFERRED_PROVIDERS if name in available]
+    if config.provider.lower() != "auto":
+        asked = config.provider.lower().removesuffix("executionprovider")
+        chosen = [name for name in available if name.lower() == asked]
+        if not chosen:
+            raise UserError(
+                f"detector.provider {config.provider}: not here; available: {', '.join(available)}"
+            )
+    options = ort.SessionOptions()
+    options.intra_op_num_threads = config.threads
+    options.log_severity_level = 3
+    try:
+        session = ort.InferenceSession(path, options, [available[name] for name in chosen])
+    except Exception as error:  # onnxruntime's errors have no common base class
+        raise UserError(f"detector.model {path}: onnxruntime cannot load it: {_first_line(error)}") from None
+    used = session.get_providers()[0].removesuffix("ExecutionProvider")
+    if config.provider.lower() != "auto" and used != chosen[0]:
+        raise UserError(
+            f"detector.provider {config.provider}: could not be started, onnxruntime fell back to {used}"
+        )
+    return session, used
+
+
+def _first_line(error: Exception) -> str:
+    return next(iter(str(error).splitlines()), type(error).__name__)
+
+
+def _symbol(dimension: Any) -> tuple[str, ...]:
+    return (dimension,) if isinstance(dimension, str) else ()
+
+
+def _literal(text: str | None, kind: type) -> Any:
+    """The Python literal in a metadata value, None where there is none of that kind."""
+    try:
+        value = ast.literal_eval(text or "")
+    except (ValueError, SyntaxError):
+        return None
+    return value if isinstance(value, kind) else None
+
+
+def _metadata_names(metadata: Mapping[str, str]) -> tuple[str, ...] | None:
+    """Ultralytics writes ``names`` as a dict of class id -> name, others as a list."""
+    by_id = _literal(metadata.get("names"), dict)
+    if by_id:
+        return tuple(str(by_id.get(i, f"class_{i}")) for i in range(max(by_id) + 1))
+    return tuple(map(str, _literal(metadata.get("names"), list) or ())) or None
+
+
+def _read_names(path: Path) -> tuple[str, ...]:
+    try:
+        names = tuple(line.strip() for line in path.read_text().splitlines() if line.strip())
+    except (OSError, UnicodeDecodeError) as error:
+        raise UserError(f"detector.names {path}: cannot be read: {_first_line(error)}") from None
+    if not names:
+        raise UserError(f"detector.names {path}: holds no class name; expected one a line")
+    return names
+
+
+def _default_names(count: int | None) -> tuple[str, ...]:
+    return COCO if count == len(COCO) else tuple(f"class_{i}" for i in range(count or 0))
