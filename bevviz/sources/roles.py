@@ -1,0 +1,331 @@
+"""Which topic plays which role: found by type, name and frame, or set by hand."""
+
+from __future__ import annotations
+
+import difflib
+import re
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from posixpath import commonprefix
+
+from bevviz.config import SourceConfig
+from bevviz.errors import UserError
+
+
+@dataclass(frozen=True, slots=True)
+class Topic:
+    """A topic of a bag or of a live graph, as far as it is known."""
+
+    name: str
+    type: str  # sensor_msgs/msg/PointCloud2, or the shorter spelling of ROS 1
+    count: int | None = None  # messages; None: not known, as on a live graph
+    frame_id: str = ""  # of its first message; "": not known
+    rate: float | None = None  # Hz
+
+    @property
+    def kind(self) -> str:
+        """The type without its package: PointCloud2."""
+        return self.type.rpartition("/")[2]
+
+
+@dataclass(frozen=True, slots=True)
+class CameraRole:
+    name: str  # of its entities
+    topic: str
+    info_topic: str  # "": there is none
+    rectified: bool
+    compressed: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Roles:
+    """The topics that play. ``notes`` says of every topic, in a few words, why it does or does not."""
+
+    lidars: tuple[str, ...] = ()
+    lidar_names: tuple[str, ...] = ()  # entity name of each
+    cameras: tuple[CameraRole, ...] = ()
+    tf: tuple[str, ...] = ()
+    tf_static: tuple[str, ...] = ()
+    odometry: str = ""
+    robot_detections_2d: tuple[str, ...] = ()
+    robot_detections_3d: tuple[str, ...] = ()
+    truth: str = ""
+    notes: Mapping[str, str] = field(default_factory=dict)
+
+
+def find_roles(topics: Sequence[Topic], config: SourceConfig) -> Roles:
+    """Give each topic its role.
+
+    Topics that are stated in the configuration are taken as they are. Otherwise one frame is one sensor:
+    of several clouds, or several images, with the same frame_id the one nearest to the sensor is taken
+    (images: the rectified one, as the others of a pipeline are made from it).
+
+    Raises:
+        UserError: a stated topic does not exist, or is of another type.
+    """
+    notes = {topic.name: f"not used: nothing here reads {topic.type}" for topic in topics}
+    lidars = _find_lidars(topics, config, notes)
+    images = _find_images(topics, config, notes)
+    names = _unique_names(
+        [(entity_name(t.name, t.frame_id), t) for t in lidars] + [(entity_name(t.name), t) for t in images]
+    )
+    cameras = tuple(
+        _camera(t, name, topics, config, notes) for t, name in zip(images, names[len(lidars) :], strict=True)
+    )
+    for topic in _of(topics, "CameraInfo"):
+        used_by = [camera.name for camera in cameras if camera.info_topic == topic.name]
+        notes[topic.name] = (
+            f"calibration of {', '.join(used_by)}" if used_by else "not used: its images are not"
+        )
+
+    transforms = [t for t in topics if t.kind.lower() == "tfmessage"]
+    static = [t for t in transforms if t.name.endswith("tf_static")]
+    moving = [t for t in transforms if t not in static]
+    _note(notes, static, "static transforms")
+    _note(notes, moving, "transforms")
+    odometry = _find_odometry(topics, config, notes)
+    boxes = _of(topics, "Detection3DArray")
+    truth = [t for t in boxes if t.name.endswith("ground_truth")][:1]
+    boxes = [t for t in boxes if t not in truth]
+    detections = _of(topics, "Detection2DArray")
+    _note(notes, truth, "ground truth, by its name")
+    _note(notes, [*boxes, *detections], "the robot's own result")
+    return Roles(
+        lidars=_names(lidars),
+        lidar_names=tuple(names[: len(lidars)]),
+        cameras=cameras,
+        tf=_names(moving),
+        tf_static=_names(static),
+        odometry=odometry,
+        robot_detections_2d=_names(detections),
+        robot_detections_3d=_names(boxes),
+        truth=truth[0].name if truth else "",
+        notes=notes,
+    )
+
+
+def _names(topics: Iterable[Topic]) -> tuple[str, ...]:
+    return tuple(topic.name for topic in topics)
+
+
+def _note(notes: dict[str, str], topics: Iterable[Topic], text: str) -> None:
+    notes.update({topic.name: text for topic in topics})
+
+
+def _of(topics: Iterable[Topic], *kinds: str) -> list[Topic]:
+    return [topic for topic in topics if topic.kind in kinds]
+
+
+def _stated(name: str, topics: Sequence[Topic], key: str, *kinds: str) -> Topic:
+    """The topic that the configuration names under ``key``."""
+    fitting = _of(topics, *kinds)
+    for topic in topics:
+        if topic.name == name:
+            if topic in fitting:
+                return topic
+            raise UserError(f"{key}: {name} is a {topic.type}, but must be {' or '.join(kinds)}")
+    near = difflib.get_close_matches(name, _names(fitting), n=3, cutoff=0.4) or _names(fitting)
+    there = f"the nearest are {', '.join(near)}" if near else f"there is no {' or '.join(kinds)} topic"
+    raise UserError(f"{key}: there is no topic {name}; {there}")
+
+
+# --- LiDARs ------------------------------------------------------------------------------------
+
+_LIDAR = re.compile(r"lidar|laser|velodyne|ouster|os_|livox|hesai|robosense|pandar|points|scan")
+_DERIVED_CLOUD = re.compile(
+    r"ground|cluster|obstacle|filter|registered|depth|stereo|camera|zed|realsense|rgbd|map|voxel|fused|segment"
+    r"|crop|downsample|object|debug|feature|plane|merged|concat"
+)
+
+
+def _find_lidars(topics: Sequence[Topic], config: SourceConfig, notes: dict[str, str]) -> list[Topic]:
+    clouds = _of(topics, "PointCloud2")
+    if config.lidar_topics:
+        chosen = [_stated(t, topics, "source.lidar_topics", "PointCloud2") for t in config.lidar_topics]
+        _note(notes, clouds, "not used: not in source.lidar_topics")
+        _note(notes, chosen, "LiDAR, by source.lidar_topics")
+        return chosen
+    tiers = {topic: _lidar_tier(topic) for topic in clouds}
+    best = min(tiers.values(), default=0)
+    _note(notes, clouds, "not used: looks like a result or a depth camera's cloud, not like a LiDAR's")
+    _note(notes, [t for t in clouds if t.count == 0], "not used: without messages")
+    candidates = sorted((t for t in clouds if tiers[t] == best), key=lambda t: (len(t.name), t.name))
+    chosen = _one_a_frame(candidates, lambda t: t.frame_id or t.name, notes, "LiDAR, by type and name")
+    return sorted(chosen, key=lambda t: t.name)
+
+
+def _lidar_tier(topic: Topic) -> int:
+    """0 what is named like a LiDAR, 1 any other cloud, 2 a derived one, 3 without messages."""
+    name, frame = topic.name.lower(), topic.frame_id.lower()
+    if topic.count == 0:
+        return 3
+    if _DERIVED_CLOUD.search(name) or "optical" in frame:
+        return 2
+    return 0 if _LIDAR.search(name) or _LIDAR.search(frame) else 1
+
+
+def _one_a_frame(
+    candidates: Iterable[Topic], sensor: Callable[[Topic], str], notes: dict[str, str], why: str
+) -> list[Topic]:
+    """The first candidate of each sensor."""
+    chosen: dict[str, Topic] = {}
+    for topic in candidates:
+        first = chosen.setdefault(sensor(topic), topic)
+        notes[topic.name] = why if first is topic else f"not used: the same sensor as {first.name}, which is"
+    return list(chosen.values())
+
+
+# --- cameras -----------------------------------------------------------------------------------
+
+_TRANSPORT = re.compile(r"/(compressed|compressedDepth|theora|ffmpeg|zstd)$")
+_DERIVED_IMAGE = re.compile(
+    r"depth(?!ai)|disparity|confidence|annotat|debug|dbg|bev|mask|overlay|detect|visuali[sz]|segment|semantic|label"
+    r"|heat_?map|costmap|stereo(_raw)?/image|track|result|infra|normal|cloud|side_by_side"
+)
+_RECTIFIED = re.compile(r"(?<![a-z])rect")
+
+
+def _find_images(topics: Sequence[Topic], config: SourceConfig, notes: dict[str, str]) -> list[Topic]:
+    images = _of(topics, "Image", "CompressedImage")
+    if config.camera_topics:
+        chosen = [
+            _stated(t, topics, "source.camera_topics", "Image", "CompressedImage")
+            for t in config.camera_topics
+        ]
+        _note(notes, images, "not used: not in source.camera_topics")
+        _note(notes, chosen, "camera, by source.camera_topics")
+        return chosen
+    usable = []
+    for topic in images:
+        if topic.count == 0:
+            notes[topic.name] = "not used: without messages"
+        elif match := _DERIVED_IMAGE.search(topic.name.lower()):
+            notes[topic.name] = f"not used: '{match.group()}' in the name says it is no camera's colour image"
+        else:
+            usable.append(topic)
+
+    def distance(topic: Topic) -> tuple[bool, bool, bool, bool, int, str]:
+        name = topic.name.lower()
+        return (
+            not _RECTIFIED.search(name),
+            "gray" in name or "mono" in name,
+            not _info_topic(topic, topics),
+            topic.kind == "CompressedImage",  # what the robot's detector saw is mostly the other one
+            len(name),
+            name,
+        )
+
+    usable.sort(key=distance)
+    chosen = _one_a_frame(usable, lambda t: t.frame_id or _stem(t.name), notes, "camera, by type and name")
+    return sorted(chosen, key=lambda t: t.name)
+
+
+def _stem(topic: str) -> str:
+    """What all variants of a camera's image have in common: its namespace, without raw, gray or color."""
+    namespace = _TRANSPORT.sub("", topic).rpartition("/")[0] or topic
+    return re.sub(r"[/_](raw|rect|gray|color|rgb|mono)(?![a-z])", "", namespace)
+
+
+def _camera(
+    topic: Topic, name: str, topics: Sequence[Topic], config: SourceConfig, notes: dict[str, str]
+) -> CameraRole:
+    stated = config.camera_info_topics.get(topic.name)
+    if stated is None:
+        info = _info_topic(topic, topics)
+    else:
+        info = _stated(stated, topics, "source.camera_info_topics", "CameraInfo").name
+    rectified = bool(_RECTIFIED.search(topic.name.lower()))
+    if config.rectified != "auto":
+        rectified = config.rectified == "yes"
+    notes[topic.name] += f", {'rectified' if rectified else 'not rectified'}, {info or 'without CameraInfo'}"
+    return CameraRole(name, topic.name, info, rectified, topic.kind == "CompressedImage")
+
+
+def _info_topic(image: Topic, topics: Sequence[Topic]) -> str:
+    """The CameraInfo beside the image, as ROS has it; else one in its frame or a namespace above; else ""."""
+    base = _TRANSPORT.sub("", image.name)
+    infos = [t for t in _of(topics, "CameraInfo") if t.count != 0]
+    beside = [base.rpartition("/")[0] + "/camera_info", base + "/camera_info"]
+    for name in beside:
+        if any(t.name == name for t in infos):
+            return name
+
+    def shared(topic: Topic) -> int:
+        return len(commonprefix([topic.name.split("/"), base.split("/")]))
+
+    same_frame = [t for t in infos if image.frame_id and t.frame_id == image.frame_id]
+    above = [
+        t for t in infos if base.startswith(t.name.removesuffix("camera_info")) and t.name.count("/") > 1
+    ]
+    return max(same_frame or above, key=shared).name if same_frame or above else ""
+
+
+# --- odometry ----------------------------------------------------------------------------------
+
+
+def _find_odometry(topics: Sequence[Topic], config: SourceConfig, notes: dict[str, str]) -> str:
+    candidates = _of(topics, "Odometry")
+    if config.odometry_topic:
+        chosen = _stated(config.odometry_topic, topics, "source.odometry_topic", "Odometry")
+    elif not candidates:
+        return ""
+    else:
+        chosen = min(candidates, key=lambda t: (t.count == 0, t.name.count("/"), t.name))
+    _note(notes, candidates, f"not used: {chosen.name} is")
+    notes[chosen.name] = "odometry, where the transforms have no fixed frame"
+    return chosen.name
+
+
+# --- names -------------------------------------------------------------------------------------
+
+_IMAGE_WORDS = re.compile(
+    r"(?:image|rgb|colou?r|raw|rect|gray|mono|rectified)(?:_(?:image|rgb|colou?r|raw|rect|gray|mono))*"
+)
+_WEAK = {"left", "right", "front", "rear", "back", "center", "camera", "cam", "sensor", "driver", "points"}
+_TAKEN = ("bev", "frustums", "fused", "lidars", "robot", "truth")  # entities of /world beside the sensors
+
+
+def entity_name(topic: str, frame_id: str = "") -> str:
+    """Name of a sensor's entities: its frame's, or without one its topic's.
+
+    LiDARs are named by their frame. Cameras, whose frames have long names, by the part of the topic that
+    tells the device, with the side where there is one.
+
+    >>> entity_name("/rslidar_points", "rslidar")
+    'rslidar'
+    >>> entity_name("/zed2/zed/rgb/image_rect_color")
+    'zed'
+    >>> entity_name("/stereo/left/image_raw")
+    'stereo_left'
+    """
+    if frame_id:
+        return _clean(frame_id)
+    parts = _device(topic)
+    weak = parts[-1] in _WEAK and len(parts) > 1 and parts[-2] != parts[-1]
+    return _clean("_".join(parts[-2:] if weak else parts[-1:]))
+
+
+def _device(topic: str) -> list[str]:
+    """The parts of a topic that name a device."""
+    parts = _TRANSPORT.sub("", topic).strip("/").split("/")
+    kept = [part.removesuffix("_node") for part in parts if not _IMAGE_WORDS.fullmatch(part)]
+    return kept or ["camera"]
+
+
+def _clean(name: str) -> str:
+    """A part of an entity path that needs no escapes."""
+    return re.sub(r"[^A-Za-z0-9_-]+", "_", name).strip("_") or "sensor"
+
+
+def _unique_names(named: Sequence[tuple[str, Topic]]) -> list[str]:
+    """The short names where they are unique, else those of the whole topic, else with a number."""
+    short = [name for name, _ in named]
+    unique: list[str] = []
+    for name, topic in named:
+        if short.count(name) > 1 or name in _TAKEN:
+            name = _clean("_".join(_device(topic.name)))
+        number, free = 2, name
+        while free in unique or free in _TAKEN:
+            free, number = f"{name}_{number}", number + 1
+        unique.append(free)
+    return unique
