@@ -2,76 +2,616 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+import re
+from bisect import bisect_left
+from collections import Counter, deque
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any, Generic, TypeVar
 
+import numpy as np
+from numpy.typing import NDArray
+
+from bevviz import geometry
 from bevviz.config import Config
-from bevviz.frame import Cloud, Frame, Image, Intrinsics, LabelledBoxes2D, LabelledBoxes3D
+from bevviz.errors import UserError
+from bevviz.frame import F32, F64, Camera, Cloud, Frame, Image, Intrinsics, LabelledBoxes2D, LabelledBoxes3D
 from bevviz.sources.messages import StampedTransform
-from bevviz.sources.roles import Roles
+from bevviz.sources.roles import CameraRole, Roles, entity_name
+from bevviz.sources.tf import Lookup, Origin, TransformBuffer, TransformError
+
+T = TypeVar("T")
+
+SECOND = 1_000_000_000
+JUMP = SECOND  # a stamp that is this much older than its topic's newest means that the clock was reset
+LATENCY = 2 * SECOND  # the longest a cloud is expected to arrive after an image of the same stamp
+FIXED_FRAMES = {"map", "odom", "world", "earth", "global", "utm", "enu", "ned", "mocap", "vicon", "init"}
+GLOBE_FRAMES = {"earth", "ecef", "utm"}  # coordinates too large for the float32 of a viewer
+TUTORIAL_K = np.array([[267.0, 0.0, 320.0], [0.0, 267.0, 180.0], [0.0, 0.0, 1.0]])
 
 
 @dataclass(slots=True)
 class SyncReport:
     """What arrived, what was lost and what looked wrong so far."""
 
-    clouds: int = 0
+    clouds: int = 0  # of every LiDAR
     frames: int = 0
+    reordered: int = 0  # clouds that came out of order, put back in their place
+    late: int = 0  # clouds dropped: a newer one had been delivered already
+    duplicates: int = 0  # clouds dropped: same stamp as another
+    unwaited: int = 0  # clouds sent on early, the queue being full
+    resets: int = 0  # stamps of the clouds that jumped back
+    gaps: int = 0  # stamps of the clouds that jumped forward
+    longest_gap: float = 0.0  # seconds
+    idle: str = ""  # topic of the LiDAR that should drive, while only others deliver
+    unstamped: Counter[str] = field(default_factory=Counter)  # topic -> messages with stamp zero
+    without_image: Counter[str] = field(default_factory=Counter)  # camera -> frames
+    undecodable: Counter[str] = field(default_factory=Counter)  # camera -> images
+    problems: Counter[str] = field(default_factory=Counter)  # missing transforms and CameraInfo -> frames
+    transforms: tuple[str, ...] = ()  # what looked wrong in the transforms
 
     def warnings(self) -> tuple[str, ...]:
         """One sentence each."""
-        raise NotImplementedError
+        said = [
+            (self.reordered, "{} came out of order and {} put back in order"),
+            (self.late, "{} came after a newer one had gone on and {} dropped"),
+            (self.duplicates, "{} had the stamp of another one and {} dropped"),
+            (self.unwaited, "{} went on early because sync.queue was full"),
+        ]
+        found = [
+            text.format("1 cloud" if n == 1 else f"{n} clouds", "was" if n == 1 else "were")
+            for n, text in said
+            if n
+        ]
+        if self.resets:
+            found.append(f"the stamps of the clouds jumped back {_times(self.resets)}")
+        if self.gaps:
+            found.append(
+                f"the stamps of the clouds have {self.gaps} gap(s), the longest {self.longest_gap:.2f} s"
+            )
+        if self.idle:
+            found.append(
+                f"no cloud on {self.idle}, which drives the frames; choose the LiDARs with source.lidar_topics"
+            )
+        for topic, n in self.unstamped.items():
+            found.append(f"{topic}: no stamp in the header {_times(n)}, time of receipt used instead")
+        for camera, n in self.without_image.items():
+            found.append(f"{n} of {self.frames} frames have no image of camera '{camera}'")
+        for camera, n in self.undecodable.items():
+            found.append(f"camera '{camera}': an image could not be decoded {_times(n)}")
+        found += [f"{text} ({n} of {self.frames} frames)" for text, n in self.problems.items()]
+        return (*found, *self.transforms)
+
+
+def _times(n: int) -> str:
+    return "once" if n == 1 else f"{n} times"
+
+
+@dataclass(frozen=True, slots=True)
+class _Undecoded:
+    """The header of an image, and how to get the rest."""
+
+    stamp: int
+    frame_id: str
+    load: Callable[[], Image]
+
+
+class _Track(Generic[T]):
+    """The last messages of one topic, in order of stamp, ``horizon`` nanoseconds of them."""
+
+    def __init__(self, horizon: int) -> None:
+        self._horizon = horizon
+        self._stamps: list[int] = []
+        self._items: list[T] = []
+
+    def __len__(self) -> int:
+        return len(self._items)
+
+    @property
+    def newest(self) -> int | None:
+        return self._stamps[-1] if self._stamps else None
+
+    def add(self, stamp: int, item: T) -> None:
+        if self._stamps and stamp < self._stamps[-1] - JUMP:
+            self.keep(0, -1)
+        i = bisect_left(self._stamps, stamp)
+        if i < len(self._stamps) and self._stamps[i] == stamp:
+            self._items[i] = item
+            return
+        self._stamps.insert(i, stamp)
+        self._items.insert(i, item)
+        self.forget(self._stamps[-1] - self._horizon)
+
+    def nearest(self, stamp: int) -> tuple[int, T] | None:
+        near = bisect_left(self._stamps, stamp)
+        best = min(range(near - 1, near + 1), key=lambda i: self._distance(i, stamp))
+        return (self._stamps[best], self._items[best]) if 0 <= best < len(self) else None
+
+    def _distance(self, i: int, stamp: int) -> float:
+        return abs(self._stamps[i] - stamp) if 0 <= i < len(self) else float("inf")
+
+    def take(self, stamp: int, first: int, last: int) -> T | None:
+        """Remove and return the item within [first, last] that is nearest to ``stamp``."""
+        inside = [i for i, s in enumerate(self._stamps) if first <= s <= last]
+        if not inside:
+            return None
+        best = min(inside, key=lambda i: self._distance(i, stamp))
+        del self._stamps[best]
+        return self._items.pop(best)
+
+    def forget(self, before: int) -> None:
+        """Drop what is older, but for the last of it, which may be the nearest to the next cloud."""
+        first = max(0, bisect_left(self._stamps, before) - 1)
+        del self._stamps[:first], self._items[:first]
+
+    def keep(self, first: int, last: int) -> None:
+        low, high = bisect_left(self._stamps, first), bisect_left(self._stamps, last + 1)
+        self._stamps, self._items = self._stamps[low:high], self._items[low:high]
+
+
+@dataclass(frozen=True, slots=True)
+class _Place:
+    """Where the points of a frame are, and how they hang together with the world."""
+
+    stamp: int
+    points_frame: str
+    world_frame: str  # "" where there is none
+    inertial_frame: str  # the smoothest fixed frame, to compensate motion with; "" where there is none
+    world_from_points: F64 | None = None
+    tf_age: float = float("nan")
 
 
 class Synchronizer:
-    """Bounded in memory; the same for a bag and a live robot. Messages come in the order of receipt."""
+    """Bounded in memory; the same for a bag and a live robot. Messages come in the order of receipt.
 
-    report: SyncReport
+    A cloud waits until each camera has an image of its stamp or later and the transforms reach as far,
+    at most ``sync.max_wait`` seconds of received time, and in a queue of ``sync.queue``. Clouds out of
+    order within the queue are put back in order; later ones are dropped, and all of it is counted.
+    """
 
     def __init__(self, roles: Roles, config: Config) -> None:
-        raise NotImplementedError
+        self.report = SyncReport()
+        self.tf = TransformBuffer()
+        self._roles = roles
+        self._config = config
+        self._tolerance = round(config.sync.tolerance * 1e9)
+        self._wait = round(config.sync.max_wait * 1e9)
+        self._horizon = self._wait + self._tolerance + LATENCY
+        self._now = 0
+        self._clouds: list[Cloud] = []  # of the driving LiDAR, in order of stamp
+        self._done: deque[Frame] = deque()
+        self._index = 0
+        self._last: int | None = None  # stamp of the last frame
+        self._partners: dict[str, _Track[Cloud]] = {t: _Track(self._horizon) for t in roles.lidars[1:]}
+        self._images: dict[str, _Track[_Undecoded]] = {c.topic: _Track(self._horizon) for c in roles.cameras}
+        self._camera_frames: dict[str, str] = {}  # image topic -> optical frame
+        self._intrinsics: dict[str, Intrinsics] = {}
+        self._odometry_frames: set[str] = set()
+        self._boxes: dict[str, _Track[LabelledBoxes3D]] = {}
+        self._detections: dict[str, _Track[LabelledBoxes2D]] = {}
+        self._truth: dict[str, _Track[LabelledBoxes3D]] = {}
+        for names, pose in config.source.extrinsics.items():
+            self.tf.add(_extrinsic(names, pose), static=True, origin=Origin.CONFIG)
+
+    # --- what comes in -------------------------------------------------------------------------
 
     def add_cloud(self, cloud: Cloud) -> None:
         """A scan of a LiDAR, told by ``cloud.topic``."""
-        raise NotImplementedError
+        if cloud.topic not in self._roles.lidars:
+            return
+        cloud = replace(cloud, stamp=self._arrived(cloud.topic, cloud.stamp, cloud.received))
+        self.report.clouds += 1
+        if cloud.topic in self._partners:
+            self._partners[cloud.topic].add(cloud.stamp, cloud)
+            return
+        newest = self._clouds[-1].stamp if self._clouds else self._last
+        if newest is not None and cloud.stamp < newest - JUMP:
+            self._reset(cloud.stamp)
+        elif newest is not None and cloud.stamp > newest + JUMP:
+            self.report.gaps += 1
+            self.report.longest_gap = max(self.report.longest_gap, (cloud.stamp - newest) * 1e-9)
+        place = bisect_left(self._clouds, cloud.stamp, key=_stamp_of)
+        if cloud.stamp == self._last or cloud.stamp in map(_stamp_of, self._clouds[place : place + 1]):
+            self.report.duplicates += 1
+        elif self._last is not None and cloud.stamp < self._last:
+            self.report.late += 1
+        else:
+            self.report.reordered += place < len(self._clouds)
+            self._clouds.insert(place, cloud)
 
     def add_image(
         self, topic: str, stamp: int, frame_id: str, received: int, load: Callable[[], Image]
     ) -> None:
-        """An image not yet decoded: only the header is looked at, ``load`` is called when it is chosen.
+        """An image not yet decoded: ``load`` is called only when a frame takes it.
 
         ``load`` may raise a UserError, which becomes a problem of that frame's camera.
         """
-        raise NotImplementedError
+        if topic in self._images:
+            stamp = self._arrived(topic, stamp, received)
+            self._camera_frames[topic] = frame_id
+            self._images[topic].add(stamp, _Undecoded(stamp, frame_id, load))
 
     def add_camera_info(self, topic: str, intrinsics: Intrinsics) -> None:
         """``topic`` is that of the CameraInfo; the newest one holds."""
-        raise NotImplementedError
+        self._intrinsics[topic] = intrinsics
 
-    def add_transform(self, transform: StampedTransform, static: bool = False, fallback: bool = False) -> None:
-        """``fallback``: taken from Odometry, used only where no other source has a parent for the child."""
-        raise NotImplementedError
+    def add_transform(
+        self, transform: StampedTransform, static: bool = False, fallback: bool = False
+    ) -> None:
+        """``fallback``: from Odometry, used only where nothing else states the child's parent."""
+        if fallback:
+            self._odometry_frames.add(transform.parent.lstrip("/"))
+        self.tf.add(transform, static, Origin.ODOMETRY if fallback else Origin.TF)
+        self.report.transforms = self.tf.problems
 
     def add_boxes(self, boxes: LabelledBoxes3D) -> None:
         """The robot's own 3D boxes."""
-        raise NotImplementedError
+        self._add_result(self._boxes, boxes)
 
     def add_detections(self, detections: LabelledBoxes2D) -> None:
         """The robot's own image boxes."""
-        raise NotImplementedError
+        self._add_result(self._detections, detections)
 
     def add_truth(self, truth: LabelledBoxes3D) -> None:
         """Ground truth boxes."""
-        raise NotImplementedError
+        self._add_result(self._truth, truth)
+
+    def _add_result(self, tracks: dict[str, _Track[Any]], result: LabelledBoxes2D | LabelledBoxes3D) -> None:
+        stamp = self._arrived(result.topic, result.stamp, result.received)
+        track = tracks.setdefault(result.topic, _Track(self._horizon))
+        track.add(stamp, replace(result, stamp=stamp))
+
+    def _arrived(self, topic: str, stamp: int, received: int) -> int:
+        """The stamp to go by."""
+        self._now = received
+        if stamp == 0:
+            self.report.unstamped[topic] += 1
+            return received
+        return stamp
+
+    def _reset(self, stamp: int) -> None:
+        """The clock went back to ``stamp``: a bag played in a loop, or a simulation restarted."""
+        self.report.resets += 1
+        self._done.extend(self._build_all())
+        self._last = None
+        self.tf.forget_after(stamp + JUMP)
+        for track in self._tracks():
+            track.keep(0, stamp + JUMP)
+
+    def _tracks(self) -> Iterator[_Track[Any]]:
+        for group in (self._partners, self._images, self._boxes, self._detections, self._truth):
+            yield from group.values()
+
+    # --- what goes out -------------------------------------------------------------------------
 
     def ready(self, now: int | None = None) -> Iterator[Frame]:
         """The frames, in order of stamp, that have all they wait for, or have waited long enough.
 
-        ``now``: newest received time in nanoseconds; None: that of the messages added so far. Call it
-        after every message, or every few.
+        ``now``: newest received time in nanoseconds; None: that of the last message added. Call it
+        after every message, or every few: what is not fetched is held.
         """
-        raise NotImplementedError
+        if now is not None:
+            self._now = now
+        while self._done:
+            yield self._done.popleft()
+        while self._clouds:
+            full = len(self._clouds) > self._config.sync.queue
+            over = self._now - self._clouds[0].received > self._wait
+            if not (full or over or self._complete()):
+                return
+            self.report.unwaited += full and not over
+            yield self._build()
 
     def flush(self) -> Iterator[Frame]:
         """The frames still held, at the end of the stream."""
-        raise NotImplementedError
+        while self._done:
+            yield self._done.popleft()
+        yield from self._build_all()
+
+    def _build_all(self) -> Iterator[Frame]:
+        while self._clouds:
+            yield self._build()
+
+    def _complete(self) -> bool:
+        """Whether nothing that may still come could change the oldest cloud's frame."""
+        stamp = self._clouds[0].stamp
+        if any(track.newest is None or track.newest < stamp for track in self._tracks()):
+            return False
+        results = (*self._boxes.values(), *self._detections.values(), *self._truth.values())
+        if len(self._clouds) == 1 and any(self._may_be_of_next(track, stamp) for track in results):
+            return False
+        if any(c.info_topic and c.info_topic not in self._intrinsics for c in self._roles.cameras):
+            return False
+        return self._transforms_reach(self._clouds[0])
+
+    def _may_be_of_next(self, track: _Track[Any], stamp: int) -> bool:
+        nearest = track.nearest(stamp)
+        return nearest is not None and 0 < nearest[0] - stamp <= self._tolerance
+
+    def _transforms_reach(self, cloud: Cloud) -> bool:
+        """Whether the transforms have samples up to the cloud and to each camera's image."""
+        place = self._place(cloud)
+        moving = self._roles.tf or self._roles.odometry
+        if moving and not place.world_frame:
+            return False
+        asked = [(cloud.stamp, cloud.frame_id)]
+        for role in self._roles.cameras:
+            nearest = self._images[role.topic].nearest(cloud.stamp)
+            if nearest is not None and abs(nearest[0] - cloud.stamp) <= self._tolerance:
+                asked.append((max(nearest[0], cloud.stamp), nearest[1].frame_id))
+        try:
+            for stamp, frame in asked:
+                for other in {place.points_frame, place.world_frame or place.points_frame}:
+                    newest = self.tf.latest(other, frame)
+                    if newest is not None and newest < stamp:
+                        return False
+        except TransformError:
+            return False
+        return True
+
+    # --- one frame -----------------------------------------------------------------------------
+
+    def _build(self) -> Frame:
+        cloud = self._clouds.pop(0)
+        problems: list[str] = []
+        place = self._place(cloud, problems)
+        clouds, poses = self._gather(cloud, place, problems)
+        points, fields = _merge(clouds, poses, cloud.frame_id.lstrip("/") == place.points_frame)
+        cameras = tuple(self._camera(role, place) for role in self._roles.cameras)
+        first, last = self._window(cloud.stamp)
+        boxes = [track.take(cloud.stamp, first, last) for track in self._boxes.values()]
+        truths = [track.take(cloud.stamp, first, last) for track in self._truth.values()]
+        placed = [self._placed(b, place, problems) for b in boxes if b is not None]
+        truth = [self._placed(t, place, problems) for t in truths if t is not None]
+        frame = Frame(
+            index=self._index,
+            stamp=cloud.stamp,
+            received=cloud.received,
+            lidar="lidars" if self._partners else entity_name(cloud.topic, cloud.frame_id),
+            points=points,
+            points_frame=place.points_frame,
+            fields=fields,
+            world_frame=place.world_frame or place.points_frame,
+            world_from_points=place.world_from_points,
+            clouds=clouds,
+            points_from_clouds=poses,
+            cameras=cameras,
+            robot_boxes=tuple(placed),
+            robot_detections=self._robot_detections(cameras, cloud.stamp, first, last),
+            truth=truth[0] if truth else None,
+            tf_age=place.tf_age,
+            problems=tuple(problems),
+        )
+        self._index += 1
+        self._last = cloud.stamp
+        self.report.frames += 1
+        for track in self._tracks():
+            track.forget(cloud.stamp - self._tolerance)
+        return frame
+
+    def _place(self, cloud: Cloud, problems: list[str] | None = None) -> _Place:
+        """Find the frames of reference; with ``problems``, also where the points are in the world."""
+        points_frame = cloud.frame_id.lstrip("/")
+        base = self._config.source.base_frame
+        if self._partners and self.tf.knows(base, points_frame):
+            points_frame = base
+        path = self.tf.ancestors(points_frame)
+        fixed = [f for f in path if f in self._odometry_frames or _words(f) & FIXED_FRAMES]
+        near = [f for f in fixed if not _words(f) & GLOBE_FRAMES] or fixed
+        stated = self._config.source.fixed_frame
+        world = stated or (near[-1] if near else "")
+        place = _Place(cloud.stamp, points_frame, world, near[0] if near else stated)
+        if problems is None:
+            return place
+        if self._partners and points_frame != base:
+            self._complain(
+                problems,
+                f"no transform from '{points_frame}' to source.base_frame '{base}': "
+                f"the LiDARs are merged in '{points_frame}'",
+            )
+        if not world:
+            return place
+        try:
+            found = self.tf.lookup(world, points_frame, cloud.stamp, self._config.sync.tf_tolerance)
+        except TransformError as error:
+            self._complain(problems, f"{error}: the cloud has no place in the world")
+            return place
+        return replace(place, world_from_points=found.matrix, tf_age=found.age)
+
+    def _gather(
+        self, cloud: Cloud, place: _Place, problems: list[str]
+    ) -> tuple[tuple[Cloud, ...], tuple[F64, ...]]:
+        """The clouds of every LiDAR nearest to ``cloud``, each with points_from_cloud."""
+        clouds, poses = [cloud], [np.eye(4)]
+        if place.points_frame != cloud.frame_id.lstrip("/"):
+            try:
+                poses[0] = self._moved(place, cloud.stamp, cloud.frame_id)[0].matrix
+            except TransformError as error:
+                self._complain(problems, f"{error}: the points of {cloud.topic} stay where they are")
+        for topic, track in self._partners.items():
+            nearest = track.nearest(cloud.stamp)
+            if nearest is None or abs(nearest[0] - cloud.stamp) > self._tolerance:
+                problems.append(f"no cloud of LiDAR {topic} {self._nearest(nearest, cloud.stamp)}")
+                continue
+            partner = nearest[1]
+            try:
+                found, _ = self._moved(place, partner.stamp, partner.frame_id)
+            except TransformError as error:
+                self._complain(problems, f"{error}: the points of {topic} are left out")
+                continue
+            clouds.append(partner)
+            poses.append(found.matrix)
+        return tuple(clouds), tuple(poses)
+
+    def _moved(self, place: _Place, stamp: int, frame: str) -> tuple[Lookup, bool]:
+        """points at the cloud's stamp from ``frame`` at ``stamp``, and whether motion is compensated."""
+        tolerance = self._config.sync.tf_tolerance
+        if self._config.sync.motion_compensation and place.inertial_frame:
+            try:
+                return self.tf.lookup_moving(
+                    place.points_frame, place.stamp, frame, stamp, place.inertial_frame, tolerance
+                ), True
+            except TransformError:
+                pass  # without motion is the next best
+        return self.tf.lookup(place.points_frame, frame, place.stamp, tolerance), False
+
+    def _camera(self, role: CameraRole, place: _Place) -> Camera:
+        problems: list[str] = []
+        image, stamp = self._image(role, place.stamp, problems)
+        frame = self._camera_frames.get(role.topic, "")
+        found, compensated = None, False
+        if role.topic in self._camera_frames:
+            try:
+                found, compensated = self._moved(place, stamp, frame)
+            except TransformError as error:
+                self._complain(problems, f"{error}; state it with source.extrinsics")
+        camera_from_points = None if found is None else geometry.inverse(found.matrix)
+        world_from_camera = None
+        if found is not None:
+            world = np.eye(4) if place.world_from_points is None else place.world_from_points
+            world_from_camera = world @ found.matrix
+        if place.inertial_frame and self._config.sync.motion_compensation and found and not compensated:
+            problems.append(
+                f"the cloud is not moved to the image's time: '{place.inertial_frame}' is out of reach"
+            )
+        return Camera(
+            name=role.name,
+            image=image,
+            intrinsics=self._camera_intrinsics(role, image, problems),
+            camera_from_points=camera_from_points,
+            world_from_camera=world_from_camera,
+            sync_error=(stamp - place.stamp) * 1e-9 if image is not None else float("nan"),
+            tf_age=float("nan") if found is None else found.age,
+            motion_compensated=compensated,
+            problems=tuple(problems),
+        )
+
+    def _image(self, role: CameraRole, stamp: int, problems: list[str]) -> tuple[Image | None, int]:
+        """The decoded image nearest to ``stamp``, and its stamp; without one, ``stamp``."""
+        nearest = self._images[role.topic].nearest(stamp)
+        if nearest is None or abs(nearest[0] - stamp) > self._tolerance:
+            self.report.without_image[role.name] += 1
+            problems.append(f"no image of camera '{role.name}' {self._nearest(nearest, stamp)}")
+            return None, stamp
+        try:
+            return replace(nearest[1].load(), stamp=nearest[0]), nearest[0]
+        except UserError as error:
+            self.report.undecodable[role.name] += 1
+            problems.append(str(error))
+            return None, stamp
+
+    def _nearest(self, nearest: tuple[int, Any] | None, stamp: int) -> str:
+        within = f"within {self._tolerance * 1e-9:.2f} s"
+        if nearest is None:
+            return f"{within}: none at all around this time"
+        away = (nearest[0] - stamp) * 1e-9
+        return f"{within}: nearest is {abs(away):.2f} s {'later' if away > 0 else 'earlier'}"
+
+    def _camera_intrinsics(
+        self, role: CameraRole, image: Image | None, problems: list[str]
+    ) -> Intrinsics | None:
+        intrinsics = self._intrinsics.get(role.info_topic or "")
+        if intrinsics is not None and image is not None:
+            return self._fitted(role, intrinsics, image, problems)
+        if intrinsics is not None:
+            return intrinsics
+        missing = f"no CameraInfo on {role.info_topic}" if role.info_topic else "no CameraInfo topic"
+        if self._config.preset == "reference":
+            self._complain(problems, f"{missing} yet: using fx = fy = 267, cx 320, cy 180 of the reference")
+            height, width = image.bgr.shape[:2] if image is not None else (360, 640)
+            return Intrinsics(width, height, TUTORIAL_K, assumed=True)
+        self._complain(
+            problems,
+            f"{missing} for camera '{role.name}': nothing can be projected into it; "
+            f"name the topic with source.camera_info_topics",
+        )
+        return None
+
+    def _fitted(
+        self, role: CameraRole, intrinsics: Intrinsics, image: Image, problems: list[str]
+    ) -> Intrinsics | None:
+        """The intrinsics for the image's own size."""
+        height, width = image.bgr.shape[:2]
+        if (width, height) == (intrinsics.width, intrinsics.height):
+            return intrinsics
+        if not intrinsics.width or not intrinsics.height:  # many drivers leave them empty
+            return replace(intrinsics, width=width, height=height)
+        sx, sy = width / intrinsics.width, height / intrinsics.height
+        if abs(sx / sy - 1) > 0.01:
+            self._complain(
+                problems,
+                f"CameraInfo on {role.info_topic} is for {intrinsics.width} x {intrinsics.height} pixels, "
+                f"the image has {width} x {height}: nothing can be projected into it",
+            )
+            return None
+        # Pixel (0, 0) is the centre of the corner pixel, so that the corner itself is at -0.5.
+        scale = np.array([[sx, 0, (sx - 1) / 2], [0, sy, (sy - 1) / 2], [0, 0, 1]])
+        return replace(intrinsics, width=width, height=height, K=scale @ intrinsics.K)
+
+    def _window(self, stamp: int) -> tuple[int, int]:
+        """The stamps that are nearer to this cloud than to its neighbours, within the tolerance."""
+        first, last = stamp - self._tolerance, stamp + self._tolerance
+        if self._last is not None:
+            first = max(first, (self._last + stamp) // 2 + 1)
+        if self._clouds:
+            last = min(last, (stamp + self._clouds[0].stamp) // 2)
+        return first, last
+
+    def _placed(self, boxes: LabelledBoxes3D, place: _Place, problems: list[str]) -> LabelledBoxes3D:
+        known = place.world_from_points is not None
+        try:
+            found = self.tf.lookup(
+                place.world_frame if known else place.points_frame,
+                boxes.frame_id,
+                boxes.stamp if known else place.stamp,
+                self._config.sync.tf_tolerance,
+            )
+        except TransformError as error:
+            self._complain(problems, f"{error}: the boxes of {boxes.topic} have no place in the world")
+            return boxes
+        return replace(boxes, world_from_boxes=found.matrix)
+
+    def _robot_detections(
+        self, cameras: tuple[Camera, ...], stamp: int, first: int, last: int
+    ) -> tuple[LabelledBoxes2D, ...]:
+        """The robot's image boxes of this time, each told its camera by the image's frame."""
+        names = {c.image.frame_id: c.name for c in cameras if c.image is not None}
+        found = (track.take(stamp, first, last) for track in self._detections.values())
+        return tuple(
+            d if d.camera else replace(d, camera=names.get(d.frame_id, "")) for d in found if d is not None
+        )
+
+    def _complain(self, problems: list[str], text: str) -> None:
+        """Tell this frame, and count in the report, where sentences that differ in a number are one."""
+        problems.append(text)
+        self.report.problems[re.sub(r"\d+\.\d+ s ", "", text)] += 1
+
+
+def _stamp_of(cloud: Cloud) -> int:
+    return cloud.stamp
+
+
+def _words(frame: str) -> set[str]:
+    return set(re.split(r"[/_]", frame.lower()))
+
+
+def _extrinsic(names: str, pose: tuple[float, ...]) -> StampedTransform:
+    parent, _, child = names.strip().partition(" ")
+    if not parent or not child.strip():
+        raise UserError(f"source.extrinsics: '{names}' should be 'parent child', two frame names")
+    try:
+        matrix = geometry.transform(np.array(pose[:3]), np.array(pose[3:]))
+    except ValueError as error:
+        raise UserError(f"source.extrinsics '{names}': {error}; expected x y z qx qy qz qw") from None
+    return StampedTransform(0, parent, child.strip(), matrix)
+
+
+def _merge(
+    clouds: tuple[Cloud, ...], poses: tuple[F64, ...], in_place: bool
+) -> tuple[F32, Mapping[str, NDArray[Any]]]:
+    """All points in one frame, with the fields that every cloud has."""
+    if len(clouds) == 1 and in_place:
+        return clouds[0].xyz, clouds[0].fields
+    points = np.concatenate([geometry.apply(p, c.xyz) for c, p in zip(clouds, poses, strict=True)])
+    common = [name for name in clouds[0].fields if all(name in c.fields for c in clouds)]
+    return points, {name: np.concatenate([c.fields[name] for c in clouds]) for name in common}
