@@ -8,8 +8,8 @@ import numpy as np
 
 from bevviz.config import ClusteringConfig
 from bevviz.frame import F32, F64, I32, I64, Boxes3D, Clusters, ClusterState
+from bevviz.stages.cells import cell_keys, group, sort_by
 from bevviz.stages.kernel import kernel
-from bevviz.stages.voxel import cell_keys, group
 
 MIN_SIZE = 0.01  # metres: no box is thinner, so that each has a volume and can be drawn and hit
 
@@ -27,7 +27,7 @@ def cluster(points: F32, config: ClusteringConfig) -> Clusters:
         shorter than ``MIN_SIZE``.
     """
     labels = dbscan(points, config.eps, config.min_points)
-    order, start = _sort_by(labels + 1, int(labels.max(initial=-1)) + 2)
+    order, start = sort_by(labels + 1, int(labels.max(initial=-1)) + 2)
     centroid, low, high, oriented = _boxes(points, order, start[1:])
     count = np.diff(start[1:])
     state = np.full(len(count), ClusterState.KEPT, np.int32)
@@ -64,7 +64,7 @@ def dbscan(points: F32, eps: float, min_points: int) -> I32:
     by_key = np.argsort(keys)
     rank = np.empty(len(by_key), np.int32)
     rank[by_key] = np.arange(len(by_key), dtype=np.int32)
-    order, start = _sort_by(rank[cell], len(rank))
+    order, start = sort_by(rank[cell], len(rank))
     x, y, z = np.ascontiguousarray(points[order].T)
     box = _cell_boxes(x, y, z, start)
     near, neighbours = _adjacent(keys[by_key], strides, box, eps * eps)
@@ -76,22 +76,6 @@ def dbscan(points: F32, eps: float, min_points: int) -> I32:
 # --- DBSCAN ------------------------------------------------------------------------------------
 # Points are sorted by cell: those of cell c are start[c]:start[c + 1], its core points come first. The cells
 # that may hold neighbours of c's points are neighbours[near[c]:near[c + 1]].
-
-
-@kernel
-def _sort_by(number: I32, count: int) -> tuple[I32, I32]:
-    """Stable counting sort: the order, and the start of each number in it."""
-    start = np.zeros(count + 1, np.int32)
-    for i in range(len(number)):
-        start[number[i] + 1] += 1
-    for k in range(count):
-        start[k + 1] += start[k]
-    end = start[:-1].copy()
-    order = np.empty(len(number), np.int32)
-    for i in range(len(number)):
-        order[end[number[i]]] = i
-        end[number[i]] += 1
-    return order, start
 
 
 @kernel

@@ -1,13 +1,12 @@
-"""Voxel grid, and the packed integer cells that it shares with the clustering."""
+"""Voxel grid."""
 
 from __future__ import annotations
-
-import math
 
 import numpy as np
 
 from bevviz.config import VoxelConfig
-from bevviz.frame import F32, F64, I32, I64, Voxels
+from bevviz.frame import F32, I32, Voxels
+from bevviz.stages.cells import cell_keys, group
 from bevviz.stages.kernel import kernel
 
 
@@ -30,93 +29,6 @@ def voxel_grid(points: F32, config: VoxelConfig) -> Voxels:
     keys, _ = cell_keys(points, config.size, shift=0.5)
     inverse, first = group(keys)
     return Voxels(_means(points, inverse, len(first)) if config.average else points[first], inverse)
-
-
-def cell_keys(points: F32, size: float, shift: float = 0.0, reach: int = 0) -> tuple[I64, I64]:
-    """Pack the integer cell of each point into one int64, z fastest.
-
-    Args:
-        points: (N, 3) float32 finite points, N > 0.
-        size: edge of a cell in metres.
-        shift: cells by which the grid begins before the lowest corner of the cloud, in [0, 1).
-        reach: largest offset in cells that the caller will add to a key.
-
-    Returns:
-        keys: (N,) the packed cells; unequal cells have unequal keys.
-        strides: (3,) ``keys + offset @ strides`` are the keys at an offset of up to ``reach`` cells.
-    """
-    low, high = _bounds(points)
-    origin = low - shift * size
-    counts = np.floor((high - origin) / size) + 1 + 2 * reach
-    if math.prod(counts.tolist()) < 2**62:
-        strides = np.array([counts[1] * counts[2], counts[2], 1], np.int64)
-        return _pack(points, origin, size, strides), strides
-    # Points scattered too widely for 64 bits: shorten the empty gaps along each axis that nothing reaches over.
-    columns = []
-    for axis in range(3):
-        layers, layer = np.unique(np.floor((points[:, axis] - origin[axis]) / size), return_inverse=True)
-        steps = np.minimum(np.diff(layers, prepend=layers[0]), reach + 1)
-        columns.append(np.cumsum(steps).astype(np.int64)[layer])
-    _, ny, nz = (int(column.max()) + 1 + 2 * reach for column in columns)
-    strides = np.array([ny * nz, nz, 1], np.int64)
-    return np.stack(columns, axis=1) @ strides, strides
-
-
-@kernel
-def group(keys: I64) -> tuple[I32, I32]:
-    """Number equal keys in the order of their first appearance, by hashing.
-
-    Returns:
-        number: (N,) int32 number of each key.
-        first: (M,) int32 index at which each number appears first.
-    """
-    n = len(keys)
-    bits = 4
-    while (1 << bits) < 2 * n:
-        bits += 1
-    table = np.full(1 << bits, -1, np.int32)
-    number = np.empty(n, np.int32)
-    first = np.empty(n, np.int32)
-    seen = np.empty(n, np.int64)
-    found = 0
-    for i in range(n):
-        key = keys[i]
-        if i > 0 and key == keys[i - 1]:
-            number[i] = number[i - 1]
-            continue
-        slot = np.int64((np.uint64(key) * np.uint64(0x9E3779B97F4A7C15)) >> np.uint64(64 - bits))
-        while table[slot] >= 0 and seen[table[slot]] != key:
-            slot = (slot + 1) & ((1 << bits) - 1)
-        if table[slot] < 0:
-            table[slot] = found
-            seen[found] = key
-            first[found] = i
-            found += 1
-        number[i] = table[slot]
-    return number, first[:found].copy()
-
-
-@kernel
-def _bounds(points: F32) -> tuple[F64, F64]:
-    low = points[0].astype(np.float64)
-    high = low.copy()
-    for i in range(len(points)):
-        for axis in range(3):
-            low[axis] = min(low[axis], points[i, axis])
-            high[axis] = max(high[axis], points[i, axis])
-    return low, high
-
-
-@kernel
-def _pack(points: F32, origin: F64, size: float, strides: I64) -> I64:
-    keys = np.empty(len(points), np.int64)
-    for i in range(len(points)):
-        key = 0
-        for axis in range(3):
-            # The coordinate is not negative, so that truncation is the floor.
-            key += np.int64((points[i, axis] - origin[axis]) / size) * strides[axis]
-        keys[i] = key
-    return keys
 
 
 @kernel

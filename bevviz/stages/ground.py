@@ -1,0 +1,261 @@
+"""Ground segmentation: the reference's single plane, and a surface that follows slopes and kerbs."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from bevviz.config import GroundConfig
+from bevviz.frame import F32, F64, I32, Bool, Ground
+from bevviz.stages.cells import sort_by
+from bevviz.stages.kernel import kernel
+
+# Rings are as wide as sqrt(r^2 + RING_SCALE^2) / RING_COUNT: half a metre near the sensor, 4% of the range
+# far away, where the beams are sparse.
+RING_SCALE = 12.5
+RING_COUNT = 25.0
+NEAR = 20.0  # metres around the sensor in which the first plane is sought
+MEMORY = 5.0  # metres over which the slope of the ground is remembered
+
+
+def segment_ground(points: F32, config: GroundConfig) -> Ground:
+    """Tell the ground from the obstacles.
+
+    ``ransac`` takes the plane with the most points within ``distance_threshold``, whichever it is, even a
+    wall, as Open3D's ``segment_plane`` does; the heights are above that plane.
+
+    ``polar`` follows the ground outward from the sensor over sectors and rings, as Himmelsbach et al. 2010,
+    but through all sectors at once: each bin offers its lowest point that is no further than ``max_step``
+    from where the rings before lead to, and the ground rises by the median of the offers of the sectors
+    around. A car is too high a step, a reflection below the road too low, a kerb is followed; where nothing
+    is offered the ground goes on as it was. What is below the ground counts as ground.
+
+    Args:
+        points: (N, 3) float32 finite points, z up, the sensor near x = y = 0.
+        config: the method and its parameters.
+
+    Returns:
+        Ground. Without a plane to start from (fewer than three points, or all on a line) nothing is ground
+        and all heights are NaN.
+    """
+    return _ransac(points, config) if config.method == "ransac" else _polar(points, config)
+
+
+# --- one plane ---------------------------------------------------------------------------------
+
+
+def _ransac(points: F32, config: GroundConfig) -> Ground:
+    inliers = _largest_plane(points, config.distance_threshold, config)
+    if not inliers.any():
+        return _unknown(len(points))
+    plane = _fit(points[inliers])
+    return Ground(inliers, _above(points, plane), plane)
+
+
+def _unknown(count: int) -> Ground:
+    return Ground(np.zeros(count, np.bool_), np.full(count, np.nan, np.float32))
+
+
+def _above(points: F32, plane: F64) -> F32:
+    """(N,) signed distance of points from a plane a, b, c, d of unit normal."""
+    distance: F32 = points @ plane[:3].astype(np.float32) + np.float32(plane[3])
+    return distance
+
+
+def _largest_plane(points: F32, threshold: float, config: GroundConfig, steepest: float = np.inf) -> Bool:
+    """(N,) the points nearer than the threshold to the best plane through three random points (RANSAC).
+
+    Planes steeper than ``steepest``, a tangent, take no part. All False: no three points made a plane.
+    """
+    if len(points) < 3:
+        return np.zeros(len(points), np.bool_)
+    sample = np.random.default_rng(config.seed).integers(len(points), size=(config.iterations, 3))
+    a, b, c = points[sample].astype(np.float64).transpose(1, 0, 2)
+    normal = np.cross(b - a, c - a)
+    length = np.linalg.norm(normal, axis=1)
+    taking_part = (length > 0) & (np.hypot(normal[:, 0], normal[:, 1]) <= steepest * np.abs(normal[:, 2]))
+    normal = (normal[taking_part] / length[taking_part, None]).astype(np.float32)
+    return _best_support(points, a[taking_part].astype(np.float32), normal, np.float32(threshold))
+
+
+@kernel
+def _best_support(points: F32, anchor: F32, normal: F32, threshold: np.float32) -> Bool:
+    """(N,) the points near the plane, of those through each anchor, that has the most."""
+    x, y, z = points[:, 0].copy(), points[:, 1].copy(), points[:, 2].copy()
+    near = np.zeros(len(x), np.bool_)
+    most, best = 0, -1
+    for k in range(len(normal)):
+        px, py, pz = anchor[k]
+        a, b, c = normal[k]
+        count = 0
+        for i in range(len(x)):
+            count += abs(a * (x[i] - px) + b * (y[i] - py) + c * (z[i] - pz)) < threshold
+        if count > most:
+            most, best = count, k
+    if best >= 0:
+        px, py, pz = anchor[best]
+        a, b, c = normal[best]
+        for i in range(len(x)):
+            near[i] = abs(a * (x[i] - px) + b * (y[i] - py) + c * (z[i] - pz)) < threshold
+    return near
+
+
+def _fit(points: F32) -> F64:
+    """(4,) plane, unit normal upwards, by least squares along the axis nearest to its normal, as Open3D's."""
+    center = points.mean(axis=0, dtype=np.float64)
+    r = points - center
+    scatter = r.T @ r
+    # The cofactors of the scatter matrix: the row with the largest diagonal one is the normal.
+    cofactors = np.cross(scatter[[1, 2, 0]], scatter[[2, 0, 1]])
+    normal = cofactors[np.argmax(np.diagonal(cofactors))]
+    normal = normal / (np.linalg.norm(normal) * (-1 if normal[2] < 0 else 1))
+    return np.append(normal, -normal @ center)
+
+
+# --- a surface over rings and sectors ----------------------------------------------------------
+
+
+def _polar(points: F32, config: GroundConfig) -> Ground:
+    ring, sector = _place(points, config.sectors)
+    rings = math.ceil(RING_COUNT * math.asinh(config.max_range / RING_SCALE))
+    # Beyond max_range the last ring goes on.
+    row = np.minimum(ring.astype(np.int32), rings - 1)
+    order, start = sort_by(row * config.sectors + sector.astype(np.int32), rings * config.sectors)
+    plane = _first_plane(points, order, start, config)
+    if plane is None:
+        return _unknown(len(points))
+    rise = _above(points, plane) / np.float32(plane[2])
+    radius = RING_SCALE * np.sinh(np.arange(0.5, rings) / RING_COUNT)
+    steepest = math.tan(math.radians(config.max_slope))
+    surface = _follow(rise, order, start, radius, config.sectors, config.max_step, steepest)
+    _settle(surface, rise, order, start, config.distance_threshold / 2)
+    height = _height(rise, ring, sector, surface)
+    return Ground(height < config.distance_threshold, height)
+
+
+def _first_plane(points: F32, order: I32, start: I32, config: GroundConfig) -> F64 | None:
+    """The ground around the sensor as a plane, from the lowest points of the bins."""
+    low = points[_lowest(points, order, start)]
+    distance = np.hypot(low[:, 0], low[:, 1])
+    steepest = math.tan(math.radians(config.max_slope))
+    if config.sensor_height is not None:
+        low = low[np.abs(low[:, 2] + config.sensor_height) < config.max_step + steepest * distance]
+        distance = np.hypot(low[:, 0], low[:, 1])
+    if np.count_nonzero(distance < NEAR) >= 3:
+        low = low[distance < NEAR]
+    inliers = _largest_plane(low, config.distance_threshold, config, steepest)
+    return _fit(low[inliers]) if inliers.any() else None
+
+
+@kernel
+def _place(points: F32, sectors: int) -> tuple[F32, F32]:
+    """Ring and sector of each point, with the fraction of the way through it."""
+    ring = np.empty(len(points), np.float32)
+    sector = np.empty(len(points), np.float32)
+    scale, count = np.float32(1 / RING_SCALE), np.float32(RING_COUNT)
+    turn, whole = np.float32(sectors / (2 * math.pi)), np.float32(sectors)
+    for i in range(len(points)):
+        x, y = points[i, 0], points[i, 1]
+        ring[i] = count * np.arcsinh(scale * np.sqrt(x * x + y * y))
+        angle = turn * np.arctan2(y, x)
+        # Rounding takes a tiny negative angle to the whole turn, which is the first sector again.
+        angle = angle + whole if angle < 0 else angle
+        sector[i] = angle if angle < whole else np.float32(0)
+    return ring, sector
+
+
+@kernel
+def _lowest(points: F32, order: I32, start: I32) -> I32:
+    """Index of the lowest point of each occupied bin."""
+    lowest = np.empty(len(start) - 1, np.int32)
+    found = 0
+    for b in range(len(start) - 1):
+        if start[b] == start[b + 1]:
+            continue
+        low = order[start[b]]
+        for k in range(start[b] + 1, start[b + 1]):
+            if points[order[k], 2] < points[low, 2]:
+                low = order[k]
+        lowest[found] = low
+        found += 1
+    return lowest[:found]
+
+
+@kernel
+def _follow(
+    rise: F32, order: I32, start: I32, radius: F64, sectors: int, max_step: float, steepest: float
+) -> F64:
+    """(R, S) height of the ground above the first plane, ring by ring outwards."""
+    surface = np.zeros((len(radius), sectors))
+    level = np.zeros(sectors)
+    slope = np.zeros(sectors)
+    unseen = np.zeros(sectors)  # metres since the last offer
+    offer = np.empty(sectors)
+    for r in range(len(radius)):
+        step = radius[r] - radius[r - 1] if r > 0 else radius[0]
+        keep = math.exp(-step / MEMORY)
+        for s in range(sectors):
+            level[s] += slope[s] * step
+            # The longer the ground was hidden, the less is known of where it comes up again.
+            gate = max_step * (1 + unseen[s] / MEMORY)
+            offer[s] = np.inf
+            for k in range(start[r * sectors + s], start[r * sectors + s + 1]):
+                step_up = rise[order[k]] - level[s]
+                if abs(step_up) <= gate and step_up < offer[s]:
+                    offer[s] = step_up
+        # Offers of sectors within a metre to each side.
+        reach = min(max(2, math.ceil(sectors / (2 * math.pi * radius[r]))), 8)
+        around = np.empty(2 * reach + 1)
+        for s in range(sectors):
+            count = 0
+            for k in range(s - reach, s + reach + 1):
+                if offer[k % sectors] < np.inf:
+                    around[count] = offer[k % sectors]
+                    count += 1
+            if count > 0:
+                change = np.median(around[:count])
+                level[s] += change
+                slope[s] += (1 - keep) / step * change
+                slope[s] = min(max(slope[s], -steepest), steepest)
+                unseen[s] = 0
+            else:
+                slope[s] *= keep
+                unseen[s] += step
+            surface[r, s] = level[s]
+    return surface
+
+
+@kernel
+def _settle(surface: F64, rise: F32, order: I32, start: I32, band: float) -> None:
+    """Move each bin of the surface to the mean of the points within the band around it.
+
+    The lowest points, which it was made of, lie below the ground by the noise of the sensor.
+    """
+    flat = surface.ravel()
+    for b in range(len(flat)):
+        total, count = 0.0, 0
+        for k in range(start[b], start[b + 1]):
+            if abs(rise[order[k]] - flat[b]) < band:
+                total += rise[order[k]]
+                count += 1
+        if count > 0:
+            flat[b] = total / count
+
+
+@kernel
+def _height(rise: F32, ring: F32, sector: F32, surface: F64) -> F32:
+    """(N,) height above the surface, which is bilinear between the middles of its bins."""
+    rings, sectors = surface.shape
+    height = np.empty(len(rise), np.float32)
+    for i in range(len(rise)):
+        r = min(max(ring[i] - 0.5, 0.0), rings - 1.0)
+        r0 = min(int(r), rings - 2)
+        s = sector[i] + sectors - 0.5
+        s0 = int(s) % sectors
+        s1 = (s0 + 1) % sectors
+        u, v = r - r0, s - int(s)
+        near = surface[r0, s0] * (1 - v) + surface[r0, s1] * v
+        far = surface[r0 + 1, s0] * (1 - v) + surface[r0 + 1, s1] * v
+        height[i] = rise[i] - (near * (1 - u) + far * u)
+    return height
