@@ -5,11 +5,15 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from numpy.polynomial import Polynomial
 from numpy.typing import NDArray
 
 from bevviz.frame import F32, F64, Boxes3D, Intrinsics
 
 FloatArray = NDArray[Any]
+
+MIN_DEPTH = 1e-3  # metres; what is nearer to the camera's plane has no meaningful pixel
+FISHEYE = ("equidistant", "fisheye")
 
 # --- rigid transforms --------------------------------------------------------------------------
 
@@ -109,43 +113,16 @@ def project(points: FloatArray, intrinsics: Intrinsics) -> tuple[F32, F32]:
     """
     p = np.asarray(points)
     depth = np.asarray(p[:, 2], np.float32)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        inv = np.where(p[:, 2] > 1e-3, 1.0 / p[:, 2], np.nan)
+    inv = np.full(len(p), np.nan, p.dtype if p.dtype.kind == "f" else np.float64)
+    np.divide(1.0, p[:, 2], out=inv, where=p[:, 2] > MIN_DEPTH)
     x, y = p[:, 0] * inv, p[:, 1] * inv
-    if intrinsics.D.size and np.any(intrinsics.D):
+    if np.any(intrinsics.D):
         x, y = _distort(x, y, intrinsics)
     k = intrinsics.K
     uv = np.empty((len(p), 2), np.float32)
-    uv[:, 0] = k[0, 0] * x + k[0, 1] * y + k[0, 2]
-    uv[:, 1] = k[1, 1] * y + k[1, 2]
+    uv[:, 0] = float(k[0, 0]) * x + float(k[0, 2])
+    uv[:, 1] = float(k[1, 1]) * y + float(k[1, 2])
     return uv, depth
-
-
-def _distort(x: FloatArray, y: FloatArray, intrinsics: Intrinsics) -> tuple[FloatArray, FloatArray]:
-    d = np.zeros(8)
-    d[: min(8, intrinsics.D.size)] = intrinsics.D[:8]
-    r2 = x * x + y * y
-    if intrinsics.distortion_model in ("equidistant", "fisheye"):
-        r = np.sqrt(r2)
-        theta = np.arctan(r)
-        t2 = theta * theta
-        turned = theta * (1 + t2 * (d[0] + t2 * (d[1] + t2 * (d[2] + t2 * d[3]))))
-        slope = 1 + t2 * (3 * d[0] + t2 * (5 * d[1] + t2 * (7 * d[2] + t2 * 9 * d[3])))
-        scale = np.where(slope > 0, np.where(r > 1e-8, turned / np.maximum(r, 1e-8), 1.0), np.nan)
-        return x * scale, y * scale
-    k1, k2, p1, p2, k3, k4, k5, k6 = d
-    numerator = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-    denominator = 1 + r2 * (k4 + r2 * (k5 + r2 * k6))
-    radial = numerator / denominator
-    # Beyond its calibrated field of view the polynomial folds back: such points would land in the image.
-    slope_n = k1 + r2 * (2 * k2 + r2 * 3 * k3)
-    slope_d = k4 + r2 * (2 * k5 + r2 * 3 * k6)
-    grows = radial + 2 * r2 * (slope_n * denominator - numerator * slope_d) / denominator**2
-    radial = np.where(grows > 0, radial, np.nan)
-    return (
-        x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
-        y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
-    )
 
 
 def rays(uv: FloatArray, intrinsics: Intrinsics) -> F64:
@@ -153,31 +130,89 @@ def rays(uv: FloatArray, intrinsics: Intrinsics) -> F64:
     import cv2
 
     points = np.ascontiguousarray(uv, np.float64).reshape(-1, 1, 2)
-    d = np.asarray(intrinsics.D, np.float64)
-    if d.size and np.any(d):
-        if intrinsics.distortion_model in ("equidistant", "fisheye"):
-            flat = cv2.fisheye.undistortPoints(points, intrinsics.K, d[:4])
-        else:
-            flat = cv2.undistortPointsIter(
-                points, intrinsics.K, d, None, None, (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 1e-12)
-            )
+    rays = np.ones((len(points), 3))
+    if len(points) == 0:
+        return rays
+    d, criteria = _coefficients(intrinsics), (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-12)
+    if intrinsics.distortion_model in FISHEYE:
+        flat = cv2.fisheye.undistortPoints(points, intrinsics.K, d[:4], criteria=criteria)
     else:
-        flat = cv2.undistortPoints(points, intrinsics.K, np.zeros(5))
-    return np.column_stack([flat.reshape(-1, 2), np.ones(len(points))])
+        flat = cv2.undistortPoints(points, intrinsics.K, d, criteria=criteria)
+    rays[:, :2] = flat.reshape(-1, 2)
+    return rays
+
+
+def frustum(
+    xyxy: FloatArray, intrinsics: Intrinsics, near: FloatArray | float, far: FloatArray | float
+) -> F32:
+    """(D, 8, 3) corners, in the optical frame, of what (D, 4) image boxes see between two depths.
+
+    ``near`` and ``far``, one for all or (D,), are metres along the optical axis. The corners run top
+    left, top right, bottom right, bottom left, first at ``near``, then at ``far``.
+    """
+    directions = rays(np.asarray(xyxy)[:, [0, 1, 2, 1, 2, 3, 0, 3]].reshape(-1, 2), intrinsics).reshape(
+        -1, 1, 4, 3
+    )
+    depths = np.stack([np.broadcast_to(d, len(xyxy)) for d in (near, far)], axis=1)
+    return np.asarray(directions * depths[:, :, None, None], np.float32).reshape(-1, 8, 3)
+
+
+def _coefficients(intrinsics: Intrinsics) -> F64:
+    """(8,) the distortion coefficients, zero where not given."""
+    d = np.zeros(8)
+    given = np.ravel(intrinsics.D)[:8]
+    d[: len(given)] = given
+    return d
+
+
+def _distort(x: FloatArray, y: FloatArray, intrinsics: Intrinsics) -> tuple[FloatArray, FloatArray]:
+    k1, k2, p1, p2, k3, k4, k5, k6 = _coefficients(intrinsics).tolist()
+    r2 = x * x + y * y
+    if intrinsics.distortion_model in FISHEYE:
+        k1, k2, k3, k4 = _coefficients(intrinsics)[:4].tolist()
+        r = np.sqrt(r2)
+        theta = np.arctan(r)
+        t2 = theta * theta
+        t2 = np.where(t2 < _first_root(Polynomial([1, 3 * k1, 5 * k2, 7 * k3, 9 * k4])), t2, np.nan)
+        turned = theta * (1 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4))))
+        scale = np.divide(turned, r, out=np.ones_like(r), where=r > 1e-8)
+        return x * scale, y * scale
+    # r * numerator / denominator must grow with r; its derivative, times denominator^2, in r^2:
+    numerator, denominator = Polynomial([1, k1, k2, k3]), Polynomial([1, k4, k5, k6])
+    turns = numerator.deriv() * denominator - numerator * denominator.deriv()
+    slope = numerator * denominator + Polynomial([0, 2]) * turns
+    r2 = np.where(r2 < min(_first_root(slope), _first_root(denominator)), r2, np.nan)
+    radial = (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / (1 + r2 * (k4 + r2 * (k5 + r2 * k6)))
+    return (
+        x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
+        y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
+    )
+
+
+def _first_root(polynomial: Polynomial) -> float:
+    """The least positive root, infinite where there is none."""
+    roots = polynomial.trim().roots()
+    real = roots.real[(np.abs(roots.imag) < 1e-9) & (roots.real > 0)]
+    return float(real.min(initial=np.inf))
 
 
 # --- boxes -------------------------------------------------------------------------------------
 
 
 def iou(a: FloatArray, b: FloatArray) -> F32:
-    """(A, B) intersection over union of (A, 4) and (B, 4) image boxes x0, y0, x1, y1."""
+    """(A, B) intersection over union of (A, 4) and (B, 4) image boxes x0, y0, x1, y1.
+
+    Zero with a box that is empty or NaN.
+    """
     low = np.maximum(a[:, None, :2], b[None, :, :2])
     high = np.minimum(a[:, None, 2:], b[None, :, 2:])
     inter = np.prod(np.clip(high - low, 0, None), axis=2)
     area_a = np.prod(np.clip(a[:, 2:] - a[:, :2], 0, None), axis=1)
     area_b = np.prod(np.clip(b[:, 2:] - b[:, :2], 0, None), axis=1)
     union = area_a[:, None] + area_b[None, :] - inter
-    return np.divide(inter, union, out=np.zeros_like(inter, np.float32), where=union > 0, casting="unsafe")
+    ratio = np.zeros(inter.shape, np.float32)
+    np.divide(inter, union, out=ratio, where=union > 0, casting="same_kind")
+    return ratio
 
 
 def corners(boxes: Boxes3D) -> F32:
@@ -188,5 +223,7 @@ def corners(boxes: Boxes3D) -> F32:
     )
     local = unit[None] * (boxes.size[:, None] / 2)
     c, s = np.cos(boxes.yaw)[:, None], np.sin(boxes.yaw)[:, None]
-    turned = np.stack([c * local[..., 0] - s * local[..., 1], s * local[..., 0] + c * local[..., 1], local[..., 2]], -1)
+    turned = np.stack(
+        [c * local[..., 0] - s * local[..., 1], s * local[..., 0] + c * local[..., 1], local[..., 2]], -1
+    )
     return np.asarray(turned + boxes.center[:, None], np.float32)

@@ -155,7 +155,7 @@ class Detector:
     def _letterbox(self, bgr: U8) -> tuple[Any, F32, F32]:
         """The network's input, with the scale and offset (x, y) that took the image there."""
         size = np.array(bgr.shape[:2])
-        ratio = np.min(np.array(self.input_size) / size)
+        ratio = float(np.min(np.array(self.input_size) / size))
         yolox = self.layout is Layout.YOLOX
         # Megvii cuts the resized image's fraction of a pixel off, Ultralytics rounds it.
         inner = np.maximum((size * ratio).astype(int) if yolox else np.rint(size * ratio).astype(int), 1)

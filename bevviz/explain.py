@@ -1,0 +1,228 @@
+"""Every decision of a frame in words, with its numbers and the parameter it hung on."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+
+from bevviz.config import Config
+from bevviz.frame import (
+    CameraResult,
+    Clusters,
+    ClusterState,
+    Decision,
+    Detections,
+    DetectionState,
+    Explanation,
+    Fusion,
+)
+
+Looked = dict[tuple[int, int], int]  # (detection, cluster) -> row of Fusion.pairs
+
+
+def explain(
+    cameras: Sequence[CameraResult], clusters: Clusters | None, config: Config
+) -> tuple[Explanation, ...]:
+    """One self-contained sentence for each detection, each cluster and each problem of a camera.
+
+    A detection's distances are along its camera's optical axis, a cluster's are horizontal, from the
+    origin of its frame. A cluster is explained once for each camera that has it in view, otherwise once.
+    Problems have the subject ``camera``, row -1 and the state ``problem``.
+
+    Args:
+        cameras: results of all cameras.
+        clusters: the frame's clusters, None where their stage failed.
+        config: what the frame was run with.
+    """
+    looked = [_looked(camera.fusion) for camera in cameras]
+    found: list[Explanation] = []
+    for result, rows in zip(cameras, looked, strict=True):
+        found.extend(_problems(result, config))
+        if result.detections is not None:
+            found.extend(_detections(result, result.detections, rows, clusters, config))
+    if clusters is not None:
+        found.extend(_clusters(cameras, looked, clusters, config))
+    return tuple(found)
+
+
+def _looked(fusion: Fusion | None) -> Looked:
+    if fusion is None:
+        return {}
+    pairs = zip(fusion.pairs.detection.tolist(), fusion.pairs.cluster.tolist(), strict=True)
+    return {pair: row for row, pair in enumerate(pairs)}
+
+
+def _problems(result: CameraResult, config: Config) -> Iterator[Explanation]:
+    texts = [*result.camera.problems]
+    if result.detections is None and result.camera.image is not None:
+        why = "the detector failed" if config.detector.model else "detector.model is not set"
+        texts.append(f"no detections, {why}")
+    for text in texts:
+        yield Explanation("camera", result.camera.name, -1, "problem", f"{result.camera.name}: {text}")
+
+
+# --- detections --------------------------------------------------------------------------------
+
+
+def _detections(
+    result: CameraResult, detections: Detections, looked: Looked, clusters: Clusters | None, config: Config
+) -> Iterator[Explanation]:
+    for d, value in enumerate(detections.state.tolist()):
+        state = DetectionState(value)
+        key = state.name.lower()
+        if state is DetectionState.BELOW_THRESHOLD:
+            text = f"below detector.conf_threshold {config.detector.conf_threshold:g}"
+        elif state is DetectionState.SUPPRESSED:
+            rival = _label(detections, int(detections.suppressed_by[d]))
+            limit = f"detector.iou_threshold {config.detector.iou_threshold:g}"
+            text = f"suppressed by {rival}, IoU {detections.overlap[d]:.2f} > {limit}"
+        elif result.fusion is None or clusters is None:
+            why = "; ".join(result.camera.problems) or "no clusters in this frame"
+            text = f"not compared with clusters: {why}"
+        else:
+            decision = Decision(int(result.fusion.detection_decision[d]))
+            key = decision.name.lower()
+            text = _detection(decision, d, result, result.fusion, detections, looked, clusters, config)
+        yield Explanation("detection", result.camera.name, d, key, f"{_label(detections, d)}: {text}")
+
+
+def _detection(
+    decision: Decision,
+    d: int,
+    result: CameraResult,
+    fusion: Fusion,
+    detections: Detections,
+    looked: Looked,
+    clusters: Clusters,
+    config: Config,
+) -> str:
+    if decision is Decision.NO_CLUSTER:
+        return f"no cluster, {_unclustered(d, result, detections, clusters, config)}"
+    k = int(fusion.detection_cluster[d])
+    pairs, row = fusion.pairs, looked[d, k]
+    if config.fusion.method == "centroid":
+        evidence = (
+            f"centre of cluster {k} at {pairs.depth[row]:.1f} m is {pairs.distance[row]:.0f} px from its own"
+        )
+    else:
+        evidence = (
+            f"{_points(pairs.points[row])} of cluster {k} in its frustum "
+            f"at {pairs.depth[row]:.1f} m, IoU {pairs.iou[row]:.2f}"
+        )
+    if decision is Decision.MATCHED:
+        named = (fusion.cluster_decision == Decision.MATCHED) & (fusion.cluster_detection == d)
+        others = [str(other) for other in np.flatnonzero(named).tolist() if other != k]
+        also = f"; clusters {', '.join(others)} take the same box" if others else ""
+        return f"{evidence}, matched{also}"
+    if decision is Decision.TAKEN:
+        return f"no match: {evidence}, taken by {_label(detections, int(fusion.cluster_detection[k]))}"
+    return f"no match: {evidence}, {_rule(decision, config)}"
+
+
+def _unclustered(
+    d: int, result: CameraResult, detections: Detections, clusters: Clusters, config: Config
+) -> str:
+    """What the obstacle points in a frustum are, of which no cluster is a candidate."""
+    if config.fusion.method == "centroid":
+        return "none has its centre before the camera"
+    if result.uv is None or result.depth is None:
+        return f"{_points(result.fusion.detection_points[d] if result.fusion else 0)} in its frustum"
+    x0, y0, x1, y1 = detections.xyxy[d]
+    u, v = result.uv.T
+    labels = clusters.labels[(u >= x0) & (u <= x1) & (v >= y0) & (v <= y1) & (result.depth > 0)]
+    if len(labels) == 0:
+        return "no obstacle point in its frustum"
+    kinds = []
+    for label, count in zip(*np.unique(labels, return_counts=True), strict=True):
+        if label < 0:
+            kinds.append(f"{count} noise (clustering.min_points is {config.clustering.min_points})")
+        else:
+            kinds.append(f"{count} of cluster {label} ({_set_aside(int(clusters.state[label]), config)})")
+    return f"{_points(len(labels))} in its frustum: {', '.join(kinds)}"
+
+
+# --- clusters ----------------------------------------------------------------------------------
+
+
+def _clusters(
+    cameras: Sequence[CameraResult], looked: Sequence[Looked], clusters: Clusters, config: Config
+) -> Iterator[Explanation]:
+    compared = [result.camera.name for result in cameras if result.fusion is not None]
+    ranges = np.hypot(clusters.centroid[:, 0], clusters.centroid[:, 1])
+    for k, (state, count, distance) in enumerate(
+        zip(clusters.state.tolist(), clusters.count, ranges, strict=True)
+    ):
+        head = f"cluster {k}: {_points(count)} at {distance:.1f} m"
+        if state != ClusterState.KEPT:
+            text = f"{head}: {_set_aside(state, config)}"
+            yield Explanation("cluster", "", k, ClusterState(state).name.lower(), text)
+            continue
+        if not compared:
+            yield Explanation(
+                "cluster", "", k, "kept", f"{head}: not compared with detections, as no camera has any"
+            )
+            continue
+        unseen = True
+        for result, rows in zip(cameras, looked, strict=True):
+            fusion, detections = result.fusion, result.detections
+            if fusion is None or detections is None or fusion.cluster_decision[k] == Decision.OUT_OF_VIEW:
+                continue
+            unseen = False
+            decision = Decision(int(fusion.cluster_decision[k]))
+            text = _cluster(decision, k, fusion, detections, rows, config)
+            if decision is not Decision.MATCHED:
+                text = f"in view of {result.camera.name}, {text}"
+            yield Explanation("cluster", result.camera.name, k, decision.name.lower(), f"{head}: {text}")
+        if unseen:
+            yield Explanation(
+                "cluster", "", k, "out_of_view", f"{head}: out of view of {' and '.join(compared)}"
+            )
+
+
+def _cluster(
+    decision: Decision, k: int, fusion: Fusion, detections: Detections, looked: Looked, config: Config
+) -> str:
+    if decision is Decision.NO_DETECTION:
+        return "under no detection"
+    d = int(fusion.cluster_detection[k])
+    label = _label(detections, d)
+    if decision is Decision.MATCHED:
+        return f"matched with {label}"
+    pairs, row = fusion.pairs, looked[d, k]
+    if config.fusion.method == "centroid":
+        evidence = f"its centre {pairs.distance[row]:.0f} px from that of {label}"
+    else:
+        evidence = f"{_points(pairs.points[row])} in the frustum of {label}, IoU {pairs.iou[row]:.2f}"
+    if decision is Decision.TAKEN:
+        return f"{evidence}, taken by cluster {fusion.detection_cluster[d]}"
+    return f"{evidence}, {_rule(decision, config)}"
+
+
+# --- words -------------------------------------------------------------------------------------
+
+
+def _label(detections: Detections, d: int) -> str:
+    return f"{detections.names[d]} {detections.score[d]:.2f}"
+
+
+def _points(count: int | np.integer) -> str:
+    return f"{count} point" if count == 1 else f"{count} points"
+
+
+def _rule(decision: Decision, config: Config) -> str:
+    """The parameter that forbade a pair."""
+    fusion = config.fusion
+    if decision is Decision.TOO_FEW_POINTS:
+        return f"fusion.min_points is {fusion.min_points}"
+    if decision is Decision.LOW_OVERLAP:
+        return f"fusion.min_iou is {fusion.min_iou:g}"
+    if fusion.method == "centroid":
+        return f"fusion.match_radius is {fusion.match_radius:g} px"
+    return f"fusion.max_depth is {fusion.max_depth:g} m"
+
+
+def _set_aside(state: int, config: Config) -> str:
+    if state == ClusterState.TOO_SMALL:
+        return f"set aside, clustering.min_cluster_points is {config.clustering.min_cluster_points}"
+    return f"set aside, clustering.max_cluster_points is {config.clustering.max_cluster_points}"

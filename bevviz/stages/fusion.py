@@ -1,0 +1,326 @@
+"""Which 2D detection is which LiDAR cluster."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from bevviz.config import ClusteringConfig, FusionConfig
+from bevviz.frame import (
+    F32,
+    F64,
+    I32,
+    I64,
+    Boxes3D,
+    CameraResult,
+    Clusters,
+    ClusterState,
+    Decision,
+    Detections,
+    DetectionState,
+    Fusion,
+    Intrinsics,
+    Objects,
+    Pairs,
+)
+from bevviz.geometry import apply, iou
+
+# What makes a cluster look like a detection, each from 0 to 1 (see ``fuse``).
+IOU_WEIGHT, SHARE_WEIGHT, NEARNESS_WEIGHT = 0.6, 0.25, 0.15
+
+
+def fuse(
+    uv: F32,
+    depth: F32,
+    clusters: Clusters,
+    detections: Detections,
+    intrinsics: Intrinsics,
+    camera_from_points: F64,
+    config: FusionConfig,
+) -> Fusion:
+    """Match one camera's detections with the clusters.
+
+    ``frustum``: a box in the image encloses the silhouette of what is seen of an object, so the object's
+    cluster lies in the box's frustum, fills it, and has little outside of it; what is behind shows only
+    around that silhouette. Each pair of a kept detection and a kept cluster with points in its frustum
+    is rated ::
+
+        score * (0.6 IoU + 0.25 share of the cluster's points in the frustum + 0.15 nearest depth / depth)
+
+    with the IoU of the detection and the box around the projected cluster, and the median depth of the
+    points in the frustum relative to that of the nearest permitted cluster in it. The matches are the
+    one-to-one assignment of greatest total rating: of two boxes on one object the surer one gets it,
+    and of two clusters that fit equally the near one is taken.
+
+    ``centroid``: the tutorial's way. Each cluster's centroid, projected without distortion, takes the
+    nearest centre of a 2D box within ``match_radius``, so that one box may name several clusters.
+
+    Args:
+        uv: (P, 2) obstacle points in pixels, NaN where not in front of the camera.
+        depth: (P,) metres along the optical axis.
+        clusters: clusters of those points.
+        detections: of this camera's image; those not KEPT only have their points counted.
+        intrinsics: the camera.
+        camera_from_points: (4, 4) optical frame from the clusters' frame.
+        config: method and its thresholds.
+
+    Returns:
+        The matches, and for every detection and cluster the decision and the evidence.
+    """
+    size = np.array([intrinsics.width, intrinsics.height], np.float32)
+    with np.errstate(invalid="ignore"):
+        visible = np.flatnonzero(((uv >= -0.5) & (uv < size - 0.5)).all(axis=1) & (depth > 0))
+    visible = visible[np.argsort(uv[visible, 0])]
+    uv, depth, labels = uv[visible], depth[visible], clusters.labels[visible]
+    cluster_uv = _boxes_around(uv, labels, len(clusters))
+    inside = _in_boxes(uv, detections.xyxy)
+    if config.method == "centroid":
+        pairs, order = _centroid_pairs(
+            clusters, detections, cluster_uv, intrinsics, camera_from_points, config
+        )
+        reason = np.where(np.isfinite(pairs.cost), Decision.TAKEN, Decision.TOO_FAR).astype(np.int32)
+        nearest = _first_of_each(pairs.cluster, order)
+        matched = nearest[np.isfinite(pairs.cost[nearest])]
+    else:
+        pairs, reason = _frustum_pairs(inside, depth, labels, cluster_uv, clusters, detections, config)
+        allowed = np.flatnonzero(reason == Decision.TAKEN)
+        matched = allowed[_assign_pairs(pairs, allowed)]
+        # Permitted pairs come first as the most telling, then those that fit best.
+        order = np.lexsort((-pairs.points, -pairs.iou, pairs.cost))
+
+    reason[matched] = Decision.MATCHED
+    order = np.concatenate([matched[np.argsort(pairs.cost[matched], kind="stable")], order])
+    best_cluster, best_detection = (
+        _first_of_each(pairs.detection, order),
+        _first_of_each(pairs.cluster, order),
+    )
+    detection_decision, detection_cluster = _decide(
+        np.where(detections.state == DetectionState.KEPT, Decision.NO_CLUSTER, Decision.NOT_KEPT),
+        pairs.detection[best_cluster],
+        pairs.cluster[best_cluster],
+        reason[best_cluster],
+    )
+    in_view = np.isfinite(cluster_uv[:, 0])
+    cluster_decision, cluster_detection = _decide(
+        np.where(
+            clusters.state != ClusterState.KEPT,
+            Decision.NOT_KEPT,
+            np.where(in_view, Decision.NO_DETECTION, Decision.OUT_OF_VIEW),
+        ),
+        pairs.cluster[best_detection],
+        pairs.detection[best_detection],
+        reason[best_detection],
+    )
+    # A centroid may be before the camera and its cluster yet outside the image: that is the reason then.
+    cluster_decision[~in_view & (cluster_decision == Decision.TOO_FAR)] = Decision.OUT_OF_VIEW
+    return Fusion(
+        detection_decision=detection_decision,
+        detection_cluster=detection_cluster,
+        detection_points=np.array([len(points) for points in inside], np.int32),
+        cluster_decision=cluster_decision,
+        cluster_detection=cluster_detection,
+        pairs=pairs,
+        cluster_uv=cluster_uv,
+    )
+
+
+def merge(clusters: Clusters, cameras: Sequence[CameraResult], config: ClusteringConfig) -> Objects:
+    """Named 3D boxes from all cameras: where several name one cluster, the best score wins.
+
+    Args:
+        clusters: the frame's clusters.
+        cameras: results; those without fusion are skipped.
+        config: ``boxes`` chooses oriented or axis-aligned ones.
+    """
+    best: dict[int, tuple[float, str, str, int]] = {}
+    for result in cameras:
+        if result.fusion is None or result.detections is None:
+            continue
+        for k in np.flatnonzero(result.fusion.cluster_decision == Decision.MATCHED).tolist():
+            d = int(result.fusion.cluster_detection[k])
+            score = float(result.detections.score[d])
+            if k not in best or score > best[k][0]:
+                best[k] = score, result.detections.names[d], result.camera.name, d
+    rows = sorted(best)
+    boxes = clusters.obb if config.boxes == "oriented" else clusters.aabb
+    return Objects(
+        boxes=Boxes3D(boxes.center[rows], boxes.size[rows], boxes.yaw[rows]),
+        names=tuple(best[k][1] for k in rows),
+        score=np.array([best[k][0] for k in rows], np.float32),
+        cluster=np.array(rows, np.int32),
+        camera=tuple(best[k][2] for k in rows),
+        detection=np.array([best[k][3] for k in rows], np.int32),
+    )
+
+
+def assign(cost: F64, unmatched: float) -> I32:
+    """Optimal one-to-one assignment in which a row may also stay alone.
+
+    Shortest augmenting paths with dual variables (Jonker and Volgenant 1987, in the form of Crouse 2016,
+    "On implementing 2D rectangular assignment algorithms"), on the matrix widened by columns that stand
+    for staying alone.
+
+    Args:
+        cost: (R, C), inf where a pair is forbidden.
+        unmatched: cost of a row that stays alone.
+
+    Returns:
+        (R,) column of each row, -1 for alone, of least total cost.
+    """
+    rows, columns = cost.shape
+    cost = np.hstack([cost, np.full((rows, rows), unmatched)])
+    u, v = np.zeros(rows), np.zeros(columns + rows)
+    column_of, row_of = np.full(rows, -1), np.full(columns + rows, -1)
+    for start in range(rows):
+        shortest = np.full(columns + rows, np.inf)  # path costs from start to each column
+        before = np.full(columns + rows, -1)  # row before each column on that path
+        done = np.zeros(columns + rows, bool)
+        row, length = start, 0.0
+        while True:
+            through = length + cost[row] - u[row] - v
+            shorter = ~done & (through < shortest)
+            shortest[shorter], before[shorter] = through[shorter], row
+            sink = int(np.argmin(np.where(done, np.inf, shortest)))
+            length = shortest[sink]
+            if row_of[sink] < 0:
+                break
+            done[sink] = True
+            row = row_of[sink]
+        u[start] += length
+        u[row_of[done]] += length - shortest[done]
+        v[done] -= length - shortest[done]
+        while True:
+            row = before[sink]
+            row_of[sink] = row
+            column_of[row], sink = sink, column_of[row]
+            if row == start:
+                break
+    return np.where(column_of < columns, column_of, -1).astype(np.int32)
+
+
+def _boxes_around(uv: F32, labels: I32, count: int) -> F32:
+    """(count, 4) image box around the points of each label, NaN for labels without points."""
+    clustered = np.flatnonzero(labels >= 0)
+    order = clustered[np.argsort(labels[clustered], kind="stable")]
+    label, start = np.unique(labels[order], return_index=True)
+    boxes = np.full((count, 4), np.nan, np.float32)
+    if len(label):
+        boxes[label, :2] = np.minimum.reduceat(uv[order], start)
+        boxes[label, 2:] = np.maximum.reduceat(uv[order], start)
+    return boxes
+
+
+def _in_boxes(uv: F32, xyxy: F32) -> list[I64]:
+    """Rows of the points in each box; ``uv`` is sorted by u."""
+    left = np.searchsorted(uv[:, 0], xyxy[:, 0], "left")
+    right = np.searchsorted(uv[:, 0], xyxy[:, 2], "right")
+    v = uv[:, 1]
+    return [
+        i + np.flatnonzero((v[i:j] >= box[1]) & (v[i:j] <= box[3]))
+        for box, i, j in zip(xyxy, left, right, strict=True)
+    ]
+
+
+def _frustum_pairs(
+    inside: list[I64],
+    depth: F32,
+    labels: I32,
+    cluster_uv: F32,
+    clusters: Clusters,
+    detections: Detections,
+    config: FusionConfig,
+) -> tuple[Pairs, I32]:
+    """Every kept detection with every kept cluster in its frustum; TAKEN, or the rule that forbids it."""
+    kept = np.flatnonzero(detections.state == DetectionState.KEPT)
+    point = np.concatenate([np.zeros(0, np.int64), *(inside[d] for d in kept)])
+    detection = np.repeat(kept, [len(inside[d]) for d in kept])
+    usable = np.append(clusters.state == ClusterState.KEPT, False)[labels[point]]  # noise, -1, is the last
+    point, detection = point[usable], detection[usable]
+
+    key = detection * max(len(clusters), 1) + labels[point]
+    order = np.lexsort((depth[point], key))
+    key, start, points = np.unique(key[order], return_index=True, return_counts=True)
+    by_depth = depth[point[order]]
+    median = (by_depth[start + (points - 1) // 2] + by_depth[start + points // 2]) / 2
+    detection, cluster = np.divmod(key, max(len(clusters), 1))
+
+    box, around = detections.xyxy[detection], cluster_uv[cluster]
+    overlap = iou(detections.xyxy, cluster_uv)[detection, cluster]
+    reason = np.select(
+        [median > config.max_depth, points < config.min_points, overlap < config.min_iou],
+        [Decision.TOO_FAR, Decision.TOO_FEW_POINTS, Decision.LOW_OVERLAP],
+        Decision.TAKEN,
+    ).astype(np.int32)
+
+    allowed = reason == Decision.TAKEN
+    nearest = np.full(len(detections), np.inf, np.float32)
+    np.minimum.at(nearest, detection[allowed], median[allowed])
+    share = points / np.maximum(np.bincount(labels[labels >= 0], minlength=len(clusters))[cluster], 1)
+    nearness = np.minimum(nearest[detection] / median, 1)
+    fit = IOU_WEIGHT * overlap + SHARE_WEIGHT * share + NEARNESS_WEIGHT * nearness
+    pairs = Pairs(
+        detection=detection.astype(np.int32),
+        cluster=cluster.astype(np.int32),
+        points=points.astype(np.int32),
+        depth=median,
+        iou=overlap,
+        distance=_distance(box, around),
+        cost=np.where(allowed, 1 - detections.score[detection] * fit, np.inf).astype(np.float32),
+    )
+    return pairs, reason
+
+
+def _assign_pairs(pairs: Pairs, allowed: I64) -> I64:
+    """Which of the allowed pairs are matches."""
+    d, row = np.unique(pairs.detection[allowed], return_inverse=True)
+    k, column = np.unique(pairs.cluster[allowed], return_inverse=True)
+    cost = np.full((len(d), len(k)), np.inf)
+    cost[row, column] = pairs.cost[allowed]
+    return np.flatnonzero(assign(cost, unmatched=1.0)[row] == column)
+
+
+def _centroid_pairs(
+    clusters: Clusters,
+    detections: Detections,
+    cluster_uv: F32,
+    intrinsics: Intrinsics,
+    camera_from_points: F64,
+    config: FusionConfig,
+) -> tuple[Pairs, I64]:
+    """Every kept detection with every kept cluster before the camera, and their order by distance."""
+    center = apply(camera_from_points, clusters.centroid)
+    kept = np.flatnonzero(detections.state == DetectionState.KEPT)
+    ahead = np.flatnonzero((clusters.state == ClusterState.KEPT) & (center[:, 2] > 0))
+    detection, cluster = (a.ravel() for a in np.meshgrid(kept, ahead, indexing="ij"))
+    on_image = center[cluster] @ intrinsics.K.T.astype(np.float32)
+    point = on_image[:, :2] / on_image[:, 2:]
+    box = detections.xyxy[detection]
+    distance = _distance(box, np.hstack([point, point]))
+    pairs = Pairs(
+        detection=detection.astype(np.int32),
+        cluster=cluster.astype(np.int32),
+        points=np.zeros(len(detection), np.int32),
+        depth=center[cluster, 2],
+        iou=iou(detections.xyxy, cluster_uv)[detection, cluster],
+        distance=distance,
+        cost=np.where(distance <= config.match_radius, distance, np.inf).astype(np.float32),
+    )
+    return pairs, np.argsort(distance, kind="stable")
+
+
+def _distance(a: F32, b: F32) -> F32:
+    """(Q,) distances between the centres of (Q, 4) boxes."""
+    offset = (a[:, :2] + a[:, 2:] - b[:, :2] - b[:, 2:]) / 2
+    return np.hypot(offset[:, 0], offset[:, 1]).astype(np.float32)
+
+
+def _first_of_each(values: I32, order: I64) -> I64:
+    """The first row of each value when the rows are taken in this order."""
+    return order[np.unique(values[order], return_index=True)[1]]
+
+
+def _decide(default: I32, row: I32, partner: I32, reason: I32) -> tuple[I32, I32]:
+    decision, other = default.astype(np.int32), np.full(len(default), -1, np.int32)
+    decision[row], other[row] = reason, partner
+    return decision, other
