@@ -1,0 +1,176 @@
+"""The drive as a source of frames."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from bevviz import geometry
+from bevviz.errors import UserError
+from bevviz.frame import F64, I32, Boxes3D, Camera, Cloud, Frame, Image, Intrinsics, LabelledBoxes3D
+from bevviz.sources import Scene
+from bevviz.sources.synthetic.sensors import Caster, Lidar, PinholeCamera, View, optical
+from bevviz.sources.synthetic.world import World, bounds
+
+LIDAR_TOPIC = "/rslidar_points"
+IMAGE_TOPIC = "/zed2/zed/rgb/image_rect_color"
+CAMERA_INFO_TOPIC = "/zed2/zed/rgb/camera_info"
+ODOMETRY_TOPIC = "/odom"
+TRUTH_TOPIC = "/ground_truth"
+MAP, ODOM, BASE = "map", "odom", "base_link"
+LIDAR_FRAME, CAMERA_FRAME = "rslidar", "zed2_left_camera_optical_frame"
+
+START = 1_750_000_000_000_000_000  # stamp of the first scan
+PERIOD = 100_000_000  # nanoseconds between scans
+IMAGE_DELAY = 12_000_000  # nanoseconds from a scan to its image
+LATENCY = 8_000_000  # nanoseconds from a stamp to its reception
+TRUTH_RANGE = 80.0  # metres
+
+
+@dataclass(frozen=True, slots=True)
+class Snapshot:
+    """A frame, with what only a simulator knows. Object numbers are those of the world's actors."""
+
+    frame: Frame
+    truth_object: I32  # (K,) number of the object of each box in Frame.truth
+    truth_hits: I32  # (K,) LiDAR points on that object: one with few or none is hidden
+    point_object: I32  # (N,) object of each point in Frame.points, 0: scenery
+    pixel_object: I32  # (H, W) object of each pixel, 0: scenery, -1: sky
+
+
+class SyntheticSource:
+    """A vehicle drives down a street, at 10 Hz: a source of frames with exact ground truth.
+
+    The scan is one instant (free of motion distortion); the image is taken ``IMAGE_DELAY`` later, so that
+    projection needs motion compensation. The same arguments give the same frames, each of them whatever
+    was asked for before.
+
+    Args:
+        frames: length of the drive.
+        seed: of street, traffic, light and sensor noise.
+
+    Raises:
+        UserError: ``frames`` below 1.
+    """
+
+    def __init__(
+        self,
+        frames: int = 100,
+        seed: int = 0,
+        *,
+        lidar: Lidar | None = None,
+        camera: PinholeCamera | None = None,
+    ) -> None:
+        if frames < 1:
+            raise UserError(f"a synthetic drive needs at least 1 frame, not {frames}")
+        self.total = frames
+        self.seed = seed
+        self.scene = Scene(
+            f"synthetic drive, seed {seed}",
+            lidar=LIDAR_FRAME,
+            lidars=(LIDAR_FRAME,),
+            cameras=("zed",),
+            truth=True,
+        )
+        self.warnings: tuple[str, ...] = ()
+        self.base_from_lidar = geometry.transform(np.array([0.2, 0.0, 1.9]), np.array([0, 0, 0, 1.0]))
+        self.base_from_camera = optical((0.7, 0.06, 1.55), np.radians(3.0))
+        self._lidar, self._camera = lidar or Lidar(), camera or PinholeCamera()
+
+    @cached_property
+    def world(self) -> World:
+        return World(self.seed, self.total * PERIOD * 1e-9)
+
+    @cached_property
+    def _static(self) -> Caster:
+        return Caster(self.world.static)
+
+    @property
+    def intrinsics(self) -> Intrinsics:
+        return self._camera.intrinsics
+
+    @cached_property
+    def map_from_odom(self) -> F64:
+        """Odometry starts at zero where the drive starts."""
+        return self.world.ego(0.0)
+
+    def map_from_base(self, stamp: int) -> F64:
+        return self.world.ego((stamp - START) * 1e-9)
+
+    def __iter__(self) -> Iterator[Frame]:
+        for index in range(self.total):
+            yield self.snapshot(index).frame
+
+    def snapshot(self, index: int) -> Snapshot:
+        """Frame ``index``, made anew."""
+        rng = np.random.default_rng((self.seed, index))
+        stamp = START + index * PERIOD
+        shot = stamp + IMAGE_DELAY
+        map_from_lidar = self.map_from_base(stamp) @ self.base_from_lidar
+        map_from_camera = self.map_from_base(shot) @ self.base_from_camera
+        at_scan, at_image = ((t - START) * 1e-9 for t in (stamp, shot))
+
+        moving = self.world.moving(at_scan, map_from_lidar[:3, 3], self._lidar.reach)
+        scan = self._lidar.scan(View(self._static, moving), map_from_lidar, rng)
+        seen = View(self._static, self.world.moving(at_image, map_from_camera[:3, 3], self._lidar.reach))
+        picture = self._camera.picture(seen, map_from_camera, self.world.light, rng)
+
+        fields = {"intensity": scan.intensity, "ring": scan.ring, "time": scan.time}
+        cloud = Cloud(stamp, LIDAR_FRAME, scan.xyz, fields, LIDAR_TOPIC, stamp + LATENCY)
+        image = Image(shot, CAMERA_FRAME, picture.bgr, topic=IMAGE_TOPIC, received=shot + LATENCY)
+        camera = Camera(
+            name="zed",
+            image=image,
+            intrinsics=self.intrinsics,
+            camera_from_points=geometry.inverse(map_from_camera) @ map_from_lidar,
+            world_from_camera=map_from_camera,
+            sync_error=(shot - stamp) * 1e-9,
+            tf_age=0.0,
+            motion_compensated=True,
+        )
+        truth, numbers = self._truth(stamp, at_scan, map_from_lidar)
+        frame = Frame(
+            index=index,
+            stamp=stamp,
+            received=cloud.received,
+            lidar=LIDAR_FRAME,
+            points=scan.xyz,
+            points_frame=LIDAR_FRAME,
+            fields=fields,
+            world_frame=MAP,
+            world_from_points=map_from_lidar,
+            clouds=(cloud,),
+            points_from_clouds=(np.eye(4),),
+            cameras=(camera,),
+            truth=truth,
+            tf_age=0.0,
+        )
+        hits = np.bincount(scan.object, minlength=len(self.world.actors) + 1)[numbers]
+        return Snapshot(frame, numbers, hits.astype(np.int32), scan.object, picture.object)
+
+    def _truth(self, stamp: int, time: float, map_from_lidar: F64) -> tuple[LabelledBoxes3D, I32]:
+        """Tight boxes, upright in the LiDAR's frame, around every actor in range, hidden or not."""
+        lidar_from_map = geometry.inverse(map_from_lidar)
+        objects = self.world.objects(time, map_from_lidar[:3, 3], TRUTH_RANGE)
+        yaw = np.array([heading for _, _, heading in objects]) - geometry.yaw(map_from_lidar)
+        extent = np.array(
+            [bounds(mesh, lidar_from_map, y) for (_, mesh, _), y in zip(objects, yaw, strict=True)]
+        )
+        extent = extent.reshape(-1, 2, 3).astype(np.float32)
+        turned = np.arctan2(np.sin(yaw), np.cos(yaw)).astype(np.float32)
+        boxes = Boxes3D(extent[:, 0], extent[:, 1], turned)
+        labels = tuple(actor.label for actor, _, _ in objects)
+        truth = LabelledBoxes3D(
+            TRUTH_TOPIC,
+            stamp,
+            LIDAR_FRAME,
+            boxes,
+            labels,
+            np.ones(len(objects), np.float32),
+            map_from_lidar,
+            stamp + LATENCY,
+        )
+        return truth, np.array([actor.number for actor, _, _ in objects], np.int32)

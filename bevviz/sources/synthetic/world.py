@@ -1,0 +1,313 @@
+"""The street, who is in it, and where everything is at a given time."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from bevviz import geometry
+from bevviz.frame import F32, F64
+from bevviz.sources.synthetic import models
+from bevviz.sources.synthetic.mesh import Material, Mesh, grid, merge
+
+SPEED = 8.0  # metres per second, the ego vehicle's mean
+MARGIN = 140.0  # metres of street before the start and beyond the end: more than the LiDAR's range
+ROAD, PAVEMENT, KERB = (
+    6.4,
+    9.4,
+    0.14,
+)  # metres: half width of the road, edge of the pavement, height of the kerb
+
+
+class Street:
+    """A centre line that turns, climbs and falls gently. ``s`` is the way along it, ``lateral`` to its left."""
+
+    def __init__(self, rng: np.random.Generator, length: float) -> None:
+        self.start, self.end = -MARGIN, length + MARGIN
+        self.s = np.arange(self.start, self.end + 0.5, 0.5)
+        wave, phase = rng.uniform((200, 150, 90), (300, 200, 120)), rng.uniform(0, 2 * np.pi, 3)
+        grade = rng.uniform(0.035, 0.055) * np.sin(2 * np.pi * self.s / wave[1] + phase[1])
+        grade += 0.015 * np.sin(2 * np.pi * self.s / wave[2] + phase[2])
+        heading = rng.uniform(0.12, 0.2) * np.sin(2 * np.pi * self.s / wave[0] + phase[0])
+        heading -= np.interp(0.0, self.s, heading)
+        steps = 0.5 * np.stack([np.cos(heading), np.sin(heading), grade], axis=-1)
+        way = np.cumsum(steps, axis=0)
+        way -= [np.interp(0.0, self.s, column) for column in way.T]
+        self.way, self.heading, self.grade = way, heading, grade
+
+    def point(self, s: ArrayLike, lateral: ArrayLike, height: ArrayLike = 0.0) -> F64:
+        """(..., 3) points of the map frame."""
+        x, y, z = (np.interp(s, self.s, column) for column in self.way.T)
+        heading = np.interp(s, self.s, self.heading)
+        placed = (x - np.sin(heading) * lateral, y + np.cos(heading) * lateral, z + np.asarray(height))
+        return np.stack(np.broadcast_arrays(*placed), axis=-1)
+
+    def pose(
+        self, s: float, lateral: float, height: float = 0.0, turn: float = 0.0, upright: bool = True
+    ) -> F64:
+        """(4, 4) map_from_body, turned by ``turn``; not ``upright``: pitched with the road's grade."""
+        heading, grade = (
+            np.interp(s, self.s, self.heading),
+            0.0 if upright else np.interp(s, self.s, self.grade),
+        )
+        ahead = np.array([np.cos(heading), np.sin(heading), grade]) / np.hypot(1.0, grade)
+        left = np.array([-np.sin(heading), np.cos(heading), 0.0])
+        c, t = np.cos(turn), np.sin(turn)
+        m = np.eye(4)
+        m[:3, :3] = np.stack([c * ahead + t * left, c * left - t * ahead, np.cross(ahead, left)], axis=-1)
+        m[:3, 3] = self.point(s, lateral, height)
+        return m
+
+
+@dataclass(frozen=True, slots=True)
+class Actor:
+    """A road user: where it is at time 0, and how it goes along the street."""
+
+    number: int  # 1, 2, ...: the object in meshes and images
+    label: str
+    model: models.Model
+    s: float
+    lateral: float
+    height: float
+    turn: float  # against the street's heading
+    speed: float  # along the street, negative: towards its start
+    upright: bool
+
+    def pose(self, street: Street, time: float) -> F64:
+        return street.pose(self.s + self.speed * time, self.lateral, self.height, self.turn, self.upright)
+
+    def mesh(self, street: Street, time: float) -> Mesh:
+        return self.model.at(abs(self.speed) * time).moved(self.pose(street, time)).numbered(self.number)
+
+
+@dataclass(frozen=True, slots=True)
+class Light:
+    sun: F32  # (3,) unit vector to the sun
+    direct: F32  # (3,) BGR strength of the sun
+    ambient: F32  # (3,) BGR strength of the sky
+    zenith: F32  # (3,) BGR colour
+    horizon: F32  # (3,)
+
+
+class World:
+    """Everything of one seed: the street with its scenery, and its actors.
+
+    Args:
+        seed: of everything that is drawn at random.
+        duration: seconds that the ego vehicle drives.
+    """
+
+    def __init__(self, seed: int, duration: float) -> None:
+        rng = np.random.default_rng(seed)
+        self.length = SPEED * duration + 10.0
+        self.street = Street(rng, self.length)
+        self.light = _light(rng)
+        self._sway = rng.uniform(0, 2 * np.pi, 2)
+        self.actors = _Cast(rng, self.street, duration).actors
+        self._parked = {a.number: a.mesh(self.street, 0.0) for a in self.actors if a.speed == 0}
+        scenery = [_ground(self.street), *_houses(rng, self.street), *_furniture(rng, self.street)]
+        self.static = merge([*scenery, *self._parked.values()])
+
+    def ego(self, time: float) -> F64:
+        """(4, 4) map_from_base_link: on the road below the middle of the vehicle."""
+        s = SPEED * time + 1.5 * (np.sin(0.5 * time + self._sway[0]) - np.sin(self._sway[0]))
+        rate = 2 * np.pi / 6.0
+        lateral = -1.7 + 0.2 * np.sin(rate * time + self._sway[1])
+        turn = np.arctan2(0.2 * rate * np.cos(rate * time + self._sway[1]), SPEED)
+        return self.street.pose(s, lateral, turn=turn, upright=False)
+
+    def moving(self, time: float, centre: F64, reach: float) -> Mesh:
+        """The moving actors within ``reach`` metres of ``centre``."""
+        return merge([a.mesh(self.street, time) for a in self._near(time, centre, reach) if a.speed != 0])
+
+    def objects(self, time: float, centre: F64, reach: float) -> list[tuple[Actor, Mesh, float]]:
+        """Every actor within ``reach`` metres of ``centre``, with its mesh and its heading in the map frame."""
+        return [
+            (
+                a,
+                self._parked.get(a.number) or a.mesh(self.street, time),
+                geometry.yaw(a.pose(self.street, time)),
+            )
+            for a in self._near(time, centre, reach)
+        ]
+
+    def _near(self, time: float, centre: F64, reach: float) -> list[Actor]:
+        s = np.array([a.s + a.speed * time for a in self.actors])
+        place = self.street.point(s, np.array([a.lateral for a in self.actors]))
+        near = (
+            (np.linalg.norm(place - centre, axis=1) < reach)
+            & (s > self.street.start + 5)
+            & (s < self.street.end - 5)
+        )
+        return [self.actors[i] for i in np.flatnonzero(near)]
+
+
+# --- population --------------------------------------------------------------------------------
+
+
+class _Cast:
+    """Draws the actors. Those of a lane share one speed, so that none drives through another."""
+
+    def __init__(self, rng: np.random.Generator, street: Street, duration: float) -> None:
+        self.rng, self.actors = rng, list[Actor]()
+        extra = 10.0 * duration  # ground that oncoming traffic covers meanwhile
+        for side in (-1, 1):
+            self._park(street, side)
+        self._drive(-1.7, SPEED, (-22.0, 21.0, *self._spaced(55.0, street.end, 20, 60)))
+        self._drive(1.7, -9.0, self._spaced(20.0, street.end + extra, 20, 60))
+        self._ride(-3.7, 4.6, self._spaced(9.0, street.end, 18, 45))
+        self._ride(3.7, -4.8, self._spaced(14.0, street.end + extra, 18, 55))
+        for side in (-1, 1):
+            self._walk(side * 8.0, rng.uniform(1.15, 1.3), self._spaced(street.start, street.end, 5, 26))
+            self._walk(side * 8.8, -rng.uniform(1.15, 1.3), self._spaced(street.start, street.end, 5, 26))
+            for s in self._spaced(street.start, street.end, 12, 50):
+                self._add(
+                    "person",
+                    models.person(rng, walking=False),
+                    s,
+                    side * 7.3,
+                    KERB,
+                    rng.uniform(0, 2 * np.pi),
+                )
+
+    def _spaced(self, start: float, end: float, least: float, most: float) -> list[float]:
+        steps = self.rng.uniform(least, most, int((end - start) / least) + 1)
+        places = start + np.cumsum(steps) - least
+        return [float(s) for s in places[places < end - 8]]
+
+    def _add(
+        self,
+        label: str,
+        model: models.Model,
+        s: float,
+        lateral: float,
+        height: float,
+        turn: float,
+        speed: float = 0.0,
+    ) -> None:
+        upright = label == "person"
+        self.actors.append(
+            Actor(len(self.actors) + 1, label, model, s, lateral, height, turn, speed, upright)
+        )
+
+    def _park(self, street: Street, side: int) -> None:
+        rng, s = self.rng, street.start + 8
+        while s < street.end - 12:
+            if rng.random() < 0.62:
+                turn = rng.normal(0, 0.02) + (np.pi if (side > 0) ^ (rng.random() < 0.15) else 0)
+                self._add("car", models.car(rng), s, side * (5.3 + rng.normal(0, 0.05)), 0.0, turn)
+            elif rng.random() < 0.3:
+                self._add("person", models.person(rng, False), s, side * 4.9, 0.0, -side * np.pi / 2)
+            s += rng.uniform(5.9, 7.5)
+
+    def _drive(self, lateral: float, speed: float, places: tuple[float, ...] | list[float]) -> None:
+        for s in places:
+            self._add("car", models.car(self.rng), s, lateral, 0.0, 0.0 if speed > 0 else np.pi, speed)
+
+    def _ride(self, lateral: float, speed: float, places: list[float]) -> None:
+        for s in places:
+            self._add(
+                "cyclist", models.cyclist(self.rng), s, lateral, 0.0, 0.0 if speed > 0 else np.pi, speed
+            )
+
+    def _walk(self, lateral: float, speed: float, places: list[float]) -> None:
+        for s in places:
+            turn = 0.0 if speed > 0 else np.pi
+            aside = (0.0, 0.6) if self.rng.random() < 0.25 else (self.rng.normal(0, 0.1),)
+            for offset in aside:
+                model = models.person(self.rng)
+                pace = speed * (1.0 if len(aside) == 2 else self.rng.uniform(0.97, 1.03))
+                self._add("person", model, s, lateral - np.sign(lateral) * offset, KERB, turn, pace)
+
+
+# --- scenery -----------------------------------------------------------------------------------
+
+
+def _light(rng: np.random.Generator) -> Light:
+    azimuth, height = rng.uniform(0, 2 * np.pi), np.radians(rng.uniform(28, 62))
+    sun = np.array([np.cos(azimuth) * np.cos(height), np.sin(azimuth) * np.cos(height), np.sin(height)])
+    cloudy = rng.random()
+    clear, grey = np.array([(215, 160, 105), (235, 215, 190)]), np.array([(205, 200, 195), (222, 220, 216)])
+    zenith, horizon = clear + cloudy * (grey - clear)
+    direct = np.array([0.62, 0.68, 0.72]) * (1 - 0.75 * cloudy)
+    ambient = np.array([0.5, 0.46, 0.43]) + 0.28 * cloudy
+    return Light(*(v.astype(np.float32) for v in (sun, direct, ambient, zenith, horizon)))
+
+
+def _ground(street: Street) -> Mesh:
+    s = np.append(np.arange(street.start, street.end, 2.0), street.end)
+    strips = (
+        ((-60, -25, -PAVEMENT), KERB, (60, 115, 95), Material.GRASS),
+        ((-PAVEMENT, -8, -ROAD), KERB, (140, 146, 150), Material.PAVEMENT),
+        ((-ROAD, -3.2, 0, 3.2, ROAD), 0.0, (82, 82, 82), Material.ROAD),
+        ((ROAD, 8, PAVEMENT), KERB, (140, 146, 150), Material.PAVEMENT),
+        ((PAVEMENT, 25, 60), KERB, (60, 115, 95), Material.GRASS),
+    )
+    parts = []
+    for lateral, height, color, material in strips:
+        points = street.point(s[:, None], np.array(lateral, float), height)
+        uv = np.stack(np.broadcast_arrays(s[:, None], np.array(lateral, float)), axis=-1)
+        parts.append(grid(points, uv, color, material))
+    for lateral_ in (-ROAD, ROAD):
+        points = np.stack([street.point(s, lateral_), street.point(s, lateral_, KERB)], axis=1)
+        parts.append(grid(points, np.zeros((*points.shape[:2], 2)), (170, 172, 175), Material.KERB))
+    return merge(parts)
+
+
+def _houses(rng: np.random.Generator, street: Street) -> list[Mesh]:
+    parts = []
+    for side in (-1, 1):
+        s = street.start
+        while s < street.end - 20:
+            length = rng.uniform(8, 18)
+            if rng.random() < 0.2:
+                parts.append(models.hedge(rng, length).moved(street.pose(s + length / 2, side * 9.9, KERB)))
+                for at in np.arange(s + 2, s + length, 5.0):
+                    parts.append(models.tree(rng).moved(street.pose(at, side * rng.uniform(11.5, 18), KERB)))  # noqa: PERF401
+            else:
+                mesh = models.house(rng, length, rng.uniform(8, 12), rng.uniform(6, 14))
+                front = side * (PAVEMENT + 0.25 + max(0.0, rng.normal(0, 0.5)))
+                parts.append(
+                    mesh.moved(street.pose(s + length / 2, front, KERB, turn=0 if side > 0 else np.pi))
+                )
+            s += length
+        for end, way in ((street.start, -1), (street.end, 1)):  # a house across each end closes the view
+            across = models.house(rng, 70.0, 10.0, 12.0)
+            parts.append(across.moved(street.pose(end, 0.0, turn=-way * np.pi / 2)))
+    return parts
+
+
+def _furniture(rng: np.random.Generator, street: Street) -> list[Mesh]:
+    parts = []
+    for side in (-1, 1):
+        s = street.start + rng.uniform(2, 12)
+        while s < street.end - 5:
+            kind = rng.choice(["lamp", "tree", "sign", "bin"], p=[0.35, 0.35, 0.18, 0.12])
+            if kind == "lamp":
+                parts.append(
+                    models.lamp_post().moved(street.pose(s, side * 6.75, KERB, turn=0 if side < 0 else np.pi))
+                )
+            elif kind == "tree":
+                parts.append(models.tree(rng).moved(street.pose(s, side * 6.9, KERB)))
+            elif kind == "sign":
+                parts.append(
+                    models.sign(rng).moved(street.pose(s, side * 6.8, KERB, turn=0 if side < 0 else np.pi))
+                )
+            else:
+                parts.append(models.bin_(rng).moved(street.pose(s, side * 6.85, KERB)))
+            s += rng.uniform(7, 15)
+    return parts
+
+
+def bounds(mesh: Mesh, frame_from_map: F64, heading: float) -> tuple[F32, F32]:
+    """Centre and size of the tight upright box, turned by ``heading``, around a mesh of the map frame."""
+    points = geometry.apply(frame_from_map, mesh.vertices)
+    c, s = np.float32(np.cos(heading)), np.float32(np.sin(heading))
+    turned = np.stack(
+        [c * points[:, 0] + s * points[:, 1], c * points[:, 1] - s * points[:, 0], points[:, 2]], -1
+    )
+    low, high = turned.min(0), turned.max(0)
+    x, y, z = (low + high) / 2
+    return np.array([c * x - s * y, s * x + c * y, z], np.float32), high - low
