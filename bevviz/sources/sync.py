@@ -66,12 +66,11 @@ class SyncReport:
         if self.resets:
             found.append(f"the stamps of the clouds jumped back {_times(self.resets)}")
         if self.gaps:
-            found.append(
-                f"the stamps of the clouds have {self.gaps} gap(s), the longest {self.longest_gap:.2f} s"
-            )
+            gaps = "1 gap" if self.gaps == 1 else f"{self.gaps} gaps"
+            found.append(f"the stamps of the clouds have {gaps}, the longest {self.longest_gap:.2f} s")
         if self.idle:
             found.append(
-                f"no cloud on {self.idle}, which drives the frames; choose the LiDARs with source.lidar_topics"
+                f"no cloud on {self.idle}, which should drive: set source.lidar_topics, the driving one first"
             )
         for topic, n in self.unstamped.items():
             found.append(f"{topic}: no stamp in the header {_times(n)}, time of receipt used instead")
@@ -210,8 +209,8 @@ class Synchronizer:
         elif newest is not None and cloud.stamp > newest + JUMP:
             self.report.gaps += 1
             self.report.longest_gap = max(self.report.longest_gap, (cloud.stamp - newest) * 1e-9)
-        place = bisect_left(self._clouds, cloud.stamp, key=_stamp_of)
-        if cloud.stamp == self._last or cloud.stamp in map(_stamp_of, self._clouds[place : place + 1]):
+        place = bisect_left(self._clouds, cloud.stamp, key=lambda c: c.stamp)
+        if cloud.stamp == self._last or [cloud.stamp] == [c.stamp for c in self._clouds[place : place + 1]]:
             self.report.duplicates += 1
         elif self._last is not None and cloud.stamp < self._last:
             self.report.late += 1
@@ -295,11 +294,11 @@ class Synchronizer:
         while self._done:
             yield self._done.popleft()
         while self._clouds:
-            full = len(self._clouds) > self._config.sync.queue
             over = self._now - self._clouds[0].received > self._wait
-            if not (full or over or self._complete()):
-                return
-            self.report.unwaited += full and not over
+            if not over and not self._complete():
+                if len(self._clouds) <= self._config.sync.queue:
+                    return
+                self.report.unwaited += 1
             yield self._build()
 
     def flush(self) -> Iterator[Frame]:
@@ -307,6 +306,8 @@ class Synchronizer:
         while self._done:
             yield self._done.popleft()
         yield from self._build_all()
+        if self.report.clouds and not self.report.frames:
+            self.report.idle = self._roles.lidars[0]
 
     def _build_all(self) -> Iterator[Frame]:
         while self._clouds:
@@ -317,7 +318,11 @@ class Synchronizer:
         stamp = self._clouds[0].stamp
         if any(track.newest is None or track.newest < stamp for track in self._tracks()):
             return False
-        results = (*self._boxes.values(), *self._detections.values(), *self._truth.values())
+        results: list[_Track[Any]] = [
+            *self._boxes.values(),
+            *self._detections.values(),
+            *self._truth.values(),
+        ]
         if len(self._clouds) == 1 and any(self._may_be_of_next(track, stamp) for track in results):
             return False
         if any(c.info_topic and c.info_topic not in self._intrinsics for c in self._roles.cameras):
@@ -367,7 +372,7 @@ class Synchronizer:
             index=self._index,
             stamp=cloud.stamp,
             received=cloud.received,
-            lidar="lidars" if self._partners else entity_name(cloud.topic, cloud.frame_id),
+            lidar="lidars" if self._partners else self._lidar_name(cloud),
             points=points,
             points_frame=place.points_frame,
             fields=fields,
@@ -389,6 +394,10 @@ class Synchronizer:
             track.forget(cloud.stamp - self._tolerance)
         return frame
 
+    def _lidar_name(self, cloud: Cloud) -> str:
+        names = self._roles.lidar_names
+        return names[0] if names else entity_name(cloud.topic, cloud.frame_id)
+
     def _place(self, cloud: Cloud, problems: list[str] | None = None) -> _Place:
         """Find the frames of reference; with ``problems``, also where the points are in the world."""
         points_frame = cloud.frame_id.lstrip("/")
@@ -398,7 +407,7 @@ class Synchronizer:
         path = self.tf.ancestors(points_frame)
         fixed = [f for f in path if f in self._odometry_frames or _words(f) & FIXED_FRAMES]
         near = [f for f in fixed if not _words(f) & GLOBE_FRAMES] or fixed
-        stated = self._config.source.fixed_frame
+        stated = self._config.source.fixed_frame.lstrip("/")
         world = stated or (near[-1] if near else "")
         place = _Place(cloud.stamp, points_frame, world, near[0] if near else stated)
         if problems is None:
@@ -410,6 +419,10 @@ class Synchronizer:
                 f"the LiDARs are merged in '{points_frame}'",
             )
         if not world:
+            self.report.problems[
+                f"no fixed frame (map, odom or the like) above '{points_frame}' in TF: motion is not "
+                f"compensated; odometry is taken from source.odometry_topic"
+            ] += 1
             return place
         try:
             found = self.tf.lookup(world, points_frame, cloud.stamp, self._config.sync.tf_tolerance)
@@ -471,9 +484,7 @@ class Synchronizer:
             world = np.eye(4) if place.world_from_points is None else place.world_from_points
             world_from_camera = world @ found.matrix
         if place.inertial_frame and self._config.sync.motion_compensation and found and not compensated:
-            problems.append(
-                f"the cloud is not moved to the image's time: '{place.inertial_frame}' is out of reach"
-            )
+            self._complain(problems, f"no motion compensation: '{place.inertial_frame}' is out of reach")
         return Camera(
             name=role.name,
             image=image,
@@ -585,10 +596,6 @@ class Synchronizer:
         """Tell this frame, and count in the report, where sentences that differ in a number are one."""
         problems.append(text)
         self.report.problems[re.sub(r"\d+\.\d+ s ", "", text)] += 1
-
-
-def _stamp_of(cloud: Cloud) -> int:
-    return cloud.stamp
 
 
 def _words(frame: str) -> set[str]:
