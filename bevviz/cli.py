@@ -207,8 +207,9 @@ def _demo(options: argparse.Namespace) -> int:
     if options.bag is not None:
         from tqdm import tqdm
 
-        with tqdm(total=source.total, unit="scan", desc="simulate", disable=None) as bar:
-            write_bag(source, options.bag, progress=bar.update)
+        write_bag(
+            source, options.bag, tqdm(source, total=source.total, unit="scan", desc="simulate", disable=None)
+        )
         print(f"{options.bag}: {source.total} scans; 'bevviz bag {options.bag} --model demo' runs on it")
         return 0
     config = _load_config(options)

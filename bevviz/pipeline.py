@@ -78,6 +78,9 @@ class Pipeline:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
+        self.close()
+
+    def close(self) -> None:
         self._network.shutdown(cancel_futures=True)
 
     def run(self, frame: Frame) -> FrameResult:

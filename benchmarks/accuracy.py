@@ -1,0 +1,240 @@
+"""How well the pipeline sees: ground, clusters, image detections and fused objects against exact truth.
+
+Runs both presets on the same frames of synthetic drives that the demo network was not trained on.
+"""
+
+from __future__ import annotations
+
+import argparse
+import platform
+from collections import Counter, defaultdict
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from tqdm import tqdm
+
+from bevviz.config import Preset, load
+from bevviz.frame import DetectionState, FrameResult
+from bevviz.geometry import iou
+from bevviz.pipeline import Pipeline
+from bevviz.sources.synthetic import Snapshot, SyntheticSource
+
+PRESETS: tuple[Preset, ...] = ("reference", "default")
+CLASSES = ("person", "cyclist", "car")
+MIN_HITS = 10  # LiDAR points on an object that must be found
+MIN_HEIGHT = 20  # visible pixels in height of an object that must be found
+MAX_DISTANCE = 2.0  # metres between the centres, on the ground plane, of a box and its object
+RANGE = 40.0  # metres
+
+INTRO = f"""# Accuracy
+
+*How well does it see?* Measured on the synthetic drive against its exact ground truth, by `make accuracy`,
+with the shipped demo network. Both presets process the same frames, from drives whose seeds the network was
+not trained on. A simulator is kinder than a street: read the figures as a comparison of methods and as a
+guard against regressions, not as a promise about your robot.
+
+An object must be found if it lies within {RANGE:.0f} m, has at least {MIN_HITS} LiDAR points and at least
+{MIN_HEIGHT} px of visible height in the image. Others are neither required nor counted as false when found.
+A fused box is right if an object of its class has its centre within {MAX_DISTANCE:.0f} m on the ground plane,
+one box for one object; the centre error is that of the right ones. LiDAR boxes enclose what the sensor saw,
+so that the centre of a half-seen car lies towards the sensor.
+"""
+
+
+@dataclass
+class Tally:
+    """Counts of one preset."""
+
+    ground: Counter[str] = field(default_factory=Counter)
+    clusters: dict[str, Counter[str]] = field(default_factory=lambda: defaultdict(Counter))
+    detections: dict[str, Counter[str]] = field(default_factory=lambda: defaultdict(Counter))
+    objects: dict[str, Counter[str]] = field(default_factory=lambda: defaultdict(Counter))
+    errors: dict[str, list[float]] = field(default_factory=lambda: defaultdict(list))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--seeds", type=int, nargs="+", default=[1000, 1001, 1002], help="drives")
+    parser.add_argument("--frames", type=int, default=100, help="length of each drive in scans")
+    parser.add_argument("--every", type=int, default=5, help="each N-th scan is measured")
+    parser.add_argument("--write", type=Path, help="Markdown page to write, instead of printing it")
+    options = parser.parse_args()
+
+    tallies = {preset: Tally() for preset in PRESETS}
+    pipelines = {p: Pipeline(load(settings=["detector.model=demo"], preset=p)) for p in PRESETS}
+    shots = [(seed, index) for seed in options.seeds for index in range(0, options.frames, options.every)]
+    sources = {seed: SyntheticSource(options.frames, seed) for seed in options.seeds}
+    for seed, index in tqdm(shots, unit="frame", disable=None):
+        shot = sources[seed].snapshot(index)
+        for preset, tally in tallies.items():
+            result = pipelines[preset].run(shot.frame)
+            if result.failures:
+                raise SystemExit(f"seed {seed}, frame {index}, {preset}: {result.failures}")
+            add_ground(tally, shot, result)
+            add_clusters(tally, shot, result)
+            add_detections(tally, shot, result)
+            add_objects(tally, shot, result)
+    for pipeline in pipelines.values():
+        pipeline.close()
+    page = (
+        INTRO
+        + f"\n{len(shots)} frames, seeds {options.seeds}, Python {platform.python_version()}.\n"
+        + tables(tallies)
+    )
+    if options.write:
+        options.write.write_text(page)
+    else:
+        print(page)
+
+
+def add_ground(tally: Tally, shot: Snapshot, result: FrameResult) -> None:
+    """Per raw point: is ground called ground, and does every point of an object stay an obstacle?"""
+    assert result.ground is not None and result.voxels is not None
+    called, true, on_object = (
+        result.ground.mask[result.voxels.inverse],
+        shot.point_ground,
+        shot.point_object > 0,
+    )
+    tally.ground["tp"] += int((called & true).sum())
+    tally.ground["fp"] += int((called & ~true).sum())
+    tally.ground["fn"] += int((~called & true).sum())
+    tally.ground["object kept"] += int((~called & on_object).sum())
+    tally.ground["object"] += int(on_object.sum())
+
+
+def required(shot: Snapshot) -> tuple[np.ndarray, np.ndarray]:
+    """For each truth box: must it be found, and its visible image box (K, 4), NaN where there is none."""
+    assert shot.frame.truth is not None
+    truth = shot.frame.truth
+    boxes = np.full((len(truth.boxes), 4), np.nan, np.float32)
+    must = np.zeros(len(boxes), bool)
+    for row, number in enumerate(shot.truth_object):
+        ys, xs = np.nonzero(shot.pixel_object == number)
+        if len(xs) == 0:
+            continue
+        boxes[row] = xs.min(), ys.min(), xs.max(), ys.max()
+        near = np.hypot(*truth.boxes.center[row, :2]) <= RANGE
+        tall = ys.max() - ys.min() >= MIN_HEIGHT
+        must[row] = near and tall and shot.truth_hits[row] >= MIN_HITS
+    return must, boxes
+
+
+def add_clusters(tally: Tally, shot: Snapshot, result: FrameResult) -> None:
+    """An object is clustered if one kept cluster holds most of its points and is mostly made of them."""
+    assert result.clusters is not None and result.voxels is not None and result.ground is not None
+    assert shot.frame.truth is not None
+    _, first = np.unique(result.voxels.inverse, return_index=True)
+    owner = shot.point_object[first][~result.ground.mask]
+    must, _ = required(shot)
+    for row in np.flatnonzero(must):
+        name = shot.frame.truth.labels[row]
+        labels = result.clusters.labels[owner == shot.truth_object[row]]
+        held = np.bincount(labels[labels >= 0], minlength=len(result.clusters))
+        tally.clusters[name]["all"] += 1
+        if len(held) == 0 or held.max() == 0:
+            continue
+        best = int(held.argmax())
+        whole = held[best] >= 0.5 * len(labels)
+        pure = held[best] >= 0.5 * result.clusters.count[best]
+        tally.clusters[name]["alone"] += int(whole and pure and result.clusters.state[best] == 0)
+
+
+def add_detections(tally: Tally, shot: Snapshot, result: FrameResult) -> None:
+    """Image boxes at IoU 0.5 with the visible part."""
+    assert shot.frame.truth is not None
+    detections = result.cameras[0].detections
+    assert detections is not None
+    must, boxes = required(shot)
+    kept = np.flatnonzero(detections.state == DetectionState.KEPT)
+    for name in CLASSES:
+        mine = np.array([d for d in kept if detections.names[d] == name], int)
+        rows = np.array([r for r, label in enumerate(shot.frame.truth.labels) if label == name], int)
+        rows = rows[np.isfinite(boxes[rows, 0])] if len(rows) else rows
+        distance = (
+            1 - iou(detections.xyxy[mine], boxes[rows])
+            if len(mine) and len(rows)
+            else np.zeros((len(mine), 0))
+        )
+        count(tally.detections[name], distance, must[rows], 0.5)
+
+
+def add_objects(tally: Tally, shot: Snapshot, result: FrameResult) -> None:
+    assert shot.frame.truth is not None and result.objects is not None
+    truth = shot.frame.truth
+    must, _ = required(shot)
+    for name in CLASSES:
+        mine = np.array([j for j, n in enumerate(result.objects.names) if n == name], int)
+        mine = mine[np.argsort(-result.objects.score[mine])] if len(mine) else mine
+        rows = np.array([r for r, label in enumerate(truth.labels) if label == name], int)
+        offset = result.objects.boxes.center[mine][:, None, :2] - truth.boxes.center[rows][None, :, :2]
+        distance = np.linalg.norm(offset, axis=2) if len(mine) and len(rows) else np.zeros((len(mine), 0))
+        tally.errors[name] += count(tally.objects[name], distance, must[rows], MAX_DISTANCE)
+
+
+def count(counts: Counter[str], distance: np.ndarray, must: np.ndarray, limit: float) -> list[float]:
+    """Greedy one-to-one matches, best first; one with an object that need not be found counts for nothing."""
+    free = np.ones(distance.shape[1], bool)
+    errors = []
+    for row in distance:
+        candidates = np.flatnonzero(free & (row <= limit))
+        if len(candidates) == 0:
+            counts["fp"] += 1
+            continue
+        best = candidates[row[candidates].argmin()]
+        free[best] = False
+        if must[best]:
+            counts["tp"] += 1
+            errors.append(float(row[best]))
+    counts["fn"] += int((free & must).sum()) if len(must) else 0
+    return errors
+
+
+def tables(tallies: dict[Preset, Tally]) -> str:
+    def share(part: float, whole: float) -> str:
+        return f"{part / whole:.3f}" if whole else "-"
+
+    lines = [
+        "\n## Ground\n",
+        "| preset | precision | recall | IoU | object points kept |",
+        "| --- | ---: | ---: | ---: | ---: |",
+    ]
+    for preset, tally in tallies.items():
+        g = tally.ground
+        lines.append(
+            f"| {preset} | {share(g['tp'], g['tp'] + g['fp'])} | {share(g['tp'], g['tp'] + g['fn'])} "
+            f"| {share(g['tp'], g['tp'] + g['fp'] + g['fn'])} | {share(g['object kept'], g['object'])} |"
+        )
+    lines += [
+        "\n## Clusters: objects that have one of their own\n",
+        "| class | objects | " + " | ".join(tallies) + " |",
+    ]
+    lines.append("| --- | ---: |" + " ---: |" * len(tallies))
+    for name in CLASSES:
+        first = next(iter(tallies.values()))
+        shares = [share(t.clusters[name]["alone"], t.clusters[name]["all"]) for t in tallies.values()]
+        lines.append(f"| {name} | {first.clusters[name]['all']} | " + " | ".join(shares) + " |")
+    lines.append("\n## Image detections: demo network, IoU 0.5, the same in both presets\n")
+    lines += ["| class | objects | precision | recall |", "| --- | ---: | ---: | ---: |"]
+    for name in CLASSES:
+        c = tallies["default"].detections[name]
+        found, all_found, all_there = c["tp"], c["tp"] + c["fp"], c["tp"] + c["fn"]
+        lines.append(f"| {name} | {all_there} | {share(found, all_found)} | {share(found, all_there)} |")
+    lines.append("\n## Fused objects: class and place\n")
+    lines.append("| class | preset | precision | recall | centre error, median m | 90 % m |")
+    lines.append("| --- | --- | ---: | ---: | ---: | ---: |")
+    for name in (*CLASSES, "all"):
+        for preset, tally in tallies.items():
+            chosen = CLASSES if name == "all" else (name,)
+            c = sum((tally.objects[n] for n in chosen), Counter())
+            precision, recall = share(c["tp"], c["tp"] + c["fp"]), share(c["tp"], c["tp"] + c["fn"])
+            errors = [e for n in chosen for e in tally.errors[n]]
+            middle, most = (f"{q:.2f}" for q in np.quantile(errors, (0.5, 0.9))) if errors else ("-", "-")
+            lines.append(f"| {name} | {preset} | {precision} | {recall} | {middle} | {most} |")
+    return "\n".join(lines) + "\n"
+
+
+if __name__ == "__main__":
+    main()
