@@ -116,7 +116,8 @@ class TransformBuffer:
                 if not (edge.static or static) and t.stamp < edge.stamps[-1]:
                     return
             if not self._break_cycle(parent, child, origin):
-                self._problems[f"{about} is refused: '{child}' is above '{parent}' already"] += 1
+                if origin is not Origin.ODOMETRY:  # which only fills in for what others leave open
+                    self._problems[f"{about} is refused: '{child}' is above '{parent}' already"] += 1
                 return
             edge = self._edges[child] = _Edge(parent, origin, static)
         elif static and not edge.static:
