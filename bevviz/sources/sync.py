@@ -181,16 +181,19 @@ class Synchronizer:
         self._done: deque[Frame] = deque()
         self._index = 0
         self._last: int | None = None  # stamp of the last frame
-        self._partners: dict[str, _Track[Cloud]] = {t: _Track(self._horizon) for t in roles.lidars[1:]}
-        self._images: dict[str, _Track[_Undecoded]] = {c.topic: _Track(self._horizon) for c in roles.cameras}
+        self._partners: dict[str, _Track[Cloud]] = self._make_tracks(*roles.lidars[1:])
+        self._images: dict[str, _Track[_Undecoded]] = self._make_tracks(*(c.topic for c in roles.cameras))
         self._camera_frames: dict[str, str] = {}  # image topic -> optical frame
         self._intrinsics: dict[str, Intrinsics] = {}
         self._odometry_frames: set[str] = set()
-        self._boxes: dict[str, _Track[LabelledBoxes3D]] = {}
-        self._detections: dict[str, _Track[LabelledBoxes2D]] = {}
-        self._truth: dict[str, _Track[LabelledBoxes3D]] = {}
+        self._boxes: dict[str, _Track[LabelledBoxes3D]] = self._make_tracks(*roles.robot_detections_3d)
+        self._detections: dict[str, _Track[LabelledBoxes2D]] = self._make_tracks(*roles.robot_detections_2d)
+        self._truth: dict[str, _Track[LabelledBoxes3D]] = self._make_tracks(*filter(None, [roles.truth]))
         for names, pose in config.source.extrinsics.items():
             self.tf.add(_extrinsic(names, pose), static=True, origin=Origin.CONFIG)
+
+    def _make_tracks(self, *topics: str) -> dict[str, _Track[Any]]:
+        return {topic: _Track(self._horizon) for topic in topics}
 
     # --- what comes in -------------------------------------------------------------------------
 
