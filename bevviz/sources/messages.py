@@ -62,11 +62,10 @@ def decode_cloud(msg: Any, topic: str, received: int) -> Cloud:
     layout = _point_layout(msg, topic)
     grid = _point_grid(msg, layout)
     xyz = np.empty((*grid.shape, 3), np.float32)
-    with np.errstate(over="ignore"):  # a float64 beyond float32 becomes infinite, and is dropped
+    with np.errstate(over="ignore", invalid="ignore"):  # a float64 beyond float32 is infinite, and dropped
         for axis, name in enumerate(_AXES):
             xyz[..., axis] = grid[name]
-    xyz = xyz.reshape(-1, 3)
-    with np.errstate(invalid="ignore"):
+        xyz = xyz.reshape(-1, 3)
         finite = np.isfinite(xyz[:, 0] + xyz[:, 1] + xyz[:, 2])
     kept = None if finite.all() else np.flatnonzero(finite)
     fields: dict[str, NDArray[Any]] = {}
@@ -207,17 +206,15 @@ def decode_image(msg: Any, topic: str, received: int) -> Image:
     if scalar.itemsize == 2:
         pixels = to_8_bits(pixels.astype(np.uint16))
     try:
-        bgr = (
-            np.ascontiguousarray(pixels) if encoding.to_bgr is None else cv2.cvtColor(pixels, encoding.to_bgr)
-        )
+        bgr = pixels if encoding.to_bgr is None else cv2.cvtColor(pixels, encoding.to_bgr)
     except cv2.error as error:
         raise MessageError(
-            f"{topic}: a {width} x {height} image cannot be {msg.encoding}: {error.err}"
+            f"{topic}: a {width} x {height} image cannot be {msg.encoding} (OpenCV: {error.err})"
         ) from None
     return Image(
         stamp=stamp_ns(msg.header.stamp),
         frame_id=_frame(msg.header.frame_id),
-        bgr=bgr,
+        bgr=np.ascontiguousarray(bgr),
         topic=topic,
         received=received,
     )
@@ -327,7 +324,7 @@ def _distortion(name: str, D: F64, topic: str) -> str:
     if model is None:
         raise MessageError(
             f"{topic}: distortion model '{name}' is not supported; supported are "
-            f"{', '.join(filter(None, _DISTORTION))}"
+            f"{', '.join(sorted(set(_DISTORTION.values()) - {''}))}"
         )
     if not np.isfinite(D).all() or np.any(D[8:]) or (model == "equidistant" and len(D) < 4):
         raise MessageError(f"{topic}: {list(D)} are no coefficients of the distortion model '{name}'")

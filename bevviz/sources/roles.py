@@ -63,6 +63,7 @@ def find_roles(topics: Sequence[Topic], config: SourceConfig) -> Roles:
     Raises:
         UserError: a stated topic does not exist, or is of another type.
     """
+    topics = sorted(topics, key=lambda t: t.name)  # the order of a bag's or a graph's topics is chance
     notes = {topic.name: f"not used: nothing here reads {topic.type}" for topic in topics}
     lidars = _find_lidars(topics, config, notes)
     images = _find_images(topics, config, notes)
@@ -177,6 +178,7 @@ def _one_a_frame(
 
 # --- cameras -----------------------------------------------------------------------------------
 
+_IMAGES = ("Image", "CompressedImage")
 _TRANSPORT = re.compile(r"/(compressed|compressedDepth|theora|ffmpeg|zstd)$")
 _DERIVED_IMAGE = re.compile(
     r"depth(?!ai)|disparity|confidence|annotat|debug|dbg|bev|mask|overlay|detect|visuali[sz]|segment|semantic|label"
@@ -186,12 +188,11 @@ _RECTIFIED = re.compile(r"(?<![a-z])rect")
 
 
 def _find_images(topics: Sequence[Topic], config: SourceConfig, notes: dict[str, str]) -> list[Topic]:
-    images = _of(topics, "Image", "CompressedImage")
+    images = _of(topics, *_IMAGES)
+    for name in config.camera_info_topics:
+        _stated(name, topics, "source.camera_info_topics", *_IMAGES)
     if config.camera_topics:
-        chosen = [
-            _stated(t, topics, "source.camera_topics", "Image", "CompressedImage")
-            for t in config.camera_topics
-        ]
+        chosen = [_stated(t, topics, "source.camera_topics", *_IMAGES) for t in config.camera_topics]
         _note(notes, images, "not used: not in source.camera_topics")
         _note(notes, chosen, "camera, by source.camera_topics")
         return chosen
