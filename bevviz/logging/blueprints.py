@@ -1,0 +1,86 @@
+"""Finds and loads viewer layouts: the ones that come along by name, a user's own from a file."""
+
+from __future__ import annotations
+
+import difflib
+import importlib.util
+from pathlib import Path
+
+import rerun.blueprint as rrb
+from rerun.recording_stream import RecordingStream
+
+import bevviz
+from bevviz.errors import UserError
+from bevviz.sources import Scene
+
+
+def _folder() -> Path:
+    """Beside the package where it is installed, beside the package's folder in a checkout."""
+    package = Path(bevviz.__file__).parent
+    installed = package / "blueprints"
+    return installed if installed.is_dir() else package.parent / "blueprints"
+
+
+def names() -> list[str]:
+    """The layouts that come along."""
+    return sorted(path.stem for path in _folder().glob("*.py") if not path.stem.startswith("_"))
+
+
+def load(name_or_path: str, scene: Scene) -> rrb.Blueprint:
+    """A layout for the scene.
+
+    Args:
+        name_or_path: one of ``names()``, a .py file with a function ``blueprint(scene)`` that returns an
+            ``rrb.Blueprint``, or a .rbl file that was saved in the viewer.
+        scene: names of the sensors.
+
+    Raises:
+        UserError: unknown name, no such file, or a file that makes no layout.
+    """
+    if name_or_path in names():
+        return _from_python(_folder() / f"{name_or_path}.py", scene)
+    path = Path(name_or_path)
+    if path.suffix not in (".py", ".rbl"):
+        near = difflib.get_close_matches(name_or_path, names(), 1, 0.4)
+        hint = f"did you mean '{near[0]}'?" if near else f"there are {', '.join(names())}"
+        raise UserError(f"--blueprint {name_or_path}: unknown; {hint} (or give a .py or .rbl file)")
+    if not path.is_file():
+        raise UserError(f"--blueprint {path}: no such file")
+    return _from_python(path, scene) if path.suffix == ".py" else Saved(path)
+
+
+def _from_python(path: Path, scene: Scene) -> rrb.Blueprint:
+    spec = importlib.util.spec_from_file_location(f"bevviz_blueprint_{path.stem}", path)
+    if spec is None or spec.loader is None:
+        raise UserError(f"--blueprint {path}: cannot be loaded")
+    module = importlib.util.module_from_spec(spec)
+    try:
+        spec.loader.exec_module(module)
+        layout = module.blueprint(scene)
+    except Exception as error:  # whatever a user's file may do
+        reason = str(error).splitlines()[0] if str(error) else ""
+        raise UserError(f"--blueprint {path}: {type(error).__name__}: {reason}") from error
+    if not isinstance(layout, rrb.Blueprint):
+        kind = type(layout).__name__
+        raise UserError(f"--blueprint {path}: blueprint(scene) must return an rrb.Blueprint, not {kind}")
+    return layout
+
+
+class Saved(rrb.Blueprint):
+    """A layout that the viewer saved as .rbl: sent on as it is."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(rrb.Grid())
+        from rerun.chunk import RrdReader
+
+        try:
+            reader = RrdReader(path)
+            stores = reader.blueprints()
+            self._chunks = reader.stream(store=stores[0]).to_chunks() if stores else []
+        except Exception as error:
+            raise UserError(f"--blueprint {path}: cannot be read: {str(error).splitlines()[0]}") from None
+        if not self._chunks:
+            raise UserError(f"--blueprint {path}: holds no blueprint")
+
+    def _log_to_stream(self, stream: RecordingStream) -> None:
+        stream.send_chunks(self._chunks)

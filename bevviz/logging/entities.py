@@ -1,0 +1,131 @@
+"""Where everything is in a recording: entity paths and class ids, in one place (see docs/entities.md)."""
+
+from __future__ import annotations
+
+from enum import IntEnum
+
+from bevviz.frame import ClusterState, DetectionState
+
+# --- timelines ---------------------------------------------------------------------------------
+
+STAMP = "stamp"  # sensor time, from the header of the cloud
+FRAME = "frame"  # sequence
+RECEIVED = "received"  # when the cloud was received, or logged into the bag
+
+# --- entities ----------------------------------------------------------------------------------
+
+WORLD = "/world"
+FUSED = "/world/fused"
+FRUSTUMS = "/world/frustums"
+GRID = "/world/bev"
+TRUTH = "/world/ground_truth"
+BEV = "/bev"
+ROBOT = "/robot"
+EXPLAIN = "/explain"
+EXPLAIN_LOG = "/explain/log"
+STATES = "/explain/states"
+HEALTH = "/health"
+CONFIG = "/config"
+
+
+def sensor(name: str) -> str:
+    """A LiDAR or a camera: carries its pose."""
+    return f"{WORLD}/{name}"
+
+
+def points(lidar: str) -> str:
+    return f"{WORLD}/{lidar}/points"
+
+
+def ground(lidar: str) -> str:
+    return f"{WORLD}/{lidar}/points/ground"
+
+
+def obstacles(lidar: str) -> str:
+    return f"{WORLD}/{lidar}/points/obstacles"
+
+
+def clusters(lidar: str) -> str:
+    return f"{WORLD}/{lidar}/clusters"
+
+
+def set_aside(lidar: str) -> str:
+    """Clusters outside the size limits."""
+    return f"{WORLD}/{lidar}/clusters/set_aside"
+
+
+def image(camera: str) -> str:
+    return f"{WORLD}/{camera}/image"
+
+
+def detections(camera: str) -> str:
+    return f"{WORLD}/{camera}/image/detections"
+
+
+def weak(camera: str) -> str:
+    """Detections below the threshold, or suppressed by a better one."""
+    return f"{WORLD}/{camera}/image/detections/weak"
+
+
+def projected(camera: str) -> str:
+    return f"{WORLD}/{camera}/image/points"
+
+
+def channel(name: str) -> str:
+    return f"{BEV}/{name}"
+
+
+def overlay(what: str) -> str:
+    """Outlines over the bird's-eye image: of the ground truth, or of what the robot published."""
+    return f"{BEV}/overlay/{what}"
+
+
+def robot(topic: str) -> str:
+    return f"{ROBOT}/{topic.strip('/')}"
+
+
+def state(*lane: str) -> str:
+    return "/".join((STATES, *lane))
+
+
+def stage_time(stage: str) -> str:
+    return f"{HEALTH}/time_ms/{stage}"
+
+
+def rate(what: str) -> str:
+    return f"{HEALTH}/rate_hz/{what}"
+
+
+def count(what: str) -> str:
+    return f"{HEALTH}/count/{what}"
+
+
+def sync_error(camera: str) -> str:
+    return f"{HEALTH}/sync_error_ms/{camera}"
+
+
+def tf_age(sensor: str) -> str:
+    return f"{HEALTH}/tf_age_ms/{sensor}"
+
+
+# --- class ids ---------------------------------------------------------------------------------
+
+
+class ClassId(IntEnum):
+    """Class ids of points and boxes; the annotation context of /world names and colours them."""
+
+    UNCLASSIFIED = 0
+    GROUND = 1
+    OBSTACLE = 2
+    NOISE = 3  # obstacle point of no cluster
+    DETECTION = 10  # + DetectionState
+    CLUSTER = 20  # + ClusterState, for clusters outside the size limits
+    TRACK = 100  # + number of the cluster's colour
+
+
+TRACK_COLORS = 64
+DEPTH_BINS = 64  # class ids of the points projected into an image: bins of the depth
+DEPTH_RANGE = 50.0  # metres that these bins span
+
+DETECTION_CLASS = {state: ClassId.DETECTION + state for state in DetectionState}
+CLUSTER_CLASS = {state: ClassId.CLUSTER + state for state in ClusterState}

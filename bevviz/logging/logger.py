@@ -1,0 +1,664 @@
+"""Logs a FrameResult: what each entity looks like in Rerun."""
+
+from __future__ import annotations
+
+import platform
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from importlib.metadata import version
+from typing import Any
+
+import cv2
+import numpy as np
+import rerun as rr
+
+from bevviz import __version__, geometry
+from bevviz.colors import bins, class_color, palette, turbo
+from bevviz.config import Config, dump
+from bevviz.frame import (
+    F32,
+    F64,
+    U8,
+    Bev,
+    Boxes3D,
+    CameraResult,
+    Clusters,
+    ClusterState,
+    Decision,
+    Detections,
+    DetectionState,
+    Frame,
+    FrameResult,
+    Image,
+    Intrinsics,
+    LabelledBoxes2D,
+    LabelledBoxes3D,
+    Objects,
+)
+from bevviz.logging import entities
+from bevviz.logging.entities import ClassId
+from bevviz.logging.text import markdown
+from bevviz.logging.tracks import Tracks
+from bevviz.sources import Scene
+from bevviz.sources.roles import entity_name
+
+_TRUTH_COLOR = (255, 255, 255)
+_ROBOT_COLOR = (255, 210, 0)
+_FAINT = (150, 150, 160, 110)
+_UNMATCHED_DEPTH = 20.0  # metres that the frustum of a detection without a match is drawn to
+
+_STATES = {
+    "ok": (70, 160, 90),
+    "matched": (70, 160, 90),
+    "degraded": (220, 160, 50),
+    "failed": (210, 70, 70),
+    "no cluster": (210, 70, 70),
+    "too few points": (220, 160, 50),
+    "low overlap": (220, 160, 50),
+    "taken": (150, 120, 220),
+    "too far": (110, 130, 160),
+    "not fused": (110, 110, 120),
+}
+
+
+class Logger:
+    """Writes frames to a recording, on the timelines ``stamp``, ``frame`` and ``received``.
+
+    Call ``log_static`` once, then ``log`` for each frame.
+
+    Args:
+        recording: where to; it may have any number of sinks.
+        config: how the results were made; stored in the recording.
+        scene: names of the sensors.
+    """
+
+    def __init__(self, recording: rr.RecordingStream, config: Config, scene: Scene) -> None:
+        self._recording = recording
+        self._config = config
+        self._scene = scene
+        self._tracks = Tracks()
+        self._intrinsics: dict[str, Intrinsics] = {}
+        self._image_stamps: dict[str, int] = {}
+        self._lanes: dict[str, str] = {}  # state lane -> its latest state
+        self._shown: set[str] = set()  # entities with something of the frame before
+        self._now: set[str] = set()
+        self._last: Frame | None = None
+
+    # --- once ----------------------------------------------------------------------------------
+
+    def log_static(self) -> None:
+        """How the recording was made, the axes, the classes and the looks: what no frame changes."""
+        self._log_origin()
+        self._static(entities.WORLD, rr.ViewCoordinates.FLU, _annotations())
+        for lidar in dict.fromkeys((self._scene.lidar, *self._scene.lidars)):
+            self._static(entities.points(lidar), rr.Points3D.from_fields(radii=rr.Radius.ui_points(1.0)))
+            for path in (entities.ground(lidar), entities.obstacles(lidar)):
+                self._static(path, rr.Points3D.from_fields(radii=rr.Radius.ui_points(1.5)))
+            self._static(
+                entities.clusters(lidar),
+                rr.Points3D.from_fields(radii=rr.Radius.ui_points(2.0), show_labels=False),
+                rr.Boxes3D.from_fields(radii=rr.Radius.ui_points(0.75)),
+            )
+            self._static(entities.set_aside(lidar), rr.Boxes3D.from_fields(show_labels=False))
+        for camera in self._scene.cameras:
+            self._static(
+                entities.projected(camera),
+                _depth_annotations(),
+                rr.Points2D.from_fields(radii=rr.Radius.ui_points(1.5), show_labels=False, draw_order=10.0),
+            )
+            self._static(entities.detections(camera), rr.Boxes2D.from_fields(draw_order=30.0))
+            self._static(
+                entities.weak(camera),
+                rr.Boxes2D.from_fields(
+                    colors=[_FAINT], radii=rr.Radius.ui_points(0.5), show_labels=False, draw_order=20.0
+                ),
+            )
+        self._static(entities.FUSED, rr.Boxes3D.from_fields(radii=rr.Radius.ui_points(2.0), show_labels=True))
+        self._static(
+            entities.TRUTH,
+            rr.Boxes3D.from_fields(colors=[_TRUTH_COLOR], radii=rr.Radius.ui_points(0.75), show_labels=False),
+        )
+
+    def _log_origin(self) -> None:
+        packages = ("rerun-sdk", "numpy", "open3d", "onnxruntime", "opencv-python-headless", "rosbags")
+        versions = {"bevviz": __version__, "python": platform.python_version()}
+        versions |= {name: version(name) for name in packages}
+        config = dump(self._config)
+        self._static(
+            entities.CONFIG,
+            rr.TextDocument(
+                "# How this recording was made\n\n"
+                + f"Source: **{self._scene.name}**, preset: **{self._config.preset}**\n\n"
+                + f"```yaml\n{config}```\n\n"
+                + "\n".join(f"- {name} {number}" for name, number in versions.items()),
+                media_type=rr.MediaType.MARKDOWN,
+            ),
+        )
+        self._recording.send_recording_name(self._scene.name)
+        self._recording.send_property(
+            "bevviz",
+            rr.AnyValues(
+                source=self._scene.name,
+                preset=self._config.preset,
+                config=config,
+                versions=[f"{name} {number}" for name, number in versions.items()],
+                lidars=list(self._scene.lidars or (self._scene.lidar,)),
+                cameras=list(self._scene.cameras) or None,
+            ),
+        )
+
+    # --- each frame ----------------------------------------------------------------------------
+
+    def log(self, result: FrameResult) -> None:
+        """Everything of one frame. What the frame before had and this one has not is cleared."""
+        frame = result.frame
+        self._now = set()
+        self._set_time(frame)
+        self._log_cloud(result)
+        if result.clusters is not None and result.obstacles is not None:
+            self._log_clusters(frame, result.clusters, result.obstacles)
+        for camera in result.cameras:
+            self._log_camera(frame, camera)
+        if result.objects is not None and len(result.objects):
+            self._log_objects(result, result.objects)
+        self._log_frustums(frame, result.cameras)
+        if result.bev is not None:
+            self._log_bev(result, result.bev)
+        self._log_others(frame)
+        self._log_decisions(result)
+        self._log_health(result)
+        for path in self._shown - self._now:
+            self._recording.log(path, rr.Clear(recursive=False))
+        self._shown = self._now
+        self._last = frame
+
+    def _log_cloud(self, result: FrameResult) -> None:
+        frame = result.frame
+        world_from_points = _pose(frame)
+        self._put(entities.sensor(frame.lidar), _transform(world_from_points))
+        if self._config.logging.raw_cloud:
+            classes = np.zeros(len(frame.points), np.uint16)
+            if result.voxels is not None and result.ground is not None:
+                of_voxel = np.where(result.ground.mask, ClassId.GROUND, ClassId.OBSTACLE).astype(np.uint16)
+                classes = of_voxel[result.voxels.inverse]
+            if len(frame.clouds) > 1:
+                self._log_merged(frame, world_from_points, classes)
+            elif len(frame.points):
+                self._put(entities.points(frame.lidar), rr.Points3D(frame.points, class_ids=classes))
+        if result.voxels is not None and result.ground is not None:
+            road = result.voxels.points[result.ground.mask]
+            self._put_points(entities.ground(frame.lidar), road, ClassId.GROUND)
+        if result.obstacles is not None:
+            self._put_points(entities.obstacles(frame.lidar), result.obstacles, ClassId.OBSTACLE)
+
+    def _log_merged(self, frame: Frame, world_from_points: F64, classes: np.ndarray[Any, Any]) -> None:
+        """Several LiDARs: each raw cloud in the frame of its own sensor."""
+        end = 0
+        for cloud, points_from_cloud in zip(frame.clouds, frame.points_from_clouds, strict=True):
+            start, end = end, end + len(cloud.xyz)
+            name = entity_name(cloud.topic, cloud.frame_id)
+            self._put(entities.sensor(name), _transform(world_from_points @ points_from_cloud))
+            if len(cloud.xyz):
+                self._put(entities.points(name), rr.Points3D(cloud.xyz, class_ids=classes[start:end]))
+
+    def _put_points(self, path: str, points: F32, class_id: int) -> None:
+        if len(points):
+            self._put(path, rr.Points3D(points, class_ids=class_id))
+
+    def _log_clusters(self, frame: Frame, clusters: Clusters, obstacles: F32) -> None:
+        boxes = clusters.obb if self._config.clustering.boxes == "oriented" else clusters.aabb
+        tracks = self._tracks.update(geometry.apply(_pose(frame), clusters.centroid))
+        colors = (ClassId.TRACK + tracks % entities.TRACK_COLORS).astype(np.uint16)
+        kept = np.flatnonzero(clusters.state == ClusterState.KEPT)
+        member = clusters.labels >= 0
+        member[member] = (clusters.state == ClusterState.KEPT)[clusters.labels[member]]
+        if len(kept):
+            self._put(
+                entities.clusters(frame.lidar),
+                rr.Points3D(obstacles[member], class_ids=colors[clusters.labels[member]]),
+                _boxes(boxes, kept, [f"{k}" for k in kept], class_ids=colors[kept]),
+            )
+        aside = np.flatnonzero(clusters.state != ClusterState.KEPT)
+        if len(aside):
+            states = [ClusterState(s) for s in clusters.state[aside].tolist()]
+            self._put(
+                entities.set_aside(frame.lidar),
+                _boxes(
+                    boxes,
+                    aside,
+                    [f"{k}: {n} points" for k, n in zip(aside, clusters.count[aside], strict=True)],
+                    class_ids=[entities.CLUSTER_CLASS[s] for s in states],
+                ),
+            )
+
+    # --- cameras -------------------------------------------------------------------------------
+
+    def _log_camera(self, frame: Frame, result: CameraResult) -> None:
+        camera = result.camera
+        world_from_camera = _camera_pose(frame, result)
+        if world_from_camera is not None:
+            self._put(entities.sensor(camera.name), _transform(world_from_camera))
+        if camera.intrinsics is not None:
+            self._log_intrinsics(camera.name, camera.intrinsics)
+        if camera.image is not None:
+            self._log_image(camera.name, camera.image)
+        if result.detections is not None:
+            self._log_detections(camera.name, result.detections)
+        if self._config.logging.projected_points and result.uv is not None and result.depth is not None:
+            seen = np.isfinite(result.uv[:, 0])
+            if seen.any():
+                depth = bins(result.depth[seen], 0, entities.DEPTH_RANGE, entities.DEPTH_BINS)
+                self._put(entities.projected(camera.name), rr.Points2D(result.uv[seen], class_ids=depth))
+
+    def _log_intrinsics(self, name: str, intrinsics: Intrinsics) -> None:
+        """Static, so that a viewer that joins late has it; logged again where the calibration changes."""
+        if self._intrinsics.get(name) is intrinsics:
+            return
+        last, self._intrinsics[name] = self._intrinsics.get(name), intrinsics
+        size = [intrinsics.width, intrinsics.height]
+        if last is None or [last.width, last.height] != size or not np.array_equal(last.K, intrinsics.K):
+            self._static(
+                entities.image(name),
+                rr.Pinhole(
+                    image_from_camera=intrinsics.K,
+                    resolution=size,
+                    camera_xyz=rr.ViewCoordinates.RDF,
+                    image_plane_distance=1.5,
+                ),
+            )
+
+    def _log_image(self, name: str, image: Image) -> None:
+        path = entities.image(name)
+        self._now.add(path)
+        if self._image_stamps.get(name) == image.stamp and path in self._shown:
+            return  # the camera is slower than the LiDAR: the image is already there
+        self._image_stamps[name] = image.stamp
+        if image.encoded is not None:
+            self._put(path, rr.EncodedImage(contents=image.encoded, media_type=image.media_type or None))
+        else:
+            self._put(path, _jpeg(image.bgr, self._config.logging.jpeg_quality))
+
+    def _log_detections(self, name: str, detections: Detections) -> None:
+        for path, rows in (
+            (entities.detections(name), np.flatnonzero(detections.state == DetectionState.KEPT)),
+            (entities.weak(name), np.flatnonzero(detections.state != DetectionState.KEPT)),
+        ):
+            if len(rows) == 0:
+                continue
+            names = [detections.names[d] for d in rows]
+            self._put(
+                path,
+                rr.Boxes2D(
+                    array=detections.xyxy[rows],
+                    array_format=rr.Box2DFormat.XYXY,
+                    labels=[f"{n} {s:.2f}" for n, s in zip(names, detections.score[rows], strict=True)],
+                    colors=[class_color(n) for n in names] if path == entities.detections(name) else None,
+                    class_ids=[entities.DETECTION_CLASS[DetectionState(s)] for s in detections.state[rows]],
+                ),
+            )
+
+    # --- fusion --------------------------------------------------------------------------------
+
+    def _log_objects(self, result: FrameResult, objects: Objects) -> None:
+        reasons = {(e.camera, e.row): e.text for e in result.explanations if e.subject == "detection"}
+        self._put(
+            entities.FUSED,
+            _transform(_pose(result.frame)),
+            _boxes(
+                objects.boxes,
+                np.arange(len(objects)),
+                [f"{n} {s:.2f}" for n, s in zip(objects.names, objects.score, strict=True)],
+                colors=[class_color(n) for n in objects.names],
+            ),
+            rr.AnyValues(
+                class_name=list(objects.names),
+                score=objects.score,
+                cluster=objects.cluster,
+                camera=list(objects.camera),
+                reason=[
+                    reasons.get((c, d), "") for c, d in zip(objects.camera, objects.detection, strict=True)
+                ],
+            ),
+        )
+
+    def _log_frustums(self, frame: Frame, cameras: Sequence[CameraResult]) -> None:
+        strips: list[F32] = []
+        colors: list[tuple[int, ...]] = []
+        labels: list[str] = []
+        for camera in cameras:
+            pose, intrinsics = _camera_pose(frame, camera), camera.camera.intrinsics
+            found, fusion = camera.detections, camera.fusion
+            if pose is None or intrinsics is None or found is None or fusion is None:
+                continue
+            rows = np.flatnonzero(found.state == DetectionState.KEPT)
+            if len(rows) == 0:
+                continue
+            far = np.full(len(found), _UNMATCHED_DEPTH, np.float32)
+            matched = fusion.detection_decision == Decision.MATCHED
+            pairs = fusion.pairs
+            chosen = matched[pairs.detection] & (fusion.detection_cluster[pairs.detection] == pairs.cluster)
+            far[pairs.detection[chosen]] = pairs.depth[chosen]
+            near = np.full(len(rows), 0.3, np.float32)
+            corners = geometry.frustum(found.xyxy[rows], intrinsics, near, far[rows])
+            corners = geometry.apply(pose, corners.reshape(-1, 3)).reshape(-1, 8, 3)
+            for d, eight in zip(rows.tolist(), corners, strict=True):
+                strips.append(eight[_FRUSTUM_PATH])
+                colors.append((*class_color(found.names[d]), 255) if matched[d] else _FAINT)
+                labels.append(f"{found.names[d]} {found.score[d]:.2f}")
+        if strips:
+            self._put(
+                entities.FRUSTUMS,
+                rr.LineStrips3D(strips, colors=colors, labels=labels, show_labels=False),
+            )
+
+    # --- bird's-eye view -----------------------------------------------------------------------
+
+    def _log_bev(self, result: FrameResult, bev: Bev) -> None:
+        if self._config.bev.style == "reference":
+            self._put(entities.BEV, _png(bev.image))  # pixel for pixel
+        else:
+            self._put(entities.BEV, _jpeg(bev.image, self._config.logging.jpeg_quality))
+        if self._config.logging.bev_channels:
+            for name, grid in bev.channels.items():
+                self._put(entities.channel(name), rr.Image(grid, color_model="L"))
+        if "occupancy" in bev.channels:
+            self._log_grid(result, bev)
+
+    def _log_grid(self, result: FrameResult, bev: Bev) -> None:
+        """The occupancy on the ground. A grid map's origin is its lower left corner, right and up its axes."""
+        grid = bev.channels["occupancy"]
+        level = 0.0
+        if result.ground is not None and result.voxels is not None and result.ground.mask.any():
+            level = float(np.median(result.voxels.points[::8, 2][result.ground.mask[::8]]))
+        self._put(
+            entities.GRID,
+            _transform(_pose(result.frame)),
+            rr.GridMap(
+                data=grid.tobytes(),
+                format=rr.components.ImageFormat(
+                    width=grid.shape[1], height=grid.shape[0], color_model="L", channel_datatype="U8"
+                ),
+                cell_size=bev.resolution,
+                translation=[-bev.range_x, bev.range_y, level - 0.05],
+                rotation_axis_angle=rr.RotationAxisAngle([0, 0, 1], radians=-np.pi / 2),
+                opacity=0.35,
+                colormap=rr.components.Colormap.RvizMap,
+            ),
+        )
+
+    # --- what others state ---------------------------------------------------------------------
+
+    def _log_others(self, frame: Frame) -> None:
+        world_from_points = _pose(frame)
+        if frame.truth is not None and len(frame.truth.boxes):
+            self._log_stated(entities.TRUTH, frame.truth, None)
+            self._log_outlines("ground_truth", frame.truth, world_from_points, _TRUTH_COLOR)
+        for stated in frame.robot_boxes:
+            if len(stated.boxes):
+                self._log_stated(entities.robot(stated.topic), stated, _ROBOT_COLOR)
+                self._log_outlines(stated.topic.strip("/"), stated, world_from_points, _ROBOT_COLOR)
+        for found in frame.robot_detections:
+            if len(found.xyxy):
+                self._log_stated_2d(found)
+
+    def _log_stated(self, path: str, stated: LabelledBoxes3D, color: tuple[int, int, int] | None) -> None:
+        pose = np.eye(4) if stated.world_from_boxes is None else stated.world_from_boxes
+        self._put(
+            path,
+            _transform(pose),
+            _boxes(
+                stated.boxes,
+                np.arange(len(stated.boxes)),
+                [f"{n} {s:.2f}" for n, s in zip(stated.labels, stated.scores, strict=True)],
+                colors=None if color is None else [color],
+            ),
+        )
+
+    def _log_stated_2d(self, found: LabelledBoxes2D) -> None:
+        """Under /robot, but in the space of the camera's image, so that it can be shown over it."""
+        frame = rr.CoordinateFrame(f"tf#{entities.image(found.camera)}") if found.camera else None
+        self._put(
+            entities.robot(found.topic),
+            *([frame] if frame else []),
+            rr.Boxes2D(
+                array=found.xyxy,
+                array_format=rr.Box2DFormat.XYXY,
+                labels=[f"{n} {s:.2f}" for n, s in zip(found.labels, found.scores, strict=True)],
+                colors=[_ROBOT_COLOR],
+                draw_order=25.0,
+            ),
+        )
+
+    def _log_outlines(
+        self, what: str, stated: LabelledBoxes3D, world_from_points: F64, color: tuple[int, int, int]
+    ) -> None:
+        """Boxes seen from above, over the bird's-eye image."""
+        pose = np.eye(4) if stated.world_from_boxes is None else stated.world_from_boxes
+        corners = geometry.corners(stated.boxes)[:, [0, 1, 2, 3, 0]]
+        moved = geometry.apply(geometry.inverse(world_from_points) @ pose, corners.reshape(-1, 3))
+        config = self._config.bev
+        uv = (np.array([config.range_y, config.range_x], np.float32) - moved[:, 1::-1]) / config.resolution
+        self._put(
+            entities.overlay(what),
+            rr.LineStrips2D(
+                uv.reshape(-1, 5, 2),
+                colors=[color],
+                radii=rr.Radius.ui_points(0.75),
+                labels=list(stated.labels),
+                show_labels=False,
+                draw_order=10.0,
+            ),
+        )
+
+    # --- decisions -----------------------------------------------------------------------------
+
+    def _log_decisions(self, result: FrameResult) -> None:
+        self._put(entities.EXPLAIN, rr.TextDocument(markdown(result), media_type=rr.MediaType.MARKDOWN))
+        lines = [("ERROR", f"{f.stage}: {f.reason}") for f in result.failures]
+        lines += [("WARN", problem) for problem in result.frame.problems]
+        for camera in result.cameras:
+            lines += [("WARN", f"{camera.camera.name}: {problem}") for problem in camera.camera.problems]
+        quiet = {"matched", "not_kept", "below_threshold", "suppressed"}
+        lines += [
+            ("INFO", f"{e.camera}: {e.text}")
+            for e in result.explanations
+            if e.subject == "detection" and e.state not in quiet
+        ]
+        if lines:
+            levels, texts = zip(*lines, strict=True)
+            rr.send_columns(
+                entities.EXPLAIN_LOG,
+                self._times(result.frame, len(lines)),
+                rr.TextLog.columns(text=texts, level=levels),
+                recording=self._recording,
+            )
+        self._log_states(result)
+
+    def _log_states(self, result: FrameResult) -> None:
+        """One lane for the pipeline, one for each camera, one for each class that a camera has seen."""
+        lanes = dict.fromkeys(self._lanes, "")
+        degraded = result.frame.problems or any(c.camera.problems for c in result.cameras)
+        lanes[entities.state("pipeline")] = "failed" if result.failures else "degraded" if degraded else "ok"
+        for camera in result.cameras:
+            name = camera.camera.name
+            failed = camera.detections is None
+            lanes[entities.state(name)] = (
+                "degraded"
+                if camera.camera.problems
+                else "not fused"
+                if failed or camera.fusion is None
+                else "ok"
+            )
+            for class_name, decision in _best_decisions(camera):
+                lanes[entities.state(name, class_name.replace(" ", "_"))] = decision
+        for lane, value in lanes.items():
+            if lane not in self._lanes:
+                self._static(lane, rr.StateConfiguration(values=list(_STATES), colors=list(_STATES.values())))
+            if self._lanes.get(lane) != value:
+                self._recording.log(lane, rr.StateChange(state=value))
+        self._lanes = lanes
+
+    # --- health --------------------------------------------------------------------------------
+
+    def _log_health(self, result: FrameResult) -> None:
+        for path, value in _health(result, self._last):
+            if np.isfinite(value):
+                self._recording.log(path, rr.Scalars(float(value)))
+
+    # --- plumbing ------------------------------------------------------------------------------
+
+    def _static(self, path: str, *archetypes: rr.AsComponents) -> None:
+        for archetype in archetypes:
+            self._recording.log(path, archetype, static=True)
+
+    def _put(self, path: str, *archetypes: rr.AsComponents) -> None:
+        self._recording.log(path, *archetypes)
+        self._now.add(path)
+
+    def _set_time(self, frame: Frame) -> None:
+        self._recording.reset_time()
+        self._recording.set_time(entities.FRAME, sequence=frame.index)
+        self._recording.set_time(entities.STAMP, timestamp=np.datetime64(frame.stamp, "ns"))
+        if frame.received:
+            self._recording.set_time(entities.RECEIVED, timestamp=np.datetime64(frame.received, "ns"))
+
+    def _times(self, frame: Frame, rows: int) -> list[rr.TimeColumn]:
+        columns = [
+            rr.TimeColumn(entities.FRAME, sequence=[frame.index] * rows),
+            rr.TimeColumn(entities.STAMP, timestamp=np.full(rows, frame.stamp, "datetime64[ns]")),
+        ]
+        if frame.received:
+            columns.append(
+                rr.TimeColumn(entities.RECEIVED, timestamp=np.full(rows, frame.received, "datetime64[ns]"))
+            )
+        return columns
+
+
+# --- pieces ------------------------------------------------------------------------------------
+
+_FRUSTUM_PATH = [0, 1, 2, 3, 0, 4, 5, 1, 5, 6, 2, 6, 7, 3, 7, 4]  # every edge in one stroke
+
+
+def _annotations() -> rr.AnnotationContext:
+    classes: list[tuple[int, str, tuple[int, ...]]] = [
+        (ClassId.UNCLASSIFIED, "", (130, 130, 140)),
+        (ClassId.GROUND, "ground", (92, 84, 76)),
+        (ClassId.OBSTACLE, "obstacle", (170, 175, 190)),
+        (ClassId.NOISE, "noise", (110, 110, 120)),
+        (entities.DETECTION_CLASS[DetectionState.KEPT], "kept", (255, 255, 255)),
+        (entities.DETECTION_CLASS[DetectionState.BELOW_THRESHOLD], "below threshold", _FAINT),
+        (entities.DETECTION_CLASS[DetectionState.SUPPRESSED], "suppressed", _FAINT),
+        (entities.CLUSTER_CLASS[ClusterState.TOO_SMALL], "too small", (120, 120, 130)),
+        (entities.CLUSTER_CLASS[ClusterState.TOO_LARGE], "too large", (140, 100, 100)),
+    ]
+    colors = palette(entities.TRACK_COLORS).tolist()
+    return rr.AnnotationContext(
+        [
+            *(rr.AnnotationInfo(id=i, label=label or None, color=color) for i, label, color in classes),
+            *(rr.AnnotationInfo(id=ClassId.TRACK + i, color=color) for i, color in enumerate(colors)),
+        ]
+    )
+
+
+def _depth_annotations() -> rr.AnnotationContext:
+    width = entities.DEPTH_RANGE / entities.DEPTH_BINS
+    near_is_red = turbo(entities.DEPTH_BINS)[::-1].tolist()
+    return rr.AnnotationContext(
+        [
+            rr.AnnotationInfo(id=i, label=f"{i * width:.1f} m", color=color)
+            for i, color in enumerate(near_is_red)
+        ]
+    )
+
+
+def _pose(frame: Frame) -> F64:
+    return np.eye(4) if frame.world_from_points is None else frame.world_from_points
+
+
+def _camera_pose(frame: Frame, result: CameraResult) -> F64 | None:
+    camera = result.camera
+    if camera.world_from_camera is not None:
+        return camera.world_from_camera
+    if camera.camera_from_points is not None:
+        return _pose(frame) @ geometry.inverse(camera.camera_from_points)
+    return None
+
+
+def _transform(world_from_entity: F64) -> rr.Transform3D:
+    return rr.Transform3D(
+        translation=world_from_entity[:3, 3],
+        quaternion=rr.Quaternion(xyzw=geometry.quaternion(world_from_entity)),
+    )
+
+
+def _boxes(boxes: Boxes3D, rows: np.ndarray[Any, Any], labels: list[str], **looks: Any) -> rr.Boxes3D:
+    half = boxes.yaw[rows] / 2
+    turns = np.zeros((len(rows), 4), np.float32)
+    turns[:, 2], turns[:, 3] = np.sin(half), np.cos(half)
+    return rr.Boxes3D(
+        centers=boxes.center[rows], sizes=boxes.size[rows], quaternions=turns, labels=labels, **looks
+    )
+
+
+def _jpeg(bgr: U8, quality: int) -> rr.EncodedImage:
+    _, data = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, quality])
+    return rr.EncodedImage(contents=data.tobytes(), media_type="image/jpeg")
+
+
+def _png(bgr: U8) -> rr.EncodedImage:
+    _, data = cv2.imencode(".png", bgr, [cv2.IMWRITE_PNG_COMPRESSION, 1])
+    return rr.EncodedImage(contents=data.tobytes(), media_type="image/png")
+
+
+def _best_decisions(camera: CameraResult) -> Iterator[tuple[str, str]]:
+    """For each class, what became of its best kept detection."""
+    if camera.detections is None or camera.fusion is None:
+        return
+    found, seen = camera.detections, set()
+    for d in np.flatnonzero(found.state == DetectionState.KEPT).tolist():
+        if found.names[d] not in seen:
+            seen.add(found.names[d])
+            decision = Decision(int(camera.fusion.detection_decision[d]))
+            yield found.names[d], decision.name.lower().replace("_", " ")
+
+
+def _health(result: FrameResult, last: Frame | None) -> Iterator[tuple[str, float]]:
+    frame = result.frame
+    for stage, seconds in result.timings.items():
+        yield entities.stage_time(stage), seconds * 1e3
+    if result.timings.get("total"):
+        yield entities.rate("pipeline"), 1 / result.timings["total"]
+    if last is not None:
+        if frame.stamp > last.stamp:
+            yield entities.rate("sensor"), 1e9 / (frame.stamp - last.stamp)
+        if frame.received > last.received > 0:
+            yield entities.rate("received"), 1e9 / (frame.received - last.received)
+    for what, number in _counts(result, last).items():
+        yield entities.count(what), number
+    yield entities.tf_age(frame.lidar), frame.tf_age * 1e3
+    for camera in result.cameras:
+        yield entities.sync_error(camera.camera.name), camera.camera.sync_error * 1e3
+        yield entities.tf_age(camera.camera.name), camera.camera.tf_age * 1e3
+
+
+def _counts(result: FrameResult, last: Frame | None) -> Mapping[str, int]:
+    frame = result.frame
+    counts: Counter[str] = Counter(
+        points=len(frame.points),
+        invalid_points=sum(cloud.dropped for cloud in frame.clouds),
+        problems=len(frame.problems) + sum(len(c.camera.problems) for c in result.cameras),
+        failures=len(result.failures),
+        skipped_frames=max(0, frame.index - last.index - 1) if last is not None else 0,
+    )
+    if result.voxels is not None:
+        counts["voxels"] = len(result.voxels.points)
+    if result.obstacles is not None:
+        counts["obstacle_points"] = len(result.obstacles)
+    if result.clusters is not None:
+        counts["clusters"] = int((result.clusters.state == ClusterState.KEPT).sum())
+    for camera in result.cameras:
+        if camera.detections is not None:
+            counts["detections"] += int((camera.detections.state == DetectionState.KEPT).sum())
+        if camera.fusion is not None:
+            counts["matches"] += int((camera.fusion.detection_decision == Decision.MATCHED).sum())
+    return counts

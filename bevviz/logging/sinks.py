@@ -1,0 +1,180 @@
+"""Where a recording goes: a file, a viewer on this machine, one elsewhere, a browser; several at once."""
+
+from __future__ import annotations
+
+import socket
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from urllib.parse import quote, urlsplit
+
+import rerun as rr
+import rerun_cli
+
+from bevviz.config import Config
+from bevviz.errors import UserError
+from bevviz.logging import blueprints
+from bevviz.sources import Scene
+
+APPLICATION = "bevviz"
+MEMORY = "25%"  # of the machine's, for what a server keeps for those who join late, and for the viewer
+
+
+@dataclass(frozen=True, slots=True)
+class Sinks:
+    """An open recording. ``urls``: what to open in a browser or viewer, one for each server."""
+
+    recording: rr.RecordingStream
+    urls: list[str] = field(default_factory=list)
+
+
+@contextmanager
+def open_recording(
+    scene: Scene,
+    config: Config,
+    *,
+    save: Path | None = None,
+    serve: int | None = None,
+    connect: str | None = None,
+    spawn: bool = False,
+    blueprint: str = "debug",
+) -> Iterator[Sinks]:
+    """Open a recording that goes to everything that is asked for, with the blueprint.
+
+    A file is written while the recording goes on: what was logged before an interruption is in it.
+
+    Args:
+        scene: names of the sensors, for the blueprint.
+        config: the configuration.
+        save: .rrd file; overwritten.
+        serve: port of the web viewer on this machine.
+        connect: URL of a viewer that listens, rerun+http://host:9876/proxy.
+        spawn: open the viewer on this machine.
+        blueprint: name of a layout, or a .py or .rbl file.
+
+    Raises:
+        UserError: unknown blueprint, file that cannot be written, port in use, no viewer found or reached;
+            on leaving, when not everything could be written.
+    """
+    layout = blueprints.load(blueprint, scene)
+    sinks: list[rr.FileSink | rr.GrpcSink | rr.GrpcServerSink] = []
+    urls: list[str] = []
+    if save is not None:
+        sinks.append(_file(save))
+    if connect is not None:
+        sinks.append(_connection(connect))
+    if spawn:
+        sinks.append(_viewer())
+    if serve is not None:
+        server, address = _server(serve)
+        sinks.append(server)
+        urls.append(address)
+    recording = rr.RecordingStream(APPLICATION)
+    recording.set_log_time_enabled(False)  # frames have their own clocks
+    try:
+        recording.set_sinks(*sinks, default_blueprint=layout)
+    except (RuntimeError, ValueError) as error:
+        raise UserError(f"cannot open the outputs: {error}") from None
+    try:
+        yield Sinks(recording, urls)
+    finally:
+        _close(recording)
+
+
+def _close(recording: rr.RecordingStream) -> None:
+    """Write what is still on its way. An error that is already on its way out goes first."""
+    pending = sys.exc_info()[0] is not None
+    try:
+        recording.flush()
+    except (RuntimeError, ValueError) as error:
+        if not pending:
+            raise UserError(f"the end of the recording was lost: {error}") from None
+    finally:
+        recording.disconnect()
+
+
+def _file(path: Path) -> rr.FileSink:
+    try:
+        with path.open("wb"):
+            pass
+    except OSError as error:
+        raise UserError(f"{path}: cannot write the recording: {error.strerror}") from None
+    return rr.FileSink(path)
+
+
+def _connection(url: str) -> rr.GrpcSink:
+    """A viewer elsewhere. Rerun would only complain when the recording ends: try the port first."""
+    parts = urlsplit(url)
+    scheme = parts.scheme in ("rerun", "rerun+http", "rerun+https")
+    try:
+        host, port = parts.hostname, parts.port
+    except ValueError:
+        host, port = None, None
+    if not scheme or not host or parts.path != "/proxy":
+        raise UserError(f"--connect {url}: expected a URL such as rerun+http://192.168.0.2:9876/proxy")
+    port = port or (80 if parts.scheme == "rerun+http" else 443)
+    try:
+        socket.create_connection((host, port), timeout=5).close()
+    except OSError as error:
+        why = error.strerror or str(error)
+        raise UserError(f"--connect {url}: no viewer answers there ({why}); start one with 'rerun'") from None
+    return rr.GrpcSink(url)
+
+
+def _viewer() -> rr.GrpcSink:
+    """The viewer on this machine, of the very version that came with the SDK."""
+    binary = Path(rerun_cli.__file__).parent / "rerun"
+    port = _free(9876)
+    try:
+        rr.spawn(
+            port=port,
+            connect=False,
+            memory_limit="50%",
+            server_memory_limit=MEMORY,
+            hide_welcome_screen=True,
+            executable_path=str(binary) if binary.exists() else None,
+        )
+    except RuntimeError as error:
+        raise UserError(
+            f"cannot start the viewer: {_first_line(error)}; --save or --serve need none"
+        ) from None
+    return rr.GrpcSink(f"rerun+http://127.0.0.1:{port}/proxy")
+
+
+def _server(port: int) -> tuple[rr.GrpcServerSink, str]:
+    """The web viewer at ``port`` and beside it the server that it takes the data from."""
+    if not _is_free(port):
+        raise UserError(f"--serve {port}: the port is in use; another one: --serve {_free(port + 1)}")
+    data_port = _free(9876, but=port)
+    server = rr.GrpcServerSink(
+        port=data_port, server_memory_limit=MEMORY, cors_allow_origin=[f"http://*:{port}"]
+    )
+    try:
+        rr.serve_web_viewer(web_port=port, open_browser=False)
+    except RuntimeError as error:
+        raise UserError(f"--serve {port}: {_first_line(error)}") from None
+    return (
+        server,
+        f"http://localhost:{port}/?url={quote(f'rerun+http://localhost:{data_port}/proxy', safe='')}",
+    )
+
+
+def _is_free(port: int) -> bool:
+    with socket.socket() as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind(("", port))
+        except OSError:
+            return False
+    return True
+
+
+def _free(port: int, but: int = 0) -> int:
+    """The port, or the next one that is free."""
+    return next(p for p in range(port, 65536) if p != but and _is_free(p))
+
+
+def _first_line(error: Exception) -> str:
+    return str(error).strip().splitlines()[0].rstrip(".")

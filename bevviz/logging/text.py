@@ -1,0 +1,63 @@
+"""The decisions of one frame as a page of Markdown."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+
+from bevviz.frame import Explanation, FrameResult
+
+_WEAK = {"not_kept", "below_threshold", "suppressed"}
+_MANY = {"out_of_view", "too_small", "too_large"}  # clusters that are only counted and numbered
+
+
+def markdown(result: FrameResult) -> str:
+    """What went wrong first, then each camera's detections, best decision first, then the clusters."""
+    return "\n".join(_lines(result))
+
+
+def _lines(result: FrameResult) -> Iterator[str]:
+    frame = result.frame
+    yield f"## Frame {frame.index}"
+    yield ""
+    yield from _section("Failures", (f"**{f.stage}**: {f.reason}" for f in result.failures))
+    problems = list(frame.problems)
+    problems += [e.text for e in result.explanations if e.subject == "camera"]
+    yield from _section("Problems", problems)
+    for camera in result.cameras:
+        name = camera.camera.name
+        mine = [e for e in result.explanations if e.subject == "detection" and e.camera == name]
+        kept = sorted((e for e in mine if e.state not in _WEAK), key=lambda e: e.state != "matched")
+        if camera.detections is not None:
+            yield from _section(f"{name}: detections", map(_item, kept) if kept else ["none"])
+        yield from _section(f"{name}: not kept", (e.text for e in mine if e.state in _WEAK))
+        yield from _clusters(
+            [e for e in result.explanations if e.subject == "cluster" and e.camera == name], name
+        )
+    yield from _clusters([e for e in result.explanations if e.subject == "cluster" and not e.camera], "")
+
+
+def _clusters(explanations: list[Explanation], camera: str) -> Iterator[str]:
+    if not explanations:
+        return
+    title = f"{camera}: clusters" if camera else "Clusters"
+    items = [
+        _item(e) for e in sorted(explanations, key=lambda e: e.state != "matched") if e.state not in _MANY
+    ]
+    for state in sorted(_MANY):
+        rows = [e.row for e in explanations if e.state == state]
+        if rows:
+            items.append(f"{len(rows)} {state.replace('_', ' ')}: {', '.join(map(str, rows))}")
+    yield from _section(title, items)
+
+
+def _item(explanation: Explanation) -> str:
+    return f"**{explanation.state.replace('_', ' ')}** {explanation.text}"
+
+
+def _section(title: str, items: Iterable[str]) -> Iterator[str]:
+    lines = [f"- {item}" for item in items]
+    if lines:
+        yield f"### {title}"
+        yield ""
+        yield from lines
+        yield ""
