@@ -190,7 +190,7 @@ def _follow(
     surface = np.zeros((len(radius), sectors))
     level = np.zeros(sectors)
     slope = np.zeros(sectors)
-    unseen = np.zeros(sectors)  # metres since the last offer
+    unseen = np.full(sectors, -NEAR)  # metres since the last offer; the first plane is good for NEAR
     offer = np.empty(sectors)
     for r in range(len(radius)):
         step = radius[r] - radius[r - 1] if r > 0 else radius[0]
@@ -198,12 +198,11 @@ def _follow(
         for s in range(sectors):
             level[s] += slope[s] * step
             # The longer the ground was hidden, the less is known of where it comes up again.
-            gate = max_step * (1 + unseen[s] / MEMORY)
+            gate = max_step * (1 + max(unseen[s], 0.0) / MEMORY)
             offer[s] = np.inf
             for k in range(start[r * sectors + s], start[r * sectors + s + 1]):
-                step_up = rise[order[k]] - level[s]
-                if abs(step_up) <= gate and step_up < offer[s]:
-                    offer[s] = step_up
+                if abs(rise[order[k]] - level[s]) <= gate:
+                    offer[s] = min(offer[s], rise[order[k]])
         # Offers of sectors within a metre to each side.
         reach = min(max(2, math.ceil(sectors / (2 * math.pi * radius[r]))), 8)
         around = np.empty(2 * reach + 1)
@@ -214,7 +213,7 @@ def _follow(
                     around[count] = offer[k % sectors]
                     count += 1
             if count > 0:
-                change = np.median(around[:count])
+                change = np.median(around[:count]) - level[s]
                 level[s] += change
                 slope[s] += (1 - keep) / step * change
                 slope[s] = min(max(slope[s], -steepest), steepest)
