@@ -1,0 +1,298 @@
+"""Frames from a recorded bag: read once from front to back, so that its length costs no memory."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import replace
+from datetime import UTC, datetime
+from functools import partial
+from pathlib import Path
+from types import TracebackType
+
+import numpy as np
+
+from bevviz.config import Config
+from bevviz.errors import UserError
+from bevviz.frame import Frame, Image
+from bevviz.sources import Scene
+from bevviz.sources.messages import (
+    MessageError,
+    decode_camera_info,
+    decode_cloud,
+    decode_compressed_image,
+    decode_detections_2d,
+    decode_detections_3d,
+    decode_image,
+    decode_odometry,
+    decode_transforms,
+)
+from bevviz.sources.recording import RawMessage, Recording
+from bevviz.sources.roles import CameraRole, find_roles
+from bevviz.sources.sync import Synchronizer
+
+SECOND = 1_000_000_000
+MARGIN = 2 * SECOND  # what else belongs to the first and the last cloud is looked for this far outside
+EPOCH = 1e8  # a larger number of seconds is a date
+
+Handler = Callable[[RawMessage], None]
+
+
+class BagSource:
+    """The frames of one recording, kept in one or several bags.
+
+    Args:
+        paths: bag files or folders.
+        config: roles and synchronisation.
+        start: first log time, see ``parse_time``.
+        end: log time to stop at.
+        every: only each N-th scan becomes a frame; the others are not decoded.
+        frames: only scans A to B - 1 of those between ``start`` and ``end``, as in a Python slice.
+
+    Raises:
+        UserError: no bag, nothing in it, no LiDAR, or nothing in the part asked for.
+    """
+
+    def __init__(
+        self,
+        paths: Sequence[Path],
+        config: Config,
+        *,
+        start: str | None = None,
+        end: str | None = None,
+        every: int = 1,
+        frames: tuple[int | None, int | None] | None = None,
+    ) -> None:
+        self.config = config
+        self.recording = Recording(paths)
+        try:
+            self.roles = find_roles(self.recording.topics, config.source)
+            self._driver = self._find_driver()
+            self._low = self._time(start, self.recording.start)
+            self._high = self._time(end, self.recording.end + 1)
+            self._chosen = self._choose(every, frames or (None, None))
+        except BaseException:
+            self.close()
+            raise
+        self._damaged: Counter[str] = Counter()
+        self._first_damage: dict[str, str] = {}
+        self._sync: Synchronizer | None = None
+
+    def __enter__(self) -> BagSource:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        self.recording.close()
+
+    @property
+    def scene(self) -> Scene:
+        names = self.roles.lidar_names
+        return Scene(
+            name=self.recording.name,
+            lidar=names[0] if len(names) == 1 else "lidars",
+            lidars=names,
+            cameras=tuple(camera.name for camera in self.roles.cameras),
+            robot=bool(self.roles.robot_detections_2d or self.roles.robot_detections_3d),
+            truth=bool(self.roles.truth),
+        )
+
+    @property
+    def total(self) -> int:
+        return len(self._chosen)
+
+    @property
+    def warnings(self) -> Sequence[str]:
+        damaged = [
+            f"{count} message(s) of {topic} could not be used, the first: {self._first_damage[topic]}"
+            for topic, count in self._damaged.items()
+        ]
+        return [*self.recording.warnings, *damaged, *(self._sync.report.warnings() if self._sync else ())]
+
+    def __iter__(self) -> Iterator[Frame]:
+        sync = self._sync = Synchronizer(self.roles, self.config)
+        self._damaged.clear()
+        handlers = self._handlers(sync)
+        self._hold_throughout(sync, handlers)
+        numbers: dict[int, int] = {}  # stamp -> number of the scan, for those not yet delivered
+        number = -1
+        stop = self._high + MARGIN
+        for message in self.recording.messages(handlers.keys(), self._low - MARGIN, stop):
+            if message.received > stop:
+                break
+            if message.topic == self._driver:
+                if not self._low <= message.received < self._high:
+                    continue
+                number += 1
+                if number not in self._chosen:
+                    continue
+                if number == self._chosen[-1]:
+                    stop = message.received + MARGIN
+                with suppress(MessageError):  # told when the scan is decoded
+                    numbers[message.header()[0] or message.received] = number
+            elif message.topic in self.roles.lidars and not (
+                number in self._chosen or number + 1 in self._chosen
+            ):
+                continue
+            self._handle(handlers[message.topic], message)
+            yield from self._numbered(sync.ready(message.received), numbers)
+        yield from self._numbered(sync.flush(), numbers)
+
+    def _numbered(self, frames: Iterator[Frame], numbers: dict[int, int]) -> Iterator[Frame]:
+        """The frames, each with the number of its scan in the part of the recording that is read."""
+        for frame in frames:
+            yield replace(frame, index=numbers.pop(frame.stamp, frame.index))
+            for stamp in [s for s in numbers if s < frame.stamp - 10 * MARGIN]:
+                del numbers[stamp]  # of scans that were dropped
+
+    def _handle(self, handler: Handler, message: RawMessage) -> None:
+        try:
+            handler(message)
+        except MessageError as error:
+            self._damaged[message.topic] += 1
+            self._first_damage.setdefault(message.topic, str(error))
+
+    def _handlers(self, sync: Synchronizer) -> dict[str, Handler]:
+        """What to do with a message, by topic."""
+        roles, decode = self.roles, self.recording.decode
+
+        def add_transforms(message: RawMessage, static: bool) -> None:
+            for transform in decode_transforms(decode(message), message.topic):
+                sync.add_transform(transform, static=static)
+
+        def add_image(message: RawMessage, camera: CameraRole) -> None:
+            stamp, frame_id = message.header()
+            load = partial(self._load_image, message, camera.compressed)
+            sync.add_image(message.topic, stamp, frame_id, message.received, load)
+
+        def add_info(message: RawMessage, rectified: bool) -> None:
+            info = decode_camera_info(decode(message), rectified, message.topic)
+            sync.add_camera_info(message.topic, info)
+
+        handlers: dict[str, Handler] = {}
+        for topic in roles.lidars:
+            handlers[topic] = lambda m: sync.add_cloud(decode_cloud(decode(m), m.topic, m.received))
+        for camera in roles.cameras:
+            handlers[camera.topic] = partial(add_image, camera=camera)
+            if camera.info_topic:
+                handlers[camera.info_topic] = partial(add_info, rectified=camera.rectified)
+        for topic in roles.tf:
+            handlers[topic] = partial(add_transforms, static=False)
+        for topic in roles.tf_static:
+            handlers[topic] = partial(add_transforms, static=True)
+        if roles.odometry:
+            handlers[roles.odometry] = lambda m: sync.add_transform(
+                decode_odometry(decode(m), m.topic), fallback=True
+            )
+        for topic in roles.robot_detections_2d:
+            handlers[topic] = lambda m: sync.add_detections(
+                decode_detections_2d(decode(m), m.topic, m.received)
+            )
+        for topic in roles.robot_detections_3d:
+            handlers[topic] = lambda m: sync.add_boxes(decode_detections_3d(decode(m), m.topic, m.received))
+        if roles.truth:
+            handlers[roles.truth] = lambda m: sync.add_truth(
+                decode_detections_3d(decode(m), m.topic, m.received)
+            )
+        return handlers
+
+    def _load_image(self, message: RawMessage, compressed: bool) -> Image:
+        decode = decode_compressed_image if compressed else decode_image
+        return decode(self.recording.decode(message), message.topic, message.received)
+
+    def _hold_throughout(self, sync: Synchronizer, handlers: Mapping[str, Handler]) -> None:
+        """Give what is published once to all frames, wherever in the bag it is.
+
+        Of each static transform the last one before the start, else the first one after it.
+        """
+        static = {}
+        for message in self.recording.messages(self.roles.tf_static):
+            try:
+                for transform in decode_transforms(self.recording.decode(message), message.topic):
+                    if message.received <= self._low or transform.child not in static:
+                        static[transform.child] = transform
+            except MessageError:
+                continue  # counted when its turn comes
+        for transform in static.values():
+            sync.add_transform(transform, static=True)
+        for topic in {camera.info_topic for camera in self.roles.cameras} - {""}:
+            if (info := self.recording.first(topic)) is not None:
+                self._handle(handlers[topic], info)
+
+    def _find_driver(self) -> str:
+        """The first LiDAR: its scans make the frames."""
+        topics = {topic.name: topic for topic in self.recording.topics}
+        if not self.roles.lidars:
+            there = ", ".join(f"{t.name} ({t.kind})" for t in topics.values())
+            raise UserError(
+                f"{self.recording.name}: no LiDAR (no sensor_msgs/PointCloud2 topic) among {there}; "
+                "set by hand with --set source.lidar_topics=[/topic]"
+            )
+        driver = self.roles.lidars[0]
+        if not topics[driver].count:
+            raise UserError(
+                f"{self.recording.name}: the LiDAR's topic {driver} has no messages; "
+                "choose another one with --set source.lidar_topics=[/topic]"
+            )
+        return driver
+
+    def _time(self, text: str | None, default: int) -> int:
+        if text is None:
+            return default
+        start, end = self.recording.start, self.recording.end
+        time = parse_time(text, start)
+        if not start - SECOND <= time <= end + SECOND:
+            raise UserError(
+                f"{text} is outside the recording, which has {(end - start) / SECOND:.1f} s from {iso(start)}"
+            )
+        return time
+
+    def _choose(self, every: int, frames: tuple[int | None, int | None]) -> range:
+        times = self.recording.times(self._driver)
+        first, last = np.searchsorted(times, [self._low, self._high])
+        there = range(int(last - first))
+        chosen = there[slice(*frames)][:: max(every, 1)]
+        if not chosen:
+            raise UserError(
+                f"{self.recording.name}: {self._driver} has {len(there)} scans in the time asked for, "
+                "and none of them is among --frames"
+                if there
+                else f"{self.recording.name}: {self._driver} has no scan in the time asked for"
+            )
+        return chosen
+
+
+def parse_time(text: str, origin: int) -> int:
+    """Nanoseconds since 1970 of ``12.5`` (seconds after ``origin``), ``1700000000.0`` or an ISO 8601 date.
+
+    A date without a zone is in UTC.
+
+    Raises:
+        UserError: none of the three.
+    """
+    try:
+        seconds = float(text)
+    except ValueError:
+        try:
+            date = datetime.fromisoformat(text)
+        except ValueError:
+            raise UserError(
+                f"'{text}' is no time: expected seconds from the start (12.5), seconds since 1970 "
+                "(1700000000.0) or ISO 8601 (2026-11-21T10:00:00)"
+            ) from None
+        date = date if date.tzinfo else date.replace(tzinfo=UTC)
+        return round(date.timestamp() * 1e6) * 1000
+    if not np.isfinite(seconds) or seconds < 0:
+        raise UserError(f"'{text}' is no time: expected seconds, zero or more")
+    return round(seconds * SECOND) + (origin if seconds < EPOCH else 0)
+
+
+def iso(nanoseconds: int) -> str:
+    """A time in UTC to the millisecond: ``2026-11-21T10:00:00.500Z``."""
+    date = datetime.fromtimestamp(nanoseconds // SECOND, UTC)
+    return f"{date:%Y-%m-%dT%H:%M:%S}.{nanoseconds % SECOND // 1_000_000:03d}Z"

@@ -1,0 +1,395 @@
+"""One recording on disk, whatever its files: MCAP, sqlite3 or ROS 1, compressed, split or cut."""
+
+from __future__ import annotations
+
+import heapq
+import struct
+from collections import Counter
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from operator import itemgetter
+from pathlib import Path, PurePath
+from tempfile import TemporaryDirectory
+from types import TracebackType
+from typing import Any
+
+import numpy as np
+from backports import zstd
+from rosbags.interfaces import Connection, ConnectionExtRosbag1, MessageDefinitionFormat
+from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
+from rosbags.typesys.msg import normalize_msgtype
+from rosbags.typesys.store import Typestore
+
+from bevviz.errors import UserError
+from bevviz.frame import I64
+from bevviz.sources import mcap, ros1, sqlite, vision_msgs
+from bevviz.sources.mcap import McapFile, megabytes
+from bevviz.sources.messages import MessageError
+from bevviz.sources.roles import Topic
+from bevviz.sources.ros1 import Ros1File
+from bevviz.sources.sqlite import SqliteFile
+
+BagFile = McapFile | SqliteFile | Ros1File
+
+KINDS: Mapping[bytes, type[BagFile]] = {
+    mcap.MAGIC: McapFile,
+    sqlite.MAGIC: SqliteFile,
+    ros1.MAGIC: Ros1File,
+}
+ZSTD = b"\x28\xb5\x2f\xfd"
+OTHERS = {
+    b"RRF": "a Rerun recording: open it with 'rerun'",
+    b"PK\x03\x04": "a zip archive: unpack it first",
+    b"\x1f\x8b": "a gzip archive: unpack it first",
+    b"BZh": "a bzip2 archive: unpack it first",
+    b"\xfd7zXZ": "an xz archive: unpack it first",
+    b"\xd4\xc3\xb2\xa1": "a packet capture, not a bag: record the driver's topics instead",
+    b"#ROSBAG V1": "a bag of ROS before 1.2: 'rosbag fix' converts it",
+}
+METADATA = "metadata.yaml"
+
+
+@dataclass(frozen=True, slots=True)
+class RawMessage:
+    topic: str
+    received: int  # log time, nanoseconds
+    data: bytes | memoryview
+    connection: Connection
+
+    def content(self) -> bytes | memoryview:
+        """The serialised message; a compressed one is unpacked."""
+        return zstd.decompress(self.data) if self.data[:4] == ZSTD else self.data
+
+    def header(self) -> tuple[int, str]:
+        """Stamp in nanoseconds and frame_id of a message that begins with a Header; the rest is not decoded.
+
+        Raises:
+            MessageError: there is no header.
+        """
+        try:
+            data = self.content()
+            order = "<" if _is_ros1(self.connection) or data[1] & 1 else ">"
+            sec, nanosec, size = struct.unpack_from(f"{order}iII", data, 4)  # behind seq, or the encoding
+            (name,) = struct.unpack_from(f"{size}s", data, 16)
+            return sec * 10**9 + nanosec, name.rstrip(b"\0").decode().removeprefix("/")
+        except (struct.error, IndexError, UnicodeDecodeError, zstd.ZstdError):
+            raise MessageError(f"{self.topic}: a message of {len(self.data)} bytes has no header") from None
+
+
+class Recording:
+    """The messages of one or several bags as a single stream in order of log time.
+
+    Args:
+        paths: bag files and folders, in any order.
+
+    Raises:
+        UserError: a path that does not exist, cannot be read, is empty or is no bag.
+    """
+
+    def __init__(self, paths: Sequence[Path]) -> None:
+        if not paths:
+            raise UserError("no bag given")
+        self.paths = tuple(paths)
+        self.files: list[BagFile] = []
+        self._notes: list[str] = []
+        self._stores: dict[tuple[object, ...], Typestore] = {}
+        self._default = Stores.ROS2_JAZZY
+        self._folder = TemporaryDirectory(prefix="bevviz-", ignore_cleanup_errors=True)
+        try:
+            for path in paths:
+                self._open(path)
+            if not self.message_count:
+                raise UserError("; ".join([f"{self.name}: there are no messages in it", *self.warnings]))
+        except BaseException:
+            self.close()
+            raise
+
+    def __enter__(self) -> Recording:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        while self.files:
+            self.files.pop().close()
+        self._folder.cleanup()
+
+    @property
+    def name(self) -> str:
+        return self.paths[0].resolve().name
+
+    @cached_property
+    def size(self) -> int:
+        """Bytes on disk."""
+        files = [f for p in self.paths for f in (_bag_files(p) if p.is_dir() else [p])]
+        return sum(f.stat().st_size for f in files)
+
+    @cached_property
+    def start(self) -> int:
+        """Log time of the first message, in nanoseconds."""
+        return min(_span(f)[0] for f in self.files if _span(f)[1])
+
+    @cached_property
+    def end(self) -> int:
+        """Log time of the last message, in nanoseconds."""
+        return max(_span(f)[1] for f in self.files) - 1
+
+    @property
+    def message_count(self) -> int:
+        return sum(c.msgcount for f in self.files for c in f.connections)
+
+    @property
+    def warnings(self) -> list[str]:
+        """What is missing or damaged, as far as it was met."""
+        return [*self._notes, *(text for file in self.files for text in file.warnings)]
+
+    @cached_property
+    def topics(self) -> tuple[Topic, ...]:
+        """Every topic by name, with the frame_id of its first message."""
+        counts: Counter[str] = Counter()
+        first: dict[str, Connection] = {}
+        for connection in (c for f in self.files for c in f.connections):
+            known = first.setdefault(connection.topic, connection)
+            counts[connection.topic] += connection.msgcount
+            if known.msgtype != connection.msgtype:
+                self._notes.append(
+                    f"{connection.topic} is recorded both as {known.msgtype} and as {connection.msgtype}: "
+                    "only the former is used"
+                )
+        duration = (self.end - self.start) / 1e9
+        return tuple(
+            Topic(
+                name,
+                normalize_msgtype(first[name].msgtype),
+                counts[name],
+                self._frame_id(name) if counts[name] and self._has_header(first[name]) else "",
+                (counts[name] - 1) / duration if counts[name] > 1 and duration else None,
+            )
+            for name in sorted(first)
+        )
+
+    def messages(
+        self, topics: Collection[str], start: int | None = None, stop: int | None = None
+    ) -> Iterator[RawMessage]:
+        """Messages of ``topics`` with start <= log time < stop (nanoseconds), in order of log time."""
+        sources = [_lazily(f, topics, start, stop) for f in self.files]
+        for _, message in heapq.merge(*sources, key=itemgetter(0)):
+            if message is not None:
+                yield message
+
+    def first(self, topic: str) -> RawMessage | None:
+        return next(self.messages([topic]), None)
+
+    def times(self, topic: str) -> I64:
+        """Log times of all messages of a topic in nanoseconds, sorted, without reading them."""
+        parts = [f.times([c for c in f.connections if c.topic == topic]) for f in self.files]
+        return np.sort(np.concatenate(parts))
+
+    def decode(self, message: RawMessage) -> Any:
+        """The message as an object with the fields of its definition.
+
+        Raises:
+            MessageError: the data does not fit the definition, or there is none.
+        """
+        connection = message.connection
+        msgtype = normalize_msgtype(connection.msgtype)
+        try:
+            data = message.content()
+            store = self._store(connection)
+            if _is_ros1(connection):
+                return store.deserialize_ros1(data, msgtype)
+            return store.deserialize_cdr(data, msgtype)
+        except KeyError:
+            raise MessageError(
+                f"{message.topic}: the bag does not say what a {msgtype} is made of, and neither does bevviz"
+            ) from None
+        except Exception as error:  # generated decoders raise whatever the bytes lead them to
+            reason = str(error) or type(error).__name__
+            raise MessageError(f"{message.topic}: not a {msgtype}: {reason}") from None
+
+    def _store(self, connection: Connection) -> Typestore:
+        """The types that the bag itself defines, else those of the ROS release."""
+        ros1, definition = _is_ros1(connection), connection.msgdef
+        key = (ros1, connection.msgtype, definition)
+        if key not in self._stores:
+            store = None
+            if definition.format != MessageDefinitionFormat.NONE:
+                try:
+                    store = _defined(connection)
+                except Exception as error:  # a definition that rosbags cannot parse
+                    self._notes.append(
+                        f"{connection.topic}: the bag's own definition of {connection.msgtype} is not usable "
+                        f"({error}); that of {self._default.value} is taken"
+                    )
+            if store is None:
+                store = get_typestore(Stores.ROS1_NOETIC if ros1 else self._default)
+                vision_msgs.register(store)
+            self._stores[key] = store
+        return self._stores[key]
+
+    def _has_header(self, connection: Connection) -> bool:
+        try:
+            _, fields = self._store(connection).fielddefs[normalize_msgtype(connection.msgtype)]
+        except KeyError:
+            return False
+        return bool(fields) and fields[0][1][1] == "std_msgs/msg/Header"
+
+    def _frame_id(self, topic: str) -> str:
+        message = self.first(topic)
+        try:
+            return message.header()[1] if message else ""
+        except MessageError:
+            return ""
+
+    def _open(self, path: Path) -> None:
+        try:
+            if path.name == METADATA:
+                path = path.parent
+            if path.is_dir():
+                self._open_folder(path)
+            else:
+                self.files.append(self._open_file(path))
+        except FileNotFoundError:
+            raise UserError(f"{path}: no such file or folder") from None
+        except PermissionError:
+            raise UserError(f"{path}: permission denied: you may not read it") from None
+        except OSError as error:
+            raise UserError(f"{path}: cannot be read: {error.strerror or error}") from None
+
+    def _open_folder(self, folder: Path) -> None:
+        files = _bag_files(folder)
+        if not files:
+            within = sorted(d.name for d in folder.iterdir() if d.is_dir() and _bag_files(d))
+            hint = f"; there are bags in its folders: {', '.join(within[:5])}" if within else ""
+            raise UserError(f"{folder}: a folder without a bag (no .mcap, .db3 or .bag file){hint}")
+        metadata = self._read_metadata(folder)
+        failed: list[UserError] = []
+        before = self.message_count
+        for file in files:
+            try:
+                self.files.append(self._open_file(file))
+            except UserError as error:
+                failed.append(error)
+        if len(failed) == len(files):
+            raise failed[0]
+        self._notes += map(str, failed)
+        try:
+            expected = int(metadata.get("message_count", 0))
+            listed = {PurePath(p).name for p in metadata.get("relative_file_paths", ())}
+        except (TypeError, ValueError):
+            expected, listed = 0, set()
+        if missing := sorted(listed - {f.name for f in files}):
+            self._notes.append(f"{folder}: {', '.join(missing)} of {METADATA} is missing: read without")
+        found = self.message_count - before
+        if found < expected:
+            self._notes.append(
+                f"{folder}: {METADATA} counts {expected} messages, {found} were found: "
+                f"{expected - found} are lost"
+            )
+
+    def _read_metadata(self, folder: Path) -> Mapping[str, Any]:
+        from ruamel.yaml import YAML
+        from ruamel.yaml.error import YAMLError
+
+        path = folder / METADATA
+        if not path.exists():
+            if not any(f.suffix == ".bag" for f in _bag_files(folder)):
+                self._notes.append(
+                    f"{folder}: {METADATA} is missing: read without ('ros2 bag reindex' makes one)"
+                )
+            return {}
+        try:
+            content = YAML(typ="safe", pure=True).load(path.read_text())["rosbag2_bagfile_information"]
+            distro = content.get("ros_distro")
+            if f"ros2_{distro}" in {s.value for s in Stores}:
+                self._default = Stores(f"ros2_{distro}")
+            return dict(content)
+        except (YAMLError, KeyError, TypeError, AttributeError, ValueError):
+            self._notes.append(f"{path}: not readable as {METADATA}: read without")
+            return {}
+
+    def _open_file(self, path: Path) -> BagFile:
+        with path.open("rb") as file:
+            head = file.read(16)
+        if head.startswith(ZSTD):
+            path = self._unpack(path)
+            with path.open("rb") as file:
+                head = file.read(16)
+        if not head:
+            raise UserError(f"{path}: the file is empty")
+        kind = next((kind for magic, kind in KINDS.items() if head.startswith(magic)), None)
+        if kind is None:
+            what = next((text for magic, text in OTHERS.items() if head.startswith(magic)), None)
+            raise UserError(
+                f"{path}: {what or 'not a bag: neither MCAP, nor sqlite3, nor ROS 1 by its first bytes'}"
+            )
+        opened = kind(path)
+        opened.open()
+        return opened
+
+    def _unpack(self, path: Path) -> Path:
+        target = Path(self._folder.name) / f"{len(self.files)}" / path.stem
+        target.parent.mkdir(exist_ok=True)
+        try:
+            with path.open("rb") as raw, zstd.open(raw, "rb") as source, target.open("wb") as out:
+                while block := source.read(1 << 20):
+                    out.write(block)
+        except (EOFError, zstd.ZstdError) as error:
+            self._notes.append(
+                f"{path.name}: the compressed file is damaged or its end is missing: "
+                f"{megabytes(target.stat().st_size)} could be unpacked ({error})"
+            )
+        return target
+
+
+def _bag_files(folder: Path) -> list[Path]:
+    """Bag files of a folder by suffix, compressed ones too."""
+    suffixes = {".mcap", ".db3", ".bag", ".active"}
+    names = [f.with_suffix("") if f.suffix in (".zstd", ".zst") else f for f in folder.iterdir()]
+    return sorted(
+        f for f, n in zip(folder.iterdir(), names, strict=True) if n.suffix in suffixes and f.is_file()
+    )
+
+
+def _is_ros1(connection: Connection) -> bool:
+    extra = connection.ext
+    return isinstance(extra, ConnectionExtRosbag1) or extra.serialization_format == "ros1"
+
+
+def _span(file: BagFile) -> tuple[int, int]:
+    """Log time of the first message, and just after that of the last one; 0 where there is none."""
+    about = file if isinstance(file, Ros1File) else file.metadata
+    return about.start_time, about.end_time
+
+
+def _lazily(
+    file: BagFile, topics: Collection[str], start: int | None, stop: int | None
+) -> Iterator[tuple[int, RawMessage | None]]:
+    """The messages of one file behind an empty item, so that a merge reads a file only at its time."""
+    types: dict[str, str] = {}
+    connections = [
+        c for c in file.connections if c.topic in topics and types.setdefault(c.topic, c.msgtype) == c.msgtype
+    ]
+    if not connections:
+        return
+    yield _span(file)[0], None
+    for connection, time, data in file.messages(connections, start, stop):
+        yield time, RawMessage(connection.topic, time, data, connection)
+
+
+def _defined(connection: Connection) -> Typestore:
+    """A store of the types that a connection's own definition lists."""
+    text, msgtype = connection.msgdef.data, normalize_msgtype(connection.msgtype)
+    if connection.msgdef.format == MessageDefinitionFormat.MSG:
+        types = get_types_from_msg(text, msgtype)
+    else:
+        types = {}
+        for part in text.split("=" * 80 + "\n"):
+            types.update(get_types_from_idl(part.partition("\n")[2] if part.startswith("IDL: ") else part))
+    store = get_typestore(Stores.EMPTY)
+    store.register(types)
+    return store
