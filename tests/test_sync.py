@@ -204,6 +204,21 @@ def test_waits_no_longer_than_max_wait_and_tells_what_was_missing() -> None:
     assert feed.sync.report.warnings()[0] == "1 of 1 frames have no image of camera 'zed'"
 
 
+def test_transforms_that_end_too_early() -> None:
+    feed = Feed()
+    feed.calibration()
+    feed.info()
+    feed.odometry(turning, 0.0, 1.0)
+    feed.sync.add_cloud(cloud(3.0))
+    feed.image(3.05)
+    (frame,) = feed.sync.flush()
+    (camera,) = frame.cameras
+    assert frame.world_frame == "odom" and frame.world_from_points is None
+    assert "'odom' -> 'base_link' ends 2.00 s before the asked stamp" in frame.problems[0]
+    assert camera.camera_from_points is not None and not camera.motion_compensated  # the mounting is known
+    assert camera.problems == ("no motion compensation: 'odom' is out of reach",)
+
+
 def test_undecodable_image_is_a_problem_of_its_camera() -> None:
     feed = Feed()
     feed.calibration()
@@ -367,6 +382,14 @@ def test_stamp_zero_is_replaced_by_the_time_of_receipt() -> None:
     )
 
 
+def test_every_tenth_scan_is_no_gap_but_a_missing_one_is() -> None:
+    feed = Feed(replace(ONE, cameras=()))
+    feed.clouds(*np.arange(0, 20, 2.0))
+    assert feed.sync.report.gaps == 0
+    feed.clouds(30.0)
+    assert feed.sync.report.gaps == 1
+
+
 def test_full_queue_sends_the_oldest_on() -> None:
     feed = Feed(ONE, "sync.queue=3", "sync.max_wait=60")
     frames = feed.clouds(*np.arange(0, 1, 0.1))
@@ -420,6 +443,18 @@ def test_two_lidars_are_merged_in_the_base_frame() -> None:
     rows = [geometry.apply(p, c.xyz) for c, p in zip(frame.clouds, frame.points_from_clouds, strict=True)]
     np.testing.assert_array_equal(np.concatenate(rows), frame.points)
     assert frame.problems == ()
+
+
+def test_base_frame_is_awaited() -> None:
+    feed = Feed(Roles(lidars=("/front", "/back"), lidar_names=("front", "back")))
+    for topic in ("/front", "/back"):
+        feed.sync.add_cloud(cloud(0.0, topic, topic[1:]))
+    assert list(feed.sync.ready()) == []
+    for child in ("front", "back"):
+        feed.sync.add_transform(edge("base_link", child, pose(1.0)), static=True)
+    (frame,) = feed.sync.ready()
+    assert frame.points_frame == "base_link" and frame.problems == ()
+    np.testing.assert_array_equal(frame.points, [[11, 1, 0], [11, 1, 0]])
 
 
 def test_lidars_that_do_not_fit_together_are_told() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from bisect import bisect_left
 from collections import Counter, deque
@@ -41,7 +42,7 @@ class SyncReport:
     duplicates: int = 0  # clouds dropped: same stamp as another
     unwaited: int = 0  # clouds sent on early, the queue being full
     resets: int = 0  # stamps of the clouds that jumped back
-    gaps: int = 0  # stamps of the clouds that jumped forward
+    gaps: int = 0  # stamps of the clouds that jumped forward, by a second and three usual steps or more
     longest_gap: float = 0.0  # seconds
     idle: str = ""  # topic of the LiDAR that should drive, while only others deliver
     unstamped: Counter[str] = field(default_factory=Counter)  # topic -> messages with stamp zero
@@ -181,6 +182,7 @@ class Synchronizer:
         self._done: deque[Frame] = deque()
         self._index = 0
         self._last: int | None = None  # stamp of the last frame
+        self._step = math.inf  # nanoseconds between the last two clouds; a gap is much longer
         self._partners: dict[str, _Track[Cloud]] = self._make_tracks(*roles.lidars[1:])
         self._images: dict[str, _Track[_Undecoded]] = self._make_tracks(*(c.topic for c in roles.cameras))
         self._camera_frames: dict[str, str] = {}  # image topic -> optical frame
@@ -206,19 +208,15 @@ class Synchronizer:
         if cloud.topic in self._partners:
             self._partners[cloud.topic].add(cloud.stamp, cloud)
             return
-        newest = self._clouds[-1].stamp if self._clouds else self._last
-        if newest is not None and cloud.stamp < newest - JUMP:
-            self._reset(cloud.stamp)
-        elif newest is not None and cloud.stamp > newest + JUMP:
-            self.report.gaps += 1
-            self.report.longest_gap = max(self.report.longest_gap, (cloud.stamp - newest) * 1e-9)
-        place = bisect_left(self._clouds, cloud.stamp, key=lambda c: c.stamp)
-        if cloud.stamp == self._last or [cloud.stamp] == [c.stamp for c in self._clouds[place : place + 1]]:
+        self._watch_clock(cloud.stamp)
+        stamps = [waiting.stamp for waiting in self._clouds]
+        place = bisect_left(stamps, cloud.stamp)
+        if cloud.stamp == self._last or cloud.stamp in stamps:
             self.report.duplicates += 1
         elif self._last is not None and cloud.stamp < self._last:
             self.report.late += 1
         else:
-            self.report.reordered += place < len(self._clouds)
+            self.report.reordered += place < len(stamps)
             self._clouds.insert(place, cloud)
 
     def add_image(
@@ -270,6 +268,19 @@ class Synchronizer:
             self.report.unstamped[topic] += 1
             return received
         return stamp
+
+    def _watch_clock(self, stamp: int) -> None:
+        newest = self._clouds[-1].stamp if self._clouds else self._last
+        if newest is None:
+            return
+        step = stamp - newest
+        if step < -JUMP:
+            self._reset(stamp)
+        elif step > max(JUMP, 3 * self._step):
+            self.report.gaps += 1
+            self.report.longest_gap = max(self.report.longest_gap, step * 1e-9)
+        if step > 0:
+            self._step = step
 
     def _reset(self, stamp: int) -> None:
         """The clock went back to ``stamp``: a bag played in a loop, or a simulation restarted."""
@@ -337,25 +348,25 @@ class Synchronizer:
         return nearest is not None and 0 < nearest[0] - stamp <= self._tolerance
 
     def _transforms_reach(self, cloud: Cloud) -> bool:
-        """Whether the transforms have samples up to the cloud and to each camera's image."""
+        """Whether the transforms have samples up to the cloud and to all that it is joined with."""
         place = self._place(cloud)
         moving = self._roles.tf or self._roles.odometry
         if moving and not place.world_frame:
             return False
         asked = [(cloud.stamp, cloud.frame_id)]
-        for role in self._roles.cameras:
-            nearest = self._images[role.topic].nearest(cloud.stamp)
+        joined: list[_Track[Any]] = [*self._images.values(), *self._partners.values()]
+        for track in joined:
+            nearest = track.nearest(cloud.stamp)
             if nearest is not None and abs(nearest[0] - cloud.stamp) <= self._tolerance:
                 asked.append((max(nearest[0], cloud.stamp), nearest[1].frame_id))
+        anchors = {place.points_frame, place.world_frame or place.points_frame}
+        if self._partners:
+            anchors.add(self._config.source.base_frame)
         try:
-            for stamp, frame in asked:
-                for other in {place.points_frame, place.world_frame or place.points_frame}:
-                    newest = self.tf.latest(other, frame)
-                    if newest is not None and newest < stamp:
-                        return False
+            ends = [(self.tf.latest(anchor, frame), stamp) for stamp, frame in asked for anchor in anchors]
         except TransformError:
             return False
-        return True
+        return all(end is None or end >= stamp for end, stamp in ends)
 
     # --- one frame -----------------------------------------------------------------------------
 
@@ -462,7 +473,7 @@ class Synchronizer:
     def _moved(self, place: _Place, stamp: int, frame: str) -> tuple[Lookup, bool]:
         """points at the cloud's stamp from ``frame`` at ``stamp``, and whether motion is compensated."""
         tolerance = self._config.sync.tf_tolerance
-        if self._config.sync.motion_compensation and place.inertial_frame:
+        if self._compensates(place):
             try:
                 return self.tf.lookup_moving(
                     place.points_frame, place.stamp, frame, stamp, place.inertial_frame, tolerance
@@ -471,31 +482,33 @@ class Synchronizer:
                 pass  # without motion is the next best
         return self.tf.lookup(place.points_frame, frame, place.stamp, tolerance), False
 
+    def _compensates(self, place: _Place) -> bool:
+        return self._config.sync.motion_compensation and bool(place.inertial_frame)
+
     def _camera(self, role: CameraRole, place: _Place) -> Camera:
         problems: list[str] = []
         image, stamp = self._image(role, place.stamp, problems)
-        frame = self._camera_frames.get(role.topic, "")
-        found, compensated = None, False
-        if role.topic in self._camera_frames:
-            try:
-                found, compensated = self._moved(place, stamp, frame)
-            except TransformError as error:
-                self._complain(problems, f"{error}; state it with source.extrinsics")
-        camera_from_points = None if found is None else geometry.inverse(found.matrix)
-        world_from_camera = None
-        if found is not None:
-            world = np.eye(4) if place.world_from_points is None else place.world_from_points
-            world_from_camera = world @ found.matrix
-        if place.inertial_frame and self._config.sync.motion_compensation and found and not compensated:
+        intrinsics = self._camera_intrinsics(role, image, problems)
+        camera = Camera(role.name, image, intrinsics, None, None, problems=tuple(problems))
+        if image is not None:
+            camera = replace(camera, sync_error=(stamp - place.stamp) * 1e-9)
+        frame = self._camera_frames.get(role.topic)
+        if frame is None:
+            return camera
+        try:
+            found, compensated = self._moved(place, stamp, frame)
+        except TransformError as error:
+            lacking = not self.tf.knows(place.points_frame, frame)
+            self._complain(problems, f"{error}; source.extrinsics can state it" if lacking else str(error))
+            return replace(camera, problems=tuple(problems))
+        if image is not None and not compensated and self._compensates(place):
             self._complain(problems, f"no motion compensation: '{place.inertial_frame}' is out of reach")
-        return Camera(
-            name=role.name,
-            image=image,
-            intrinsics=self._camera_intrinsics(role, image, problems),
-            camera_from_points=camera_from_points,
-            world_from_camera=world_from_camera,
-            sync_error=(stamp - place.stamp) * 1e-9 if image is not None else float("nan"),
-            tf_age=float("nan") if found is None else found.age,
+        world = np.eye(4) if place.world_from_points is None else place.world_from_points
+        return replace(
+            camera,
+            camera_from_points=geometry.inverse(found.matrix),
+            world_from_camera=world @ found.matrix,
+            tf_age=found.age,
             motion_compensated=compensated,
             problems=tuple(problems),
         )
