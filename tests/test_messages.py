@@ -303,11 +303,11 @@ def random_pixels(*shape: int, dtype: str = "u1", high: int = 256) -> NDArray[An
 ORDERS = {"bgr8": (0, 1, 2), "rgb8": (2, 1, 0), "bgra8": (0, 1, 2), "rgba8": (2, 1, 0), "8UC3": (0, 1, 2)}
 
 
-@pytest.mark.parametrize("padding", [0, 5])
 @pytest.mark.parametrize("encoding", [*ORDERS, "8UC4", "mono8", "8UC1"])
-def test_8_bit_images(encoding: str, padding: int) -> None:
+@given(height=st.integers(1, 9), width=st.integers(1, 9), padding=st.integers(0, 5))
+def test_8_bit_images(encoding: str, height: int, width: int, padding: int) -> None:
     channels = 4 if "a8" in encoding or encoding == "8UC4" else 1 if encoding in ("mono8", "8UC1") else 3
-    pixels = random_pixels(6, 8, channels)
+    pixels = random_pixels(height, width, channels)
     image = messages.decode_image(image_message(pixels, encoding, padding), "/image", 3)
     order = (0, 0, 0) if channels == 1 else ORDERS.get(encoding, (0, 1, 2))
     np.testing.assert_array_equal(image.bgr, pixels[..., list(order)])

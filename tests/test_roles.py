@@ -93,6 +93,11 @@ def test_variants_of_an_image_count_once_while_no_frame_is_known() -> None:
     assert cameras(find_roles(live, DEFAULT)) == {"zed": "/zed2/zed/rgb/image_rect_color"}
 
 
+def test_cameras_side_by_side_in_a_namespace_are_two_cameras() -> None:
+    topics = [Topic("/cameras/front", IMAGE), Topic("/cameras/rear", IMAGE)]
+    assert list(cameras(find_roles(topics, DEFAULT))) == ["cameras_front", "cameras_rear"]
+
+
 def test_ros_1_spelling_of_types() -> None:
     ros1 = [Topic(t.name, t.type.replace("/msg/", "/"), t.count, t.frame_id) for t in TUTORIAL]
     assert find_roles(ros1, DEFAULT).cameras == find_roles(TUTORIAL, DEFAULT).cameras
@@ -151,16 +156,23 @@ def test_several_lidars_play_and_derived_clouds_do_not() -> None:
         Topic("/rear/velodyne_points", CLOUD, 9, "velodyne_rear"),
         Topic("/global_map", CLOUD, 9, "map"),
         Topic("/obstacle_points", CLOUD, 9, "base_link"),
+        Topic("/aligned_points", CLOUD, 9, "odom"),
     ]
     roles = find_roles(topics, DEFAULT)
     assert roles.lidars == ("/ouster/points", "/rear/velodyne_points")
     assert roles.lidar_names == ("os_sensor", "velodyne_rear")
-    assert roles.notes["/ouster/points_deskewed"] == "not used: the same sensor as /ouster/points, which is"
+    assert (
+        roles.notes["/ouster/points_deskewed"]
+        == "not used: the sensor of /ouster/points, by its frame or name"
+    )
 
 
 def test_a_derived_cloud_plays_where_there_is_no_other() -> None:
     derived, silent = Topic("/camera/depth/points", CLOUD, 9, "cam"), Topic("/lidar", CLOUD, 0)
     assert find_roles([derived, silent], DEFAULT).lidars == ("/camera/depth/points",)
+    result = Topic("/map", CLOUD, 9, "map")
+    assert find_roles([result, derived], DEFAULT).lidars == ("/camera/depth/points",)
+    assert find_roles([result], DEFAULT).lidars == ("/map",)
     assert find_roles([silent], DEFAULT).lidars == ("/lidar",)
     assert find_roles([], DEFAULT) == Roles()
 

@@ -204,7 +204,7 @@ def decode_image(msg: Any, topic: str, received: int) -> Image:
         (rows, width, encoding.channels), scalar, data, strides=(step, pixel_bytes, scalar.itemsize)
     )
     if scalar.itemsize == 2:
-        pixels = to_8_bits(pixels.astype(np.uint16))
+        pixels = to_8_bits(np.asarray(pixels, np.uint16))
     try:
         bgr = pixels if encoding.to_bgr is None else cv2.cvtColor(pixels, encoding.to_bgr)
     except cv2.error as error:
@@ -254,7 +254,7 @@ def decode_compressed_image(msg: Any, topic: str, received: int) -> Image:
             f"{topic}: compressed image of format '{msg.format}' holds neither JPEG nor PNG data "
             f"({len(encoded)} bytes)"
         )
-    cut = media_type == "image/jpeg" and b"\xff\xd9" not in encoded  # decoders fill the rest with grey
+    cut = media_type == "image/jpeg" and encoded.rfind(b"\xff\xd9") < 0  # decoders fill the rest with grey
     # Orientation: the calibration belongs to the pixels as they are stored, not as EXIF would turn them.
     flags = cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
     try:
@@ -278,9 +278,8 @@ def decode_compressed_image(msg: Any, topic: str, received: int) -> Image:
 # --- camera models -----------------------------------------------------------------------------
 
 _DISTORTION = {
-    "": "",
-    "none": "",
     "plumb_bob": "plumb_bob",
+    "": "plumb_bob",  # coefficients without a name
     "rational_polynomial": "rational_polynomial",
     "equidistant": "equidistant",
     "fisheye": "equidistant",
@@ -324,11 +323,11 @@ def _distortion(name: str, D: F64, topic: str) -> str:
     if model is None:
         raise MessageError(
             f"{topic}: distortion model '{name}' is not supported; supported are "
-            f"{', '.join(sorted(set(_DISTORTION.values()) - {''}))}"
+            f"{', '.join(sorted(set(_DISTORTION.values())))}"
         )
     if not np.isfinite(D).all() or np.any(D[8:]) or (model == "equidistant" and len(D) < 4):
         raise MessageError(f"{topic}: {list(D)} are no coefficients of the distortion model '{name}'")
-    return model or "plumb_bob"  # coefficients without a name
+    return model
 
 
 def _either(msg: Any, *names: str) -> Any:

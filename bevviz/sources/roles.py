@@ -135,8 +135,9 @@ def _stated(name: str, topics: Sequence[Topic], key: str, *kinds: str) -> Topic:
 _LIDAR = re.compile(r"lidar|laser|velodyne|ouster|os_|livox|hesai|robosense|pandar|points|scan")
 _DERIVED_CLOUD = re.compile(
     r"ground|cluster|obstacle|filter|registered|depth|stereo|camera|zed|realsense|rgbd|map|voxel|fused|segment"
-    r"|crop|downsample|object|debug|feature|plane|merged|concat"
+    r"|crop|downsample|object|debug|feature|plane|merged|concat|keypoint|matched|odom|slam"
 )
+_FIXED = ("map", "odom", "world", "camera_init")  # no sensor moves with them
 
 
 def _find_lidars(topics: Sequence[Topic], config: SourceConfig, notes: dict[str, str]) -> list[Topic]:
@@ -151,14 +152,18 @@ def _find_lidars(topics: Sequence[Topic], config: SourceConfig, notes: dict[str,
     _note(notes, clouds, "not used: looks like a result or a depth camera's cloud, not like a LiDAR's")
     _note(notes, [t for t in clouds if t.count == 0], "not used: without messages")
     candidates = sorted((t for t in clouds if tiers[t] == best), key=lambda t: (len(t.name), t.name))
+    if best in (2, 3):
+        candidates = candidates[:1]  # results are no sensors to be merged
     chosen = _one_a_frame(candidates, lambda t: t.frame_id or t.name, notes, "LiDAR, by type and name")
     return sorted(chosen, key=lambda t: t.name)
 
 
 def _lidar_tier(topic: Topic) -> int:
-    """0 what is named like a LiDAR, 1 any other cloud, 2 a derived one, 3 without messages."""
+    """0 what is named like a LiDAR, 1 any other cloud, 2 a derived one, 3 in a fixed frame, 4 without messages."""
     name, frame = topic.name.lower(), topic.frame_id.lower()
     if topic.count == 0:
+        return 4
+    if frame in _FIXED:
         return 3
     if _DERIVED_CLOUD.search(name) or "optical" in frame:
         return 2
@@ -172,7 +177,9 @@ def _one_a_frame(
     chosen: dict[str, Topic] = {}
     for topic in candidates:
         first = chosen.setdefault(sensor(topic), topic)
-        notes[topic.name] = why if first is topic else f"not used: the same sensor as {first.name}, which is"
+        notes[topic.name] = (
+            why if first is topic else f"not used: the sensor of {first.name}, by its frame or name"
+        )
     return list(chosen.values())
 
 
@@ -181,8 +188,8 @@ def _one_a_frame(
 _IMAGES = ("Image", "CompressedImage")
 _TRANSPORT = re.compile(r"/(compressed|compressedDepth|theora|ffmpeg|zstd)$")
 _DERIVED_IMAGE = re.compile(
-    r"depth(?!ai)|disparity|confidence|annotat|debug|dbg|bev|mask|overlay|detect|visuali[sz]|segment|semantic|label"
-    r"|heat_?map|costmap|stereo(_raw)?/image|track|result|infra|normal|cloud|side_by_side"
+    r"depth(?!ai)|disparity|confidence|annotat|debug|dbg|bev|mask|overlay|detect|visuali[sz]|segment|semantic"
+    r"|label|heat_?map|costmap|stereo(_raw)?/image|track|result|infra|normal|cloud|side_by_side"
 )
 _RECTIFIED = re.compile(r"(?<![a-z])rect")
 
@@ -222,9 +229,8 @@ def _find_images(topics: Sequence[Topic], config: SourceConfig, notes: dict[str,
 
 
 def _stem(topic: str) -> str:
-    """What all variants of a camera's image have in common: its namespace, without raw, gray or color."""
-    namespace = _TRANSPORT.sub("", topic).rpartition("/")[0] or topic
-    return re.sub(r"[/_](raw|rect|gray|color|rgb|mono)(?![a-z])", "", namespace)
+    """What all variants of a camera's image have in common: the topic without raw, rect, gray or color."""
+    return "/".join(re.sub(r"_(raw|rect|gray|color|mono)$", "", part) for part in _device(topic))
 
 
 def _camera(
@@ -256,7 +262,7 @@ def _info_topic(image: Topic, topics: Sequence[Topic]) -> str:
 
     same_frame = [t for t in infos if image.frame_id and t.frame_id == image.frame_id]
     above = [
-        t for t in infos if base.startswith(t.name.removesuffix("camera_info")) and t.name.count("/") > 1
+        t for t in infos if t.name != "/camera_info" and base.startswith(t.name.removesuffix("camera_info"))
     ]
     return max(same_frame or above, key=shared).name if same_frame or above else ""
 
@@ -283,7 +289,7 @@ _IMAGE_WORDS = re.compile(
     r"(?:image|rgb|colou?r|raw|rect|gray|mono|rectified)(?:_(?:image|rgb|colou?r|raw|rect|gray|mono))*"
 )
 _WEAK = {"left", "right", "front", "rear", "back", "center", "camera", "cam", "sensor", "driver", "points"}
-_TAKEN = ("bev", "frustums", "fused", "lidars", "robot", "truth")  # entities of /world beside the sensors
+_TAKEN = ("bev", "frustums", "fused", "ground_truth", "lidars")  # entities of /world beside the sensors
 
 
 def entity_name(topic: str, frame_id: str = "") -> str:
