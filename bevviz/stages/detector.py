@@ -61,6 +61,9 @@ class Detector:
     (``layout``) comes from the model itself: its inputs, its metadata, and the shape that one run on a
     grey image returns.
 
+    Args:
+        config: model file, thresholds, provider and threads.
+
     Attributes:
         names: class names by class id.
         layout: how the output is read.
@@ -92,18 +95,21 @@ class Detector:
 
         metadata = self._session.get_modelmeta().custom_metadata_map
         self._stride = int(_literal(metadata.get("stride"), int) or 32)
-        sizes = _literal(metadata.get("imgsz"), list) or [DEFAULT_SIZE, DEFAULT_SIZE]
+        size = _literal(metadata.get("imgsz"), list) or []
+        size = size if len(size) == 2 else [DEFAULT_SIZE, DEFAULT_SIZE]
         self._open_axes = tuple(not isinstance(n, int) for n in shape[2:])
         self.input_size = tuple(
-            n if isinstance(n, int) else int(s) for n, s in zip(shape[2:], sizes, strict=True)
+            n if isinstance(n, int) else int(s) for n, s in zip(shape[2:], size, strict=True)
         )
         names = _read_names(Path(config.names)) if config.names else _metadata_names(metadata)
-        self._output, self.layout, count = self._probe(where, len(names) if names else None)
+        more = metadata.get("task") in ("segment", "pose")  # these append columns to the class scores
+        self._output, self.layout, count = self._probe(where, len(names) if names else None, more)
         self.names = names or _default_names(count)
         self._wanted = self._wanted_classes()
-        size = f"{self.input_size[1]} x {self.input_size[0]}"
-        classes = f"{len(self.names) or 'unnamed'} classes"
-        self.description = f"{path.name}: {self.layout}, {size}, {classes}, {self.provider}"
+        self.description = (
+            f"{path.name}: {self.layout}, {self.input_size[1]} x {self.input_size[0]}, "
+            f"{len(self.names) or 'unnamed'} classes, {self.provider}"
+        )
 
     def __call__(self, bgr: U8) -> Detections:
         """Detect in an (H, W, 3) uint8 BGR image.
@@ -122,14 +128,16 @@ class Detector:
         output = self._session.run([self._output], {self._input: blob})[0][0]
         xyxy, score, class_id = self._decode(output, blob.shape[2:])
         # Networks count from the corner of the first pixel, bevviz from its centre.
-        xyxy = (xyxy - np.tile(offset, 2)) / np.tile(scale, 2) - np.float32(0.5)
-        xyxy = np.clip(xyxy, np.float32(-0.5), np.array([width, height, width, height], np.float32) - 0.5)
+        xyxy -= np.tile(offset, 2)
+        xyxy /= np.tile(scale, 2)
+        xyxy -= 0.5
+        np.clip(xyxy, -0.5, np.array([width, height] * 2, np.float32) - 0.5, out=xyxy)
         sound = np.isfinite(xyxy).all(axis=1) & (xyxy[:, 2] > xyxy[:, 0]) & (xyxy[:, 3] > xyxy[:, 1])
         if self._wanted is not None:
             sound &= np.isin(class_id, self._wanted)
         order = np.flatnonzero(sound)
         order = order[np.argsort(-score[order], kind="stable")[:MAX_CANDIDATES]]
-        xyxy, score, class_id = xyxy[order].astype(np.float32), score[order], class_id[order]
+        xyxy, score, class_id = xyxy[order], score[order], class_id[order]
 
         if self.layout is Layout.END_TO_END:
             suppressor, overlap = np.full(len(order), -1, np.int32), np.zeros(len(order), np.float32)
@@ -202,7 +210,7 @@ class Detector:
         xyxy = np.hstack([boxes[:, :2] - half, boxes[:, :2] + half])
         return xyxy[strong], score[strong], class_id[strong]
 
-    def _probe(self, where: str, classes: int | None) -> tuple[str, Layout, int | None]:
+    def _probe(self, where: str, classes: int | None, more: bool) -> tuple[str, Layout, int | None]:
         """Run once on grey; name of the detections' output, its layout and the count of classes.
 
         This also pays the first run's allocations before the first real image.
@@ -217,7 +225,7 @@ class Detector:
         names = [o.name for o in self._session.get_outputs()]
         shapes = [list(np.shape(o)) for o in outputs]
         for name, output, shape in zip(names, outputs, shapes, strict=True):
-            layout, count = find_layout(shape, self.input_size, classes)
+            layout, count = find_layout(shape, self.input_size, classes, more)
             if layout is Layout.YOLOX and np.median(np.abs(output[0, :, :2])) > 8:
                 raise UserError(
                     f"{where}: one box a cell {shape} with boxes decoded already; export the raw grid"
@@ -268,25 +276,31 @@ def nms(xyxy: F32, class_id: I32, threshold: float) -> tuple[I32, F32]:
 
 
 def find_layout(
-    shape: Sequence[int], input_size: Sequence[int], classes: int | None = None
+    shape: Sequence[int], input_size: Sequence[int], classes: int | None = None, more: bool = False
 ) -> tuple[Layout | None, int | None]:
-    """Layout and count of classes of an output's shape, given the network's input height and width.
+    """Layout and count of classes of an output, None where it is none of a detector's.
 
-    One box a cell, summed over neighbouring strides, tells a grid from a list of boxes: 8400 for 640 x 640
-    and strides 8, 16, 32, three times that with YOLOv5's anchors. ``classes``, where known, lets the
-    columns that segmentation and pose models append be told from class scores.
+    One box a cell, summed over neighbouring strides, tells a grid from other lists: 8400 for 640 x 640 and
+    strides 8, 16, 32, three times that with YOLOv5's anchors.
+
+    Args:
+        shape: of the output.
+        input_size: height and width of the network's input.
+        classes: how many there are, None where unknown.
+        more: further columns follow those of the classes.
     """
     if len(shape) != 3 or shape[0] != 1:
         return None, None
     _, rows, columns = shape
     cells = _cells(input_size)
-    found: tuple[tuple[bool, Layout, int], ...] = (
-        (columns in cells, Layout.YOLOV8, rows - 4),
-        (rows in cells, Layout.YOLOX, columns - 5),
-        (rows % 3 == 0 and rows // 3 in cells, Layout.YOLOV5, columns - 5),
-    )
-    for fits, layout, count in found:
-        if fits and count >= (classes or 1):
+    # Rows could also be those of an end-to-end head, 300 as a rule, so that only whole pyramids count.
+    pyramids = {count for count, strides in cells.items() if {8, 16, 32} <= set(strides)}
+    for fits, layout, count in (
+        (columns in cells and columns > rows, Layout.YOLOV8, rows - 4),
+        (rows in pyramids, Layout.YOLOX, columns - 5),
+        (rows % 3 == 0 and rows // 3 in pyramids, Layout.YOLOV5, columns - 5),
+    ):
+        if fits and count > 0 and (classes is None or count == classes or (more and count > classes)):
             return layout, classes or count
     return (Layout.END_TO_END, classes) if columns == 6 else (None, None)
 
