@@ -160,7 +160,8 @@ def kitti(shared: Path, name: str) -> Kitti:
     beside = np.eye(4)
     beside[:3, 3] = np.linalg.solve(p2[:, :3], p2[:, 3])
     png = (folder / "image_2" / f"{name}.png").read_bytes()
-    height, width = np.shape(cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR))[:2]
+    image: Any = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR)
+    height, width = image.shape[:2]
     return Kitti(
         points=np.fromfile(folder / "velodyne" / f"{name}.bin", np.float32).reshape(-1, 4),
         png=png,

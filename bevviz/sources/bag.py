@@ -114,6 +114,11 @@ class BagSource:
         ]
         return [*self.recording.warnings, *damaged, *(self._sync.report.warnings() if self._sync else ())]
 
+    @property
+    def tree(self) -> Mapping[str, str]:
+        """Child to parent of the transforms met so far."""
+        return self._sync.tf.tree() if self._sync else {}
+
     def __iter__(self) -> Iterator[Frame]:
         sync = self._sync = Synchronizer(self.roles, self.config)
         self._damaged.clear()

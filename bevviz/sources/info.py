@@ -1,0 +1,253 @@
+"""What is in a bag: topics, sensors, transforms, and what is missing for a full run."""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from itertools import islice
+from pathlib import Path
+
+import numpy as np
+
+from bevviz.config import Config
+from bevviz.errors import UserError
+from bevviz.frame import Camera, Frame
+from bevviz.sources.bag import SECOND, BagSource, iso
+from bevviz.sources.mcap import megabytes
+from bevviz.sources.recording import Recording
+from bevviz.sources.roles import Roles, Topic, find_roles
+
+WIDTH = 100
+TRIAL = 5  # the scan that is tried out: at the first ones a camera or a transform may not have begun
+MANY = 2_000_000  # messages; their times are not gathered, for that would take seconds
+
+
+@dataclass(frozen=True, slots=True)
+class TopicInfo:
+    name: str
+    type: str
+    count: int
+    frame_id: str
+    rate: float | None  # Hz, between the first and the last message
+    pause: float | None  # longest time between two messages, seconds of log time
+    pause_at: float | None  # when it begins, seconds from the start
+    role: str
+
+
+@dataclass(frozen=True, slots=True)
+class BagInfo:
+    """What ``bevviz info`` prints. Times are log times in nanoseconds."""
+
+    paths: tuple[str, ...]
+    formats: tuple[str, ...]  # of each file
+    size: int  # bytes on disk
+    start: int
+    end: int
+    messages: int
+    topics: tuple[TopicInfo, ...]
+    lidars: tuple[str, ...] = ()
+    cameras: tuple[Camera, ...] = ()  # as one scan sees them
+    tree: Mapping[str, str] = field(default_factory=dict)  # child frame -> parent frame
+    points_frame: str = ""
+    world_frame: str = ""  # "": the fixed frame is not connected
+    missing: tuple[str, ...] = ()  # for a full run, with the option that gives it
+    warnings: tuple[str, ...] = ()
+
+    @property
+    def duration(self) -> float:
+        return (self.end - self.start) / SECOND
+
+
+def describe(paths: Sequence[Path], config: Config) -> BagInfo:
+    """Look at the index of a bag and run one scan through synchronisation.
+
+    Raises:
+        UserError: no readable bag, or a stated topic that is not in it.
+    """
+    try:
+        source = BagSource(paths, config)
+    except UserError as error:
+        with Recording(paths) as recording:
+            roles = find_roles(recording.topics, config.source)
+            return _describe(recording, roles, config, missing=[str(error)])
+    with source:
+        roles = source.roles
+        frame = next(reversed(list(islice(source, min(TRIAL, source.total)))), None)
+        missing = _missing(roles, frame, config)
+        return _describe(source.recording, roles, config, missing, frame, source)
+
+
+def _describe(
+    recording: Recording,
+    roles: Roles,
+    config: Config,
+    missing: Sequence[str],
+    frame: Frame | None = None,
+    source: BagSource | None = None,
+) -> BagInfo:
+    if not config.detector.model:
+        missing = [*missing, "no detector: --model FILE.onnx"]
+    return BagInfo(
+        paths=tuple(map(str, recording.paths)),
+        formats=tuple(", ".join(filter(None, [f.format, f.compression])) for f in recording.files),
+        size=recording.size,
+        start=recording.start,
+        end=recording.end,
+        messages=recording.message_count,
+        topics=tuple(_topic(recording, topic, roles) for topic in recording.topics),
+        lidars=roles.lidar_names,
+        cameras=frame.cameras if frame else (),
+        tree=dict(source.tree) if source else {},
+        points_frame=frame.points_frame if frame else "",
+        world_frame=frame.world_frame if frame and frame.world_from_points is not None else "",
+        missing=tuple(missing),
+        warnings=tuple(recording.warnings),
+    )
+
+
+def _topic(recording: Recording, topic: Topic, roles: Roles) -> TopicInfo:
+    rate = pause = pause_at = None
+    if (topic.count or 0) > 1 and recording.message_count < MANY:
+        times = recording.times(topic.name)
+        steps = np.diff(times)
+        longest = int(np.argmax(steps))
+        pause = float(steps[longest]) / SECOND
+        pause_at = float(times[longest] - recording.start) / SECOND
+        if times[-1] > times[0]:
+            rate = float(len(steps) / ((times[-1] - times[0]) / SECOND))
+    return TopicInfo(
+        name=topic.name,
+        type=topic.type,
+        count=topic.count or 0,
+        frame_id=topic.frame_id,
+        rate=rate,
+        pause=pause,
+        pause_at=pause_at,
+        role=roles.notes.get(topic.name, ""),
+    )
+
+
+def _missing(roles: Roles, frame: Frame | None, config: Config) -> list[str]:
+    if frame is None:
+        return ["no scan could be read"]
+    found = []
+    if not roles.cameras:
+        found.append("no camera: --set source.camera_topics=[/topic]")
+    for role, camera in zip(roles.cameras, frame.cameras, strict=True):
+        about = f"camera '{role.name}'"
+        placed = camera.camera_from_points is not None or camera.image is None
+        if not role.info_topic:
+            setting = f"source.camera_info_topics='{{{role.topic}: /camera_info}}'"
+            found.append(f"{about} has no CameraInfo: --set {setting}")
+        if not placed and camera.image is not None:
+            between = f"'{frame.points_frame}' to '{camera.image.frame_id}'"
+            edge = f"{frame.points_frame} {camera.image.frame_id}"
+            setting = f"source.extrinsics='{{{edge}: [x, y, z, qx, qy, qz, qw]}}'"
+            found.append(f"{about} is not placed, no transform from {between}: --set {setting}")
+        if role.info_topic and placed:
+            found += [f"{about}: {problem}" for problem in camera.problems]
+    if frame.world_from_points is None:
+        found.append(
+            f"no fixed frame above '{frame.points_frame}', so that motion is not compensated: "
+            "--set source.odometry_topic=/topic or --set source.fixed_frame=name"
+        )
+    return [*found, *frame.problems]
+
+
+def render(info: BagInfo) -> str:
+    """The description as text for a terminal of 100 columns."""
+    kinds = sorted(set(info.formats))
+    files = f"{len(info.formats)} files of " if len(info.formats) > 1 else ""
+    lines = [
+        _row("bag", ", ".join(info.paths)),
+        _row("format", f"{files}{'; '.join(kinds)}; {megabytes(info.size)}"),
+        _row("time", f"{info.duration:.2f} s from {iso(info.start)}, {info.messages} messages"),
+        "",
+        *_topic_table(info.topics),
+        "",
+        *_section("roles", [f"{t.name}: {t.role}" for t in info.topics if t.role]),
+        *_section("cameras", [_camera(camera) for camera in info.cameras]),
+        *_section("transforms", list(_tree(info))),
+        *_section("missing for a full run", info.missing or ["nothing"]),
+        *_section("warnings", info.warnings),
+    ]
+    return "\n".join(lines).rstrip()
+
+
+def _row(name: str, text: str) -> str:
+    return textwrap.fill(text, WIDTH, initial_indent=f"{name:<8}", subsequent_indent=" " * 8)
+
+
+def _section(title: str, items: Sequence[str]) -> list[str]:
+    return [title, *(line for item in items for line in _item(item)), ""] if items else []
+
+
+def _item(text: str) -> Iterator[str]:
+    """Wrapped text; an option at its end stays in one piece, to be copied."""
+    said, separator, option = text.partition(": --")
+    depth = len(said) - len(said.lstrip())
+    yield from textwrap.wrap(
+        said.lstrip() + separator[:1],
+        WIDTH,
+        initial_indent=" " * (2 + depth),
+        subsequent_indent=" " * (4 + depth),
+        break_on_hyphens=False,
+    )
+    if option:
+        yield f"      --{option}"
+
+
+def _topic_table(topics: Sequence[TopicInfo]) -> Iterator[str]:
+    head = ("topic", "type", "count", "Hz", "longest gap", "frame_id")
+    rows = [
+        (
+            t.name,
+            t.type.rpartition("/")[2],
+            str(t.count),
+            "" if t.rate is None else f"{t.rate:.1f}",
+            "" if t.pause is None else f"{t.pause:.2f} s at {t.pause_at:.1f} s",
+            t.frame_id,
+        )
+        for t in topics
+    ]
+    widths = [max(len(row[i]) for row in [head, *rows]) for i in range(len(head))]
+    for row in [head, *rows]:
+        cells = [
+            c.rjust(w) if i in (2, 3) else c.ljust(w)
+            for i, (c, w) in enumerate(zip(row, widths, strict=True))
+        ]
+        yield "  ".join(cells).rstrip()
+
+
+def _camera(camera: Camera) -> str:
+    parts = [f"{camera.name}:"]
+    if camera.image is not None:
+        height, width = camera.image.bgr.shape[:2]
+        parts.append(f"{width} x {height} {camera.image.media_type or 'uncompressed'},")
+    if camera.intrinsics is None:
+        parts.append("no intrinsics")
+    else:
+        k = camera.intrinsics.K
+        parts.append(f"fx {k[0, 0]:.1f} fy {k[1, 1]:.1f} cx {k[0, 2]:.1f} cy {k[1, 2]:.1f},")
+        parts.append(camera.intrinsics.distortion_model or "no distortion")
+        if camera.intrinsics.assumed:
+            parts.append("(assumed)")
+    parts.append(", not placed" if camera.camera_from_points is None else ", placed by TF")
+    return " ".join(parts).replace(" ,", ",")
+
+
+def _tree(info: BagInfo) -> Iterator[str]:
+    children: dict[str, list[str]] = {}
+    for child, parent in sorted(info.tree.items()):
+        children.setdefault(parent, []).append(child)
+
+    def below(frame: str, depth: int) -> Iterator[str]:
+        yield "  " * depth + frame
+        for child in children.get(frame, ()):
+            yield from below(child, depth + 1)
+
+    for root in sorted(children.keys() - info.tree.keys()):
+        yield from below(root, 0)
+    if info.points_frame:
+        yield f"fixed frame of '{info.points_frame}': {info.world_frame or 'none'}"
