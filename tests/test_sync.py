@@ -355,6 +355,20 @@ def test_jumping_stamps() -> None:
     assert "the stamps of the clouds have 1 gap, the longest 3.50 s" in told
 
 
+def test_short_jump_back_does_not_mix_old_and_new_poses() -> None:
+    feed = Feed(replace(ONE, cameras=(), tf=("/tf",)))
+    feed.sync.add_transform(edge("base_link", "rslidar", pose()), static=True)
+    feed.odometry(lambda t: pose(100.0), 9.0, 12.0)
+    feed.clouds(10.0)
+    feed.odometry(lambda t: pose(1.0), 2.0, 3.0)
+    (frame,) = feed.clouds(2.5)
+    assert frame.world_from_points is not None and frame.world_from_points[0, 3] == 1.0
+    assert feed.clouds(3.05) == []  # the pose is not there yet, for all that was said of 9 s and later
+    (frame,) = feed.sync.flush()
+    assert frame.world_from_points is not None and frame.world_from_points[0, 3] == 1.0
+    assert frame.tf_age == pytest.approx(0.05)
+
+
 def test_what_waits_when_the_clock_is_reset_is_delivered_first() -> None:
     feed = Feed()
     feed.calibration()
@@ -362,8 +376,10 @@ def test_what_waits_when_the_clock_is_reset_is_delivered_first() -> None:
     feed.image(50.0)
     feed.sync.add_cloud(cloud(50.02))
     feed.sync.add_cloud(cloud(1.0))
-    feed.image(1.01)
     frames = list(feed.sync.ready())
+    assert len(frames) == 1  # the image of before the reset is not taken for a later one
+    feed.image(1.01)
+    frames += feed.sync.ready()
     assert [f.stamp for f in frames] == [ns(50.02), ns(1.0)]
     taken = [f.cameras[0].image for f in frames]
     assert [image.stamp for image in taken if image is not None] == [ns(50.0), ns(1.01)]
@@ -509,17 +525,17 @@ def test_results_of_the_robot_go_to_the_one_nearest_frame() -> None:
     for t in (0.0, 0.1, 0.2, 0.3):
         feed.sync.add_cloud(cloud(t))
         frames += feed.sync.ready()
-    for t in (0.0, 0.14, 0.3):
+    for t in (0.0, 0.12, 0.14, 0.3):  # that of 0.14 belongs to a cloud that has a nearer one
         feed.sync.add_boxes(boxes(t))
         feed.sync.add_truth(boxes(t, "/ground_truth", "base_link"))
         frames += feed.sync.ready()
     frames += feed.sync.flush()
-    assert [[b.stamp for b in f.robot_boxes] for f in frames] == [[ns(0.0)], [ns(0.14)], [], [ns(0.3)]]
+    assert [[b.stamp for b in f.robot_boxes] for f in frames] == [[ns(0.0)], [ns(0.12)], [], [ns(0.3)]]
     assert [f.truth is not None for f in frames] == [True, True, False, True]
     (box,) = frames[1].robot_boxes
     assert box.world_from_boxes is not None and frames[1].truth is not None
-    np.testing.assert_allclose(box.world_from_boxes, turning(0.14) @ pose(0.3, 0, 1.2), atol=1e-9)
-    np.testing.assert_allclose(frames[1].truth.world_from_boxes, turning(0.14), atol=1e-9)  # type: ignore[arg-type]
+    np.testing.assert_allclose(box.world_from_boxes, turning(0.12) @ pose(0.3, 0, 1.2), atol=1e-9)
+    np.testing.assert_allclose(frames[1].truth.world_from_boxes, turning(0.12), atol=1e-9)  # type: ignore[arg-type]
 
 
 def test_detections_of_the_robot_know_their_camera() -> None:
@@ -548,7 +564,7 @@ def test_memory_is_bounded() -> None:
         yield from (len(track) for track in feed.sync._tracks())
         yield from (len(edge.poses) for edge in feed.sync.tf._edges.values())
 
-    frames, most = 0, 0
+    frames = most = most_images = 0
     for i in range(10_000):
         t = i * 0.1
         feed.sync.add_transform(edge("odom", "base_link", pose(t), t))
@@ -559,7 +575,9 @@ def test_memory_is_bounded() -> None:
             feed.sync.add_cloud(cloud(t, "/back"))
         frames += sum(1 for _ in feed.sync.ready())
         most = max(most, *held())
+        most_images = max(most_images, len(feed.sync._images[LEFT.topic]))
     assert frames >= 9_990 and most <= 376  # 30 s of transforms, a quarter of slack
+    assert most_images <= 4  # those within the tolerance of a cloud, and one older
     for i in range(10_000):  # now only the camera is alive
         feed.image(1000 + i * 0.03)
     assert len(feed.sync._images[LEFT.topic]) < 100
