@@ -159,7 +159,7 @@ def _find_lidars(topics: Sequence[Topic], config: SourceConfig, notes: dict[str,
 
 
 def _lidar_tier(topic: Topic) -> int:
-    """0 what is named like a LiDAR, 1 any other cloud, 2 a derived one, 3 in a fixed frame, 4 without messages."""
+    """0: named like a LiDAR, 1: other cloud, 2: derived one, 3: in a fixed frame, 4: without messages."""
     name, frame = topic.name.lower(), topic.frame_id.lower()
     if topic.count == 0:
         return 4
