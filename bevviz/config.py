@@ -104,20 +104,22 @@ class VoxelConfig(Section):
 
 class GroundConfig(Section):
     method: Literal["polar", "ransac"] = Field(
-        "polar", description="polar: line fits in sectors (Himmelsbach 2010); ransac: one plane"
+        "polar", description="polar: a surface that follows slopes and kerbs outwards; ransac: one plane"
     )
     distance_threshold: Metres = Field(
         0.2, gt=0, le=5, description="height above the ground still called ground"
     )
-    iterations: int = Field(100, ge=1, le=100_000, description="ransac: samples of three points")
-    seed: int = Field(0, ge=0, description="ransac: random seed")
+    iterations: int = Field(
+        100, ge=1, le=100_000, description="samples of three points for the (polar: first) plane"
+    )
+    seed: int = Field(0, ge=0, description="random seed of these samples")
     sensor_height: Metres | None = Field(
         None, description="height of points_frame above the road; empty: estimated from the cloud"
     )
     max_slope: Degrees = Field(15.0, gt=0, lt=90, description="polar: steepest ground")
-    max_step: Metres = Field(0.25, gt=0, le=2, description="polar: highest jump between neighbouring bins")
+    max_step: Metres = Field(0.25, gt=0, le=2, description="polar: highest step from one ring to the next")
     sectors: int = Field(180, ge=8, le=3600, description="polar: sectors around the sensor")
-    max_range: Metres = Field(100.0, gt=0, le=1000, description="polar: range beyond which all is obstacle")
+    max_range: Metres = Field(100.0, gt=0, le=1000, description="polar: beyond it the ground goes on level")
 
 
 class ClusteringConfig(Section):

@@ -1,4 +1,4 @@
-"""Points binned in cells: packed keys, their numbering and a counting sort, for voxels, clusters and ground."""
+"""Points binned in cells: packed keys, their numbering and a counting sort."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def cell_keys(points: F32, size: float, shift: float = 0.0, reach: int = 0) -> t
     if math.prod(counts.tolist()) < 2**62:
         strides = np.array([counts[1] * counts[2], counts[2], 1], np.int64)
         return _pack(points, origin, size, strides), strides
-    # Points scattered too widely for 64 bits: shorten the empty gaps along each axis that nothing reaches over.
+    # Scattered too widely for 64 bits: shorten the gaps along each axis that nothing reaches over.
     columns = []
     for axis in range(3):
         layers, layer = np.unique(np.floor((points[:, axis] - origin[axis]) / size), return_inverse=True)

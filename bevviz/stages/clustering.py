@@ -34,7 +34,9 @@ def cluster(points: F32, config: ClusteringConfig) -> Clusters:
     state[count < config.min_cluster_points] = ClusterState.TOO_SMALL
     if config.max_cluster_points is not None:
         state[count > config.max_cluster_points] = ClusterState.TOO_LARGE
-    aligned = Boxes3D((low + high) / 2, np.maximum(high - low, MIN_SIZE), np.zeros(len(count), np.float32))
+    aligned = Boxes3D(
+        np.float32(0.5) * (low + high), np.maximum(high - low, MIN_SIZE), np.zeros(len(count), np.float32)
+    )
     return Clusters(labels, state, count, centroid, aligned, _upright(oriented))
 
 

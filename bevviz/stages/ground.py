@@ -16,6 +16,7 @@ from bevviz.stages.kernel import kernel
 RING_SCALE = 12.5
 RING_COUNT = 25.0
 NEAR = 20.0  # metres around the sensor in which the first plane is sought
+TALL = 2.0  # metres: what is higher may hang over the ground, a crown or a bridge
 MEMORY = 5.0  # metres over which the slope of the ground is remembered
 
 
@@ -27,9 +28,10 @@ def segment_ground(points: F32, config: GroundConfig) -> Ground:
 
     ``polar`` follows the ground outward from the sensor over sectors and rings, as Himmelsbach et al. 2010,
     but through all sectors at once: each bin offers its lowest point that is no further than ``max_step``
-    from where the rings before lead to, and the ground rises by the median of the offers of the sectors
-    around. A car is too high a step, a reflection below the road too low, a kerb is followed; where nothing
-    is offered the ground goes on as it was. What is below the ground counts as ground.
+    from where the rings before lead to, unless something stands in it whose foot may be hidden, and the
+    ground goes to the median of the offers of the sectors around. So a kerb is followed, a car is too high
+    a step, a reflection below the road too low; where nothing is offered the ground goes on as it was. What
+    is below the ground counts as ground.
 
     Args:
         points: (N, 3) float32 finite points, z up, the sensor near x = y = 0.
@@ -63,10 +65,11 @@ def _above(points: F32, plane: F64) -> F32:
     return distance
 
 
-def _largest_plane(points: F32, threshold: float, config: GroundConfig, steepest: float = np.inf) -> Bool:
+def _largest_plane(points: F32, threshold: float, config: GroundConfig, upright: float = 0.0) -> Bool:
     """(N,) the points nearer than the threshold to the best plane through three random points (RANSAC).
 
-    Planes steeper than ``steepest``, a tangent, take no part. All False: no three points made a plane.
+    Only planes whose unit normal has |z| of at least ``upright`` take part.
+    All False: no three points made a plane.
     """
     if len(points) < 3:
         return np.zeros(len(points), np.bool_)
@@ -74,7 +77,7 @@ def _largest_plane(points: F32, threshold: float, config: GroundConfig, steepest
     a, b, c = points[sample].astype(np.float64).transpose(1, 0, 2)
     normal = np.cross(b - a, c - a)
     length = np.linalg.norm(normal, axis=1)
-    taking_part = (length > 0) & (np.hypot(normal[:, 0], normal[:, 1]) <= steepest * np.abs(normal[:, 2]))
+    taking_part = (length > 0) & (np.abs(normal[:, 2]) >= upright * length)
     normal = (normal[taking_part] / length[taking_part, None]).astype(np.float32)
     return _best_support(points, a[taking_part].astype(np.float32), normal, np.float32(threshold))
 
@@ -138,13 +141,13 @@ def _first_plane(points: F32, order: I32, start: I32, config: GroundConfig) -> F
     """The ground around the sensor as a plane, from the lowest points of the bins."""
     low = points[_lowest(points, order, start)]
     distance = np.hypot(low[:, 0], low[:, 1])
-    steepest = math.tan(math.radians(config.max_slope))
+    steepest = math.radians(config.max_slope)
     if config.sensor_height is not None:
-        low = low[np.abs(low[:, 2] + config.sensor_height) < config.max_step + steepest * distance]
+        low = low[np.abs(low[:, 2] + config.sensor_height) < config.max_step + math.tan(steepest) * distance]
         distance = np.hypot(low[:, 0], low[:, 1])
     if np.count_nonzero(distance < NEAR) >= 3:
         low = low[distance < NEAR]
-    inliers = _largest_plane(low, config.distance_threshold, config, steepest)
+    inliers = _largest_plane(low, config.distance_threshold, config, math.cos(steepest))
     return _fit(low[inliers]) if inliers.any() else None
 
 
@@ -200,9 +203,15 @@ def _follow(
             # The longer the ground was hidden, the less is known of where it comes up again.
             gate = max_step * (1 + max(unseen[s], 0.0) / MEMORY)
             offer[s] = np.inf
+            standing = False
             for k in range(start[r * sectors + s], start[r * sectors + s + 1]):
-                if abs(rise[order[k]] - level[s]) <= gate:
+                above = rise[order[k]] - level[s]
+                if abs(above) <= gate:
                     offer[s] = min(offer[s], rise[order[k]])
+                standing |= gate < above < TALL
+            # The lowest point of something that stands there need not be its foot.
+            if standing and offer[s] > level[s]:
+                offer[s] = np.inf
         # Offers of sectors within a metre to each side.
         reach = min(max(2, math.ceil(sectors / (2 * math.pi * radius[r]))), 8)
         around = np.empty(2 * reach + 1)
