@@ -1,13 +1,26 @@
-"""Everything of a frame at once: 3D, each camera, the bird's-eye view, what was decided, and how long it took."""
+"""Everything of a frame at once: 3D, cameras, bird's-eye view, what was decided, how long it took."""
 
 from __future__ import annotations
 
 import rerun.blueprint as rrb
 
+from bevviz.logging import views
 from bevviz.sources import Scene
 
 
 def blueprint(scene: Scene) -> rrb.Blueprint:
+    side: list[rrb.Container | rrb.View] = [views.cameras(scene)] if scene.cameras else []
     return rrb.Blueprint(
-        rrb.Spatial3DView(origin="/world", contents=["/world/**", "/robot/**"]),
+        rrb.Vertical(
+            rrb.Horizontal(
+                views.space(scene),
+                rrb.Vertical(*side, views.birds_eye(), row_shares=[*[2] * len(side), 3]),
+                rrb.Tabs(views.explain(), views.log(), views.config(), name="Decisions"),
+                column_shares=[5, 4, 3],
+            ),
+            rrb.Horizontal(views.stage_times(), views.clocks(), views.counts(), views.states()),
+            row_shares=[4, 1],
+        ),
+        views.time_panel(),
+        *views.panels(),
     )

@@ -155,8 +155,11 @@ class Logger:
         self._now = set()
         self._set_time(frame)
         self._log_cloud(result)
-        if result.clusters is not None and result.obstacles is not None:
-            self._log_clusters(frame, result.clusters, result.obstacles)
+        if result.obstacles is not None:
+            obstacles = self._rounded(result.obstacles)
+            self._put_points(entities.obstacles(frame.lidar), obstacles, ClassId.OBSTACLE)
+            if result.clusters is not None:
+                self._log_clusters(frame, result.clusters, obstacles)
         for camera in result.cameras:
             self._log_camera(frame, camera)
         if result.objects is not None and len(result.objects):
@@ -186,10 +189,8 @@ class Logger:
             elif len(frame.points):
                 self._put(entities.points(frame.lidar), rr.Points3D(frame.points, class_ids=classes))
         if result.voxels is not None and result.ground is not None:
-            road = result.voxels.points[result.ground.mask]
+            road = self._rounded(result.voxels.points[result.ground.mask])
             self._put_points(entities.ground(frame.lidar), road, ClassId.GROUND)
-        if result.obstacles is not None:
-            self._put_points(entities.obstacles(frame.lidar), result.obstacles, ClassId.OBSTACLE)
 
     def _log_merged(self, frame: Frame, world_from_points: F64, classes: np.ndarray[Any, Any]) -> None:
         """Several LiDARs: each raw cloud in the frame of its own sensor."""
@@ -200,6 +201,15 @@ class Logger:
             self._put(entities.sensor(name), _transform(world_from_points @ points_from_cloud))
             if len(cloud.xyz):
                 self._put(entities.points(name), rr.Points3D(cloud.xyz, class_ids=classes[start:end]))
+
+    def _rounded(self, points: F32) -> F32:
+        """Points of the voxel grid to a fraction of a voxel: they compress to half, the raw cloud is exact."""
+        scale = (
+            np.float32(2.0 ** np.floor(np.log2(8 / self._config.voxel.size)))
+            if self._config.voxel.size
+            else 0
+        )
+        return np.round(points * scale) * (1 / scale) if scale else points
 
     def _put_points(self, path: str, points: F32, class_id: int) -> None:
         if len(points):
@@ -365,7 +375,7 @@ class Logger:
             self._log_grid(result, bev)
 
     def _log_grid(self, result: FrameResult, bev: Bev) -> None:
-        """The occupancy on the ground. A grid map's origin is its lower left corner, right and up its axes."""
+        """The occupancy laid on the ground. A grid map's origin is its lower left corner, its x to the right."""
         grid = bev.channels["occupancy"]
         level = 0.0
         if result.ground is not None and result.voxels is not None and result.ground.mask.any():

@@ -1,0 +1,135 @@
+"""The views that the layouts in ``blueprints/`` are put together from; for a layout of your own, too."""
+
+from __future__ import annotations
+
+import rerun as rr
+import rerun.blueprint as rrb
+
+from bevviz.logging import entities
+from bevviz.sources import Scene
+
+_DARK = (13, 14, 18)
+_HIDDEN = rrb.EntityBehavior(visible=False)
+
+
+def space(scene: Scene, *, raw: bool = True, grid: bool = True) -> rrb.Spatial3DView:
+    """Points, boxes, frusta and poses around the robot, seen from behind and above it.
+
+    The origin is the LiDAR: the robot stays where it is and the world moves, whichever way it drives.
+
+    Args:
+        scene: names of the sensors.
+        raw: with every raw point, coloured as ground or obstacle.
+        grid: with the occupancy on the ground.
+    """
+    hidden = [entities.ground(scene.lidar), entities.set_aside(scene.lidar)]
+    # The coloured points of the clusters and the raw cloud already show what is obstacle.
+    hidden += [entities.obstacles(scene.lidar)] if raw else []
+    hidden += [] if raw else [entities.points(lidar) for lidar in scene.lidars or (scene.lidar,)]
+    hidden += [] if grid else [entities.GRID]
+    return rrb.Spatial3DView(
+        name="3D",
+        origin=entities.sensor(scene.lidar),
+        contents=[f"{entities.WORLD}/**", f"{entities.ROBOT}/**"],
+        background=_DARK,
+        line_grid=False,
+        eye_controls=rrb.EyeControls3D(
+            kind=rrb.Eye3DKind.Orbital,
+            position=(-16.0, 5.0, 11.0),
+            look_target=(10.0, 0.0, -1.0),
+            eye_up=(0.0, 0.0, 1.0),
+        ),
+        overrides={path: _HIDDEN for path in hidden},
+    )
+
+
+def camera(scene: Scene, name: str) -> rrb.Spatial2DView:
+    """The image with detections and the projected points; what the robot itself detected there, too."""
+    return rrb.Spatial2DView(
+        name=name,
+        origin=entities.image(name),
+        contents=["$origin/**", *([f"{entities.ROBOT}/**"] if scene.robot else [])],
+        overrides={entities.weak(name): _HIDDEN},
+    )
+
+
+def cameras(scene: Scene) -> rrb.Container | rrb.View:
+    """Every camera; tabs where there are more than two."""
+    views = [camera(scene, name) for name in scene.cameras]
+    if len(views) == 1:
+        return views[0]
+    return rrb.Tabs(*views, name="Cameras") if len(views) > 2 else rrb.Vertical(*views, name="Cameras")
+
+
+def birds_eye() -> rrb.Spatial2DView:
+    """The bird's-eye image with the outlines of ground truth and of the robot's own boxes."""
+    channels = [f"- {entities.channel(name)}/**" for name in ("density", "height", "intensity", "occupancy")]
+    return rrb.Spatial2DView(
+        name="Bird's-eye view", origin=entities.BEV, contents=["$origin/**", *channels], background=_DARK
+    )
+
+
+def explain() -> rrb.TextDocumentView:
+    """Every decision of the frame in words."""
+    return rrb.TextDocumentView(name="Explain", origin=entities.EXPLAIN, contents=["$origin"])
+
+
+def log() -> rrb.TextLogView:
+    """Failures, problems and rejected detections of all frames."""
+    return rrb.TextLogView(name="Log", origin=entities.EXPLAIN_LOG)
+
+
+def states() -> rrb.StateTimelineView:
+    """What became of the pipeline, of each camera and of the best detection of each class, over time."""
+    return rrb.StateTimelineView(name="States", origin=entities.STATES)
+
+
+def stage_times() -> rrb.TimeSeriesView:
+    return rrb.TimeSeriesView(
+        name="Stage times, ms", origin=entities.stage_time(""), plot_legend=rrb.Corner2D.LeftTop
+    )
+
+
+def clocks() -> rrb.TimeSeriesView:
+    """Image against cloud, and how old the transforms are."""
+    return rrb.TimeSeriesView(
+        name="Sync error and TF age, ms",
+        origin=entities.HEALTH,
+        contents=[f"{entities.sync_error('**')}", f"{entities.tf_age('**')}"],
+        plot_legend=rrb.Corner2D.LeftTop,
+    )
+
+
+def counts() -> rrb.TimeSeriesView:
+    """Clusters, detections and matches: the numbers of the same size."""
+    return rrb.TimeSeriesView(
+        name="Counts",
+        origin=entities.HEALTH,
+        contents=[
+            entities.count(what) for what in ("clusters", "detections", "matches", "problems", "failures")
+        ],
+        plot_legend=rrb.Corner2D.LeftTop,
+    )
+
+
+def rates() -> rrb.TimeSeriesView:
+    return rrb.TimeSeriesView(name="Rates, Hz", origin=entities.rate(""), plot_legend=rrb.Corner2D.LeftTop)
+
+
+def health() -> rrb.Tabs:
+    return rrb.Tabs(stage_times(), clocks(), counts(), rates(), name="Health")
+
+
+def config() -> rrb.TextDocumentView:
+    """How the recording was made."""
+    return rrb.TextDocumentView(name="Configuration", origin=entities.CONFIG)
+
+
+def time_panel(*, follow: bool = False) -> rrb.TimePanel:
+    """Sensor time, collapsed. ``follow``: stay at the newest frame."""
+    play = rrb.components.PlayState.Following if follow else None
+    return rrb.TimePanel(state="collapsed", timeline=entities.STAMP, play_state=play)
+
+
+def panels() -> tuple[rrb.BlueprintPanel, rrb.SelectionPanel]:
+    return rrb.BlueprintPanel(state="collapsed"), rrb.SelectionPanel(state="collapsed")

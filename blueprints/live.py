@@ -1,0 +1,26 @@
+"""A running robot: light, at the newest frame, without the raw cloud and the texts."""
+
+from __future__ import annotations
+
+import rerun.blueprint as rrb
+
+from bevviz.logging import views
+from bevviz.sources import Scene
+
+
+def blueprint(scene: Scene) -> rrb.Blueprint:
+    side: list[rrb.Container | rrb.View] = [views.cameras(scene)] if scene.cameras else []
+    return rrb.Blueprint(
+        rrb.Horizontal(
+            views.space(scene, raw=False, grid=False),
+            rrb.Vertical(
+                *side,
+                views.birds_eye(),
+                rrb.Tabs(views.rates(), views.stage_times(), views.clocks(), views.states(), views.log()),
+                row_shares=[*[2] * len(side), 3, 2],
+            ),
+            column_shares=[3, 2],
+        ),
+        views.time_panel(follow=True),
+        *views.panels(),
+    )
