@@ -92,7 +92,7 @@ def to_input(layout: Layout, boxes: NDArray[Any], width: int, height: int) -> ND
         inner = (round(width * ratio), round(height * ratio))
         offset = ((W - inner[0]) // 2, (H - inner[1]) // 2)
     edges = boxes + 0.5  # networks count pixels from the corner of the first one
-    return edges * np.tile([inner[0] / width, inner[1] / height], 2) + np.tile(offset, 2)
+    return np.asarray(edges * np.tile([inner[0] / width, inner[1] / height], 2) + np.tile(offset, 2))
 
 
 def detector(model: str, **options: Any) -> Detector:

@@ -131,8 +131,9 @@ class Detector:
         xyxy -= np.tile(offset, 2)
         xyxy /= np.tile(scale, 2)
         xyxy -= 0.5
+        finite = np.isfinite(xyxy).all(axis=1)
         np.clip(xyxy, -0.5, np.array([width, height] * 2, np.float32) - 0.5, out=xyxy)
-        sound = np.isfinite(xyxy).all(axis=1) & (xyxy[:, 2] > xyxy[:, 0]) & (xyxy[:, 3] > xyxy[:, 1])
+        sound = finite & (xyxy[:, 2] > xyxy[:, 0]) & (xyxy[:, 3] > xyxy[:, 1])
         if self._wanted is not None:
             sound &= np.isin(class_id, self._wanted)
         order = np.flatnonzero(sound)
