@@ -113,8 +113,10 @@ def _detection(
     if decision is Decision.MATCHED:
         named = (fusion.cluster_decision == Decision.MATCHED) & (fusion.cluster_detection == d)
         others = [str(other) for other in np.flatnonzero(named).tolist() if other != k]
-        also = f"; clusters {', '.join(others)} take the same box" if others else ""
-        return f"{evidence}, matched{also}"
+        if not others:
+            return f"{evidence}, matched"
+        also = f"clusters {', '.join(others)} take" if others[1:] else f"cluster {others[0]} takes"
+        return f"{evidence}, matched; {also} the same box"
     if decision is Decision.TAKEN:
         return f"no match: {evidence}, taken by {_label(detections, int(fusion.cluster_detection[k]))}"
     return f"no match: {evidence}, {_rule(decision, config)}"

@@ -94,10 +94,11 @@ def check(fusion: Fusion, clusters: Clusters, detections: Detections, config: Fu
     assert len(pairs) == len(fusion.pairs.detection)
     named = np.flatnonzero(fusion.cluster_decision == Decision.MATCHED)
     if config.method == "frustum":
-        assert len(set(fusion.cluster_detection[named].tolist())) == len(named), "one box names one object"
-        for k in named:
-            assert fusion.detection_cluster[fusion.cluster_detection[k]] == k
-    for d, k in enumerate(fusion.detection_cluster.tolist()):
+        boxes = fusion.cluster_detection[named]
+        assert len(set(boxes.tolist())) == len(named), "one box names one object"
+        np.testing.assert_array_equal(fusion.detection_cluster[boxes], named)
+    of_detections: list[int] = fusion.detection_cluster.tolist()
+    for d, k in enumerate(of_detections):
         decision = fusion.detection_decision[d]
         assert (decision == Decision.NOT_KEPT) == (detections.state[d] != DetectionState.KEPT)
         assert (k < 0) == (decision in (Decision.NOT_KEPT, Decision.NO_CLUSTER))
@@ -105,7 +106,8 @@ def check(fusion: Fusion, clusters: Clusters, detections: Detections, config: Fu
         if decision == Decision.MATCHED:
             assert fusion.cluster_decision[k] == Decision.MATCHED
             assert fusion.cluster_detection[k] == d
-    for k, d in enumerate(fusion.cluster_detection.tolist()):
+    of_clusters: list[int] = fusion.cluster_detection.tolist()
+    for k, d in enumerate(of_clusters):
         assert (fusion.cluster_decision[k] == Decision.NOT_KEPT) == (clusters.state[k] != ClusterState.KEPT)
         assert d < 0 or (d, k) in pairs
     assert fusion.detection_decision.dtype == fusion.cluster_detection.dtype == np.int32
