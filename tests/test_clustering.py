@@ -126,6 +126,7 @@ def hard_clouds() -> dict[str, F32]:
         "two cells": two_cells.astype(np.float32),
         "far apart": rng.uniform(-1e30, 1e30, (n, 3)).astype(np.float32),
         "far away": rng.uniform([4.4e6, 5.5e6, 300], [4.40002e6, 5.50002e6, 320], (n, 3)).astype(np.float32),
+        "upright line": np.column_stack([np.zeros((n, 2)), rng.permutation(n)]).astype(np.float32),
         "no neighbours": (rng.permutation(n)[:, None] * np.array([[1.0, 0.5, 0.1]])).astype(np.float32),
     }
 
@@ -137,7 +138,7 @@ def test_hard_clouds_take_no_longer(name: str) -> None:
     begin = time.perf_counter()
     labels = dbscan(points, 0.5, 10)
     assert time.perf_counter() - begin < 3
-    clusters = {"one place": 1, "one cell": 1, "two cells": 1, "far apart": 0, "no neighbours": 0}
+    clusters = {"one place": 1, "one cell": 1, "two cells": 1, "far apart": 0, "upright line": 0, "no neighbours": 0}
     if name in clusters:
         assert labels.max() + 1 == clusters[name]
 

@@ -41,7 +41,7 @@ def cluster(points: F32, config: ClusteringConfig) -> Clusters:
 
 
 def dbscan(points: F32, eps: float, min_points: int) -> I32:
-    """Exact DBSCAN (Ester et al. 1996) in time linear in the occupied cells.
+    """Exact DBSCAN (Ester et al. 1996) on a grid.
 
     Points are binned in cells whose diagonal is shorter than ``eps`` (Gunawan 2013): a cell with
     ``min_points`` points has core points only, and the core points of a cell belong together without any
@@ -60,7 +60,9 @@ def dbscan(points: F32, eps: float, min_points: int) -> I32:
     if len(points) == 0:
         return np.zeros(0, np.int32)
     # A hair less than eps / sqrt(3), so that rounding never puts points eps apart into one cell.
-    keys, strides = cell_keys(points, eps / math.sqrt(3) * (1 - 1e-6), reach=2)
+    # The longest axis first and the shortest last, so that a row of neighbouring cells holds few others.
+    axes = np.argsort(points.min(axis=0) - points.max(axis=0))
+    keys, strides = cell_keys(points[:, axes], eps / math.sqrt(3) * (1 - 1e-6), reach=2)
     cell, first = group(keys)
     keys = keys[first]
     by_key = np.argsort(keys)
@@ -84,9 +86,11 @@ def dbscan(points: F32, eps: float, min_points: int) -> I32:
 def _cell_boxes(x: F32, y: F32, z: F32, start: I32) -> F64:
     box = np.empty((len(start) - 1, 6))
     for c in range(len(box)):
-        a, b = start[c], start[c + 1]
-        box[c, 0], box[c, 1], box[c, 2] = x[a:b].min(), y[a:b].min(), z[a:b].min()
-        box[c, 3], box[c, 4], box[c, 5] = x[a:b].max(), y[a:b].max(), z[a:b].max()
+        box[c, :3], box[c, 3:] = np.inf, -np.inf
+        for i in range(start[c], start[c + 1]):
+            box[c, 0], box[c, 3] = min(box[c, 0], x[i]), max(box[c, 3], x[i])
+            box[c, 1], box[c, 4] = min(box[c, 1], y[i]), max(box[c, 4], y[i])
+            box[c, 2], box[c, 5] = min(box[c, 2], z[i]), max(box[c, 5], z[i])
     return box
 
 
@@ -100,32 +104,32 @@ def _gap(low: float, high: float, other_low: float, other_high: float) -> float:
 def _adjacent(keys: I64, strides: I64, box: F64, eps2: float) -> tuple[I32, I32]:
     """Other cells whose points may be nearer than eps, as (C + 1,) starts into one list.
 
-    Cells come sorted by key. The neighbours of a cell lie in 25 columns along z, each of which moves
-    forward with the cell, so that pointers find them without a search.
+    Cells come sorted by key. The neighbours of a cell lie in five rows, one for each offset along the
+    slowest axis, and each row is a range of keys that moves forward with the cell: no search is needed.
     """
     cells = len(keys)
+    reach = 2 * strides[1] + 2
+    begin = np.zeros(5, np.int64)
     near = np.zeros(cells + 1, np.int32)
-    found = np.empty(32 * cells, np.int32)
+    found = np.empty(16 * cells, np.int32)
     used = 0
-    column = np.zeros(25, np.int64)
     for c in range(cells):
-        if used + 125 > len(found):
-            larger = np.empty(2 * len(found) + 125, np.int32)
-            larger[:used] = found[:used]
-            found = larger
-        for k in range(25):
-            middle = keys[c] + (k // 5 - 2) * strides[0] + (k % 5 - 2) * strides[1]
-            while column[k] < cells and keys[column[k]] < middle - 2:
-                column[k] += 1
-            other = column[k]
-            while other < cells and keys[other] <= middle + 2:
-                dx = _gap(box[c, 0], box[c, 3], box[other, 0], box[other, 3])
-                dy = _gap(box[c, 1], box[c, 4], box[other, 1], box[other, 4])
-                dz = _gap(box[c, 2], box[c, 5], box[other, 2], box[other, 5])
-                if other != c and dx * dx + dy * dy + dz * dz < eps2:
-                    found[used] = other
-                    used += 1
-                other += 1
+        for row in range(5):
+            middle = keys[c] + (row - 2) * strides[0]
+            o = begin[row]
+            while o < cells and keys[o] < middle - reach:
+                o += 1
+            begin[row] = o
+            while o < cells and keys[o] <= middle + reach:
+                if used == len(found):
+                    found = np.append(found, np.empty_like(found))
+                dx = _gap(box[c, 0], box[c, 3], box[o, 0], box[o, 3])
+                dy = _gap(box[c, 1], box[c, 4], box[o, 1], box[o, 4])
+                dz = _gap(box[c, 2], box[c, 5], box[o, 2], box[o, 5])
+                # Written always and kept sometimes: there is no branch to mispredict.
+                found[used] = o
+                used += (o != c) & (dx * dx + dy * dy + dz * dz < eps2)
+                o += 1
         near[c + 1] = used
     return near, found[:used]
 
