@@ -125,7 +125,7 @@ def recordings(bag: Path, frames: int, model: Path | None) -> None:
             f"| {size / 1e6:.1f} | {size / base:.2f} |"
         )
     print(
-        f"\nthe bag: {duration:.0f} s, {bag.stat().st_size / 1e6:.1f} MB; a run includes the start of its process"
+        f"\nthe bag: {duration:.0f} s, {bag.stat().st_size / 1e6:.1f} MB; runs include the start of the process"
     )
 
 

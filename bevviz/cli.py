@@ -187,8 +187,6 @@ def _bag(options: argparse.Namespace) -> int:
         every=options.every,
         frames=options.frames,
     ) as source:
-        if source.scene.cameras and not config.detector.model:
-            _say("no detector: give --model FILE.onnx to find objects in the images")
         return _process(source, config, options, Path(options.paths[0].stem + ".rrd"))
 
 
@@ -245,12 +243,11 @@ def _process(source: Source, config: Config, options: argparse.Namespace, defaul
     from bevviz.sources.prefetch import prefetch
 
     save, viewer = options.save, options.viewer
-    if save is None and options.serve is None and options.connect is None:
-        if _has_display():
-            viewer = True
-        else:
-            save = default
-            _say(f"no display: saving {save} (--serve shows it in a browser)")
+    unsaid = save is None and options.serve is None and options.connect is None and not viewer
+    if unsaid and _has_display():
+        viewer = True
+    elif unsaid:
+        save = default
 
     frames = 0
     interrupted = False
@@ -266,8 +263,12 @@ def _process(source: Source, config: Config, options: argparse.Namespace, defaul
             blueprint=options.blueprint,
         ) as sinks,
     ):
+        if unsaid and not viewer:
+            _say(f"no display: saving {save} (--serve shows it in a browser)")
         for url in sinks.urls:
             _say(f"viewer at {url}")
+        if source.scene.cameras and not config.detector.model:
+            _say("no detector: give --model FILE.onnx to find objects in the images")
         logger = Logger(sinks.recording, config, source.scene)
         logger.log_static()
         try:

@@ -79,7 +79,7 @@ class SourceConfig(Section):
         "auto", description="image is already free of distortion; auto: from the topic's name"
     )
     extrinsics: Mapping[str, tuple[float, float, float, float, float, float, float]] = Field(
-        {}, description="'parent child' -> x y z (metres) qx qy qz qw, for a transform that TF lacks"
+        {}, description="'parent child' -> x y z (metres) qx qy qz qw; wins over TF"
     )
 
 

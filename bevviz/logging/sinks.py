@@ -11,7 +11,6 @@ from pathlib import Path
 from urllib.parse import quote, urlsplit
 
 import rerun as rr
-import rerun_cli
 
 from bevviz.config import Config
 from bevviz.errors import UserError
@@ -96,6 +95,8 @@ def _close(recording: rr.RecordingStream) -> None:
 
 
 def _file(path: Path) -> rr.FileSink:
+    if path.suffix != ".rrd":  # a slip must not overwrite the bag itself
+        raise UserError(f"--save {path}: expected a file name that ends in .rrd")
     try:
         with path.open("wb"):
             pass
@@ -125,7 +126,7 @@ def _connection(url: str) -> rr.GrpcSink:
 
 def _viewer() -> rr.GrpcSink:
     """The viewer on this machine, of the very version that came with the SDK."""
-    binary = Path(rerun_cli.__file__).parent / "rerun"
+    binary = Path(rr.__file__).parents[1] / "rerun_cli" / "rerun"
     port = _free(9876)
     try:
         rr.spawn(

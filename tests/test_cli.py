@@ -1,0 +1,294 @@
+"""The commands as a user runs them: what they make, what they say, how they end."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from bevviz.cli import main
+from tests import bags
+from tests.recordings import read
+
+Capture = pytest.CaptureFixture[str]
+
+
+@pytest.fixture(autouse=True)
+def elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is saved by default goes nowhere near the checkout, and no viewer opens."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+
+
+def error_of(capsys: Capture, *arguments: str | Path) -> str:
+    """The one line that a wrong call prints."""
+    assert main([str(a) for a in arguments]) == 2
+    said = capsys.readouterr().err
+    assert said.startswith("bevviz: error: ")
+    assert said.count("\n") == 1
+    return said
+
+
+def small_bag(change: Callable[[list[bags.Item], bags.Messages], None] | None = None, scans: int = 5) -> Path:
+    """A bag in the working directory, its messages changed on the way."""
+    messages = bags.Messages()
+    items = bags.small_items(messages, scans=scans)
+    if change is not None:
+        change(items, messages)
+    return bags.write(Path("drive"), items, messages)
+
+
+def replaced(topic: str, make: Callable[[bags.Messages, int], Any]) -> Callable[..., None]:
+    """A change of a bag: other messages on one topic."""
+
+    def change(items: list[bags.Item], messages: bags.Messages) -> None:
+        for i, item in enumerate(items):
+            if item.topic == topic:
+                items[i] = item._replace(message=make(messages, item.received))
+
+    return change
+
+
+def without(*topics: str) -> Callable[..., None]:
+    def change(items: list[bags.Item], messages: bags.Messages) -> None:
+        items[:] = [item for item in items if item.topic not in topics]
+
+    return change
+
+
+# --- runs --------------------------------------------------------------------------------------
+
+
+def test_demo_saves_where_there_is_no_display(tmp_path: Path, capsys: Capture) -> None:
+    assert main(["demo", "--frames", "2"]) == 0
+    assert "no display: saving demo.rrd" in capsys.readouterr().err
+    recording = read(tmp_path / "demo.rrd")
+    assert len(recording.rows("/bev")) == 2
+    assert "/world/fused" in recording.entities
+
+
+def test_demo_writes_a_bag_that_runs(tmp_path: Path, capsys: Capture) -> None:
+    assert main(["demo", "--frames", "3", "--bag", "drive.mcap"]) == 0
+    assert main(["bag", "drive.mcap", "--model", "demo", "--save", "out.rrd"]) == 0
+    assert "3 frames in out.rrd" in capsys.readouterr().err
+    assert len(read(tmp_path / "out.rrd").rows("/bev")) == 3
+
+
+def test_selection_of_frames(tmp_path: Path, capsys: Capture) -> None:
+    small_bag(scans=20)
+    assert main(["bag", "drive", "--frames", "4:12", "--every", "3", "--save", "out.rrd"]) == 0
+    assert read(tmp_path / "out.rrd").column("/bev", "frame") == [4, 7, 10]
+
+
+def test_info_names_sensors_and_what_is_missing(capsys: Capture) -> None:
+    small_bag()
+    assert main(["info", "drive"]) == 0
+    said = capsys.readouterr().out
+    assert bags.CLOUD in said
+    assert "--model" in said
+
+
+def test_config_is_read_back(capsys: Capture, tmp_path: Path) -> None:
+    assert main(["config", "--preset", "reference", "--set", "voxel_size=3 cm"]) == 0
+    Path("c.yaml").write_text(capsys.readouterr().out)
+    assert main(["config", "--config", "c.yaml"]) == 0
+    assert "size: 0.03" in capsys.readouterr().out
+
+
+def test_help_teaches(capsys: Capture) -> None:
+    for command in ((), ("bag",), ("info",), ("demo",), ("config",)):
+        with pytest.raises(SystemExit) as ended:
+            main([*command, "--help"])
+        assert ended.value.code == 0
+    assert (
+        "examples:"
+        in subprocess.run(
+            [sys.executable, "-m", "bevviz.cli", "--help"],
+            capture_output=True,
+            text=True,
+            check=True,
+            env=environment(),
+        ).stdout
+    )
+
+
+# --- wrong input: one clear line, exit status 2 --------------------------------------------------
+
+
+def test_a_missing_file(capsys: Capture) -> None:
+    assert "absent.mcap" in error_of(capsys, "bag", "absent.mcap")
+
+
+def test_a_directory_that_is_no_bag(capsys: Capture) -> None:
+    Path("folder").mkdir()
+    Path("folder/notes.txt").write_text("no bag")
+    assert "folder" in error_of(capsys, "bag", "folder")
+
+
+def test_an_empty_file(capsys: Capture) -> None:
+    Path("empty.mcap").touch()
+    assert "empty.mcap" in error_of(capsys, "bag", "empty.mcap")
+
+
+def test_a_bag_without_messages(capsys: Capture) -> None:
+    bags.write(Path("empty"), [])
+    assert "empty" in error_of(capsys, "bag", "empty")
+
+
+def test_a_lidar_topic_without_messages(capsys: Capture) -> None:
+    items = [item for item in bags.small_items() if item.topic != bags.CLOUD]
+    bags.write(Path("drive"), items, topics=[(bags.CLOUD, "sensor_msgs/msg/PointCloud2")])
+    said = error_of(capsys, "bag", "drive")
+    assert bags.CLOUD in said
+    assert "source.lidar_topics" in said
+
+
+def test_a_bag_without_a_lidar(capsys: Capture) -> None:
+    small_bag(without(bags.CLOUD))
+    assert "source.lidar_topics" in error_of(capsys, "bag", "drive")
+
+
+def test_a_topic_that_is_not_there(capsys: Capture) -> None:
+    small_bag()
+    said = error_of(capsys, "bag", "drive", "--set", "source.lidar_topics=[/velodyne_point]")
+    assert bags.CLOUD in said
+
+
+@pytest.mark.parametrize("name", ["absent.onnx", "text.onnx"])
+def test_a_model_that_is_none(capsys: Capture, name: str) -> None:
+    small_bag()
+    Path("text.onnx").write_text("not a network")
+    assert name in error_of(capsys, "bag", "drive", "--model", name)
+
+
+def test_a_time_outside_the_bag(capsys: Capture) -> None:
+    small_bag()
+    assert "1000" in error_of(capsys, "bag", "drive", "--start", "1000")
+    assert "soon" in error_of(capsys, "bag", "drive", "--start", "soon")
+
+
+def test_an_unknown_blueprint(capsys: Capture) -> None:
+    small_bag()
+    said = error_of(capsys, "bag", "drive", "--save", "o.rrd", "--blueprint", "debugg")
+    assert "did you mean 'debug'?" in said
+
+
+def test_a_file_that_cannot_be_written(capsys: Capture) -> None:
+    small_bag()
+    assert "absent/o.rrd" in error_of(capsys, "bag", "drive", "--save", "absent/o.rrd")
+
+
+def test_a_recording_never_overwrites_a_bag(capsys: Capture) -> None:
+    small_bag()
+    before = {path: path.read_bytes() for path in Path("drive").iterdir()}
+    for path in before:
+        assert "ends in .rrd" in error_of(capsys, "bag", "drive", "--save", path)
+    assert {path: path.read_bytes() for path in Path("drive").iterdir()} == before
+
+
+@pytest.mark.parametrize("frames", ["5", "a:b", "1-3"])
+def test_frames_that_are_no_range(capsys: Capture, frames: str) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main(["bag", "drive", "--frames", frames])
+    assert ended.value.code == 2
+    assert "is not A:B" in capsys.readouterr().err
+
+
+# --- bad data: every frame is made, and says what it lacks ---------------------------------------
+
+
+def test_clouds_without_a_point(tmp_path: Path) -> None:
+    none = np.zeros((0, 4), np.float32)
+    small_bag(replaced(bags.CLOUD, lambda m, t: m.cloud(t, none)))
+    assert main(["bag", "drive", "--save", "out.rrd"]) == 0
+    recording = read(tmp_path / "out.rrd")
+    assert len(recording.rows("/explain")) == 5
+    assert "no finite point" in recording.text("/explain")[0]
+
+
+def test_clouds_of_nan(tmp_path: Path) -> None:
+    nan = np.full((50, 4), np.nan, np.float32)
+    small_bag(replaced(bags.CLOUD, lambda m, t: m.cloud(t, nan)))
+    assert main(["bag", "drive", "--save", "out.rrd"]) == 0
+    texts = read(tmp_path / "out.rrd").text("/explain")
+    assert len(texts) == 5
+    assert "no finite point" in texts[0]
+
+
+def test_an_image_of_unknown_encoding(tmp_path: Path, capsys: Capture) -> None:
+    def strange(messages: bags.Messages, stamp: int) -> Any:
+        image = messages.image(stamp, np.zeros((48, 64, 3), np.uint8))
+        image.encoding = "rgb565"
+        return image
+
+    small_bag(replaced(bags.IMAGE, strange))
+    assert main(["bag", "drive", "--save", "out.rrd"]) == 0
+    texts = read(tmp_path / "out.rrd").text("/explain")
+    assert len(texts) == 5
+    assert "rgb565" in texts[0]
+    assert bags.IMAGE in texts[0]
+
+
+def test_no_camera_info(tmp_path: Path) -> None:
+    small_bag(without(bags.INFO))
+    assert main(["bag", "drive", "--model", "demo", "--save", "out.rrd"]) == 0
+    texts = read(tmp_path / "out.rrd").text("/explain")
+    assert len(texts) == 5
+    assert "source.camera_info_topics" in texts[0]
+
+
+def test_no_transforms(tmp_path: Path) -> None:
+    small_bag(without("/tf", "/tf_static"))
+    assert main(["bag", "drive", "--model", "demo", "--save", "out.rrd"]) == 0
+    texts = read(tmp_path / "out.rrd").text("/explain")
+    assert len(texts) == 5
+    assert "source.extrinsics" in texts[0]
+
+
+def test_a_bag_cut_in_the_middle(tmp_path: Path, capsys: Capture) -> None:
+    small_bag(scans=40)
+    (whole,) = Path("drive").glob("*.mcap")
+    data = whole.read_bytes()
+    Path("cut.mcap").write_bytes(data[: len(data) // 2])
+    assert main(["bag", "cut.mcap", "--save", "out.rrd"]) == 0
+    said = capsys.readouterr().err
+    assert "warning: cut.mcap" in said
+    frames = len(read(tmp_path / "out.rrd").rows("/bev"))
+    assert 10 < frames < 30
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_an_interrupted_run_leaves_a_readable_recording(tmp_path: Path, number: signal.Signals) -> None:
+    run = subprocess.Popen(
+        [sys.executable, "-m", "bevviz.cli", "demo", "--frames", "500", "--save", "out.rrd"],
+        stderr=subprocess.PIPE,
+        text=True,
+        env=environment(),
+    )
+    saved = tmp_path / "out.rrd"
+    deadline = time.monotonic() + 120
+    while run.poll() is None and time.monotonic() < deadline:
+        if saved.exists() and saved.stat().st_size > 4_000_000:
+            break
+        time.sleep(0.1)
+    run.send_signal(number)
+    _, said = run.communicate(timeout=60)
+    assert run.returncode == 130
+    assert "interrupted after" in said
+    assert "Traceback" not in said
+    assert 0 < len(read(saved).rows("/bev")) < 500
+
+
+def environment() -> dict[str, str]:
+    """Of a process that finds this checkout and no display."""
+    kept = {k: v for k, v in os.environ.items() if k not in ("DISPLAY", "WAYLAND_DISPLAY")}
+    return {**kept, "PYTHONPATH": str(Path(__file__).resolve().parents[1])}

@@ -1,0 +1,85 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from bevviz.config import load
+from bevviz.frame import Frame
+from bevviz.pipeline import Pipeline
+from bevviz.sources.synthetic import SyntheticSource
+
+
+@pytest.fixture(scope="module")
+def frame() -> Frame:
+    return SyntheticSource(frames=10).snapshot(5).frame
+
+
+@pytest.mark.parametrize("preset", ["default", "reference"])
+def test_every_stage_runs_on_a_whole_frame(frame: Frame, preset: str) -> None:
+    with Pipeline(load(settings=["detector.model=demo"], preset=preset)) as pipeline:  # type: ignore[arg-type]
+        result = pipeline.run(frame)
+    assert result.failures == ()
+    assert result.voxels is not None
+    assert result.ground is not None
+    assert result.obstacles is not None
+    assert result.clusters is not None
+    assert result.objects is not None
+    assert result.bev is not None
+    assert len(result.voxels.inverse) == len(frame.points)
+    assert len(result.obstacles) == (~result.ground.mask).sum() == len(result.clusters.labels)
+    (camera,) = result.cameras
+    assert camera.detections is not None
+    assert camera.fusion is not None
+    assert len(result.objects) > 0
+    subjects = [e.subject for e in result.explanations]
+    assert subjects.count("detection") == len(camera.detections)
+    assert subjects.count("cluster") == len(result.clusters)
+    assert {"voxel", "ground", "clustering", "detector", "fusion", "bev", "total"} <= set(result.timings)
+
+
+def test_the_pipeline_is_deterministic(frame: Frame) -> None:
+    results = []
+    for _ in range(2):
+        with Pipeline(load(settings=["detector.model=demo"])) as pipeline:
+            results.append(pipeline.run(frame))
+    a, b = results
+    assert a.explanations == b.explanations
+    assert a.clusters is not None
+    assert b.clusters is not None
+    np.testing.assert_array_equal(a.clusters.labels, b.clusters.labels)
+
+
+def test_without_points_the_image_is_still_searched(frame: Frame) -> None:
+    empty = replace(frame, points=np.zeros((0, 3), np.float32), fields={})
+    with Pipeline(load(settings=["detector.model=demo"])) as pipeline:
+        result = pipeline.run(empty)
+    assert [f.stage for f in result.failures] == ["cloud"]
+    assert result.cameras[0].detections is not None
+    assert len(result.cameras[0].detections) > 0
+    assert result.clusters is None
+
+
+def test_without_a_place_for_the_camera_the_rest_is_made(frame: Frame) -> None:
+    lost = replace(frame.cameras[0], camera_from_points=None, problems=("no transform",))
+    with Pipeline(load(settings=["detector.model=demo"])) as pipeline:
+        result = pipeline.run(replace(frame, cameras=(lost,)))
+    assert result.clusters is not None
+    assert result.cameras[0].detections is not None
+    assert result.cameras[0].fusion is None
+    assert result.objects is not None
+    assert len(result.objects) == 0
+
+
+def test_a_failing_stage_is_a_reason_and_not_the_end(frame: Frame, monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken(*args: object) -> None:
+        raise ZeroDivisionError("planted")
+
+    monkeypatch.setattr("bevviz.pipeline.cluster", broken)
+    with Pipeline(load(settings=["detector.model=demo"])) as pipeline:
+        result = pipeline.run(frame)
+    assert [(f.stage, f.reason) for f in result.failures] == [("clustering", "ZeroDivisionError: planted")]
+    assert result.ground is not None
+    assert result.bev is not None
+    assert result.cameras[0].detections is not None
