@@ -14,7 +14,7 @@ Values = dict[int, Any]  # frame -> what one component was
 
 
 class Recording:
-    """``at[entity][component][frame]`` and ``static[entity][component]``, as lists; ``times[timeline][frame]``."""
+    """``at[entity][component][frame]``, ``static[entity][component]`` and ``times[timeline][frame]``."""
 
     def __init__(self, path: Path) -> None:
         self.at: dict[str, dict[str, Values]] = defaultdict(lambda: defaultdict(dict))
@@ -36,6 +36,14 @@ class Recording:
                     self.at[chunk.entity_path][name][row["frame"]] = value
                 for name in chunk.timeline_names:
                     self.times[name][row["frame"]] = row[name]
+
+    def column(self, entity: str, component: str) -> list[Any]:
+        """A component's values in order of frame."""
+        return [value for _, value in sorted(self.at[entity][component].items())]
+
+    def text(self, entity: str) -> list[str]:
+        """A text document's content in order of frame."""
+        return [value[0] for value in self.column(entity, "TextDocument:text")]
 
     def cleared(self, entity: str) -> set[int]:
         return set(self.at[entity]["Clear:is_recursive"])

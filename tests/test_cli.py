@@ -16,7 +16,7 @@ import pytest
 
 from bevviz.cli import main
 from tests import bags
-from tests.recordings import read
+from tests.recordings import Recording
 
 Capture = pytest.CaptureFixture[str]
 
@@ -71,22 +71,22 @@ def without(*topics: str) -> Callable[..., None]:
 def test_demo_saves_where_there_is_no_display(tmp_path: Path, capsys: Capture) -> None:
     assert main(["demo", "--frames", "2"]) == 0
     assert "no display: saving demo.rrd" in capsys.readouterr().err
-    recording = read(tmp_path / "demo.rrd")
-    assert len(recording.rows("/bev")) == 2
-    assert "/world/fused" in recording.entities
+    recording = Recording(tmp_path / "demo.rrd")
+    assert len(recording.rows["/bev"]) == 2
+    assert "/world/fused" in recording.at
 
 
 def test_demo_writes_a_bag_that_runs(tmp_path: Path, capsys: Capture) -> None:
     assert main(["demo", "--frames", "3", "--bag", "drive.mcap"]) == 0
     assert main(["bag", "drive.mcap", "--model", "demo", "--save", "out.rrd"]) == 0
     assert "3 frames in out.rrd" in capsys.readouterr().err
-    assert len(read(tmp_path / "out.rrd").rows("/bev")) == 3
+    assert len(Recording(tmp_path / "out.rrd").rows["/bev"]) == 3
 
 
 def test_selection_of_frames(tmp_path: Path, capsys: Capture) -> None:
     small_bag(scans=20)
     assert main(["bag", "drive", "--frames", "4:12", "--every", "3", "--save", "out.rrd"]) == 0
-    assert read(tmp_path / "out.rrd").column("/bev", "frame") == [4, 7, 10]
+    assert sorted(row["frame"] for row in Recording(tmp_path / "out.rrd").rows["/bev"]) == [4, 7, 10]
 
 
 def test_info_names_sensors_and_what_is_missing(capsys: Capture) -> None:
@@ -210,8 +210,8 @@ def test_clouds_without_a_point(tmp_path: Path) -> None:
     none = np.zeros((0, 4), np.float32)
     small_bag(replaced(bags.CLOUD, lambda m, t: m.cloud(t, none)))
     assert main(["bag", "drive", "--save", "out.rrd"]) == 0
-    recording = read(tmp_path / "out.rrd")
-    assert len(recording.rows("/explain")) == 5
+    recording = Recording(tmp_path / "out.rrd")
+    assert len(recording.rows["/explain"]) == 5
     assert "no finite point" in recording.text("/explain")[0]
 
 
@@ -219,7 +219,7 @@ def test_clouds_of_nan(tmp_path: Path) -> None:
     nan = np.full((50, 4), np.nan, np.float32)
     small_bag(replaced(bags.CLOUD, lambda m, t: m.cloud(t, nan)))
     assert main(["bag", "drive", "--save", "out.rrd"]) == 0
-    texts = read(tmp_path / "out.rrd").text("/explain")
+    texts = Recording(tmp_path / "out.rrd").text("/explain")
     assert len(texts) == 5
     assert "no finite point" in texts[0]
 
@@ -232,7 +232,7 @@ def test_an_image_of_unknown_encoding(tmp_path: Path, capsys: Capture) -> None:
 
     small_bag(replaced(bags.IMAGE, strange))
     assert main(["bag", "drive", "--save", "out.rrd"]) == 0
-    texts = read(tmp_path / "out.rrd").text("/explain")
+    texts = Recording(tmp_path / "out.rrd").text("/explain")
     assert len(texts) == 5
     assert "rgb565" in texts[0]
     assert bags.IMAGE in texts[0]
@@ -241,7 +241,7 @@ def test_an_image_of_unknown_encoding(tmp_path: Path, capsys: Capture) -> None:
 def test_no_camera_info(tmp_path: Path) -> None:
     small_bag(without(bags.INFO))
     assert main(["bag", "drive", "--model", "demo", "--save", "out.rrd"]) == 0
-    texts = read(tmp_path / "out.rrd").text("/explain")
+    texts = Recording(tmp_path / "out.rrd").text("/explain")
     assert len(texts) == 5
     assert "source.camera_info_topics" in texts[0]
 
@@ -249,7 +249,7 @@ def test_no_camera_info(tmp_path: Path) -> None:
 def test_no_transforms(tmp_path: Path) -> None:
     small_bag(without("/tf", "/tf_static"))
     assert main(["bag", "drive", "--model", "demo", "--save", "out.rrd"]) == 0
-    texts = read(tmp_path / "out.rrd").text("/explain")
+    texts = Recording(tmp_path / "out.rrd").text("/explain")
     assert len(texts) == 5
     assert "source.extrinsics" in texts[0]
 
@@ -262,7 +262,7 @@ def test_a_bag_cut_in_the_middle(tmp_path: Path, capsys: Capture) -> None:
     assert main(["bag", "cut.mcap", "--save", "out.rrd"]) == 0
     said = capsys.readouterr().err
     assert "warning: cut.mcap" in said
-    frames = len(read(tmp_path / "out.rrd").rows("/bev"))
+    frames = len(Recording(tmp_path / "out.rrd").rows["/bev"])
     assert 10 < frames < 30
 
 
@@ -285,7 +285,7 @@ def test_an_interrupted_run_leaves_a_readable_recording(tmp_path: Path, number: 
     assert run.returncode == 130
     assert "interrupted after" in said
     assert "Traceback" not in said
-    assert 0 < len(read(saved).rows("/bev")) < 500
+    assert 0 < len(Recording(saved).rows["/bev"]) < 500
 
 
 def environment() -> dict[str, str]:
