@@ -1,4 +1,4 @@
-"""A synthetic drive: a street, its traffic, a LiDAR and a camera, all by ray casting, seeded and reproducible."""
+"""A synthetic drive: a street, its traffic, a LiDAR and a camera by ray casting, seeded and reproducible."""
 
 from bevviz.sources.synthetic.bag import BagWriter, write_bag
 from bevviz.sources.synthetic.drive import Snapshot, SyntheticSource

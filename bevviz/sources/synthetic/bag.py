@@ -25,7 +25,9 @@ VISION_MSGS = {
     "ObjectHypothesis": "string class_id\nfloat64 score\n",
     "ObjectHypothesisWithPose": "ObjectHypothesis hypothesis\ngeometry_msgs/PoseWithCovariance pose\n",
     "BoundingBox3D": "geometry_msgs/Pose center\ngeometry_msgs/Vector3 size\n",
-    "Detection3D": "std_msgs/Header header\nObjectHypothesisWithPose[] results\nBoundingBox3D bbox\nstring id\n",
+    "Detection3D": (
+        "std_msgs/Header header\nObjectHypothesisWithPose[] results\nBoundingBox3D bbox\nstring id\n"
+    ),
     "Detection3DArray": "std_msgs/Header header\nDetection3D[] detections\n",
 }
 
@@ -90,19 +92,20 @@ class BagWriter:
 
     def write(self, frame: Frame) -> None:
         """Append one frame, with odometry and transforms up to the next one."""
+        cloud, camera, truth = frame.clouds[0], frame.cameras[0], frame.truth
+        messages = [(drive.LIDAR_TOPIC, cloud.received, self._cloud(cloud))]
         for stamp in range(frame.stamp, frame.stamp + drive.PERIOD, ODOMETRY_PERIOD):
-            self._write_pose(stamp)
-        cloud, camera = frame.clouds[0], frame.cameras[0]
-        self._put(drive.LIDAR_TOPIC, cloud.received, self._cloud(cloud))
-        if frame.truth is not None:
-            self._put(drive.TRUTH_TOPIC, frame.truth.received, self._boxes(frame.truth))
+            messages += self._poses(stamp)
+        if truth is not None:
+            messages.append((drive.TRUTH_TOPIC, truth.received, self._boxes(truth)))
         if camera.image is not None and camera.intrinsics is not None:
-            self._put(
-                drive.CAMERA_INFO_TOPIC,
-                camera.image.received,
-                self._camera_info(camera.image, camera.intrinsics),
-            )
-            self._put(drive.IMAGE_TOPIC, camera.image.received, self._image(camera.image))
+            received, info = camera.image.received, self._camera_info(camera.image, camera.intrinsics)
+            messages += [
+                (drive.CAMERA_INFO_TOPIC, received, info),
+                (drive.IMAGE_TOPIC, received, self._image(camera.image)),
+            ]
+        for topic, received, message in sorted(messages, key=lambda m: m[1]):
+            self._put(topic, received, message)
 
     def _put(self, topic: str, received: int, message: Any) -> None:
         data = self._store.serialize_cdr(message, TOPICS[topic])
@@ -148,7 +151,7 @@ class BagWriter:
         ]
         self._put("/tf_static", stamp, self._make("tf2_msgs/msg/TFMessage", transforms=mounts))
 
-    def _write_pose(self, stamp: int) -> None:
+    def _poses(self, stamp: int) -> list[tuple[str, int, Any]]:
         source = self._source
         odom_from_map = geometry.inverse(source.map_from_odom)
         pose = odom_from_map @ source.map_from_base(stamp)
@@ -172,8 +175,8 @@ class BagWriter:
             pose=self._make("geometry_msgs/msg/PoseWithCovariance", pose=self._pose(pose), covariance=none),
             twist=self._make("geometry_msgs/msg/TwistWithCovariance", twist=twist, covariance=none),
         )
-        self._put("/tf", stamp, self._make("tf2_msgs/msg/TFMessage", transforms=chain))
-        self._put(drive.ODOMETRY_TOPIC, stamp, odometry)
+        transforms = self._make("tf2_msgs/msg/TFMessage", transforms=chain)
+        return [("/tf", stamp, transforms), (drive.ODOMETRY_TOPIC, stamp, odometry)]
 
     def _cloud(self, cloud: Cloud) -> Any:
         columns = dict(zip("xyz", cloud.xyz.T, strict=True)) | dict(cloud.fields)

@@ -5,8 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from bevviz import geometry
 from bevviz.errors import UserError
@@ -118,7 +120,7 @@ class SyntheticSource:
         seen = View(self._static, self.world.moving(at_image, map_from_camera[:3, 3], self._lidar.reach))
         picture = self._camera.picture(seen, map_from_camera, self.world.light, rng)
 
-        fields = {"intensity": scan.intensity, "ring": scan.ring, "time": scan.time}
+        fields: dict[str, NDArray[Any]] = {"intensity": scan.intensity, "ring": scan.ring, "time": scan.time}
         cloud = Cloud(stamp, LIDAR_FRAME, scan.xyz, fields, LIDAR_TOPIC, stamp + LATENCY)
         image = Image(shot, CAMERA_FRAME, picture.bgr, topic=IMAGE_TOPIC, received=shot + LATENCY)
         camera = Camera(

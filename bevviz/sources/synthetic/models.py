@@ -15,7 +15,6 @@ from bevviz.sources.synthetic.mesh import (
     Material,
     Mesh,
     box,
-    build,
     ellipsoid,
     grid,
     loft,
@@ -27,8 +26,9 @@ from bevviz.sources.synthetic.mesh import (
 Color = tuple[int, int, int]  # BGR
 
 PAINTS: Sequence[Color] = (
-    (235, 235, 235), (190, 190, 185), (120, 120, 120), (50, 50, 52), (28, 26, 25), (130, 60, 30), (160, 110, 60),
-    (30, 30, 150), (40, 40, 190), (60, 100, 50), (60, 120, 190), (110, 150, 170), (40, 160, 210),
+    (235, 235, 235), (190, 190, 185), (120, 120, 120), (50, 50, 52), (28, 26, 25), (130, 60, 30),
+    (160, 110, 60), (30, 30, 150), (40, 40, 190), (60, 100, 50), (60, 120, 190), (110, 150, 170),
+    (40, 160, 210),
 )  # fmt: skip
 CLOTHES: Sequence[Color] = (
     (40, 40, 45), (90, 60, 40), (140, 90, 50), (50, 50, 150), (40, 60, 180), (70, 110, 60), (200, 200, 200),
@@ -45,7 +45,8 @@ TROUSERS: Sequence[Color] = (
 SKINS: Sequence[Color] = ((160, 185, 225), (120, 150, 200), (70, 100, 150), (45, 65, 100))
 HAIR: Sequence[Color] = ((25, 30, 40), (40, 60, 90), (90, 130, 170), (110, 110, 115))
 WALLS: Sequence[Color] = (
-    (80, 95, 150), (150, 185, 205), (190, 205, 215), (140, 160, 175), (110, 140, 190), (165, 165, 160), (130, 175, 215),
+    (80, 95, 150), (150, 185, 205), (190, 205, 215), (140, 160, 175), (110, 140, 190), (165, 165, 160),
+    (130, 175, 215),
 )  # fmt: skip
 ROOFS: Sequence[Color] = ((60, 70, 130), (75, 75, 80), (50, 60, 95))
 BLACK, DARK, GREY, STEEL, WHITE = (
@@ -91,7 +92,7 @@ def _swing(limb: Limb, cycles: float) -> F64:
 
 def _pick(rng: np.random.Generator, colors: Sequence[Color]) -> Color:
     shade = rng.normal(0, 8)
-    b, g, r = (int(np.clip(c + shade, 8, 245)) for c in colors[rng.integers(len(colors))])
+    b, g, r = (int(np.clip(c + shade, 8, 245)) for c in colors[int(rng.integers(len(colors)))])
     return b, g, r
 
 
@@ -110,8 +111,8 @@ def car(rng: np.random.Generator) -> Model:
     paint = _pick(rng, PAINTS)
     belt, x = height * (0.5 if kind == "van" else 0.6), length / 2
     profile = np.array(
-        [(-x, 0.38), (-x + 0.04, belt - 0.12), (-x + 0.22, belt), (front * length, belt), (x - 0.3, belt - 0.16),
-         (x - 0.04, belt - 0.32), (x, 0.36), (x - 0.18, 0.2), (-x + 0.18, 0.2)]
+        [(-x, 0.38), (-x + 0.04, belt - 0.12), (-x + 0.22, belt), (front * length, belt),
+         (x - 0.3, belt - 0.16), (x - 0.04, belt - 0.32), (x, 0.36), (x - 0.18, 0.2), (-x + 0.18, 0.2)]
     )  # fmt: skip
     sides = []
     for y, inset in ((-0.5, 0.94), (-0.44, 1.0), (0.44, 1.0), (0.5, 0.94)):
@@ -131,16 +132,15 @@ def car(rng: np.random.Generator) -> Model:
         b, r = base[side] * 0.45 + base[side + across] * 0.55, roof[side] * 0.45 + roof[side + across] * 0.55
         parts.append(tube(b, r, (0.05, 0.05), paint, Material.PAINT, 5))
     if kind == "van":  # the load space has no windows
-        middle, width_in = (front * 0.35 + rear * 0.65) * length, width * 0.91
-        parts.append(
-            box((middle, 0, (belt + height) / 2), (length * 0.58, width_in, height - belt - 0.04), paint, Material.PAINT, (1, 0.86))
-        )  # fmt: skip
-    for wx in (-0.31, 0.31):
+        middle = ((front * 0.35 + rear * 0.65) * length, 0, (belt + height) / 2)
+        size = (length * 0.58, width * 0.91, height - belt - 0.04)
+        parts.append(box(middle, size, paint, Material.PAINT, (1.0, 0.86)))
+    for ahead in (-0.31 * length, 0.31 * length):
         for side in (-1, 1):
-            inner, outer = side * (width / 2 - 0.23), side * (width / 2 + 0.005)
-            hub = (wx * length, outer + side * 0.006, 0.32)
-            parts.append(tube((wx * length, inner, 0.32), (wx * length, outer, 0.32), (0.32, 0.32), BLACK, Material.RUBBER, 14))  # fmt: skip
-            parts.append(tube((wx * length, outer, 0.32), hub, (0.2, 0.19), STEEL, Material.METAL, 10))
+            inner, outer = ((ahead, side * (width / 2 + y), 0.32) for y in (-0.23, 0.005))
+            hub = np.add(outer, (0, side * 0.006, 0))
+            parts.append(tube(inner, outer, (0.32, 0.32), BLACK, Material.RUBBER, 14))
+            parts.append(tube(outer, hub, (0.2, 0.19), STEEL, Material.METAL, 10))
     for side in (-1, 1):
         lamp = side * (width / 2 - 0.25)
         parts.append(box((x - 0.07, lamp, belt - 0.38), (0.16, 0.36, 0.14), (225, 235, 240), Material.METAL))
@@ -162,7 +162,10 @@ def person(rng: np.random.Generator, walking: bool = True) -> Model:
     oval = np.stack([np.cos(angle), np.sin(angle)], -1)
     torso = [
         np.column_stack([oval * (np.array(r) * k * [wide, 1]), np.full(8, z * k)])
-        for z, r in ((0.82, (0.1, 0.15)), (0.95, (0.12, 0.17)), (1.15, (0.11, 0.155)), (1.38, (0.12, 0.2)), (1.47, (0.07, 0.09)))
+        for z, r in (
+            (0.82, (0.1, 0.15)), (0.95, (0.12, 0.17)), (1.15, (0.11, 0.155)), (1.38, (0.12, 0.2)),
+            (1.47, (0.07, 0.09)),
+        )
     ]  # fmt: skip
     body = [
         loft(torso, shirt, Material.CLOTH),
@@ -249,19 +252,22 @@ def cyclist(rng: np.random.Generator) -> Model:
     angle = np.linspace(0, 2 * np.pi, 8, endpoint=False)
     oval = np.stack([np.cos(angle), np.sin(angle), np.zeros(8)], -1)
     torso = [
-        hip + (neck - hip) * t + oval * [*r, 0]
-        for t, r in ((-0.1, (0.1, 0.14)), (0.1, (0.13, 0.17)), (0.5, (0.12, 0.155)), (0.88, (0.12, 0.2)), (1.05, (0.07, 0.09)))
+        np.add(hip, (neck - hip)) * t + oval * [*r, 0]
+        for t, r in (
+            (-0.1, (0.1, 0.14)), (0.1, (0.13, 0.17)), (0.5, (0.12, 0.155)), (0.88, (0.12, 0.2)),
+            (1.05, (0.07, 0.09)),
+        )
     ]  # fmt: skip
     parts += [
         loft(torso, shirt, Material.CLOTH),
-        tube(neck, neck + [0.04, 0, 0.12], (0.055, 0.05), skin, Material.SKIN, 6),
-        ellipsoid(neck + [0.06, 0, 0.19], (0.1, 0.08, 0.12), skin, Material.SKIN),
-        ellipsoid(neck + [0.05, 0, 0.24], (0.13, 0.095, 0.09), helmet, Material.PAINT),
+        tube(neck, np.add(neck, (0.04, 0, 0.12)), (0.055, 0.05), skin, Material.SKIN, 6),
+        ellipsoid(np.add(neck, (0.06, 0, 0.19)), (0.1, 0.08, 0.12), skin, Material.SKIN),
+        ellipsoid(np.add(neck, (0.05, 0, 0.24)), (0.13, 0.095, 0.09), helmet, Material.PAINT),
     ]
     limbs = []
     for side in (-1, 1):
         y = side * 0.1
-        shoulder, elbow = neck + [0, side * 0.2, -0.06], neck + [0.14, side * 0.27, -0.28]
+        shoulder, elbow = np.add(neck, (0, side * 0.2, -0.06)), np.add(neck, (0.14, side * 0.27, -0.28))
         hand = (0.38, side * 0.25, 1.08)
         parts += [
             tube(shoulder, elbow, (0.058, 0.046), shirt, Material.CLOTH, 6),
@@ -269,7 +275,7 @@ def cyclist(rng: np.random.Generator) -> Model:
         ]
         knee, foot = (0.14, y, 0.72), (-0.02, y, 0.28)
         leg = [
-            tube(hip + [0, y, -0.04], knee, (0.09, 0.065), trousers, Material.CLOTH),
+            tube(np.add(hip, (0, y, -0.04)), knee, (0.09, 0.065), trousers, Material.CLOTH),
             tube(knee, foot, (0.065, 0.045), trousers, Material.CLOTH),
             box((0.03, y, 0.26), (0.25, 0.09, 0.08), DARK, Material.RUBBER),
         ]
@@ -281,7 +287,7 @@ def cyclist(rng: np.random.Generator) -> Model:
 
 
 def house(rng: np.random.Generator, length: float, depth: float, height: float) -> Mesh:
-    """A house whose front is y = 0, reaching back to y = ``depth``; texture coordinates run along each wall."""
+    """A house with its front at y = 0 and its back at ``depth``; texture coordinates run along each wall."""
     wall = _pick(rng, WALLS)
     corner = np.array([(-length / 2, 0.0), (length / 2, 0.0), (length / 2, depth), (-length / 2, depth)])
     parts = []
@@ -317,13 +323,13 @@ def tree(rng: np.random.Generator) -> Mesh:
     for _ in range(6):
         offset = rng.normal(0, 0.45 * spread, 3) * (1, 1, 0.8)
         radii = spread * rng.uniform(0.5, 0.8, 3)
-        parts.append(ellipsoid(offset + [0, 0, height], radii, green, Material.FOLIAGE, 9, 7))
+        parts.append(ellipsoid(np.add(offset, (0, 0, height)), radii, green, Material.FOLIAGE, 9, 7))
     return merge(parts)
 
 
 def hedge(rng: np.random.Generator, length: float) -> Mesh:
-    height = rng.uniform(0.9, 1.6)
-    return box((0, 0, height / 2), (length, 0.8, height), _pick(rng, ((40, 85, 55), (45, 100, 70))), Material.FOLIAGE, (0.98, 0.8))  # fmt: skip
+    height, green = rng.uniform(0.9, 1.6), _pick(rng, ((40, 85, 55), (45, 100, 70)))
+    return box((0, 0, height / 2), (length, 0.8, height), green, Material.FOLIAGE, (0.98, 0.8))
 
 
 def lamp_post() -> Mesh:
@@ -344,6 +350,7 @@ def sign(rng: np.random.Generator) -> Mesh:
     return merge([tube((0, 0, 0), (0, 0, 2.7), (0.035, 0.035), STEEL, Material.METAL, 6), disc, inner])
 
 
-def bin_(rng: np.random.Generator) -> Mesh:
-    lid = build([(0.3, 0.3, 1.02), (-0.3, 0.3, 1.1), (-0.3, -0.3, 1.1), (0.3, -0.3, 1.02)], [(0, 1, 2), (0, 2, 3)], DARK, Material.RUBBER)  # fmt: skip
-    return merge([box((0, 0, 0.5), (0.5, 0.5, 1.0), _pick(rng, ((60, 90, 50), (60, 60, 62))), Material.RUBBER, (1.15, 1.15)), lid])  # fmt: skip
+def litter_bin(rng: np.random.Generator) -> Mesh:
+    color = _pick(rng, ((60, 90, 50), (60, 60, 62)))
+    lid = box((0, 0, 1.04), (0.62, 0.62, 0.1), DARK, Material.RUBBER, (0.8, 0.9))
+    return merge([box((0, 0, 0.5), (0.5, 0.5, 1.0), color, Material.RUBBER, (1.15, 1.15)), lid])

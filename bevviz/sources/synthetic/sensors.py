@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -13,17 +13,15 @@ from bevviz.frame import F32, F64, I32, U8, Intrinsics
 from bevviz.sources.synthetic.mesh import Material, Mesh
 from bevviz.sources.synthetic.world import Light
 
-# Share of the emitted light that comes back, and amplitude of the texture, by material.
-REFLECTANCE = np.zeros(len(Material), np.float32)
-TEXTURE = np.zeros(len(Material), np.float32)
-for _material, _reflectance, _texture in (
-    (Material.ROAD, 0.12, 0.3), (Material.PAVEMENT, 0.28, 0.2), (Material.KERB, 0.35, 0.15),
-    (Material.GRASS, 0.4, 0.5), (Material.FACADE, 0.42, 0.12), (Material.ROOF, 0.3, 0.25),
-    (Material.PAINT, 0.5, 0.0), (Material.GLASS, 0.06, 0.0), (Material.RUBBER, 0.05, 0.0),
-    (Material.CLOTH, 0.33, 0.08), (Material.SKIN, 0.45, 0.0), (Material.METAL, 0.55, 0.0),
-    (Material.FOLIAGE, 0.45, 0.7), (Material.BARK, 0.25, 0.4), (Material.SIGN, 1.0, 0.0),
-):  # fmt: skip
-    REFLECTANCE[_material], TEXTURE[_material] = _reflectance, _texture
+# Share of the emitted light that comes back, and amplitude of the texture.
+_SURFACE: Mapping[Material, tuple[float, float]] = {
+    Material.ROAD: (0.12, 0.14), Material.PAVEMENT: (0.28, 0.2), Material.KERB: (0.35, 0.15),
+    Material.GRASS: (0.4, 0.5), Material.FACADE: (0.42, 0.12), Material.ROOF: (0.3, 0.25),
+    Material.PAINT: (0.5, 0.0), Material.GLASS: (0.06, 0.0), Material.RUBBER: (0.05, 0.0),
+    Material.CLOTH: (0.33, 0.08), Material.SKIN: (0.45, 0.0), Material.METAL: (0.55, 0.0),
+    Material.FOLIAGE: (0.45, 0.7), Material.BARK: (0.25, 0.4), Material.SIGN: (1.0, 0.0),
+}  # fmt: skip
+REFLECTANCE, TEXTURE = np.array([_SURFACE[m] for m in Material], np.float32).T
 
 
 class Caster:
@@ -52,7 +50,7 @@ class Caster:
 
 @dataclass(frozen=True, slots=True)
 class Hits:
-    """What R rays met; every array but the first two has one row for each of the H rays that met something."""
+    """One row for each of the H rays that met something."""
 
     ray: NDArray[np.intp]  # (H,) row of the ray
     distance: F32  # (H,) metres
@@ -71,10 +69,12 @@ class View:
 
     def cast(self, rays: F32, reach: float = np.inf) -> Hits:
         answers = [caster.cast(rays) for caster in self._casters]
-        nearest = np.argmin([a["t_hit"] for a in answers], axis=0)
-        distance = np.min([a["t_hit"] for a in answers], axis=0)
-        hit = distance < reach
-        ray = np.flatnonzero(hit)
+        distance = answers[0]["t_hit"]
+        nearest = np.zeros(len(rays), np.uint8)
+        if len(answers) == 2:
+            nearest = (answers[1]["t_hit"] < distance).view(np.uint8)
+            distance = np.minimum(distance, answers[1]["t_hit"])
+        ray = np.flatnonzero(distance < reach)
         out = Hits(
             ray,
             distance[ray],
@@ -127,7 +127,7 @@ class Lidar:
     """A spinning LiDAR with the beams of a Velodyne HDL-64E. Scans are free of motion distortion."""
 
     beams: int = 64
-    azimuths: int = 2048
+    azimuths: int = 1900
     lowest: float = -24.8  # degrees
     highest: float = 2.0
     reach: float = 120.0  # metres
@@ -186,7 +186,7 @@ class PinholeCamera:
 
     width: int = 640
     height: int = 360
-    focal: float = 360.0  # pixels
+    focal: float = 440.0  # pixels, as a ZED 2 with its 4 mm lens
     _directions: F32 = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -298,9 +298,9 @@ def _reflect(shade: F32, hits: Hits, direction: F32, light: Light) -> None:
 def _sky(direction: F32, light: Light) -> F32:
     up = np.clip(direction[:, 2], 0, 1)
     blend = np.sqrt(np.minimum(up * 2.2, 1))[:, None]
-    scale = 60 / (up + 0.15)
+    scale = 20 / (up + 0.15)
     u, v = (direction[:, 0] * scale).astype(np.int32), (direction[:, 1] * scale).astype(np.int32)
-    cloud = np.clip(_TILE[u & 255, v & 255] * 1.5 - 0.2, 0, 1)[:, None] * blend * 0.7
+    cloud = np.clip(_TILE[u & 255, v & 255] * 1.2, 0, 1)[:, None] * blend * 0.5
     clear = light.horizon * (1 - blend) + light.zenith * blend
     return np.asarray(clear * (1 - cloud) + 238 * cloud, np.float32)
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from bevviz import geometry
 from bevviz.frame import F32, F64
@@ -22,7 +21,7 @@ ROAD, PAVEMENT, KERB = (
 
 
 class Street:
-    """A centre line that turns, climbs and falls gently. ``s`` is the way along it, ``lateral`` to its left."""
+    """A centre line that turns, climbs and falls. ``s`` is the way along it, ``lateral`` to its left."""
 
     def __init__(self, rng: np.random.Generator, length: float) -> None:
         self.start, self.end = -MARGIN, length + MARGIN
@@ -37,7 +36,7 @@ class Street:
         way -= [np.interp(0.0, self.s, column) for column in way.T]
         self.way, self.heading, self.grade = way, heading, grade
 
-    def point(self, s: ArrayLike, lateral: ArrayLike, height: ArrayLike = 0.0) -> F64:
+    def point(self, s: F64 | float, lateral: F64 | float, height: F64 | float = 0.0) -> F64:
         """(..., 3) points of the map frame."""
         x, y, z = (np.interp(s, self.s, column) for column in self.way.T)
         heading = np.interp(s, self.s, self.heading)
@@ -123,7 +122,7 @@ class World:
         return merge([a.mesh(self.street, time) for a in self._near(time, centre, reach) if a.speed != 0])
 
     def objects(self, time: float, centre: F64, reach: float) -> list[tuple[Actor, Mesh, float]]:
-        """Every actor within ``reach`` metres of ``centre``, with its mesh and its heading in the map frame."""
+        """Every actor within ``reach`` metres of ``centre``, its mesh and its heading in the map frame."""
         return [
             (
                 a,
@@ -195,10 +194,10 @@ class _Cast:
     def _park(self, street: Street, side: int) -> None:
         rng, s = self.rng, street.start + 8
         while s < street.end - 12:
-            if rng.random() < 0.62:
+            if rng.random() < 0.48:
                 turn = rng.normal(0, 0.02) + (np.pi if (side > 0) ^ (rng.random() < 0.15) else 0)
                 self._add("car", models.car(rng), s, side * (5.3 + rng.normal(0, 0.05)), 0.0, turn)
-            elif rng.random() < 0.3:
+            elif rng.random() < 0.4:
                 self._add("person", models.person(rng, False), s, side * 4.9, 0.0, -side * np.pi / 2)
             s += rng.uniform(5.9, 7.5)
 
@@ -296,7 +295,7 @@ def _furniture(rng: np.random.Generator, street: Street) -> list[Mesh]:
                     models.sign(rng).moved(street.pose(s, side * 6.8, KERB, turn=0 if side < 0 else np.pi))
                 )
             else:
-                parts.append(models.bin_(rng).moved(street.pose(s, side * 6.85, KERB)))
+                parts.append(models.litter_bin(rng).moved(street.pose(s, side * 6.85, KERB)))
             s += rng.uniform(7, 15)
     return parts
 
