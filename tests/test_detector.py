@@ -224,6 +224,7 @@ some_boxes = st.lists(
 )
 
 
+@settings(deadline=None)
 @given(some_boxes, st.floats(0.1, 0.9))
 def test_nms_keeps_what_the_definition_keeps(rows: list[tuple[float, ...]], threshold: float) -> None:
     table = np.array(rows, np.float32)

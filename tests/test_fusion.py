@@ -9,7 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from bevviz.config import ClusteringConfig, Config, FusionConfig, load
@@ -238,6 +238,7 @@ def test_nothing_to_fuse(config: FusionConfig) -> None:
     assert lonely.detection_cluster.tolist() == [-1]
 
 
+@settings(deadline=None)
 @given(st.integers(0, 2**32 - 1), st.sampled_from([DEFAULT, REFERENCE]))
 def test_random_scenes_keep_the_rules(seed: int, config: FusionConfig) -> None:
     rng = np.random.default_rng(seed)
@@ -277,6 +278,7 @@ def costs(draw: st.DrawFn) -> F64:
     return np.array(flat, np.float64).reshape(rows, columns)
 
 
+@settings(deadline=None)
 @given(costs())
 def test_assignment_is_the_best_of_all(cost: F64) -> None:
     rows, columns = cost.shape

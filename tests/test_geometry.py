@@ -5,7 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from bevviz import geometry
@@ -30,6 +30,7 @@ def poses(draw: st.DrawFn) -> F64:
     return geometry.transform(np.array(draw(st.tuples(reals, reals, reals))), np.array(draw(quaternions)))
 
 
+@settings(deadline=None)
 @given(quaternions)
 def test_quaternion_round_trip(q: tuple[float, ...]) -> None:
     unit = np.array(q) / np.linalg.norm(q)
@@ -44,12 +45,14 @@ def test_no_rotation(q: tuple[float, ...]) -> None:
         geometry.transform(np.zeros(3), np.array(q))
 
 
+@settings(deadline=None)
 @given(poses())
 def test_inverse(pose: F64) -> None:
     np.testing.assert_allclose(geometry.inverse(pose) @ pose, np.eye(4), atol=1e-9)
     np.testing.assert_allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), atol=1e-12)
 
 
+@settings(deadline=None)
 @given(poses(), poses(), st.floats(0, 1))
 def test_interpolation_turns_evenly_on_the_shorter_arc(a: F64, b: F64, t: float) -> None:
     def angle(m: F64, n: F64) -> float:
@@ -62,6 +65,7 @@ def test_interpolation_turns_evenly_on_the_shorter_arc(a: F64, b: F64, t: float)
     assert angle(middle, b) == pytest.approx((1 - t) * angle(a, b), abs=1e-6)
 
 
+@settings(deadline=None)
 @given(poses(), st.lists(st.tuples(reals, reals, reals), max_size=20))
 def test_apply(pose: F64, points: list[tuple[float, float, float]]) -> None:
     p = np.array(points, np.float32).reshape(-1, 3)
@@ -70,6 +74,7 @@ def test_apply(pose: F64, points: list[tuple[float, float, float]]) -> None:
     np.testing.assert_allclose(moved, (pose @ np.c_[p, np.ones(len(p))].T).T[:, :3], atol=1e-3)
 
 
+@settings(deadline=None)
 @given(st.floats(-3.1, 3.1))
 def test_yaw(angle: float) -> None:
     pose = geometry.transform(np.zeros(3), np.array([0, 0, np.sin(angle / 2), np.cos(angle / 2)]))
@@ -172,6 +177,7 @@ whole_boxes = st.lists(
 )
 
 
+@settings(deadline=None)
 @given(whole_boxes, whole_boxes)
 def test_iou_counts_cells(a: list[tuple[int, ...]], b: list[tuple[int, ...]]) -> None:
     def cells(box: tuple[int, ...]) -> set[tuple[int, int]]:
@@ -191,6 +197,7 @@ def test_iou_with_a_box_that_is_nowhere() -> None:
     assert geometry.iou(box, nowhere) == 0
 
 
+@settings(deadline=None)
 @given(st.tuples(reals, reals, reals), st.tuples(*[st.floats(0.1, 10)] * 3), st.floats(-3.1, 3.1))
 def test_corners_of_a_turned_box(center: tuple[float, ...], size: tuple[float, ...], angle: float) -> None:
     boxes = Boxes3D(*(np.array([v], np.float32) for v in (center, size, angle)))

@@ -170,18 +170,10 @@ class Detector:
         inner = np.maximum((size * ratio).astype(int) if yolox else np.rint(size * ratio).astype(int), 1)
         padded = -(-inner // self._stride) * self._stride
         outer = np.where(self._open_axes, padded, self.input_size)
-        top, left = (0, 0) if yolox else (outer - inner) // 2
-        bottom, right = outer - inner - (top, left)
-        resized = bgr if np.array_equal(inner, size) else cv2.resize(bgr, (int(inner[1]), int(inner[0])))
-        canvas = cv2.copyMakeBorder(
-            resized,
-            int(top),
-            int(bottom),
-            int(left),
-            int(right),
-            cv2.BORDER_CONSTANT,
-            value=(GREY, GREY, GREY),
-        )
+        top, left = (0, 0) if yolox else ((outer - inner) // 2).tolist()
+        height, width = inner.tolist()
+        canvas = np.full((*outer, 3), GREY, np.uint8)
+        canvas[top : top + height, left : left + width] = cv2.resize(bgr, (width, height))
         blob = cv2.dnn.blobFromImage(canvas, 1.0 if yolox else 1 / 255, swapRB=not yolox)
         scale = (inner / size)[::-1].astype(np.float32)
         return blob.astype(self._dtype, copy=False), scale, np.array([left, top], np.float32)
@@ -344,6 +336,8 @@ def _open(path: Path, config: DetectorConfig) -> tuple[Any, str]:
     options = ort.SessionOptions()
     options.intra_op_num_threads = config.threads
     options.log_severity_level = 3
+    # Threads that spin between runs cost as much processor time as the network, and the LiDAR stages need it.
+    options.add_session_config_entry("session.intra_op.allow_spinning", "0")
     try:
         session = ort.InferenceSession(path, options, [available[name] for name in chosen])
     except Exception as error:  # onnxruntime's errors have no common base class

@@ -68,10 +68,11 @@ def fuse(
     Returns:
         The matches, and for every detection and cluster the decision and the evidence.
     """
-    size = np.array([intrinsics.width, intrinsics.height], np.float32)
-    with np.errstate(invalid="ignore"):
-        visible = np.flatnonzero(((uv >= -0.5) & (uv < size - 0.5)).all(axis=1) & (depth > 0))
-    visible = visible[np.argsort(uv[visible, 0])]
+    u, v = uv.T
+    visible = np.flatnonzero(
+        (u >= -0.5) & (u < intrinsics.width - 0.5) & (v >= -0.5) & (v < intrinsics.height - 0.5) & (depth > 0)
+    )
+    visible = visible[np.argsort(u[visible])]  # for _in_boxes
     uv, depth, labels = uv[visible], depth[visible], clusters.labels[visible]
     cluster_uv = _boxes_around(uv, labels, len(clusters))
     inside = _in_boxes(uv, detections.xyxy)
@@ -91,10 +92,8 @@ def fuse(
 
     reason[matched] = Decision.MATCHED
     order = np.concatenate([matched[np.argsort(pairs.cost[matched], kind="stable")], order])
-    best_cluster, best_detection = (
-        _first_of_each(pairs.detection, order),
-        _first_of_each(pairs.cluster, order),
-    )
+    best_cluster = _first_of_each(pairs.detection, order)
+    best_detection = _first_of_each(pairs.cluster, order)
     detection_decision, detection_cluster = _decide(
         np.where(detections.state == DetectionState.KEPT, Decision.NO_CLUSTER, Decision.NOT_KEPT),
         pairs.detection[best_cluster],
