@@ -138,7 +138,14 @@ def test_hard_clouds_take_no_longer(name: str) -> None:
     begin = time.perf_counter()
     labels = dbscan(points, 0.5, 10)
     assert time.perf_counter() - begin < 3
-    clusters = {"one place": 1, "one cell": 1, "two cells": 1, "far apart": 0, "upright line": 0, "no neighbours": 0}
+    clusters = {
+        "one place": 1,
+        "one cell": 1,
+        "two cells": 1,
+        "far apart": 0,
+        "upright line": 0,
+        "no neighbours": 0,
+    }
     if name in clusters:
         assert labels.max() + 1 == clusters[name]
 

@@ -38,8 +38,8 @@ def segment_ground(points: F32, config: GroundConfig) -> Ground:
         config: the method and its parameters.
 
     Returns:
-        Ground. Without a plane to start from (fewer than three points, or all on a line) nothing is ground
-        and all heights are NaN.
+        Ground. Without a plane to start from (fewer than three points, all on a line, none where
+        ``sensor_height`` would have them) nothing is ground and all heights are NaN.
     """
     return _ransac(points, config) if config.method == "ransac" else _polar(points, config)
 
