@@ -330,6 +330,8 @@ def test_an_empty_image_and_a_broken_answer_give_no_detection(tmp_path: Path) ->
         ((1, 8400, 6), (640, 640), None, Layout.YOLOX, 1),
         ((1, 300, 6), (640, 640), None, Layout.END_TO_END, None),
         ((1, 300, 6), (640, 640), 80, Layout.END_TO_END, 80),
+        ((1, 9, 777), (360, 640), 5, Layout.YOLOV8, 5),  # of no grid, but of the right count
+        ((1, 9, 777), (360, 640), None, None, None),
         ((1, 84, 8400), (640, 640), 3, None, None),  # names of another model
         ((1, 197, 768), (224, 224), None, None, None),  # a transformer's tokens
         ((1, 1000), (224, 224), None, None, None),

@@ -274,7 +274,8 @@ def find_layout(
     """Layout and count of classes of an output, None where it is none of a detector's.
 
     One box a cell, summed over neighbouring strides, tells a grid from other lists: 8400 for 640 x 640 and
-    strides 8, 16, 32, three times that with YOLOv5's anchors.
+    strides 8, 16, 32, three times that with YOLOv5's anchors. YOLOv8's boxes need no grid to be decoded:
+    the right count of classes will do.
 
     Args:
         shape: of the output.
@@ -289,7 +290,7 @@ def find_layout(
     # Rows could also be those of an end-to-end head, 300 as a rule, so that only whole pyramids count.
     pyramids = {count for count, strides in cells.items() if {8, 16, 32} <= set(strides)}
     for fits, layout, count in (
-        (columns in cells and columns > rows, Layout.YOLOV8, rows - 4),
+        ((columns in cells or rows - 4 == classes) and columns > rows, Layout.YOLOV8, rows - 4),
         (rows in pyramids, Layout.YOLOX, columns - 5),
         (rows % 3 == 0 and rows // 3 in pyramids, Layout.YOLOV5, columns - 5),
     ):
