@@ -334,14 +334,21 @@ class Recording:
     def _unpack(self, path: Path) -> Path:
         target = Path(self._folder.name) / f"{len(self.files)}" / path.stem
         target.parent.mkdir(exist_ok=True)
-        try:
-            with path.open("rb") as raw, zstd.open(raw, "rb") as source, target.open("wb") as out:
-                while block := source.read(1 << 20):
-                    out.write(block)
-        except (EOFError, zstd.ZstdError) as error:
+        stream, damaged = zstd.ZstdDecompressor(), False
+        with path.open("rb") as source, target.open("wb") as out:
+            while block := source.read(1 << 20):
+                try:
+                    out.write(stream.decompress(block))
+                    while stream.eof and stream.unused_data:  # one frame behind another
+                        block, stream = stream.unused_data, zstd.ZstdDecompressor()
+                        out.write(stream.decompress(block))
+                except (zstd.ZstdError, EOFError):
+                    damaged = True
+                    break
+        if damaged or not stream.eof:
             self._notes.append(
                 f"{path.name}: the compressed file is damaged or its end is missing: "
-                f"{megabytes(target.stat().st_size)} could be unpacked ({error})"
+                f"{megabytes(target.stat().st_size)} could be unpacked"
             )
         return target
 

@@ -139,6 +139,8 @@ class Ros1File(Reader):
         records.seek(entry.offset)
         while (header := Header.read(records)).get_uint8("op") == RecordType.CONNECTION:
             records.seek(read_uint32(records), 1)
+        if header.get_time("time") != entry.time:
+            raise ReaderError("the index leads to another message")
         return header.get_uint32("conn"), read_bytes(records, read_uint32(records))
 
     def _chunk_data(self, position: int) -> bytes:

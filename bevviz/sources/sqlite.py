@@ -71,19 +71,25 @@ class SqliteFile(Sqlite3Reader):
         Raises:
             UserError: not a bag, or nothing in it is readable.
         """
-        with suppress(ReaderError, apsw.Error):
-            super().open()
-            return
         with self.path.open("rb") as file:
-            self._bytes = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
-        if len(self._bytes) < 512 or self._bytes[: len(MAGIC)] != MAGIC:
-            raise UserError(f"{self.path}: not a sqlite3 file, or too short to be one")
-        self._collect(self._bytes)
+            head = file.read(32)
+            size = file.seek(0, 2)
+        page = int.from_bytes(head[16:18], "big")
+        self._page = 65536 if page == 1 else page
+        self._missing = max(0, int.from_bytes(head[28:32], "big") * self._page - size)
+        if head[: len(MAGIC)] != MAGIC or self._page < 512 or size < self._page:
+            raise UserError(f"{self.path}: not a sqlite3 file, or nothing of it is left")
+        self._usable = self._page - head[20]
+        if not self._missing:  # else sqlite3 would fill a page that is cut with zeros
+            with suppress(ReaderError, apsw.Error):
+                super().open()
+                return
+        self._collect()
 
     def close(self) -> None:
-        if self._bytes is None:
+        if self.dbconn is not None:
             super().close()
-        else:
+        if self._bytes is not None:
             self._bytes.close()
 
     @property
@@ -107,17 +113,20 @@ class SqliteFile(Sqlite3Reader):
         self, connections: Collection[Connection], start: int | None = None, stop: int | None = None
     ) -> Generator[tuple[Connection, int, bytes], None, None]:
         """Messages of ``connections`` with start <= log time < stop, in order of log time."""
+        given = 0
         if self._rows is None:
-            yield from super().messages(connections, start, stop)
-            return
+            try:
+                for message in super().messages(connections, start, stop):
+                    yield message
+                    given += 1
+                return
+            except apsw.Error:  # a damaged page: what is left is found without the tree
+                self._collect()
         wanted = {c.id: c for c in connections}
-        for row in self._rows:
-            if (
-                row.topic in wanted
-                and (start is None or row.timestamp >= start)
-                and (stop is None or row.timestamp < stop)
-            ):
-                yield wanted[row.topic], row.timestamp, self._content(row.record)[row.record.columns[3][1] :]
+        low, high = start or 0, 2**63 if stop is None else stop
+        rows = [r for r in self._rows or () if r.topic in wanted and low <= r.timestamp < high]
+        for row in rows[given:]:
+            yield wanted[row.topic], row.timestamp, self._content(row.record)[row.record.columns[3][1] :]
 
     def times(self, connections: Collection[Connection]) -> I64:
         """Log times of all messages of ``connections``, sorted, without their data."""
@@ -129,11 +138,9 @@ class SqliteFile(Sqlite3Reader):
         query = f"SELECT timestamp FROM messages WHERE topic_id IN ({marks}) ORDER BY timestamp"
         return np.fromiter((t for (t,) in self.dbconn.execute(query, topics)), np.int64)
 
-    def _collect(self, data: mmap.mmap) -> None:
-        page = int.from_bytes(data[16:18], "big")
-        self._page = 65536 if page == 1 else page
-        self._usable = self._page - data[20]
-        self._missing = max(0, int.from_bytes(data[28:32], "big") * self._page - len(data))
+    def _collect(self) -> None:
+        with self.path.open("rb") as file:
+            data = self._bytes = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
         topics: dict[int, tuple[str, str, str]] = {}
         definitions: dict[str, MessageDefinition] = {}
         rows: dict[int, Row] = {}
@@ -147,6 +154,8 @@ class SqliteFile(Sqlite3Reader):
         self._rows = sorted(complete)
         counts = Counter(r.topic for r in self._rows)
         nothing = MessageDefinition(MessageDefinitionFormat.NONE, "")
+        if self.connections:  # found damaged while reading
+            return
         for number, (name, msgtype, encoding) in sorted(topics.items()):
             ext = ConnectionExtRosbag2(encoding, [])
             definition = definitions.get(msgtype, nothing)

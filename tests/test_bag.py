@@ -1,0 +1,532 @@
+"""Bags of every format, whole and damaged, as a source of frames."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import tracemalloc
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from bevviz import geometry
+from bevviz.config import Config, load
+from bevviz.errors import UserError
+from bevviz.frame import Frame
+from bevviz.sources.bag import BagSource, iso, parse_time
+from bevviz.sources.recording import Recording
+from tests import bags
+
+FORMATS = [
+    ("mcap", ""),
+    ("mcap", "storage"),
+    ("mcap", "file"),
+    ("mcap", "message"),
+    ("sqlite3", ""),
+    ("sqlite3", "file"),
+    ("sqlite3", "message"),
+    ("ros1", ""),
+    ("ros1", "bz2"),
+    ("ros1", "lz4"),
+]
+CLOUD = "sensor_msgs/msg/PointCloud2"
+
+
+def make(folder: Path, form: str = "mcap", compression: str = "", name: str = "", **options: Any) -> Path:
+    """A small drive; ``options`` of ``bags.small_items``."""
+    messages = bags.Messages(form == "ros1")
+    name = name or f"drive_{form}_{compression or 'plain'}"
+    path = folder / (f"{name}.bag" if form == "ros1" else name)
+    return bags.write(
+        path, bags.small_items(messages, **options), messages, form=form, compression=compression
+    )
+
+
+def storage_file(bag: Path) -> Path:
+    """The one file of a bag that holds its messages."""
+    return bag if bag.is_file() else next(f for f in bag.iterdir() if f.name != "metadata.yaml")
+
+
+def frames_of(*paths: Path, config: Config | None = None, **options: Any) -> list[Frame]:
+    with BagSource(paths, config or Config(), **options) as source:
+        return list(source)
+
+
+def scans(frames: Sequence[Frame]) -> list[int]:
+    """Number of the scan that each frame is of: the x of its first point."""
+    return [int(frame.points[0, 0]) for frame in frames]
+
+
+def content(*paths: Path) -> list[tuple[str, int, bytes]]:
+    with Recording(paths) as recording:
+        names = [topic.name for topic in recording.topics]
+        return [(m.topic, m.received, bytes(m.content())) for m in recording.messages(names)]
+
+
+def is_part(found: Sequence[Any], whole: Sequence[Any]) -> bool:
+    """Whether ``found`` is ``whole`` with some of its items left out."""
+    rest = iter(whole)
+    return all(item in rest for item in found)
+
+
+# --- formats -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("form", "compression"), FORMATS)
+def test_every_format_gives_the_same_frames(tmp_path: Path, form: str, compression: str) -> None:
+    path = make(tmp_path, form, compression)
+    with BagSource([path], Config()) as source:
+        assert source.total == 30
+        frames = list(source)
+        assert not source.warnings
+    assert scans(frames) == [f.index for f in frames] == list(range(30))
+    assert [f.stamp for f in frames] == [bags.START + i * bags.PERIOD for i in range(30)]
+    assert [f.received - f.stamp for f in frames] == [bags.PERIOD // 10] * 30
+    assert source.scene.lidars == ("velodyne",)
+    assert source.scene.cameras == ("camera",)
+    for frame in frames:
+        (camera,) = frame.cameras
+        assert not camera.problems
+        assert camera.image is not None
+        assert camera.image.bgr.shape == (48, 64, 3)
+        assert frame.world_frame == "odom"
+        assert frame.world_from_points is not None
+        assert frame.world_from_points[0, 3] == pytest.approx(scans([frame])[0])
+
+
+@pytest.mark.parametrize(("form", "compression"), FORMATS)
+def test_messages_come_back_as_written(tmp_path: Path, form: str, compression: str) -> None:
+    messages = bags.Messages(form == "ros1")
+    items = bags.small_items(messages, scans=5)
+    serialize = messages.store.serialize_ros1 if messages.ros1 else messages.store.serialize_cdr
+    path = bags.write(tmp_path / "drive.bag", items, messages, form=form, compression=compression)
+    written = [(i.topic, i.received, bytes(serialize(i.message, i.type))) for i in items]
+    assert sorted(content(path)) == sorted(written)
+
+
+@pytest.mark.parametrize("form", ["mcap", "sqlite3"])
+def test_a_lone_file_and_a_folder_without_metadata(tmp_path: Path, form: str) -> None:
+    bag = make(tmp_path, form)
+    assert len(frames_of(storage_file(bag))) == 30
+    (bag / "metadata.yaml").unlink()
+    with BagSource([bag], Config()) as source:
+        assert len(list(source)) == 30
+        assert any("metadata.yaml is missing" in w for w in source.warnings)
+
+
+def test_the_kind_of_file_is_told_by_its_content(tmp_path: Path) -> None:
+    lone = tmp_path / "recording"
+    storage_file(make(tmp_path)).rename(lone)
+    assert len(frames_of(lone)) == 30
+
+
+def test_metadata_that_is_no_yaml_is_told(tmp_path: Path) -> None:
+    bag = make(tmp_path)
+    (bag / "metadata.yaml").write_text("rosbag2: [")
+    with BagSource([bag], Config()) as source:
+        assert source.total == 30
+        assert any("not readable as metadata.yaml" in w for w in source.warnings)
+
+
+def test_several_bags_are_one_recording_in_order_of_time(tmp_path: Path) -> None:
+    items = bags.small_items()
+    cut = bags.START + 15 * bags.PERIOD
+    first = bags.write(tmp_path / "b", [i for i in items if i.received < cut])
+    second = bags.write(tmp_path / "a", [i for i in items if i.received >= cut], form="sqlite3")
+    for paths in ([first, second], [second, first]):
+        assert scans(frames_of(*paths)) == list(range(30))
+
+
+def test_a_folder_of_split_files(tmp_path: Path) -> None:
+    items = bags.small_items()
+    bag = tmp_path / "split"
+    bag.mkdir()
+    for part in range(3):
+        chosen = [i for i in items if (i.received - bags.START) // (10 * bags.PERIOD) == part]
+        piece = bags.write(tmp_path / f"part_{2 - part}", chosen)
+        storage_file(piece).rename(bag / f"part_{2 - part}.mcap")
+    assert scans(frames_of(bag)) == list(range(30))
+
+
+def test_messages_outside_chunks_may_be_out_of_order(tmp_path: Path) -> None:
+    """As rosbag2's 'fastwrite' profile writes them, by several threads."""
+    whole = make(tmp_path, scans=8)
+    data = storage_file(whole).read_bytes()
+    head = 8 + 9 + int.from_bytes(data[9:17], "little")
+    start = head + 9 + 32 + 8  # the rosbags writer does not compress: the chunk's name is empty
+    size = int.from_bytes(data[start - 8 : start], "little")
+    records, offset = [], start
+    while offset < start + size:
+        end = offset + 9 + int.from_bytes(data[offset + 1 : offset + 9], "little")
+        records.append(data[offset:end])
+        offset = end
+    others = [r for r in records if r[0] != 5]
+    messages = [r for r in records if r[0] == 5]
+    flat = tmp_path / "flat.mcap"
+    flat.write_bytes(
+        data[:head] + b"".join(others + messages[::-1]) + b"\x0f" + (4).to_bytes(8, "little") + bytes(4)
+    )
+    found = content(flat)
+    assert sorted(found) == sorted(content(whole))
+    assert [time for _, time, _ in found] == sorted(time for _, time, _ in found)
+    assert scans(frames_of(flat)) == list(range(8))
+
+
+# --- parts -------------------------------------------------------------------------------------
+
+
+def test_start_and_end(tmp_path: Path) -> None:
+    bag = make(tmp_path)
+    assert scans(frames_of(bag, start="1.0", end="1.5")) == [10, 11, 12, 13, 14]
+    stamp = bags.START / 1e9
+    assert scans(frames_of(bag, start=f"{stamp + 2.5}")) == [25, 26, 27, 28, 29]
+    assert scans(frames_of(bag, end="2023-11-14T22:13:20.300")) == [0, 1, 2]
+    assert scans(frames_of(bag, start="2023-11-14T23:13:22.75+01:00")) == [28, 29]
+
+
+@pytest.mark.parametrize("form", ["mcap", "sqlite3", "ros1"])
+def test_what_is_published_once_holds_after_start(tmp_path: Path, form: str) -> None:
+    messages = bags.Messages(form == "ros1")
+    items = bags.small_items(messages)
+    once = [i for i in items if i.topic == bags.INFO][:1]
+    items = [i for i in items if i.topic != bags.INFO] + once
+    path = bags.write(tmp_path / "drive.bag", items, messages, form=form)
+    (frame,) = frames_of(path, start="2.5", frames=(0, 1))
+    (camera,) = frame.cameras
+    assert scans([frame]) == [25]
+    assert not camera.problems
+    assert camera.intrinsics is not None and camera.intrinsics.width == 64
+    assert camera.camera_from_points is not None
+    assert frame.world_from_points is not None
+
+
+def test_every_and_frames(tmp_path: Path) -> None:
+    bag = make(tmp_path)
+    assert scans(frames_of(bag, every=10)) == [0, 10, 20]
+    assert scans(frames_of(bag, frames=(3, 6))) == [3, 4, 5]
+    assert scans(frames_of(bag, frames=(5, 20), every=7)) == [5, 12, 19]
+    assert scans(frames_of(bag, frames=(-2, None))) == [28, 29]
+    late = frames_of(bag, start="1.0", frames=(2, 4))
+    assert scans(late) == [12, 13]
+    assert [f.index for f in late] == [2, 3]
+    with BagSource([bag], Config(), every=4, frames=(1, 22)) as source:
+        assert source.total == len(list(source)) == 6
+
+
+@settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(
+    every=st.integers(1, 8),
+    first=st.none() | st.integers(-12, 12),
+    last=st.none() | st.integers(-12, 12),
+)
+def test_parts_are_python_slices(
+    tmp_path_factory: pytest.TempPathFactory, every: int, first: int | None, last: int | None
+) -> None:
+    bag = tmp_path_factory.getbasetemp() / "sliced"
+    if not bag.exists():
+        bags.write(bag, bags.small_items(scans=10, points=20))
+    expected = list(range(10))[first:last][::every]
+    if not expected:
+        with pytest.raises(UserError, match="none of them is among --frames"):
+            frames_of(bag, every=every, frames=(first, last))
+        return
+    assert scans(frames_of(bag, every=every, frames=(first, last))) == expected
+
+
+def test_what_is_skipped_is_not_decoded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    decoded: list[str] = []
+    original = Recording.decode
+
+    def counting(self: Recording, message: Any) -> Any:
+        decoded.append(message.topic)
+        return original(self, message)
+
+    monkeypatch.setattr(Recording, "decode", counting)
+    frames_of(make(tmp_path), every=10)
+    assert decoded.count(bags.CLOUD) == 3
+    assert decoded.count(bags.IMAGE) == 3
+
+
+@pytest.mark.parametrize("text", ["soon", "-1", "nan", "2026-13-01"])
+def test_a_time_that_is_none(text: str) -> None:
+    with pytest.raises(UserError, match="is no time"):
+        parse_time(text, 0)
+
+
+def test_times_are_read_and_printed() -> None:
+    assert parse_time("12.5", 10**9) == 13_500_000_000
+    assert parse_time("1700000000.5", 5) == 1_700_000_000_500_000_000
+    assert parse_time("2023-11-14T22:13:20Z", 5) == 1_700_000_000_000_000_000
+    assert iso(1_700_000_000_250_000_000) == "2023-11-14T22:13:20.250Z"
+
+
+def test_a_part_outside_the_recording_is_told(tmp_path: Path) -> None:
+    bag = make(tmp_path)
+    with pytest.raises(UserError, match=r"outside the recording, which has 2\.9 s"):
+        frames_of(bag, start="100")
+    with pytest.raises(UserError, match="no scan in the time asked for"):
+        frames_of(bag, start="2", end="1")
+
+
+# --- damage ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("form", "compression"),
+    [("mcap", ""), ("mcap", "storage"), ("sqlite3", ""), ("ros1", ""), ("ros1", "lz4")],
+)
+@pytest.mark.parametrize("share", [0.999, 0.83, 0.5, 0.37])
+def test_a_cut_bag_gives_all_before_the_cut(
+    tmp_path: Path, form: str, compression: str, share: float
+) -> None:
+    path = storage_file(make(tmp_path, form, compression, scans=60, points=1000))
+    whole = content(path)
+    data = path.read_bytes()
+    cut = path.with_name(f"cut_{path.name}")
+    cut.write_bytes(data[: int(share * len(data))])
+    with BagSource([cut], Config()) as source:
+        frames = list(source)
+        found = source.recording.message_count
+        warnings = source.warnings
+    assert is_part(content(cut), whole)
+    # Of what is not compressed only the message that is cut may be missing.
+    before = sum(data.find(m[2]) + len(m[2]) <= int(share * len(data)) for m in whole)
+    if not compression and form != "sqlite3":
+        assert content(cut) == whole[:before]
+    assert found >= int(share * len(whole)) - 12
+    assert scans(frames) == list(range(len(frames)))
+    if found < len(whole):
+        assert any(f"read {found} messages" in w for w in warnings)
+
+
+@settings(max_examples=20, deadline=None)
+@given(data=st.data())
+@pytest.mark.parametrize("form", ["mcap", "sqlite3", "ros1"])
+def test_a_cut_at_any_byte_never_gives_wrong_messages(
+    tmp_path_factory: pytest.TempPathFactory, form: str, data: st.DataObject
+) -> None:
+    folder = tmp_path_factory.getbasetemp()
+    bag = folder / (f"any_{form}.bag" if form == "ros1" else f"any_{form}")
+    if not bag.exists():
+        make(folder, form, name=f"any_{form}", scans=12, points=50)
+    path = storage_file(bag)
+    whole = content(path)
+    size = path.stat().st_size
+    cut = folder / f"any_cut_{form}"
+    cut.write_bytes(path.read_bytes()[: data.draw(st.integers(0, size - 1))])
+    try:
+        found = content(cut)
+    except UserError:
+        assert cut.stat().st_size < 0.25 * size
+        return
+    assert is_part(found, whole)
+    if form != "sqlite3":  # there a long message may lie behind a later short one
+        assert found == whole[: len(found)]
+
+
+def test_a_cut_compressed_file(tmp_path: Path) -> None:
+    bag = make(tmp_path, "mcap", "file", scans=60)
+    file = storage_file(bag)
+    file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
+    with BagSource([bag], Config()) as source:
+        frames = list(source)
+        assert 20 <= len(frames) < 60
+        assert any("compressed file is damaged" in w for w in source.warnings)
+        assert any("are lost" in w and "metadata.yaml counts 241 messages" in w for w in source.warnings)
+
+
+@pytest.mark.parametrize(
+    ("form", "compression", "magic"),
+    [
+        ("mcap", "storage", b"\x28\xb5\x2f\xfd"),
+        ("ros1", "lz4", b"\x04\x22\x4d\x18"),
+        ("ros1", "bz2", b"BZh9"),
+    ],
+)
+def test_a_damaged_chunk_costs_its_own_messages(
+    tmp_path: Path, form: str, compression: str, magic: bytes
+) -> None:
+    path = storage_file(make(tmp_path, form, compression, scans=200, points=2000))
+    whole = content(path)
+    data = bytearray(path.read_bytes())
+    middle = data.index(magic, len(data) // 2)
+    data[middle : middle + 8] = bytes(8)
+    path.write_bytes(data)
+    with Recording([path]) as recording:
+        found = [
+            (m.topic, m.received, bytes(m.content())) for m in recording.messages({t for t, *_ in whole})
+        ]
+        assert any("damaged chunk(s)" in w and "messages lost" in w for w in recording.warnings)
+    assert set(found) <= set(whole)
+    assert len(whole) / 2 < len(found) < len(whole)
+
+
+def test_a_damaged_message_is_counted_and_the_others_go_on(tmp_path: Path) -> None:
+    items = bags.small_items()
+    clouds = [i for i, item in enumerate(items) if item.topic == bags.CLOUD]
+    for i in clouds[10:12]:
+        items[i] = items[i]._replace(message=b"\0\1\0\0" + bytes(40))
+    with BagSource([bags.write(tmp_path / "drive", items)], Config()) as source:
+        assert scans(list(source)) == [*range(10), *range(12, 30)]
+        assert any(f"2 message(s) of {bags.CLOUD} could not be used" in w for w in source.warnings)
+
+
+def test_a_recorder_that_was_killed_leaves_an_unindexed_bag(tmp_path: Path) -> None:
+    path = make(tmp_path, "ros1")
+    data = bytearray(path.read_bytes())
+    at = data.index(b"index_pos=") + len(b"index_pos=")
+    data[at : at + 8] = bytes(8)
+    path.write_bytes(data)
+    with BagSource([path], Config()) as source:
+        assert scans(list(source)) == list(range(30))
+        assert any("index is missing" in w for w in source.warnings)
+
+
+# --- what is no bag ----------------------------------------------------------------------------
+
+
+def test_a_missing_file(tmp_path: Path) -> None:
+    with pytest.raises(UserError, match=r"nowhere\.mcap: no such file or folder"):
+        frames_of(tmp_path / "nowhere.mcap")
+
+
+def test_a_folder_without_a_bag(tmp_path: Path) -> None:
+    make(tmp_path)
+    with pytest.raises(UserError, match=r"a folder without a bag.*there are bags in its folders: drive"):
+        frames_of(tmp_path)
+
+
+def test_an_empty_file(tmp_path: Path) -> None:
+    path = tmp_path / "empty.mcap"
+    path.touch()
+    with pytest.raises(UserError, match=r"empty\.mcap: the file is empty"):
+        frames_of(path)
+
+
+@pytest.mark.parametrize("form", ["mcap", "sqlite3", "ros1"])
+def test_an_empty_bag(tmp_path: Path, form: str) -> None:
+    bag = bags.write(tmp_path / "empty.bag", [], form=form, topics=[(bags.CLOUD, CLOUD)])
+    with pytest.raises(UserError, match=r"empty\.bag: there are no messages in it"):
+        frames_of(bag)
+
+
+@pytest.mark.parametrize(
+    ("head", "what"),
+    [
+        (b"hello, this is text", "not a bag"),
+        (b"RRF2" + bytes(20), "a Rerun recording"),
+        (b"PK\x03\x04" + bytes(20), "a zip archive"),
+        (b"#ROSBAG V1.2\n" + bytes(20), "rosbag fix"),
+        (b"\x89MCAP0\r\n", "there are no messages"),
+        (b"SQLite format 3\0" + bytes(2000), "nothing of it is left"),
+    ],
+)
+def test_other_files(tmp_path: Path, head: bytes, what: str) -> None:
+    path = tmp_path / "drive.mcap"
+    path.write_bytes(head)
+    with pytest.raises(UserError, match=what):
+        frames_of(path)
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may read everything")
+def test_a_file_that_may_not_be_read(tmp_path: Path) -> None:
+    path = storage_file(make(tmp_path))
+    path.chmod(0)
+    with pytest.raises(UserError, match="permission denied"):
+        frames_of(path)
+
+
+def test_one_bad_file_among_several_is_told(tmp_path: Path) -> None:
+    bag = make(tmp_path)
+    (bag / "other.mcap").touch()
+    with BagSource([bag], Config()) as source:
+        assert len(list(source)) == 30
+        assert any("other.mcap: the file is empty" in w for w in source.warnings)
+
+
+@pytest.mark.parametrize("form", ["mcap", "sqlite3", "ros1"])
+def test_a_lidar_topic_without_messages(tmp_path: Path, form: str) -> None:
+    messages = bags.Messages(form == "ros1")
+    items = [i for i in bags.small_items(messages) if i.topic != bags.CLOUD]
+    path = bags.write(tmp_path / "drive.bag", items, messages, form=form, topics=[(bags.CLOUD, CLOUD)])
+    with pytest.raises(UserError, match=r"topic /velodyne_points has no messages.*source\.lidar_topics"):
+        frames_of(path)
+
+
+def test_no_lidar(tmp_path: Path) -> None:
+    path = bags.write(tmp_path / "drive", [i for i in bags.small_items() if i.topic != bags.CLOUD])
+    with pytest.raises(UserError, match=r"no LiDAR.*/tf \(TFMessage\).*source\.lidar_topics"):
+        frames_of(path)
+
+
+# --- the whole ---------------------------------------------------------------------------------
+
+
+def test_memory_does_not_grow_with_the_length(tmp_path: Path) -> None:
+    def peak(bag: Path) -> int:
+        tracemalloc.start()
+        try:
+            with BagSource([bag], Config()) as source:
+                for _ in source:
+                    pass
+            return tracemalloc.get_traced_memory()[1]
+        finally:
+            tracemalloc.stop()
+
+    short = make(tmp_path, name="short", scans=60, points=10_000)
+    long = make(tmp_path, name="long", scans=180, points=10_000)
+    peak(short)  # what is made once, as the generated decoders
+    assert peak(long) < 1.15 * peak(short)
+
+
+@pytest.mark.parametrize("name", ["000000", "000001"])
+@pytest.mark.parametrize("form", ["mcap", "ros1"])
+def test_projection_is_that_of_kitti(shared: Path, tmp_path: Path, name: str, form: str) -> None:
+    messages = bags.Messages(form == "ros1")
+    items = bags.kitti_items(shared, messages, [name])
+    (frame,) = frames_of(bags.write(tmp_path / "kitti.bag", items, messages, form=form))
+    (camera,) = frame.cameras
+    assert camera.intrinsics is not None and camera.camera_from_points is not None
+    reference = bags.kitti(shared, name)
+    np.testing.assert_array_equal(frame.points, reference.points[:, :3])
+    points = frame.points.astype(np.float64)
+    homogeneous = np.column_stack([points, np.ones(len(points))]) @ reference.pixels_from_lidar.T
+    ahead = homogeneous[:, 2] > 1
+    expected = homogeneous[ahead, :2] / homogeneous[ahead, 2:]
+    rigid = camera.camera_from_points
+    uv, depth = geometry.project(points[ahead] @ rigid[:3, :3].T + rigid[:3, 3], camera.intrinsics)
+    inside = (np.abs(expected) < 2000).all(axis=1)
+    assert inside.sum() > 10_000
+    np.testing.assert_allclose(uv[inside], expected[inside], atol=0.01)
+    np.testing.assert_allclose(depth[inside], homogeneous[ahead, 2][inside], atol=1e-3)
+
+
+def test_images_pass_through_untouched(shared: Path, tmp_path: Path) -> None:
+    (frame,) = frames_of(bags.write(tmp_path / "kitti", bags.kitti_items(shared, names=["000000"])))
+    image = frame.cameras[0].image
+    assert image is not None
+    assert image.encoded == bags.kitti(shared, "000000").png
+    raw = bags.kitti_items(shared, names=["000000"], compressed=False)
+    (plain,) = frames_of(bags.write(tmp_path / "plain", raw))
+    assert plain.cameras[0].image is not None
+    np.testing.assert_array_equal(plain.cameras[0].image.bgr, image.bgr)
+
+
+def test_roles_set_by_hand(tmp_path: Path) -> None:
+    bag = make(tmp_path)
+    with BagSource([bag], load(settings=[f"source.camera_topics=[{bags.IMAGE}]"])) as source:
+        assert source.roles.cameras[0].topic == bags.IMAGE
+    with pytest.raises(UserError, match="there is no topic /other"):
+        frames_of(bag, config=load(settings=["source.lidar_topics=[/other]"]))
+
+
+def test_a_source_can_be_read_twice(tmp_path: Path) -> None:
+    bag = make(tmp_path, scans=5)
+    with BagSource([bag], Config()) as source:
+        assert scans(list(source)) == scans(list(source)) == list(range(5))
+    shutil.rmtree(bag)  # nothing holds it
