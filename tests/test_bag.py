@@ -376,6 +376,21 @@ def test_a_damaged_message_is_counted_and_the_others_go_on(tmp_path: Path) -> No
         assert any(f"2 message(s) of {bags.CLOUD} could not be used" in w for w in source.warnings)
 
 
+def test_a_damaged_page_costs_its_own_messages(tmp_path: Path) -> None:
+    path = storage_file(make(tmp_path, "sqlite3", scans=60))
+    whole = content(path)
+    data = bytearray(path.read_bytes())
+    leaves = [at for at in range(0, len(data), 4096) if data[at] == 0x0D]
+    data[leaves[len(leaves) // 2]] = 0xFF
+    path.write_bytes(data)
+    with BagSource([path], Config()) as source:
+        assert any("the file is damaged" in w for w in source.warnings)
+        assert 50 < len(list(source)) <= 60
+    found = content(path)
+    assert is_part(found, whole)
+    assert len(whole) - 10 < len(found) < len(whole)
+
+
 def test_a_recorder_that_was_killed_leaves_an_unindexed_bag(tmp_path: Path) -> None:
     path = make(tmp_path, "ros1")
     data = bytearray(path.read_bytes())

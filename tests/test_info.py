@@ -1,0 +1,112 @@
+"""What ``bevviz info`` says of a bag."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from bevviz.config import Config, load
+from bevviz.errors import UserError
+from bevviz.sources.info import WIDTH, describe, render
+from tests import bags
+
+
+def write(path: Path, *without: str, form: str = "mcap") -> Path:
+    messages = bags.Messages(form == "ros1")
+    items = [i for i in bags.small_items(messages) if i.topic not in without]
+    return bags.write(path, items, messages, form=form)
+
+
+@pytest.mark.parametrize(("form", "name"), [("mcap", "MCAP"), ("sqlite3", "sqlite3"), ("ros1", "ROS 1 bag")])
+def test_a_whole_bag(tmp_path: Path, form: str, name: str) -> None:
+    path = write(tmp_path / "drive.bag", form=form)
+    info = describe([path], load(settings=["detector.model=yolo.onnx"]))
+    assert info.formats == (name,)
+    assert info.messages == 121
+    assert info.duration == pytest.approx(2.91)
+    files = [path] if path.is_file() else [f for f in path.iterdir() if f.name != "metadata.yaml"]
+    assert info.size == sum(f.stat().st_size for f in files)
+    assert [t.name for t in info.topics] == [bags.INFO, bags.IMAGE, "/tf", "/tf_static", bags.CLOUD]
+    cloud = info.topics[-1]
+    assert (cloud.type, cloud.count, cloud.frame_id) == ("sensor_msgs/msg/PointCloud2", 30, "velodyne")
+    assert cloud.rate == pytest.approx(10)
+    assert cloud.pause == pytest.approx(0.1)
+    assert cloud.role.startswith("LiDAR")
+    assert info.topics[3].rate is None
+    assert info.lidars == ("velodyne",)
+    (camera,) = info.cameras
+    assert camera.name == "camera"
+    assert info.tree == {"base_link": "odom", "velodyne": "base_link", "camera_optical": "velodyne"}
+    assert info.world_frame == "odom"
+    assert info.missing == info.warnings == ()
+    text = render(info)
+    assert "2.91 s from 2023-11-14T22:13:20.000Z, 121 messages" in text
+    assert (
+        "camera: 64 x 48 uncompressed, fx 60.0 fy 60.0 cx 32.0 cy 24.0, no distortion, placed by TF" in text
+    )
+    assert "  odom\n    base_link\n      velodyne\n        camera_optical\n" in text
+    assert "missing for a full run\n  nothing" in text
+
+
+def test_gaps_are_found_in_the_index(tmp_path: Path) -> None:
+    items = [
+        i
+        for i in bags.small_items()
+        if i.topic != bags.CLOUD or not 1.0 <= (i.received - bags.START) / 1e9 < 1.5
+    ]
+    for form in ("mcap", "sqlite3"):
+        info = describe([bags.write(tmp_path / form, items, form=form)], Config())
+        (cloud,) = (t for t in info.topics if t.name == bags.CLOUD)
+        assert cloud.count == 25
+        assert cloud.pause == pytest.approx(0.6)
+        assert cloud.pause_at == pytest.approx(0.91)
+        assert "0.60 s at 0.9 s" in render(info)
+
+
+def test_what_is_missing_and_the_option_that_gives_it(tmp_path: Path) -> None:
+    path = write(tmp_path / "drive", "/tf_static", "/tf", bags.INFO)
+    text = render(describe([path], Config()))
+    assert "--set source.camera_info_topics='{/camera/image_rect_color: /camera_info}'" in text
+    assert "--set source.extrinsics='{velodyne camera_optical: [x, y, z, qx, qy, qz, qw]}'" in text
+    assert "--set source.odometry_topic=/topic" in text
+    assert "--model FILE.onnx" in text
+    assert all(len(line) <= WIDTH for line in text.splitlines())
+
+
+def test_the_option_that_is_offered_is_accepted(tmp_path: Path) -> None:
+    path = write(tmp_path / "drive", "/tf_static")
+    config = load(settings=["source.extrinsics={velodyne camera_optical: [0, 0, 0, -0.5, 0.5, -0.5, 0.5]}"])
+    (camera,) = describe([path], config).cameras
+    assert camera.camera_from_points is not None
+    assert "not placed" not in render(describe([path], config))
+
+
+def test_a_bag_without_a_lidar_is_described_all_the_same(tmp_path: Path) -> None:
+    info = describe([write(tmp_path / "drive", bags.CLOUD)], Config())
+    assert [t.name for t in info.topics] == [bags.INFO, bags.IMAGE, "/tf", "/tf_static"]
+    assert "source.lidar_topics" in info.missing[0]
+    assert "no LiDAR" in render(info)
+
+
+def test_a_cut_bag_is_described_with_the_loss(tmp_path: Path) -> None:
+    (path,) = write(tmp_path / "drive").glob("*.mcap")
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    text = render(describe([path], Config()))
+    assert "warnings\n" in text
+    assert "the file ends in the middle of a record" in text
+
+
+def test_a_bag_that_is_none_is_told(tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="no such file or folder"):
+        describe([tmp_path / "nowhere"], Config())
+    with pytest.raises(UserError, match=r"source\.lidar_topics: there is no topic /x"):
+        describe([write(tmp_path / "drive")], load(settings=["source.lidar_topics=[/x]"]))
+
+
+def test_kitti(shared: Path, tmp_path: Path) -> None:
+    info = describe([bags.write(tmp_path / "kitti", bags.kitti_items(shared))], Config())
+    text = render(info)
+    assert "camera: 1242 x 375 image/png, fx 721.5" in text
+    assert "velodyne\n    camera_optical" in text
+    assert "fixed frame of 'velodyne': none" in text
