@@ -147,9 +147,10 @@ class Detector:
         state = np.where(score >= config.conf_threshold, DetectionState.KEPT, DetectionState.BELOW_THRESHOLD)
         state[suppressor >= 0] = DetectionState.SUPPRESSED
         room = max(config.max_candidates - np.count_nonzero(state == DetectionState.KEPT), 0)
+        # Survivors of NMS first: a duplicate is the least worth a word, and never outlives its suppressor.
         others = np.flatnonzero(state != DetectionState.KEPT)
+        others = others[np.argsort(state[others], kind="stable")]
         row = np.delete(np.arange(len(order)), others[room:])
-        # A suppressor is stronger than what it suppresses and so is never cut off before it.
         suppressor = np.where(suppressor[row] >= 0, np.searchsorted(row, suppressor[row]), -1)
         return Detections(
             xyxy=xyxy[row],
