@@ -6,6 +6,7 @@ import heapq
 import struct
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from operator import itemgetter
@@ -328,7 +329,12 @@ class Recording:
                 f"{path}: {what or 'not a bag: neither MCAP, nor sqlite3, nor ROS 1 by its first bytes'}"
             )
         opened = kind(path)
-        opened.open()
+        try:
+            opened.open()
+        except BaseException:
+            with suppress(Exception):  # it may not have come as far as opening the file
+                opened.close()
+            raise
         return opened
 
     def _unpack(self, path: Path) -> Path:
@@ -356,9 +362,11 @@ class Recording:
 def _bag_files(folder: Path) -> list[Path]:
     """Bag files of a folder by suffix, compressed ones too."""
     suffixes = {".mcap", ".db3", ".bag", ".active"}
-    names = [f.with_suffix("") if f.suffix in (".zstd", ".zst") else f for f in folder.iterdir()]
     return sorted(
-        f for f, n in zip(folder.iterdir(), names, strict=True) if n.suffix in suffixes and f.is_file()
+        file
+        for file in folder.iterdir()
+        if file.is_file()
+        and (file.with_suffix("") if file.suffix in (".zstd", ".zst") else file).suffix in suffixes
     )
 
 
