@@ -5,6 +5,7 @@ from __future__ import annotations
 from rosbags.typesys import get_types_from_msg
 from rosbags.typesys.store import Typestore
 
+_DETECTION = "std_msgs/Header header\nObjectHypothesisWithPose[] results\n{box} bbox\nstring id\n"
 DEFINITIONS = {
     "Point2D": "float64 x\nfloat64 y\n",
     "Pose2D": "vision_msgs/Point2D position\nfloat64 theta\n",
@@ -12,8 +13,8 @@ DEFINITIONS = {
     "BoundingBox3D": "geometry_msgs/Pose center\ngeometry_msgs/Vector3 size\n",
     "ObjectHypothesis": "string class_id\nfloat64 score\n",
     "ObjectHypothesisWithPose": "ObjectHypothesis hypothesis\ngeometry_msgs/PoseWithCovariance pose\n",
-    "Detection2D": "std_msgs/Header header\nObjectHypothesisWithPose[] results\nBoundingBox2D bbox\nstring id\n",
-    "Detection3D": "std_msgs/Header header\nObjectHypothesisWithPose[] results\nBoundingBox3D bbox\nstring id\n",
+    "Detection2D": _DETECTION.format(box="BoundingBox2D"),
+    "Detection3D": _DETECTION.format(box="BoundingBox3D"),
     "Detection2DArray": "std_msgs/Header header\nDetection2D[] detections\n",
     "Detection3DArray": "std_msgs/Header header\nDetection3D[] detections\n",
 }
