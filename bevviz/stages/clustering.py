@@ -86,7 +86,8 @@ def dbscan(points: F32, eps: float, min_points: int) -> I32:
 def _cell_boxes(x: F32, y: F32, z: F32, start: I32) -> F64:
     box = np.empty((len(start) - 1, 6))
     for c in range(len(box)):
-        box[c, :3], box[c, 3:] = np.inf, -np.inf
+        for axis in range(3):
+            box[c, axis], box[c, 3 + axis] = np.inf, -np.inf
         for i in range(start[c], start[c + 1]):
             box[c, 0], box[c, 3] = min(box[c, 0], x[i]), max(box[c, 3], x[i])
             box[c, 1], box[c, 4] = min(box[c, 1], y[i]), max(box[c, 4], y[i])
@@ -122,7 +123,9 @@ def _adjacent(keys: I64, strides: I64, box: F64, eps2: float) -> tuple[I32, I32]
             begin[row] = o
             while o < cells and keys[o] <= middle + reach:
                 if used == len(found):
-                    found = np.append(found, np.empty_like(found))
+                    longer = np.empty(2 * used, np.int32)
+                    longer[:used] = found
+                    found = longer
                 dx = _gap(box[c, 0], box[c, 3], box[o, 0], box[o, 3])
                 dy = _gap(box[c, 1], box[c, 4], box[o, 1], box[o, 4])
                 dz = _gap(box[c, 2], box[c, 5], box[o, 2], box[o, 5])
@@ -334,26 +337,42 @@ def _boxes(points: F32, order: I32, start: I32) -> tuple[F32, F32, F32, F32]:
     """
     clusters = len(start) - 1
     centroid = np.empty((clusters, 3), np.float32)
-    low = np.empty((clusters, 3), np.float32)
-    high = np.empty((clusters, 3), np.float32)
+    low = np.full((clusters, 3), np.inf, np.float32)
+    high = np.full((clusters, 3), -np.inf, np.float32)
     oriented = np.empty((clusters, 7), np.float32)
     for k in range(clusters):
-        own = points[order[start[k] : start[k + 1]]]
-        for axis in range(3):
-            centroid[k, axis] = own[:, axis].astype(np.float64).mean()
-            low[k, axis], high[k, axis] = own[:, axis].min(), own[:, axis].max()
-        # About the centroid, so that a box far from the origin loses no digits.
-        x = own[:, 0].astype(np.float64) - centroid[k, 0]
-        y = own[:, 1].astype(np.float64) - centroid[k, 1]
-        step = (len(own) + 255) // 256
-        yaw = _heading(x[::step], y[::step])
+        count = start[k + 1] - start[k]
+        mean = np.zeros(3)
+        for i in range(start[k], start[k + 1]):
+            for axis in range(3):
+                value = points[order[i], axis]
+                mean[axis] += value / count
+                low[k, axis], high[k, axis] = min(low[k, axis], value), max(high[k, axis], value)
+        step = (count + 255) // 256
+        x, y = np.empty((count + step - 1) // step), np.empty((count + step - 1) // step)
+        for i in range(len(x)):
+            # About the mean, so that a box far from the origin loses no digits.
+            x[i] = points[order[start[k] + i * step], 0] - mean[0]
+            y[i] = points[order[start[k] + i * step], 1] - mean[1]
+        yaw = _heading(x, y)
         c, s = math.cos(yaw), math.sin(yaw)
-        u, v = c * x + s * y, c * y - s * x
-        mid_u, mid_v = (u.min() + u.max()) / 2, (v.min() + v.max()) / 2
-        oriented[k, 0] = centroid[k, 0] + c * mid_u - s * mid_v
-        oriented[k, 1] = centroid[k, 1] + s * mid_u + c * mid_v
+        low_u = low_v = np.inf
+        high_u = high_v = -np.inf
+        for i in range(start[k], start[k + 1]):
+            dx, dy = points[order[i], 0] - mean[0], points[order[i], 1] - mean[1]
+            u, v = c * dx + s * dy, c * dy - s * dx
+            low_u, high_u = min(low_u, u), max(high_u, u)
+            low_v, high_v = min(low_v, v), max(high_v, v)
+        u, v = (low_u + high_u) / 2, (low_v + high_v) / 2
+        for axis in range(3):
+            centroid[k, axis] = mean[axis]
+        oriented[k, 0] = mean[0] + c * u - s * v
+        oriented[k, 1] = mean[1] + s * u + c * v
         oriented[k, 2] = (low[k, 2] + high[k, 2]) / 2
-        oriented[k, 3], oriented[k, 4] = u.max() - u.min(), v.max() - v.min()
-        oriented[k, 5] = high[k, 2] - low[k, 2]
+        oriented[k, 3], oriented[k, 4], oriented[k, 5] = (
+            high_u - low_u,
+            high_v - low_v,
+            high[k, 2] - low[k, 2],
+        )
         oriented[k, 6] = yaw
     return centroid, low, high, oriented

@@ -218,11 +218,16 @@ def _follow(
         for s in range(sectors):
             count = 0
             for k in range(s - reach, s + reach + 1):
-                if offer[k % sectors] < np.inf:
-                    around[count] = offer[k % sectors]
+                value = offer[k % sectors]
+                if value < np.inf:
+                    place = count
+                    while place > 0 and around[place - 1] > value:
+                        around[place] = around[place - 1]
+                        place -= 1
+                    around[place] = value
                     count += 1
             if count > 0:
-                change = np.median(around[:count]) - level[s]
+                change = (around[(count - 1) // 2] + around[count // 2]) / 2 - level[s]
                 level[s] += change
                 slope[s] += (1 - keep) / step * change
                 slope[s] = min(max(slope[s], -steepest), steepest)
