@@ -11,25 +11,14 @@ from typing import Any
 import numpy as np
 from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
 from rosbags.rosbag2 import StoragePlugin, Writer
-from rosbags.typesys import Stores, get_types_from_msg, get_typestore
-from rosbags.typesys.store import Typestore
+from rosbags.typesys import Stores, get_typestore
 
 from bevviz import geometry
 from bevviz.errors import UserError
 from bevviz.frame import F64, Cloud, Frame, Image, Intrinsics, LabelledBoxes3D
+from bevviz.sources import vision_msgs
 from bevviz.sources.synthetic import drive
 from bevviz.sources.synthetic.drive import SyntheticSource
-
-# vision_msgs 4 (ROS 2 Humble and later), which rosbags does not carry.
-VISION_MSGS = {
-    "ObjectHypothesis": "string class_id\nfloat64 score\n",
-    "ObjectHypothesisWithPose": "ObjectHypothesis hypothesis\ngeometry_msgs/PoseWithCovariance pose\n",
-    "BoundingBox3D": "geometry_msgs/Pose center\ngeometry_msgs/Vector3 size\n",
-    "Detection3D": (
-        "std_msgs/Header header\nObjectHypothesisWithPose[] results\nBoundingBox3D bbox\nstring id\n"
-    ),
-    "Detection3DArray": "std_msgs/Header header\nDetection3D[] detections\n",
-}
 
 TOPICS = {
     drive.LIDAR_TOPIC: "sensor_msgs/msg/PointCloud2",
@@ -61,7 +50,8 @@ class BagWriter:
         if path.exists():
             raise UserError(f"{path} exists already; remove it or give another name")
         self._source, self._path = source, path
-        self._store = _typestore()
+        self._store = get_typestore(Stores.ROS2_JAZZY)
+        vision_msgs.register(self._store)
 
     def __enter__(self) -> BagWriter:
         try:
@@ -281,13 +271,6 @@ def write_bag(source: SyntheticSource, path: Path, frames: Iterable[Frame] | Non
     with BagWriter(source, path) as bag:
         for frame in source if frames is None else frames:
             bag.write(frame)
-
-
-def _typestore() -> Typestore:
-    store = get_typestore(Stores.ROS2_JAZZY)
-    for name, text in VISION_MSGS.items():
-        store.register(get_types_from_msg(text, f"vision_msgs/msg/{name}"))
-    return store
 
 
 def _qos(latched: bool) -> Qos:

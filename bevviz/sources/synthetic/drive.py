@@ -117,7 +117,10 @@ class SyntheticSource:
 
         moving = self.world.moving(at_scan, map_from_lidar[:3, 3], self._lidar.reach)
         scan = self._lidar.scan(View(self._static, moving), map_from_lidar, rng)
-        seen = View(self._static, self.world.moving(at_image, map_from_camera[:3, 3], self._lidar.reach))
+        ahead = (
+            map_from_camera[:3, 3] + 50.0 * map_from_camera[:3, 2]
+        )  # what is far behind casts no shadow here
+        seen = View(self._static, self.world.moving(at_image, ahead, 70.0))
         picture = self._camera.picture(seen, map_from_camera, self.world.light, rng)
 
         fields: dict[str, NDArray[Any]] = {"intensity": scan.intensity, "ring": scan.ring, "time": scan.time}

@@ -31,6 +31,8 @@ class Caster:
         self._core = o3d.load().core
         self._scene = o3d.load().t.geometry.RaycastingScene()
         self.mesh = mesh
+        a, b, c = (mesh.uv[mesh.triangles[:, i]] for i in range(3))
+        self.uv = np.concatenate([a, b - a, c - a], axis=1)  # (T, 6): first corner and the two edges
         if len(mesh.triangles):
             self._scene.add_triangles(
                 self._core.Tensor.from_numpy(mesh.vertices),
@@ -87,10 +89,9 @@ class View:
         for k, (caster, answer) in enumerate(zip(self._casters, answers, strict=True)):
             row = np.flatnonzero(nearest[ray] == k)
             source, mesh = ray[row], caster.mesh
-            triangle = answer["primitive_ids"][source]
-            corner, weight = mesh.triangles[triangle], answer["primitive_uvs"][source]
-            a, b, c = (mesh.uv[corner[:, i]] for i in range(3))
-            out.uv[row] = a + weight[:, :1] * (b - a) + weight[:, 1:] * (c - a)
+            triangle = answer["primitive_ids"][source].astype(np.intp)
+            uv, weight = caster.uv[triangle], answer["primitive_uvs"][source]
+            out.uv[row] = uv[:, :2] + weight[:, :1] * uv[:, 2:4] + weight[:, 1:] * uv[:, 4:]
             out.normal[row] = answer["primitive_normals"][source]
             out.color[row], out.material[row] = mesh.color[triangle], mesh.material[triangle]
             out.object[row] = mesh.object[triangle]
@@ -106,7 +107,8 @@ class View:
 def _rays(map_from_sensor: F64, directions: F32) -> F32:
     rays = np.empty((len(directions), 6), np.float32)
     rays[:, :3] = map_from_sensor[:3, 3]
-    rays[:, 3:] = directions @ map_from_sensor[:3, :3].T.astype(np.float32)
+    # Not a BLAS product: for three columns its threads cost ten times what they compute.
+    np.einsum("ij,kj->ik", directions, map_from_sensor[:3, :3].astype(np.float32), out=rays[:, 3:])
     return rays
 
 
@@ -213,7 +215,7 @@ class PinholeCamera:
         albedo = hits.color.astype(np.float32) * _texture(hits, point)[:, None]
         _paint_road(albedo, hits)
         _paint_facades(albedo, hits)
-        lit = np.maximum(hits.normal @ light.sun, 0)
+        lit = np.maximum(np.einsum("ij,j->i", hits.normal, light.sun), 0)
         sunny = np.flatnonzero(lit > 0)
         towards = np.empty((len(sunny), 6), np.float32)
         towards[:, :3] = point[sunny] + 0.02 * hits.normal[sunny]
