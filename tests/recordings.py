@@ -8,6 +8,7 @@ from collections import defaultdict
 from pathlib import Path
 from typing import Any
 
+import pyarrow as pa
 from rerun.chunk import RrdReader
 
 Values = dict[int, Any]  # frame -> what one component was
@@ -24,6 +25,10 @@ class Recording:
         self.blueprints = len(RrdReader(path).blueprints())
         for chunk in RrdReader(path).stream():
             batch = chunk.to_record_batch()
+            clocks = {name for name in chunk.timeline_names if name != "frame"}
+            batch = batch.cast(
+                pa.schema([f.with_type(pa.int64()) if f.name in clocks else f for f in batch.schema])
+            )
             names = [name for name in batch.schema.names if not name.startswith("rerun.controls")]
             components = [name for name in names if name not in chunk.timeline_names]
             for row in batch.select(names).to_pylist():

@@ -33,6 +33,7 @@ FLAGS = [
     "--disable-background-networking",
     "--disable-component-update",
     "--hide-scrollbars",
+    "--force-dark-mode",
 ]
 
 
@@ -61,7 +62,7 @@ def main() -> int:
             call(driver, "POST", f"/session/{session}/timeouts", {"script": 600_000, "pageLoad": 600_000})
             call(driver, "POST", f"/session/{session}/url", {"url": url})
             time.sleep(options.wait)
-            png = base64.b64decode(call(driver, "GET", f"/session/{session}/screenshot"))
+            png = base64.b64decode(patiently(driver, "GET", f"/session/{session}/screenshot"))
         finally:
             call(driver, "DELETE", f"/session/{session}")
     options.image.parent.mkdir(parents=True, exist_ok=True)
@@ -113,6 +114,17 @@ def free_port() -> int:
         return int(probe.getsockname()[1])
 
 
+def patiently(driver: str, method: str, path: str) -> Any:
+    """Drawing in software keeps the page busy for longer than the driver waits: ask again."""
+    for _ in range(20):
+        try:
+            return call(driver, method, path)
+        except RuntimeError as error:
+            reason = error
+            time.sleep(2)
+    raise SystemExit(str(reason))
+
+
 def call(driver: str, method: str, path: str, body: dict[str, Any] | None = None) -> Any:
     data = None if body is None else json.dumps(body).encode()
     request = urllib.request.Request(driver + path, data, {"Content-Type": "application/json"}, method=method)
@@ -120,7 +132,7 @@ def call(driver: str, method: str, path: str, body: dict[str, Any] | None = None
         with urllib.request.urlopen(request, timeout=600) as response:
             return json.load(response)["value"]
     except urllib.error.HTTPError as error:
-        raise SystemExit(json.load(error)["value"]["message"]) from None
+        raise RuntimeError(json.load(error)["value"]["message"]) from None
 
 
 if __name__ == "__main__":

@@ -203,13 +203,11 @@ class Logger:
                 self._put(entities.points(name), rr.Points3D(cloud.xyz, class_ids=classes[start:end]))
 
     def _rounded(self, points: F32) -> F32:
-        """Points of the voxel grid to a fraction of a voxel: they compress to half, the raw cloud is exact."""
-        scale = (
-            np.float32(2.0 ** np.floor(np.log2(8 / self._config.voxel.size)))
-            if self._config.voxel.size
-            else 0
-        )
-        return np.round(points * scale) * (1 / scale) if scale else points
+        """Voxelised points to a fraction of a voxel, which compresses to half. The raw cloud stays exact."""
+        if self._config.voxel.size == 0:
+            return points
+        scale = np.float32(2.0 ** np.floor(np.log2(8 / self._config.voxel.size)))
+        return np.asarray(np.round(points * scale) / scale, np.float32)
 
     def _put_points(self, path: str, points: F32, class_id: int) -> None:
         if len(points):
@@ -268,7 +266,7 @@ class Logger:
         size = [intrinsics.width, intrinsics.height]
         if last is None or [last.width, last.height] != size or not np.array_equal(last.K, intrinsics.K):
             self._static(
-                entities.image(name),
+                entities.sensor(name),
                 rr.Pinhole(
                     image_from_camera=intrinsics.K,
                     resolution=size,
@@ -375,7 +373,7 @@ class Logger:
             self._log_grid(result, bev)
 
     def _log_grid(self, result: FrameResult, bev: Bev) -> None:
-        """The occupancy laid on the ground. A grid map's origin is its lower left corner, its x to the right."""
+        """The occupancy laid on the ground. The pose of a grid map is that of its lower left corner."""
         grid = bev.channels["occupancy"]
         level = 0.0
         if result.ground is not None and result.voxels is not None and result.ground.mask.any():
@@ -391,7 +389,7 @@ class Logger:
                 cell_size=bev.resolution,
                 translation=[-bev.range_x, bev.range_y, level - 0.05],
                 rotation_axis_angle=rr.RotationAxisAngle([0, 0, 1], radians=-np.pi / 2),
-                opacity=0.35,
+                opacity=0.2,
                 colormap=rr.components.Colormap.RvizMap,
             ),
         )

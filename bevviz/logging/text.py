@@ -17,7 +17,7 @@ def markdown(result: FrameResult) -> str:
 
 def _lines(result: FrameResult) -> Iterator[str]:
     frame = result.frame
-    yield f"## Frame {frame.index}"
+    yield f"### Frame {frame.index}"
     yield ""
     yield from _section("Failures", (f"**{f.stage}**: {f.reason}" for f in result.failures))
     problems = list(frame.problems)
@@ -57,7 +57,7 @@ def _item(explanation: Explanation) -> str:
 def _section(title: str, items: Iterable[str]) -> Iterator[str]:
     lines = [f"- {item}" for item in items]
     if lines:
-        yield f"### {title}"
+        yield f"#### {title}"
         yield ""
         yield from lines
         yield ""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import rerun as rr
 import rerun.blueprint as rrb
 
 from bevviz.logging import entities
@@ -39,7 +38,7 @@ def space(scene: Scene, *, raw: bool = True, grid: bool = True) -> rrb.Spatial3D
             look_target=(10.0, 0.0, -1.0),
             eye_up=(0.0, 0.0, 1.0),
         ),
-        overrides={path: _HIDDEN for path in hidden},
+        overrides=dict.fromkeys(hidden, _HIDDEN),
     )
 
 
@@ -47,7 +46,7 @@ def camera(scene: Scene, name: str) -> rrb.Spatial2DView:
     """The image with detections and the projected points; what the robot itself detected there, too."""
     return rrb.Spatial2DView(
         name=name,
-        origin=entities.image(name),
+        origin=entities.sensor(name),
         contents=["$origin/**", *([f"{entities.ROBOT}/**"] if scene.robot else [])],
         overrides={entities.weak(name): _HIDDEN},
     )

@@ -1,0 +1,128 @@
+"""Layouts: those that come along, a user's own, and what is said of a file that makes none."""
+
+from __future__ import annotations
+
+import importlib
+import textwrap
+from pathlib import Path
+
+import pytest
+import rerun.blueprint as rrb
+from rerun.chunk import RrdReader
+
+from bevviz.errors import UserError
+from bevviz.logging import blueprints
+from bevviz.sources import Scene
+
+SCENES = {
+    "lidar only": Scene("a", "lidar", ("lidar",)),
+    "one camera": Scene("b", "lidar", ("lidar",), ("zed",), robot=True, truth=True),
+    "many": Scene("c", "lidars", ("front", "rear"), ("left", "right", "rear_camera")),
+}
+
+
+def views(path: Path) -> dict[str, list[str]]:
+    """Name -> contents of each view of a .rbl file."""
+    names: dict[str, str] = {}
+    contents: dict[str, list[str]] = {}
+    reader = RrdReader(path)
+    for chunk in reader.stream(store=reader.blueprints()[0]):
+        parts = chunk.entity_path.strip("/").split("/")
+        if parts[0] != "view":
+            continue
+        batch = chunk.to_record_batch()
+        components = [name for name in batch.schema.names if ":" in name]
+        for row in batch.select(components).to_pylist():
+            if row.get("ViewBlueprint:display_name"):
+                names[parts[1]] = row["ViewBlueprint:display_name"][0]
+            if row.get("ViewContents:query"):
+                contents[parts[1]] = row["ViewContents:query"]
+    return {names[key]: contents[key] for key in names}
+
+
+def save(layout: rrb.Blueprint, path: Path) -> Path:
+    layout.save("bevviz", path)
+    return path
+
+
+def test_names() -> None:
+    assert {"debug", "live", "bug_report"} <= set(blueprints.names())
+
+
+@pytest.mark.parametrize("scene", SCENES.values(), ids=SCENES.keys())
+@pytest.mark.parametrize("name", blueprints.names())
+def test_every_layout_fits_every_scene(name: str, scene: Scene, tmp_path: Path) -> None:
+    found = views(save(blueprints.load(name, scene), tmp_path / "layout.rbl"))
+    assert {"3D", "Bird's-eye view", *scene.cameras} <= set(found)
+    assert found["3D"] == ["/world/**", "/robot/**"]
+
+
+def test_a_users_own_python_file(tmp_path: Path) -> None:
+    own = tmp_path / "own.py"
+    own.write_text(
+        textwrap.dedent("""
+            import rerun.blueprint as rrb
+            from bevviz.logging import views
+
+            def blueprint(scene):
+                cameras = [views.camera(scene, name) for name in scene.cameras]
+                return rrb.Blueprint(rrb.Tabs(views.space(scene), *cameras))
+        """)
+    )
+    layout = blueprints.load(str(own), SCENES["many"])
+    assert set(views(save(layout, tmp_path / "own.rbl"))) == {"3D", "left", "right", "rear_camera"}
+
+
+def test_a_saved_layout_is_sent_on_as_it_is(tmp_path: Path) -> None:
+    original = save(blueprints.load("live", SCENES["one camera"]), tmp_path / "original.rbl")
+    again = save(blueprints.load(str(original), SCENES["lidar only"]), tmp_path / "again.rbl")
+    assert views(again) == views(original)
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "message"),
+    [
+        ("a.py", "def blueprint(scene): return 1", "must return an rrb.Blueprint, not int"),
+        ("a.py", "x = 1", "has no attribute 'blueprint'"),
+        ("a.py", "def blueprint(scene) return 1", "SyntaxError"),
+        ("a.py", "import nothing_of_the_kind", "ModuleNotFoundError: No module named 'nothing_of_the_kind'"),
+        (
+            "a.py",
+            "def blueprint(scene): return scene.wheels",
+            "AttributeError: 'Scene' object has no",
+        ),
+        ("a.rbl", "not a blueprint", "a.rbl: cannot be read"),
+        ("a.rbl", "", "a.rbl: "),
+    ],
+)
+def test_a_file_that_makes_no_layout(name: str, text: str, message: str, tmp_path: Path) -> None:
+    path = tmp_path / name
+    path.write_text(text)
+    with pytest.raises(UserError, match=message) as caught:
+        blueprints.load(str(path), SCENES["one camera"])
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("bugreport", "unknown; did you mean 'bug_report'"),
+        ("zzz", "unknown; there are bug_report, "),
+        ("/nonexistent/a.py", "no such file"),
+        ("/nonexistent/a.rbl", "no such file"),
+    ],
+)
+def test_unknown_names(name: str, message: str) -> None:
+    with pytest.raises(UserError, match=message):
+        blueprints.load(name, SCENES["lidar only"])
+
+
+def test_installed_beside_the_package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As in the wheel: blueprints/ inside the package's folder goes first."""
+    package = tmp_path / "bevviz"
+    (package / "blueprints").mkdir(parents=True)
+    (package / "__init__.py").touch()
+    (package / "blueprints" / "mine.py").write_text("")
+    bevviz = importlib.import_module("bevviz")
+    monkeypatch.setattr(bevviz, "__file__", str(package / "__init__.py"))
+    assert blueprints.names() == ["mine"]

@@ -1,0 +1,630 @@
+"""Recordings: what is logged is read back through the SDK and compared with the results it was made from."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import signal
+import socket
+import subprocess
+import sys
+import textwrap
+import urllib.request
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from bevviz import geometry
+from bevviz.config import Config, load
+from bevviz.errors import UserError
+from bevviz.explain import explain
+from bevviz.frame import (
+    Boxes3D,
+    Camera,
+    CameraResult,
+    Cloud,
+    Clusters,
+    Decision,
+    Detections,
+    DetectionState,
+    Failure,
+    Frame,
+    FrameResult,
+    Fusion,
+    Ground,
+    Image,
+    Intrinsics,
+    LabelledBoxes2D,
+    LabelledBoxes3D,
+    Objects,
+    Pairs,
+    Voxels,
+)
+from bevviz.logging.entities import DEPTH_BINS, DEPTH_RANGE, TRACK_COLORS, ClassId
+from bevviz.logging.logger import Logger
+from bevviz.logging.sinks import open_recording
+from bevviz.logging.tracks import Tracks
+from bevviz.sources import Scene
+from bevviz.stages.bev import bev
+from tests.recordings import Recording, verify
+
+SCENE = Scene("drive", "lidar", ("lidar",), ("zed",), robot=True, truth=True)
+START = 1_700_000_000_123_456_789
+JPEG = cv2.imencode(".jpg", np.full((36, 64, 3), 90, np.uint8))[1].tobytes()
+WORLD_FROM_LIDAR = geometry.transform(np.array([5.0, -2.0, 1.7]), np.array([0, 0, 0.3, 0.95]))
+LIDAR_FROM_CAMERA = geometry.transform(np.array([0.3, 0.0, -0.2]), np.array([-0.5, 0.5, -0.5, 0.5]))
+WORLD_FROM_CAMERA = WORLD_FROM_LIDAR @ LIDAR_FROM_CAMERA
+INTRINSICS = Intrinsics(64, 36, np.array([[40.0, 0, 31.5], [0, 40.0, 17.5], [0, 0, 1]]))
+
+Make = Callable[..., FrameResult]
+
+
+def f32(*rows: Any) -> Any:
+    return np.array(rows, np.float32)
+
+
+def make(index: int = 0, **changes: Any) -> FrameResult:
+    """One frame in which a person at 8 m is matched, a car is not, and a third box is too weak."""
+    config = changes.pop("config", load())
+    stamp = START + index * 100_000_000
+    rng = np.random.default_rng(index)
+    person = rng.normal((8, 0.5, -0.8), 0.1, (20, 3))
+    bush = rng.normal((12, -6, -1), 0.1, (15, 3))
+    road = np.column_stack([rng.uniform(3, 30, 100), rng.uniform(-10, 10, 100), np.full(100, -1.7)])
+    points = np.concatenate([road, person, bush, [[20.0, 9.0, 0.0]]]).astype(np.float32)
+    ground = np.arange(len(points)) < 100
+    obstacles = points[~ground]
+    labels = np.repeat(np.array([0, 1, -1], np.int32), [20, 15, 1])
+    boxes = Boxes3D(f32([8, 0.5, -0.8], [12, -6, -1]), f32([0.6, 0.5, 1.7], [2, 1, 1]), f32(0, 0.4))
+    zero = np.zeros(2, np.int32)
+    clusters = Clusters(labels, zero, np.array([20, 15], np.int32), boxes.center, boxes, boxes)
+    detections = Detections(
+        f32([20, 10, 30, 30], [40, 15, 60, 25], [0, 0, 5, 5]),
+        f32(0.9, 0.5, 0.1),
+        np.array([0, 2, 2], np.int32),
+        ("person", "car", "car"),
+        np.array([DetectionState.KEPT, DetectionState.KEPT, DetectionState.BELOW_THRESHOLD], np.int32),
+        np.full(3, -1, np.int32),
+        np.zeros(3, np.float32),
+    )
+    one = np.array([0], np.int32)
+    pairs = Pairs(one, one, one + 14, f32(7.8), f32(0.61), f32(3), f32(0.4))
+    fusion = Fusion(
+        np.array([Decision.MATCHED, Decision.NO_CLUSTER, Decision.NOT_KEPT], np.int32),
+        np.array([0, -1, -1], np.int32),
+        np.array([14, 3, 0], np.int32),
+        np.array([Decision.MATCHED, Decision.OUT_OF_VIEW], np.int32),
+        np.array([0, -1], np.int32),
+        pairs,
+        f32([20, 10, 30, 30], [np.nan] * 4),
+    )
+    camera_from_lidar = geometry.inverse(LIDAR_FROM_CAMERA)
+    uv, depth = geometry.project(geometry.apply(camera_from_lidar, obstacles), INTRINSICS)
+    uv[20:] = np.nan
+    image = Image(
+        stamp + 20_000_000, "zed", cv2.imdecode(np.frombuffer(JPEG, np.uint8), 1), JPEG, "image/jpeg"
+    )
+    camera = Camera(
+        "zed",
+        image,
+        INTRINSICS,
+        camera_from_lidar,
+        WORLD_FROM_CAMERA,
+        sync_error=0.02,
+        tf_age=0.005,
+    )
+    cameras = (CameraResult(camera, detections, fusion, uv, depth),)
+    cloud = Cloud(stamp, "lidar", points, {}, "/points", stamp + 30_000_000, dropped=7)
+    frame = Frame(
+        index=index,
+        stamp=stamp,
+        received=stamp + 30_000_000,
+        lidar="lidar",
+        points=points,
+        points_frame="lidar",
+        world_frame="map",
+        world_from_points=WORLD_FROM_LIDAR,
+        clouds=(cloud,),
+        points_from_clouds=(np.eye(4),),
+        cameras=(camera,),
+        tf_age=0.004,
+    )
+    objects = Objects(
+        Boxes3D(boxes.center[:1], boxes.size[:1], boxes.yaw[:1]), ("person",), f32(0.9), one, ("zed",), one
+    )
+    result = FrameResult(
+        frame=frame,
+        voxels=Voxels(points, np.arange(len(points), dtype=np.int32)),
+        ground=Ground(ground, points[:, 2] + np.float32(1.7)),
+        obstacles=obstacles,
+        clusters=clusters,
+        cameras=cameras,
+        objects=objects,
+        bev=bev(points, None, ground, objects, clusters, config.bev),
+        explanations=explain(cameras, clusters, config),
+        timings={"voxel": 0.004, "total": 0.02},
+    )
+    return dataclasses.replace(result, **changes)
+
+
+def nothing(index: int, *failures: Failure, **changes: Any) -> FrameResult:
+    """A frame of which no more than the cloud's stamp is known."""
+    empty = make(index)
+    frame = dataclasses.replace(
+        empty.frame, points=np.zeros((0, 3), np.float32), clouds=(), cameras=(), **changes
+    )
+    return FrameResult(frame, None, None, None, None, (), None, None, (), {"total": 0.001}, failures)
+
+
+@pytest.fixture
+def record(tmp_path: Path) -> Callable[..., Recording]:
+    def run(results: Iterable[FrameResult], config: Config | None = None, scene: Scene = SCENE) -> Recording:
+        path = tmp_path / "test.rrd"
+        config = config or load()
+        with open_recording(scene, config, save=path) as sinks:
+            logger = Logger(sinks.recording, config, scene)
+            logger.log_static()
+            for result in results:
+                logger.log(result)
+        return Recording(path)
+
+    return run
+
+
+# --- entities and values -----------------------------------------------------------------------
+
+
+def test_a_drive_with_gaps_is_a_valid_recording(tmp_path: Path) -> None:
+    path = tmp_path / "drive.rrd"
+    with open_recording(SCENE, load(), save=path) as sinks:
+        logger = Logger(sinks.recording, load(), SCENE)
+        logger.log_static()
+        for index in range(10):
+            logger.log(nothing(index, Failure("voxel", "out of memory")) if index % 4 == 3 else make(index))
+    verify(path)
+    assert Recording(path).blueprints == 1
+
+
+def test_times(record: Callable[..., Recording]) -> None:
+    found = record([make(0), make(3)])
+    assert set(found.times) == {"frame", "stamp", "received"}
+    assert found.times["stamp"] == {0: START, 3: START + 300_000_000}
+    assert found.times["received"][3] == START + 330_000_000
+
+
+def test_cloud(record: Callable[..., Recording]) -> None:
+    result = make()
+    found = record([result])
+    raw = found.at["/world/lidar/points"]
+    np.testing.assert_array_equal(np.array(raw["Points3D:positions"][0], np.float32), result.frame.points)
+    assert result.ground is not None and result.obstacles is not None
+    expected = np.where(result.ground.mask, ClassId.GROUND, ClassId.OBSTACLE)
+    assert raw["Points3D:class_ids"][0] == expected.tolist()
+    for entity, points in (
+        ("/world/lidar/points/ground", result.frame.points[result.ground.mask]),
+        ("/world/lidar/points/obstacles", result.obstacles),
+    ):
+        np.testing.assert_allclose(found.at[entity]["Points3D:positions"][0], points, atol=0.1 / 8)
+
+
+def test_poses_and_calibration(record: Callable[..., Recording]) -> None:
+    found = record([make()])
+    for entity, pose in (
+        ("/world/lidar", WORLD_FROM_LIDAR),
+        ("/world/zed", WORLD_FROM_CAMERA),
+    ):
+        (translation,) = found.at[entity]["Transform3D:translation"][0]
+        (turn,) = found.at[entity]["Transform3D:quaternion"][0]
+        np.testing.assert_allclose(geometry.transform(np.array(translation), np.array(turn)), pose, atol=1e-6)
+    (k,) = found.static["/world/zed"]["Pinhole:image_from_camera"]
+    np.testing.assert_allclose(np.array(k).reshape(3, 3).T, INTRINSICS.K)
+    assert found.static["/world/zed"]["Pinhole:resolution"] == [[64, 36]]
+    assert found.static["/world"]["ViewCoordinates:xyz"] == [[5, 4, 1]]  # forward, left, up
+
+
+def test_clusters(record: Callable[..., Recording]) -> None:
+    result = make()
+    found = record([result])
+    seen = found.at["/world/lidar/clusters"]
+    assert result.clusters is not None and result.obstacles is not None
+    np.testing.assert_array_equal(seen["Boxes3D:centers"][0], result.clusters.obb.center)
+    np.testing.assert_allclose(
+        2 * np.array(seen["Boxes3D:half_sizes"][0]), result.clusters.obb.size, rtol=1e-6
+    )
+    turns = np.array(seen["Boxes3D:quaternions"][0])
+    np.testing.assert_allclose(2 * np.arctan2(turns[:, 2], turns[:, 3]), result.clusters.obb.yaw, atol=1e-6)
+    assert seen["Boxes3D:labels"][0] == ["0", "1"]
+    members = result.clusters.labels >= 0
+    points = np.array(seen["Points3D:positions"][0])
+    np.testing.assert_allclose(points, result.obstacles[members], atol=0.1 / 8)
+    box_classes = np.array(seen["Boxes3D:class_ids"][0])
+    assert len(set(box_classes)) == 2
+    assert seen["Points3D:class_ids"][0] == box_classes[result.clusters.labels[members]].tolist()
+    assert (box_classes >= ClassId.TRACK).all()
+
+
+def test_clusters_outside_the_limits_are_set_aside(record: Callable[..., Recording]) -> None:
+    result = make()
+    assert result.clusters is not None
+    clusters = dataclasses.replace(result.clusters, state=np.array([0, 1], np.int32))
+    found = record([dataclasses.replace(result, clusters=clusters)])
+    assert found.at["/world/lidar/clusters"]["Boxes3D:labels"][0] == ["0"]
+    assert len(found.at["/world/lidar/clusters"]["Points3D:positions"][0]) == 20
+    assert found.at["/world/lidar/clusters/set_aside"]["Boxes3D:labels"][0] == ["1: 15 points"]
+    assert found.at["/health/count/clusters"]["Scalars:scalars"][0] == [1]
+
+
+def test_camera(record: Callable[..., Recording]) -> None:
+    result = make()
+    (camera,) = result.cameras
+    found = record([result])
+    image = found.at["/world/zed/image"]
+    assert bytes(image["EncodedImage:blob"][0][0]) == JPEG  # passed through untouched
+    assert image["EncodedImage:media_type"][0] == ["image/jpeg"]
+
+    kept = found.at["/world/zed/image/detections"]
+    assert kept["Boxes2D:labels"][0] == ["person 0.90", "car 0.50"]
+    assert kept["Boxes2D:centers"][0] == [[25, 20], [50, 20]]
+    assert kept["Boxes2D:half_sizes"][0] == [[5, 10], [10, 5]]
+    assert kept["Boxes2D:class_ids"][0] == [ClassId.DETECTION + DetectionState.KEPT] * 2
+    weak = found.at["/world/zed/image/detections/weak"]
+    assert weak["Boxes2D:labels"][0] == ["car 0.10"]
+    assert weak["Boxes2D:class_ids"][0] == [ClassId.DETECTION + DetectionState.BELOW_THRESHOLD]
+
+    points = found.at["/world/zed/image/points"]
+    assert camera.uv is not None and camera.depth is not None
+    np.testing.assert_array_equal(np.array(points["Points2D:positions"][0], np.float32), camera.uv[:20])
+    bins = (camera.depth[:20] / DEPTH_RANGE * DEPTH_BINS).astype(int)
+    assert points["Points2D:class_ids"][0] == bins.tolist()
+
+
+def test_an_image_that_came_raw_is_compressed_and_logged_once(record: Callable[..., Recording]) -> None:
+    results = []
+    for index in range(3):
+        result = make(index)
+        (camera,) = result.cameras
+        assert camera.camera.image is not None
+        image = dataclasses.replace(
+            camera.camera.image, encoded=None, stamp=START + index // 2, media_type=""
+        )
+        camera = dataclasses.replace(camera, camera=dataclasses.replace(camera.camera, image=image))
+        results.append(dataclasses.replace(result, cameras=(camera,)))
+    found = record(results)
+    blobs = found.at["/world/zed/image"]["EncodedImage:blob"]
+    assert sorted(blobs) == [0, 2]  # frame 1 has the same image as frame 0
+    assert found.cleared("/world/zed/image") == set()
+    shown = cv2.imdecode(np.array(blobs[0][0], np.uint8), cv2.IMREAD_COLOR)
+    assert shown is not None
+    np.testing.assert_allclose(shown, image.bgr, atol=4)
+
+
+def test_fused_boxes_say_why(record: Callable[..., Recording]) -> None:
+    found = record([make()])
+    fused = found.at["/world/fused"]
+    assert fused["Boxes3D:labels"][0] == ["person 0.90"]
+    np.testing.assert_allclose(fused["Boxes3D:centers"][0], [[8, 0.5, -0.8]], rtol=1e-6)
+    np.testing.assert_allclose(fused["Transform3D:translation"][0], [[5, -2, 1.7]], rtol=1e-6)
+    (reason,) = fused["reason"][0]
+    assert "14 points of cluster 0" in reason
+    assert "matched" in reason
+
+
+def test_frustums_end_at_the_matched_depth(record: Callable[..., Recording]) -> None:
+    found = record([make()])
+    strips = found.at["/world/frustums"]["LineStrips3D:strips"][0]
+    camera_from_world = geometry.inverse(WORLD_FROM_CAMERA)
+    matched, unmatched = (geometry.apply(camera_from_world, np.array(strip)) for strip in strips)
+    assert np.unique(matched[:, 2].round(3)).tolist() == pytest.approx([0.3, 7.8], abs=1e-3)
+    assert unmatched[:, 2].max() > 10
+    far = matched[matched[:, 2] > 1]
+    uv, _ = geometry.project(far, INTRINSICS)
+    np.testing.assert_allclose([uv.min(0), uv.max(0)], [[20, 10], [30, 30]], atol=1e-3)
+
+
+def test_grid_lies_on_the_ground_the_right_way_round(record: Callable[..., Recording]) -> None:
+    result = make()
+    found = record([result])
+    grid = found.at["/world/bev"]
+    assert result.bev is not None
+    np.testing.assert_array_equal(
+        np.array(grid["GridMap:data"][0][0], np.uint8).view(np.int8),
+        result.bev.channels["occupancy"].ravel(),
+    )
+    (origin,) = grid["GridMap:translation"][0]
+    ((*axis, angle),) = [(*r["axis"], r["angle"]) for r in grid["GridMap:rotation_axis_angle"][0]]
+    assert axis == [0, 0, 1]
+    c, s = np.cos(angle), np.sin(angle)
+    rows, columns = result.bev.channels["occupancy"].shape
+    v, u = np.argwhere(result.bev.channels["occupancy"] == 100).T
+    right, up = (u + 0.5) * result.bev.resolution, (rows - v - 0.5) * result.bev.resolution
+    x, y = origin[0] + c * right - s * up, origin[1] + s * right + c * up
+    assert result.obstacles is not None
+    nearest = np.hypot(x[:, None] - result.obstacles[:, 0], y[:, None] - result.obstacles[:, 1]).min(1)
+    assert nearest.max() < 0.1  # each occupied cell has an obstacle point within the cell
+    assert abs(origin[2] + 1.7) < 0.1
+    assert columns == rows == 800
+
+
+def test_reference_image_is_stored_without_loss(record: Callable[..., Recording]) -> None:
+    config = load(preset="reference")
+    result = make(config=config)
+    found = record([result], config)
+    blob = np.array(found.at["/bev"]["EncodedImage:blob"][0][0], np.uint8)
+    assert result.bev is not None
+    np.testing.assert_array_equal(cv2.imdecode(blob, cv2.IMREAD_COLOR), result.bev.image)
+
+
+def test_truth_and_the_robots_own(record: Callable[..., Recording]) -> None:
+    result = make()
+    boxes = Boxes3D(f32([2, 1, 0]), f32([4, 2, 1.5]), f32(0.5))
+    stated = LabelledBoxes3D(
+        "/detection/fused_3d", START, "lidar", boxes, ("car",), f32(0.7), WORLD_FROM_LIDAR
+    )
+    truth = dataclasses.replace(stated, topic="/ground_truth", scores=f32(1.0))
+    flat = LabelledBoxes2D(
+        "/detection/camera_2d", START, "zed", f32([1, 2, 11, 22]), ("dog",), f32(0.3), "zed"
+    )
+    frame = dataclasses.replace(result.frame, truth=truth, robot_boxes=(stated,), robot_detections=(flat,))
+    found = record([dataclasses.replace(result, frame=frame)])
+    for entity in ("/world/ground_truth", "/robot/detection/fused_3d"):
+        assert found.at[entity]["Boxes3D:centers"][0] == [[2, 1, 0]]
+        np.testing.assert_allclose(found.at[entity]["Transform3D:translation"][0], [[5, -2, 1.7]], rtol=1e-6)
+    assert found.at["/robot/detection/fused_3d"]["Boxes3D:labels"][0] == ["car 0.70"]
+    robot = found.at["/robot/detection/camera_2d"]
+    assert robot["Boxes2D:centers"][0] == [[6, 12]]
+    assert robot["CoordinateFrame:frame"][0] == ["tf#/world/zed/image"]
+    (outline,) = found.at["/bev/overlay/ground_truth"]["LineStrips2D:strips"][0]
+    center = np.mean(outline[:4], axis=0)
+    np.testing.assert_allclose(center, [(40 - 1) / 0.1, (40 - 2) / 0.1], atol=0.01)
+
+
+def test_several_lidars_keep_their_own_frames(record: Callable[..., Recording]) -> None:
+    result = make()
+    shift = geometry.transform(np.array([1.0, 0, 0]), np.array([0, 0, 0, 1]))
+    first = Cloud(START, "front_lidar", result.frame.points[:60], {}, "/front/points")
+    second = Cloud(START, "rear_lidar", result.frame.points[60:], {}, "/rear/points")
+    frame = dataclasses.replace(
+        result.frame, lidar="lidars", clouds=(first, second), points_from_clouds=(np.eye(4), shift)
+    )
+    scene = dataclasses.replace(SCENE, lidar="lidars", lidars=("front_lidar", "rear_lidar"))
+    found = record([dataclasses.replace(result, frame=frame)], scene=scene)
+    assert len(found.at["/world/front_lidar/points"]["Points3D:positions"][0]) == 60
+    rear = found.at["/world/rear_lidar"]["Transform3D:translation"][0]
+    np.testing.assert_allclose(rear, [(WORLD_FROM_LIDAR @ shift)[:3, 3]], rtol=1e-6)
+    classes = found.at["/world/rear_lidar/points"]["Points3D:class_ids"][0]
+    assert classes == [ClassId.GROUND] * 40 + [ClassId.OBSTACLE] * 36
+    assert "/world/lidars/points" not in found.at
+    assert "Boxes3D:centers" in found.at["/world/lidars/clusters"]
+
+
+# --- decisions and health ----------------------------------------------------------------------
+
+
+def test_explanations_in_words_and_as_states(record: Callable[..., Recording]) -> None:
+    result = make()
+    found = record([result, make(1)])
+    (page,) = found.at["/explain"]["TextDocument:text"][0]
+    assert found.at["/explain"]["TextDocument:media_type"][0] == ["text/markdown"]
+    for explanation in result.explanations:
+        listed = explanation.text in page
+        assert listed or explanation.state == "out_of_view", explanation
+    assert "1 out of view: 1" in page
+    assert page.index("person 0.90") < page.index("car 0.50") < page.index("car 0.10")
+
+    lines = [row for row in found.rows["/explain/log"] if row["frame"] == 0]
+    assert [row["TextLog:level"] for row in lines] == [["INFO"]]
+    assert "car 0.50: no cluster" in lines[0]["TextLog:text"][0]
+
+    assert found.at["/explain/states/zed/person"]["StateChange:state"] == {0: ["matched"]}
+    assert found.at["/explain/states/zed/car"]["StateChange:state"] == {0: ["no cluster"]}
+    assert found.at["/explain/states/pipeline"]["StateChange:state"] == {0: ["ok"]}
+
+
+def test_health(record: Callable[..., Recording]) -> None:
+    found = record([make(0), make(3)])
+    value = {
+        entity: scalars["Scalars:scalars"]
+        for entity, scalars in found.at.items()
+        if "Scalars:scalars" in scalars
+    }
+    assert value["/health/time_ms/voxel"][0] == [4]
+    assert value["/health/rate_hz/pipeline"][0] == [50]
+    assert value["/health/rate_hz/sensor"] == {3: pytest.approx([1 / 0.3])}
+    assert value["/health/sync_error_ms/zed"][0] == [20]
+    assert value["/health/tf_age_ms/zed"][0] == [5]
+    assert value["/health/tf_age_ms/lidar"][0] == [4]
+    counts = {name.rpartition("/")[2]: v[3] for name, v in value.items() if name.startswith("/health/count")}
+    assert counts == {
+        "points": [136],
+        "invalid_points": [7],
+        "voxels": [136],
+        "obstacle_points": [36],
+        "clusters": [2],
+        "detections": [2],
+        "matches": [1],
+        "problems": [0],
+        "failures": [0],
+        "skipped_frames": [2],
+    }
+
+
+def test_what_a_frame_lacks_is_cleared(record: Callable[..., Recording]) -> None:
+    found = record([make(0), nothing(1), make(2)])
+    for entity in (
+        "/world/lidar/points",
+        "/world/lidar/points/ground",
+        "/world/lidar/points/obstacles",
+        "/world/lidar/clusters",
+        "/world/zed/image",
+        "/world/zed/image/detections",
+        "/world/zed/image/detections/weak",
+        "/world/zed/image/points",
+        "/world/frustums",
+        "/world/fused",
+        "/world/bev",
+        "/bev",
+    ):
+        assert found.cleared(entity) == {1}, entity
+    assert len(found.at["/world/zed/image"]["EncodedImage:blob"]) == 2
+    assert found.at["/explain/states/zed/person"]["StateChange:state"][1] in ([""], [])
+
+
+def test_a_frame_that_failed_is_logged_with_its_reason(record: Callable[..., Recording]) -> None:
+    failed = nothing(0, Failure("ground", "only 2 points"), problems=("no odometry at this time",))
+    found = record([failed])
+    lines = {row["TextLog:level"][0]: row["TextLog:text"][0] for row in found.rows["/explain/log"]}
+    assert lines == {"ERROR": "ground: only 2 points", "WARN": "no odometry at this time"}
+    (page,) = found.at["/explain"]["TextDocument:text"][0]
+    assert "**ground**: only 2 points" in page
+    assert "no odometry at this time" in page
+    assert found.at["/explain/states/pipeline"]["StateChange:state"][0] == ["failed"]
+    assert found.at["/health/count/failures"]["Scalars:scalars"][0] == [1]
+
+
+def test_a_recording_says_how_it_was_made(record: Callable[..., Recording]) -> None:
+    config = load(settings=["clustering.eps=0.7"])
+    found = record([make()], config)
+    (text,) = found.static["/config"]["TextDocument:text"]
+    assert "eps: 0.7" in text
+    properties = found.static["/__properties/bevviz"]
+    assert "eps: 0.7" in properties["config"][0]
+    assert properties["preset"] == ["default"]
+    assert any(line.startswith("rerun-sdk 0.") for line in properties["versions"])
+    assert properties["cameras"] == ["zed"]
+
+
+# --- colours that stay -------------------------------------------------------------------------
+
+
+@given(
+    st.lists(st.tuples(st.integers(-20, 20), st.integers(-20, 20)), min_size=1, max_size=30, unique=True),
+    st.randoms(use_true_random=False),
+)
+@settings(deadline=None)
+def test_a_cluster_keeps_its_number_whatever_its_row(cells: list[tuple[int, int]], random: Any) -> None:
+    before = np.array([(4 * x, 4 * y, 0) for x, y in cells], np.float32)
+    order = list(range(len(cells)))
+    random.shuffle(order)
+    moved = before[order] + f32(0.6, -0.6, 0.1)
+    tracks = Tracks(gate=1.5)
+    first = tracks.update(before)
+    assert len(set(first.tolist())) == len(cells)
+    np.testing.assert_array_equal(tracks.update(moved), first[order])
+
+
+def test_what_leaves_gives_its_number_to_nobody() -> None:
+    tracks = Tracks()
+    near, far = f32([0, 0, 0]), f32([50, 0, 0])
+    (first,) = tracks.update(near)
+    (second,) = tracks.update(far)
+    assert len(tracks.update(np.zeros((0, 3), np.float32))) == 0
+    (third,) = tracks.update(near)
+    assert len({first, second, third}) == 3
+
+
+def test_colours_follow_the_object_not_the_row(record: Callable[..., Recording]) -> None:
+    first, second = make(0), make(1)
+    assert second.clusters is not None
+    swapped = Clusters(
+        np.array([1, 0, -1], np.int32)[second.clusters.labels],
+        second.clusters.state,
+        second.clusters.count[::-1],
+        second.clusters.centroid[::-1],
+        second.clusters.aabb,
+        Boxes3D(*(np.ascontiguousarray(a[::-1]) for a in dataclasses.astuple(second.clusters.obb))),
+    )
+    found = record([first, dataclasses.replace(second, clusters=swapped)])
+    classes = found.at["/world/lidar/clusters"]["Boxes3D:class_ids"]
+    assert classes[1] == classes[0][::-1]
+    assert max(classes[0]) < ClassId.TRACK + TRACK_COLORS
+
+
+# --- sinks -------------------------------------------------------------------------------------
+
+
+def test_several_outputs_at_once(tmp_path: Path) -> None:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    path = tmp_path / "both.rrd"
+    with open_recording(SCENE, load(), save=path, serve=port) as sinks:
+        (url,) = sinks.urls
+        assert url.startswith(f"http://localhost:{port}/?url=rerun%2Bhttp%3A%2F%2Flocalhost%3A")
+        with urllib.request.urlopen(url, timeout=10) as page:
+            assert b"rerun" in page.read().lower()
+        Logger(sinks.recording, load(), SCENE).log(make())
+    verify(path)
+    assert Recording(path).blueprints == 1
+
+
+def test_an_error_on_the_way_leaves_a_readable_file(tmp_path: Path) -> None:
+    path = tmp_path / "broken.rrd"
+    with pytest.raises(KeyboardInterrupt), open_recording(SCENE, load(), save=path) as sinks:
+        logger = Logger(sinks.recording, load(), SCENE)
+        logger.log_static()
+        logger.log(make(0))
+        logger.log(make(1))
+        raise KeyboardInterrupt
+    verify(path)
+    assert sorted(Recording(path).at["/world/lidar/points"]["Points3D:positions"]) == [0, 1]
+
+
+def test_a_killed_process_leaves_what_it_had_logged(tmp_path: Path) -> None:
+    path = tmp_path / "killed.rrd"
+    script = f"""
+        import os, signal, time
+        from pathlib import Path
+        from bevviz.config import load
+        from bevviz.logging.logger import Logger
+        from bevviz.logging.sinks import open_recording
+        from tests.test_logging import SCENE, make
+        with open_recording(SCENE, load(), save=Path({str(path)!r})) as sinks:
+            logger = Logger(sinks.recording, load(), SCENE)
+            logger.log_static()
+            for index in range(5):
+                logger.log(make(index))
+            time.sleep(1.5)
+            os.kill(os.getpid(), signal.SIGKILL)
+    """
+    root = Path(__file__).resolve().parents[1]
+    env = {**os.environ, "PYTHONPATH": str(root)}
+    done = subprocess.run([sys.executable, "-c", textwrap.dedent(script)], cwd=root, env=env, timeout=120)
+    assert done.returncode == -signal.SIGKILL
+    assert sorted(Recording(path).at["/world/lidar/points"]["Points3D:positions"]) == [0, 1, 2, 3, 4]
+
+
+@pytest.mark.parametrize(
+    ("where", "message"),
+    [
+        (
+            {"save": Path("/nonexistent/a.rrd")},
+            "/nonexistent/a.rrd: cannot write the recording",
+        ),
+        ({"connect": "localhost"}, "--connect localhost: expected a URL such as rerun"),
+        ({"connect": "rerun+http://127.0.0.1:x/proxy"}, "expected a URL such as rerun"),
+        ({"connect": "rerun+http://127.0.0.1:1/proxy"}, "no viewer answers there"),
+        ({"blueprint": "debgu"}, "did you mean 'debug'"),
+    ],
+)
+def test_outputs_that_cannot_be_opened(where: dict[str, Any], message: str) -> None:
+    with pytest.raises(UserError, match=message) as caught, open_recording(SCENE, load(), **where):
+        pass
+    assert "\n" not in str(caught.value)
+
+
+def test_a_port_in_use_names_a_free_one() -> None:
+    with socket.socket() as taken:
+        taken.bind(("", 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        with (
+            pytest.raises(UserError, match=rf"--serve {port}: the port is in use; another one: --serve \d+"),
+            open_recording(SCENE, load(), serve=port),
+        ):
+            pass
