@@ -17,10 +17,10 @@ check: $(VENV)/.tested
 	$(BIN)/mypy
 
 bench: $(VENV)/.installed
-	$(BIN)/python benchmarks/pipeline.py
+	$(BIN)/python -m benchmarks.pipeline
 
 accuracy: $(VENV)/.installed
-	$(BIN)/python benchmarks/accuracy.py --write docs/accuracy.md
+	$(BIN)/python -m benchmarks.accuracy --write docs/accuracy.md
 
 $(VENV)/.installed: pyproject.toml
 	$(PYTHON) -m venv $(VENV)

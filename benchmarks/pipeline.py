@@ -15,13 +15,13 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 from statistics import median
-from typing import Any
+from typing import Any, TypeVar
 
 import cv2
 import numpy as np
 from tqdm import tqdm
 
-import tutorial
+from benchmarks import tutorial
 from bevviz.config import load
 from bevviz.frame import Frame
 from bevviz.logging.logger import Logger
@@ -30,6 +30,8 @@ from bevviz.pipeline import Pipeline
 from bevviz.sources.bag import BagSource
 from bevviz.sources.messages import decode_cloud
 from bevviz.sources.synthetic import SyntheticSource, write_bag
+
+T = TypeVar("T")
 
 STAGES = ("voxel", "ground", "clustering", "projection", "bev", "explain")
 
@@ -62,24 +64,24 @@ def stages(bag: Path, frames: list[Frame]) -> None:
     messages = _clouds(bag)
     with Pipeline(load()) as pipeline, tempfile.TemporaryDirectory() as folder:
         pipeline.run(frames[0])  # compiled kernels are loaded here
-        reference.clustering(reference.ground(reference.voxel(reference.cloud(frames[0].points))))
+        reference.clustering(reference.ground(reference.voxel(frames[0].points)))
         with open_recording(_scene(bag), load(), save=Path(folder, "x.rrd"), blueprint="debug") as sinks:
             logger = Logger(sinks.recording, load(), _scene(bag))
             logger.log_static()
             for frame, message in zip(
                 tqdm(frames, unit="frame", desc="stages", disable=None), messages, strict=True
             ):
-                _timed(ours, "decode", lambda m=message: decode_cloud(m, "/points", 0))
+                _timed(ours, "decode", decode_cloud, message, "/points", 0)
                 result = pipeline.run(frame)
                 for stage in STAGES:
                     ours.setdefault(stage, []).append(result.timings.get(stage, 0.0))
-                _timed(ours, "log", lambda r=result: logger.log(r))
+                _timed(ours, "log", logger.log, result)
 
-                points = _timed(theirs, "decode", lambda m=message: tutorial.decode(m))
-                cloud = _timed(theirs, "voxel", lambda p=points: reference.voxel(reference.cloud(p)))
-                obstacles = _timed(theirs, "ground", lambda c=cloud: reference.ground(c))
-                _timed(theirs, "clustering", lambda o=obstacles: reference.clustering(o))
-                _timed(theirs, "bev", lambda p=points: tutorial.bev(p, 10, 10, 0.05))
+                points = _timed(theirs, "decode", tutorial.decode, message)
+                cloud = _timed(theirs, "voxel", reference.voxel, points)
+                obstacles = _timed(theirs, "ground", reference.ground, cloud)
+                _timed(theirs, "clustering", reference.clustering, obstacles)
+                _timed(theirs, "bev", tutorial.bev, points, 10, 10, 0.05)
 
     print(f"\n{len(frames)} frames, {median(len(f.points) for f in frames):.0f} points, medians\n")
     print("| stage | tutorial, ms | bevviz `default`, ms | ratio |\n| --- | ---: | ---: | ---: |")
@@ -124,14 +126,12 @@ def recordings(bag: Path, frames: int, model: Path | None) -> None:
             f"| {name} | {seconds:.1f} | {duration / seconds:.2f} | {frames / seconds:.1f} "
             f"| {size / 1e6:.1f} | {size / base:.2f} |"
         )
-    print(
-        f"\nthe bag: {duration:.0f} s, {bag.stat().st_size / 1e6:.1f} MB; runs include the start of the process"
-    )
+    print(f"\nthe bag: {duration:.0f} s, {bag.stat().st_size / 1e6:.1f} MB; runs include the process's start")
 
 
-def _timed(times: dict[str, list[float]], name: str, function: Callable[[], Any]) -> Any:
+def _timed(times: dict[str, list[float]], name: str, function: Callable[..., T], *arguments: Any) -> T:
     start = time.perf_counter()
-    result = function()
+    result = function(*arguments)
     times.setdefault(name, []).append(time.perf_counter() - start)
     return result
 

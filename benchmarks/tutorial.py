@@ -38,11 +38,9 @@ class Stages:
     def __init__(self) -> None:
         self.o3d = o3d.load()
 
-    def cloud(self, points: NDArray[np.float32]) -> Any:
-        return self.o3d.geometry.PointCloud(self.o3d.utility.Vector3dVector(points.astype(np.float64)))
-
-    def voxel(self, cloud: Any) -> Any:
-        return cloud.voxel_down_sample(0.05)
+    def voxel(self, points: NDArray[np.float32]) -> Any:
+        vector = self.o3d.utility.Vector3dVector(points.astype(np.float64))
+        return self.o3d.geometry.PointCloud(vector).voxel_down_sample(0.05)
 
     def ground(self, cloud: Any) -> Any:
         _, inliers = cloud.segment_plane(0.5, 3, 100)

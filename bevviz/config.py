@@ -142,7 +142,9 @@ class DetectorConfig(Section):
     conf_threshold: float = Field(0.25, gt=0, le=1, description="lowest score of a detection")
     iou_threshold: float = Field(0.45, gt=0, le=1, description="class-wise NMS")
     explain_threshold: float = Field(0.01, gt=0, le=1, description="weaker candidates are not even explained")
-    max_candidates: int = Field(100, ge=1, le=10_000, description="candidates kept for explanation, duplicates last")
+    max_candidates: int = Field(
+        100, ge=1, le=10_000, description="candidates kept for explanation, duplicates last"
+    )
     classes: tuple[str, ...] = Field((), description="only these class names; empty: all")
     provider: str = Field("auto", description="onnxruntime execution provider, e.g. CPU, CUDA, TensorRT")
     threads: int = Field(0, ge=0, description="onnxruntime threads; 0: all cores")
