@@ -252,7 +252,7 @@ def cyclist(rng: np.random.Generator) -> Model:
     angle = np.linspace(0, 2 * np.pi, 8, endpoint=False)
     oval = np.stack([np.cos(angle), np.sin(angle), np.zeros(8)], -1)
     torso = [
-        np.add(hip, (neck - hip)) * t + oval * [*r, 0]
+        hip + (neck - hip) * t + oval * [*r, 0]
         for t, r in (
             (-0.1, (0.1, 0.14)), (0.1, (0.13, 0.17)), (0.5, (0.12, 0.155)), (0.88, (0.12, 0.2)),
             (1.05, (0.07, 0.09)),
