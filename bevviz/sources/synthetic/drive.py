@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 
 from bevviz import geometry
 from bevviz.errors import UserError
-from bevviz.frame import F64, I32, Boxes3D, Camera, Cloud, Frame, Image, Intrinsics, LabelledBoxes3D
+from bevviz.frame import F64, I32, Bool, Boxes3D, Camera, Cloud, Frame, Image, Intrinsics, LabelledBoxes3D
 from bevviz.sources import Scene
+from bevviz.sources.synthetic.mesh import Material
 from bevviz.sources.synthetic.sensors import Caster, Lidar, PinholeCamera, View, optical
 from bevviz.sources.synthetic.world import World, bounds
 
@@ -30,6 +31,7 @@ PERIOD = 100_000_000  # nanoseconds between scans
 IMAGE_DELAY = 12_000_000  # nanoseconds from a scan to its image
 LATENCY = 8_000_000  # nanoseconds from a stamp to its reception
 TRUTH_RANGE = 80.0  # metres
+GROUND = (Material.ROAD, Material.PAVEMENT, Material.KERB, Material.GRASS)
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,6 +42,7 @@ class Snapshot:
     truth_object: I32  # (K,) number of the object of each box in Frame.truth
     truth_hits: I32  # (K,) LiDAR points on that object: one with few or none is hidden
     point_object: I32  # (N,) object of each point in Frame.points, 0: scenery
+    point_ground: Bool  # (N,) road, kerb, pavement or grass
     pixel_object: I32  # (H, W) object of each pixel, 0: scenery, -1: sky
 
 
@@ -154,7 +157,8 @@ class SyntheticSource:
             tf_age=0.0,
         )
         hits = np.bincount(scan.object, minlength=len(self.world.actors) + 1)[numbers]
-        return Snapshot(frame, numbers, hits.astype(np.int32), scan.object, picture.object)
+        ground = np.isin(scan.material, GROUND)
+        return Snapshot(frame, numbers, hits.astype(np.int32), scan.object, ground, picture.object)
 
     def _truth(self, stamp: int, time: float, map_from_lidar: F64) -> tuple[LabelledBoxes3D, I32]:
         """Tight boxes, upright in the LiDAR's frame, around every actor in range, hidden or not."""

@@ -121,6 +121,7 @@ class Scan:
     intensity: F32  # (N,) 0 to 255
     ring: NDArray[np.uint16]  # (N,) beam, 0 is the lowest
     time: F32  # (N,) seconds since the scan began
+    material: U8  # (N,) Material
     object: I32  # (N,) number of the object, 0: scenery
 
 
@@ -169,6 +170,7 @@ class Lidar:
             intensity=intensity.astype(np.float32),
             ring=(ray % self.beams).astype(np.uint16),
             time=(ray // self.beams * (0.1 / self.azimuths)).astype(np.float32),
+            material=material,
             object=hits.object[kept],
         )
 
