@@ -156,7 +156,7 @@ def add_detections(tally: Tally, shot: Snapshot, result: FrameResult) -> None:
         distance = (
             1 - iou(detections.xyxy[mine], boxes[rows])
             if len(mine) and len(rows)
-            else np.zeros((len(mine), 0))
+            else np.zeros((len(mine), len(rows)))
         )
         count(tally.detections[name], distance, must[rows], 0.5)
 
@@ -170,7 +170,9 @@ def add_objects(tally: Tally, shot: Snapshot, result: FrameResult) -> None:
         mine = mine[np.argsort(-result.objects.score[mine])] if len(mine) else mine
         rows = np.array([r for r, label in enumerate(truth.labels) if label == name], int)
         offset = result.objects.boxes.center[mine][:, None, :2] - truth.boxes.center[rows][None, :, :2]
-        distance = np.linalg.norm(offset, axis=2) if len(mine) and len(rows) else np.zeros((len(mine), 0))
+        distance = (
+            np.linalg.norm(offset, axis=2) if len(mine) and len(rows) else np.zeros((len(mine), len(rows)))
+        )
         tally.errors[name] += count(tally.objects[name], distance, must[rows], MAX_DISTANCE)
 
 
@@ -188,7 +190,7 @@ def count(counts: Counter[str], distance: np.ndarray, must: np.ndarray, limit: f
         if must[best]:
             counts["tp"] += 1
             errors.append(float(row[best]))
-    counts["fn"] += int((free & must).sum()) if len(must) else 0
+    counts["fn"] += int((free & must).sum())
     return errors
 
 
