@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import errno
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from rosbags.highlevel import AnyReader
+from rosbags.rosbag2.storage_mcap import McapWriter
 
 from bevviz import geometry
 from bevviz.config import Config, DetectorConfig
 from bevviz.errors import UserError
 from bevviz.frame import DetectionState
+from bevviz.sources import Source
 from bevviz.sources.bag import BagSource
 from bevviz.sources.synthetic import BagWriter, Snapshot, SyntheticSource, write_bag
 from bevviz.sources.synthetic.bag import TOPICS
@@ -22,7 +25,9 @@ from bevviz.stages.detector import Detector
 
 @pytest.fixture(scope="module")
 def source() -> SyntheticSource:
-    return SyntheticSource(frames=20, seed=3)
+    drive: Source = SyntheticSource(frames=20, seed=3)
+    assert isinstance(drive, SyntheticSource)
+    return drive
 
 
 @pytest.fixture(scope="module")
@@ -221,6 +226,19 @@ def test_a_failing_writer_leaves_nothing(tmp_path: Path) -> None:
     source = SyntheticSource(frames=1)
     with pytest.raises(KeyboardInterrupt), BagWriter(source, tmp_path / "drive.mcap"):
         raise KeyboardInterrupt
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_full_disk_is_one_clear_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with (
+        pytest.raises(UserError, match=r"drive\.mcap: cannot write the bag: No space left on device"),
+        BagWriter(SyntheticSource(frames=1), tmp_path / "drive.mcap") as bag,
+    ):
+        monkeypatch.setattr(McapWriter, "write", full)
+        bag.write(next(iter(SyntheticSource(frames=1))))
     assert not list(tmp_path.iterdir())
 
 

@@ -74,9 +74,13 @@ class BagWriter:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         try:
-            self._writer.close()
             if kind is None:
+                self._writer.close()
                 next(Path(self._folder.name).glob("bag/*.mcap")).replace(self._path)
+            else:
+                self._writer.abort()
+        except OSError as failure:
+            raise UserError(f"{self._path}: cannot write the bag: {failure.strerror}") from None
         finally:
             self._folder.cleanup()
 
@@ -99,7 +103,10 @@ class BagWriter:
 
     def _put(self, topic: str, received: int, message: Any) -> None:
         data = self._store.serialize_cdr(message, TOPICS[topic])
-        self._writer.write(self._topics[topic], received, data)
+        try:
+            self._writer.write(self._topics[topic], received, data)
+        except OSError as error:
+            raise UserError(f"{self._path}: cannot write the bag: {error.strerror}") from None
 
     def _make(self, kind: str, **values: Any) -> Any:
         return self._store.types[kind](**values)
