@@ -107,18 +107,9 @@ def make(index: int = 0, **changes: Any) -> FrameResult:
     camera_from_lidar = geometry.inverse(LIDAR_FROM_CAMERA)
     uv, depth = geometry.project(geometry.apply(camera_from_lidar, obstacles), INTRINSICS)
     uv[20:] = np.nan
-    image = Image(
-        stamp + 20_000_000, "zed", cv2.imdecode(np.frombuffer(JPEG, np.uint8), 1), JPEG, "image/jpeg"
-    )
-    camera = Camera(
-        "zed",
-        image,
-        INTRINSICS,
-        camera_from_lidar,
-        WORLD_FROM_CAMERA,
-        sync_error=0.02,
-        tf_age=0.005,
-    )
+    bgr = np.full((36, 64, 3), 90, np.uint8)
+    image = Image(stamp + 20_000_000, "zed", bgr, JPEG, "image/jpeg")
+    camera = Camera("zed", image, INTRINSICS, camera_from_lidar, WORLD_FROM_CAMERA, 0.02, 0.005)
     cameras = (CameraResult(camera, detections, fusion, uv, depth),)
     cloud = Cloud(stamp, "lidar", points, {}, "/points", stamp + 30_000_000, dropped=7)
     frame = Frame(
@@ -360,6 +351,17 @@ def test_reference_image_is_stored_without_loss(record: Callable[..., Recording]
     np.testing.assert_array_equal(cv2.imdecode(blob, cv2.IMREAD_COLOR), result.bev.image)
 
 
+def test_channels_where_they_are_asked_for(record: Callable[..., Recording]) -> None:
+    config = load(settings=["logging.bev_channels=true"])
+    result = make(config=config)
+    found = record([result], config)
+    assert result.bev is not None
+    assert {"density", "height", "occupancy"} <= set(result.bev.channels)
+    for name, grid in result.bev.channels.items():
+        buffer = bytes(found.at[f"/bev/{name}"]["Image:buffer"][0][0])
+        np.testing.assert_array_equal(np.frombuffer(buffer, grid.dtype).reshape(grid.shape), grid)
+
+
 def test_truth_and_the_robots_own(record: Callable[..., Recording]) -> None:
     result = make()
     boxes = Boxes3D(f32([2, 1, 0]), f32([4, 2, 1.5]), f32(0.5))
@@ -575,6 +577,7 @@ def test_an_error_on_the_way_leaves_a_readable_file(tmp_path: Path) -> None:
     assert sorted(Recording(path).at["/world/lidar/points"]["Points3D:positions"]) == [0, 1]
 
 
+@pytest.mark.filterwarnings("ignore:RRD file has no footer")
 def test_a_killed_process_leaves_what_it_had_logged(tmp_path: Path) -> None:
     path = tmp_path / "killed.rrd"
     script = f"""
