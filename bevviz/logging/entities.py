@@ -117,7 +117,6 @@ class ClassId(IntEnum):
     UNCLASSIFIED = 0
     GROUND = 1
     OBSTACLE = 2
-    NOISE = 3  # obstacle point of no cluster
     DETECTION = 10  # + DetectionState
     CLUSTER = 20  # + ClusterState, for clusters outside the size limits
     TRACK = 100  # + number of the cluster's colour

@@ -552,7 +552,6 @@ def _annotations() -> rr.AnnotationContext:
         (ClassId.UNCLASSIFIED, "", (130, 130, 140)),
         (ClassId.GROUND, "ground", (92, 84, 76)),
         (ClassId.OBSTACLE, "obstacle", (170, 175, 190)),
-        (ClassId.NOISE, "noise", (110, 110, 120)),
         (entities.DETECTION_CLASS[DetectionState.KEPT], "kept", (255, 255, 255)),
         (entities.DETECTION_CLASS[DetectionState.BELOW_THRESHOLD], "below threshold", _FAINT),
         (entities.DETECTION_CLASS[DetectionState.SUPPRESSED], "suppressed", _FAINT),
