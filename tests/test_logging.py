@@ -364,20 +364,20 @@ def test_channels_where_they_are_asked_for(record: Callable[..., Recording]) -> 
 
 def test_truth_and_the_robots_own(record: Callable[..., Recording]) -> None:
     result = make()
-    boxes = Boxes3D(f32([2, 1, 0]), f32([4, 2, 1.5]), f32(0.5))
+    boxes = Boxes3D(f32([2, 1, 0], [60, 0, 0]), f32([4, 2, 1.5], [4, 2, 1.5]), f32(0.5, 0))
     stated = LabelledBoxes3D(
-        "/detection/fused_3d", START, "lidar", boxes, ("car",), f32(0.7), WORLD_FROM_LIDAR
+        "/detection/fused_3d", START, "lidar", boxes, ("car", "bus"), f32(0.7, 0.6), WORLD_FROM_LIDAR
     )
-    truth = dataclasses.replace(stated, topic="/ground_truth", scores=f32(1.0))
+    truth = dataclasses.replace(stated, topic="/ground_truth", scores=f32(1, 1))
     flat = LabelledBoxes2D(
         "/detection/camera_2d", START, "zed", f32([1, 2, 11, 22]), ("dog",), f32(0.3), "zed"
     )
     frame = dataclasses.replace(result.frame, truth=truth, robot_boxes=(stated,), robot_detections=(flat,))
     found = record([dataclasses.replace(result, frame=frame)])
     for entity in ("/world/ground_truth", "/robot/detection/fused_3d"):
-        assert found.at[entity]["Boxes3D:centers"][0] == [[2, 1, 0]]
+        assert found.at[entity]["Boxes3D:centers"][0] == [[2, 1, 0], [60, 0, 0]]
         np.testing.assert_allclose(found.at[entity]["Transform3D:translation"][0], [[5, -2, 1.7]], rtol=1e-6)
-    assert found.at["/robot/detection/fused_3d"]["Boxes3D:labels"][0] == ["car 0.70"]
+    assert found.at["/robot/detection/fused_3d"]["Boxes3D:labels"][0] == ["car 0.70", "bus 0.60"]
     robot = found.at["/robot/detection/camera_2d"]
     assert robot["Boxes2D:centers"][0] == [[6, 12]]
     assert robot["CoordinateFrame:frame"][0] == ["tf#/world/zed/image"]

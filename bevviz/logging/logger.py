@@ -42,7 +42,8 @@ from bevviz.logging.tracks import Tracks
 from bevviz.sources import Scene
 from bevviz.sources.roles import entity_name
 
-_TRUTH_COLOR = (255, 255, 255)
+_OUTLINE = rr.components.FillMode.MajorWireframe
+_TRUTH_COLOR = (215, 215, 215)
 _ROBOT_COLOR = (255, 210, 0)
 _FAINT = (150, 150, 160, 110)
 _UNMATCHED_DEPTH = 20.0  # metres that the frustum of a detection without a match is drawn to
@@ -97,7 +98,7 @@ class Logger:
             self._static(
                 entities.clusters(lidar),
                 rr.Points3D.from_fields(radii=rr.Radius.ui_points(2.0), show_labels=False),
-                rr.Boxes3D.from_fields(radii=rr.Radius.ui_points(0.75)),
+                rr.Boxes3D.from_fields(radii=rr.Radius.ui_points(1.0), fill_mode=_OUTLINE),
             )
             self._static(entities.set_aside(lidar), rr.Boxes3D.from_fields(show_labels=False))
         for camera in self._scene.cameras:
@@ -116,7 +117,12 @@ class Logger:
         self._static(entities.FUSED, rr.Boxes3D.from_fields(radii=rr.Radius.ui_points(2.0), show_labels=True))
         self._static(
             entities.TRUTH,
-            rr.Boxes3D.from_fields(colors=[_TRUTH_COLOR], radii=rr.Radius.ui_points(0.75), show_labels=False),
+            rr.Boxes3D.from_fields(
+                colors=[_TRUTH_COLOR],
+                radii=rr.Radius.ui_points(0.5),
+                show_labels=False,
+                fill_mode=_OUTLINE,
+            ),
         )
 
     def _log_origin(self) -> None:
@@ -356,7 +362,9 @@ class Logger:
         if strips:
             self._put(
                 entities.FRUSTUMS,
-                rr.LineStrips3D(strips, colors=colors, labels=labels, show_labels=False),
+                rr.LineStrips3D(
+                    strips, colors=colors, labels=labels, radii=rr.Radius.ui_points(1.0), show_labels=False
+                ),
             )
 
     # --- bird's-eye view -----------------------------------------------------------------------
@@ -440,19 +448,23 @@ class Logger:
     def _log_outlines(
         self, what: str, stated: LabelledBoxes3D, world_from_points: F64, color: tuple[int, int, int]
     ) -> None:
-        """Boxes seen from above, over the bird's-eye image."""
+        """Boxes seen from above, over the bird's-eye image; only those whose centre is in it."""
         pose = np.eye(4) if stated.world_from_boxes is None else stated.world_from_boxes
-        corners = geometry.corners(stated.boxes)[:, [0, 1, 2, 3, 0]]
-        moved = geometry.apply(geometry.inverse(world_from_points) @ pose, corners.reshape(-1, 3))
+        points_from_boxes = geometry.inverse(world_from_points) @ pose
         config = self._config.bev
-        uv = (np.array([config.range_y, config.range_x], np.float32) - moved[:, 1::-1]) / config.resolution
+        reach = np.array([config.range_x, config.range_y], np.float32)
+        inside = (np.abs(geometry.apply(points_from_boxes, stated.boxes.center)[:, :2]) < reach).all(axis=1)
+        if not inside.any():
+            return
+        corners = geometry.corners(stated.boxes)[inside][:, [0, 1, 2, 3, 0]]
+        xy = geometry.apply(points_from_boxes, corners.reshape(-1, 3))[:, :2]
         self._put(
             entities.overlay(what),
             rr.LineStrips2D(
-                uv.reshape(-1, 5, 2),
+                ((reach - xy) / np.float32(config.resolution))[:, ::-1].reshape(-1, 5, 2),
                 colors=[color],
                 radii=rr.Radius.ui_points(0.75),
-                labels=list(stated.labels),
+                labels=[stated.labels[k] for k in np.flatnonzero(inside)],
                 show_labels=False,
                 draw_order=10.0,
             ),
