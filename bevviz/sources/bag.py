@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from datetime import UTC, datetime
-from functools import partial
 from pathlib import Path
 from types import TracebackType
 
@@ -15,28 +14,17 @@ import numpy as np
 
 from bevviz.config import Config
 from bevviz.errors import UserError
-from bevviz.frame import Frame, Image
+from bevviz.frame import Frame
 from bevviz.sources import Scene
-from bevviz.sources.messages import (
-    MessageError,
-    decode_camera_info,
-    decode_cloud,
-    decode_compressed_image,
-    decode_detections_2d,
-    decode_detections_3d,
-    decode_image,
-    decode_odometry,
-    decode_transforms,
-)
+from bevviz.sources.feed import Handler, make_handlers
+from bevviz.sources.messages import MessageError, decode_transforms
 from bevviz.sources.recording import RawMessage, Recording
-from bevviz.sources.roles import CameraRole, find_roles
+from bevviz.sources.roles import find_roles
 from bevviz.sources.sync import Synchronizer
 
 SECOND = 1_000_000_000
 MARGIN = 2 * SECOND  # what else belongs to the first and the last cloud is looked for this far outside
 EPOCH = 1e8  # a larger number of seconds is a date
-
-Handler = Callable[[RawMessage], None]
 
 
 class BagSource:
@@ -122,7 +110,7 @@ class BagSource:
     def __iter__(self) -> Iterator[Frame]:
         sync = self._sync = Synchronizer(self.roles, self.config)
         self._damaged.clear()
-        handlers = self._handlers(sync)
+        handlers = make_handlers(sync, self.roles, self.recording.decode)
         self._hold_throughout(sync, handlers)
         numbers: dict[int, int] = {}  # stamp -> number of the scan, for those not yet delivered
         number = -1
@@ -155,62 +143,14 @@ class BagSource:
             for stamp in [s for s in numbers if s < frame.stamp - 10 * MARGIN]:
                 del numbers[stamp]  # of scans that were dropped
 
-    def _handle(self, handler: Handler, message: RawMessage) -> None:
+    def _handle(self, handler: Handler[RawMessage], message: RawMessage) -> None:
         try:
             handler(message)
         except MessageError as error:
             self._damaged[message.topic] += 1
             self._first_damage.setdefault(message.topic, str(error))
 
-    def _handlers(self, sync: Synchronizer) -> dict[str, Handler]:
-        """What to do with a message, by topic."""
-        roles, decode = self.roles, self.recording.decode
-
-        def add_transforms(message: RawMessage, static: bool) -> None:
-            for transform in decode_transforms(decode(message), message.topic):
-                sync.add_transform(transform, static=static)
-
-        def add_image(message: RawMessage, camera: CameraRole) -> None:
-            stamp, frame_id = message.header()
-            load = partial(self._load_image, message, camera.compressed)
-            sync.add_image(message.topic, stamp, frame_id, message.received, load)
-
-        def add_info(message: RawMessage, rectified: bool) -> None:
-            info = decode_camera_info(decode(message), rectified, message.topic)
-            sync.add_camera_info(message.topic, info)
-
-        handlers: dict[str, Handler] = {}
-        for topic in roles.lidars:
-            handlers[topic] = lambda m: sync.add_cloud(decode_cloud(decode(m), m.topic, m.received))
-        for camera in roles.cameras:
-            handlers[camera.topic] = partial(add_image, camera=camera)
-            if camera.info_topic:
-                handlers[camera.info_topic] = partial(add_info, rectified=camera.rectified)
-        for topic in roles.tf:
-            handlers[topic] = partial(add_transforms, static=False)
-        for topic in roles.tf_static:
-            handlers[topic] = partial(add_transforms, static=True)
-        if roles.odometry:
-            handlers[roles.odometry] = lambda m: sync.add_transform(
-                decode_odometry(decode(m), m.topic), fallback=True
-            )
-        for topic in roles.robot_detections_2d:
-            handlers[topic] = lambda m: sync.add_detections(
-                decode_detections_2d(decode(m), m.topic, m.received)
-            )
-        for topic in roles.robot_detections_3d:
-            handlers[topic] = lambda m: sync.add_boxes(decode_detections_3d(decode(m), m.topic, m.received))
-        if roles.truth:
-            handlers[roles.truth] = lambda m: sync.add_truth(
-                decode_detections_3d(decode(m), m.topic, m.received)
-            )
-        return handlers
-
-    def _load_image(self, message: RawMessage, compressed: bool) -> Image:
-        decode = decode_compressed_image if compressed else decode_image
-        return decode(self.recording.decode(message), message.topic, message.received)
-
-    def _hold_throughout(self, sync: Synchronizer, handlers: Mapping[str, Handler]) -> None:
+    def _hold_throughout(self, sync: Synchronizer, handlers: Mapping[str, Handler[RawMessage]]) -> None:
         """Give what is published once to all frames, wherever in the bag it is.
 
         Of each static transform the last one before the start, else the first one after it.

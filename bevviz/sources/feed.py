@@ -1,0 +1,86 @@
+"""From the messages of each role into the synchroniser: the same for a bag and a live robot."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any, Protocol, TypeVar
+
+from bevviz.frame import Image
+from bevviz.sources.messages import (
+    decode_camera_info,
+    decode_cloud,
+    decode_compressed_image,
+    decode_detections_2d,
+    decode_detections_3d,
+    decode_image,
+    decode_odometry,
+    decode_transforms,
+)
+from bevviz.sources.roles import CameraRole, Roles
+from bevviz.sources.sync import Synchronizer
+
+
+class Message(Protocol):
+    """A serialised message as it was received."""
+
+    @property
+    def topic(self) -> str: ...
+
+    @property
+    def received(self) -> int: ...
+
+    def header(self) -> tuple[int, str]:
+        """Stamp in nanoseconds and frame_id; may raise MessageError."""
+        ...
+
+
+M = TypeVar("M", bound=Message)
+Handler = Callable[[M], None]
+
+
+def make_handlers(sync: Synchronizer, roles: Roles, decode: Callable[[M], Any]) -> dict[str, Handler[M]]:
+    """What to do with a message, by topic: decode it and hand it on. An image is decoded when it is used.
+
+    The handlers raise MessageError for what cannot be used, and so does ``decode``.
+    """
+
+    def add_transforms(message: M, static: bool) -> None:
+        for transform in decode_transforms(decode(message), message.topic):
+            sync.add_transform(transform, static=static)
+
+    def load_image(message: M, compressed: bool) -> Image:
+        decode_pixels = decode_compressed_image if compressed else decode_image
+        return decode_pixels(decode(message), message.topic, message.received)
+
+    def add_image(message: M, camera: CameraRole) -> None:
+        stamp, frame_id = message.header()
+        load = partial(load_image, message, camera.compressed)
+        sync.add_image(message.topic, stamp, frame_id, message.received, load)
+
+    def add_info(message: M, rectified: bool) -> None:
+        info = decode_camera_info(decode(message), rectified, message.topic)
+        sync.add_camera_info(message.topic, info)
+
+    handlers: dict[str, Handler[M]] = {}
+    for topic in roles.lidars:
+        handlers[topic] = lambda m: sync.add_cloud(decode_cloud(decode(m), m.topic, m.received))
+    for camera in roles.cameras:
+        handlers[camera.topic] = partial(add_image, camera=camera)
+        if camera.info_topic:
+            handlers[camera.info_topic] = partial(add_info, rectified=camera.rectified)
+    for topic in roles.tf:
+        handlers[topic] = partial(add_transforms, static=False)
+    for topic in roles.tf_static:
+        handlers[topic] = partial(add_transforms, static=True)
+    if roles.odometry:
+        handlers[roles.odometry] = lambda m: sync.add_transform(
+            decode_odometry(decode(m), m.topic), fallback=True
+        )
+    for topic in roles.robot_detections_2d:
+        handlers[topic] = lambda m: sync.add_detections(decode_detections_2d(decode(m), m.topic, m.received))
+    for topic in roles.robot_detections_3d:
+        handlers[topic] = lambda m: sync.add_boxes(decode_detections_3d(decode(m), m.topic, m.received))
+    if roles.truth:
+        handlers[roles.truth] = lambda m: sync.add_truth(decode_detections_3d(decode(m), m.topic, m.received))
+    return handlers
