@@ -108,6 +108,21 @@ def tf_age(sensor: str) -> str:
     return f"{HEALTH}/tf_age_ms/{sensor}"
 
 
+def latency(what: str) -> str:
+    """From the arrival of the cloud until its results are logged: percentiles of the last frames."""
+    return f"{HEALTH}/latency_ms/{what}"
+
+
+def drops(where: str) -> str:
+    """Frames that were left out so far, by the place that they were left out at."""
+    return f"{HEALTH}/drops/{where}"
+
+
+def process(what: str) -> str:
+    """What the process itself takes."""
+    return f"{HEALTH}/process/{what}"
+
+
 # --- class ids ---------------------------------------------------------------------------------
 
 

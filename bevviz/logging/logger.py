@@ -5,7 +5,9 @@ from __future__ import annotations
 import platform
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from importlib.metadata import version
+from types import MappingProxyType
 from typing import Any
 
 import cv2
@@ -46,6 +48,7 @@ _OUTLINE = rr.components.FillMode.MajorWireframe
 _TRUTH_COLOR = (215, 215, 215)
 _ROBOT_COLOR = (255, 210, 0)
 _FAINT = (150, 150, 160, 110)
+_UNMATCHED = (80, 80, 92)
 _UNMATCHED_DEPTH = 20.0  # metres that the frustum of a detection without a match is drawn to
 
 _STATES = {
@@ -60,6 +63,17 @@ _STATES = {
     "too far": (110, 130, 160),
     "not fused": (110, 110, 120),
 }
+
+
+@dataclass(frozen=True, slots=True)
+class Context:
+    """What a frame relies on that was logged with earlier ones: a recording that starts with it needs this."""
+
+    config: Config
+    scene: Scene
+    clock: tuple[int, int, int] = (0, 0, 0)  # index, stamp and received of the frame
+    intrinsics: Mapping[str, Intrinsics] = field(default_factory=dict)
+    lanes: Mapping[str, str] = field(default_factory=dict)  # state lane -> its state
 
 
 class Logger:
@@ -81,9 +95,17 @@ class Logger:
         self._intrinsics: dict[str, Intrinsics] = {}
         self._image_stamps: dict[str, int] = {}
         self._lanes: dict[str, str] = {}  # state lane -> its latest state
+        self._known: set[str] = set()  # entities that any frame had
         self._shown: set[str] = set()  # entities with something of the frame before
         self._now: set[str] = set()
         self._last: Frame | None = None
+
+    @property
+    def context(self) -> Context:
+        """What the frame that was logged last relies on."""
+        last = self._last
+        clock = (0, 0, 0) if last is None else (last.index, last.stamp, last.received)
+        return Context(self._config, self._scene, clock, self._intrinsics, self._lanes)
 
     # --- once ----------------------------------------------------------------------------------
 
@@ -155,11 +177,22 @@ class Logger:
 
     # --- each frame ----------------------------------------------------------------------------
 
-    def log(self, result: FrameResult) -> None:
-        """Everything of one frame. What the frame before had and this one has not is cleared."""
+    def log(
+        self,
+        result: FrameResult,
+        health: Mapping[str, float] = MappingProxyType({}),
+        notes: Sequence[tuple[str, str]] = (),
+    ) -> None:
+        """Everything of one frame. What the frame before had and this one has not is cleared.
+
+        Args:
+            result: the frame and what was made of it.
+            health: further scalars, by entity.
+            notes: further lines of the log: level and text.
+        """
         frame = result.frame
         self._now = set()
-        self._set_time(frame)
+        self._set_time(frame.index, frame.stamp, frame.received)
         self._log_cloud(result)
         if result.obstacles is not None:
             obstacles = self._rounded(result.obstacles)
@@ -174,8 +207,9 @@ class Logger:
         if result.bev is not None:
             self._log_bev(result, result.bev)
         self._log_others(frame)
-        self._log_decisions(result)
-        self._log_health(result)
+        self._log_decisions(result, notes)
+        self._log_health(result, health)
+        self._known |= self._now
         for path in self._shown - self._now:
             self._recording.log(path, rr.Clear(recursive=False))
         self._shown = self._now
@@ -268,7 +302,8 @@ class Logger:
         """Static, so that a viewer that joins late has it; logged again where the calibration changes."""
         if self._intrinsics.get(name) is intrinsics:
             return
-        last, self._intrinsics[name] = self._intrinsics.get(name), intrinsics
+        last = self._intrinsics.get(name)
+        self._intrinsics = {**self._intrinsics, name: intrinsics}  # a context may hold the one before
         size = [intrinsics.width, intrinsics.height]
         if last is None or [last.width, last.height] != size or not np.array_equal(last.K, intrinsics.K):
             self._static(
@@ -357,7 +392,7 @@ class Logger:
             corners = geometry.apply(pose, corners.reshape(-1, 3)).reshape(-1, 8, 3)
             for d, eight in zip(rows.tolist(), corners, strict=True):
                 strips.append(eight[_FRUSTUM_PATH])
-                colors.append((*class_color(found.names[d]), 255) if matched[d] else _FAINT)
+                colors.append(class_color(found.names[d]) if matched[d] else _UNMATCHED)
                 labels.append(f"{found.names[d]} {found.score[d]:.2f}")
         if strips:
             self._put(
@@ -472,9 +507,9 @@ class Logger:
 
     # --- decisions -----------------------------------------------------------------------------
 
-    def _log_decisions(self, result: FrameResult) -> None:
+    def _log_decisions(self, result: FrameResult, notes: Sequence[tuple[str, str]]) -> None:
         self._put(entities.EXPLAIN, rr.TextDocument(markdown(result), media_type=rr.MediaType.MARKDOWN))
-        lines = [("ERROR", f"{f.stage}: {f.reason}") for f in result.failures]
+        lines = [*notes, *(("ERROR", f"{f.stage}: {f.reason}") for f in result.failures)]
         lines += [("WARN", problem) for problem in result.frame.problems]
         for camera in result.cameras:
             lines += [("WARN", f"{camera.camera.name}: {problem}") for problem in camera.camera.problems]
@@ -511,17 +546,20 @@ class Logger:
             )
             for class_name, decision in _best_decisions(camera):
                 lanes[entities.state(name, class_name.replace(" ", "_"))] = decision
+        self._change_states(lanes)
+
+    def _change_states(self, lanes: Mapping[str, str]) -> None:
         for lane, value in lanes.items():
             if lane not in self._lanes:
                 self._static(lane, rr.StateConfiguration(values=list(_STATES), colors=list(_STATES.values())))
             if self._lanes.get(lane) != value:
                 self._recording.log(lane, rr.StateChange(state=value))
-        self._lanes = lanes
+        self._lanes = dict(lanes)
 
     # --- health --------------------------------------------------------------------------------
 
-    def _log_health(self, result: FrameResult) -> None:
-        for path, value in _health(result, self._last):
+    def _log_health(self, result: FrameResult, more: Mapping[str, float]) -> None:
+        for path, value in (*_health(result, self._last), *more.items()):
             if np.isfinite(value):
                 self._recording.log(path, rr.Scalars(float(value)))
 
@@ -535,12 +573,12 @@ class Logger:
         self._recording.log(path, *archetypes)
         self._now.add(path)
 
-    def _set_time(self, frame: Frame) -> None:
+    def _set_time(self, index: int, stamp: int, received: int) -> None:
         self._recording.reset_time()
-        self._recording.set_time(entities.FRAME, sequence=frame.index)
-        self._recording.set_time(entities.STAMP, timestamp=np.datetime64(frame.stamp, "ns"))
-        if frame.received:
-            self._recording.set_time(entities.RECEIVED, timestamp=np.datetime64(frame.received, "ns"))
+        self._recording.set_time(entities.FRAME, sequence=index)
+        self._recording.set_time(entities.STAMP, timestamp=np.datetime64(stamp, "ns"))
+        if received:
+            self._recording.set_time(entities.RECEIVED, timestamp=np.datetime64(received, "ns"))
 
     def _times(self, frame: Frame, rows: int) -> list[rr.TimeColumn]:
         columns = [
