@@ -50,14 +50,16 @@ class Unit:
 
 
 METRES = Unit("metres", {"m": 1.0, "cm": 0.01, "mm": 0.001})
-SECONDS = Unit("seconds", {"s": 1.0, "ms": 0.001, "us": 1e-6})
+SECONDS = Unit("seconds", {"s": 1.0, "ms": 0.001, "us": 1e-6, "min": 60.0, "h": 3600.0})
 DEGREES = Unit("degrees", {"deg": 1.0, "rad": 57.29577951308232})
 PIXELS = Unit("pixels", {"px": 1.0})
+MEGABYTES = Unit("MB", {"MB": 1.0, "GB": 1000.0, "kB": 0.001})
 
 Metres = Annotated[float, BeforeValidator(METRES.parse)]
 Seconds = Annotated[float, BeforeValidator(SECONDS.parse)]
 Degrees = Annotated[float, BeforeValidator(DEGREES.parse)]
 Pixels = Annotated[float, BeforeValidator(PIXELS.parse)]
+Megabytes = Annotated[float, BeforeValidator(MEGABYTES.parse)]
 
 
 class Section(BaseModel):
@@ -179,6 +181,40 @@ class LoggingConfig(Section):
     bev_channels: bool = Field(False, description="log each BEV channel as an image of its own")
 
 
+class LiveConfig(Section):
+    """How ``bevviz live`` runs beside the robot."""
+
+    nice: int = Field(0, ge=0, le=19, description="priority given up to other processes, as nice(1)")
+    max_rate: float | None = Field(None, gt=0, le=1000, description="frames a second at most; empty: all")
+    every: int = Field(1, ge=1, description="run each N-th scan only")
+    points: int | None = Field(None, ge=1, description="points kept of each scan; empty: all")
+    log_queue: int = Field(2, ge=1, le=100, description="results that may wait to be logged; the oldest goes")
+    viewer_queue: int = Field(20, ge=1, le=1000, description="frames that may wait for a slow viewer")
+    viewer_memory: Megabytes = Field(
+        500.0, ge=10, description="recent past kept for a viewer that comes late (--serve)"
+    )
+    split_size: Megabytes | None = Field(
+        None, ge=1, description="--save: size that a part is closed at; empty: any"
+    )
+    split_time: Seconds | None = Field(
+        None, ge=1, description="--save: time that a part is closed after; empty: any"
+    )
+    flight_time: Seconds = Field(30.0, ge=0, le=3600, description="flight recorder: the last seconds; 0: off")
+    flight_size: Megabytes = Field(500.0, ge=1, description="flight recorder: memory at most")
+    flight_folder: str = Field("", description="where its recordings go; empty: the working directory")
+    trigger_no_cluster: int = Field(
+        0, ge=0, description="save when a class is detected without a cluster for so many frames; 0: never"
+    )
+    trigger_stage_time: Seconds | None = Field(
+        None, gt=0, description="save when a stage takes longer; empty: never"
+    )
+    trigger_tf_lost: bool = Field(False, description="save when a transform that was there is missing")
+    trigger_sync_error: Seconds | None = Field(
+        None, gt=0, description="save when |image stamp - cloud stamp| is greater; empty: never"
+    )
+    trigger_pause: Seconds = Field(60.0, ge=0, description="least time from one automatic save to the next")
+
+
 class Config(Section):
     """Everything that can be set. ``bevviz config`` prints the effective one."""
 
@@ -192,6 +228,7 @@ class Config(Section):
     fusion: FusionConfig = FusionConfig()
     bev: BevConfig = BevConfig()
     logging: LoggingConfig = LoggingConfig()
+    live: LiveConfig = LiveConfig()
 
 
 REFERENCE: dict[str, dict[str, Any]] = {
