@@ -6,6 +6,7 @@ both welcome, whichever the ROS version. Every function raises MessageError and 
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -36,6 +37,25 @@ class StampedTransform:
 def stamp_ns(stamp: Any) -> int:
     """Nanoseconds of a builtin_interfaces/Time."""
     return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
+
+
+def read_header(data: bytes | memoryview, order: str, topic: str) -> tuple[int, str]:
+    """Stamp in nanoseconds and frame_id of a serialised message that begins with a Header.
+
+    Args:
+        data: from four bytes before the stamp: the encoding of CDR, or the seq of ROS 1.
+        order: ``<`` or ``>``, of the bytes.
+        topic: for the error message.
+
+    Raises:
+        MessageError: there is no header.
+    """
+    try:
+        sec, nanosec, size = struct.unpack_from(f"{order}iII", data, 4)
+        (name,) = struct.unpack_from(f"{size}s", data, 16)
+        return sec * 1_000_000_000 + nanosec, _frame(name.rstrip(b"\0").decode())
+    except (struct.error, UnicodeDecodeError):
+        raise MessageError(f"{topic}: a message of {len(data)} bytes has no header") from None
 
 
 def _frame(name: str) -> str:

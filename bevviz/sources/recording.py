@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import heapq
-import struct
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
@@ -26,7 +25,7 @@ from bevviz.errors import UserError
 from bevviz.frame import I64
 from bevviz.sources import mcap, ros1, sqlite, vision_msgs
 from bevviz.sources.mcap import McapFile, megabytes
-from bevviz.sources.messages import MessageError
+from bevviz.sources.messages import MessageError, read_header
 from bevviz.sources.roles import Topic
 from bevviz.sources.ros1 import Ros1File
 from bevviz.sources.sqlite import SqliteFile
@@ -70,12 +69,10 @@ class RawMessage:
         """
         try:
             data = self.content()
-            order = "<" if _is_ros1(self.connection) or data[1] & 1 else ">"
-            sec, nanosec, size = struct.unpack_from(f"{order}iII", data, 4)  # behind seq, or the encoding
-            (name,) = struct.unpack_from(f"{size}s", data, 16)
-            return sec * 10**9 + nanosec, name.rstrip(b"\0").decode().removeprefix("/")
-        except (struct.error, IndexError, UnicodeDecodeError, zstd.ZstdError):
-            raise MessageError(f"{self.topic}: a message of {len(self.data)} bytes has no header") from None
+        except zstd.ZstdError:
+            raise MessageError(f"{self.topic}: a message of {len(self.data)} bytes is damaged") from None
+        little = _is_ros1(self.connection) or data[1:2] != b"\0"
+        return read_header(data, "<" if little else ">", self.topic)
 
 
 class Recording:

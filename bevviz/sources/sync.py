@@ -186,7 +186,7 @@ class Synchronizer:
         self._partners: dict[str, _Track[Cloud]] = self._make_tracks(*roles.lidars[1:])
         self._images: dict[str, _Track[_Undecoded]] = self._make_tracks(*(c.topic for c in roles.cameras))
         self._camera_frames: dict[str, str] = {}  # image topic -> optical frame
-        self._intrinsics: dict[str, Intrinsics] = {}
+        self.intrinsics: dict[str, Intrinsics] = {}  # CameraInfo topic -> the newest
         self._odometry_frames: set[str] = set()
         self._boxes: dict[str, _Track[LabelledBoxes3D]] = self._make_tracks(*roles.robot_detections_3d)
         self._detections: dict[str, _Track[LabelledBoxes2D]] = self._make_tracks(*roles.robot_detections_2d)
@@ -196,6 +196,11 @@ class Synchronizer:
 
     def _make_tracks(self, *topics: str) -> dict[str, _Track[Any]]:
         return {topic: _Track(self._horizon) for topic in topics}
+
+    def take_over(self, former: Synchronizer) -> None:
+        """Go on with the transforms, calibrations and counts of ``former``, when the roles change."""
+        self.report, self.tf, self.intrinsics = former.report, former.tf, former.intrinsics
+        self._odometry_frames = former._odometry_frames
 
     # --- what comes in -------------------------------------------------------------------------
 
@@ -233,7 +238,7 @@ class Synchronizer:
 
     def add_camera_info(self, topic: str, intrinsics: Intrinsics) -> None:
         """``topic`` is that of the CameraInfo; the newest one holds."""
-        self._intrinsics[topic] = intrinsics
+        self.intrinsics[topic] = intrinsics
 
     def add_transform(
         self, transform: StampedTransform, static: bool = False, fallback: bool = False
@@ -339,7 +344,7 @@ class Synchronizer:
         ]
         if len(self._clouds) == 1 and any(self._may_be_of_next(track, stamp) for track in results):
             return False
-        if any(c.info_topic and c.info_topic not in self._intrinsics for c in self._roles.cameras):
+        if any(c.info_topic and c.info_topic not in self.intrinsics for c in self._roles.cameras):
             return False
         return self._transforms_reach(self._clouds[0])
 
@@ -537,7 +542,7 @@ class Synchronizer:
     def _camera_intrinsics(
         self, role: CameraRole, image: Image | None, problems: list[str]
     ) -> Intrinsics | None:
-        intrinsics = self._intrinsics.get(role.info_topic or "")
+        intrinsics = self.intrinsics.get(role.info_topic or "")
         if intrinsics is not None and image is not None:
             return self._fitted(role, intrinsics, image, problems)
         if intrinsics is not None:

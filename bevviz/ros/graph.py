@@ -1,0 +1,63 @@
+"""What is published on the graph, by whom and with which quality of service."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+LATCHED_DEPTH = 100  # one message of each node that states static transforms
+SENSOR_DEPTH = 5
+STREAM_DEPTH = 100  # small messages that come in bursts
+
+
+@dataclass(frozen=True, slots=True)
+class PublishedTopic:
+    name: str
+    type: str
+    publishers: tuple[Any, ...]  # rclpy's TopicEndpointInfo, without those of the asking node
+
+
+def published_topics(node: Any) -> dict[str, PublishedTopic]:
+    """Every topic that another node publishes."""
+    own = (node.get_name(), node.get_namespace())
+    found = {}
+    for name, _ in node.get_topic_names_and_types():
+        others = tuple(
+            p for p in node.get_publishers_info_by_topic(name) if (p.node_name, p.node_namespace) != own
+        )
+        if others:
+            found[name] = PublishedTopic(name, others[0].topic_type, others)
+    return found
+
+
+def matched_qos(publishers: Sequence[Any], kind: str) -> Any:
+    """The strongest quality of service that every publisher offers.
+
+    Reliable where all are; with one best-effort publisher, best effort serves them all. Latched messages
+    are asked for where anybody latches: a volatile publisher beside is then told by ``mismatches``, while
+    the other way round static transforms would be missed in silence.
+    """
+    from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+
+    reliable = all(p.qos_profile.reliability == ReliabilityPolicy.RELIABLE for p in publishers)
+    latched = any(p.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL for p in publishers)
+    bulky = kind in ("PointCloud2", "Image", "CompressedImage")
+    return QoSProfile(
+        history=HistoryPolicy.KEEP_LAST,
+        depth=SENSOR_DEPTH if bulky else LATCHED_DEPTH if latched else STREAM_DEPTH,
+        reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
+        durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
+    )
+
+
+def mismatches(topic: PublishedTopic, qos: Any) -> Iterable[str]:
+    """The publishers that a subscription with ``qos`` cannot hear, and why, one sentence each."""
+    from rclpy.qos import QoSCompatibility, qos_check_compatible
+
+    for publisher in topic.publishers:
+        compatible, reason = qos_check_compatible(publisher.qos_profile, qos)
+        if compatible is QoSCompatibility.ERROR:
+            who = f"{publisher.node_namespace.rstrip("/")}/{publisher.node_name}"
+            said = reason.removeprefix("ERROR: ").rstrip(".;")
+            yield f"{topic.name}: {who} is not heard, its quality of service does not fit: {said}"

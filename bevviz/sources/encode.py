@@ -1,0 +1,219 @@
+"""Arrays into ROS 2 messages, as objects that rosbags serialises: the other way round than ``messages``."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from functools import cache
+from typing import Any
+
+import numpy as np
+from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys.store import Typestore
+
+from bevviz import geometry
+from bevviz.frame import F32, F64, Boxes3D, Cloud, Image, Intrinsics
+from bevviz.sources import vision_msgs
+
+
+@cache
+def typestore() -> Typestore:
+    """The definitions of ROS 2 Jazzy and of vision_msgs."""
+    store = get_typestore(Stores.ROS2_JAZZY)
+    vision_msgs.register(store)
+    return store
+
+
+Hypotheses = Sequence[tuple[str, float]]  # class and score, the first one being the box's own
+
+
+def encode_cloud(cloud: Cloud) -> Any:
+    """A sensor_msgs/PointCloud2 with the points' own fields."""
+    columns = dict(zip("xyz", cloud.xyz.T, strict=True)) | dict(cloud.fields)
+    layout = np.dtype([(name, values.dtype) for name, values in columns.items()], align=True)
+    points = np.zeros(len(cloud.xyz), layout)
+    for name, values in columns.items():
+        points[name] = values
+    fields = [
+        _make(
+            "sensor_msgs/msg/PointField",
+            name=name,
+            offset=int(layout.fields[name][1]),  # type: ignore[index]
+            datatype=_POINT_FIELD[values.dtype.str[1:]],
+            count=1,
+        )
+        for name, values in columns.items()
+    ]
+    return _make(
+        "sensor_msgs/msg/PointCloud2",
+        header=_header(cloud.stamp, cloud.frame_id),
+        height=1,
+        width=len(points),
+        fields=fields,
+        is_bigendian=False,
+        point_step=layout.itemsize,
+        row_step=layout.itemsize * len(points),
+        data=points.view(np.uint8),
+        is_dense=True,
+    )
+
+
+_POINT_FIELD = {"i1": 1, "u1": 2, "i2": 3, "u2": 4, "i4": 5, "u4": 6, "f4": 7, "f8": 8}
+
+
+def encode_image(image: Image) -> Any:
+    """A sensor_msgs/Image in bgr8."""
+    height, width = image.bgr.shape[:2]
+    return _make(
+        "sensor_msgs/msg/Image",
+        header=_header(image.stamp, image.frame_id),
+        height=height,
+        width=width,
+        encoding="bgr8",
+        is_bigendian=0,
+        step=3 * width,
+        data=np.ascontiguousarray(image.bgr).reshape(-1),
+    )
+
+
+def encode_camera_info(image: Image, intrinsics: Intrinsics) -> Any:
+    """The sensor_msgs/CameraInfo that belongs to an image."""
+    k = intrinsics.K
+    region = _make(
+        "sensor_msgs/msg/RegionOfInterest", x_offset=0, y_offset=0, height=0, width=0, do_rectify=False
+    )
+    return _make(
+        "sensor_msgs/msg/CameraInfo",
+        header=_header(image.stamp, image.frame_id),
+        height=intrinsics.height,
+        width=intrinsics.width,
+        distortion_model=intrinsics.distortion_model,
+        d=np.asarray(intrinsics.D, np.float64),
+        k=k.reshape(-1),
+        r=np.eye(3).reshape(-1),
+        p=np.column_stack([k, np.zeros(3)]).reshape(-1),
+        binning_x=0,
+        binning_y=0,
+        roi=region,
+    )
+
+
+def encode_boxes_3d(stamp: int, frame_id: str, boxes: Boxes3D, results: Iterable[Hypotheses]) -> Any:
+    """A vision_msgs/Detection3DArray; ``results`` has the hypotheses of each box."""
+    about = _header(stamp, frame_id)
+    detections = []
+    for center, size, yaw, hypotheses in zip(boxes.center, boxes.size, boxes.yaw, results, strict=True):
+        half = float(yaw) / 2
+        place = _pose(geometry.transform(center, np.array([0, 0, np.sin(half), np.cos(half)])))
+        box = _make("vision_msgs/msg/BoundingBox3D", center=place, size=_vector("Vector3", size))
+        detections.append(
+            _make(
+                "vision_msgs/msg/Detection3D",
+                header=about,
+                results=_results(hypotheses, place),
+                bbox=box,
+                id="",
+            )
+        )
+    return _make("vision_msgs/msg/Detection3DArray", header=about, detections=detections)
+
+
+def encode_boxes_2d(stamp: int, frame_id: str, xyxy: F32, results: Iterable[Hypotheses]) -> Any:
+    """A vision_msgs/Detection2DArray; ``results`` has the hypotheses of each box."""
+    about, nowhere = _header(stamp, frame_id), _pose(np.eye(4))
+    detections = []
+    for (x0, y0, x1, y1), hypotheses in zip(xyxy.tolist(), results, strict=True):
+        middle = _make("vision_msgs/msg/Point2D", x=(x0 + x1) / 2, y=(y0 + y1) / 2)
+        box = _make(
+            "vision_msgs/msg/BoundingBox2D",
+            center=_make("vision_msgs/msg/Pose2D", position=middle, theta=0.0),
+            size_x=x1 - x0,
+            size_y=y1 - y0,
+        )
+        detections.append(
+            _make(
+                "vision_msgs/msg/Detection2D",
+                header=about,
+                results=_results(hypotheses, nowhere),
+                bbox=box,
+                id="",
+            )
+        )
+    return _make("vision_msgs/msg/Detection2DArray", header=about, detections=detections)
+
+
+def _results(hypotheses: Hypotheses, place: Any) -> list[Any]:
+    covered = _make("geometry_msgs/msg/PoseWithCovariance", pose=place, covariance=np.zeros(36))
+    return [
+        _make(
+            "vision_msgs/msg/ObjectHypothesisWithPose",
+            hypothesis=_make("vision_msgs/msg/ObjectHypothesis", class_id=name, score=float(score)),
+            pose=covered,
+        )
+        for name, score in hypotheses
+    ]
+
+
+def encode_transforms(stamp: int, edges: Iterable[tuple[str, str, F64]]) -> Any:
+    """A tf2_msgs/TFMessage of (parent, child, parent_from_child)."""
+    return _make("tf2_msgs/msg/TFMessage", transforms=[_transform(stamp, *edge) for edge in edges])
+
+
+def _transform(stamp: int, parent: str, child: str, parent_from_child: F64) -> Any:
+    return _make(
+        "geometry_msgs/msg/TransformStamped",
+        header=_header(stamp, parent),
+        child_frame_id=child,
+        transform=_make(
+            "geometry_msgs/msg/Transform",
+            translation=_vector("Vector3", parent_from_child[:3, 3]),
+            rotation=_rotation(parent_from_child),
+        ),
+    )
+
+
+def encode_odometry(
+    stamp: int, parent: str, child: str, parent_from_child: F64, later: F64, dt: float
+) -> Any:
+    """A nav_msgs/Odometry, its velocities being those of the way to the pose ``dt`` seconds later."""
+    step = geometry.inverse(parent_from_child) @ later
+    turn = np.array([step[2, 1] - step[1, 2], step[0, 2] - step[2, 0], step[1, 0] - step[0, 1]]) / 2
+    twist = _make(
+        "geometry_msgs/msg/Twist",
+        linear=_vector("Vector3", step[:3, 3] / dt),
+        angular=_vector("Vector3", turn / dt),
+    )
+    none = np.zeros(36)
+    return _make(
+        "nav_msgs/msg/Odometry",
+        header=_header(stamp, parent),
+        child_frame_id=child,
+        pose=_make("geometry_msgs/msg/PoseWithCovariance", pose=_pose(parent_from_child), covariance=none),
+        twist=_make("geometry_msgs/msg/TwistWithCovariance", twist=twist, covariance=none),
+    )
+
+
+# --- parts -------------------------------------------------------------------------------------
+
+
+def _make(kind: str, **values: Any) -> Any:
+    return typestore().types[kind](**values)
+
+
+def _header(stamp: int, frame_id: str) -> Any:
+    time = _make("builtin_interfaces/msg/Time", sec=stamp // 10**9, nanosec=stamp % 10**9)
+    return _make("std_msgs/msg/Header", stamp=time, frame_id=frame_id)
+
+
+def _vector(kind: str, xyz: Iterable[float]) -> Any:
+    x, y, z = map(float, xyz)
+    return _make(f"geometry_msgs/msg/{kind}", x=x, y=y, z=z)
+
+
+def _rotation(a_from_b: F64) -> Any:
+    x, y, z, w = map(float, geometry.quaternion(a_from_b))
+    return _make("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w)
+
+
+def _pose(a_from_b: F64) -> Any:
+    position = _vector("Point", a_from_b[:3, 3])
+    return _make("geometry_msgs/msg/Pose", position=position, orientation=_rotation(a_from_b))

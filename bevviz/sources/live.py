@@ -1,0 +1,351 @@
+"""Frames from a running ROS 2 graph: topics are found, followed through restarts, and never waited for."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from types import TracebackType
+from typing import Any
+
+from bevviz.config import Config, SourceConfig
+from bevviz.errors import UserError
+from bevviz.frame import Frame, Intrinsics
+from bevviz.ros.graph import PublishedTopic, matched_qos, mismatches, published_topics
+from bevviz.ros.session import Session
+from bevviz.ros.typesupport import message_type
+from bevviz.sources import Scene
+from bevviz.sources.encode import typestore
+from bevviz.sources.feed import Handler, make_handlers
+from bevviz.sources.messages import MessageError, read_header
+from bevviz.sources.roles import Roles, Topic, find_roles
+from bevviz.sources.sync import Synchronizer
+
+LOOK = 0.5  # seconds between two looks at the graph
+TICK = 0.02  # seconds between two looks at the clouds that have waited long enough
+SETTLE = 1.0  # seconds without a change of roles after which the scene is taken as complete
+PATIENCE = 3.0  # seconds that a topic without messages may delay the scene
+SILENCE = 2.0  # seconds without a cloud that are told
+
+KINDS = {
+    "sensor_msgs/msg/PointCloud2",
+    "sensor_msgs/msg/Image",
+    "sensor_msgs/msg/CompressedImage",
+    "sensor_msgs/msg/CameraInfo",
+    "tf2_msgs/msg/TFMessage",
+    "nav_msgs/msg/Odometry",
+    "vision_msgs/msg/Detection2DArray",
+    "vision_msgs/msg/Detection3DArray",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class LiveMessage:
+    topic: str
+    type: str
+    received: int  # nanoseconds, when the middleware had it
+    data: bytes  # CDR
+
+    def header(self) -> tuple[int, str]:
+        return read_header(self.data, "<" if self.data[1:2] != b"\0" else ">", self.topic)
+
+    def decode(self) -> Any:
+        """The message as an object with the fields of its definition.
+
+        Raises:
+            MessageError: the data does not fit the definition.
+        """
+        try:
+            return typestore().deserialize_cdr(self.data, self.type)
+        except Exception as error:  # generated decoders raise whatever the bytes lead them to
+            reason = str(error) or type(error).__name__
+            raise MessageError(f"{self.topic}: not a {self.type}: {reason}") from None
+
+
+@dataclass(slots=True)
+class _Subscription:
+    handle: Any
+    type: str
+    qos: Any
+
+
+class LiveSource:
+    """The frames of a robot, as they become complete, until ``stop``.
+
+    Messages are received, decoded and synchronised in a thread of their own. It hands over through a slot
+    for one frame: whoever iterates gets the newest one, and those that nobody came for are counted in
+    ``dropped``. What has to be said meanwhile (a lost publisher, a new calibration) goes to ``tell``.
+
+    Args:
+        config: roles and synchronisation.
+        arguments: what follows ``--ros-args``: remaps, namespace, parameters.
+        tell: called with one sentence each, from the receiving thread.
+
+    Raises:
+        UserError: no working rclpy, or arguments that it refuses.
+    """
+
+    def __init__(
+        self, config: Config, *, arguments: Sequence[str] = (), tell: Callable[[str], None] | None = None
+    ) -> None:
+        self.config = config
+        self.roles = Roles()
+        self.received: Counter[str] = Counter()  # topic -> messages
+        self.lost: Counter[str] = Counter()  # topic -> messages that the middleware could not deliver
+        self.dropped = 0  # frames that were overtaken by a newer one before anybody took them
+        self._tell: Callable[[str], None] = tell or (lambda text: None)
+        self._damaged: Counter[str] = Counter()
+        self._first_damage: dict[str, str] = {}
+        self._told: dict[str, str] = {}  # what a sentence is about -> the sentence, while it holds
+        self._topics: dict[str, PublishedTopic] = {}
+        self._present: dict[str, PublishedTopic] = {}
+        self._frame_ids: dict[str, str] = {}
+        self._subscriptions: dict[str, _Subscription] = {}
+        self._handlers: dict[str, Handler[LiveMessage]] = {}
+        self._sync = Synchronizer(self.roles, config)
+        self._changed = self._last_cloud = time.monotonic()
+        self._settled = threading.Event()
+        self._handover = threading.Condition()
+        self._frame: Frame | None = None
+        self._frames = 0
+        self._ended = False
+
+        self._session = Session(arguments, on_end=self.stop)
+        self._add_timer(LOOK, self._look)
+        self._add_timer(TICK, self._tick)
+        self._session.start()
+
+    def __enter__(self) -> LiveSource:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Leave the graph."""
+        self.stop()
+        self._session.close()
+
+    def stop(self) -> None:
+        """End the iteration, from any thread."""
+        with self._handover:
+            self._ended = True
+            self._handover.notify_all()
+        self._settled.set()
+
+    @property
+    def node(self) -> Any:
+        """The rclpy node, for what publishes back and takes orders."""
+        return self._session.node
+
+    # --- as a source ---------------------------------------------------------------------------
+
+    def wait(self, timeout: float | None = None) -> bool:
+        """Until the scene is known: a LiDAR delivers and the roles have settled. False: not yet."""
+        return self._settled.wait(timeout) and not self._ended
+
+    @property
+    def missing(self) -> str:
+        """What ``wait`` waits for, in one sentence; empty once the scene is known."""
+        if self._settled.is_set():
+            return ""
+        present = self._present
+        if not present:
+            return (
+                f"nothing is published on ROS domain {self._session.domain}: is the robot running, with this "
+                f"ROS_DOMAIN_ID, and not limited to its own machine (ROS_AUTOMATIC_DISCOVERY_RANGE)?"
+            )
+        if not self.roles.lidars:
+            return (
+                f"no LiDAR (no sensor_msgs/PointCloud2) among {len(present)} topics; 'bevviz info --live' "
+                f"shows them, --set source.lidar_topics=[/topic] states one"
+            )
+        silent = [topic for topic in self.roles.lidars if not self.received[topic]]
+        return f"no message on {', '.join(silent)} yet" if silent else "the topics are still changing"
+
+    @property
+    def scene(self) -> Scene:
+        """Known after ``wait``; another one when sensors come up later."""
+        names = self.roles.lidar_names
+        return Scene(
+            name="live",
+            lidar=names[0] if len(names) == 1 else "lidars",
+            lidars=names,
+            cameras=tuple(camera.name for camera in self.roles.cameras),
+            robot=bool(self.roles.robot_detections_2d or self.roles.robot_detections_3d),
+            truth=bool(self.roles.truth),
+        )
+
+    @property
+    def total(self) -> None:
+        return None
+
+    @property
+    def warnings(self) -> Sequence[str]:
+        damaged = [
+            f"{count} message(s) of {topic} could not be used, the first: {self._first_damage[topic]}"
+            for topic, count in self._damaged.items()
+        ]
+        lost = [f"{count} message(s) of {topic} were lost on the way" for topic, count in self.lost.items()]
+        return [*self._told.values(), *lost, *damaged, *self._sync.report.warnings()]
+
+    def __iter__(self) -> Iterator[Frame]:
+        while True:
+            with self._handover:
+                self._handover.wait_for(lambda: self._ended or self._frame is not None)
+                frame, self._frame = self._frame, None
+            if self._session.error is not None:
+                raise self._session.error
+            if frame is None:
+                return
+            yield frame
+
+    # --- the receiving thread ------------------------------------------------------------------
+
+    def _add_timer(self, period: float, callback: Callable[[], None]) -> None:
+        from rclpy.clock import Clock
+        from rclpy.clock_type import ClockType
+
+        # Not the node's clock, which stands still where a simulation is paused.
+        self.node.create_timer(period, callback, clock=Clock(clock_type=ClockType.STEADY_TIME))
+
+    def _receive(self, topic: str, kind: str, data: bytes, info: dict[str, Any]) -> None:
+        message = LiveMessage(topic, kind, info["received_timestamp"] or time.time_ns(), data)
+        first = not self.received[topic]
+        self.received[topic] += 1
+        before = self._sync.intrinsics.get(topic)
+        try:
+            if first and kind.endswith(("PointCloud2", "Image")):
+                self._frame_ids[topic] = message.header()[1]
+                self._assign()
+            if (handler := self._handlers.get(topic)) is not None:
+                handler(message)
+        except MessageError as error:
+            self._damaged[topic] += 1
+            self._first_damage.setdefault(topic, str(error))
+        if before is not None:
+            self._compare(topic, before, self._sync.intrinsics[topic])
+        if topic in self.roles.lidars:
+            self._last_cloud = time.monotonic()
+        self._deliver(self._sync.ready(message.received))
+
+    def _compare(self, topic: str, before: Intrinsics, after: Intrinsics) -> None:
+        if (before.K != after.K).any() or before.D.tolist() != after.D.tolist():
+            old, new = before.K[0, 0], after.K[0, 0]
+            self._tell(f"the calibration on {topic} has changed: fx {old:.1f} -> {new:.1f}")
+
+    def _tick(self) -> None:
+        self._deliver(self._sync.ready(time.time_ns()))
+
+    def _deliver(self, frames: Iterable[Frame]) -> None:
+        for frame in frames:
+            if not self._settled.is_set():
+                continue
+            with self._handover:
+                self.dropped += self._frame is not None
+                self._frame = replace(frame, index=self._frames)
+                self._frames += 1
+                self._handover.notify()
+
+    # --- the graph -----------------------------------------------------------------------------
+
+    def _look(self) -> None:
+        self._present = published_topics(self.node)
+        known = {name: topic for name, topic in self._topics.items() if self.received[name]}
+        self._topics = known | {name: t for name, t in self._present.items() if t.type in KINDS}
+        self._assign()
+        for name, subscription in self._subscriptions.items():
+            topic = self._present.get(name)
+            gone = f"{name} has no publisher any more; waiting for it to come back"
+            self._note(name, gone if topic is None else "", f"{name} is published again")
+            unheard = "; ".join(mismatches(topic, subscription.qos)) if topic is not None else ""
+            self._note(f"{name} quality", unheard, f"{name}: every publisher is received")
+        silent = self._settled.is_set() and time.monotonic() - self._last_cloud > SILENCE
+        quiet = f"no cloud for {SILENCE:.0f} s on {', '.join(self.roles.lidars)}"
+        self._note("silence", quiet if silent else "", "the clouds are back")
+        if not self._settled.is_set() and self._is_settled():
+            self._settled.set()
+
+    def _note(self, about: str, text: str, over: str) -> None:
+        """Tell ``text`` when it begins to hold, and ``over`` when it is empty again."""
+        before = self._told.pop(about, "")
+        if text:
+            self._told[about] = text
+        if text != before:
+            self._tell(text or over)
+
+    def _is_settled(self) -> bool:
+        calm = time.monotonic() - self._changed
+        used = [*self.roles.lidars, *(camera.topic for camera in self.roles.cameras)]
+        complete = all(self.received[topic] for topic in used)
+        driven = any(self.received[topic] for topic in self.roles.lidars)
+        return driven and calm > (SETTLE if complete else PATIENCE)
+
+    def _assign(self) -> None:
+        """Give the topics their roles, and listen to those that play one."""
+        topics = [Topic(t.name, t.type, None, self._frame_ids.get(t.name, "")) for t in self._topics.values()]
+        try:
+            roles = find_roles(*_without_absent(topics, self.config.source))
+        except UserError as error:
+            self._note("roles", str(error), "")
+            return
+        self._note("roles", "", "the topics fit the configuration")
+        if replace(roles, notes={}) != replace(self.roles, notes={}):
+            self._changed = time.monotonic()
+            former, self._sync = self._sync, Synchronizer(roles, self.config)
+            self._sync.take_over(former)
+            self._handlers = make_handlers(self._sync, roles, LiveMessage.decode)
+        self.roles = roles
+        for name in self._subscriptions.keys() - self._handlers.keys():
+            self.node.destroy_subscription(self._subscriptions.pop(name).handle)
+        for name in self._handlers:
+            self._listen(self._topics[name])
+
+    def _listen(self, topic: PublishedTopic) -> None:
+        """Subscribe, or again where the publishers now offer something else."""
+        from rclpy.event_handler import SubscriptionEventCallbacks
+
+        qos = matched_qos(topic.publishers, topic.type.rpartition("/")[2])
+        former = self._subscriptions.get(topic.name)
+        if former is not None:
+            if (former.type, former.qos) == (topic.type, qos):
+                return
+            self.node.destroy_subscription(former.handle)
+
+        def receive(data: bytes, info: dict[str, Any]) -> None:
+            self._receive(topic.name, topic.type, data, info)
+
+        def count_lost(event: Any) -> None:
+            self.lost[topic.name] += event.total_count_change
+
+        events = SubscriptionEventCallbacks(
+            message_lost=count_lost,
+            incompatible_qos=lambda event: None,  # told by name in ``_look``
+            use_default_callbacks=False,
+        )
+        handle = self.node.create_subscription(
+            message_type(topic.type), topic.name, receive, qos, event_callbacks=events, raw=True
+        )
+        self._subscriptions[topic.name] = _Subscription(handle, topic.type, qos)
+
+
+def _without_absent(topics: list[Topic], config: SourceConfig) -> tuple[list[Topic], SourceConfig]:
+    """A stated topic that is not there yet is waited for; no other one may take its role meanwhile."""
+    names = {topic.name for topic in topics}
+    changes: dict[str, Any] = {}
+    for key, kinds in (("lidar_topics", {"PointCloud2"}), ("camera_topics", {"Image", "CompressedImage"})):
+        stated = getattr(config, key)
+        changes[key] = tuple(name for name in stated if name in names)
+        if stated and not changes[key]:
+            topics = [topic for topic in topics if topic.kind not in kinds]
+    changes["camera_info_topics"] = {
+        image: info for image, info in config.camera_info_topics.items() if {image, info} <= names
+    }
+    if config.odometry_topic not in names and config.odometry_topic:
+        changes["odometry_topic"] = ""
+        topics = [topic for topic in topics if topic.kind != "Odometry"]
+    return topics, config.model_copy(update=changes)
