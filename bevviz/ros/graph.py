@@ -58,6 +58,6 @@ def mismatches(topic: PublishedTopic, qos: Any) -> Iterable[str]:
     for publisher in topic.publishers:
         compatible, reason = qos_check_compatible(publisher.qos_profile, qos)
         if compatible is QoSCompatibility.ERROR:
-            who = f"{publisher.node_namespace.rstrip("/")}/{publisher.node_name}"
+            who = f"{publisher.node_namespace.rstrip('/')}/{publisher.node_name}"
             said = reason.removeprefix("ERROR: ").rstrip(".;")
             yield f"{topic.name}: {who} is not heard, its quality of service does not fit: {said}"
