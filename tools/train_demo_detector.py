@@ -107,12 +107,12 @@ def dataset(folder: Path, name: str, first_seed: int, seeds: int, workers: int) 
 
 
 def crop(rng: np.random.Generator, image: U8, labels: Labels, size: tuple[int, int]) -> tuple[U8, Labels]:
-    """A scaled, flipped, recoloured window of ``size`` (width, height), mostly around an object."""
+    """A scaled, flipped, recoloured window of ``size`` (width, height), every other one around an object."""
     width, height = size
     scale = np.exp(rng.uniform(np.log(0.6), np.log(1.6)))
     middle = rng.uniform((0, 0), image.shape[1::-1])
     asked = np.flatnonzero(labels.kind >= 0)
-    if len(asked) and rng.random() < 0.67:
+    if len(asked) and rng.random() < 0.5:
         x0, y0, x1, y1 = labels.xyxy[rng.choice(asked)]
         middle = np.array([x0 + x1, y0 + y1]) / 2 + rng.normal(0, 0.2, 2) * size / scale
     flip = -1.0 if rng.random() < 0.5 else 1.0
@@ -289,8 +289,7 @@ def loss(network: Network, images: Tensor, xyxy: Tensor, kind: Tensor) -> Tensor
     target = torch.zeros_like(logits)
     own_kind = kind.gather(1, owner.clamp(min=0)).clamp(min=0)
     target.scatter_(2, own_kind[..., None], (quality * picked)[..., None])
-    # Varifocal weighting (Zhang et al. 2021): what is already rejected with confidence counts little.
-    weight = torch.where(target > 0, target, 0.75 * logits.detach().sigmoid().pow(2)) * ~ignored[..., None]
+    weight = ~ignored[..., None]
     total = quality.sum().clamp(min=1.0)
     classes = (F.binary_cross_entropy_with_logits(logits, target, reduction="none") * weight).sum() / total
     own_box = xyxy.gather(1, owner.clamp(min=0)[..., None].expand(-1, -1, 4))
@@ -298,10 +297,11 @@ def loss(network: Network, images: Tensor, xyxy: Tensor, kind: Tensor) -> Tensor
     return classes + 2.5 * ((1 - giou) * quality[picked]).sum() / total
 
 
-def train(data: Sequence[tuple[U8, Labels]], minutes: float, batch: int, seed: int) -> Network:
+def train(
+    network: Network, data: Sequence[tuple[U8, Labels]], minutes: float, batch: int, seed: int
+) -> Network:
     """AdamW with warm-up and cosine decay over the time given, and an average of the weights."""
-    torch.manual_seed(seed)
-    network = Network().to(memory_format=torch.channels_last).train()
+    network = network.to(memory_format=torch.channels_last).train()
     average = torch.optim.swa_utils.AveragedModel(
         network, multi_avg_fn=torch.optim.swa_utils.get_ema_multi_avg_fn(0.99), use_buffers=True
     )
@@ -403,13 +403,19 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("bevviz/data/demo_detector.onnx"))
     parser.add_argument("--streets", type=int, default=80, help=f"training streets, {PER_SEED} images each")
     parser.add_argument("--minutes", type=float, default=20.0, help="of training")
+    parser.add_argument("--start", type=Path, help="weights to go on from: network.pt of an earlier --work")
+    parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--batch", type=int, default=16)
     parser.add_argument("--threads", type=int, default=2)
     options = parser.parse_args()
     torch.set_num_threads(options.threads)
     held_out = dataset(options.work, "test", TEST_SEED, 6, options.threads)
     data = dataset(options.work, "train", TRAIN_SEED, options.streets, options.threads)
-    network = train(data, options.minutes, options.batch, seed=0)
+    torch.manual_seed(options.seed)
+    network = Network()
+    if options.start:
+        network.load_state_dict(torch.load(options.start))
+    network = train(network, data, options.minutes, options.batch, options.seed)
     torch.save(network.state_dict(), options.work / "network.pt")
     export(network, options.out)
     count = sum(p.numel() for p in network.parameters())
