@@ -67,7 +67,7 @@ _STATES = {
 
 @dataclass(frozen=True, slots=True)
 class Context:
-    """What a frame relies on that was logged with earlier ones: a recording that starts with it needs this."""
+    """What a frame relies on that was logged before it: a recording that starts with it needs this."""
 
     config: Config
     scene: Scene
@@ -146,6 +146,25 @@ class Logger:
                 fill_mode=_OUTLINE,
             ),
         )
+
+    def log_context(self, context: Context) -> None:
+        """Static data, calibration and states of a frame, for a recording that starts with it."""
+        self.log_static()
+        for name, intrinsics in context.intrinsics.items():
+            self._log_intrinsics(name, intrinsics)
+        if context.lanes:
+            self._set_time(*context.clock)
+            self._change_states(context.lanes)
+
+    def reconfigure(self, config: Config, scene: Scene) -> None:
+        """From here on the results are made in another way, or of other sensors."""
+        self._config, self._scene = config, scene
+        self.log_static()
+
+    def refresh(self) -> None:
+        """Make the next frame whole without those before: what it lacks is cleared, images come again."""
+        self._shown = set(self._known)
+        self._image_stamps.clear()
 
     def _log_origin(self) -> None:
         packages = ("rerun-sdk", "numpy", "open3d", "onnxruntime", "opencv-python-headless", "rosbags")

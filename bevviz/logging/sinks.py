@@ -107,6 +107,16 @@ def _file(path: Path) -> rr.FileSink:
 
 def _connection(url: str) -> rr.GrpcSink:
     """A viewer elsewhere. Rerun would only complain when the recording ends: try the port first."""
+    check_viewer(url)
+    return rr.GrpcSink(url)
+
+
+def check_viewer(url: str) -> tuple[str, int]:
+    """Host and port of a viewer that answers.
+
+    Raises:
+        UserError: the URL is none of a viewer, or nobody answers.
+    """
     parts = urlsplit(url)
     scheme = parts.scheme in ("rerun", "rerun+http", "rerun+https")
     try:
@@ -121,13 +131,22 @@ def _connection(url: str) -> rr.GrpcSink:
     except OSError as error:
         why = error.strerror or str(error)
         raise UserError(f"--connect {url}: no viewer answers there ({why}); start one with 'rerun'") from None
-    return rr.GrpcSink(url)
+    return host, port
+
+
+def answers(host: str, port: int) -> bool:
+    """Whether somebody listens there."""
+    try:
+        socket.create_connection((host, port), timeout=5).close()
+    except OSError:
+        return False
+    return True
 
 
 def _viewer() -> rr.GrpcSink:
     """The viewer on this machine, of the very version that came with the SDK."""
     binary = Path(rr.__file__).parents[1] / "rerun_cli" / "rerun"
-    port = _free(9876)
+    port = free_port(9876)
     try:
         rr.spawn(
             port=port,
@@ -146,9 +165,8 @@ def _viewer() -> rr.GrpcSink:
 
 def _server(port: int) -> tuple[rr.GrpcServerSink, str]:
     """The web viewer at ``port`` and beside it the server that it takes the data from."""
-    if not _is_free(port):
-        raise UserError(f"--serve {port}: the port is in use; another one: --serve {_free(port + 1)}")
-    data_port = _free(9876, but=port)
+    check_port(port)
+    data_port = free_port(9876, but=port)
     server = rr.GrpcServerSink(
         port=data_port, server_memory_limit=MEMORY, cors_allow_origin=[f"http://*:{port}"]
     )
@@ -156,10 +174,18 @@ def _server(port: int) -> tuple[rr.GrpcServerSink, str]:
         rr.serve_web_viewer(web_port=port, open_browser=False)
     except RuntimeError as error:
         raise UserError(f"--serve {port}: {_first_line(error)}") from None
-    return (
-        server,
-        f"http://localhost:{port}/?url={quote(f'rerun+http://localhost:{data_port}/proxy', safe='')}",
-    )
+    return server, viewer_address("localhost", port, data_port)
+
+
+def viewer_address(host: str, port: int, data_port: int) -> str:
+    """What to open in a browser."""
+    return f"http://{host}:{port}/?url={quote(f'rerun+http://{host}:{data_port}/proxy', safe='')}"
+
+
+def check_port(port: int) -> None:
+    """Raises UserError with a free port where this one is in use."""
+    if not _is_free(port):
+        raise UserError(f"--serve {port}: the port is in use; another one: --serve {free_port(port + 1)}")
 
 
 def _is_free(port: int) -> bool:
@@ -172,7 +198,7 @@ def _is_free(port: int) -> bool:
     return True
 
 
-def _free(port: int, but: int = 0) -> int:
+def free_port(port: int, but: int = 0) -> int:
     """The port, or the next one that is free."""
     return next(p for p in range(port, 65536) if p != but and _is_free(p))
 

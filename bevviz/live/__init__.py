@@ -1,0 +1,7 @@
+"""The live runtime: receiving, pipeline and logging decoupled, outputs that cannot stop each other."""
+
+from bevviz.live.flight import FlightRecorder
+from bevviz.live.notes import Notes
+from bevviz.live.runtime import Live
+
+__all__ = ["FlightRecorder", "Live", "Notes"]

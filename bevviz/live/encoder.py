@@ -1,0 +1,127 @@
+"""Encodes each frame once, into bytes that every output shares: files, viewers and the flight recorder.
+
+The bytes of consecutive frames, put behind a prelude, are a complete recording.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from types import TracebackType
+from typing import Self
+
+import rerun as rr
+import rerun.blueprint as rrb
+
+from bevviz.config import Config
+from bevviz.frame import FrameResult
+from bevviz.logging import blueprints
+from bevviz.logging.logger import Context, Logger
+from bevviz.logging.sinks import APPLICATION
+from bevviz.sources import Scene
+
+WHOLE = 1.0  # seconds from one frame that needs none before it to the next
+
+
+@dataclass(frozen=True, slots=True)
+class Packet:
+    """One encoded frame. A recording may begin with a ``whole`` one, after the prelude of its context."""
+
+    data: bytes
+    whole: bool
+    context: Context
+    time: float  # seconds, monotonic
+
+
+class _Stream:
+    """A recording whose bytes are read back as they are written, through a file in memory."""
+
+    def __init__(self, recording_id: str | None = None, blueprint: rrb.Blueprint | None = None) -> None:
+        self._file = os.memfd_create("recording")
+        self._end = 0
+        self.recording = rr.RecordingStream(APPLICATION, recording_id=recording_id)
+        self.recording.set_log_time_enabled(False)
+        # A footer would list every chunk that was ever logged, in memory.
+        sink = rr.FileSink(f"/proc/self/fd/{self._file}", write_footer=False)
+        self.recording.set_sinks(sink, default_blueprint=blueprint)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        self.recording.disconnect()
+        os.close(self._file)
+
+    def read(self) -> bytes:
+        """What was logged since the last call. Its memory is given back: the file only looks long."""
+        self.recording.flush()
+        start, self._end = self._end, os.fstat(self._file).st_size
+        data = os.pread(self._file, self._end - start, start)
+        os.ftruncate(self._file, 0)
+        return data
+
+
+class Encoder:
+    """Turns results into packets. For one thread, but for ``prelude``.
+
+    Args:
+        config: how the results are made.
+        scene: names of the sensors.
+        blueprint: name of a layout, or a .py or .rbl file.
+
+    Raises:
+        UserError: no such blueprint.
+    """
+
+    def __init__(self, config: Config, scene: Scene, blueprint: str) -> None:
+        self._blueprint = blueprint
+        blueprints.load(blueprint, scene)  # what is wrong with it is said at the start
+        self._config, self._scene = config, scene
+        self._stream = _Stream()
+        self._logger = Logger(self._stream.recording, config, scene)
+        self._whole = float("-inf")
+        self.recording_id: str = self._stream.recording.get_recording_id() or ""
+        self.header = self._stream.read()  # behind it, packets alone are readable, without static data
+
+    def close(self) -> None:
+        self._stream.close()
+
+    @property
+    def context(self) -> Context:
+        return self._logger.context
+
+    def encode(
+        self,
+        result: FrameResult,
+        config: Config,
+        scene: Scene,
+        health: Mapping[str, float],
+        notes: Sequence[tuple[str, str]],
+    ) -> Packet:
+        """One frame, and with it whatever is new in the configuration or the scene."""
+        if (config, scene) != (self._config, self._scene):
+            if scene != self._scene:
+                self._stream.recording.send_blueprint(blueprints.load(self._blueprint, scene))
+            self._config, self._scene = config, scene
+            self._logger.reconfigure(config, scene)
+        now = time.monotonic()
+        whole = now - self._whole >= WHOLE
+        if whole:
+            self._whole = now
+            self._logger.refresh()
+        self._logger.log(result, health, notes)
+        return Packet(self._stream.read(), whole, self._logger.context, now)
+
+    def prelude(self, context: Context, *, blueprint: bool = True) -> bytes:
+        """The beginning of a recording whose first packet has this context. From any thread."""
+        layout = blueprints.load(self._blueprint, context.scene) if blueprint else None
+        with _Stream(self.recording_id, layout) as stream:
+            Logger(stream.recording, context.config, context.scene).log_context(context)
+            return stream.read()

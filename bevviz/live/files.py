@@ -1,0 +1,138 @@
+"""Recordings on disk: written as they come, in parts that each open on their own, until the disk is full."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import rerun as rr
+
+from bevviz.config import LiveConfig
+from bevviz.errors import UserError
+from bevviz.live.encoder import Encoder, Packet
+from bevviz.live.notes import Notes
+
+MEGABYTE = 1_000_000
+INDEXED = 1000 * MEGABYTE  # the index is made in memory; a larger file stays without
+
+
+def rerun_binary() -> str:
+    """The command line program of the very version that came with the SDK."""
+    binary = Path(rr.__file__).parents[1] / "rerun_cli" / "rerun"
+    return str(binary) if binary.exists() else "rerun"
+
+
+class Indexer:
+    """Gives finished recordings their index and merges their many small chunks, in the background.
+
+    Without it they open as well, but slowly. Where it cannot be done, the file stays as it is.
+    """
+
+    def __init__(self) -> None:
+        self._worker = ThreadPoolExecutor(1, "index")
+
+    def add(self, path: Path) -> None:
+        if path.stat().st_size <= INDEXED:
+            self._worker.submit(self._index, path)
+
+    def close(self) -> None:
+        """Finish what is waiting."""
+        self._worker.shutdown()
+
+    def _index(self, path: Path) -> None:
+        indexed = path.with_suffix(".rrd.part")
+        command = ["nice", "-n", "19", rerun_binary(), "rrd", "optimize", str(path), "-o", str(indexed)]
+        done = subprocess.run(command, capture_output=True, check=False, start_new_session=True)
+        if done.returncode == 0 and indexed.exists():
+            indexed.replace(path)
+        else:
+            indexed.unlink(missing_ok=True)
+
+
+class Saver:
+    """Writes every packet to ``path``, or with a limit of size or time to ``path`` numbered.
+
+    A full disk is said once and ends the saving, nothing else; what is on it is cut to whole frames.
+
+    Raises:
+        UserError: the name does not end in .rrd, or the file cannot be written.
+    """
+
+    def __init__(
+        self, path: Path, config: LiveConfig, encoder: Encoder, indexer: Indexer, notes: Notes
+    ) -> None:
+        if path.suffix != ".rrd":  # a slip must not overwrite something else
+            raise UserError(f"--save {path}: expected a file name that ends in .rrd")
+        self.paths: list[Path] = []
+        self._path = path
+        self._size = config.split_size and config.split_size * MEGABYTE
+        self._time = config.split_time
+        self._encoder, self._indexer, self._notes = encoder, indexer, notes
+        self._written = 0
+        self._started = 0.0
+        self._file = -1
+        self._full = False
+        try:
+            self._open()
+        except OSError as error:
+            raise UserError(f"{self._next}: cannot write the recording: {error.strerror}") from None
+
+    def put(self, packet: Packet) -> None:
+        if self._full or (not self._written and not packet.whole):
+            return
+        try:
+            if packet.whole and self._is_complete(packet):
+                self._finish()
+                self._open()
+            if not self._written:
+                self._started = packet.time
+                self._write(self._encoder.prelude(packet.context))
+            self._write(packet.data)
+        except OSError as error:
+            self._full = True
+            self._notes.warn(f"{self._path}: saving ends here, the rest goes on: {error.strerror}")
+
+    def close(self) -> None:
+        if not self._full:
+            self._finish()
+
+    @property
+    def _next(self) -> Path:
+        if self._size is None and self._time is None:
+            return self._path
+        return self._path.with_stem(f"{self._path.stem}_{len(self.paths):03d}")
+
+    def _is_complete(self, packet: Packet) -> bool:
+        if not self._written:
+            return False
+        large = self._size is not None and self._written + len(packet.data) > self._size
+        return large or (self._time is not None and packet.time - self._started >= self._time)
+
+    def _open(self) -> None:
+        path = self._next
+        self._file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, 0o666)
+        self.paths.append(path)
+        self._written = 0
+
+    def _write(self, data: bytes) -> None:
+        try:
+            write_all(self._file, data)
+        except OSError:
+            os.ftruncate(self._file, self._written)
+            os.close(self._file)
+            raise
+        self._written += len(data)
+
+    def _finish(self) -> None:
+        os.close(self._file)
+        if self._written:
+            self._indexer.add(self.paths[-1])
+
+
+def write_all(file: int, data: bytes) -> None:
+    """``os.write`` until all is written: a disk that fills up takes a part first."""
+    rest = memoryview(data)
+    while rest:
+        rest = rest[os.write(file, rest) :]

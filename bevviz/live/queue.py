@@ -1,0 +1,52 @@
+"""A queue between two threads in which the newest items win."""
+
+from __future__ import annotations
+
+import threading
+from collections import deque
+from collections.abc import Iterator
+from typing import Generic, TypeVar
+
+T = TypeVar("T")
+
+
+class NewestQueue(Generic[T]):
+    """Holds up to ``size`` items; a further one pushes the oldest out, which is counted.
+
+    Putting never blocks. Iteration takes items, oldest first, and ends after ``close``.
+    """
+
+    def __init__(self, size: int = 1) -> None:
+        self.dropped = 0
+        self._size = size
+        self._items: deque[T] = deque()
+        self._closed = False
+        self._changed = threading.Condition()
+
+    def __len__(self) -> int:
+        return len(self._items)
+
+    def put(self, item: T) -> None:
+        with self._changed:
+            if self._closed:
+                return
+            if len(self._items) == self._size:
+                self._items.popleft()
+                self.dropped += 1
+            self._items.append(item)
+            self._changed.notify()
+
+    def close(self) -> None:
+        """No more items are taken in; those that wait are still handed out."""
+        with self._changed:
+            self._closed = True
+            self._changed.notify_all()
+
+    def __iter__(self) -> Iterator[T]:
+        while True:
+            with self._changed:
+                self._changed.wait_for(lambda: self._items or self._closed)
+                if not self._items:
+                    return
+                item = self._items.popleft()
+            yield item

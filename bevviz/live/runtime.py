@@ -1,0 +1,385 @@
+"""The live run: receives, processes and logs in three threads; the newest frame wins, drops are counted."""
+
+from __future__ import annotations
+
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from bevviz.config import Config
+from bevviz.errors import UserError
+from bevviz.frame import CameraResult, Frame, FrameResult
+from bevviz.live.control import Control
+from bevviz.live.encoder import Encoder
+from bevviz.live.files import Indexer, Saver
+from bevviz.live.flight import FlightRecorder
+from bevviz.live.health import Health, set_nice
+from bevviz.live.notes import Notes
+from bevviz.live.queue import NewestQueue
+from bevviz.live.settings import AT_START, Settings, differences
+from bevviz.live.triggers import Triggers
+from bevviz.live.viewers import Viewer, remote, server, window
+from bevviz.logging import entities
+from bevviz.pipeline import Pipeline
+from bevviz.sources import Source
+
+TICK = 0.2  # seconds between two looks at signals
+LOOK = 1.0  # seconds between two looks at the configuration file and the clock
+PATIENCE = 10.0  # seconds that a thread may take to end
+
+
+@dataclass(frozen=True, slots=True)
+class Outputs:
+    """Where the results go, any number at once: file, window, web viewer at a port, viewers elsewhere."""
+
+    save: Path | None = None
+    window: bool = False
+    serve: int | None = None
+    bind: str = "127.0.0.1"
+    connect: Sequence[str] = ()
+    blueprint: str = "live"
+
+
+@dataclass(frozen=True, slots=True)
+class Status:
+    """How it goes. ``drops``: frames left out so far, by place; those thinned on purpose are ``thinned``."""
+
+    frames: int
+    p50: float  # seconds from arrival to logged, over the last frames
+    p99: float
+    cpu: float  # percent of one core
+    memory: float  # MB
+    drops: Mapping[str, int]
+
+
+class Live:
+    """Runs the pipeline beside a robot until the source ends, ``stop`` is called, or Ctrl-C.
+
+    Args:
+        source: its iteration may block; with a method ``stop`` it is told when to end.
+        settings: the configuration, and where it comes from.
+        outputs: where to.
+        notes: what has to be said.
+        observe: leave the pipeline off; only what the robot publishes is logged.
+        on_result: called with each result in a thread of its own; when it is too slow the newest wins.
+
+    Raises:
+        UserError: the detector's model, an output or the blueprint cannot be used.
+    """
+
+    def __init__(
+        self,
+        source: Source,
+        settings: Settings,
+        outputs: Outputs,
+        notes: Notes,
+        *,
+        observe: bool = False,
+        on_result: Callable[[FrameResult], None] | None = None,
+    ) -> None:
+        self.notes = notes
+        self.urls: list[str] = []
+        self.frames = 0  # logged
+        self.thinned = 0  # left out on purpose: live.every and live.max_rate
+        self._source, self._settings = source, settings
+        self._observe, self._on_result = observe, on_result
+        self._changing = threading.Lock()
+        self._over = threading.Event()
+        self._error: BaseException | None = None
+        self._asked_to_save = False
+        live = self.config.live
+
+        self._nice(live.nice)
+        self._pipeline = None if observe else Pipeline(self.config)
+        self._encoder = Encoder(self.config, source.scene, outputs.blueprint)
+        self._indexer = Indexer()
+        self._saves = ThreadPoolExecutor(1, "save")
+        self.flight = FlightRecorder(live, self._encoder, self._indexer)
+        self._triggers = Triggers(live)
+        self._health = Health()
+        self._incoming: NewestQueue[Frame] = NewestQueue(1)
+        self._results: NewestQueue[tuple[FrameResult, Config]] = NewestQueue(live.log_queue)
+        self._published: NewestQueue[FrameResult] = NewestQueue(1)
+
+        programs = [remote(url, self._encoder.recording_id) for url in outputs.connect]
+        if outputs.serve is not None:
+            program, address = server(outputs.serve, outputs.bind, live.viewer_memory)
+            programs.append(program)
+            self.urls.append(address)
+        if outputs.window:
+            programs.append(window())
+        self.saver: Saver | None = None
+        if outputs.save is not None:
+            self.saver = Saver(outputs.save, live, self._encoder, self._indexer, notes)
+        self._viewers = [Viewer(program, live.viewer_queue, self._encoder, notes) for program in programs]
+
+    @property
+    def config(self) -> Config:
+        return self._settings.config
+
+    @property
+    def status(self) -> Status:
+        health = self._health
+        return Status(
+            self.frames,
+            health.percentile(50),
+            health.percentile(99),
+            health.cpu,
+            health.memory,
+            self._drops(),
+        )
+
+    def stop(self) -> None:
+        """End ``run``, from any thread."""
+        self._over.set()
+
+    # --- the run -------------------------------------------------------------------------------
+
+    def run(self, on_tick: Callable[[Status], None] = lambda status: None) -> None:
+        """From the main thread. On KeyboardInterrupt everything is closed, then it goes on.
+
+        Raises:
+            UserError: of the source, or a failure of the runtime, when all outputs are closed.
+        """
+        threads = [
+            self._thread("receive", self._receive),
+            self._thread("pipeline", self._process),
+            self._thread("log", self._log),
+            self._thread("publish", self._publish),
+        ]
+        with ExitStack() as stack:
+            stack.callback(self._close, threads)
+            stack.enter_context(Control(self._save))
+            stack.enter_context(self._signal())
+            looked = time.monotonic()
+            while not self._over.wait(TICK):
+                if self._asked_to_save:
+                    self._asked_to_save = False
+                    self._save_soon("SIGUSR1")
+                if time.monotonic() - looked >= LOOK:
+                    looked = time.monotonic()
+                    self._look()
+                    on_tick(self.status)
+        if isinstance(self._error, UserError):
+            raise self._error
+        if self._error is not None:
+            raise UserError(f"ended by {type(self._error).__name__}: {self._error}") from self._error
+
+    def _thread(self, name: str, work: Callable[[], None]) -> threading.Thread:
+        def guarded() -> None:
+            try:
+                work()
+            except BaseException as error:
+                self._error = self._error or error
+                self._over.set()
+
+        thread = threading.Thread(target=guarded, name=name, daemon=True)
+        thread.start()
+        return thread
+
+    @contextmanager
+    def _signal(self) -> Iterator[None]:
+        """SIGUSR1 saves the flight recorder. The handler takes no lock: it may interrupt one that is held."""
+
+        def ask(number: int, stack: object) -> None:
+            self._asked_to_save = True
+
+        before = signal.signal(signal.SIGUSR1, ask)
+        try:
+            yield
+        finally:
+            signal.signal(signal.SIGUSR1, before)
+
+    def _look(self) -> None:
+        if self._settings.changed():
+            self._reload()
+        if jump := self._health.clock_jump():
+            self.notes.warn(f"the clock of this machine has jumped by {jump:+.1f} s")
+
+    def _close(self, threads: Sequence[threading.Thread]) -> None:
+        stop = getattr(self._source, "stop", None)
+        if stop is not None:
+            stop()
+        self._incoming.close()  # whatever the source does
+        for thread in threads[1:]:
+            thread.join(PATIENCE)
+        for viewer in self._viewers:
+            viewer.close()
+        self._saves.shutdown()
+        if self.saver is not None:
+            self.saver.close()
+        self._indexer.close()
+        self._encoder.close()
+        if self._pipeline is not None:
+            self._pipeline.close()
+
+    # --- the threads ---------------------------------------------------------------------------
+
+    def _receive(self) -> None:
+        earliest = 0.0
+        try:
+            for number, frame in enumerate(self._source):
+                if self._over.is_set():
+                    return
+                live, now = self.config.live, time.monotonic()
+                if number % live.every or now < earliest:
+                    self.thinned += 1
+                    continue
+                if live.max_rate is not None:
+                    # Frames that come a little early keep their turn; a pause earns no burst.
+                    earliest = max(earliest + 1 / live.max_rate, now - 0.5 / live.max_rate)
+                self._incoming.put(frame)
+        finally:
+            self._incoming.close()
+
+    def _process(self) -> None:
+        try:
+            used = self._pipeline
+            for frame in self._incoming:
+                with self._changing:
+                    pipeline, config = self._pipeline, self.config
+                if used is not None and used is not pipeline:
+                    used.close()
+                used = pipeline
+                frame = thin(frame, config.live.points)
+                result = observed(frame) if pipeline is None else pipeline.run(frame)
+                self._results.put((result, config))
+                if self._on_result is not None:
+                    self._published.put(result)
+        finally:
+            self._results.close()
+            self._published.close()
+
+    def _log(self) -> None:
+        for result, config in self._results:
+            drops = {entities.drops(where): float(count) for where, count in self._drops().items()}
+            packet = self._encoder.encode(
+                result, config, self._source.scene, self._health.scalars() | drops, self.notes.take()
+            )
+            for viewer in self._viewers:
+                viewer.put(packet)
+            self.flight.put(packet)
+            if self.saver is not None:
+                self.saver.put(packet)
+            self._health.logged(result.frame.received)
+            self.frames += 1
+            if reason := self._triggers.check(result):
+                self._save_soon(reason)
+        self._over.set()
+
+    def _publish(self) -> None:
+        failed = False
+        for result in self._published:
+            try:
+                assert self._on_result is not None
+                self._on_result(result)
+            except Exception as error:
+                if not failed:
+                    self.notes.warn(f"results cannot be published: {type(error).__name__}: {error}")
+                failed = True
+
+    def _drops(self) -> dict[str, int]:
+        drops = {"source": getattr(self._source, "dropped", 0)}
+        drops |= {"incoming": self._incoming.dropped, "logging": self._results.dropped}
+        if self._on_result is not None:
+            drops["publishing"] = self._published.dropped
+        for viewer in self._viewers:
+            drops[viewer.name] = drops.get(viewer.name, 0) + viewer.dropped
+        return drops
+
+    # --- the flight recorder -------------------------------------------------------------------
+
+    def _save(self, path: Path | None) -> Path:
+        saved = self.flight.save(path)
+        self.notes.info(f"flight recorder saved in {saved}")
+        return saved
+
+    def _save_soon(self, reason: str) -> None:
+        """In a thread of its own: nothing waits for the disk."""
+
+        def save() -> None:
+            try:
+                self.notes.info(f"flight recorder saved in {self.flight.save()} ({reason})")
+            except UserError as error:
+                self.notes.warn(f"flight recorder not saved ({reason}): {error}")
+
+        self._saves.submit(save)
+
+    # --- changes -------------------------------------------------------------------------------
+
+    def update(self, settings: Sequence[str]) -> None:
+        """Take on settings, ``key=value`` as after ``--set``, from any thread.
+
+        Raises:
+            UserError: one of them is wrong; nothing is changed.
+        """
+        with self._changing:
+            self._apply(self._settings.read(settings))
+            self._settings.keep(self._settings.config, settings)
+
+    def _reload(self) -> None:
+        try:
+            with self._changing:
+                self._apply(self._settings.read())
+        except UserError as error:
+            self.notes.warn(f"{error}; the configuration stays as it was")
+
+    def _apply(self, config: Config) -> None:
+        before = self.config
+        changes = differences(before, config)
+        if self._pipeline is not None:
+            if config.detector != before.detector:
+                self._pipeline = Pipeline(config)  # the one before is closed by the thread that uses it
+            else:
+                self._pipeline.config = config
+        self._settings.keep(config)
+        self.flight.config = self._triggers.config = config.live
+        if config.live.nice != before.live.nice:
+            self._nice(config.live.nice)
+        for key, change in changes.items():
+            late = "; takes effect at the next start" if key.startswith(AT_START) else ""
+            self.notes.info(f"configuration: {key} {change}{late}")
+
+    def _nice(self, nice: int) -> None:
+        try:
+            set_nice(nice)
+        except PermissionError:
+            self.notes.warn(f"live.nice={nice}: only root may take priority back")
+
+
+def observed(frame: Frame) -> FrameResult:
+    """A result without any stage: the frame as the robot published it."""
+    cameras = tuple(CameraResult(camera, None, None) for camera in frame.cameras)
+    return FrameResult(frame, None, None, None, None, cameras, None, None)
+
+
+def thin(frame: Frame, points: int | None) -> Frame:
+    """The frame with so many points: one at random out of each of as many equal runs of its points.
+
+    A fixed step would fall on the same ring of the LiDAR again and again.
+    """
+    count = len(frame.points)
+    if points is None or count <= points:
+        return frame
+    rng = np.random.default_rng(frame.index)
+    rows = ((np.arange(points) + rng.random(points)) * (count / points)).astype(np.int64)
+    rows = np.minimum(rows, count - 1)
+    ends = np.cumsum([len(cloud.xyz) for cloud in frame.clouds])
+    clouds = []
+    for cloud, end in zip(frame.clouds, ends.tolist(), strict=True):
+        kept = rows[(rows >= end - len(cloud.xyz)) & (rows < end)] - (end - len(cloud.xyz))
+        fields = {name: values[kept] for name, values in cloud.fields.items()}
+        clouds.append(replace(cloud, xyz=cloud.xyz[kept], fields=fields))
+    return replace(
+        frame,
+        points=frame.points[rows],
+        fields={name: values[rows] for name, values in frame.fields.items()},
+        clouds=tuple(clouds),
+    )

@@ -1,0 +1,66 @@
+"""The configuration while it runs: read again when its file changes, and open to settings from outside."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from bevviz.config import Config, Preset, keys, load
+
+AT_START = ("source.", "sync.", "live.log_queue", "live.viewer_", "live.split_")  # fixed once it runs
+
+
+class Settings:
+    """Preset, file and ``key=value`` settings, later ones winning; what ``update`` brings wins over all.
+
+    Raises:
+        UserError: as ``bevviz.config.load``.
+    """
+
+    def __init__(
+        self, file: Path | None = None, settings: Sequence[str] = (), preset: Preset | None = None
+    ) -> None:
+        self.file = file
+        self._settings = list(settings)
+        self._preset = preset
+        self._version = self._stat()
+        self.config = load(file, self._settings, preset)
+
+    def changed(self) -> bool:
+        """Whether the file was saved since the last call."""
+        version = self._stat()
+        if version == self._version:
+            return False
+        self._version = version
+        return version is not None
+
+    def read(self, more: Sequence[str] = ()) -> Config:
+        """The configuration as it is now, with more settings; ``keep`` makes them last.
+
+        Raises:
+            UserError: as ``bevviz.config.load``.
+        """
+        return load(self.file, [*self._settings, *more], self._preset)
+
+    def keep(self, config: Config, more: Sequence[str] = ()) -> None:
+        self.config = config
+        self._settings += more
+
+    def _stat(self) -> tuple[int, int, int] | None:
+        """Editors write in place or put another file there; None while it is missing."""
+        try:
+            found = self.file.stat() if self.file else None
+        except OSError:
+            return None
+        return (found.st_mtime_ns, found.st_size, found.st_ino) if found else None
+
+
+def differences(old: Config, new: Config) -> dict[str, str]:
+    """Each dotted key that differs, with ``old -> new``."""
+    found = {}
+    for key in keys():
+        section, _, name = key.rpartition(".")
+        before, after = (getattr(getattr(c, section) if section else c, name) for c in (old, new))
+        if before != after:
+            found[key] = f"{before} -> {after}"
+    return found
