@@ -85,11 +85,13 @@ class Live:
         on_result: Callable[[FrameResult], None] | None = None,
     ) -> None:
         self.notes = notes
+        self.on_change: Callable[[Config], None] = lambda config: None  # called in the thread of ``run``
         self.urls: list[str] = []
         self.frames = 0  # logged
         self.thinned = 0  # left out on purpose: live.every and live.max_rate
         self._source, self._settings = source, settings
-        self._observe, self._on_result = observe, on_result
+        self._on_result = on_result
+        self._told = settings.config  # the configuration that ``on_change`` has
         self._changing = threading.Lock()
         self._over = threading.Event()
         self._error: BaseException | None = None
@@ -156,7 +158,7 @@ class Live:
         ]
         with ExitStack() as stack:
             stack.callback(self._close, threads)
-            stack.enter_context(Control(self._save))
+            stack.enter_context(Control(self.save))
             stack.enter_context(self._signal())
             looked = time.monotonic()
             while not self._over.wait(TICK):
@@ -202,6 +204,9 @@ class Live:
             self._reload()
         if jump := self._health.clock_jump():
             self.notes.warn(f"the clock of this machine has jumped by {jump:+.1f} s")
+        if self._told is not self.config:
+            self._told = self.config
+            self.on_change(self._told)
 
     def _close(self, threads: Sequence[threading.Thread]) -> None:
         stop = getattr(self._source, "stop", None)
@@ -296,7 +301,8 @@ class Live:
 
     # --- the flight recorder -------------------------------------------------------------------
 
-    def _save(self, path: Path | None) -> Path:
+    def save(self, path: Path | None = None) -> Path:
+        """``FlightRecorder.save``, and say so."""
         saved = self.flight.save(path)
         self.notes.info(f"flight recorder saved in {saved}")
         return saved
