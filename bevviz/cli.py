@@ -111,7 +111,7 @@ def _parser() -> argparse.ArgumentParser:
     live = commands.add_parser(
         "live",
         help="run the pipeline beside a robot",
-        description="Run the pipeline on a ROS 2 graph as it runs. It is never behind: the newest frame wins.",
+        description="Run the pipeline on a running ROS 2 graph. It is never behind: the newest frame wins.",
     )
     choice = live.add_argument_group("what to run")
     choice.add_argument("--model", metavar="FILE.onnx", help="detector: YOLOv5, v8, v10, 11, 26 or YOLOX")
@@ -328,7 +328,7 @@ def _watch_robot(source: LiveSource, settings: Settings, options: argparse.Names
 
         return show
 
-    return _watch(source, settings, options, notes, publisher and publisher.publish, follow)
+    return _watch(source, settings, options, notes, publisher.publish if publisher else None, follow)
 
 
 def _replay() -> Replay:
@@ -338,9 +338,8 @@ def _replay() -> Replay:
     from bevviz.sources.synthetic import SyntheticSource
 
     source = SyntheticSource(frames=30)
-    return Replay(
-        list(tqdm(source, total=source.total, unit="scan", desc="simulate", disable=None)), source.scene
-    )
+    frames = list(tqdm(source, total=source.total, unit="scan", desc="simulate", disable=None))
+    return Replay(frames, source.scene)
 
 
 def _watch(

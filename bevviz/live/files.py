@@ -70,7 +70,7 @@ class Saver:
         self._size = config.split_size and config.split_size * MEGABYTE
         self._time = config.split_time
         self._encoder, self._indexer, self._notes = encoder, indexer, notes
-        self._written = 0
+        self._written = self._whole = 0  # bytes of this part, and up to its last whole packet
         self._started = 0.0
         self._file = -1
         self._full = False
@@ -89,6 +89,8 @@ class Saver:
             if not self._written:
                 self._started = packet.time
                 self._write(self._encoder.prelude(packet.context))
+            if packet.whole:
+                self._whole = self._written
             self._write(packet.data)
         except OSError as error:
             self._full = True
@@ -107,14 +109,15 @@ class Saver:
     def _is_complete(self, packet: Packet) -> bool:
         if not self._written:
             return False
-        large = self._size is not None and self._written + len(packet.data) > self._size
+        # As much again will come before the next chance to end the part.
+        large = self._size is not None and 2 * self._written - self._whole > self._size
         return large or (self._time is not None and packet.time - self._started >= self._time)
 
     def _open(self) -> None:
         path = self._next
         self._file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, 0o666)
         self.paths.append(path)
-        self._written = 0
+        self._written = self._whole = 0
 
     def _write(self, data: bytes) -> None:
         try:
