@@ -170,7 +170,7 @@ class BevConfig(Section):
         "rich", description="reference: the tutorial's image, pixel for pixel"
     )
     channels: tuple[Literal["density", "height", "intensity", "occupancy"], ...] = Field(
-        ("density", "height", "intensity", "occupancy"), description="channels that are computed and logged"
+        ("occupancy",), description="rasters logged beside the image: density, height, intensity, occupancy"
     )
 
 
@@ -178,7 +178,6 @@ class LoggingConfig(Section):
     jpeg_quality: int = Field(85, ge=1, le=100, description="for images that came uncompressed")
     raw_cloud: bool = Field(True, description="log every raw point")
     projected_points: bool = Field(True, description="log obstacle points over the image, coloured by depth")
-    bev_channels: bool = Field(False, description="log each BEV channel as an image of its own")
 
 
 class LiveConfig(Section):

@@ -40,6 +40,7 @@ class Cloud:
     topic: str = ""
     received: int = 0
     dropped: int = 0  # points of the message that were NaN or infinite
+    name: str = ""  # entity name of the LiDAR
 
 
 @dataclass(frozen=True, slots=True)

@@ -94,13 +94,16 @@ def test_a_point_outside_is_left_out(x: float, y: float) -> None:
     assert not bev(np.array([[x, y, 0]], np.float32), None, None, None, None, REFERENCE).image.any()
 
 
+CHANNELS = ("density", "height", "intensity", "occupancy")
+
+
 @given(clouds, st.data())
 @settings(max_examples=40, deadline=None)
 def test_channels_against_plain_numpy(points: F32, data: st.DataObject) -> None:
     n = len(points)
     intensity = data.draw(hnp.arrays(np.uint8, n))
     ground = data.draw(hnp.arrays(np.bool_, n))
-    config = BevConfig(range_x=8, range_y=5, resolution=0.5, style="reference")
+    config = BevConfig(range_x=8, range_y=5, resolution=0.5, style="reference", channels=CHANNELS)
     result = bev(points, intensity, ground, None, None, config)
 
     r = np.floor((np.float32(8) - points[:, 0]) / np.float32(0.5)).astype(int)

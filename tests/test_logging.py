@@ -111,7 +111,7 @@ def make(index: int = 0, **changes: Any) -> FrameResult:
     image = Image(stamp + 20_000_000, "zed", bgr, JPEG, "image/jpeg")
     camera = Camera("zed", image, INTRINSICS, camera_from_lidar, WORLD_FROM_CAMERA, 0.02, 0.005)
     cameras = (CameraResult(camera, detections, fusion, uv, depth),)
-    cloud = Cloud(stamp, "lidar", points, {}, "/points", stamp + 30_000_000, dropped=7)
+    cloud = Cloud(stamp, "lidar", points, {}, "/points", stamp + 30_000_000, dropped=7, name="lidar")
     frame = Frame(
         index=index,
         stamp=stamp,
@@ -214,7 +214,8 @@ def test_poses_and_calibration(record: Callable[..., Recording]) -> None:
         (turn,) = found.at[entity]["Transform3D:quaternion"][0]
         np.testing.assert_allclose(geometry.transform(np.array(translation), np.array(turn)), pose, atol=1e-6)
     (k,) = found.static["/world/zed"]["Pinhole:image_from_camera"]
-    np.testing.assert_allclose(np.array(k).reshape(3, 3).T, INTRINSICS.K)
+    corner = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])  # where Rerun counts pixels from
+    np.testing.assert_allclose(np.array(k).reshape(3, 3).T, INTRINSICS.K + corner)
     assert found.static["/world/zed"]["Pinhole:resolution"] == [[64, 36]]
     assert found.static["/world"]["ViewCoordinates:xyz"] == [[5, 4, 1]]  # forward, left, up
 
@@ -261,7 +262,7 @@ def test_camera(record: Callable[..., Recording]) -> None:
 
     kept = found.at["/world/zed/image/detections"]
     assert kept["Boxes2D:labels"][0] == ["person 0.90", "car 0.50"]
-    assert kept["Boxes2D:centers"][0] == [[25, 20], [50, 20]]
+    assert kept["Boxes2D:centers"][0] == [[25.5, 20.5], [50.5, 20.5]]
     assert kept["Boxes2D:half_sizes"][0] == [[5, 10], [10, 5]]
     assert kept["Boxes2D:class_ids"][0] == [ClassId.DETECTION + DetectionState.KEPT] * 2
     weak = found.at["/world/zed/image/detections/weak"]
@@ -270,7 +271,7 @@ def test_camera(record: Callable[..., Recording]) -> None:
 
     points = found.at["/world/zed/image/points"]
     assert camera.uv is not None and camera.depth is not None
-    np.testing.assert_array_equal(np.array(points["Points2D:positions"][0], np.float32), camera.uv[:20])
+    np.testing.assert_array_equal(np.array(points["Points2D:positions"][0], np.float32), camera.uv[:20] + 0.5)
     bins = (camera.depth[:20] / DEPTH_RANGE * DEPTH_BINS).astype(int)
     assert points["Points2D:class_ids"][0] == bins.tolist()
 
@@ -352,12 +353,13 @@ def test_reference_image_is_stored_without_loss(record: Callable[..., Recording]
 
 
 def test_channels_where_they_are_asked_for(record: Callable[..., Recording]) -> None:
-    config = load(settings=["logging.bev_channels=true"])
+    config = load(settings=["bev.channels=[density, height, intensity, occupancy]"])
     result = make(config=config)
     found = record([result], config)
     assert result.bev is not None
     assert {"density", "height", "occupancy"} <= set(result.bev.channels)
-    for name, grid in result.bev.channels.items():
+    for name in ("density", "height"):
+        grid = result.bev.channels[name]
         buffer = bytes(found.at[f"/bev/{name}"]["Image:buffer"][0][0])
         np.testing.assert_array_equal(np.frombuffer(buffer, grid.dtype).reshape(grid.shape), grid)
 
@@ -379,7 +381,7 @@ def test_truth_and_the_robots_own(record: Callable[..., Recording]) -> None:
         np.testing.assert_allclose(found.at[entity]["Transform3D:translation"][0], [[5, -2, 1.7]], rtol=1e-6)
     assert found.at["/robot/detection/fused_3d"]["Boxes3D:labels"][0] == ["car 0.70", "bus 0.60"]
     robot = found.at["/robot/detection/camera_2d"]
-    assert robot["Boxes2D:centers"][0] == [[6, 12]]
+    assert robot["Boxes2D:centers"][0] == [[6.5, 12.5]]
     assert robot["CoordinateFrame:frame"][0] == ["tf#/world/zed/image"]
     (outline,) = found.at["/bev/overlay/ground_truth"]["LineStrips2D:strips"][0]
     center = np.mean(outline[:4], axis=0)
@@ -389,8 +391,8 @@ def test_truth_and_the_robots_own(record: Callable[..., Recording]) -> None:
 def test_several_lidars_keep_their_own_frames(record: Callable[..., Recording]) -> None:
     result = make()
     shift = geometry.transform(np.array([1.0, 0, 0]), np.array([0, 0, 0, 1]))
-    first = Cloud(START, "front_lidar", result.frame.points[:60], {}, "/front/points")
-    second = Cloud(START, "rear_lidar", result.frame.points[60:], {}, "/rear/points")
+    first = Cloud(START, "front_lidar", result.frame.points[:60], {}, "/front/points", name="front_lidar")
+    second = Cloud(START, "rear_lidar", result.frame.points[60:], {}, "/rear/points", name="rear_lidar")
     frame = dataclasses.replace(
         result.frame, lidar="lidars", clouds=(first, second), points_from_clouds=(np.eye(4), shift)
     )

@@ -42,13 +42,13 @@ from bevviz.logging.entities import ClassId
 from bevviz.logging.text import markdown
 from bevviz.logging.tracks import Tracks
 from bevviz.sources import Scene
-from bevviz.sources.roles import entity_name
 
 _OUTLINE = rr.components.FillMode.MajorWireframe
 _TRUTH_COLOR = (215, 215, 215)
 _ROBOT_COLOR = (255, 210, 0)
 _FAINT = (150, 150, 160, 110)
 _UNMATCHED = (80, 80, 92)
+_CORNER = 0.5  # pixels: Rerun counts from the corner of the first pixel, bevviz from its centre
 _UNMATCHED_DEPTH = 20.0  # metres that the frustum of a detection without a match is drawn to
 
 _STATES = {
@@ -256,10 +256,9 @@ class Logger:
         end = 0
         for cloud, points_from_cloud in zip(frame.clouds, frame.points_from_clouds, strict=True):
             start, end = end, end + len(cloud.xyz)
-            name = entity_name(cloud.topic, cloud.frame_id)
-            self._put(entities.sensor(name), _transform(world_from_points @ points_from_cloud))
+            self._put(entities.sensor(cloud.name), _transform(world_from_points @ points_from_cloud))
             if len(cloud.xyz):
-                self._put(entities.points(name), rr.Points3D(cloud.xyz, class_ids=classes[start:end]))
+                self._put(entities.points(cloud.name), rr.Points3D(cloud.xyz, class_ids=classes[start:end]))
 
     def _rounded(self, points: F32) -> F32:
         """Voxelised points to a fraction of a voxel, which compresses to half. The raw cloud stays exact."""
@@ -315,7 +314,9 @@ class Logger:
             seen = np.isfinite(result.uv[:, 0])
             if seen.any():
                 depth = bins(result.depth[seen], 0, entities.DEPTH_RANGE, entities.DEPTH_BINS)
-                self._put(entities.projected(camera.name), rr.Points2D(result.uv[seen], class_ids=depth))
+                self._put(
+                    entities.projected(camera.name), rr.Points2D(result.uv[seen] + _CORNER, class_ids=depth)
+                )
 
     def _log_intrinsics(self, name: str, intrinsics: Intrinsics) -> None:
         """Static, so that a viewer that joins late has it; logged again where the calibration changes."""
@@ -328,7 +329,7 @@ class Logger:
             self._static(
                 entities.sensor(name),
                 rr.Pinhole(
-                    image_from_camera=intrinsics.K,
+                    image_from_camera=intrinsics.K + np.array([[0, 0, _CORNER], [0, 0, _CORNER], [0, 0, 0]]),
                     resolution=size,
                     camera_xyz=rr.ViewCoordinates.RDF,
                     image_plane_distance=1.5,
@@ -357,7 +358,7 @@ class Logger:
             self._put(
                 path,
                 rr.Boxes2D(
-                    array=detections.xyxy[rows],
+                    array=detections.xyxy[rows] + _CORNER,
                     array_format=rr.Box2DFormat.XYXY,
                     labels=[f"{n} {s:.2f}" for n, s in zip(names, detections.score[rows], strict=True)],
                     colors=[class_color(n) for n in names] if path == entities.detections(name) else None,
@@ -428,11 +429,11 @@ class Logger:
             self._put(entities.BEV, _png(bev.image))  # pixel for pixel
         else:
             self._put(entities.BEV, _jpeg(bev.image, self._config.logging.jpeg_quality))
-        if self._config.logging.bev_channels:
-            for name, grid in bev.channels.items():
+        for name, grid in bev.channels.items():
+            if name == "occupancy":
+                self._log_grid(result, bev)
+            else:
                 self._put(entities.channel(name), rr.Image(grid, color_model="L"))
-        if "occupancy" in bev.channels:
-            self._log_grid(result, bev)
 
     def _log_grid(self, result: FrameResult, bev: Bev) -> None:
         """The occupancy laid on the ground. The pose of a grid map is that of its lower left corner."""
@@ -491,7 +492,7 @@ class Logger:
             entities.robot(found.topic),
             *([frame] if frame else []),
             rr.Boxes2D(
-                array=found.xyxy,
+                array=found.xyxy + _CORNER,
                 array_format=rr.Box2DFormat.XYXY,
                 labels=[f"{n} {s:.2f}" for n, s in zip(found.labels, found.scores, strict=True)],
                 colors=[_ROBOT_COLOR],

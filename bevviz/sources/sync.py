@@ -208,7 +208,8 @@ class Synchronizer:
         """A scan of a LiDAR, told by ``cloud.topic``."""
         if cloud.topic not in self._roles.lidars:
             return
-        cloud = replace(cloud, stamp=self._arrived(cloud.topic, cloud.stamp, cloud.received))
+        stamp = self._arrived(cloud.topic, cloud.stamp, cloud.received)
+        cloud = replace(cloud, stamp=stamp, name=self._lidar_name(cloud))
         self.report.clouds += 1
         if cloud.topic in self._partners:
             self._partners[cloud.topic].add(cloud.stamp, cloud)
@@ -391,7 +392,7 @@ class Synchronizer:
             index=self._index,
             stamp=cloud.stamp,
             received=cloud.received,
-            lidar="lidars" if self._partners else self._lidar_name(cloud),
+            lidar="lidars" if self._partners else cloud.name,
             points=points,
             points_frame=place.points_frame,
             fields=fields,
@@ -414,8 +415,8 @@ class Synchronizer:
         return frame
 
     def _lidar_name(self, cloud: Cloud) -> str:
-        names = self._roles.lidar_names
-        return names[0] if names else entity_name(cloud.topic, cloud.frame_id)
+        names = dict(zip(self._roles.lidars, self._roles.lidar_names, strict=False))
+        return names.get(cloud.topic) or entity_name(cloud.topic, cloud.frame_id)
 
     def _place(self, cloud: Cloud, problems: list[str] | None = None) -> _Place:
         """Find the frames of reference; with ``problems``, also where the points are in the world."""

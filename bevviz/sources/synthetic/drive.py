@@ -127,7 +127,7 @@ class SyntheticSource:
         picture = self._camera.picture(seen, map_from_camera, self.world.light, rng)
 
         fields: dict[str, NDArray[Any]] = {"intensity": scan.intensity, "ring": scan.ring, "time": scan.time}
-        cloud = Cloud(stamp, LIDAR_FRAME, scan.xyz, fields, LIDAR_TOPIC, stamp + LATENCY)
+        cloud = Cloud(stamp, LIDAR_FRAME, scan.xyz, fields, LIDAR_TOPIC, stamp + LATENCY, name=LIDAR_FRAME)
         image = Image(shot, CAMERA_FRAME, picture.bgr, topic=IMAGE_TOPIC, received=shot + LATENCY)
         camera = Camera(
             name="zed",
