@@ -57,15 +57,16 @@ def main(play: Play) -> None:
         publishers["/tf_static"].publish(_bytes("/tf_static", mounting(source)))
     print("playing", flush=True)
     start, shift, count = time.monotonic(), time.time_ns() - START, 0
-    while True:
+    while rclpy.ok():
         index = count % play.frames
         for topic, offset, message in drive[index]:
             due = start + (count * PERIOD * 1e-9 + offset) * 10.0 / play.rate
             time.sleep(max(0.0, due - time.monotonic()))
-            if topic in publishers:
+            if topic in publishers and rclpy.ok():
                 moved = shift + (count - index) * PERIOD
                 publishers[topic].publish(_bytes(topic, _shifted(message, moved)))
         count += 1
+    node.destroy_node()
 
 
 def _serialised(source: SyntheticSource, play: Play, index: int) -> list[tuple[str, float, Any]]:

@@ -6,6 +6,8 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from bevviz.ros.session import Session
+
 LATCHED_DEPTH = 100  # one message of each node that states static transforms
 SENSOR_DEPTH = 5
 STREAM_DEPTH = 100  # small messages that come in bursts
@@ -15,20 +17,20 @@ STREAM_DEPTH = 100  # small messages that come in bursts
 class PublishedTopic:
     name: str
     type: str
-    publishers: tuple[Any, ...]  # rclpy's TopicEndpointInfo, without those of the asking node
+    publishers: tuple[Any, ...]  # rclpy's TopicEndpointInfo of other nodes
 
 
-def published_topics(node: Any) -> dict[str, PublishedTopic]:
-    """Every topic that another node publishes."""
-    own = (node.get_name(), node.get_namespace())
+def published_topics(session: Session) -> dict[str, PublishedTopic]:
+    """Every topic that somebody else publishes; in a namespace, its own topics and those it lacks."""
     found = {}
-    for name, _ in node.get_topic_names_and_types():
-        others = tuple(
-            p for p in node.get_publishers_info_by_topic(name) if (p.node_name, p.node_namespace) != own
-        )
+    for name, _ in session.input.get_topic_names_and_types():
+        publishers = session.input.get_publishers_info_by_topic(name)
+        others = tuple(p for p in publishers if not session.owns(p))
         if others:
             found[name] = PublishedTopic(name, others[0].topic_type, others)
-    return found
+    inside = session.namespace.rstrip("/") + "/"
+    types = {topic.type for topic in found.values() if topic.name.startswith(inside)}
+    return {n: t for n, t in found.items() if n.startswith(inside) or t.type not in types}
 
 
 def matched_qos(publishers: Sequence[Any], kind: str) -> Any:
@@ -57,7 +59,7 @@ def mismatches(topic: PublishedTopic, qos: Any) -> Iterable[str]:
 
     for publisher in topic.publishers:
         compatible, reason = qos_check_compatible(publisher.qos_profile, qos)
-        if compatible is QoSCompatibility.ERROR:
+        if compatible == QoSCompatibility.ERROR:
             who = f"{publisher.node_namespace.rstrip('/')}/{publisher.node_name}"
             said = reason.removeprefix("ERROR: ").rstrip(".;")
-            yield f"{topic.name}: {who} is not heard, its quality of service does not fit: {said}"
+            yield f"{topic.name}: {who} is not heard, its quality of service does not fit ({said})"

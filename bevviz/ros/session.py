@@ -1,4 +1,4 @@
-"""A node and the thread that spins it."""
+"""The nodes of bevviz on the graph, and the threads that spin them."""
 
 from __future__ import annotations
 
@@ -12,11 +12,15 @@ from bevviz.ros.environment import load_rclpy
 
 
 class Session:
-    """A context of its own, with one node; ``start`` spins it in a thread until ``close``.
+    """One context with two nodes, each spun by a thread of its own from ``start`` to ``close``.
+
+    ``node`` is the one that users meet: it has the name, the parameters and the services, and publishes.
+    ``input`` receives, so that an order that takes its time delays no message. It takes topics by the
+    names they have on the graph: remaps are for what is stated by name, through ``resolve``.
 
     Args:
         arguments: what follows ``--ros-args`` on the command line: remaps, namespace, parameters.
-        on_end: called when the thread ends, for whatever reason.
+        on_end: called when a thread ends, for whatever reason.
         name: of the node, unless remapped.
 
     Raises:
@@ -30,36 +34,66 @@ class Session:
         name: str = "bevviz",
     ) -> None:
         rclpy = load_rclpy()
-        from rclpy.executors import SingleThreadedExecutor
         from rclpy.signals import SignalHandlerOptions
 
+        self.error: BaseException | None = None  # what ended a thread, where it was not ``close``
+        self._on_end = on_end
         self._context: Any = rclpy.Context()
         ros_args = ["--ros-args", *arguments] if arguments else []
         try:
             # Signals are the command's own business: it ends with a readable recording.
             rclpy.init(args=ros_args, context=self._context, signal_handler_options=SignalHandlerOptions.NO)
             self.node: Any = rclpy.create_node(name, context=self._context)
+            self.input: Any = rclpy.create_node(
+                f"{self.node.get_name()}_input",
+                namespace=self.node.get_namespace(),
+                context=self._context,
+                use_global_arguments=False,
+                start_parameter_services=False,
+                enable_rosout=False,
+            )
         except Exception as error:  # rclpy has no common base class for what the arguments can do wrong
             self._context.try_shutdown()
             raise UserError(f"ROS does not start: {' '.join(str(error).split())}") from None
-        self.executor: Any = SingleThreadedExecutor(context=self._context)
-        self.executor.add_node(self.node)
-        self._on_end = on_end
-        self.error: BaseException | None = None  # what ended the thread, where it was not ``close``
-        self._thread = threading.Thread(target=self._spin, name="ros", daemon=True)
+        self._executors = [self._make_executor(node) for node in (self.node, self.input)]
+        self._threads = [
+            threading.Thread(target=self._spin, args=(executor,), name="ros", daemon=True)
+            for executor in self._executors
+        ]
+
+    def _make_executor(self, node: Any) -> Any:
+        from rclpy.executors import SingleThreadedExecutor
+
+        executor = SingleThreadedExecutor(context=self._context)
+        executor.add_node(node)
+        return executor
 
     @property
     def domain(self) -> int:
         return int(self._context.get_domain_id())
 
-    def start(self) -> None:
-        self._thread.start()
+    @property
+    def namespace(self) -> str:
+        return str(self.node.get_namespace())
 
-    def _spin(self) -> None:
+    def resolve(self, topic: str) -> str:
+        """The name on the graph of a topic that the user states: with namespace, remapped."""
+        return str(self.node.resolve_topic_name(topic))
+
+    def owns(self, endpoint: Any) -> bool:
+        """Whether rclpy's TopicEndpointInfo is of one of our nodes."""
+        whose = (endpoint.node_name, endpoint.node_namespace)
+        return any(whose == (node.get_name(), node.get_namespace()) for node in (self.node, self.input))
+
+    def start(self) -> None:
+        for thread in self._threads:
+            thread.start()
+
+    def _spin(self, executor: Any) -> None:
         from rclpy.executors import ExternalShutdownException, ShutdownException
 
         try:
-            self.executor.spin()
+            executor.spin()
         except (ExternalShutdownException, ShutdownException):
             pass
         except BaseException as error:
@@ -68,9 +102,12 @@ class Session:
             self._on_end()
 
     def close(self) -> None:
-        self.executor.shutdown(timeout_sec=0)
-        if self._thread.is_alive():
-            self._thread.join(timeout=5)
+        for executor in self._executors:
+            executor.shutdown(timeout_sec=0)
+        for thread in self._threads:
+            if thread.is_alive():
+                thread.join(timeout=5)
+        self.input.destroy_node()
         self.node.destroy_node()
         self._context.try_shutdown()
 

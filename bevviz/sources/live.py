@@ -24,7 +24,7 @@ from bevviz.sources.roles import Roles, Topic, find_roles
 from bevviz.sources.sync import Synchronizer
 
 LOOK = 0.5  # seconds between two looks at the graph
-TICK = 0.02  # seconds between two looks at the clouds that have waited long enough
+TICK = 0.05  # seconds between two looks at the clouds that have waited long enough
 SETTLE = 1.0  # seconds without a change of roles after which the scene is taken as complete
 PATIENCE = 3.0  # seconds that a topic without messages may delay the scene
 SILENCE = 2.0  # seconds without a cloud that are told
@@ -139,14 +139,16 @@ class LiveSource:
 
     @property
     def node(self) -> Any:
-        """The rclpy node, for what publishes back and takes orders."""
+        """The rclpy node, for what publishes back and takes orders; it has a thread of its own."""
         return self._session.node
 
     # --- as a source ---------------------------------------------------------------------------
 
     def wait(self, timeout: float | None = None) -> bool:
         """Until the scene is known: a LiDAR delivers and the roles have settled. False: not yet."""
-        return self._settled.wait(timeout) and not self._ended
+        settled = self._settled.wait(timeout)
+        self._check()
+        return settled and not self._ended
 
     @property
     def missing(self) -> str:
@@ -159,6 +161,9 @@ class LiveSource:
                 f"nothing is published on ROS domain {self._session.domain}: is the robot running, with this "
                 f"ROS_DOMAIN_ID, and not limited to its own machine (ROS_AUTOMATIC_DISCOVERY_RANGE)?"
             )
+        stated = {self._session.resolve(topic) for topic in self.config.source.lidar_topics}
+        if absent := stated - present.keys():
+            return f"nobody publishes {', '.join(sorted(absent))}, which source.lidar_topics states"
         if not self.roles.lidars:
             return (
                 f"no LiDAR (no sensor_msgs/PointCloud2) among {len(present)} topics; 'bevviz info --live' "
@@ -198,11 +203,15 @@ class LiveSource:
             with self._handover:
                 self._handover.wait_for(lambda: self._ended or self._frame is not None)
                 frame, self._frame = self._frame, None
-            if self._session.error is not None:
-                raise self._session.error
+            self._check()
             if frame is None:
                 return
             yield frame
+
+    def _check(self) -> None:
+        """Raise here what ended the receiving thread."""
+        if self._session.error is not None:
+            raise self._session.error
 
     # --- the receiving thread ------------------------------------------------------------------
 
@@ -211,7 +220,7 @@ class LiveSource:
         from rclpy.clock_type import ClockType
 
         # Not the node's clock, which stands still where a simulation is paused.
-        self.node.create_timer(period, callback, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        self._session.input.create_timer(period, callback, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
     def _receive(self, topic: str, kind: str, data: bytes, info: dict[str, Any]) -> None:
         message = LiveMessage(topic, kind, info["received_timestamp"] or time.time_ns(), data)
@@ -254,7 +263,7 @@ class LiveSource:
     # --- the graph -----------------------------------------------------------------------------
 
     def _look(self) -> None:
-        self._present = published_topics(self.node)
+        self._present = published_topics(self._session)
         known = {name: topic for name, topic in self._topics.items() if self.received[name]}
         self._topics = known | {name: t for name, t in self._present.items() if t.type in KINDS}
         self._assign()
@@ -288,8 +297,9 @@ class LiveSource:
     def _assign(self) -> None:
         """Give the topics their roles, and listen to those that play one."""
         topics = [Topic(t.name, t.type, None, self._frame_ids.get(t.name, "")) for t in self._topics.values()]
+        stated = _resolved(self.config.source, self._session.resolve)
         try:
-            roles = find_roles(*_without_absent(topics, self.config.source))
+            roles = find_roles(*_without_absent(topics, stated))
         except UserError as error:
             self._note("roles", str(error), "")
             return
@@ -301,7 +311,7 @@ class LiveSource:
             self._handlers = make_handlers(self._sync, roles, LiveMessage.decode)
         self.roles = roles
         for name in self._subscriptions.keys() - self._handlers.keys():
-            self.node.destroy_subscription(self._subscriptions.pop(name).handle)
+            self._session.input.destroy_subscription(self._subscriptions.pop(name).handle)
         for name in self._handlers:
             self._listen(self._topics[name])
 
@@ -314,7 +324,7 @@ class LiveSource:
         if former is not None:
             if (former.type, former.qos) == (topic.type, qos):
                 return
-            self.node.destroy_subscription(former.handle)
+            self._session.input.destroy_subscription(former.handle)
 
         def receive(data: bytes, info: dict[str, Any]) -> None:
             self._receive(topic.name, topic.type, data, info)
@@ -327,10 +337,23 @@ class LiveSource:
             incompatible_qos=lambda event: None,  # told by name in ``_look``
             use_default_callbacks=False,
         )
-        handle = self.node.create_subscription(
+        handle = self._session.input.create_subscription(
             message_type(topic.type), topic.name, receive, qos, event_callbacks=events, raw=True
         )
         self._subscriptions[topic.name] = _Subscription(handle, topic.type, qos)
+
+
+def _resolved(config: SourceConfig, resolve: Callable[[str], str]) -> SourceConfig:
+    """The configuration with the topics' names on the graph."""
+    infos = config.camera_info_topics
+    return config.model_copy(
+        update={
+            "lidar_topics": tuple(map(resolve, config.lidar_topics)),
+            "camera_topics": tuple(map(resolve, config.camera_topics)),
+            "camera_info_topics": {resolve(image): resolve(info) for image, info in infos.items()},
+            "odometry_topic": config.odometry_topic and resolve(config.odometry_topic),
+        }
+    )
 
 
 def _without_absent(topics: list[Topic], config: SourceConfig) -> tuple[list[Topic], SourceConfig]:
@@ -345,7 +368,7 @@ def _without_absent(topics: list[Topic], config: SourceConfig) -> tuple[list[Top
     changes["camera_info_topics"] = {
         image: info for image, info in config.camera_info_topics.items() if {image, info} <= names
     }
-    if config.odometry_topic not in names and config.odometry_topic:
+    if config.odometry_topic and config.odometry_topic not in names:
         changes["odometry_topic"] = ""
         topics = [topic for topic in topics if topic.kind != "Odometry"]
     return topics, config.model_copy(update=changes)

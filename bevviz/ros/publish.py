@@ -1,0 +1,96 @@
+"""What the tutorial's four nodes publish, from bevviz's results: for RViz, and to stand in for them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from bevviz.config import Config
+from bevviz.errors import UserError
+from bevviz.frame import I64, Boxes3D, Cloud, Clusters, ClusterState, DetectionState, FrameResult, Image
+from bevviz.ros.typesupport import message_type
+from bevviz.sources.encode import encode_boxes_2d, encode_boxes_3d, encode_cloud, encode_image, typestore
+
+BEV = "/visualization/bev_image"
+OBSTACLES = "/lidar/points_no_ground"
+CLUSTERS = "/detection/lidar_clusters"
+DETECTIONS = "/detection/camera_2d"
+FUSED = "/detection/fused_3d"
+TOPICS = {
+    BEV: "sensor_msgs/msg/Image",
+    OBSTACLES: "sensor_msgs/msg/PointCloud2",
+    CLUSTERS: "vision_msgs/msg/Detection3DArray",
+    DETECTIONS: "vision_msgs/msg/Detection2DArray",
+    FUSED: "vision_msgs/msg/Detection3DArray",
+}
+
+
+class Publisher:
+    """Publishes each result that somebody subscribes to, under the header of its cloud or image.
+
+    Clusters are those that were kept, with ``cluster_<row>`` as their class. Fused boxes are the named
+    ones; the class follows behind ``cluster_<row>``, where the tutorial's nodes look for it.
+
+    Args:
+        node: an rclpy node, whose remaps hold.
+        config: which boxes clusters have.
+        tell: called with one sentence each, for topics that cannot be published.
+    """
+
+    def __init__(self, node: Any, config: Config, tell: Callable[[str], None] = lambda text: None) -> None:
+        self._config = config
+        self._publishers: dict[str, Any] = {}
+        for topic, kind in TOPICS.items():
+            try:
+                self._publishers[topic] = node.create_publisher(message_type(kind), topic, 10)
+            except UserError as error:
+                tell(f"{topic} is not published: {error}")
+
+    def configure(self, config: Config) -> None:
+        self._config = config
+
+    def publish(self, result: FrameResult) -> None:
+        """Send what there is of a frame. Several cameras take turns on one topic."""
+        frame = result.frame
+        stamp, frame_id = frame.stamp, frame.points_frame
+        if result.bev is not None and self._wanted(BEV):
+            self._send(BEV, encode_image(Image(stamp, frame_id, result.bev.image)))
+        if result.obstacles is not None and self._wanted(OBSTACLES):
+            self._send(OBSTACLES, encode_cloud(Cloud(stamp, frame_id, result.obstacles)))
+        if result.clusters is not None and self._wanted(CLUSTERS):
+            rows = np.flatnonzero(result.clusters.state == ClusterState.KEPT)
+            boxes = _rows(self._boxes(result.clusters), rows)
+            names = [[(f"cluster_{row}", 1.0)] for row in rows]
+            self._send(CLUSTERS, encode_boxes_3d(stamp, frame_id, boxes, names))
+        if self._wanted(DETECTIONS):
+            self._send_detections(result)
+        if result.objects is not None and self._wanted(FUSED):
+            objects = result.objects
+            scored = zip(objects.cluster.tolist(), objects.names, objects.score.tolist(), strict=True)
+            results = [[(f"cluster_{row}", 1.0), (name, score)] for row, name, score in scored]
+            self._send(FUSED, encode_boxes_3d(stamp, frame_id, objects.boxes, results))
+
+    def _send_detections(self, result: FrameResult) -> None:
+        for camera in result.cameras:
+            image, found = camera.camera.image, camera.detections
+            if image is None or found is None:
+                continue
+            rows = np.flatnonzero(found.state == DetectionState.KEPT)
+            results = [[(found.names[row], float(found.score[row]))] for row in rows]
+            self._send(DETECTIONS, encode_boxes_2d(image.stamp, image.frame_id, found.xyxy[rows], results))
+
+    def _boxes(self, clusters: Clusters) -> Boxes3D:
+        return clusters.obb if self._config.clustering.boxes == "oriented" else clusters.aabb
+
+    def _wanted(self, topic: str) -> bool:
+        publisher = self._publishers.get(topic)
+        return publisher is not None and publisher.get_subscription_count() > 0
+
+    def _send(self, topic: str, message: Any) -> None:
+        self._publishers[topic].publish(bytes(typestore().serialize_cdr(message, TOPICS[topic])))
+
+
+def _rows(boxes: Boxes3D, rows: I64) -> Boxes3D:
+    return Boxes3D(boxes.center[rows], boxes.size[rows], boxes.yaw[rows])

@@ -1,0 +1,373 @@
+"""On a real graph: a player process publishes the synthetic drive over DDS on this machine."""
+
+from __future__ import annotations
+
+import random
+import subprocess
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from bevviz.config import Config, load
+from bevviz.errors import UserError
+from bevviz.frame import Boxes3D, CameraResult, Detections, Frame, FrameResult, Objects
+from bevviz.pipeline import Pipeline
+from bevviz.sources.encode import encode_camera_info, typestore
+from bevviz.sources.messages import decode_cloud, decode_detections_2d, decode_detections_3d, decode_image
+from bevviz.sources.synthetic import SyntheticSource
+from bevviz.sources.synthetic.bag import TOPICS
+from bevviz.sources.synthetic.drive import LIDAR_TOPIC
+from tests.ros_player import Play
+
+pytest.importorskip("rclpy", reason="needs rclpy: pip install 'bevviz[ros]'")
+
+from bevviz.ros import typesupport
+from bevviz.ros.orders import Orders
+from bevviz.ros.publish import BEV, CLUSTERS, DETECTIONS, FUSED, OBSTACLES, Publisher
+from bevviz.ros.session import Session
+from bevviz.sources.live import LiveSource
+
+PATIENCE = 30.0  # seconds for what takes one or two on an idle machine
+LIGHT = Play(frames=3, points=20_000)
+
+
+def new_domain() -> str:
+    return str(random.randint(1, 101))  # the ports of higher ones are taken by the system
+
+
+@pytest.fixture(scope="module")
+def robot() -> Iterator[str]:
+    """The domain of a robot that plays for several tests."""
+    number = new_domain()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("ROS_DOMAIN_ID", number)
+        patch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+        player = playing(LIGHT)
+        player.__enter__()
+    yield number
+    player.__exit__(None, None, None)
+
+
+@pytest.fixture(autouse=True)
+def domain(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The robot's graph, or an empty one, on this machine only."""
+    shared = "robot" in request.fixturenames
+    monkeypatch.setenv("ROS_DOMAIN_ID", request.getfixturevalue("robot") if shared else new_domain())
+    monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+
+
+@contextmanager
+def playing(play: Play) -> Iterator[None]:
+    root = Path(__file__).parents[1]
+    with subprocess.Popen(play.arguments(), cwd=root, stdout=subprocess.PIPE, text=True) as process:
+        try:
+            assert process.stdout is not None and process.stdout.readline() == "playing\n"
+            yield
+        finally:
+            process.terminate()  # the graph learns of it at once, as of a node that is shut down
+
+
+def until(condition: Callable[[], Any], what: str) -> None:
+    end = time.monotonic() + PATIENCE
+    while not condition():
+        assert time.monotonic() < end, f"never: {what}"
+        time.sleep(0.05)
+
+
+def frames(source: LiveSource) -> Iterator[Frame]:
+    assert source.wait(PATIENCE), source.missing
+    return iter(source)
+
+
+def test_frames_are_those_of_the_drive(robot: str) -> None:
+    drive = [snapshot.frame for snapshot in map(SyntheticSource(frames=3).snapshot, range(3))]
+    with LiveSource(load()) as source:
+        heard = list(islice(frames(source), 7))
+        assert source.scene.lidar == "rslidar" and source.scene.cameras == ("zed",) and source.scene.truth
+        assert set(source.received) == set(TOPICS)
+    assert [frame.index for frame in heard] == sorted({frame.index for frame in heard})
+    for frame in heard[1:]:  # the first one may have no transforms yet
+        true = next(f for f in drive if np.array_equal(np.resize(f.points, (20_000, 3)), frame.points))
+        (camera,), (expected,) = frame.cameras, true.cameras
+        assert frame.problems == camera.problems == ()
+        assert camera.image is not None and expected.image is not None
+        np.testing.assert_array_equal(camera.image.bgr, expected.image.bgr)
+        assert camera.camera_from_points is not None and expected.camera_from_points is not None
+        np.testing.assert_allclose(camera.camera_from_points, expected.camera_from_points, atol=2e-3)
+        assert camera.motion_compensated and camera.sync_error == pytest.approx(0.012, abs=1e-6)
+        assert frame.world_frame == "map" and frame.world_from_points is not None
+        assert frame.truth is not None and true.truth is not None
+        assert frame.truth.labels == true.truth.labels
+        np.testing.assert_allclose(frame.truth.boxes.center, true.truth.boxes.center, rtol=1e-6)
+        assert 0 < time.time_ns() - frame.received < PATIENCE * 1e9
+
+
+def test_newest_frame_wins(robot: str) -> None:
+    with LiveSource(load()) as source:
+        live = frames(source)
+        before = next(live).index
+        time.sleep(1.5)
+        frame = next(live)
+        assert source.dropped >= frame.index - before - 1 >= 5
+        assert time.time_ns() - frame.received < 1e9
+
+
+def test_remap_of_a_stated_topic(robot: str) -> None:
+    config = load(settings=["source.lidar_topics=[/points]"])
+    with LiveSource(config, arguments=["-r", f"/points:={LIDAR_TOPIC}"]) as source:
+        next(frames(source))
+        assert source.roles.lidars == (LIDAR_TOPIC,)
+
+
+def test_stated_topic_is_waited_for(robot: str) -> None:
+    with LiveSource(load(settings=["source.lidar_topics=[/elsewhere]"])) as source:
+        assert not source.wait(2.5)
+        assert "nobody publishes /elsewhere" in source.missing
+
+
+def test_refused_arguments() -> None:
+    with pytest.raises(UserError, match="ROS does not start"):
+        LiveSource(load(), arguments=["-r", "no rule"])
+
+
+def test_late_publisher_then_restart_with_other_qos_and_calibration() -> None:
+    said: list[str] = []
+    with LiveSource(load(), tell=said.append) as source:
+        assert not source.wait(1.0)
+        assert "nothing is published on ROS domain" in source.missing
+        with playing(LIGHT):
+            live = frames(source)
+            first = next(live)
+        until(lambda: f"{LIDAR_TOPIC} has no publisher" in "".join(said), "the publisher's end is told")
+        assert any(text.startswith("/tf_static has no publisher") for text in source.warnings)
+        with playing(replace(LIGHT, best_effort=True, focal=1.25)):
+            until(lambda: any("calibration" in text for text in said), "the new calibration is told")
+            next(live)  # made before the restart, if nobody took it
+            second = next(live)
+        before, after = first.cameras[0].intrinsics, second.cameras[0].intrinsics
+        assert before is not None and after is not None
+        assert after.K[0, 0] == pytest.approx(1.25 * before.K[0, 0])
+        assert second.index > first.index and second.stamp > first.stamp
+        assert f"{LIDAR_TOPIC} is published again" in said
+
+
+def test_incompatible_publisher_is_told() -> None:
+    said: list[str] = []
+    only_static = tuple(TOPICS.keys() - {"/tf_static"})
+    with (
+        playing(LIGHT),
+        playing(Play(frames=1, name="volatile", latched=False, without=only_static)),
+        LiveSource(load(), tell=said.append) as source,
+    ):
+        frame = next(frames(source))
+        until(lambda: said, "the mismatch")
+        assert len(said) == 1 and said == list(source.warnings)[:1]
+        assert said[0].startswith("/tf_static: /volatile is not heard") and "Volatile publisher" in said[0]
+        assert frame.cameras[0].camera_from_points is not None
+
+
+# --- types without a wheel ---------------------------------------------------------------------
+
+
+@pytest.fixture
+def pair() -> Iterator[tuple[Session, Session]]:
+    """Two participants."""
+    with Session(name="one") as one, Session(name="two") as two:
+        one.start()
+        two.start()
+        yield one, two
+
+
+def test_made_types_meet_compiled_ones(pair: tuple[Session, Session]) -> None:
+    from sensor_msgs.msg import CameraInfo
+
+    kind = "sensor_msgs/msg/CameraInfo"
+    made = typesupport._made(kind)
+    compiled: list[Any] = []
+    raw: list[bytes] = []
+    one, two = (session.node for session in pair)
+    one.create_subscription(CameraInfo, "/made", compiled.append, 10)
+    one.create_subscription(made, "/compiled", raw.append, 10, raw=True)
+    from_made, from_compiled = (
+        two.create_publisher(made, "/made", 10),
+        two.create_publisher(CameraInfo, "/compiled", 10),
+    )
+    until(lambda: from_made.get_subscription_count() and from_compiled.get_subscription_count(), "a match")
+
+    camera = SyntheticSource(frames=1).snapshot(0).frame.cameras[0]
+    assert camera.image is not None and camera.intrinsics is not None
+    sent = encode_camera_info(camera.image, camera.intrinsics)
+    from_made.publish(bytes(typestore().serialize_cdr(sent, kind)))
+    until(lambda: compiled, "a message of the made type")
+    message = compiled[0]
+    assert (message.width, message.header.frame_id) == (640, camera.image.frame_id)
+    np.testing.assert_array_equal(message.k, sent.k)
+
+    from_compiled.publish(message)
+    until(lambda: raw, "a message of the compiled type")
+    back: Any = typestore().deserialize_cdr(raw[0], kind)
+    assert back.header == sent.header and back.roi == sent.roi
+    np.testing.assert_array_equal(back.p, sent.p)
+
+    hashes = {
+        bytes(info.topic_type_hash.value)
+        for topic in ("/made", "/compiled")
+        for info in [*one.get_publishers_info_by_topic(topic), *one.get_subscriptions_info_by_topic(topic)]
+    }
+    assert len(hashes) == 1, "type hashes differ"
+
+
+def test_unknown_type_without_its_package() -> None:
+    with pytest.raises(UserError, match="install no_such_msgs"):
+        typesupport.message_type("no_such_msgs/msg/Thing")
+
+
+# --- publishing back ---------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def result() -> FrameResult:
+    """A frame's result in which the detector found one car, on the first cluster."""
+    config = load()
+    with Pipeline(config) as pipeline:
+        made = pipeline.run(SyntheticSource(frames=1).snapshot(0).frame)
+    assert made.clusters is not None
+    one, zero = np.ones(1, np.float32), np.zeros(1, np.int32)
+    car = Detections(
+        np.array([[10, 20, 110, 70]], np.float32), one * 0.75, zero, ("car",), zero, zero - 1, one
+    )
+    row = made.clusters.obb
+    boxes = Boxes3D(row.center[:1], row.size[:1], row.yaw[:1])
+    objects = Objects(boxes, ("car",), one * 0.75, zero, ("zed",), zero)
+    camera = CameraResult(made.cameras[0].camera, car, None)
+    return replace(made, cameras=(camera,), objects=objects)
+
+
+def test_results_are_published_for_others_but_not_for_us(result: FrameResult) -> None:
+    heard: dict[str, Any] = {}
+    kinds = {BEV: "Image", OBSTACLES: "PointCloud2", CLUSTERS: "Detection3DArray", FUSED: "Detection3DArray"}
+    kinds[DETECTIONS] = "Detection2DArray"
+    with LiveSource(load()) as source, Session(name="rviz") as rviz:
+        publisher = Publisher(source.node, load())
+        publisher.publish(result)  # for nobody
+        for topic, short in kinds.items():
+            kind = f"{'sensor' if short in ('Image', 'PointCloud2') else 'vision'}_msgs/msg/{short}"
+
+            def receive(data: bytes, topic: str = topic, kind: str = kind) -> None:
+                heard[topic] = typestore().deserialize_cdr(data, kind)
+
+            rviz.node.create_subscription(typesupport.message_type(kind), topic, receive, 10, raw=True)
+        rviz.start()
+
+        def all_heard() -> bool:
+            publisher.publish(result)
+            return len(heard) == len(kinds)
+
+        until(all_heard, f"all of {set(kinds)}")
+        until(lambda: len(rviz.node.get_publishers_info_by_topic(BEV)) == 1, "the graph")
+        time.sleep(1.0)  # the source looks around twice
+        assert source.roles.lidars == () and "no LiDAR" in source.missing
+
+    frame, image = result.frame, result.cameras[0].camera.image
+    assert result.bev is not None and result.obstacles is not None and result.clusters is not None
+    assert result.objects is not None and image is not None
+    bev = decode_image(heard[BEV], BEV, 0)
+    assert (bev.stamp, bev.frame_id, heard[BEV].encoding) == (frame.stamp, "rslidar", "bgr8")
+    np.testing.assert_array_equal(bev.bgr, result.bev.image)
+    cloud = decode_cloud(heard[OBSTACLES], OBSTACLES, 0)
+    assert (cloud.stamp, cloud.frame_id) == (frame.stamp, "rslidar")
+    np.testing.assert_array_equal(cloud.xyz, result.obstacles)
+    clusters = decode_detections_3d(heard[CLUSTERS], CLUSTERS, 0)
+    kept = np.flatnonzero(result.clusters.state == 0)
+    assert len(kept) and clusters.labels == tuple(f"cluster_{row}" for row in kept)
+    np.testing.assert_allclose(clusters.boxes.size, result.clusters.obb.size[kept], rtol=1e-6)
+    np.testing.assert_allclose(clusters.boxes.yaw, result.clusters.obb.yaw[kept], atol=1e-6)
+    fused = heard[FUSED].detections[0]
+    assert [h.hypothesis.class_id for h in fused.results] == ["cluster_0", "car"]
+    assert [h.hypothesis.score for h in fused.results] == [1.0, 0.75]
+    seen = decode_detections_2d(heard[DETECTIONS], DETECTIONS, 0)
+    assert (seen.stamp, seen.frame_id, seen.labels) == (image.stamp, image.frame_id, ("car",))
+    np.testing.assert_allclose(seen.xyxy, [[10, 20, 110, 70]])
+
+
+# --- orders ------------------------------------------------------------------------------------
+
+
+def _call(node: Any, client: Any, request: Any) -> Any:
+    assert client.wait_for_service(PATIENCE)
+    answer = client.call_async(request)
+    until(answer.done, "an answer")
+    return answer.result()
+
+
+def test_parameters_and_the_saving_of_the_recording(pair: tuple[Session, Session]) -> None:
+    from rcl_interfaces.srv import SetParameters
+    from rclpy.parameter import Parameter
+    from std_srvs.srv import Trigger
+
+    config = load(preset="reference")
+    ordered: list[str] = []
+
+    def change(settings: list[str]) -> None:
+        nonlocal config
+        config = load(settings=settings, preset="reference")
+        ordered.extend(settings)
+
+    full = False
+
+    def save() -> Path:
+        if full:
+            raise UserError("no space left in /tmp")
+        return Path("/tmp/robot.rrd")
+
+    robot, operator = pair
+    orders = Orders(robot.node, config, change, save)
+    client = operator.node.create_client(SetParameters, "/one/set_parameters")
+
+    def set_to(name: str, value: Any) -> Any:
+        request = SetParameters.Request(parameters=[Parameter(name, value=value).to_parameter_msg()])
+        return _call(operator.node, client, request).results[0]
+
+    assert robot.node.get_parameter("range_x").value == 10.0
+    assert set_to("range_x", 25).successful  # an integer, as `ros2 param set` makes of it
+    assert set_to("max_cluster_size", 500).successful
+    assert config.clustering.max_cluster_points == 500
+    orders.show(config)
+    assert set_to("max_cluster_size", 0).successful
+    assert config.clustering.max_cluster_points is None
+    assert ordered == [
+        "bev.range_x=25",
+        "clustering.max_cluster_points=500",
+        "clustering.max_cluster_points=null",
+    ]
+    refused = set_to("voxel_size", -1.0)
+    assert not refused.successful and "voxel.size" in refused.reason
+    assert robot.node.get_parameter("voxel_size").value == 0.05
+
+    orders.show(load(settings=["voxel_size=0.2"], preset="reference"))
+    assert robot.node.get_parameter("voxel_size").value == 0.2
+    assert len(ordered) == 3, "what is shown is no order"
+
+    trigger = operator.node.create_client(Trigger, "/one/save_recording")
+    answer = _call(operator.node, trigger, Trigger.Request())
+    assert (answer.success, answer.message) == (True, "/tmp/robot.rrd")
+    full = True
+    answer = _call(operator.node, trigger, Trigger.Request())
+    assert (answer.success, answer.message) == (False, "no space left in /tmp")
+
+
+def test_parameters_of_the_command_line() -> None:
+    ordered: list[str] = []
+    arguments = ["-p", "range_y:=12.5", "-r", "__node:=eye", "-r", "__ns:=/robot1"]
+    with Session(arguments) as session:
+        Orders(session.node, Config(), ordered.extend)
+        assert session.node.get_fully_qualified_name() == "/robot1/eye"
+        assert session.resolve("points") == "/robot1/points"
+    assert ordered == ["bev.range_y=12.5"]
