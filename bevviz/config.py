@@ -289,7 +289,8 @@ def load(
         key, sep, value = text.partition("=")
         if not sep:
             raise UserError(f"--set {text}: expected key=value, for example --set clustering.eps=0.6")
-        _put(stated, origin, key.strip(), _yaml_value(value, f"--set {text}"), f"--set {text}")
+        parsed = _yaml_value(value, f"--set {text}") if value.strip() else ""
+        _put(stated, origin, key.strip(), parsed, f"--set {text}")
     chosen = preset or stated.get("preset", "default")
     tree: dict[str, Any] = {"preset": chosen}
     base = _flatten(REFERENCE) if chosen == "reference" else {}

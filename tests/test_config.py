@@ -56,6 +56,7 @@ def test_command_line_preset_wins_over_the_file(tmp_path: Path) -> None:
         ("fusion.match_radius=100 px", "fusion.match_radius", 100.0),
         ("ground.sensor_height=173 cm", "ground.sensor_height", 1.73),
         ("max_cluster_size=1000", "clustering.max_cluster_points", 1000),
+        ("detector.model=", "detector.model", ""),
         ("detector.classes=[person, car]", "detector.classes", ("person", "car")),
     ],
 )
