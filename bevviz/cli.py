@@ -85,7 +85,8 @@ def _parser() -> argparse.ArgumentParser:
         help="what is in a bag, and what is missing for a full run",
         description="Topics, rates, gaps and frames of a bag, the role of each topic, and what is missing.",
     )
-    info.add_argument("paths", nargs="+", type=Path, metavar="PATH", help="bag file or folder")
+    info.add_argument("paths", nargs="*", type=Path, metavar="PATH", help="bag file or folder")
+    info.add_argument("--live", action="store_true", help="a running robot's topics instead of a bag's")
     _add_config(info)
     info.set_defaults(run=_info)
 
@@ -125,7 +126,14 @@ def _parser() -> argparse.ArgumentParser:
     choice.add_argument("--max-rate", metavar="HZ", help="frames a second at most")
     choice.add_argument("--points", metavar="N", help="points kept of each scan")
     choice.add_argument("--nice", metavar="0..19", help="priority given up to other processes")
-    choice.add_argument("--synthetic", action="store_true", help="the synthetic drive instead of a robot")
+    choice.add_argument(
+        "--synthetic",
+        nargs="?",
+        type=_positive,
+        const=30,
+        metavar="N",
+        help="instead of a robot N scans of the synthetic drive, forth and back (default: 30)",
+    )
     _add_config(live)
     output = _add_output(live, blueprint="live")
     output.add_argument(
@@ -252,6 +260,13 @@ def _bag(options: argparse.Namespace) -> int:
 def _info(options: argparse.Namespace) -> int:
     from bevviz.sources.info import describe, render
 
+    if options.live:
+        from bevviz.ros import info
+
+        print(info.render(info.describe(_load_config(options))))
+        return 0
+    if not options.paths:
+        raise UserError("bevviz info: which bag? Give its path, or --live for a running robot")
     print(render(describe(options.paths, _load_config(options))))
     return 0
 
@@ -296,7 +311,7 @@ def _live(options: argparse.Namespace) -> int:
     notes = Notes(_say)
     with _terminable():
         if options.synthetic:
-            return _watch(_replay(), settings, options, notes)
+            return _watch(_replay(options.synthetic), settings, options, notes)
         from bevviz.sources.live import LiveSource
 
         with LiveSource(settings.config, arguments=options.ros_args, tell=notes.info) as source:
@@ -331,15 +346,15 @@ def _watch_robot(source: LiveSource, settings: Settings, options: argparse.Names
     return _watch(source, settings, options, notes, publisher.publish if publisher else None, follow)
 
 
-def _replay() -> Replay:
+def _replay(frames: int) -> Replay:
     from tqdm import tqdm
 
     from bevviz.sources.replay import Replay
     from bevviz.sources.synthetic import SyntheticSource
 
-    source = SyntheticSource(frames=30)
-    frames = list(tqdm(source, total=source.total, unit="scan", desc="simulate", disable=None))
-    return Replay(frames, source.scene)
+    source = SyntheticSource(frames=frames)
+    drive = list(tqdm(source, total=source.total, unit="scan", desc="simulate", disable=None))
+    return Replay(drive, source.scene)
 
 
 def _watch(

@@ -32,7 +32,8 @@ class Control:
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
         self._socket.bind(str(self._path))
         self._socket.listen()
-        threading.Thread(target=self._serve, name="control", daemon=True).start()
+        self._thread = threading.Thread(target=self._serve, name="control", daemon=True)
+        self._thread.start()
 
     def __enter__(self) -> Self:
         return self
@@ -44,6 +45,7 @@ class Control:
         with suppress(OSError):
             self._socket.shutdown(socket.SHUT_RDWR)  # wakes the thread
         self._socket.close()
+        self._thread.join(PATIENCE)  # it may be saving
 
     def _serve(self) -> None:
         while True:
@@ -53,7 +55,8 @@ class Control:
                 return
             with connection, suppress(OSError, ValueError):
                 connection.settimeout(5.0)
-                connection.sendall(json.dumps(self._answer(_receive(connection))).encode())
+                if request := _receive(connection):  # else somebody only looked who is there
+                    connection.sendall(json.dumps(self._answer(request)).encode())
 
     def _answer(self, request: dict[str, Any]) -> dict[str, str]:
         try:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from pathlib import Path
 
 import rerun as rr
@@ -35,7 +36,8 @@ class Indexer:
 
     def add(self, path: Path) -> None:
         if path.stat().st_size <= INDEXED:
-            self._worker.submit(self._index, path)
+            with suppress(RuntimeError):  # closed already: it stays as it is
+                self._worker.submit(self._index, path)
 
     def close(self) -> None:
         """Finish what is waiting."""
@@ -123,7 +125,8 @@ class Saver:
         try:
             write_all(self._file, data)
         except OSError:
-            os.ftruncate(self._file, self._written)
+            with suppress(OSError):  # no file but a device
+                os.ftruncate(self._file, self._written)
             os.close(self._file)
             raise
         self._written += len(data)

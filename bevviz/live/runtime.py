@@ -375,8 +375,8 @@ def thin(frame: Frame, points: int | None) -> Frame:
     if points is None or count <= points:
         return frame
     rng = np.random.default_rng(frame.index)
-    rows = ((np.arange(points) + rng.random(points)) * (count / points)).astype(np.int64)
-    rows = np.minimum(rows, count - 1)
+    edges = np.arange(points + 1) * count // points
+    rows = rng.integers(edges[:-1], edges[1:])
     ends = np.cumsum([len(cloud.xyz) for cloud in frame.clouds])
     clouds = []
     for cloud, end in zip(frame.clouds, ends.tolist(), strict=True):

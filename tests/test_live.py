@@ -1,0 +1,731 @@
+"""The live runtime: what it keeps up with, what it drops, what it leaves behind, and how it ends."""
+
+from __future__ import annotations
+
+import os
+import resource
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from bevviz.config import load
+from bevviz.errors import UserError
+from bevviz.frame import CameraResult, Decision, Detections, Frame, FrameResult, Fusion, Pairs
+from bevviz.live import Live, Notes, Outputs, Settings
+from bevviz.live.encoder import WHOLE, Encoder, Packet
+from bevviz.live.files import Indexer, Saver
+from bevviz.live.queue import NewestQueue
+from bevviz.live.runtime import observed, thin
+from bevviz.live.triggers import Triggers
+from bevviz.pipeline import Pipeline
+from bevviz.sources import Scene
+from bevviz.sources.replay import Replay
+from bevviz.sources.synthetic import SyntheticSource
+from bevviz.sources.synthetic.sensors import Lidar, PinholeCamera
+from tests.recordings import Recording, verify
+
+Run = Callable[..., "Outcome"]
+
+
+@pytest.fixture(scope="module")
+def drive() -> SyntheticSource:
+    """Small sensors: the tests are about the runtime."""
+    return SyntheticSource(
+        frames=8, lidar=Lidar(beams=16, azimuths=360), camera=PinholeCamera(width=64, height=36, focal=44.0)
+    )
+
+
+@pytest.fixture(scope="module")
+def frames(drive: SyntheticSource) -> list[Frame]:
+    return list(drive)
+
+
+class Outcome:
+    """What a run said, counted and logged."""
+
+    def __init__(self, live: Live, said: list[str]) -> None:
+        self.live, self.said = live, said
+
+    def told(self, text: str) -> list[str]:
+        return [line for line in self.said if text in line]
+
+
+@pytest.fixture
+def run(frames: list[Frame], drive: SyntheticSource, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Run:
+    """Plays the drive into a live run, with ``during(live)`` in a thread beside it."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+
+    def play(
+        settings: Sequence[str] = (),
+        *,
+        total: int | None = 30,
+        rate: float = 20.0,
+        during: Callable[[Live], None] | None = None,
+        config: Path | None = None,
+        source: Any = None,
+        observe: bool = False,
+        on_result: Callable[[FrameResult], None] | None = None,
+        said: list[str] | None = None,
+        **outputs: Any,
+    ) -> Outcome:
+        said = [] if said is None else said
+        live = Live(
+            source or Replay(frames, drive.scene, rate=rate, total=total),
+            Settings(config, settings),
+            Outputs(**outputs),
+            Notes(said.append),
+            observe=observe,
+            on_result=on_result,
+        )
+        failed: list[BaseException] = []
+
+        def beside() -> None:
+            assert during is not None
+            try:
+                wait_for(lambda: live.frames > 0)
+                during(live)
+            except BaseException as error:
+                failed.append(error)
+                live.stop()
+
+        thread = threading.Thread(target=beside)
+        if during is not None:
+            thread.start()
+        try:
+            live.run()
+        finally:
+            if during is not None:
+                thread.join()
+        if failed:
+            raise failed[0]
+        return Outcome(live, said)
+
+    return play
+
+
+def wait_for(condition: Callable[[], object], seconds: float = 60.0) -> None:
+    deadline = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < deadline, "it did not happen"
+        time.sleep(0.02)
+
+
+def numbers(path: Path) -> list[int]:
+    """Of the frames in a recording."""
+    return sorted(row["frame"] for row in Recording(path).rows["/explain"])
+
+
+# --- never behind ------------------------------------------------------------------------------
+
+
+@given(st.lists(st.booleans()), st.integers(1, 4))
+def test_a_queue_hands_out_the_newest_items_and_counts_the_others(moves: list[bool], size: int) -> None:
+    queue: NewestQueue[int] = NewestQueue(size)
+    items = iter(queue)
+    waiting: list[int] = []
+    taken = 0
+    for number, put in enumerate(moves):
+        if put:
+            queue.put(number)
+            waiting = [*waiting, number][-size:]
+        elif waiting:
+            assert next(items) == waiting.pop(0)
+            taken += 1
+        assert len(queue) == len(waiting)
+    queue.close()
+    assert list(items) == waiting
+    assert queue.dropped == sum(moves) - taken - len(waiting)
+
+
+def test_a_slow_pipeline_takes_the_newest_frame(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    whole = Pipeline.run
+
+    def slow(self: Pipeline, frame: Frame) -> FrameResult:
+        time.sleep(0.2)
+        return whole(self, frame)
+
+    monkeypatch.setattr(Pipeline, "run", slow)
+    outcome = run(total=40, rate=40, save=Path("out.rrd"))
+    drops = outcome.live.status.drops
+    logged = numbers(Path("out.rrd"))
+    assert drops["incoming"] > 20
+    assert len(logged) + sum(drops.values()) == 40
+    assert logged[-1] == 39
+    health = Recording(Path("out.rrd")).column("/health/drops/incoming", "Scalars:scalars")
+    assert 0 < health[-1][0] <= drops["incoming"]
+
+
+def test_a_slow_log_drops_results_and_holds_nobody_up(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    whole = Encoder.encode
+
+    def slow(self: Encoder, *arguments: Any) -> Packet:
+        time.sleep(0.3)
+        return whole(self, *arguments)
+
+    monkeypatch.setattr(Encoder, "encode", slow)
+    seen: list[int] = []
+    outcome = run(["live.log_queue=3"], total=40, rate=20, on_result=lambda r: seen.append(r.frame.index))
+    drops = outcome.live.status.drops
+    assert drops["logging"] > 15
+    assert outcome.live.frames + drops["logging"] + drops["incoming"] == 40
+    assert len(seen) > 30
+
+
+def test_a_steady_run_logs_every_frame_with_its_health(run: Run) -> None:
+    outcome = run(total=30, rate=10, save=Path("out.rrd"))
+    recording = Recording(Path("out.rrd"))
+    logged = numbers(Path("out.rrd"))
+    assert len(logged) + sum(outcome.live.status.drops.values()) == 30
+    assert len(logged) > 20
+    p50 = [v[0] for v in recording.column("/health/latency_ms/p50", "Scalars:scalars")]
+    p99 = [v[0] for v in recording.column("/health/latency_ms/p99", "Scalars:scalars")]
+    assert all(0 < a <= b for a, b in zip(p50, p99, strict=True))
+    assert recording.column("/health/process/memory_mb", "Scalars:scalars")[-1][0] > 50
+    assert recording.column("/health/process/cpu_percent", "Scalars:scalars")[-1][0] > 0
+    verify(Path("out.rrd"))
+
+
+def test_lightening(run: Run) -> None:
+    run(["live.every=3"], total=30, rate=30, save=Path("every.rrd"))
+    assert all(n % 3 == 0 for n in numbers(Path("every.rrd")))
+    outcome = run(["live.max_rate=5"], total=40, rate=20, save=Path("rate.rrd"))
+    assert 8 <= outcome.live.frames + sum(outcome.live.status.drops.values()) <= 12
+    assert outcome.live.thinned >= 28
+    run(["live.points=500"], total=5, rate=5, save=Path("points.rrd"))
+    counts = Recording(Path("points.rrd")).column("/health/count/points", "Scalars:scalars")
+    assert {c[0] for c in counts} == {500}
+
+
+@given(st.integers(0, 300), st.integers(0, 300), st.integers(1, 400))
+def test_thinned_frames_are_consistent(first: int, second: int, points: int) -> None:
+    frame = merged(first, second)
+    thinned = thin(frame, points)
+    assert len(thinned.points) == min(points, first + second)
+    assert len(np.unique(thinned.points[:, 0])) == len(thinned.points)
+    np.testing.assert_array_equal(thinned.points, np.concatenate([cloud.xyz for cloud in thinned.clouds]))
+    np.testing.assert_array_equal(thinned.fields["ring"], thinned.points[:, 0])
+    for cloud in thinned.clouds:
+        np.testing.assert_array_equal(cloud.fields["ring"], cloud.xyz[:, 0])
+
+
+def merged(first: int, second: int) -> Frame:
+    """A frame of two LiDARs whose points are numbered."""
+    from bevviz.frame import Cloud
+
+    number = np.arange(first + second, dtype=np.float32)
+    points = np.repeat(number[:, None], 3, 1)
+    parts = (slice(0, first), slice(first, None))
+    clouds = tuple(Cloud(0, "l", points[p], {"ring": number[p]}) for p in parts)
+    return Frame(0, 0, 0, "lidars", points, "base_link", {"ring": number}, clouds=clouds)
+
+
+def test_observing_logs_what_the_robot_publishes_and_nothing_else(
+    run: Run, frames: list[Frame], drive: SyntheticSource
+) -> None:
+    robot = [
+        replace(f, robot_boxes=(replace(f.truth, topic="/detection/fused_3d"),)) for f in frames if f.truth
+    ]
+    run(source=Replay(robot, drive.scene, total=6), observe=True, save=Path("out.rrd"))
+    logged = Recording(Path("out.rrd")).at
+    assert {"/world/rslidar/points", "/world/zed/image", "/robot/detection/fused_3d"} <= set(logged)
+    assert not {"/bev", "/world/rslidar/clusters", "/world/fused", "/world/rslidar/points/ground"} & set(
+        logged
+    )
+
+
+def test_a_subscriber_that_fails_is_said_once(run: Run) -> None:
+    def fail(result: FrameResult) -> None:
+        raise ValueError("no network")
+
+    outcome = run(total=10, on_result=fail)
+    assert len(outcome.told("results cannot be published: ValueError: no network")) == 1
+    assert outcome.live.frames > 0
+
+
+# --- the flight recorder -----------------------------------------------------------------------
+
+
+def test_the_flight_recorder_holds_the_last_seconds(run: Run) -> None:
+    saved: list[Path] = []
+
+    def during(live: Live) -> None:
+        wait_for(lambda: live.frames >= 80)
+        saved.append(live.flight.save())
+        saved.append(live.flight.save(Path("second.rrd")))
+        with pytest.raises(UserError, match="already there"):
+            live.flight.save(Path("second.rrd"))
+
+    outcome = run(["live.flight_time=2 s"], total=100, rate=20, during=during, save=Path("all.rrd"))
+    everything = numbers(Path("all.rrd"))
+    assert len(everything) == outcome.live.frames
+    for path in saved:
+        verify(path)
+        recording = Recording(path)
+        held = numbers(path)
+        assert held == everything[everything.index(held[0]) : everything.index(held[-1]) + 1]
+        stamps = sorted(recording.times["stamp"].values())
+        assert 2.0 - WHOLE - 0.3 < (stamps[-1] - stamps[0]) * 1e-9 <= 2.1
+        assert recording.blueprints == 1
+        assert "TextDocument:text" in recording.static["/config"]
+        assert "Pinhole:image_from_camera" in recording.static["/world/zed"]
+        states = recording.at["/explain/states/pipeline"]["StateChange:state"]
+        assert min(states) == held[0]
+
+
+def test_the_flight_recorder_is_bounded_in_memory(run: Run) -> None:
+    sizes: list[int] = []
+
+    def during(live: Live) -> None:
+        while live.frames < 80:
+            sizes.append(live.flight.size)
+            time.sleep(0.05)
+
+    run(["live.flight_time=1000", "live.flight_size=2 MB"], total=100, rate=20, during=during)
+    assert max(sizes) <= 2_000_000
+    assert max(sizes) > 500_000
+
+
+def test_nothing_to_save(run: Run) -> None:
+    def during(live: Live) -> None:
+        with pytest.raises(UserError, match="flight_time is 0"):
+            live.flight.save()
+
+    run(["live.flight_time=0"], total=10, during=during)
+
+
+def test_a_recording_may_start_at_any_whole_packet(
+    frames: list[Frame], drive: SyntheticSource, tmp_path: Path
+) -> None:
+    """What an entity had before the cut is not left standing, and states are known from the first frame."""
+    config = load()
+    encoder = Encoder(config, drive.scene, "live")
+    with Pipeline(config) as pipeline:
+        full = pipeline.run(frames[0])
+    gone = replace(full, frame=replace(frames[1], index=1), clusters=None, obstacles=None)
+    packets = [encoder.encode(full, config, drive.scene, {}, ())]
+    time.sleep(WHOLE)
+    packets += [encoder.encode(gone, config, drive.scene, {}, [("WARN", "something was said")])]
+    path = tmp_path / "late.rrd"
+    path.write_bytes(encoder.prelude(packets[1].context) + packets[1].data)
+    encoder.close()
+    assert [p.whole for p in packets] == [True, True]
+    recording = Recording(path)
+    assert recording.cleared("/world/rslidar/clusters") == {1}
+    assert recording.column("/world/zed/image", "EncodedImage:blob")
+    assert ["something was said"] in recording.column("/explain/log", "TextLog:text")
+    assert recording.column("/explain/states/pipeline", "StateChange:state") == [["ok"]]
+
+
+# --- triggers ----------------------------------------------------------------------------------
+
+
+def result_of(frame: Frame, *decisions: Decision, total: float = 0.05) -> FrameResult:
+    """A frame with one detected pedestrian for each decision."""
+    n = len(decisions)
+    none = np.zeros(n, np.int32)
+    found = Detections(
+        np.zeros((n, 4), np.float32),
+        np.ones(n, np.float32),
+        none,
+        ("pedestrian",) * n,
+        none,
+        none - 1,
+        none * 1.0,
+    )
+    pairs = Pairs(*(np.zeros(0, np.int32),) * 3, *(np.zeros(0, np.float32),) * 4)
+    fusion = Fusion(
+        np.array(decisions, np.int32), none - 1, none, none[:0], none[:0], pairs, np.zeros((0, 4))
+    )
+    cameras = tuple(CameraResult(camera, found, fusion) for camera in frame.cameras)
+    return replace(observed(frame), cameras=cameras, timings={"total": total})
+
+
+def triggers(*settings: str) -> Triggers:
+    return Triggers(load(settings=["live.trigger_pause=0", *settings]).live)
+
+
+def test_trigger_of_a_detection_without_a_cluster(frames: list[Frame]) -> None:
+    watch = triggers("live.trigger_no_cluster=3")
+    alone, matched = result_of(frames[0], Decision.NO_CLUSTER), result_of(frames[0], Decision.MATCHED)
+    said = [watch.check(r) for r in [alone, alone, matched, alone, alone, alone, alone]]
+    assert said == [None] * 5 + ["pedestrian in zed without a cluster for 3 frames", None]
+
+
+def test_trigger_of_a_slow_stage(frames: list[Frame]) -> None:
+    watch = triggers("live.trigger_stage_time=100 ms")
+    assert watch.check(result_of(frames[0], total=0.09)) is None
+    assert watch.check(result_of(frames[0], total=0.15)) == "total took 150 ms"
+
+
+def test_trigger_of_a_lost_transform(frames: list[Frame]) -> None:
+    watch = triggers("live.trigger_tf_lost=true")
+    (camera,) = frames[0].cameras
+    lost = replace(frames[0], cameras=(replace(camera, camera_from_points=None),))
+    said = [watch.check(result_of(f)) for f in (lost, frames[0], lost, lost, frames[0])]
+    assert said == [None, None, "transform of zed lost", None, None]
+
+
+def test_trigger_of_the_sync_error(frames: list[Frame]) -> None:
+    watch = triggers("live.trigger_sync_error=50 ms")
+    (camera,) = frames[0].cameras
+    late = replace(frames[0], cameras=(replace(camera, sync_error=-0.06),))
+    assert watch.check(result_of(frames[0])) is None
+    assert watch.check(result_of(late)) == "zed is -60 ms off the cloud"
+
+
+def test_triggers_pause(frames: list[Frame]) -> None:
+    watch = triggers("live.trigger_stage_time=10 ms", "live.trigger_pause=1000")
+    assert [bool(watch.check(result_of(frames[0]))) for _ in range(3)] == [True, False, False]
+
+
+def test_a_trigger_saves(run: Run) -> None:
+    outcome = run(["live.trigger_stage_time=1 us", "live.flight_folder=flights"], total=20)
+    assert len(outcome.told("not saved")) == 1  # no such folder: said, and everything goes on
+    Path("flights").mkdir()
+    outcome = run(["live.trigger_stage_time=1 us", "live.flight_folder=flights"], total=20)
+    (saved,) = Path("flights").glob("*.rrd")
+    assert len(outcome.told(f"saved in {saved} (")) == 1
+    verify(saved)
+
+
+# --- files -------------------------------------------------------------------------------------
+
+
+def test_parts_open_on_their_own_and_lack_nothing_together(run: Run) -> None:
+    outcome = run(["live.split_time=2 s"], total=50, rate=10, save=Path("drive.rrd"))
+    parts = sorted(Path().glob("drive_*.rrd"))
+    assert outcome.live.saver is not None
+    assert outcome.live.saver.paths == parts
+    assert 2 <= len(parts) <= 3
+    for part in parts:
+        verify(part)
+        recording = Recording(part)
+        assert recording.blueprints == 1
+        assert "Pinhole:image_from_camera" in recording.static["/world/zed"]
+        assert "StateChange:state" in recording.at["/explain/states/pipeline"]
+    together = [number for part in parts for number in numbers(part)]
+    assert together == sorted(set(together))
+    assert len(together) == outcome.live.frames
+
+
+def test_parts_of_a_size(run: Run) -> None:
+    run(["live.split_size=2 MB"], total=60, rate=10, save=Path("drive.rrd"))
+    parts = sorted(Path().glob("drive_*.rrd"))
+    assert len(parts) > 1
+    assert all(part.stat().st_size < 2_200_000 for part in parts)
+
+
+def test_a_full_disk_is_said_once_and_nothing_else_ends(run: Run) -> None:
+    Path("full.rrd").symlink_to("/dev/full")
+    saved: list[Path] = []
+
+    def during(live: Live) -> None:
+        wait_for(lambda: live.frames > 10)
+        saved.append(live.flight.save())
+
+    outcome = run(save=Path("full.rrd"), during=during)
+    assert len(outcome.told("saving ends here, the rest goes on: No space left on device")) == 1
+    assert outcome.live.frames > 20
+    verify(saved[0])
+
+
+@contextmanager
+def file_limit(size: int) -> Iterator[None]:
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+
+def test_what_was_written_before_the_disk_was_full_is_readable(
+    frames: list[Frame], drive: SyntheticSource, tmp_path: Path
+) -> None:
+    config = load()
+    encoder = Encoder(config, drive.scene, "live")
+    with Pipeline(config) as pipeline:
+        packets = [encoder.encode(pipeline.run(frame), config, drive.scene, {}, ()) for frame in frames]
+    size = len(encoder.prelude(packets[0].context)) + sum(len(p.data) for p in packets[:3])
+    said: list[str] = []
+    path = tmp_path / "out.rrd"
+    saver = Saver(path, config.live, encoder, Indexer(), Notes(said.append))
+    with file_limit(size + len(packets[3].data) // 2):
+        for packet in packets:
+            saver.put(packet)
+    saver.close()
+    encoder.close()
+    assert len(said) == 1
+    assert numbers(path) == [0, 1, 2]
+
+
+def test_a_name_that_is_no_recording(run: Run) -> None:
+    with pytest.raises(UserError, match="expected a file name that ends in"):
+        run(save=Path("drive.mcap"))
+
+
+# --- changes while it runs -----------------------------------------------------------------------
+
+
+def test_the_configuration_is_reloaded_when_it_is_saved(run: Run) -> None:
+    file = Path("c.yaml")
+    file.write_text("clustering: {eps: 0.5}\n")
+    applied: list[float] = []
+
+    def during(live: Live) -> None:
+        live.on_change = lambda config: applied.append(config.clustering.eps)
+        file.write_text("clustering: {eps: 0.75}\n")
+        wait_for(lambda: live.config.clustering.eps == 0.75)
+        before = live.frames
+        file.write_text("clustering: {eps: -1}\n")
+        wait_for(lambda: live.frames > before + 30)
+        assert live.config.clustering.eps == 0.75
+        live.stop()
+
+    outcome = run(total=None, rate=10, config=file, during=during, save=Path("out.rrd"))
+    assert outcome.told("configuration: clustering.eps 0.5 -> 0.75")
+    assert len(outcome.told("clustering.eps")) == 2
+    (refused,) = outcome.told("stays as it was")
+    assert "c.yaml: clustering.eps must be greater than 0" in refused
+    assert applied == [0.75]
+    recording = Recording(Path("out.rrd"))
+    assert "eps: 0.75" in recording.static["/config"]["TextDocument:text"][0]
+    log = [line for lines in recording.column("/explain/log", "TextLog:text") for line in lines]
+    assert any("clustering.eps 0.5 -> 0.75" in line for line in log)
+
+
+def test_settings_from_outside(run: Run) -> None:
+    def during(live: Live) -> None:
+        live.update(["range_x=12", "voxel_size=20 cm", "live.nice=1"])
+        assert (live.config.bev.range_x, live.config.voxel.size) == (12, 0.2)
+        with pytest.raises(UserError, match="range_x"):
+            live.update(["voxel_size=30 cm", "range_x=-1"])
+        assert live.config.voxel.size == 0.2
+        live.update(["source.base_frame=base"])
+        frames = live.frames
+        wait_for(lambda: live.frames > frames + 2)
+        assert os.getpriority(os.PRIO_PROCESS, 0) == 1
+
+    before = os.getpriority(os.PRIO_PROCESS, 0)
+    try:
+        outcome = run(total=40, during=during, save=Path("out.rrd"))
+    finally:
+        if os.getuid() == 0:
+            os.setpriority(os.PRIO_PROCESS, 0, before)
+    assert outcome.told("bev.range_x 40.0 -> 12.0")
+    assert outcome.told("source.base_frame base_link -> base; takes effect at the next start")
+    assert "range_x: 12.0" in Recording(Path("out.rrd")).static["/config"]["TextDocument:text"][0]
+
+
+def test_a_sensor_that_comes_late(run: Run, frames: list[Frame], drive: SyntheticSource) -> None:
+    class Late(Replay):
+        def __iter__(self) -> Iterator[Frame]:
+            for frame in super().__iter__():
+                if frame.index == 10:
+                    self.scene = drive.scene
+                yield frame if frame.index >= 10 else replace(frame, cameras=())
+
+    lidar_only = Scene(drive.scene.name, drive.scene.lidar, drive.scene.lidars)
+    run(source=Late(frames, lidar_only, total=25), save=Path("out.rrd"))
+    recording = Recording(Path("out.rrd"))
+    assert "Pinhole:image_from_camera" in recording.static["/world/zed"]
+    assert "AnnotationContext:context" in recording.static["/world/zed/image/points"]
+
+
+# --- viewers -----------------------------------------------------------------------------------
+
+
+def rerun(*arguments: str) -> subprocess.Popen[bytes]:
+    command = [sys.executable, "-m", "rerun", *arguments]
+    return subprocess.Popen(
+        command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True
+    )
+
+
+def end(process: subprocess.Popen[bytes], number: int = signal.SIGKILL) -> None:
+    """And the children of ``python -m rerun``."""
+    with suppress(ProcessLookupError):
+        os.killpg(process.pid, number)
+    if number == signal.SIGKILL:
+        process.wait()
+
+
+def listens(port: int) -> bool:
+    try:
+        socket.create_connection(("127.0.0.1", port), 1).close()
+    except OSError:
+        return False
+    return True
+
+
+def a_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+def received(port: int, path: Path, seconds: float = 4.0) -> Recording:
+    """What a viewer that comes now is sent."""
+    late = rerun(f"rerun+http://127.0.0.1:{port}/proxy", "--save", str(path), "--port", str(a_port()))
+    time.sleep(seconds)
+    end(late, signal.SIGTERM)
+    late.wait(20)
+    return Recording(path)
+
+
+def test_a_late_viewer_sees_the_static_data_and_the_recent_past(run: Run) -> None:
+    found: list[Recording] = []
+    port = a_port()
+
+    def during(live: Live) -> None:
+        (url,) = live.urls
+        assert url.startswith(f"http://localhost:{port}/?url=")
+        wait_for(lambda: listens(port))
+        wait_for(lambda: live.frames > 40)
+        data_port = int(url.rpartition("localhost%3A")[2].partition("%2F")[0])
+        found.append(received(data_port, Path("late.rrd")))
+        live.stop()
+
+    run(total=None, rate=10, during=during, serve=port)
+    (recording,) = found
+    logged = sorted(row["frame"] for row in recording.rows["/explain"])
+    assert recording.blueprints == 1
+    assert "TextDocument:text" in recording.static["/config"]
+    assert logged[0] < 20
+    assert logged[-1] > 40
+    assert not listens(port)
+
+
+def test_viewers_that_hang_or_die_slow_nothing_down(run: Run) -> None:
+    port = a_port()
+    arguments = ("--serve-grpc", "--port", str(port), "--server-memory-limit", "1GB")
+    viewers = [rerun(*arguments)]
+    wait_for(lambda: listens(port))
+    found: list[Recording] = []
+    slow: list[int] = []
+    said: list[str] = []
+
+    def during(live: Live) -> None:
+        wait_for(lambda: live.frames > 20)
+        end(viewers[0], signal.SIGSTOP)
+        start = live.frames
+        time.sleep(5)
+        slow.append(live.frames - start)
+        end(viewers[0])
+        wait_for(lambda: not listens(port))
+        time.sleep(5)
+        viewers.append(rerun(*arguments))
+        wait_for(lambda: any("is back" in line for line in said))
+        start = live.frames
+        wait_for(lambda: live.frames > start + 30)
+        found.append(received(port, Path("late.rrd")))
+        live.stop()
+
+    try:
+        connect = [f"rerun+http://127.0.0.1:{port}/proxy"]
+        outcome = run(total=None, rate=10, during=during, said=said, connect=connect)
+    finally:
+        for viewer in viewers:
+            end(viewer)
+    assert slow[0] > 35
+    assert outcome.live.status.drops["remote"] > 0
+    assert outcome.live.status.drops["logging"] < 10
+    assert len(outcome.told("the remote viewer is gone")) == 1
+    assert len(outcome.told("the remote viewer is back")) == 1
+    (recording,) = found
+    assert recording.blueprints == 1
+    assert len(recording.rows["/explain"]) > 20
+
+
+def test_nobody_listens_where_a_viewer_should_be(run: Run) -> None:
+    with pytest.raises(UserError, match="no viewer answers"):
+        run(connect=[f"rerun+http://127.0.0.1:{a_port()}/proxy"])
+
+
+# --- how it ends -------------------------------------------------------------------------------
+
+
+def test_a_source_that_fails_leaves_a_readable_recording(
+    run: Run, frames: list[Frame], drive: SyntheticSource
+) -> None:
+    class Broken(Replay):
+        def __iter__(self) -> Iterator[Frame]:
+            yield from super().__iter__()
+            raise RuntimeError("the middleware is gone")
+
+    with pytest.raises(UserError, match="RuntimeError: the middleware is gone"):
+        run(source=Broken(frames, drive.scene, total=10), save=Path("out.rrd"))
+    assert len(numbers(Path("out.rrd"))) > 5
+    verify(Path("out.rrd"))
+
+
+def test_stamps_that_jump(run: Run, frames: list[Frame], drive: SyntheticSource) -> None:
+    class Jumping(Replay):
+        def __iter__(self) -> Iterator[Frame]:
+            for frame in super().__iter__():
+                jump = -3_600_000_000_000 if frame.index >= 5 else 0
+                yield replace(frame, stamp=frame.stamp + jump, received=frame.received + 2 * jump)
+
+    outcome = run(source=Jumping(frames, drive.scene, total=10, rate=5), save=Path("out.rrd"))
+    assert outcome.live.frames > 5
+    p99 = Recording(Path("out.rrd")).column("/health/latency_ms/p99", "Scalars:scalars")
+    assert all(value[0] < 60_000 for value in p99)
+    verify(Path("out.rrd"))
+
+
+def test_signals_and_snap_on_a_running_process(tmp_path: Path) -> None:
+    environment = {k: v for k, v in os.environ.items() if k not in ("DISPLAY", "WAYLAND_DISPLAY")}
+    environment |= {"PYTHONPATH": str(Path(__file__).resolve().parents[1]), "XDG_RUNTIME_DIR": str(tmp_path)}
+    command = [sys.executable, "-m", "bevviz.cli"]
+    run = subprocess.Popen(
+        [*command, "live", "--synthetic", "4", "--flight", "20 s", "--save", "all.rrd"],
+        stderr=subprocess.PIPE,
+        text=True,
+        cwd=tmp_path,
+        env=environment,
+    )
+
+    def ask(*arguments: str) -> subprocess.CompletedProcess[str]:
+        asked = [*command, "snap", *arguments]
+        return subprocess.run(
+            asked, capture_output=True, text=True, cwd=tmp_path, env=environment, check=False
+        )
+
+    saved = tmp_path / "all.rrd"
+    try:
+        wait_for(lambda: saved.exists() and saved.stat().st_size > 10_000_000, 120)
+        snapped = ask("mine.rrd")
+        again = ask("mine.rrd", "--pid", str(run.pid))
+        other = ask("--pid", "1")
+        run.send_signal(signal.SIGUSR1)
+        wait_for(lambda: list(tmp_path.glob("flight_*.rrd")))
+    finally:
+        run.send_signal(signal.SIGTERM)
+        _, said = run.communicate(timeout=60)
+    assert run.returncode == 0, said
+    assert "Traceback" not in said
+    assert snapped.stdout.strip() == str(tmp_path / "mine.rrd")
+    assert (again.returncode, other.returncode) == (2, 2)
+    assert "mine.rrd: is already there" in again.stderr
+    assert "no 'bevviz live' of yours with process id 1" in other.stderr
+    (signalled,) = tmp_path.glob("flight_*.rrd")
+    for path in (saved, signalled, tmp_path / "mine.rrd"):
+        verify(path)
+        assert len(numbers(path)) >= 2
+    assert f"flight recorder saved in {signalled.name} (SIGUSR1)" in said
+    assert " frames in all.rrd" in said
+    assert "no 'bevviz live' of yours runs" in ask().stderr
