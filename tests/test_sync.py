@@ -204,6 +204,21 @@ def test_waits_no_longer_than_max_wait_and_tells_what_was_missing() -> None:
     assert feed.sync.report.warnings()[0] == "1 of 1 frames have no image of camera 'zed'"
 
 
+def test_topics_without_a_publisher_are_not_waited_for() -> None:
+    feed = Feed(replace(ONE, tf=("/tf",)), "sync.max_wait=10")
+    feed.calibration()
+    feed.info()
+    feed.image(0.0)
+    feed.odometry(lambda t: pose(t), 0.0, 0.0)
+    assert len(feed.clouds(0.0)) == 1
+    assert feed.clouds(0.1) == [], "the next image and transform are awaited"
+    feed.sync.absent = frozenset({LEFT.topic})
+    assert list(feed.sync.ready()) == [], "the transform still is"
+    feed.sync.absent = frozenset({LEFT.topic, "/tf"})
+    (frame,) = feed.sync.ready()
+    assert frame.stamp == ns(0.1)
+
+
 def test_transforms_that_end_too_early() -> None:
     feed = Feed()
     feed.calibration()

@@ -8,6 +8,7 @@ from typing import Any
 
 from bevviz.ros.session import Session
 
+UNKNOWN = "_NODE_NAME_UNKNOWN_"  # rmw's name of a node whose publishers were met before itself
 LATCHED_DEPTH = 100  # one message of each node that states static transforms
 SENSOR_DEPTH = 5
 STREAM_DEPTH = 100  # small messages that come in bursts
@@ -53,6 +54,26 @@ def matched_qos(publishers: Sequence[Any], kind: str) -> Any:
     )
 
 
+def describe_qos(topic: PublishedTopic) -> str:
+    """Who publishes a topic, and how."""
+    from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
+
+    said = []
+    for publisher in topic.publishers:
+        qos = publisher.qos_profile
+        words = ["reliable" if qos.reliability == ReliabilityPolicy.RELIABLE else "best effort"]
+        if qos.durability == DurabilityPolicy.TRANSIENT_LOCAL:
+            words.append("latched")
+        said.append(f"{_full_name(publisher)} ({', '.join(words)})")
+    return f"from {', '.join(said)}"
+
+
+def _full_name(publisher: Any) -> str:
+    if publisher.node_name == UNKNOWN:
+        return "a node that does not say its name"
+    return f"{publisher.node_namespace.rstrip('/')}/{publisher.node_name}"
+
+
 def mismatches(topic: PublishedTopic, qos: Any) -> Iterable[str]:
     """The publishers that a subscription with ``qos`` cannot hear, and why, one sentence each."""
     from rclpy.qos import QoSCompatibility, qos_check_compatible
@@ -60,6 +81,6 @@ def mismatches(topic: PublishedTopic, qos: Any) -> Iterable[str]:
     for publisher in topic.publishers:
         compatible, reason = qos_check_compatible(publisher.qos_profile, qos)
         if compatible == QoSCompatibility.ERROR:
-            who = f"{publisher.node_namespace.rstrip('/')}/{publisher.node_name}"
+            who = _full_name(publisher)
             said = reason.removeprefix("ERROR: ").rstrip(".;")
             yield f"{topic.name}: {who} is not heard, its quality of service does not fit ({said})"

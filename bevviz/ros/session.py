@@ -73,6 +73,12 @@ class Session:
         return int(self._context.get_domain_id())
 
     @property
+    def middleware(self) -> str:
+        from rclpy.utilities import get_rmw_implementation_identifier
+
+        return str(get_rmw_implementation_identifier())
+
+    @property
     def namespace(self) -> str:
         return str(self.node.get_namespace())
 

@@ -27,7 +27,7 @@ MANY = 2_000_000  # messages; their times are not gathered, for that would take 
 class TopicInfo:
     name: str
     type: str
-    count: int
+    count: int | None  # None: not listened to
     frame_id: str
     rate: float | None  # Hz, between the first and the last message
     pause: float | None  # longest time between two messages, seconds of log time
@@ -35,16 +35,10 @@ class TopicInfo:
     role: str
 
 
-@dataclass(frozen=True, slots=True)
-class BagInfo:
-    """What ``bevviz info`` prints. Times are log times in nanoseconds."""
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Contents:
+    """What there is to work with, in a bag or on a graph."""
 
-    paths: tuple[str, ...]
-    formats: tuple[str, ...]  # of each file
-    size: int  # bytes on disk
-    start: int
-    end: int
-    messages: int
     topics: tuple[TopicInfo, ...]
     lidars: tuple[str, ...] = ()
     cameras: tuple[Camera, ...] = ()  # as one scan sees them
@@ -53,6 +47,18 @@ class BagInfo:
     world_frame: str = ""  # "": the fixed frame is not connected
     missing: tuple[str, ...] = ()  # for a full run, with the option that gives it
     warnings: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class BagInfo(Contents):
+    """What ``bevviz info`` prints. Times are log times in nanoseconds."""
+
+    paths: tuple[str, ...]
+    formats: tuple[str, ...]  # of each file
+    size: int  # bytes on disk
+    start: int
+    end: int
+    messages: int
 
     @property
     def duration(self) -> float:
@@ -74,7 +80,7 @@ def describe(paths: Sequence[Path], config: Config) -> BagInfo:
     with source:
         roles = source.roles
         frame = next(reversed(list(islice(source, min(TRIAL, source.total)))), None)
-        missing = _missing(roles, frame, config)
+        missing = find_missing(roles, frame, config)
         return _describe(source.recording, roles, config, missing, frame, source)
 
 
@@ -128,7 +134,8 @@ def _topic(recording: Recording, topic: Topic, roles: Roles) -> TopicInfo:
     )
 
 
-def _missing(roles: Roles, frame: Frame | None, config: Config) -> list[str]:
+def find_missing(roles: Roles, frame: Frame | None, config: Config) -> list[str]:
+    """What a full run lacks, judged by one frame, with the option that gives it."""
     if frame is None:
         return ["no scan could be read"]
     found = []
@@ -159,10 +166,18 @@ def render(info: BagInfo) -> str:
     """The description as text for a terminal of 100 columns."""
     kinds = sorted(set(info.formats))
     files = f"{len(info.formats)} files of " if len(info.formats) > 1 else ""
+    about = {
+        "bag": ", ".join(info.paths),
+        "format": f"{files}{'; '.join(kinds)}; {megabytes(info.size)}",
+        "time": f"{info.duration:.2f} s from {iso(info.start)}, {info.messages} messages",
+    }
+    return render_contents(about, info)
+
+
+def render_contents(about: Mapping[str, str], info: Contents) -> str:
+    """The contents as text, under what is said about the whole."""
     lines = [
-        _row("bag", ", ".join(info.paths)),
-        _row("format", f"{files}{'; '.join(kinds)}; {megabytes(info.size)}"),
-        _row("time", f"{info.duration:.2f} s from {iso(info.start)}, {info.messages} messages"),
+        *(_row(name, text) for name, text in about.items()),
         "",
         *_topic_table(info.topics),
         "",
@@ -204,7 +219,7 @@ def _topic_table(topics: Sequence[TopicInfo]) -> Iterator[str]:
         (
             t.name,
             t.type.rpartition("/")[2],
-            str(t.count),
+            "" if t.count is None else str(t.count),
             "" if t.rate is None else f"{t.rate:.1f}",
             "" if t.pause is None else f"{t.pause:.2f} s at {t.pause_at:.1f} s",
             t.frame_id,
@@ -237,7 +252,7 @@ def _camera(camera: Camera) -> str:
     return " ".join(parts).replace(" ,", ",")
 
 
-def _tree(info: BagInfo) -> Iterator[str]:
+def _tree(info: Contents) -> Iterator[str]:
     children: dict[str, list[str]] = {}
     for child, parent in sorted(info.tree.items()):
         children.setdefault(parent, []).append(child)

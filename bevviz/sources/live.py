@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import TracebackType
 from typing import Any
@@ -94,14 +94,14 @@ class LiveSource:
         self.roles = Roles()
         self.received: Counter[str] = Counter()  # topic -> messages
         self.lost: Counter[str] = Counter()  # topic -> messages that the middleware could not deliver
+        self.frame_ids: dict[str, str] = {}  # of each sensor topic's first message
+        self.topics: dict[str, PublishedTopic] = {}  # all that others publish
         self.dropped = 0  # frames that were overtaken by a newer one before anybody took them
         self._tell: Callable[[str], None] = tell or (lambda text: None)
         self._damaged: Counter[str] = Counter()
         self._first_damage: dict[str, str] = {}
         self._told: dict[str, str] = {}  # what a sentence is about -> the sentence, while it holds
-        self._topics: dict[str, PublishedTopic] = {}
-        self._present: dict[str, PublishedTopic] = {}
-        self._frame_ids: dict[str, str] = {}
+        self._known: dict[str, PublishedTopic] = {}  # that could play a role, or have
         self._subscriptions: dict[str, _Subscription] = {}
         self._handlers: dict[str, Handler[LiveMessage]] = {}
         self._sync = Synchronizer(self.roles, config)
@@ -142,6 +142,19 @@ class LiveSource:
         """The rclpy node, for what publishes back and takes orders; it has a thread of its own."""
         return self._session.node
 
+    @property
+    def domain(self) -> int:
+        return self._session.domain
+
+    @property
+    def middleware(self) -> str:
+        return self._session.middleware
+
+    @property
+    def tree(self) -> Mapping[str, str]:
+        """Child to parent of the transforms met so far."""
+        return self._sync.tf.tree()
+
     # --- as a source ---------------------------------------------------------------------------
 
     def wait(self, timeout: float | None = None) -> bool:
@@ -155,7 +168,7 @@ class LiveSource:
         """What ``wait`` waits for, in one sentence; empty once the scene is known."""
         if self._settled.is_set():
             return ""
-        present = self._present
+        present = self.topics
         if not present:
             return (
                 f"nothing is published on ROS domain {self._session.domain}: is the robot running, with this "
@@ -229,7 +242,7 @@ class LiveSource:
         before = self._sync.intrinsics.get(topic)
         try:
             if first and kind.endswith(("PointCloud2", "Image")):
-                self._frame_ids[topic] = message.header()[1]
+                self.frame_ids[topic] = message.header()[1]
                 self._assign()
             if (handler := self._handlers.get(topic)) is not None:
                 handler(message)
@@ -263,12 +276,13 @@ class LiveSource:
     # --- the graph -----------------------------------------------------------------------------
 
     def _look(self) -> None:
-        self._present = published_topics(self._session)
-        known = {name: topic for name, topic in self._topics.items() if self.received[name]}
-        self._topics = known | {name: t for name, t in self._present.items() if t.type in KINDS}
+        self.topics = published_topics(self._session)
+        known = {name: topic for name, topic in self._known.items() if self.received[name]}
+        self._known = known | {name: t for name, t in self.topics.items() if t.type in KINDS}
         self._assign()
+        self._sync.absent = frozenset(self._subscriptions.keys() - self.topics.keys())
         for name, subscription in self._subscriptions.items():
-            topic = self._present.get(name)
+            topic = self.topics.get(name)
             gone = f"{name} has no publisher any more; waiting for it to come back"
             self._note(name, gone if topic is None else "", f"{name} is published again")
             unheard = "; ".join(mismatches(topic, subscription.qos)) if topic is not None else ""
@@ -296,7 +310,7 @@ class LiveSource:
 
     def _assign(self) -> None:
         """Give the topics their roles, and listen to those that play one."""
-        topics = [Topic(t.name, t.type, None, self._frame_ids.get(t.name, "")) for t in self._topics.values()]
+        topics = [Topic(t.name, t.type, None, self.frame_ids.get(t.name, "")) for t in self._known.values()]
         stated = _resolved(self.config.source, self._session.resolve)
         try:
             roles = find_roles(*_without_absent(topics, stated))
@@ -313,7 +327,7 @@ class LiveSource:
         for name in self._subscriptions.keys() - self._handlers.keys():
             self._session.input.destroy_subscription(self._subscriptions.pop(name).handle)
         for name in self._handlers:
-            self._listen(self._topics[name])
+            self._listen(self._known[name])
 
     def _listen(self, topic: PublishedTopic) -> None:
         """Subscribe, or again where the publishers now offer something else."""

@@ -171,6 +171,7 @@ class Synchronizer:
 
     def __init__(self, roles: Roles, config: Config) -> None:
         self.report = SyncReport()
+        self.absent: frozenset[str] = frozenset()  # topics that nobody publishes now: not waited for
         self.tf = TransformBuffer()
         self._roles = roles
         self._config = config
@@ -199,7 +200,8 @@ class Synchronizer:
 
     def take_over(self, former: Synchronizer) -> None:
         """Go on with the transforms, calibrations and counts of ``former``, when the roles change."""
-        self.report, self.tf, self.intrinsics = former.report, former.tf, former.intrinsics
+        self.report, self.absent = former.report, former.absent
+        self.tf, self.intrinsics = former.tf, former.intrinsics
         self._odometry_frames = former._odometry_frames
 
     # --- what comes in -------------------------------------------------------------------------
@@ -294,12 +296,13 @@ class Synchronizer:
         self._done.extend(self._build_all())
         self._last = None
         self.tf.forget_after(stamp + JUMP)
-        for track in self._tracks():
+        for _, track in self._tracks():
             track.keep(0, stamp + JUMP)
 
-    def _tracks(self) -> Iterator[_Track[Any]]:
+    def _tracks(self) -> Iterator[tuple[str, _Track[Any]]]:
+        """Topic and messages."""
         for group in (self._partners, self._images, self._boxes, self._detections, self._truth):
-            yield from group.values()
+            yield from group.items()
 
     # --- what goes out -------------------------------------------------------------------------
 
@@ -336,7 +339,8 @@ class Synchronizer:
     def _complete(self) -> bool:
         """Whether nothing that may still come could change the oldest cloud's frame."""
         stamp = self._clouds[0].stamp
-        if any(track.newest is None or track.newest < stamp for track in self._tracks()):
+        waited = [track for topic, track in self._tracks() if topic not in self.absent]
+        if any(track.newest is None or track.newest < stamp for track in waited):
             return False
         results: list[_Track[Any]] = [
             *self._boxes.values(),
@@ -345,9 +349,11 @@ class Synchronizer:
         ]
         if len(self._clouds) == 1 and any(self._may_be_of_next(track, stamp) for track in results):
             return False
-        if any(c.info_topic and c.info_topic not in self.intrinsics for c in self._roles.cameras):
+        infos = {camera.info_topic for camera in self._roles.cameras} - {""}
+        if infos - self.absent - self.intrinsics.keys():
             return False
-        return self._transforms_reach(self._clouds[0])
+        lacking = not self.absent.isdisjoint((*self._roles.tf, self._roles.odometry))
+        return lacking or self._transforms_reach(self._clouds[0])
 
     def _may_be_of_next(self, track: _Track[Any], stamp: int) -> bool:
         nearest = track.nearest(stamp)
@@ -410,7 +416,7 @@ class Synchronizer:
         self._index += 1
         self._last = cloud.stamp
         self.report.frames += 1
-        for track in self._tracks():
+        for _, track in self._tracks():
             track.forget(cloud.stamp - self._tolerance)
         return frame
 

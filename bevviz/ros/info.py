@@ -1,0 +1,93 @@
+"""What is on a running graph: topics, sensors, transforms, and what is missing for a full run."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import Counter, deque
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from bevviz.config import Config
+from bevviz.frame import Frame
+from bevviz.ros.graph import PublishedTopic, describe_qos
+from bevviz.sources.info import Contents, TopicInfo, find_missing, render_contents
+from bevviz.sources.live import LiveSource
+
+PATIENCE = 10.0  # seconds until what is there so far is shown
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LiveInfo(Contents):
+    """What ``bevviz info --live`` prints."""
+
+    domain: int
+    middleware: str
+    seconds: float  # that were listened for
+
+
+def describe(config: Config, arguments: Sequence[str] = (), seconds: float = 3.0) -> LiveInfo:
+    """Listen to the graph for ``seconds``, counted from when the topics have their roles.
+
+    Raises:
+        UserError: no working rclpy, or arguments that it refuses.
+    """
+    said: list[str] = []
+    with LiveSource(config, arguments=arguments, tell=said.append) as source:
+        settled = source.wait(PATIENCE)
+        before = Counter(source.received)
+        start = time.monotonic()
+        frame = _last_frame(source, seconds)
+        seconds = time.monotonic() - start
+        counts = source.received - before
+        missing = find_missing(source.roles, frame, config) if settled else [source.missing]
+        if not config.detector.model:
+            missing.append("no detector: --model FILE.onnx")
+        return LiveInfo(
+            domain=source.domain,
+            middleware=source.middleware,
+            seconds=seconds,
+            topics=tuple(
+                _topic(topic, source, counts, seconds)
+                for topic in sorted(source.topics.values(), key=lambda t: t.name)
+            ),
+            lidars=source.roles.lidar_names,
+            cameras=frame.cameras if frame else (),
+            tree=source.tree,
+            points_frame=frame.points_frame if frame else "",
+            world_frame=frame.world_frame if frame and frame.world_from_points is not None else "",
+            missing=tuple(missing),
+            warnings=tuple(source.warnings),
+        )
+
+
+def _last_frame(source: LiveSource, seconds: float) -> Frame | None:
+    timer = threading.Timer(seconds, source.stop)
+    timer.start()
+    last = deque(source, maxlen=1)
+    timer.join()
+    return last[0] if last else None
+
+
+def _topic(topic: PublishedTopic, source: LiveSource, counts: Counter[str], seconds: float) -> TopicInfo:
+    heard = topic.name in source.received
+    role = source.roles.notes.get(topic.name, "")
+    return TopicInfo(
+        name=topic.name,
+        type=topic.type,
+        count=counts[topic.name] if heard else None,
+        frame_id=source.frame_ids.get(topic.name, ""),
+        rate=counts[topic.name] / seconds if heard and topic.name not in source.roles.tf_static else None,
+        pause=None,
+        pause_at=None,
+        role=f"{role}; {describe_qos(topic)}" if role else "",
+    )
+
+
+def render(info: LiveInfo) -> str:
+    """The description as text for a terminal of 100 columns."""
+    about = {
+        "graph": f"ROS_DOMAIN_ID {info.domain}, {info.middleware}",
+        "time": f"{info.seconds:.1f} s listened, {sum(t.count or 0 for t in info.topics)} messages",
+    }
+    return render_contents(about, info)
