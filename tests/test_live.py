@@ -347,9 +347,8 @@ def result_of(frame: Frame, *decisions: Decision, total: float = 0.05) -> FrameR
         none * 1.0,
     )
     pairs = Pairs(*(np.zeros(0, np.int32),) * 3, *(np.zeros(0, np.float32),) * 4)
-    fusion = Fusion(
-        np.array(decisions, np.int32), none - 1, none, none[:0], none[:0], pairs, np.zeros((0, 4))
-    )
+    nowhere = np.zeros((0, 4), np.float32)
+    fusion = Fusion(np.array(decisions, np.int32), none - 1, none, none[:0], none[:0], pairs, nowhere)
     cameras = tuple(CameraResult(camera, found, fusion) for camera in frame.cameras)
     return replace(observed(frame), cameras=cameras, timings={"total": total})
 

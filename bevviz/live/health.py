@@ -22,6 +22,7 @@ class Health:
 
     def __init__(self) -> None:
         self.latencies: deque[float] = deque(maxlen=RECENT)  # seconds
+        self.histogram = np.zeros(1001, np.int64)  # of all latencies, in ms; the last holds what is longer
         self.cpu = 0.0  # percent of one core
         self.memory = 0.0  # MB
         self._sampled = time.monotonic()
@@ -33,6 +34,7 @@ class Health:
         latency = time.time() - received * 1e-9
         if 0 <= latency < LONGEST:
             self.latencies.append(latency)
+            self.histogram[min(int(1e3 * latency), 1000)] += 1
 
     def percentile(self, percent: float) -> float:
         """Seconds from arrival to logged; NaN before the first frame."""

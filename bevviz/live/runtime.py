@@ -105,7 +105,7 @@ class Live:
         self._saves = ThreadPoolExecutor(1, "save")
         self.flight = FlightRecorder(live, self._encoder, self._indexer)
         self._triggers = Triggers(live)
-        self._health = Health()
+        self.health = Health()
         self._incoming: NewestQueue[Frame] = NewestQueue(1)
         self._results: NewestQueue[tuple[FrameResult, Config]] = NewestQueue(live.log_queue)
         self._published: NewestQueue[FrameResult] = NewestQueue(1)
@@ -128,7 +128,7 @@ class Live:
 
     @property
     def status(self) -> Status:
-        health = self._health
+        health = self.health
         return Status(
             self.frames,
             health.percentile(50),
@@ -202,7 +202,7 @@ class Live:
     def _look(self) -> None:
         if self._settings.changed():
             self._reload()
-        if jump := self._health.clock_jump():
+        if jump := self.health.clock_jump():
             self.notes.warn(f"the clock of this machine has jumped by {jump:+.1f} s")
         if self._told is not self.config:
             self._told = self.config
@@ -266,14 +266,14 @@ class Live:
         for result, config in self._results:
             drops = {entities.drops(where): float(count) for where, count in self._drops().items()}
             packet = self._encoder.encode(
-                result, config, self._source.scene, self._health.scalars() | drops, self.notes.take()
+                result, config, self._source.scene, self.health.scalars() | drops, self.notes.take()
             )
             for viewer in self._viewers:
                 viewer.put(packet)
             self.flight.put(packet)
             if self.saver is not None:
                 self.saver.put(packet)
-            self._health.logged(result.frame.received)
+            self.health.logged(result.frame.received)
             self.frames += 1
             if reason := self._triggers.check(result):
                 self._save_soon(reason)
