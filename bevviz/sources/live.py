@@ -208,7 +208,10 @@ class LiveSource:
             f"{count} message(s) of {topic} could not be used, the first: {self._first_damage[topic]}"
             for topic, count in self._damaged.items()
         ]
-        lost = [f"{count} message(s) of {topic} were lost on the way" for topic, count in self.lost.items()]
+        lost = [
+            f"{count} message(s) of {topic} were lost on the way, see docs/live.md"
+            for topic, count in self.lost.items()
+        ]
         return [*self._told.values(), *lost, *damaged, *self._sync.report.warnings()]
 
     def __iter__(self) -> Iterator[Frame]:
