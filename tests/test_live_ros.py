@@ -23,7 +23,7 @@ from bevviz.sources.encode import encode_camera_info, typestore
 from bevviz.sources.messages import decode_cloud, decode_detections_2d, decode_detections_3d, decode_image
 from bevviz.sources.synthetic import SyntheticSource
 from bevviz.sources.synthetic.bag import TOPICS
-from bevviz.sources.synthetic.drive import LIDAR_TOPIC
+from bevviz.sources.synthetic.drive import LIDAR_TOPIC, TRUTH_TOPIC
 from tests.ros_player import Play
 
 pytest.importorskip("rclpy", reason="needs rclpy: pip install 'bevviz[ros]'")
@@ -145,6 +145,22 @@ def test_info_shows_the_graph(robot: str) -> None:
     text = info.render(made)
     assert text.startswith(f"graph   ROS_DOMAIN_ID {robot}, rmw_fastrtps_cpp\n")
     assert "zed: 640 x 360 uncompressed" in text
+
+
+def test_what_cannot_be_received_is_told_and_not_waited_for(
+    robot: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def without_vision_msgs(name: str) -> Any:
+        if name.startswith("vision_msgs"):
+            raise UserError("vision_msgs is not installed")
+        return typesupport.message_type(name)
+
+    monkeypatch.setattr("bevviz.sources.live.message_type", without_vision_msgs)
+    said: list[str] = []
+    with LiveSource(load(settings=["sync.max_wait=20"]), tell=said.append) as source:
+        heard = list(islice(frames(source), 3))
+    assert said == [f"{TRUTH_TOPIC} is not received: vision_msgs is not installed"]
+    assert heard[-1].truth is None and heard[-1].cameras[0].image is not None
 
 
 def test_refused_arguments() -> None:

@@ -12,6 +12,16 @@ from bevviz.errors import UserError
 from bevviz.ros.environment import load_rclpy
 
 
+def _install(folder: Path, code: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """An rclpy that is found first, and fails."""
+    (folder / "rclpy").mkdir()
+    (folder / "rclpy" / "__init__.py").write_text(code)
+    for name in [name for name in sys.modules if name.partition(".")[0] == "rclpy"]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.syspath_prepend(folder)
+    monkeypatch.delenv("AMENT_PREFIX_PATH", raising=False)
+
+
 def test_no_rclpy(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "rclpy", None)
     monkeypatch.delenv("AMENT_PREFIX_PATH", raising=False)
@@ -26,6 +36,15 @@ def test_numpy_of_a_sourced_ros(monkeypatch: pytest.MonkeyPatch) -> None:
         load_rclpy()
 
 
+def test_wheels_under_the_python_of_another_environment(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _install(tmp_path, "raise ImportError('librcl.so: cannot open shared object file')", monkeypatch)
+    monkeypatch.setenv("_ROS_WHEELS_BOOTSTRAP_COMPLETE", "1")
+    with pytest.raises(UserError, match="start bevviz in a new shell"):
+        load_rclpy()
+
+
 @pytest.mark.parametrize(
     "failure",
     [
@@ -37,11 +56,7 @@ def test_numpy_of_a_sourced_ros(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_rclpy_of_a_sourced_ros_for_another_python(
     failure: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    (tmp_path / "rclpy").mkdir()
-    (tmp_path / "rclpy" / "__init__.py").write_text(failure)
-    for name in [name for name in sys.modules if name.partition(".")[0] == "rclpy"]:
-        monkeypatch.delitem(sys.modules, name)
-    monkeypatch.syspath_prepend(tmp_path)
+    _install(tmp_path, failure, monkeypatch)
     monkeypatch.setenv("AMENT_PREFIX_PATH", "/opt/ros/jazzy:/elsewhere")
     with pytest.raises(UserError, match=r"sourced ROS in /opt/ros/jazzy .* without `source"):
         load_rclpy()

@@ -16,6 +16,10 @@ UNSOURCED = (
     "pip install 'bevviz[ros]' or in RoboStack: it meets the robot's nodes over DDS all the same"
 )
 
+# Set by the wheels when they have restarted the interpreter with their library path; a child process of
+# another environment inherits it, but needs another path.
+BOOTSTRAPPED = "_ROS_WHEELS_BOOTSTRAP_COMPLETE"
+
 
 def load_rclpy() -> ModuleType:
     """Import rclpy, with the message packages that a node needs.
@@ -42,6 +46,8 @@ def load_rclpy() -> ModuleType:
 
 def _explain(error: Exception, sourced: str) -> str:
     reason = " ".join(str(error).split())
+    if "shared object" in reason and BOOTSTRAPPED in os.environ:
+        return f"the wheels do not find their libraries ({reason}): start bevviz in a new shell"
     if sourced:
         return (
             f"the sourced ROS in {sourced} does not work with this Python and numpy ({reason}); {UNSOURCED}"

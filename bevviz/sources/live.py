@@ -107,6 +107,7 @@ class LiveSource:
         self._sync = Synchronizer(self.roles, config)
         self._changed = self._last_cloud = time.monotonic()
         self._settled = threading.Event()
+        self._knowledge = threading.RLock()  # of all that the receiving thread changes piece by piece
         self._handover = threading.Condition()
         self._frame: Frame | None = None
         self._frames = 0
@@ -153,7 +154,8 @@ class LiveSource:
     @property
     def tree(self) -> Mapping[str, str]:
         """Child to parent of the transforms met so far."""
-        return self._sync.tf.tree()
+        with self._knowledge:
+            return dict(self._sync.tf.tree())
 
     # --- as a source ---------------------------------------------------------------------------
 
@@ -204,15 +206,16 @@ class LiveSource:
 
     @property
     def warnings(self) -> Sequence[str]:
-        damaged = [
-            f"{count} message(s) of {topic} could not be used, the first: {self._first_damage[topic]}"
-            for topic, count in self._damaged.items()
-        ]
-        lost = [
-            f"{count} message(s) of {topic} were lost on the way, see docs/live.md"
-            for topic, count in self.lost.items()
-        ]
-        return [*self._told.values(), *lost, *damaged, *self._sync.report.warnings()]
+        with self._knowledge:
+            damaged = [
+                f"{count} message(s) of {topic} could not be used, the first: {self._first_damage[topic]}"
+                for topic, count in self._damaged.items()
+            ]
+            lost = [
+                f"{count} message(s) of {topic} were lost on the way, see docs/live.md"
+                for topic, count in self.lost.items()
+            ]
+            return [*self._told.values(), *lost, *damaged, *self._sync.report.warnings()]
 
     def __iter__(self) -> Iterator[Frame]:
         while True:
@@ -235,8 +238,12 @@ class LiveSource:
         from rclpy.clock import Clock
         from rclpy.clock_type import ClockType
 
+        def run() -> None:
+            with self._knowledge:
+                callback()
+
         # Not the node's clock, which stands still where a simulation is paused.
-        self._session.input.create_timer(period, callback, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        self._session.input.create_timer(period, run, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
     def _receive(self, topic: str, kind: str, data: bytes, info: dict[str, Any]) -> None:
         message = LiveMessage(topic, kind, info["received_timestamp"] or time.time_ns(), data)
@@ -283,7 +290,8 @@ class LiveSource:
         known = {name: topic for name, topic in self._known.items() if self.received[name]}
         self._known = known | {name: t for name, t in self.topics.items() if t.type in KINDS}
         self._assign()
-        self._sync.absent = frozenset(self._subscriptions.keys() - self.topics.keys())
+        heard = self._subscriptions.keys() & self.topics.keys()
+        self._sync.absent = frozenset(self._handlers.keys() - heard)
         for name, subscription in self._subscriptions.items():
             topic = self.topics.get(name)
             gone = f"{name} has no publisher any more; waiting for it to come back"
@@ -336,6 +344,11 @@ class LiveSource:
         """Subscribe, or again where the publishers now offer something else."""
         from rclpy.event_handler import SubscriptionEventCallbacks
 
+        try:
+            kind = message_type(topic.type)
+        except UserError as error:
+            self._note(f"{topic.name} type", f"{topic.name} is not received: {error}", "")
+            return
         qos = matched_qos(topic.publishers, topic.type.rpartition("/")[2])
         former = self._subscriptions.get(topic.name)
         if former is not None:
@@ -344,10 +357,12 @@ class LiveSource:
             self._session.input.destroy_subscription(former.handle)
 
         def receive(data: bytes, info: dict[str, Any]) -> None:
-            self._receive(topic.name, topic.type, data, info)
+            with self._knowledge:
+                self._receive(topic.name, topic.type, data, info)
 
         def count_lost(event: Any) -> None:
-            self.lost[topic.name] += event.total_count_change
+            with self._knowledge:
+                self.lost[topic.name] += event.total_count_change
 
         events = SubscriptionEventCallbacks(
             message_lost=count_lost,
@@ -355,7 +370,7 @@ class LiveSource:
             use_default_callbacks=False,
         )
         handle = self._session.input.create_subscription(
-            message_type(topic.type), topic.name, receive, qos, event_callbacks=events, raw=True
+            kind, topic.name, receive, qos, event_callbacks=events, raw=True
         )
         self._subscriptions[topic.name] = _Subscription(handle, topic.type, qos)
 
