@@ -88,6 +88,7 @@ def _parser() -> argparse.ArgumentParser:
     info.add_argument("paths", nargs="*", type=Path, metavar="PATH", help="bag file or folder")
     info.add_argument("--live", action="store_true", help="a running robot's topics instead of a bag's")
     _add_config(info)
+    _add_ros_args(info)
     info.set_defaults(run=_info)
 
     demo = commands.add_parser(
@@ -145,13 +146,7 @@ def _parser() -> argparse.ArgumentParser:
     output.add_argument(
         "--flight", metavar="TIME", help="what the flight recorder holds (default: 30 s), for 'bevviz snap'"
     )
-    live.add_argument(
-        "--ros-args",
-        nargs=argparse.REMAINDER,
-        default=[],
-        metavar="...",
-        help="the rest is for ROS: remaps, namespace, parameters",
-    )
+    _add_ros_args(live)
     live.set_defaults(run=_live)
 
     snap = commands.add_parser(
@@ -214,6 +209,16 @@ def _add_output(parser: argparse.ArgumentParser, blueprint: str = "debug") -> ar
     return group
 
 
+def _add_ros_args(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--ros-args",
+        nargs=argparse.REMAINDER,
+        default=[],
+        metavar="...",
+        help="the rest is for ROS: remaps, namespace, parameters",
+    )
+
+
 def _positive(text: str) -> int:
     if not text.isdecimal() or int(text) < 1:
         raise argparse.ArgumentTypeError(f"'{text}' is no whole number of 1 or more")
@@ -263,7 +268,7 @@ def _info(options: argparse.Namespace) -> int:
     if options.live:
         from bevviz.ros import info
 
-        print(info.render(info.describe(_load_config(options))))
+        print(info.render(info.describe(_load_config(options), options.ros_args)))
         return 0
     if not options.paths:
         raise UserError("bevviz info: which bag? Give its path, or --live for a running robot")

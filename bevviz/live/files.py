@@ -14,6 +14,7 @@ from bevviz.config import LiveConfig
 from bevviz.errors import UserError
 from bevviz.live.encoder import Encoder, Packet
 from bevviz.live.notes import Notes
+from bevviz.live.output import Output
 
 MEGABYTE = 1_000_000
 INDEXED = 1000 * MEGABYTE  # the index is made in memory; a larger file stays without
@@ -53,7 +54,7 @@ class Indexer:
             indexed.unlink(missing_ok=True)
 
 
-class Saver:
+class Saver(Output):
     """Writes every packet to ``path``, or with a limit of size or time to ``path`` numbered.
 
     A full disk is said once and ends the saving, nothing else; what is on it is cut to whole frames.
@@ -65,6 +66,7 @@ class Saver:
     def __init__(
         self, path: Path, config: LiveConfig, encoder: Encoder, indexer: Indexer, notes: Notes
     ) -> None:
+        super().__init__("file", config.output_queue)
         if path.suffix != ".rrd":  # a slip must not overwrite something else
             raise UserError(f"--save {path}: expected a file name that ends in .rrd")
         self.paths: list[Path] = []
@@ -75,15 +77,19 @@ class Saver:
         self._written = self._whole = 0  # bytes of this part, and up to its last whole packet
         self._started = 0.0
         self._file = -1
-        self._full = False
         try:
             self._open()
         except OSError as error:
             raise UserError(f"{self._next}: cannot write the recording: {error.strerror}") from None
+        self._thread.start()
 
-    def put(self, packet: Packet) -> None:
-        if self._full or (not self._written and not packet.whole):
-            return
+    def close(self) -> None:
+        self._packets.close()
+        self._thread.join()
+        if not self._ended.is_set():
+            self._finish()
+
+    def _take(self, packet: Packet, fresh: bool) -> bool:
         try:
             if packet.whole and self._is_complete(packet):
                 self._finish()
@@ -95,12 +101,9 @@ class Saver:
                 self._whole = self._written
             self._write(packet.data)
         except OSError as error:
-            self._full = True
             self._notes.warn(f"{self._path}: saving ends here, the rest goes on: {error.strerror}")
-
-    def close(self) -> None:
-        if not self._full:
-            self._finish()
+            self._end()
+        return True
 
     @property
     def _next(self) -> Path:

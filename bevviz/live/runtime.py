@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import signal
 import threading
 import time
@@ -22,6 +23,7 @@ from bevviz.live.files import Indexer, Saver
 from bevviz.live.flight import FlightRecorder
 from bevviz.live.health import Health, set_nice
 from bevviz.live.notes import Notes
+from bevviz.live.output import Output
 from bevviz.live.queue import NewestQueue
 from bevviz.live.settings import AT_START, Settings, differences
 from bevviz.live.triggers import Triggers
@@ -118,9 +120,11 @@ class Live:
         if outputs.window:
             programs.append(window())
         self.saver: Saver | None = None
+        self._outputs: list[Output] = []
         if outputs.save is not None:
             self.saver = Saver(outputs.save, live, self._encoder, self._indexer, notes)
-        self._viewers = [Viewer(program, live.viewer_queue, self._encoder, notes) for program in programs]
+            self._outputs.append(self.saver)
+        self._outputs += [Viewer(program, live.output_queue, self._encoder, notes) for program in programs]
 
     @property
     def config(self) -> Config:
@@ -156,6 +160,8 @@ class Live:
             self._thread("log", self._log),
             self._thread("publish", self._publish),
         ]
+        gc.collect()
+        gc.freeze()  # what is there by now stays; looking through it takes tens of milliseconds each time
         with ExitStack() as stack:
             stack.callback(self._close, threads)
             stack.enter_context(Control(self.save))
@@ -215,11 +221,9 @@ class Live:
         self._incoming.close()  # whatever the source does
         for thread in threads[1:]:
             thread.join(PATIENCE)
-        for viewer in self._viewers:
-            viewer.close()
+        for output in self._outputs:
+            output.close()
         self._saves.shutdown()
-        if self.saver is not None:
-            self.saver.close()
         self._indexer.close()
         self._encoder.close()
         if self._pipeline is not None:
@@ -268,11 +272,9 @@ class Live:
             packet = self._encoder.encode(
                 result, config, self._source.scene, self.health.scalars() | drops, self.notes.take()
             )
-            for viewer in self._viewers:
-                viewer.put(packet)
+            for output in self._outputs:
+                output.put(packet)
             self.flight.put(packet)
-            if self.saver is not None:
-                self.saver.put(packet)
             self.health.logged(result.frame.received)
             self.frames += 1
             if reason := self._triggers.check(result):
@@ -295,8 +297,8 @@ class Live:
         drops |= {"incoming": self._incoming.dropped, "logging": self._results.dropped}
         if self._on_result is not None:
             drops["publishing"] = self._published.dropped
-        for viewer in self._viewers:
-            drops[viewer.name] = drops.get(viewer.name, 0) + viewer.dropped
+        for output in self._outputs:
+            drops[output.name] = drops.get(output.name, 0) + output.dropped
         return drops
 
     # --- the flight recorder -------------------------------------------------------------------

@@ -7,7 +7,14 @@ from pathlib import Path
 
 from bevviz.config import Config, Preset, keys, load
 
-AT_START = ("source.", "sync.", "live.log_queue", "live.viewer_", "live.split_")  # fixed once it runs
+AT_START = (
+    "source.",
+    "sync.",
+    "live.log_queue",
+    "live.output_queue",
+    "live.viewer_memory",
+    "live.split_",
+)  # fixed once it runs
 
 
 class Settings:

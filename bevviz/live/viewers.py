@@ -5,7 +5,6 @@ from __future__ import annotations
 import socket
 import subprocess
 import sys
-import threading
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -13,7 +12,7 @@ from dataclasses import dataclass
 from bevviz.live.encoder import Encoder, Packet
 from bevviz.live.files import rerun_binary
 from bevviz.live.notes import Notes
-from bevviz.live.queue import NewestQueue
+from bevviz.live.output import Output
 from bevviz.logging.logger import Context
 from bevviz.logging.sinks import answers, check_port, check_viewer, free_port, viewer_address
 
@@ -69,28 +68,15 @@ def remote(url: str, recording_id: str) -> Program:
     return Program("remote", command, framed=True, is_ready=lambda: answers(host, port))
 
 
-class Viewer:
-    """Feeds one program. Packets that it is too slow for are left out and counted.
-
-    After a gap it goes on at a packet that needs none before it.
-    """
+class Viewer(Output):
+    """Feeds one program."""
 
     def __init__(self, program: Program, queue: int, encoder: Encoder, notes: Notes) -> None:
-        self.name = program.name
+        super().__init__(program.name, queue)
         self._program = program
         self._encoder, self._notes = encoder, notes
-        self._packets: NewestQueue[Packet] = NewestQueue(queue)
-        self._ended = threading.Event()
         self._process = self._start()
-        self._thread = threading.Thread(target=self._feed, name=self.name, daemon=True)
         self._thread.start()
-
-    @property
-    def dropped(self) -> int:
-        return self._packets.dropped
-
-    def put(self, packet: Packet) -> None:
-        self._packets.put(packet)
 
     def close(self, patience: float = 2.0) -> None:
         """Hand over what waits, if that is soon done. A window stays open, for the user to close."""
@@ -113,47 +99,40 @@ class Viewer:
             start_new_session=True,  # Ctrl-C is for us alone
         )
 
-    def _feed(self) -> None:
+    def _run(self) -> None:
         self._begin(self._encoder.context)
-        dropped, in_step = 0, False
-        for packet in self._packets:
-            if self._ended.is_set():
-                return
-            in_step = in_step and dropped == self.dropped
-            dropped = self.dropped
-            if not (in_step or packet.whole):
-                continue
-            if not in_step:
-                in_step = self._send(self._encoder.prelude(packet.context, blueprint=False))
-            in_step = in_step and self._send(packet.data)
-            if not in_step and not self._recover(packet):
-                return
-        self._close_input()
+        super()._run()
+        assert self._process.stdin is not None
+        with suppress(OSError):
+            self._process.stdin.close()
+
+    def _take(self, packet: Packet, fresh: bool) -> bool:
+        if fresh and not self._send(self._encoder.prelude(packet.context, blueprint=False)):
+            return self._recover(packet.context)
+        return self._send(packet.data) or self._recover(packet.context)
 
     def _begin(self, context: Context) -> bool:
         if self._program.framed and not self._send(self._encoder.header):
             return False
         return self._send(self._encoder.prelude(context))
 
-    def _recover(self, packet: Packet) -> bool:
-        """Wait for the viewer to come back. False: it need not."""
+    def _recover(self, context: Context) -> bool:
+        """Wait for the viewer to come back, unless the user has closed it. Always after a gap."""
         if self._ended.is_set():
             return False
         if not self._program.lasting:
             self._notes.info("the viewer was closed; the rest goes on")
-            self._packets.close()
+            self._end()
             return False
-        self._notes.warn(
-            f"the {self.name} viewer is gone; trying again every {RETRY:.0f} s, the rest goes on"
-        )
+        self._notes.warn(f"the {self.name} viewer is gone; tried again every {RETRY:.0f} s, the rest goes on")
         while not self._ended.wait(RETRY):
             if not self._program.is_ready():
                 continue
             self._process.wait()
             self._process = self._start()
-            if self._begin(packet.context):
+            if self._begin(context):
                 self._notes.info(f"the {self.name} viewer is back")
-                return True
+                break
         return False
 
     def _send(self, data: bytes) -> bool:
@@ -166,8 +145,3 @@ class Viewer:
         except OSError:
             return False
         return True
-
-    def _close_input(self) -> None:
-        assert self._process.stdin is not None
-        with suppress(OSError):
-            self._process.stdin.close()
