@@ -218,6 +218,16 @@ def test_every_and_frames(tmp_path: Path) -> None:
         assert source.total == len(list(source)) == 6
 
 
+def test_the_scan_at_a_time(tmp_path: Path) -> None:
+    bag = make(tmp_path)
+    for time, number in (("0", 0), ("1.04", 10), ("1.07", 11), ("2.9", 29)):
+        (frame,) = frames_of(bag, at=time)
+        assert scans([frame]) == [number] == [frame.index]
+        assert frame.world_from_points is not None
+    with pytest.raises(UserError, match="outside the recording"):
+        frames_of(bag, at="77")
+
+
 @settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
     every=st.integers(1, 8),

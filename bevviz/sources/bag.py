@@ -37,6 +37,7 @@ class BagSource:
         end: log time to stop at.
         every: only each N-th scan becomes a frame; the others are not decoded.
         frames: only scans A to B - 1 of those between ``start`` and ``end``, as in a Python slice.
+        at: only the scan whose log time is nearest to this time, numbered as in the whole recording.
 
     Raises:
         UserError: no bag, nothing in it, no LiDAR, or nothing in the part asked for.
@@ -51,6 +52,7 @@ class BagSource:
         end: str | None = None,
         every: int = 1,
         frames: tuple[int | None, int | None] | None = None,
+        at: str | None = None,
     ) -> None:
         self.config = config
         self.recording = Recording(paths)
@@ -59,6 +61,9 @@ class BagSource:
             self._driver = self._find_driver()
             self._low = self._time(start, self.recording.start)
             self._high = self._time(end, self.recording.end + 1)
+            self._first = 0  # number of the first scan that is read
+            if at is not None:
+                self._narrow(self._time(at, 0))
             self._chosen = self._choose(every, frames or (None, None))
         except BaseException:
             self.close()
@@ -127,7 +132,7 @@ class BagSource:
                 if number == self._chosen[-1]:
                     stop = message.received + MARGIN
                 with suppress(MessageError):  # told when the scan is decoded
-                    numbers[message.header()[0] or message.received] = number
+                    numbers[message.header()[0] or message.received] = self._first + number
             elif message.topic in self.roles.lidars and not (
                 number in self._chosen or number + 1 in self._chosen
             ):
@@ -196,6 +201,13 @@ class BagSource:
                 f"{text} is outside the recording, which has {(end - start) / SECOND:.1f} s from {iso(start)}"
             )
         return time
+
+    def _narrow(self, time: int) -> None:
+        """Read the scan nearest to ``time`` alone."""
+        times = self.recording.times(self._driver)
+        self._first = int(np.abs(times - time).argmin())
+        self._low = int(times[self._first])
+        self._high = self._low + 1
 
     def _choose(self, every: int, frames: tuple[int | None, int | None]) -> range:
         times = self.recording.times(self._driver)

@@ -1,0 +1,50 @@
+"""The command line: parse, call, print. Imports are inside the commands, so that --help is instant."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+from collections.abc import Callable, Sequence
+
+from bevviz import __version__
+from bevviz.cli import bag, config, demo, info, live
+from bevviz.errors import UserError
+
+EPILOG = """examples:
+  bevviz demo                                 the synthetic drive, in the viewer
+  bevviz info drive.mcap                      what is in a bag, and what is missing for a full run
+  bevviz bag drive.mcap --model yolo11n.onnx  run the pipeline over a bag, in the viewer
+  bevviz bag drive.mcap --save drive.rrd      the same, saved to send with a bug report
+  bevviz live --model yolo11n.onnx --serve    the same beside a running robot, in a browser
+  bevviz snap                                 save what it saw in the last 30 seconds
+  bevviz config --preset reference            every parameter, with its unit and meaning
+"""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run bevviz. Returns the exit status: 0 done, 1 nothing made, 2 wrong input, 130 interrupted."""
+    options = _parser().parse_args(arguments)
+    run: Callable[[argparse.Namespace], int] = options.run
+    try:
+        return run(options)
+    except UserError as error:
+        print(f"bevviz: error: {error}", file=sys.stderr)
+        return 2
+    except BrokenPipeError:  # the reader of our output has gone, as in `bevviz info bag | head`
+        sys.stdout = open(os.devnull, "w")  # noqa: SIM115, PTH123
+        return 0
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="bevviz",
+        description="See what a LiDAR-camera perception pipeline saw, made and decided, in Rerun.",
+        epilog=EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("--version", action="version", version=f"bevviz {__version__}")
+    commands = parser.add_subparsers(required=True, metavar="COMMAND")
+    for command in (bag, info, demo, live, config):
+        command.add(commands)
+    return parser

@@ -1,0 +1,5 @@
+import sys
+
+from bevviz.cli import main
+
+sys.exit(main())

@@ -1,0 +1,27 @@
+"""``bevviz bag``."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from bevviz.cli.options import Commands, add_bag, add_config, add_output, add_selection, load_config, open_bag
+from bevviz.cli.run import process
+
+
+def add(commands: Commands) -> None:
+    bag = commands.add_parser(
+        "bag",
+        help="run the pipeline over a recorded bag",
+        description="Run the pipeline over a bag: MCAP, sqlite3 (.db3) or ROS 1 (.bag), compressed or not.",
+    )
+    add_selection(add_bag(bag))
+    add_config(bag)
+    add_output(bag)
+    bag.set_defaults(run=_bag)
+
+
+def _bag(options: argparse.Namespace) -> int:
+    config = load_config(options)
+    with open_bag(options, config) as source:
+        return process(source, config, options, Path(options.paths[0].stem + ".rrd"))

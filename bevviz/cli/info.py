@@ -1,0 +1,36 @@
+"""``bevviz info``."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from bevviz.cli.options import Commands, add_config, add_ros_args, load_config
+from bevviz.errors import UserError
+
+
+def add(commands: Commands) -> None:
+    info = commands.add_parser(
+        "info",
+        help="what is in a bag, and what is missing for a full run",
+        description="Topics, rates, gaps and frames of a bag, the role of each topic, and what is missing.",
+    )
+    info.add_argument("paths", nargs="*", type=Path, metavar="PATH", help="bag file or folder")
+    info.add_argument("--live", action="store_true", help="a running robot's topics instead of a bag's")
+    add_config(info)
+    add_ros_args(info)
+    info.set_defaults(run=_info)
+
+
+def _info(options: argparse.Namespace) -> int:
+    from bevviz.sources.info import describe, render
+
+    if options.live:
+        from bevviz.ros import info
+
+        print(info.render(info.describe(load_config(options), options.ros_args)))
+        return 0
+    if not options.paths:
+        raise UserError("bevviz info: which bag? Give its path, or --live for a running robot")
+    print(render(describe(options.paths, load_config(options))))
+    return 0

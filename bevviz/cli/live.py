@@ -1,0 +1,189 @@
+"""``bevviz live`` and ``bevviz snap``."""
+
+from __future__ import annotations
+
+import argparse
+import os
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from bevviz.cli.options import Commands, add_config, add_output, add_ros_args, positive
+from bevviz.cli.run import has_display, say, terminable
+
+if TYPE_CHECKING:
+    from bevviz.config import Config
+    from bevviz.frame import FrameResult
+    from bevviz.live import Live, Notes, Settings, Status
+    from bevviz.sources import Source
+    from bevviz.sources.live import LiveSource
+    from bevviz.sources.replay import Replay
+
+
+def add(commands: Commands) -> None:
+    live = commands.add_parser(
+        "live",
+        help="run the pipeline beside a robot",
+        description="Run the pipeline on a running ROS 2 graph. It is never behind: the newest frame wins.",
+    )
+    choice = live.add_argument_group("what to run")
+    choice.add_argument("--model", metavar="FILE.onnx", help="detector: YOLOv5, v8, v10, 11, 26 or YOLOX")
+    choice.add_argument(
+        "--observe", action="store_true", help="no pipeline: show only what the robot itself publishes"
+    )
+    choice.add_argument(
+        "--publish", action="store_true", help="publish the results, as the nodes of the tutorial do"
+    )
+    choice.add_argument("--every", metavar="N", help="run each N-th scan only")
+    choice.add_argument("--max-rate", metavar="HZ", help="frames a second at most")
+    choice.add_argument("--points", metavar="N", help="points kept of each scan")
+    choice.add_argument("--nice", metavar="0..19", help="priority given up to other processes")
+    choice.add_argument(
+        "--synthetic",
+        nargs="?",
+        type=positive,
+        const=30,
+        metavar="N",
+        help="instead of a robot N scans of the synthetic drive, forth and back (default: 30)",
+    )
+    add_config(live)
+    output = add_output(live, blueprint="live")
+    output.add_argument(
+        "--split", type=_split, metavar="SIZE|TIME", help="--save in parts, e.g. 500MB or 10min"
+    )
+    output.add_argument(
+        "--bind", default="127.0.0.1", metavar="ADDRESS", help="--serve at this address (0.0.0.0: at all)"
+    )
+    output.add_argument(
+        "--flight", metavar="TIME", help="what the flight recorder holds (default: 30 s), for 'bevviz snap'"
+    )
+    add_ros_args(live)
+    live.set_defaults(run=_live)
+
+    snap = commands.add_parser(
+        "snap",
+        help="save the last seconds of a running 'bevviz live'",
+        description="Have a running 'bevviz live' save its flight recorder. SIGUSR1 does the same.",
+    )
+    snap.add_argument("path", nargs="?", type=Path, metavar="FILE.rrd", help="default: named by the time")
+    snap.add_argument("--pid", type=int, metavar="PID", help="which process, where several run")
+    snap.set_defaults(run=_snap)
+
+
+def _split(text: str) -> str:
+    """The setting that is meant."""
+    return f"live.split_{'size' if text.strip().endswith('B') else 'time'}={text}"
+
+
+def _live(options: argparse.Namespace) -> int:
+    # What Rerun would warn of is meant: files are indexed when they are complete.
+    os.environ.setdefault("RUST_LOG", "warn,re_log_encoding=error")
+    from bevviz.live import Notes, Settings
+
+    given = {
+        "detector.model": options.model,
+        "live.every": options.every,
+        "live.max_rate": options.max_rate,
+        "live.points": options.points,
+        "live.nice": options.nice,
+        "live.flight_time": options.flight,
+    }
+    more = [f"{key}={value}" for key, value in given.items() if value is not None]
+    if options.split is not None:
+        more.append(options.split)
+    settings = Settings(options.config, [*options.set, *more], options.preset)
+    notes = Notes(say)
+    with terminable():
+        if options.synthetic:
+            return _watch(_replay(options.synthetic), settings, options, notes)
+        from bevviz.sources.live import LiveSource
+
+        with LiveSource(settings.config, arguments=options.ros_args, tell=notes.info) as source:
+            return _watch_robot(source, settings, options, notes)
+
+
+def _watch_robot(source: LiveSource, settings: Settings, options: argparse.Namespace, notes: Notes) -> int:
+    """Publish back and take orders, as far as that is asked for."""
+    from bevviz.ros.orders import Orders
+    from bevviz.ros.publish import Publisher
+
+    said = ""
+    with suppress(KeyboardInterrupt):
+        while not source.wait(1.0):
+            if source.missing != said:
+                said = source.missing
+                say(f"waiting: {said}")
+    if not source.wait(0):
+        return 1
+    publisher = Publisher(source.node, settings.config, notes.warn) if options.publish else None
+
+    def follow(live: Live) -> Callable[[Config], None]:
+        orders = Orders(source.node, live.config, live.update, live.save)
+
+        def show(config: Config) -> None:
+            orders.show(config)
+            if publisher is not None:
+                publisher.configure(config)
+
+        return show
+
+    return _watch(source, settings, options, notes, publisher.publish if publisher else None, follow)
+
+
+def _replay(frames: int) -> Replay:
+    from tqdm import tqdm
+
+    from bevviz.sources.replay import Replay
+    from bevviz.sources.synthetic import SyntheticSource
+
+    source = SyntheticSource(frames=frames)
+    drive = list(tqdm(source, total=source.total, unit="scan", desc="simulate", disable=None))
+    return Replay(drive, source.scene)
+
+
+def _watch(
+    source: Source,
+    settings: Settings,
+    options: argparse.Namespace,
+    notes: Notes,
+    on_result: Callable[[FrameResult], None] | None = None,
+    follow: Callable[[Live], Callable[[Config], None]] | None = None,
+) -> int:
+    """The live run, until the source ends or the user ends it."""
+    from tqdm import tqdm
+
+    from bevviz.live import Live, Outputs
+
+    window = options.viewer
+    unsaid = options.save is None and options.serve is None and options.connect is None and not window
+    window = window or (unsaid and has_display())
+    connect = [options.connect] if options.connect else []
+    outputs = Outputs(options.save, window, options.serve, options.bind, connect, options.blueprint)
+    live = Live(source, settings, outputs, notes, observe=options.observe, on_result=on_result)
+    if follow is not None:
+        live.on_change = follow(live)
+    for url in live.urls:
+        say(f"viewer at {url}")
+    if unsaid and not window:
+        say("no display: 'bevviz snap' saves the last seconds, --serve shows them in a browser")
+    with suppress(KeyboardInterrupt), tqdm(unit="frame", desc=source.scene.name, disable=None) as bar:
+
+        def show(status: Status) -> None:
+            bar.set_postfix_str(f"{1e3 * status.p50:.0f} ms, {sum(status.drops.values())} dropped", False)
+            bar.update(status.frames - bar.n)
+
+        live.run(show)
+    for warning in source.warnings:
+        say(f"warning: {warning}")
+    where = live.saver.paths if live.saver is not None else []
+    target = f" in {where[0]}" + (f" and {len(where) - 1} more" if where[1:] else "") if where else ""
+    say(f"{live.frames} frames{target}, {sum(live.status.drops.values())} dropped")
+    return 0 if live.frames else 1
+
+
+def _snap(options: argparse.Namespace) -> int:
+    from bevviz.live.control import snap
+
+    print(snap(options.path, options.pid))
+    return 0

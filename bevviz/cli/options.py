@@ -1,0 +1,130 @@
+"""Options that several commands share."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING, TypeAlias
+
+if TYPE_CHECKING:
+    from bevviz.config import Config
+    from bevviz.sources.bag import BagSource
+
+Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
+
+
+TIMES = """A time is in seconds from the start of the bag (12.5), since 1970 (1700000000.0) or
+ISO 8601 (2026-11-21T10:00:00)."""
+
+
+def add_bag(parser: argparse.ArgumentParser) -> argparse._ArgumentGroup:
+    """The bag and the detector. Returns the group that says what of it is run."""
+    parser.formatter_class = argparse.RawDescriptionHelpFormatter
+    parser.epilog = f"{parser.epilog}\n\n{TIMES}" if parser.epilog else TIMES
+    parser.add_argument(
+        "paths", nargs="+", type=Path, metavar="PATH", help="bag file or folder; several are one drive"
+    )
+    group = parser.add_argument_group("what to run")
+    group.add_argument("--model", metavar="FILE.onnx", help="detector: YOLOv5, v8, v10, 11, 26 or YOLOX")
+    return group
+
+
+def add_selection(group: argparse._ArgumentGroup) -> None:
+    """Which of its frames."""
+    group.add_argument("--start", metavar="TIME", help="skip what is before this time")
+    group.add_argument("--end", metavar="TIME", help="stop at this time")
+    group.add_argument("--every", type=positive, default=1, metavar="N", help="run each N-th scan only")
+    group.add_argument("--frames", type=slice_, metavar="A:B", help="run scans A to B-1, counted from 0")
+
+
+def open_bag(options: argparse.Namespace, config: Config) -> BagSource:
+    """What ``add_bag`` and ``add_selection`` ask for."""
+    from bevviz.sources.bag import BagSource
+
+    return BagSource(
+        options.paths,
+        config,
+        start=options.start,
+        end=options.end,
+        every=options.every,
+        frames=options.frames,
+    )
+
+
+def add_config(parser: argparse.ArgumentParser) -> None:
+    group = parser.add_argument_group("configuration")
+    group.add_argument(
+        "--preset", choices=("default", "reference"), help="reference: as the ROS 2 tutorial pipeline"
+    )
+    group.add_argument("--config", type=Path, metavar="FILE", help="YAML, as 'bevviz config' prints it")
+    group.add_argument(
+        "--set",
+        action="append",
+        default=[],
+        metavar="KEY=VALUE",
+        help="one parameter, e.g. clustering.eps='60 cm'",
+    )
+
+
+def add_output(parser: argparse.ArgumentParser, blueprint: str = "debug") -> argparse._ArgumentGroup:
+    group = parser.add_argument_group(
+        "output", "The viewer, where there is a display. Several can be given at once."
+    )
+    group.add_argument("--save", type=Path, metavar="FILE.rrd", help="save the recording, blueprint included")
+    group.add_argument(
+        "--serve",
+        nargs="?",
+        type=port,
+        const=9090,
+        metavar="PORT",
+        help="web viewer on this machine (default: 9090)",
+    )
+    group.add_argument(
+        "--connect", metavar="URL", help="a viewer elsewhere, e.g. rerun+http://laptop:9876/proxy"
+    )
+    group.add_argument("--viewer", action="store_true", help="open the viewer, beside the other outputs")
+    group.add_argument(
+        "--blueprint",
+        default=blueprint,
+        metavar="NAME|FILE",
+        help=f"layout: debug, live, bug_report, a .py or a .rbl (default: {blueprint})",
+    )
+    return group
+
+
+def add_ros_args(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--ros-args",
+        nargs=argparse.REMAINDER,
+        default=[],
+        metavar="...",
+        help="the rest is for ROS: remaps, namespace, parameters",
+    )
+
+
+def load_config(options: argparse.Namespace) -> Config:
+    """The configuration asked for, ``--model`` included."""
+    from bevviz.config import load
+
+    model = getattr(options, "model", None)
+    more = [f"detector.model={model}"] if model else []
+    return load(options.config, [*options.set, *more], options.preset)
+
+
+def positive(text: str) -> int:
+    if not text.isdecimal() or int(text) < 1:
+        raise argparse.ArgumentTypeError(f"'{text}' is no whole number of 1 or more")
+    return int(text)
+
+
+def port(text: str) -> int:
+    if not text.isdecimal() or not 0 < int(text) < 65535:
+        raise argparse.ArgumentTypeError(f"'{text}' is no port (1 to 65534)")
+    return int(text)
+
+
+def slice_(text: str) -> tuple[int | None, int | None]:
+    first, colon, last = text.partition(":")
+    if not colon or not all(part == "" or part.isdecimal() for part in (first, last)):
+        raise argparse.ArgumentTypeError(f"'{text}' is not A:B, for example 100:200, 100: or :50")
+    return (int(first) if first else None, int(last) if last else None)

@@ -1,0 +1,106 @@
+"""What the commands share while they run."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import signal
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, NoReturn
+
+if TYPE_CHECKING:
+    from bevviz.config import Config
+    from bevviz.sources import Source
+
+
+def process(source: Source, config: Config, options: argparse.Namespace, default: Path) -> int:
+    """Run the pipeline over the source into every output that was asked for."""
+    from tqdm import tqdm
+
+    from bevviz.logging.logger import Logger
+    from bevviz.logging.sinks import open_recording
+    from bevviz.pipeline import Pipeline
+    from bevviz.sources.prefetch import prefetch
+
+    save, viewer = options.save, options.viewer
+    unsaid = save is None and options.serve is None and options.connect is None and not viewer
+    if unsaid and has_display():
+        viewer = True
+    elif unsaid:
+        save = default
+
+    frames = 0
+    interrupted = False
+    with (
+        Pipeline(config) as pipeline,
+        open_recording(
+            source.scene,
+            config,
+            save=save,
+            serve=options.serve,
+            connect=options.connect,
+            spawn=viewer,
+            blueprint=options.blueprint,
+        ) as sinks,
+    ):
+        if unsaid and not viewer:
+            say(f"no display: saving {save} (--serve shows it in a browser)")
+        for url in sinks.urls:
+            say(f"viewer at {url}")
+        if source.scene.cameras and not config.detector.model:
+            say("no detector: give --model FILE.onnx to find objects in the images")
+        logger = Logger(sinks.recording, config, source.scene)
+        logger.log_static()
+        try:
+            with (
+                terminable(),
+                tqdm(total=source.total, unit="frame", desc=source.scene.name, disable=None) as bar,
+            ):
+                for frame in prefetch(source, 2):
+                    logger.log(pipeline.run(frame))
+                    frames += 1
+                    bar.update()
+        except KeyboardInterrupt:
+            interrupted = True
+        for warning in source.warnings:
+            say(f"warning: {warning}")
+        if options.serve is not None and frames and not interrupted:
+            say(f"{frames} frames; serving until Ctrl-C")
+            sinks.recording.flush()
+            wait_for_interrupt()
+    target = f" in {save}" if save is not None else ""
+    if interrupted:
+        say(f"interrupted after {frames} frames; what was made until then is complete{target}")
+        return 130
+    say(f"{frames} frames{target}")
+    return 0 if frames else 1
+
+
+def say(line: str) -> None:
+    print(f"bevviz: {line}", file=sys.stderr)
+
+
+def has_display() -> bool:
+    return sys.platform != "linux" or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+
+
+@contextmanager
+def terminable() -> Iterator[None]:
+    """SIGTERM ends a run as Ctrl-C does: with a readable recording."""
+
+    def interrupt(number: int, stack: object) -> NoReturn:
+        raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGTERM, interrupt)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+def wait_for_interrupt() -> None:
+    with suppress(KeyboardInterrupt), terminable():
+        signal.pause()
