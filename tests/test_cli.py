@@ -281,7 +281,7 @@ def test_an_interrupted_run_leaves_a_readable_recording(tmp_path: Path, number: 
             break
         time.sleep(0.1)
     run.send_signal(number)
-    _, said = run.communicate(timeout=60)
+    _, said = run.communicate(timeout=180)
     assert run.returncode == 130
     assert "interrupted after" in said
     assert "Traceback" not in said

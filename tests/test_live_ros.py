@@ -255,6 +255,25 @@ def test_made_types_meet_compiled_ones(pair: tuple[Session, Session]) -> None:
     assert len(hashes) == 1, "type hashes differ"
 
 
+@pytest.mark.parametrize(
+    ("name", "generated"),
+    [
+        ("tf2_msgs/msg/TFMessage", "e369d0f05a23ae52508854b66f6aa0437f3449d652e8cbf22d5abe85d020f087"),
+        (
+            "vision_msgs/msg/Detection2DArray",
+            "214274120007f4a683866481336b70310268cfa107aebe9d594a6acf75bda968",
+        ),
+        (
+            "vision_msgs/msg/Detection3DArray",
+            "793f5eab9595ac1c0da07873cc859db42eae51f0ee76056db8562515d830e018",
+        ),
+    ],
+)
+def test_hashes_are_those_of_the_packages(name: str, generated: str) -> None:
+    """By rosidl's own generator, from the .msg files that Jazzy ships."""
+    assert typestore().hash_rihs01(name) == f"RIHS01_{generated}"
+
+
 def test_unknown_type_without_its_package() -> None:
     with pytest.raises(UserError, match="install no_such_msgs"):
         typesupport.message_type("no_such_msgs/msg/Thing")
