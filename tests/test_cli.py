@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,8 @@ import numpy as np
 import pytest
 
 from bevviz.cli import main
+from bevviz.frame import Frame, FrameResult
+from bevviz.pipeline import Pipeline
 from tests import bags
 from tests.recordings import Recording
 
@@ -286,6 +289,24 @@ def test_an_interrupted_run_leaves_a_readable_recording(tmp_path: Path, number: 
     assert "interrupted after" in said
     assert "Traceback" not in said
     assert 0 < len(Recording(saved).rows["/bev"]) < 500
+
+
+def test_an_interrupt_that_gets_lost_in_a_library(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capture
+) -> None:
+    run = Pipeline.run
+
+    def deaf(self: Pipeline, frame: Frame) -> FrameResult:
+        if frame.index == 3:
+            with suppress(KeyboardInterrupt):
+                os.kill(os.getpid(), signal.SIGTERM)
+        return run(self, frame)
+
+    monkeypatch.setattr(Pipeline, "run", deaf)
+    small_bag(scans=40)
+    assert main(["bag", "drive", "--save", "out.rrd"]) == 130
+    assert "interrupted after 4 frames" in capsys.readouterr().err
+    assert len(Recording(tmp_path / "out.rrd").rows["/bev"]) == 4
 
 
 def environment() -> dict[str, str]:

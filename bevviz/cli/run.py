@@ -9,6 +9,7 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from threading import Event
 from typing import TYPE_CHECKING, NoReturn
 
 if TYPE_CHECKING:
@@ -56,13 +57,15 @@ def process(source: Source, config: Config, options: argparse.Namespace, default
         logger.log_static()
         try:
             with (
-                terminable(),
+                terminable() as ended,
                 tqdm(total=source.total, unit="frame", desc=source.scene.name, disable=None) as bar,
             ):
                 for frame in prefetch(source, 2):
                     logger.log(pipeline.run(frame))
                     frames += 1
                     bar.update()
+                    if ended.is_set():
+                        raise KeyboardInterrupt
         except KeyboardInterrupt:
             interrupted = True
         for warning in source.warnings:
@@ -88,17 +91,24 @@ def has_display() -> bool:
 
 
 @contextmanager
-def terminable() -> Iterator[None]:
-    """SIGTERM ends a run as Ctrl-C does: with a readable recording."""
+def terminable() -> Iterator[Event]:
+    """SIGTERM ends a run as Ctrl-C does: with a readable recording.
+
+    Both raise KeyboardInterrupt and set the event: an exception that comes while a library calls back
+    into Python can get lost there.
+    """
+    ended = Event()
 
     def interrupt(number: int, stack: object) -> NoReturn:
+        ended.set()
         raise KeyboardInterrupt
 
-    before = signal.signal(signal.SIGTERM, interrupt)
+    before = {number: signal.signal(number, interrupt) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
-        yield
+        yield ended
     finally:
-        signal.signal(signal.SIGTERM, before)
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 def wait_for_interrupt() -> None:
