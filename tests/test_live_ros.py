@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import os
 import random
+import signal
 import subprocess
+import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -24,6 +27,7 @@ from bevviz.sources.messages import decode_cloud, decode_detections_2d, decode_d
 from bevviz.sources.synthetic import SyntheticSource
 from bevviz.sources.synthetic.bag import TOPICS
 from bevviz.sources.synthetic.drive import LIDAR_TOPIC, TRUTH_TOPIC
+from tests.recordings import Recording, verify
 from tests.ros_player import Play
 
 pytest.importorskip("rclpy", reason="needs rclpy: pip install 'bevviz[ros]'")
@@ -31,6 +35,7 @@ pytest.importorskip("rclpy", reason="needs rclpy: pip install 'bevviz[ros]'")
 from bevviz.ros import info, typesupport
 from bevviz.ros.orders import Orders
 from bevviz.ros.publish import BEV, CLUSTERS, DETECTIONS, FUSED, OBSTACLES, Publisher
+from bevviz.ros.publish import TOPICS as TOPICS_PUBLISHED
 from bevviz.ros.session import Session
 from bevviz.sources.live import LiveSource
 
@@ -350,7 +355,7 @@ def test_results_are_published_for_others_but_not_for_us(result: FrameResult) ->
 # --- orders ------------------------------------------------------------------------------------
 
 
-def _call(node: Any, client: Any, request: Any) -> Any:
+def call(node: Any, client: Any, request: Any) -> Any:
     assert client.wait_for_service(PATIENCE)
     answer = client.call_async(request)
     until(answer.done, "an answer")
@@ -383,7 +388,7 @@ def test_parameters_and_the_saving_of_the_recording(pair: tuple[Session, Session
 
     def set_to(name: str, value: Any) -> Any:
         request = SetParameters.Request(parameters=[Parameter(name, value=value).to_parameter_msg()])
-        return _call(operator.node, client, request).results[0]
+        return call(operator.node, client, request).results[0]
 
     assert robot.node.get_parameter("range_x").value == 10.0
     assert set_to("range_x", 25).successful  # an integer, as `ros2 param set` makes of it
@@ -406,11 +411,61 @@ def test_parameters_and_the_saving_of_the_recording(pair: tuple[Session, Session
     assert len(ordered) == 3, "what is shown is no order"
 
     trigger = operator.node.create_client(Trigger, "/one/save_recording")
-    answer = _call(operator.node, trigger, Trigger.Request())
+    answer = call(operator.node, trigger, Trigger.Request())
     assert (answer.success, answer.message) == (True, "/tmp/robot.rrd")
     full = True
-    answer = _call(operator.node, trigger, Trigger.Request())
+    answer = call(operator.node, trigger, Trigger.Request())
     assert (answer.success, answer.message) == (False, "no space left in /tmp")
+
+
+def test_the_command_beside_a_robot(robot: str, tmp_path: Path) -> None:
+    from rcl_interfaces.srv import SetParameters
+    from rclpy.parameter import Parameter
+    from std_srvs.srv import Trigger
+
+    environment = {k: v for k, v in os.environ.items() if k not in ("DISPLAY", "WAYLAND_DISPLAY")}
+    environment |= {"PYTHONPATH": str(Path(__file__).parents[1]), "XDG_RUNTIME_DIR": str(tmp_path)}
+    command = [sys.executable, "-m", "bevviz.cli", "live", "--publish", "--save", "all.rrd"]
+    command += ["--preset", "reference", "--ros-args", "-p", "range_x:=12.0", "-r", f"{BEV}:=/seen"]
+    run = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, cwd=tmp_path, env=environment)
+    heard: dict[str, list[Any]] = {"/seen": [], CLUSTERS: []}
+    try:
+        with Session(name="operator") as operator:
+            operator.start()
+            node = operator.node
+            for topic, kind in (("/seen", TOPICS_PUBLISHED[BEV]), (CLUSTERS, TOPICS_PUBLISHED[CLUSTERS])):
+                node.create_subscription(
+                    typesupport.message_type(kind),
+                    topic,
+                    lambda data, topic=topic, kind=kind: heard[topic].append(
+                        typestore().deserialize_cdr(data, kind)
+                    ),
+                    10,
+                    raw=True,
+                )
+            until(lambda: all(heard.values()) or run.poll() is not None, "results on the graph")
+            assert {(m.height, m.width, m.encoding) for m in heard["/seen"]} == {(480, 400, "bgr8")}
+            assert {m.header.frame_id for m in heard[CLUSTERS]} == {"rslidar"}
+
+            change = SetParameters.Request(parameters=[Parameter("range_x", value=6.0).to_parameter_msg()])
+            client = node.create_client(SetParameters, "/bevviz/set_parameters")
+            assert call(node, client, change).results[0].successful
+            until(lambda: heard["/seen"][-1].height == 240, "an image of the new range")
+
+            client = node.create_client(Trigger, "/bevviz/save_recording")
+            answer = call(node, client, Trigger.Request())
+            assert answer.success, answer.message
+    finally:
+        run.send_signal(signal.SIGTERM)
+        _, said = run.communicate(timeout=60)
+    assert run.returncode == 0, said
+    assert "configuration: bev.range_x 12.0 -> 6.0" in said and "Traceback" not in said
+    for path in (tmp_path / "all.rrd", tmp_path / answer.message):
+        verify(path)
+        recording = Recording(path)
+        assert len(recording.rows["/bev"]) > 1
+        configs = recording.static["/config"] or recording.rows["/config"]
+        assert "range_x" in str(configs)
 
 
 def test_parameters_of_the_command_line() -> None:

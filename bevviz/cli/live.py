@@ -80,6 +80,7 @@ def _live(options: argparse.Namespace) -> int:
     # What Rerun would warn of is meant: files are indexed when they are complete.
     os.environ.setdefault("RUST_LOG", "warn,re_log_encoding=error")
     from bevviz.live import Notes, Settings
+    from bevviz.logging.sinks import check_port
 
     given = {
         "detector.model": options.model,
@@ -93,6 +94,8 @@ def _live(options: argparse.Namespace) -> int:
     if options.split is not None:
         more.append(options.split)
     settings = Settings(options.config, [*options.set, *more], options.preset)
+    if options.serve is not None:
+        check_port(options.serve)  # before a robot is waited for
     notes = Notes(say)
     with terminable():
         if options.synthetic:

@@ -32,8 +32,8 @@ def describe(config: Config, arguments: Sequence[str] = (), seconds: float = 3.0
     Raises:
         UserError: no working rclpy, or arguments that it refuses.
     """
-    said: list[str] = []
-    with LiveSource(config, arguments=arguments, tell=said.append) as source:
+    # Under a name of its own: what another bevviz publishes is shown, too.
+    with LiveSource(config, arguments=arguments, name="bevviz_info") as source:
         settled = source.wait(PATIENCE)
         before = Counter(source.received)
         start = time.monotonic()

@@ -82,13 +82,19 @@ class LiveSource:
         config: roles and synchronisation.
         arguments: what follows ``--ros-args``: remaps, namespace, parameters.
         tell: called with one sentence each, from the receiving thread.
+        name: of the node.
 
     Raises:
         UserError: no working rclpy, or arguments that it refuses.
     """
 
     def __init__(
-        self, config: Config, *, arguments: Sequence[str] = (), tell: Callable[[str], None] | None = None
+        self,
+        config: Config,
+        *,
+        arguments: Sequence[str] = (),
+        tell: Callable[[str], None] | None = None,
+        name: str = "bevviz",
     ) -> None:
         self.config = config
         self.roles = Roles()
@@ -113,7 +119,7 @@ class LiveSource:
         self._frames = 0
         self._ended = False
 
-        self._session = Session(arguments, on_end=self.stop)
+        self._session = Session(arguments, on_end=self.stop, name=name)
         self._add_timer(LOOK, self._look)
         self._add_timer(TICK, self._tick)
         self._session.start()
