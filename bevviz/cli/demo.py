@@ -8,6 +8,15 @@ from pathlib import Path
 from bevviz.cli.options import Commands, add_config, add_output, load_config, positive
 from bevviz.cli.run import process
 
+# Held to bevviz.sources.synthetic.FAULTS by a test: importing that takes as long as a command should.
+PLANTS = """faults to --plant:
+  hidden_person   at 1 s: a person hidden behind a parked van: no point, no pixel
+  flat_car        at 3 s: a car half a metre high, which the reference preset takes for ground
+  merged_people   at 5 s: two people a hand's breadth apart: one cluster
+  shared_box      at 7 s: a person beside a switch cabinet: the reference preset names both 'person'
+'bevviz why' explains them: bevviz demo --plant flat_car --bag flat.mcap, then
+bevviz why flat.mcap --at 3 --class car --model demo --preset reference"""
+
 
 def add(commands: Commands) -> None:
     demo = commands.add_parser(
@@ -20,11 +29,20 @@ def add(commands: Commands) -> None:
     )
     demo.add_argument("--seed", type=int, default=0, help="another seed is another street (default: 0)")
     demo.add_argument(
+        "--plant",
+        action="append",
+        default=[],
+        metavar="NAME",
+        help="plant a fault that perception gets wrong, see below; several times for several",
+    )
+    demo.add_argument(
         "--bag",
         type=Path,
         metavar="FILE.mcap",
         help="write the drive as a ROS 2 bag instead of running on it",
     )
+    demo.formatter_class = argparse.RawDescriptionHelpFormatter
+    demo.epilog = PLANTS
     add_config(demo)
     add_output(demo)
     demo.set_defaults(run=_demo)
@@ -34,7 +52,7 @@ def _demo(options: argparse.Namespace) -> int:
     from bevviz.config import load
     from bevviz.sources.synthetic import SyntheticSource, write_bag
 
-    source = SyntheticSource(frames=options.frames, seed=options.seed)
+    source = SyntheticSource(options.frames, options.seed, plant=options.plant)
     if options.bag is not None:
         from tqdm import tqdm
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -14,6 +14,7 @@ from bevviz import geometry
 from bevviz.errors import UserError
 from bevviz.frame import F64, I32, Bool, Boxes3D, Camera, Cloud, Frame, Image, Intrinsics, LabelledBoxes3D
 from bevviz.sources import Scene
+from bevviz.sources.synthetic import faults
 from bevviz.sources.synthetic.mesh import Material
 from bevviz.sources.synthetic.sensors import Caster, Lidar, PinholeCamera, View, optical
 from bevviz.sources.synthetic.world import World, bounds
@@ -56,9 +57,10 @@ class SyntheticSource:
     Args:
         frames: length of the drive.
         seed: of street, traffic, light and sensor noise.
+        plant: names of faults to plant, see ``bevviz.sources.synthetic.faults``.
 
     Raises:
-        UserError: ``frames`` below 1.
+        UserError: ``frames`` below 1, no such fault, or a drive too short for it.
     """
 
     def __init__(
@@ -66,6 +68,7 @@ class SyntheticSource:
         frames: int = 100,
         seed: int = 0,
         *,
+        plant: Sequence[str] = (),
         lidar: Lidar | None = None,
         camera: PinholeCamera | None = None,
     ) -> None:
@@ -73,8 +76,9 @@ class SyntheticSource:
             raise UserError(f"a synthetic drive needs at least 1 frame, not {frames}")
         self.total = frames
         self.seed = seed
+        self.faults = faults.find(plant, (frames - 1) * PERIOD * 1e-9)
         self.scene = Scene(
-            f"synthetic drive, seed {seed}",
+            f"synthetic drive, seed {seed}" + "".join(f", {name}" for name in plant),
             lidar=LIDAR_FRAME,
             lidars=(LIDAR_FRAME,),
             cameras=("zed",),
@@ -87,7 +91,8 @@ class SyntheticSource:
 
     @cached_property
     def world(self) -> World:
-        return World(self.seed, self.total * PERIOD * 1e-9)
+        scenes = [(fault.time, fault.scene) for fault in self.faults]
+        return World(self.seed, self.total * PERIOD * 1e-9, scenes)
 
     @cached_property
     def _static(self) -> Caster:

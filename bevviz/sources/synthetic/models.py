@@ -6,7 +6,7 @@ A model stands on z = 0, looks along +x and is centred on the origin.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -80,6 +80,10 @@ class Model:
             [self.body, *(limb.mesh.moved(_swing(limb, distance / self.stride)) for limb in self.limbs)]
         )
 
+    def scaled(self, factors: tuple[float, float, float]) -> Model:
+        """Stretched along x, y and z; for models without limbs."""
+        return replace(self, body=self.body.moved(np.diag([*factors, 1.0])))
+
 
 def _swing(limb: Limb, cycles: float) -> F64:
     angle = limb.amplitude * np.sin(2 * np.pi * cycles + limb.phase)
@@ -99,8 +103,8 @@ def _pick(rng: np.random.Generator, colors: Sequence[Color]) -> Color:
 # --- road users --------------------------------------------------------------------------------
 
 
-def car(rng: np.random.Generator) -> Model:
-    kind = rng.choice(["hatchback", "saloon", "suv", "van"], p=[0.35, 0.3, 0.22, 0.13])
+def car(rng: np.random.Generator, kind: str = "") -> Model:
+    kind = kind or rng.choice(["hatchback", "saloon", "suv", "van"], p=[0.35, 0.3, 0.22, 0.13])
     length, width, height, rear, front = {
         "hatchback": (4.05, 1.76, 1.48, -0.47, 0.22),
         "saloon": (4.65, 1.82, 1.45, -0.33, 0.2),
@@ -152,8 +156,8 @@ def car(rng: np.random.Generator) -> Model:
     return Model(merge(parts))
 
 
-def person(rng: np.random.Generator, walking: bool = True) -> Model:
-    child = rng.random() < 0.12
+def person(rng: np.random.Generator, walking: bool = True, child: bool | None = None) -> Model:
+    child = rng.random() < 0.12 if child is None else child
     height = rng.normal(1.25, 0.1) if child else np.clip(rng.normal(1.73, 0.09), 1.5, 1.95)
     shirt, trousers, skin = _pick(rng, CLOTHES), _pick(rng, TROUSERS), _pick(rng, SKINS)
     k, wide = height / 1.75, rng.uniform(0.9, 1.2)

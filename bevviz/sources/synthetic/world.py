@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -96,26 +97,43 @@ class World:
     Args:
         seed: of everything that is drawn at random.
         duration: seconds that the ego vehicle drives.
+        scenes: what else is put into it: seconds into the drive, and who puts it there. All else stays as
+            it is without, but for those who are in the way.
     """
 
-    def __init__(self, seed: int, duration: float) -> None:
+    def __init__(
+        self, seed: int, duration: float, scenes: Sequence[tuple[float, Callable[[Stage], None]]] = ()
+    ) -> None:
         rng = np.random.default_rng(seed)
         self.length = SPEED * duration + 10.0
         self.street = Street(rng, self.length)
         self.light = _light(rng)
         self._sway = rng.uniform(0, 2 * np.pi, 2)
-        self.actors = _Cast(rng, self.street, duration).actors
+        actors = _Cast(rng, self.street, duration).actors
+        stages = [
+            Stage(self.street, self._way(time), time, np.random.default_rng(seed)) for time, _ in scenes
+        ]
+        for (_, scene), stage in zip(scenes, stages, strict=True):
+            scene(stage)
+            actors = [actor for actor in actors if stage.is_clear_of(actor)]
+        actors += [actor for stage in stages for actor in stage.actors]
+        self.actors = [replace(actor, number=i + 1) for i, actor in enumerate(actors)]
         self._parked = {a.number: a.mesh(self.street, 0.0) for a in self.actors if a.speed == 0}
         scenery = [_ground(self.street), *_houses(rng, self.street), *_furniture(rng, self.street)]
+        scenery += [mesh for stage in stages for mesh in stage.placed]
         self.static = merge([*scenery, *self._parked.values()])
 
     def ego(self, time: float) -> F64:
         """(4, 4) map_from_base_link: on the road below the middle of the vehicle."""
-        s = SPEED * time + 1.5 * (np.sin(0.5 * time + self._sway[0]) - np.sin(self._sway[0]))
+        s = self._way(time)
         rate = 2 * np.pi / 6.0
         lateral = -1.7 + 0.2 * np.sin(rate * time + self._sway[1])
         turn = np.arctan2(0.2 * rate * np.cos(rate * time + self._sway[1]), SPEED)
         return self.street.pose(s, lateral, turn=turn, upright=False)
+
+    def _way(self, time: float) -> float:
+        """Metres along the street that the ego vehicle is at."""
+        return SPEED * time + 1.5 * float(np.sin(0.5 * time + self._sway[0]) - np.sin(self._sway[0]))
 
     def moving(self, time: float, centre: F64, reach: float) -> Mesh:
         """The moving actors within ``reach`` metres of ``centre``."""
@@ -141,6 +159,38 @@ class World:
             & (s < self.street.end - 5)
         )
         return [self.actors[i] for i in np.flatnonzero(near)]
+
+
+class Stage:
+    """The right half of the road ahead of the ego vehicle at one time, for what is to be seen there then.
+
+    Args:
+        street: the street.
+        way: metres along it that the ego vehicle is at.
+        time: seconds into the drive.
+        rng: for what is put there.
+    """
+
+    AHEAD, RIGHT, LEFT = (-4.0, 19.0), -6.4, 0.0  # metres from the ego vehicle, and from the centre line
+
+    def __init__(self, street: Street, way: float, time: float, rng: np.random.Generator) -> None:
+        self.rng, self._street, self._way, self._time = rng, street, way, time
+        self.actors: list[Actor] = []
+        self.placed: list[Mesh] = []
+
+    def add(self, label: str, model: models.Model, ahead: float, lateral: float, turn: float = 0.0) -> None:
+        """Somebody who stands ``ahead`` metres in front of the ego vehicle, on the road."""
+        s, upright = self._way + ahead, label == "person"
+        self.actors.append(Actor(0, label, model, s, lateral, 0.0, turn, 0.0, upright))
+
+    def place(self, mesh: Mesh, ahead: float, lateral: float) -> None:
+        """Something that nobody looks for."""
+        self.placed.append(mesh.moved(self._street.pose(self._way + ahead, lateral)))
+
+    def is_clear_of(self, actor: Actor) -> bool:
+        """Whether an actor of the street is elsewhere at that time; the others are not let on."""
+        ahead = actor.s + actor.speed * self._time - self._way
+        return not (self.AHEAD[0] < ahead < self.AHEAD[1] and self.RIGHT < actor.lateral < self.LEFT)
 
 
 # --- population --------------------------------------------------------------------------------

@@ -1,0 +1,125 @@
+"""The planted faults: real geometry, in the ground truth, and it fools the preset that it is said to fool."""
+
+from __future__ import annotations
+
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from bevviz.cli import demo, main
+from bevviz.config import load
+from bevviz.errors import UserError
+from bevviz.frame import I32, Decision, FrameResult
+from bevviz.pipeline import Pipeline
+from bevviz.sources.synthetic import FAULTS, Snapshot, SyntheticSource
+
+
+@cache
+def drive() -> SyntheticSource:
+    """With every fault, each at its own time."""
+    return SyntheticSource(frames=75, plant=list(FAULTS))
+
+
+@cache
+def at(name: str) -> Snapshot:
+    return drive().snapshot(round(FAULTS[name].time * 10))
+
+
+@cache
+def run(name: str, preset: str) -> FrameResult:
+    config = load(None, ["detector.model=demo"], "reference" if preset == "reference" else "default")
+    with Pipeline(config) as pipeline:
+        return pipeline.run(at(name).frame)
+
+
+def planted(name: str, label: str, ahead: float) -> tuple[int, ...]:
+    """Rows of the ground truth: who of that class stands on the right half of the road there."""
+    truth = at(name).frame.truth
+    assert truth is not None
+    x, y, _ = truth.boxes.center.T
+    there = (np.abs(x - ahead) < 1.0) & (y < -1.2) & (y > -4.2) & (np.array(truth.labels) == label)
+    return tuple(np.flatnonzero(there).tolist())
+
+
+def clusters_on(name: str, preset: str, row: int) -> I32:
+    """Labels of the obstacle points on an object, noise included."""
+    result, shot = run(name, preset), at(name)
+    assert result.voxels is not None and result.ground is not None and result.clusters is not None
+    voxel = np.unique(result.voxels.inverse[shot.point_object == shot.truth_object[row]])
+    obstacle = np.cumsum(~result.ground.mask) - 1
+    labels: I32 = result.clusters.labels[obstacle[voxel[~result.ground.mask[voxel]]]]
+    return labels
+
+
+def test_the_hidden_person_is_there_and_nobody_sees_it() -> None:
+    (row,) = planted("hidden_person", "person", 16.3)
+    shot = at("hidden_person")
+    assert shot.truth_hits[row] == 0
+    assert not (shot.pixel_object == shot.truth_object[row]).any()
+    (van,) = planted("hidden_person", "car", 11.9)
+    assert shot.truth_hits[van] > 1000
+
+
+def test_the_flat_car_is_ground_for_one_plane_only() -> None:
+    (row,) = planted("flat_car", "car", 10.0)
+    truth = at("flat_car").frame.truth
+    assert truth is not None and truth.boxes.size[row, 2] < 0.55
+    assert at("flat_car").truth_hits[row] > 200
+    assert (clusters_on("flat_car", "default", row) >= 0).sum() > 100
+    assert not (clusters_on("flat_car", "reference", row) >= 0).any()
+
+
+@pytest.mark.parametrize("preset", ["default", "reference"])
+def test_the_two_people_are_one_cluster(preset: str) -> None:
+    rows = planted("merged_people", "person", 9.9)
+    assert len(rows) == 2
+    one, other = (set(clusters_on("merged_people", preset, row)) - {-1} for row in rows)
+    assert one == other and len(one) == 1
+
+
+def test_the_box_names_two_clusters_in_the_reference() -> None:
+    (row,) = planted("shared_box", "person", 8.7)
+    result = run("shared_box", "reference")
+    fusion, clusters = result.cameras[0].fusion, result.clusters
+    assert fusion is not None and clusters is not None
+    own = int(np.bincount(clusters_on("shared_box", "reference", row)).argmax())
+    behind = int(np.argmin(np.hypot(*(clusters.centroid[:, :2] - (10.0, -3.9)).T)))
+    assert behind != own and np.hypot(*(clusters.centroid[behind, :2] - (10.0, -3.9))) < 0.5
+    assert fusion.cluster_decision[[own, behind]].tolist() == [Decision.MATCHED] * 2
+    assert fusion.cluster_detection[own] == fusion.cluster_detection[behind]
+
+
+def test_the_rest_of_the_drive_is_as_without() -> None:
+    plain, changed = SyntheticSource(frames=75).world, drive().world
+    there = {(a.s, a.lateral) for a in changed.actors}
+    gone = [a for a in plain.actors if (a.s, a.lateral) not in there]
+    assert 0 < len(gone) < 20
+    assert all(-6.4 < a.lateral < 0 for a in gone)
+    assert [a.number for a in changed.actors] == list(range(1, len(changed.actors) + 1))
+
+
+@pytest.mark.parametrize(
+    ("name", "frames", "message"),
+    [
+        ("flat_cat", 75, "plant flat_cat: unknown; did you mean 'flat_car'"),
+        ("x", 75, "unknown; there are hidden_person, "),
+        ("flat_car", 20, "it is seen after 3 s and the drive has 1.9 s; give it more frames"),
+    ],
+)
+def test_a_fault_that_cannot_be_planted(name: str, frames: int, message: str) -> None:
+    with pytest.raises(UserError, match=message):
+        SyntheticSource(frames, plant=[name])
+
+
+def test_demo_teaches_and_plants_every_fault(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    taught = [line.split()[0] for line in demo.PLANTS.splitlines() if line.startswith("  ")]
+    assert taught == list(FAULTS)
+    monkeypatch.chdir(tmp_path)
+    assert main(["demo", "--frames", "11", "--plant", "hidden_person", "--bag", "a.mcap"]) == 0
+    assert Path("a.mcap").exists()
+    assert main(["demo", "--frames", "11", "--plant", "flat_car", "--bag", "b.mcap"]) == 2
+    assert "give it more frames" in capsys.readouterr().err
