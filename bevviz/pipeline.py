@@ -62,14 +62,16 @@ class Pipeline:
 
     Args:
         config: the whole configuration.
+        detect: what finds the objects in a camera's image instead of the detector's model.
 
     Raises:
         UserError: the detector's model cannot be used.
     """
 
-    def __init__(self, config: Config) -> None:
+    def __init__(self, config: Config, detect: Callable[[Camera], Detections | None] | None = None) -> None:
         self.config = config
-        self.detector = Detector(config.detector) if config.detector.model else None
+        self.detector = Detector(config.detector) if config.detector.model and detect is None else None
+        self._detect_with = detect
         self._network = ThreadPoolExecutor(1, "network")
 
     def __enter__(self) -> Self:
@@ -139,6 +141,8 @@ class Pipeline:
         )
 
     def _detect(self, camera: Camera, log: StageLog) -> Detections | None:
+        if self._detect_with is not None:
+            return log.run("detector", self._detect_with, camera)
         if self.detector is None or camera.image is None:
             return None
         return log.run("detector", self.detector, camera.image.bgr)

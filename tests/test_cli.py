@@ -108,7 +108,7 @@ def test_config_is_read_back(capsys: Capture, tmp_path: Path) -> None:
 
 
 def test_help_teaches(capsys: Capture) -> None:
-    for command in ((), ("bag",), ("info",), ("demo",), ("config",)):
+    for command in ((), ("bag",), ("info",), ("report",), ("demo",), ("config",)):
         with pytest.raises(SystemExit) as ended:
             main([*command, "--help"])
         assert ended.value.code == 0

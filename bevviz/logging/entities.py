@@ -26,6 +26,8 @@ EXPLAIN_LOG = "/explain/log"
 STATES = "/explain/states"
 HEALTH = "/health"
 CONFIG = "/config"
+REPORT = "/report"
+DIGEST = "/report/digest"  # fingerprints of each frame's results
 
 
 def sensor(name: str) -> str:

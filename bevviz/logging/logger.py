@@ -167,17 +167,14 @@ class Logger:
         self._image_stamps.clear()
 
     def _log_origin(self) -> None:
-        packages = ("rerun-sdk", "numpy", "open3d", "onnxruntime", "opencv-python-headless", "rosbags")
-        versions = {"bevviz": __version__, "python": platform.python_version()}
-        versions |= {name: version(name) for name in packages}
-        config = dump(self._config)
+        config, made_with = dump(self._config), versions()
         self._static(
             entities.CONFIG,
             rr.TextDocument(
                 "# How this recording was made\n\n"
                 + f"Source: **{self._scene.name}**, preset: **{self._config.preset}**\n\n"
                 + f"```yaml\n{config}```\n\n"
-                + "\n".join(f"- {name} {number}" for name, number in versions.items()),
+                + "\n".join(f"- {line}" for line in made_with),
                 media_type=rr.MediaType.MARKDOWN,
             ),
         )
@@ -188,7 +185,7 @@ class Logger:
                 source=self._scene.name,
                 preset=self._config.preset,
                 config=config,
-                versions=[f"{name} {number}" for name, number in versions.items()],
+                versions=made_with,
                 lidars=list(self._scene.lidars or (self._scene.lidar,)),
                 cameras=list(self._scene.cameras) or None,
             ),
@@ -579,7 +576,7 @@ class Logger:
     # --- health --------------------------------------------------------------------------------
 
     def _log_health(self, result: FrameResult, more: Mapping[str, float]) -> None:
-        for path, value in (*_health(result, self._last), *more.items()):
+        for path, value in (*health(result, self._last), *more.items()):
             if np.isfinite(value):
                 self._recording.log(path, rr.Scalars(float(value)))
 
@@ -610,6 +607,14 @@ class Logger:
                 rr.TimeColumn(entities.RECEIVED, timestamp=np.full(rows, frame.received, "datetime64[ns]"))
             )
         return columns
+
+
+def versions() -> list[str]:
+    """Name and version of all that results depend on."""
+    packages = ("rerun-sdk", "numpy", "open3d", "onnxruntime", "opencv-python-headless", "rosbags")
+    found = {"bevviz": __version__, "python": platform.python_version()}
+    found |= {name: version(name) for name in packages}
+    return [f"{name} {number}" for name, number in found.items()]
 
 
 # --- pieces ------------------------------------------------------------------------------------
@@ -699,7 +704,8 @@ def _best_decisions(camera: CameraResult) -> Iterator[tuple[str, str]]:
             yield found.names[d], decision.name.lower().replace("_", " ")
 
 
-def _health(result: FrameResult, last: Frame | None) -> Iterator[tuple[str, float]]:
+def health(result: FrameResult, last: Frame | None) -> Iterator[tuple[str, float]]:
+    """Entity and value of every scalar of a frame; ``last`` is the frame before it. NaN: not known."""
     frame = result.frame
     for stage, seconds in result.timings.items():
         yield entities.stage_time(stage), seconds * 1e3

@@ -108,6 +108,11 @@ class BagSource:
         return [*self.recording.warnings, *damaged, *(self._sync.report.warnings() if self._sync else ())]
 
     @property
+    def span(self) -> tuple[int, int]:
+        """Log times of the scans that are read: from the first, to before the second."""
+        return self._low, self._high
+
+    @property
     def tree(self) -> Mapping[str, str]:
         """Child to parent of the transforms met so far."""
         return self._sync.tf.tree() if self._sync else {}

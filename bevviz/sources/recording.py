@@ -12,12 +12,17 @@ from operator import itemgetter
 from pathlib import Path, PurePath
 from tempfile import TemporaryDirectory
 from types import TracebackType
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from backports import zstd
-from rosbags.interfaces import Connection, ConnectionExtRosbag1, MessageDefinitionFormat
-from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
+from rosbags.interfaces import (
+    Connection,
+    ConnectionExtRosbag1,
+    MessageDefinition,
+    MessageDefinitionFormat,
+)
+from rosbags.typesys import Stores, TypesysError, get_types_from_idl, get_types_from_msg, get_typestore
 from rosbags.typesys.msg import normalize_msgtype
 from rosbags.typesys.store import Typestore
 
@@ -71,7 +76,7 @@ class RawMessage:
             data = self.content()
         except zstd.ZstdError:
             raise MessageError(f"{self.topic}: a message of {len(self.data)} bytes is damaged") from None
-        little = _is_ros1(self.connection) or data[1:2] != b"\0"
+        little = is_ros1(self.connection) or data[1:2] != b"\0"
         return read_header(data, "<" if little else ">", self.topic)
 
 
@@ -198,7 +203,7 @@ class Recording:
         try:
             data = message.content()
             store = self._store(connection)
-            if _is_ros1(connection):
+            if is_ros1(connection):
                 return store.deserialize_ros1(data, msgtype)
             return store.deserialize_cdr(data, msgtype)
         except KeyError:
@@ -209,9 +214,28 @@ class Recording:
             reason = str(error) or type(error).__name__
             raise MessageError(f"{message.topic}: not a {msgtype}: {reason}") from None
 
+    def encode(self, message: RawMessage, content: Any) -> memoryview:
+        """``content``, as ``decode`` gave it and changed since, serialised as the message was."""
+        store, msgtype = self._store(message.connection), normalize_msgtype(message.connection.msgtype)
+        if is_ros1(message.connection):
+            return store.serialize_ros1(content, msgtype)
+        return store.serialize_cdr(content, msgtype)
+
+    def definition(self, connection: Connection) -> MessageDefinition:
+        """What a type is made of: as the bag says, else as the ROS release does; NONE where nobody knows."""
+        if connection.msgdef.format != MessageDefinitionFormat.NONE:
+            return connection.msgdef
+        version: Literal[1, 2] = 1 if is_ros1(connection) else 2
+        try:
+            msgtype = normalize_msgtype(connection.msgtype)
+            text, _ = self._store(connection).generate_msgdef(msgtype, ros_version=version)
+        except (KeyError, TypesysError):
+            return connection.msgdef
+        return MessageDefinition(MessageDefinitionFormat.MSG, text)
+
     def _store(self, connection: Connection) -> Typestore:
         """The types that the bag itself defines, else those of the ROS release."""
-        ros1, definition = _is_ros1(connection), connection.msgdef
+        ros1, definition = is_ros1(connection), connection.msgdef
         key = (ros1, connection.msgtype, definition)
         if key not in self._stores:
             store = None
@@ -367,7 +391,8 @@ def _bag_files(folder: Path) -> list[Path]:
     )
 
 
-def _is_ros1(connection: Connection) -> bool:
+def is_ros1(connection: Connection) -> bool:
+    """Whether its messages are serialised as in ROS 1."""
     extra = connection.ext
     return isinstance(extra, ConnectionExtRosbag1) or extra.serialization_format == "ros1"
 

@@ -1,0 +1,122 @@
+"""``bevviz report``."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from bevviz.cli.options import Commands, add_bag, add_config, load_config
+from bevviz.cli.run import say, terminable
+from bevviz.errors import UserError
+
+
+def add(commands: Commands) -> None:
+    report = commands.add_parser(
+        "report",
+        help="a bug report that stands on its own, and its check",
+        description="Cut a window out of a bag, run it, and save a recording (bug.rrd), a page for any "
+        "browser (bug.html) and the raw messages (bug.mcap) to send on. With --check: run a report again and "
+        "compare.",
+        epilog="examples:\n"
+        "  bevviz report drive.mcap --at 12.5 --model yolo11n.onnx --note 'no match for the pedestrian'\n"
+        "  bevviz report --check bug.rrd",
+    )
+    group = add_bag(report)
+    group.add_argument("--at", metavar="TIME", help="the time that the report is about")
+    group.add_argument("--before", type=_seconds, default=5.0, metavar="SECONDS", help="(default: 5)")
+    group.add_argument("--after", type=_seconds, default=5.0, metavar="SECONDS", help="(default: 5)")
+    add_config(report)
+    content = report.add_argument_group("the report")
+    content.add_argument(
+        "-o", "--output", type=Path, default=Path("bug.rrd"), metavar="FILE.rrd", help="(default: bug.rrd)"
+    )
+    note = content.add_mutually_exclusive_group()
+    note.add_argument("--note", default="", metavar="TEXT", help="what went wrong, in your words")
+    note.add_argument("--note-file", type=Path, metavar="FILE", help="the same, from a text file")
+    content.add_argument(
+        "--topics",
+        nargs="*",
+        metavar="TOPIC",
+        help="topics (* and ? match) in the bag beside those that the pipeline reads; default: all",
+    )
+    content.add_argument(
+        "--redact", action="store_true", help="hide the people and vehicles that the detector finds"
+    )
+    content.add_argument("--include-model", action="store_true", help="copy the detector's file beside it")
+    content.add_argument("--force", action="store_true", help="overwrite an older report")
+    report.add_argument(
+        "--check", action="store_true", help="PATH is a report's .rrd: run its bag again and compare"
+    )
+    report.set_defaults(run=_report)
+
+
+def _report(options: argparse.Namespace) -> int:
+    with terminable():
+        try:
+            return _check(options) if options.check else _make(options)
+        except KeyboardInterrupt:
+            say("interrupted: nothing was written" if not options.check else "interrupted")
+            return 130
+
+
+def _make(options: argparse.Namespace) -> int:
+    from bevviz.report.make import Order, make
+    from bevviz.sources.mcap import megabytes
+
+    if options.at is None:
+        raise UserError("--at TIME is missing: the time that the report is about")
+    made = make(
+        Order(
+            paths=options.paths,
+            config=load_config(options),
+            at=options.at,
+            before=options.before,
+            after=options.after,
+            output=options.output,
+            note=options.note if options.note_file is None else _read(options.note_file),
+            topics=options.topics,
+            redact=options.redact,
+            include_model=options.include_model,
+            force=options.force,
+        )
+    )
+    for warning in made.warnings:
+        say(f"warning: {warning}")
+    written = ", ".join(f"{path} ({megabytes(path.stat().st_size)})" for path in made.files)
+    if made.interrupted:
+        say(f"interrupted after {made.frames} frames; what was made until then is complete: {written}")
+        return 130
+    say(f"{made.frames} frames: {written}")
+    return 0 if made.frames else 1
+
+
+def _check(options: argparse.Namespace) -> int:
+    from bevviz.report.check import check
+
+    if len(options.paths) != 1:
+        raise UserError("--check takes one report: bevviz report --check bug.rrd")
+    verdict = check(
+        options.paths[0],
+        model=None if options.model is None else Path(options.model),
+        settings=options.set,
+    )
+    for line in verdict.lines():
+        print(line)
+    return 0 if verdict.same else 1
+
+
+def _read(path: Path) -> str:
+    try:
+        return path.read_text(encoding="utf-8").strip()
+    except (OSError, UnicodeDecodeError) as error:
+        raise UserError(f"--note-file {path}: cannot be read: {error}") from None
+
+
+def _seconds(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = -1.0
+    if not 0 <= value < 1e6:
+        raise argparse.ArgumentTypeError(f"'{text}' is no time in seconds")
+    return value

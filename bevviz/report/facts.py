@@ -1,0 +1,82 @@
+"""What a report states beside its results: where it comes from, what lies beside it, how to run it again."""
+
+from __future__ import annotations
+
+import json
+import shlex
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from bevviz import __version__
+from bevviz.config import Config
+from bevviz.report.origin import Model, changes
+from bevviz.report.window import Window
+from bevviz.sources.bag import SECOND, iso
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Facts:
+    """What a page states beside the results. All of it is text, and escaped where it is written."""
+
+    title: str
+    note: str
+    where: str  # the bag, its window, and the place in it
+    start: int  # log time of the recording's start: seconds count from here
+    config: str  # preset in a sentence
+    changes: Mapping[str, tuple[object, object]]  # key -> value of the preset, value here
+    versions: Sequence[str]
+    hardware: Sequence[str]
+    warnings: Sequence[str]
+    files: Sequence[str]  # what lies beside the page
+    commands: Sequence[str]
+
+    def markdown(self) -> str:
+        """The same for the recording, without what it holds already."""
+        lines = [f"# {self.title}", "", self.where, ""]
+        lines += [f"> {line}" for line in self.note.splitlines()]
+        for title, items in (("Files", self.files), ("Warnings", self.warnings), ("Hardware", self.hardware)):
+            lines += ["", f"## {title}", "", *(f"- {item}" for item in items)] if items else []
+        return "\n".join([*lines, "", "## How to run it again", "", "```", *self.commands, "```"])
+
+
+def window_text(name: str, window: Window) -> str:
+    """Where in a bag, in both kinds of time."""
+    first, last, at = ((t - window.start) / SECOND for t in (window.low, window.high, window.at))
+    return f"{name}, {first:.1f} to {last:.1f} s of it, at {at:.3f} s ({iso(window.at)})"
+
+
+def commands(rrd: Path, window: Window, config: Config, redacted: bool) -> list[str]:
+    """What to type where the files are, to see, to prove and to run it again.
+
+    Args:
+        rrd: the recording; the bag lies beside it.
+        window: the scans.
+        config: without the folders of this machine.
+        redacted: whether the bag's images are.
+    """
+    run = ["bevviz", "bag", rrd.with_suffix(".mcap").name]
+    run += ["--start", iso(window.low), "--end", iso(window.high)]
+    run += ["--preset", config.preset] if config.preset != "default" else []
+    for key, (_, value) in changes(config).items():
+        run += ["--model", config.detector.model] if key == "detector.model" else []
+        run += ["--set", f"{key}={json.dumps(value)}"] if key != "detector.model" else []
+    note = ["# its images are redacted: here the network sees less than it did"] if redacted else []
+    return [
+        f"pip install bevviz=={__version__}",
+        shlex.join(["rerun", rrd.name]),
+        shlex.join(["bevviz", "report", "--check", rrd.name]),
+        *note,
+        shlex.join(run),
+    ]
+
+
+def file_lines(sizes: Mapping[str, str], counts: Mapping[str, int], model: Model | None) -> list[str]:
+    """The files of a report, and the model that it needs."""
+    lines = [f"{name}: {size}" for name, size in sizes.items()]
+    if counts:
+        told = ", ".join(f"{topic} ({n})" for topic, n in sorted(counts.items()))
+        lines.append(f"messages in the bag, by topic: {told}")
+    if model is not None:
+        lines.append(f"model: {model.name}, SHA-256 {model.sha256}")
+    return lines

@@ -1,0 +1,91 @@
+"""What a frame looks like, as small pictures for a page."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from bevviz.colors import bins, class_color, turbo
+from bevviz.frame import U8, Bool, CameraResult, Decision, DetectionState
+from bevviz.logging.entities import DEPTH_BINS, DEPTH_RANGE
+
+
+def camera_picture(
+    result: CameraResult, width: int, *, labels: bool = False, points: bool = False
+) -> U8 | None:
+    """The camera's image with its kept detections, (h, width, 3) BGR; None where there is no image.
+
+    A matched box is drawn thick, another one thin.
+
+    Args:
+        result: of one camera.
+        width: of the picture, in pixels; a smaller image is not enlarged.
+        labels: with class and score, and the reason where there is no match, as far as there is room.
+        points: with the obstacle points on top, by depth: near red, far blue.
+    """
+    if result.camera.image is None:
+        return None
+    picture, scale = shrink(result.camera.image.bgr, width)
+    if points:
+        _draw_points(picture, result, scale)
+    found = result.detections
+    if found is None:
+        return picture
+    kept = np.flatnonzero(found.state == DetectionState.KEPT)
+    matched = np.zeros(len(found), bool)
+    if result.fusion is not None:
+        matched = result.fusion.detection_decision == Decision.MATCHED
+    corners = np.round((found.xyxy + 0.5) * scale - 0.5).astype(int)
+    for d in kept[::-1].tolist():
+        x0, y0, x1, y1 = corners[d].tolist()
+        width = 2 if matched[d] else 1
+        cv2.rectangle(picture, (x0, y0), (x1, y1), class_color(found.names[d])[::-1], width, cv2.LINE_AA)
+    taken = np.zeros(picture.shape[:2], bool)
+    for d in sorted(kept.tolist(), key=lambda d: bool(matched[d])) if labels else ():  # the unmatched first
+        text = f"{found.names[d]} {found.score[d]:.2f}"
+        if not matched[d] and result.fusion is not None:
+            decision = Decision(int(result.fusion.detection_decision[d]))
+            text += f", {decision.name.lower().replace('_', ' ')}"
+        x, y = corners[d, :2].tolist()
+        _label(picture, taken, text, x, y, class_color(found.names[d])[::-1])
+    return picture
+
+
+def shrink(bgr: U8, width: int) -> tuple[U8, float]:
+    """A copy of at most this width, and its scale."""
+    scale = min(1.0, width / bgr.shape[1])
+    if scale == 1.0:
+        return bgr.copy(), scale
+    size = max(1, round(bgr.shape[1] * scale)), max(1, round(bgr.shape[0] * scale))
+    small: U8 = cv2.resize(bgr, size, interpolation=cv2.INTER_AREA)
+    return small, scale
+
+
+def jpeg(bgr: U8, quality: int = 80) -> bytes:
+    _, data = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, quality])
+    return bytes(data.tobytes())
+
+
+def _draw_points(picture: U8, result: CameraResult, scale: float) -> None:
+    if result.uv is None or result.depth is None:
+        return
+    seen = np.isfinite(result.uv[:, 0])
+    u, v = np.floor((result.uv[seen] + 0.5) * scale).astype(int).T
+    colors = turbo(DEPTH_BINS)[::-1, ::-1][bins(result.depth[seen], 0, DEPTH_RANGE, DEPTH_BINS)]
+    height, width = picture.shape[:2]
+    picture[np.clip(v, 0, height - 1), np.clip(u, 0, width - 1)] = colors
+
+
+def _label(picture: U8, taken: Bool, text: str, x: int, y: int, color: tuple[int, ...]) -> None:
+    """A text above the point, where no other one is."""
+    font, size = cv2.FONT_HERSHEY_SIMPLEX, 0.45
+    (width, height), below = cv2.getTextSize(text, font, size, 1)
+    x = max(0, min(x, picture.shape[1] - width - 4))
+    y = max(y, height + below + 2)
+    place = np.s_[y - height - below - 2 : y, x : x + width + 4]
+    if taken[place].any():
+        return
+    taken[place] = True
+    picture[place] = color
+    ink = (0, 0, 0) if sum(color) > 330 else (255, 255, 255)
+    cv2.putText(picture, text, (x + 2, y - below), font, size, ink, 1, cv2.LINE_AA)

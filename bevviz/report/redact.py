@@ -1,0 +1,168 @@
+"""People and vehicles made unrecognisable in images, before anything of them is written."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Collection, Sequence
+from dataclasses import replace
+from typing import Any
+
+import cv2
+import numpy as np
+
+from bevviz.config import DetectorConfig
+from bevviz.errors import UserError
+from bevviz.frame import F32, U8
+from bevviz.sources.messages import MessageError, decode_compressed_image, decode_image
+from bevviz.sources.recording import RawMessage, Recording
+from bevviz.stages.detector import Detector
+
+SCORE = 0.01  # candidates from here on are hidden: rather too much than too little
+CELLS = 8  # along the longer side of a box: one or two for a face or a plate
+SMALLEST = 8  # pixels of a cell's edge, at least
+MARGIN = 0.15  # of a box's sides, on each side of it
+QUALITY = 95  # of JPEGs that are encoded anew
+
+PEOPLE = re.compile(r"person|people|pedestrian|rider|cyclist|human|man\b|child|face|head")
+VEHICLES = re.compile(
+    r"car\b|van\b|truck|bus\b|tram|train|motor|bike|bicycle|cycle|trailer|caravan|vehicle|taxi|scooter|plate"
+)
+IMAGES = ("Image", "CompressedImage")
+# Pictures in other clothes, which nothing here can decode.
+PICTURES = re.compile(r"image|video|ffmpeg|theora|h26[45]|jpeg|png|disparity", re.IGNORECASE)
+COLOUR_FIELDS = {"rgb", "rgba", "r", "red", "color"}  # of a cloud that is a picture, too
+
+
+class Redactor:
+    """Hides people and vehicles in the image messages of a recording.
+
+    A box is hidden with ``MARGIN`` around it: each of at most ``CELLS`` x ``CELLS`` cells gets its mean
+    colour. Of vehicles the whole box goes, since a plate may be anywhere in it. What the detector does not
+    find stays as it is.
+
+    Args:
+        config: the detector. Its thresholds and its choice of classes do not count here.
+        recording: which the messages are of.
+        lidars: topics whose clouds are kept even where their points have colours.
+
+    Raises:
+        UserError: no model, or one that knows no people or no vehicles.
+    """
+
+    def __init__(self, config: DetectorConfig, recording: Recording, lidars: Collection[str] = ()) -> None:
+        if not config.model:
+            raise UserError(
+                "--redact needs a detector that finds people and vehicles: give --model FILE.onnx"
+            )
+        settings = {"classes": (), "conf_threshold": SCORE, "explain_threshold": SCORE}
+        self._detector = Detector(config.model_copy(update=settings))
+        names = [name.lower() for name in self._detector.names]
+        for what, pattern in (("people", PEOPLE), ("vehicles, which plates are on", VEHICLES)):
+            if not any(pattern.search(name) for name in names):
+                raise UserError(
+                    f"--redact: {config.model} finds no {what}, but {', '.join(names) or 'unnamed'}"
+                )
+        self._recording, self._lidars = recording, lidars
+        self._left_out: Counter[str] = Counter()
+        self.images = 0
+        self.hidden = 0  # boxes
+
+    @property
+    def notes(self) -> list[str]:
+        """What is not in the report, one sentence each."""
+        return [f"{n} message(s) of {why}" for why, n in self._left_out.items()]
+
+    def __call__(self, message: RawMessage, data: bytes | memoryview) -> bytes | memoryview | None:
+        """The message as it may be written: untouched where it shows nobody, None where nobody can tell."""
+        msgtype = message.connection.msgtype
+        package, _, kind = msgtype.rpartition("/")
+        try:
+            if kind in IMAGES and package.startswith("sensor_msgs"):
+                return self._redacted(message, data, kind == "CompressedImage")
+            if PICTURES.search(msgtype):
+                raise MessageError(f"a {msgtype} cannot be looked into")
+            if kind == "PointCloud2" and message.topic not in self._lidars and self._is_coloured(message):
+                raise MessageError("its points have the colours of a picture")
+        except MessageError as error:
+            reason = str(error).removeprefix(f"{message.topic}: ")
+            self._left_out[f"{message.topic} left out: {reason}"] += 1
+            return None
+        return data
+
+    def _is_coloured(self, message: RawMessage) -> bool:
+        names = {field.name.lower() for field in self._recording.decode(message).fields}
+        return not names.isdisjoint(COLOUR_FIELDS)
+
+    def _redacted(
+        self, message: RawMessage, data: bytes | memoryview, compressed: bool
+    ) -> bytes | memoryview:
+        decode = decode_compressed_image if compressed else decode_image
+        content = self._recording.decode(message)
+        bgr = decode(content, message.topic, message.received).bgr
+        self.images += 1
+        boxes = self.find(bgr)
+        if not len(boxes):
+            return data
+        self.hidden += len(boxes)
+        hidden = hide(bgr, boxes)
+        values: dict[str, Any]
+        if compressed:
+            values = {"data": _encoded(hidden, bytes(content.data[:8]))}
+        else:
+            height, width = hidden.shape[:2]
+            values = {
+                "encoding": "bgr8",
+                "is_bigendian": 0,
+                "step": 3 * width,
+                "data": hidden.reshape(-1),
+                "height": height,
+            }
+        return self._recording.encode(message, replace(content, **values))
+
+    def find(self, bgr: U8) -> F32:
+        """(B, 4) boxes of people and vehicles in an (H, W, 3) image, the largest last."""
+        found = self._detector(bgr)
+        rows = [
+            i for i, n in enumerate(found.names) if PEOPLE.search(n.lower()) or VEHICLES.search(n.lower())
+        ]
+        boxes = found.xyxy[rows]
+        sizes = boxes[:, 2:] - boxes[:, :2]
+        return boxes[np.argsort(sizes.prod(axis=1), kind="stable")]
+
+
+def hide(bgr: U8, boxes: F32) -> U8:
+    """A copy of an (H, W, 3) image in which the (B, 4) boxes and their margins are a few flat cells."""
+    hidden = bgr.copy()
+    height, width = bgr.shape[:2]
+    for x0, y0, x1, y1 in grown(boxes, width, height):
+        part = hidden[y0:y1, x0:x1]
+        edge = max(SMALLEST, -(-max(part.shape[:2]) // CELLS))
+        cells = [max(1, side // edge) for side in part.shape[1::-1]]
+        means = cv2.resize(part, cells, interpolation=cv2.INTER_AREA)
+        part[:] = cv2.resize(means, part.shape[1::-1], interpolation=cv2.INTER_NEAREST)
+    return hidden
+
+
+def grown(boxes: F32, width: int, height: int) -> Sequence[tuple[int, int, int, int]]:
+    """Whole pixels of the boxes with their margin: first column and row, and those after the last.
+
+    A box outside the image has none.
+    """
+    found = []
+    for x0, y0, x1, y1 in boxes.tolist():
+        dx, dy = MARGIN * (x1 - x0) + 2, MARGIN * (y1 - y0) + 2
+        left, top = max(0, int(np.floor(x0 - dx + 0.5))), max(0, int(np.floor(y0 - dy + 0.5)))
+        right, bottom = min(width, int(np.ceil(x1 + dx + 0.5))), min(height, int(np.ceil(y1 + dy + 0.5)))
+        if left < right and top < bottom:
+            found.append((left, top, right, bottom))
+    return found
+
+
+def _encoded(bgr: U8, magic: bytes) -> U8:
+    """In the form that the first bytes tell: PNG without loss, JPEG with little."""
+    png = magic.startswith(b"\x89PNG")
+    form, options = (".png", []) if png else (".jpg", [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
+    _, data = cv2.imencode(form, bgr, options)
+    encoded: U8 = data.reshape(-1)
+    return encoded

@@ -1,0 +1,79 @@
+"""What a page tells of a run, gathered frame by frame: small, however many frames there are."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+from bevviz.frame import Frame, FrameResult
+from bevviz.logging.logger import health
+from bevviz.report.pictures import camera_picture, jpeg, shrink
+
+STRIP_PICTURES = 48  # of all cameras and the bird's-eye view together
+STRIP_WIDTH = 400
+
+
+@dataclass(frozen=True, slots=True)
+class Moment:
+    """One frame. ``states``: subject, class and state of each decision."""
+
+    index: int
+    stamp: int
+    received: int
+    health: Mapping[str, float]  # by entity
+    states: Counter[tuple[str, str, str]]
+    problems: tuple[str, ...]
+
+
+@dataclass(slots=True)
+class Story:
+    """The frames of a window.
+
+    Args:
+        at: time of receipt, in nanoseconds, of the scan that the report is about.
+        total: frames to expect.
+        cameras: how many there are.
+    """
+
+    at: int
+    total: int
+    cameras: int
+    moments: list[Moment] = field(default_factory=list)
+    strip: list[tuple[Moment, dict[str, bytes]]] = field(default_factory=list)  # JPEGs by sensor
+    result: FrameResult | None = None  # of the scan nearest to ``at``
+    _last: Frame | None = None
+
+    def add(self, result: FrameResult) -> Moment:
+        """Take in the next frame."""
+        frame = result.frame
+        names = {c.camera.name: c.detections.names for c in result.cameras if c.detections is not None}
+        states = Counter(
+            (e.subject, names[e.camera][e.row] if e.subject == "detection" else "", e.state)
+            for e in result.explanations
+            if e.subject != "camera"
+        )
+        problems = [f"{f.stage}: {f.reason}" for f in result.failures]
+        problems += frame.problems
+        problems += [f"{c.camera.name}: {p}" for c in result.cameras for p in c.camera.problems]
+        measured = dict(health(result, self._last))
+        moment = Moment(frame.index, frame.stamp, frame.received, measured, states, tuple(problems))
+        if self._is_for_strip(len(self.moments)):
+            self.strip.append((moment, strip_pictures(result)))
+        if self.result is None or abs(frame.received - self.at) < abs(self.result.frame.received - self.at):
+            self.result = result
+        self.moments.append(moment)
+        self._last = frame
+        return moment
+
+    def _is_for_strip(self, number: int) -> bool:
+        """Evenly spread over the window."""
+        wanted = min(self.total, max(2, STRIP_PICTURES // (1 + self.cameras)))
+        return number * wanted // self.total != (number - 1) * wanted // self.total
+
+
+def strip_pictures(result: FrameResult) -> dict[str, bytes]:
+    pictures = {c.camera.name: camera_picture(c, STRIP_WIDTH) for c in result.cameras}
+    if result.bev is not None:
+        pictures["bird's-eye view"] = shrink(result.bev.image, STRIP_WIDTH)[0]
+    return {name: jpeg(picture, 70) for name, picture in pictures.items() if picture is not None}

@@ -1,0 +1,152 @@
+"""The part of a bag that a report is about, cut out as a bag of its own that runs again."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import dataclass
+from fnmatch import fnmatchcase
+from pathlib import Path
+
+import numpy as np
+from backports import zstd
+
+from bevviz.config import Config
+from bevviz.errors import UserError
+from bevviz.sources.bag import MARGIN, SECOND, BagSource, iso
+from bevviz.sources.mcap_writer import McapWriter
+from bevviz.sources.recording import RawMessage, Recording, is_ros1
+from bevviz.sources.roles import Roles
+
+MILLISECOND = 1_000_000
+
+Edit = Callable[[RawMessage, bytes | memoryview], bytes | memoryview | None]
+
+
+@dataclass(frozen=True, slots=True)
+class Window:
+    """Log times in nanoseconds. ``low`` and ``high`` are whole milliseconds, so that they can be written."""
+
+    at: int  # of the scan that the report is about
+    low: int  # scans from here
+    high: int  # to before here
+    start: int  # of the whole recording
+
+
+@dataclass(frozen=True, slots=True)
+class Cut:
+    """What a bag was made of."""
+
+    counts: Counter[str]  # messages by topic
+    left_out: tuple[str, ...]  # one sentence each
+
+
+def find_window(source: BagSource, at: int, before: float, after: float) -> Window:
+    """The window from the first scan to the last one within ``before`` and ``after`` seconds of ``at``."""
+    times = source.recording.times(source.roles.lidars[0])
+    first, last = np.searchsorted(times, [at - round(before * SECOND), at + round(after * SECOND) + 1])
+    low = int(times[first]) // MILLISECOND * MILLISECOND
+    high = (int(times[last - 1]) // MILLISECOND + 1) * MILLISECOND
+    return Window(at, low, high, source.recording.start)
+
+
+def open_window(paths: Sequence[Path], config: Config, low: int, high: int) -> BagSource:
+    """The scans of a window, in the whole bag as in the one cut out."""
+    return BagSource(paths, config, start=iso(low), end=iso(high))
+
+
+def choose_topics(recording: Recording, roles: Roles, patterns: Sequence[str] | None) -> list[str]:
+    """Those that the pipeline reads, and those of the others that a pattern names; None: all of them.
+
+    Raises:
+        UserError: a pattern that no topic fits.
+    """
+    there = [topic.name for topic in recording.topics]
+    if patterns is None:
+        return there
+    for pattern in patterns:
+        if not any(fnmatchcase(name, pattern) for name in there):
+            raise UserError(f"--topics {pattern}: no topic fits among {', '.join(there)}")
+    needed = set(_read(roles))
+    return [n for n in there if n in needed or any(fnmatchcase(n, pattern) for pattern in patterns)]
+
+
+def _read(roles: Roles) -> list[str]:
+    """Every topic that the pipeline reads."""
+    cameras = [name for camera in roles.cameras for name in (camera.topic, camera.info_topic)]
+    single = [roles.odometry, roles.truth]
+    return [
+        *roles.lidars,
+        *roles.tf,
+        *roles.tf_static,
+        *roles.robot_detections_2d,
+        *roles.robot_detections_3d,
+        *(name for name in (*cameras, *single) if name),
+    ]
+
+
+def cut(
+    recording: Recording,
+    window: Window,
+    topics: Collection[str],
+    static: Collection[str],
+    path: Path,
+    edit: Edit = lambda message, data: data,
+) -> Cut:
+    """Write the messages of a window to an MCAP file, byte for byte, with all that it needs to run again.
+
+    That is: ``MARGIN`` on either side, as ``BagSource`` reads it, everything that was said on the
+    ``static`` topics, and of each topic that is silent in the window the last message before it, else the
+    first one after it (a calibration, a map or a robot's description that was published once).
+
+    Args:
+        recording: the whole bag.
+        window: the scans.
+        topics: those to be written.
+        static: topics of static transforms.
+        path: of the MCAP file.
+        edit: gives the data to be written for a message, None: leave it out.
+
+    Raises:
+        UserError: the file cannot be written.
+    """
+    low, high = window.low - MARGIN, window.high + MARGIN
+    chosen = [name for name in topics if name not in static]
+    counts: Counter[str] = Counter()
+    damaged: Counter[str] = Counter()
+    ros1 = is_ros1(next(c for f in recording.files for c in f.connections))
+    with McapWriter(path, recording.definition, ros1=ros1) as bag:
+
+        def put(message: RawMessage) -> None:
+            try:
+                content = message.content()
+            except zstd.ZstdError:
+                damaged[message.topic] += 1
+                return
+            if (data := edit(message, content)) is not None:
+                bag.write(message.connection, message.received, data)
+                counts[message.topic] += 1
+
+        silent = [_last(recording, name, low, high) for name in chosen]
+        early = [m for m in silent if m is not None and m.received < low]
+        late = [m for m in silent if m is not None and m.received >= high]
+        early += recording.messages(static, None, low)
+        for message in sorted(early, key=lambda m: m.received):
+            put(message)
+        for message in recording.messages(topics, low, high):
+            put(message)
+        late += recording.messages(static, high)
+        for message in sorted(late, key=lambda m: m.received):
+            put(message)
+    lost = [f"{n} damaged message(s) of {name} are left out" for name, n in damaged.items()]
+    return Cut(counts, tuple(lost))
+
+
+def _last(recording: Recording, topic: str, low: int, high: int) -> RawMessage | None:
+    """What holds in the window, of a topic without a message in it; None where it has one."""
+    times = recording.times(topic)
+    first, last = np.searchsorted(times, [low, high])
+    if first < last or not len(times):
+        return None
+    nearest = int(times[first - 1]) if first else int(times[0])
+    return next(recording.messages([topic], nearest, nearest + 1), None)

@@ -1,0 +1,204 @@
+"""Raw messages into an MCAP file, byte for byte as they were recorded (https://mcap.dev/spec)."""
+
+from __future__ import annotations
+
+import struct
+from binascii import crc32
+from collections import Counter, defaultdict
+from collections.abc import Callable
+from io import BytesIO
+from pathlib import Path
+from types import TracebackType
+from typing import IO, Self
+
+from backports import zstd
+from rosbags.interfaces import Connection, ConnectionExtRosbag2, MessageDefinition, MessageDefinitionFormat
+from rosbags.rosbag2.metadata import dump_qos_v9
+from ruamel.yaml import YAML
+
+from bevviz import __version__
+from bevviz.errors import UserError
+from bevviz.sources.mcap import (
+    CHANNEL,
+    CHUNK,
+    CHUNK_HEAD,
+    DATA_END,
+    FOOTER,
+    MAGIC,
+    MESSAGE,
+    MESSAGE_HEAD,
+    MESSAGE_INDEX,
+    RECORD,
+    SCHEMA,
+)
+
+HEADER, CHUNK_INDEX, STATISTICS = 1, 8, 0x0B
+CHUNK_SIZE = 1 << 22  # bytes that a chunk is closed at
+
+
+class McapWriter:
+    """Context manager: ``write`` messages in order of log time. The file appears when all went well.
+
+    The messages of ROS 1 stay what they are: with the encoding ``ros1``, which MCAP has beside ``cdr``.
+
+    Args:
+        path: the ``.mcap`` file; replaced where it exists.
+        define: tells what the type of a connection is made of.
+        ros1: the profile that the file states.
+
+    Raises:
+        UserError: the file cannot be written.
+    """
+
+    def __init__(
+        self, path: Path, define: Callable[[Connection], MessageDefinition], *, ros1: bool = False
+    ) -> None:
+        self._path = path
+        self._part = path.with_name(f".{path.name}.part")
+        self._define = define
+        self._profile = "ros1" if ros1 else "ros2"
+        self._schemas: dict[tuple[str, MessageDefinition], int] = {}
+        self._channels: dict[tuple[str, str, MessageDefinition], int] = {}
+        self._declared = BytesIO()  # schemas and channels, for the summary
+        self._chunk = BytesIO()
+        self._index: dict[int, list[tuple[int, int]]] = defaultdict(list)  # of the open chunk, by channel
+        self._chunks = BytesIO()  # their records of the summary
+        self._chunk_count = 0
+        self._counts: Counter[int] = Counter()
+        self._span = (2**63 - 1, 0)
+
+    def __enter__(self) -> Self:
+        try:
+            self._file: IO[bytes] = self._part.open("wb")
+        except OSError as error:
+            raise UserError(f"{self._path}: cannot write the bag: {error.strerror}") from None
+        self._file.write(MAGIC + _record(HEADER, _text(self._profile) + _text(f"bevviz {__version__}")))
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        try:
+            if kind is None:
+                self._finish()
+            self._file.close()
+            if kind is None:
+                self._part.replace(self._path)
+        except OSError as failure:
+            raise UserError(f"{self._path}: cannot write the bag: {failure.strerror}") from None
+        finally:
+            self._part.unlink(missing_ok=True)
+
+    def write(self, connection: Connection, time: int, data: bytes | memoryview) -> None:
+        """Append a message.
+
+        Args:
+            connection: where it was recorded: its topic, type, encoding and quality of service are kept.
+            time: log time, nanoseconds.
+            data: the serialised message.
+        """
+        key = connection.topic, connection.msgtype, connection.msgdef
+        channel = self._channels.get(key)
+        if channel is None:
+            channel = self._channels[key] = self._add_channel(connection, len(self._channels) + 1)
+        self._index[channel].append((time, self._chunk.tell()))
+        count = self._counts[channel]
+        self._counts[channel] += 1
+        self._chunk.write(RECORD.pack(MESSAGE, MESSAGE_HEAD.size + len(data)))
+        self._chunk.write(MESSAGE_HEAD.pack(channel, count & 0xFFFFFFFF, time, time))
+        self._chunk.write(data)
+        if self._chunk.tell() > CHUNK_SIZE:
+            try:
+                self._close_chunk()
+            except OSError as error:
+                raise UserError(f"{self._path}: cannot write the bag: {error.strerror}") from None
+
+    def _add_channel(self, connection: Connection, number: int) -> int:
+        extra, definition = connection.ext, self._define(connection)
+        ros2 = isinstance(extra, ConnectionExtRosbag2) and extra.serialization_format != "ros1"
+        schema = self._schemas.get((connection.msgtype, definition)) or self._add_schema(
+            connection.msgtype, definition, ros2
+        )
+        metadata = b""
+        if isinstance(extra, ConnectionExtRosbag2) and extra.offered_qos_profiles:
+            # So that a player offers what is published once to whoever comes late, as the robot did.
+            profiles = BytesIO()
+            YAML(typ="safe", pure=True).dump(dump_qos_v9(extra.offered_qos_profiles), profiles)
+            metadata = _text("offered_qos_profiles") + _text(profiles.getvalue().decode())
+        self._declare(
+            CHANNEL,
+            struct.pack("<HH", number, schema)
+            + _text(connection.topic)
+            + _text("cdr" if ros2 else "ros1")
+            + _bytes(metadata),
+        )
+        return number
+
+    def _add_schema(self, msgtype: str, definition: MessageDefinition, ros2: bool) -> int:
+        number = self._schemas[msgtype, definition] = len(self._schemas) + 1
+        kind = {
+            MessageDefinitionFormat.MSG: "ros2msg" if ros2 else "ros1msg",
+            MessageDefinitionFormat.IDL: "ros2idl",
+            MessageDefinitionFormat.NONE: "",
+        }[definition.format]
+        name = msgtype if ros2 else msgtype.replace("/msg/", "/")
+        self._declare(SCHEMA, struct.pack("<H", number) + _text(name) + _text(kind) + _text(definition.data))
+        return number
+
+    def _declare(self, opcode: int, content: bytes) -> None:
+        record = _record(opcode, content)
+        self._chunk.write(record)
+        self._declared.write(record)
+
+    def _close_chunk(self) -> None:
+        data, start = self._chunk.getvalue(), self._file.tell()
+        packed = zstd.compress(data)
+        times = [time for entries in self._index.values() for time, _ in entries]
+        first, last = min(times, default=0), max(times, default=0)
+        head = CHUNK_HEAD.pack(first, last, len(data), crc32(data), len(b"zstd")) + b"zstd"
+        self._file.write(_record(CHUNK, head + struct.pack("<Q", len(packed)) + packed))
+        index_start = self._file.tell()
+        offsets = b""
+        for channel, entries in self._index.items():
+            offsets += struct.pack("<HQ", channel, self._file.tell())
+            listed = b"".join(struct.pack("<QQ", *entry) for entry in entries)
+            self._file.write(_record(MESSAGE_INDEX, struct.pack("<H", channel) + _bytes(listed)))
+        about = struct.pack("<QQQQ", first, last, start, index_start - start) + _bytes(offsets)
+        about += struct.pack("<Q", self._file.tell() - index_start) + _text("zstd")
+        self._chunks.write(_record(CHUNK_INDEX, about + struct.pack("<QQ", len(packed), len(data))))
+        self._chunk_count += 1
+        if times:
+            self._span = min(first, self._span[0]), max(last, self._span[1])
+        self._chunk, self._index = BytesIO(), defaultdict(list)
+
+    def _finish(self) -> None:
+        if self._chunk.tell():
+            self._close_chunk()
+        self._file.write(_record(DATA_END, struct.pack("<I", 0)))
+        summary = self._file.tell()
+        counts = b"".join(struct.pack("<HQ", *pair) for pair in sorted(self._counts.items()))
+        about = struct.pack(
+            "<QHIIIIQQ",
+            self._counts.total(),
+            len(self._schemas),
+            len(self._channels),
+            0,  # attachments
+            0,  # metadata
+            self._chunk_count,
+            *(self._span if self._counts else (0, 0)),
+        )
+        self._file.write(self._declared.getvalue() + _record(STATISTICS, about + _bytes(counts)))
+        self._file.write(self._chunks.getvalue())
+        self._file.write(_record(FOOTER, struct.pack("<QQI", summary, 0, 0)) + MAGIC)
+
+
+def _record(opcode: int, content: bytes) -> bytes:
+    return RECORD.pack(opcode, len(content)) + content
+
+
+def _bytes(content: bytes) -> bytes:
+    return struct.pack("<I", len(content)) + content
+
+
+def _text(text: str) -> bytes:
+    return _bytes(text.encode())

@@ -1,0 +1,217 @@
+"""Redaction: what is hidden in every file of a report, what stays, and that the check still holds."""
+
+from __future__ import annotations
+
+import base64
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from bevviz.cli import main
+from bevviz.frame import F32, U8
+from bevviz.report.pictures import shrink
+from bevviz.report.redact import CELLS, Redactor, grown, hide
+from bevviz.report.story import STRIP_WIDTH
+from bevviz.sources.messages import decode_compressed_image, decode_image
+from bevviz.sources.recording import Recording as Bag
+from tests import bags
+from tests.recordings import Recording, verify
+from tests.test_cli import Capture, error_of
+
+PNG, RAW, JPEG = "/camera/image_rect_color/compressed", "/annotated", "/other/compressed"
+PERSON = np.array([712, 143, 811, 308])  # the pedestrian of KITTI 000000
+
+
+def unfold(bag: Path) -> dict[str, list[U8]]:
+    """The images of a bag by topic."""
+    found: dict[str, list[U8]] = {}
+    with Bag([bag]) as recording:
+        for m in recording.messages([PNG, RAW, JPEG]):
+            decode = decode_image if m.topic == RAW else decode_compressed_image
+            found.setdefault(m.topic, []).append(decode(recording.decode(m), m.topic, m.received).bgr)
+    return found
+
+
+@pytest.fixture(scope="module")
+def drive(shared: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """One KITTI frame, its picture on three topics, and what cannot be looked into."""
+    messages, stamp = bags.Messages(), bags.START
+    items = bags.kitti_items(shared, messages, ["000000"], step=4)
+    png = bags.kitti(shared, "000000").png
+    bgr: Any = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR)
+    jpeg = cv2.imencode(".jpg", bgr)[1].tobytes()
+    image = "sensor_msgs/msg/Image"
+    colored = messages.cloud(stamp, np.zeros((3, 4), np.float32))
+    colored.fields[3].name = "rgb"
+    depth = messages.image(stamp, bgr[:4, :4])
+    depth.encoding = "32FC1"
+    return bags.write(
+        tmp_path_factory.mktemp("redact") / "drive",
+        [
+            *items,
+            bags.Item(RAW, image, stamp, messages.image(stamp, bgr)),
+            bags.Item(
+                JPEG, "sensor_msgs/msg/CompressedImage", stamp, messages.compressed(stamp, jpeg, "jpeg")
+            ),
+            bags.Item("/depth", image, stamp, depth),
+            bags.Item("/video", "stereo_msgs/msg/DisparityImage", stamp, b"\0" * 64),
+            bags.Item("/depth/points", "sensor_msgs/msg/PointCloud2", stamp, colored),
+        ],
+        messages,
+    )
+
+
+@pytest.fixture(scope="module")
+def report(drive: Path, shared: Path) -> Path:
+    out = drive.parent / "bug.rrd"
+    call = ["report", drive, "--at", "0", "-o", out, "--model", shared / "models" / "yolox_nano.onnx"]
+    assert main([*map(str, call), "--redact", "--set", f"source.camera_topics=[{PNG}]"]) == 0
+    return out
+
+
+def is_hidden(bgr: U8) -> bool:
+    """Whether the middle of the pedestrian is a few flat cells."""
+    x0, y0, x1, y1 = PERSON
+    inner = bgr[y0 + 10 : y1 - 10, x0 + 10 : x1 - 10]
+    rows = np.abs(np.diff(inner.astype(int), axis=0)).max(axis=(1, 2)) > 3
+    return int(np.count_nonzero(rows)) <= CELLS
+
+
+def test_images_of_the_bag(drive: Path, report: Path) -> None:
+    before, after = unfold(drive), unfold(report.with_suffix(".mcap"))
+    assert after.keys() == before.keys() == {PNG, RAW, JPEG}
+    assert not is_hidden(before[RAW][0])
+    for topic in (PNG, RAW):
+        assert is_hidden(after[topic][0])
+    np.testing.assert_array_equal(after[PNG][0], after[RAW][0])  # both without loss
+    # JPEG is encoded anew: hidden all the same, next to unchanged elsewhere.
+    changed = np.abs(after[JPEG][0].astype(int) - before[JPEG][0]).max(axis=2)
+    outside = (after[RAW][0] == before[RAW][0]).all(axis=2)
+    assert np.percentile(changed[cv2.erode(outside.astype(np.uint8), np.ones((17, 17))) > 0], 99) <= 12
+    assert 0.05 < 1 - outside.mean() < 0.5
+
+
+def test_everything_else_of_the_bag_is_untouched(drive: Path, report: Path, capsys: Capture) -> None:
+    with Bag([drive]) as old, Bag([report.with_suffix(".mcap")]) as new:
+        there = {t.name for t in old.topics}
+        here = {t.name for t in new.topics}
+        assert there - here == {"/depth", "/video", "/depth/points"}
+        topics = sorted(here - {PNG, RAW, JPEG})
+        contents = [[(m.topic, bytes(m.content())) for m in b.messages(topics)] for b in (old, new)]
+    assert contents[0] == contents[1]
+    about = json.loads(Recording(report).static["/__properties/report"]["about"][0])
+    told = " ".join(about["warnings"])
+    for reason in (
+        "/depth left out: image encoding '32FC1'",
+        "/video left out",
+        "colours of a picture",
+    ):
+        assert reason in told
+
+
+def test_images_of_the_recording_and_the_page(drive: Path, report: Path) -> None:
+    verify(report)
+    redacted, whole = unfold(report.with_suffix(".mcap"))[PNG][0], unfold(drive)[PNG][0]
+    blobs = Recording(report).column("/world/camera/image", "EncodedImage:blob")
+    assert len(blobs) == 1
+    logged: Any = cv2.imdecode(np.array(blobs[0][0], np.uint8), cv2.IMREAD_COLOR)
+    np.testing.assert_array_equal(logged, redacted)
+
+    text = report.with_suffix(".html").read_text()
+    pictures: list[Any] = [
+        cv2.imdecode(np.frombuffer(base64.b64decode(data), np.uint8), cv2.IMREAD_COLOR)
+        for data in re.findall(r"base64,([^\"]+)", text)
+    ]
+    ratio = whole.shape[1] / whole.shape[0]
+    shown = [p for p in pictures if abs(p.shape[1] / p.shape[0] - ratio) < 0.1]
+    assert len(shown) == 2  # the scene and the strip
+    x0, y0, x1, y1 = np.round(PERSON * STRIP_WIDTH / whole.shape[1]).astype(int)
+    inner = np.s_[y0 + 4 : y1 - 4, x0 + 4 : x1 - 4]
+    for picture in shown:
+        small = shrink(picture, STRIP_WIDTH)[0][inner].astype(int)
+        to_redacted = np.abs(small - shrink(redacted, STRIP_WIDTH)[0][inner]).mean()
+        to_whole = np.abs(small - shrink(whole, STRIP_WIDTH)[0][inner]).mean()
+        assert to_redacted < 0.6 * to_whole
+
+
+def test_detections_are_those_of_the_whole_images(report: Path, capsys: Capture) -> None:
+    labels = Recording(report).column("/world/camera/image/detections", "Boxes2D:labels")
+    assert labels[0][0].startswith("person 0.8")
+    assert main(["report", "--check", str(report)]) == 0
+    said = capsys.readouterr().out
+    assert "1 frames: the same in every bit" in said
+    assert "detections are taken from the report" in said
+
+
+def test_a_check_still_sees_a_change(report: Path, capsys: Capture) -> None:
+    assert main(["report", "--check", str(report), "--set", "fusion.min_iou=0.99"]) == 1
+    assert "in 'fusion camera'" in capsys.readouterr().out
+
+
+def test_it_needs_a_detector_of_people_and_vehicles(drive: Path, tmp_path: Path, capsys: Capture) -> None:
+    output = str(tmp_path / "bug.rrd")
+    call = ["report", str(drive), "--at", "0", "-o", output, "--redact"]
+    assert "--redact needs a detector" in error_of(capsys, *call)
+    names = tmp_path / "names.txt"
+    names.write_text("cat\ncar\ndog\n")
+    call += ["--model", "demo", "--set", f"detector.names={names}"]
+    assert "finds no people, but cat, car, dog" in error_of(capsys, *call)
+    assert [p.name for p in tmp_path.iterdir()] == ["names.txt"]
+
+
+def test_a_narrow_configuration_does_not_count(drive: Path, shared: Path) -> None:
+    """Neither a high threshold nor a choice of classes keeps anybody visible."""
+    from bevviz.config import DetectorConfig
+
+    config = DetectorConfig(
+        model=str(shared / "models" / "yolox_nano.onnx"),
+        classes=("dog",),
+        conf_threshold=0.99,
+        explain_threshold=0.99,
+        max_candidates=1,
+    )
+    with Bag([drive]) as recording:
+        redactor = Redactor(config, recording)
+    boxes = redactor.find(unfold(drive)[PNG][0])
+    assert np.abs(boxes - PERSON).max(axis=1).min() < 15
+    assert len(boxes) > 5
+
+
+# --- hiding ------------------------------------------------------------------------------------
+
+SIDE = st.floats(-20, 140, width=32)
+
+
+@given(
+    st.integers(0, 1000),
+    SIDE,
+    SIDE,
+    st.floats(0.5, 100, width=32),
+    st.floats(0.5, 100, width=32),
+)
+def test_a_box_becomes_a_few_flat_cells_and_nothing_else_changes(
+    seed: int, x: float, y: float, width: float, height: float
+) -> None:
+    image: U8 = np.random.default_rng(seed).integers(0, 256, (90, 120, 3), np.uint8)
+    box: F32 = np.array([[x, y, x + width, y + height]], np.float32)
+    hidden = hide(image, box)
+    places = grown(box, 120, 90)
+    if not places:
+        np.testing.assert_array_equal(hidden, image)
+        assert x + width < 0 or y + height < 0 or x > 119 or y > 89
+        return
+    left, top, right, bottom = places[0]
+    outside = np.ones((90, 120), bool)
+    outside[top:bottom, left:right] = False
+    np.testing.assert_array_equal(hidden[outside], image[outside])
+    part = hidden[top:bottom, left:right].reshape(-1, 3)
+    assert len(np.unique(part, axis=0)) <= CELLS * CELLS
+    x0, y0, x1, y1 = np.clip(box[0], 0, [119, 89, 119, 89])
+    assert left <= x0 and top <= y0 and right >= x1 and bottom >= y1
