@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import onnx
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -146,6 +147,7 @@ def test_the_model_without_its_folder(tmp_path: Path, small: Path, capsys: Captu
     found = Recording(Path("bug.rrd"))
     about = json.loads(found.static["/__properties/report"]["about"][0])
     assert about["model"]["name"] == "net.onnx"
+    assert "network: CPU" in about["hardware"]
     assert "secret" not in Path("bug.html").read_text() + str(found.static)
     capsys.readouterr()
     assert "--model FILE" in error_of(capsys, "report", "--check", "bug.rrd")
@@ -153,7 +155,14 @@ def test_the_model_without_its_folder(tmp_path: Path, small: Path, capsys: Captu
     assert main([*call, "--force", "--include-model"]) == 0
     assert main(["report", "--check", "bug.rrd"]) == 0
     assert Path("net.onnx").read_bytes() == model.read_bytes()
+    capsys.readouterr()
     assert main(["report", "--check", "bug.rrd", "--model", "demo"]) == 0  # the same network elsewhere
+    assert capsys.readouterr().out == "1 frames: the same in every bit\n"
+    other = onnx.load(model)
+    other.doc_string = "another file"
+    onnx.save(other, "net.onnx")
+    assert main(["report", "--check", "bug.rrd"]) == 0
+    assert re.search(r"not as it was: model was net\.onnx \(SHA-256 \w+\), is \w+", capsys.readouterr().out)
 
 
 # --- the check ---------------------------------------------------------------------------------
@@ -212,7 +221,7 @@ def test_other_versions_and_machines_are_named(
     from bevviz.report import check, origin
 
     monkeypatch.setattr(check, "versions", lambda: ["numpy 9.9"])
-    monkeypatch.setattr(check, "hardware", lambda: origin.Hardware("abacus", 1, "0 GiB", "none"))
+    monkeypatch.setattr(check, "hardware", lambda _: origin.Hardware("abacus", 1, "0 GiB", "none"))
     assert main(["report", "--check", str(small)]) == 0
     said = capsys.readouterr().out
     assert re.search(r"not as it was: numpy was \d.*, is 9\.9", said)

@@ -57,7 +57,7 @@ def digests(path: Path, config: Config, window: Window) -> list[tuple[Stage, ...
 )
 def test_raw_messages_and_the_same_results(form: str, compression: str, tmp_path: Path) -> None:
     messages = bags.Messages(form == "ros1")
-    items = bags.small_items(messages, scans=80)
+    items = bags.small_items(messages, scans=60)
     path = bags.write(
         tmp_path / ("drive.bag" if form == "ros1" else "drive"),
         items,

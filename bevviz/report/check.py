@@ -89,7 +89,7 @@ def check(rrd: Path, *, model: Path | None = None, settings: Sequence[str] = ())
         raise UserError(f"{bag}: the bag of the report is not there; it has the name of the recording")
     with TemporaryDirectory(prefix="bevviz-") as folder:
         stored, config = _config(rrd, kept, model, settings, Path(folder))
-        verdict = Verdict(redacted=about.redacted, changed=_changed(kept, bag, stored, config))
+        verdict = Verdict(redacted=about.redacted)
         detections = {
             key: value for stages in kept.frames.values() for key, value in detections_of(stages).items()
         }
@@ -97,6 +97,7 @@ def check(rrd: Path, *, model: Path | None = None, settings: Sequence[str] = ())
             open_window([bag], config, about.low, about.high) as source,
             Pipeline(config, replay(detections) if about.redacted else None) as pipeline,
         ):
+            verdict.changed = _changed(kept, bag, stored, pipeline)
             left = dict(kept.frames)
             for frame in tqdm(
                 prefetch(source, 2), total=source.total, unit="frame", desc="check", disable=None
@@ -164,8 +165,9 @@ def _config(
     return stored, load(file, [*here, *settings])
 
 
-def _changed(kept: Kept, bag: Path, stored: Config, config: Config) -> list[str]:
-    about, found = kept.about, []
+def _changed(kept: Kept, bag: Path, stored: Config, pipeline: Pipeline) -> list[str]:
+    about, config = kept.about, pipeline.config
+    found = []
     if file_hash(bag) != about.bag_sha256:
         found.append(f"{bag.name} is not the file that the report was made with (SHA-256)")
     local = ("detector.model", "detector.names")
@@ -181,7 +183,7 @@ def _changed(kept: Kept, bag: Path, stored: Config, config: Config) -> list[str]
         name, number = line.rsplit(" ", 1)
         if here.get(name) != number:
             found.append(f"{name} was {number}, is {here.get(name, 'absent')}")
-    machine = dict(line.split(": ", 1) for line in hardware().lines())
+    machine = dict(line.split(": ", 1) for line in hardware(pipeline).lines())
     for line in about.hardware:
         name, value = line.split(": ", 1)
         if machine.get(name) != value:

@@ -20,7 +20,16 @@ from bevviz.logging.sinks import open_recording
 from bevviz.pipeline import Pipeline
 from bevviz.report.digest import digest, pack
 from bevviz.report.facts import Facts, commands, file_lines, window_text
-from bevviz.report.origin import About, changes, file_hash, hardware, model_of, model_path, shareable
+from bevviz.report.origin import (
+    About,
+    Hardware,
+    changes,
+    file_hash,
+    hardware,
+    model_of,
+    model_path,
+    shareable,
+)
 from bevviz.report.page import page
 from bevviz.report.redact import Redactor
 from bevviz.report.story import Story
@@ -116,8 +125,11 @@ def make(order: Order) -> Made:
         made.frames = len(story.moments)
         made.warnings += [w for w in again.warnings if w not in made.warnings]
         made.warnings = [_without_folders(w, [*order.paths, bag]) for w in made.warnings]
-        facts = _facts(order, public, window, part, made, whole.scene.name)
-        recording.send_property("report", rr.AnyValues(about=_about(order, window, made, bag).dump()))
+        machine = hardware(pipeline)
+        facts = _facts(order, public, window, part, made, machine, whole.scene.name)
+        recording.send_property(
+            "report", rr.AnyValues(about=_about(order, window, made, machine, bag).dump())
+        )
         document = rr.TextDocument(facts.markdown(), media_type=rr.MediaType.MARKDOWN)
         recording.log(entities.REPORT, document, static=True)
     try:
@@ -181,7 +193,7 @@ def _cut(
         return cut(source.recording, window, topics, source.roles.tf_static, bag, edit)
 
 
-def _about(order: Order, window: Window, made: Made, bag: Path) -> About:
+def _about(order: Order, window: Window, made: Made, machine: Hardware, bag: Path) -> About:
     return About(
         low=window.low,
         high=window.high,
@@ -189,7 +201,7 @@ def _about(order: Order, window: Window, made: Made, bag: Path) -> About:
         bag_sha256=file_hash(bag),
         model=model_of(order.config),
         classes=_class_names(order.config),
-        hardware=hardware().lines(),
+        hardware=machine.lines(),
         redacted=order.redact,
         interrupted=made.interrupted,
         note=order.note,
@@ -197,7 +209,9 @@ def _about(order: Order, window: Window, made: Made, bag: Path) -> About:
     )
 
 
-def _facts(order: Order, public: Config, window: Window, part: Cut, made: Made, name: str) -> Facts:
+def _facts(
+    order: Order, public: Config, window: Window, part: Cut, made: Made, machine: Hardware, name: str
+) -> Facts:
     sizes = {
         path.name: f"{what}, {megabytes(path.stat().st_size)}"
         for path, what in (
@@ -222,7 +236,7 @@ def _facts(order: Order, public: Config, window: Window, part: Cut, made: Made, 
         config=f"Preset {public.preset}, {differs}.",
         changes=changed,
         versions=versions(),
-        hardware=hardware().lines(),
+        hardware=machine.lines(),
         warnings=made.warnings,
         files=file_lines(sizes, part.counts, model_of(order.config)),
         commands=commands(order.output, window, public, order.redact),

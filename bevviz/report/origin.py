@@ -12,6 +12,7 @@ from hashlib import sha256
 from pathlib import Path
 
 from bevviz.config import Config, load
+from bevviz.pipeline import Pipeline
 from bevviz.stages.detector import DEMO_MODEL
 
 
@@ -29,9 +30,10 @@ class Hardware:
     cores: int
     memory: str
     system: str
+    network: str = ""  # what the detector's network runs on, "": there is none
 
     def lines(self) -> list[str]:
-        return [f"{name}: {value}" for name, value in asdict(self).items()]
+        return [f"{name}: {value}" for name, value in asdict(self).items() if value]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -61,8 +63,10 @@ class About:
         return About(model=None if model is None else Model(**model), **values)
 
 
-def hardware() -> Hardware:
-    return Hardware(_processor(), os.cpu_count() or 0, _memory(), _system())
+def hardware(pipeline: Pipeline) -> Hardware:
+    """This machine, as the pipeline uses it."""
+    network = "" if pipeline.detector is None else pipeline.detector.provider
+    return Hardware(_processor(), os.cpu_count() or 0, _memory(), _system(), network)
 
 
 def file_hash(path: Path) -> str:
