@@ -102,8 +102,8 @@ class Pipeline:
         if voxels is not None:
             ground = log.run("ground", segment_ground, voxels.points, config.ground)
         if voxels is not None and ground is not None:
-            obstacles = voxels.points[~ground.mask]
-            raw_ground = ground.mask[voxels.inverse]
+            obstacles = voxels.points.compress(~ground.mask, axis=0)
+            raw_ground = ground.mask.take(voxels.inverse)
             clusters = log.run("clustering", cluster, obstacles, config.clustering)
 
         cameras = []
@@ -168,8 +168,9 @@ def _project(points: F32, camera: Camera) -> tuple[F32, F32] | None:
     if camera.intrinsics is None or camera.camera_from_points is None:
         return None
     uv, depth = geometry.project(geometry.apply(camera.camera_from_points, points), camera.intrinsics)
-    limit = np.array([camera.intrinsics.width, camera.intrinsics.height], np.float32) - 0.5
+    u, v = uv.T
     with np.errstate(invalid="ignore"):
-        outside = ~((uv >= -0.5) & (uv < limit)).all(axis=1)
-    uv[outside] = np.nan
+        seen = (u >= -0.5) & (u < camera.intrinsics.width - 0.5)
+        seen &= (v >= -0.5) & (v < camera.intrinsics.height - 0.5)
+    np.copyto(uv, np.nan, where=~seen[:, None])
     return uv, depth

@@ -6,6 +6,7 @@ both welcome, whichever the ROS version. Every function raises MessageError and 
 
 from __future__ import annotations
 
+import math
 import struct
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
@@ -479,7 +480,7 @@ def _rows(
         rows = [(row(d), *_hypothesis(d.results)) for d in msg.detections]
     except AttributeError as error:
         raise MessageError(f"{topic}: unknown version of vision_msgs: {error}") from None
-    rows = [r for r in rows if np.isfinite(r[0]).all()]
+    rows = [r for r in rows if all(map(math.isfinite, r[0]))]
     values = np.array([r[0] for r in rows], np.float64).reshape(-1, width)
     return values, tuple(r[1] for r in rows), np.nan_to_num(np.array([r[2] for r in rows], np.float32))
 
@@ -495,4 +496,4 @@ def _hypothesis(results: Iterable[Any]) -> tuple[str, float]:
         return "", 0.0
     labels = [(str(_either(h, "class_id", "id")), float(h.score)) for h in hypotheses]
     named = [item for item in labels if not item[0].startswith("cluster_")]
-    return max(named, key=lambda item: np.nan_to_num(item[1])) if named else labels[0]
+    return max(named, key=lambda item: 0.0 if math.isnan(item[1]) else item[1]) if named else labels[0]

@@ -8,13 +8,13 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from bevviz.colors import class_color, turbo
 from bevviz.config import BevConfig
-from bevviz.frame import F32, I32, U8, Bev, Bool, Boxes3D, Clusters, ClusterState, Objects
+from bevviz.frame import F32, I32, I64, U8, Bev, Bool, Boxes3D, Clusters, ClusterState, Objects
 from bevviz.geometry import corners
+from bevviz.stages.kernel import kernel
 
 UNKNOWN, FREE, OCCUPIED = -1, 0, 100  # values of the occupancy channel, as in nav_msgs/OccupancyGrid
 
@@ -64,34 +64,37 @@ def bev(
     for name, array in (("intensity", intensity), ("ground", ground)):
         if array is not None and len(array) != len(points):
             raise ValueError(f"{name} has {len(array)} values for {len(points)} points")
-    rows, columns = int(2 * config.range_x / config.resolution), int(2 * config.range_y / config.resolution)
+    shape = int(2 * config.range_x / config.resolution), int(2 * config.range_y / config.resolution)
     scale = np.array([config.range_x, config.range_y, config.resolution], np.float32)
     points = np.ascontiguousarray(points, np.float32)
+    cell = _cells(points, scale, *shape)
 
     missing = {"intensity"} if intensity is None else set()
     if ground is None:
         missing.add("occupancy")
     channels = [name for name in config.channels if name not in missing]
     shaded = ("density", "height", "occupancy") if config.style == "rich" else ()
-    grids = _rasterise(points, intensity, ground, scale, (rows, columns), {*channels, *shaded})
+    grids = _rasterise(cell, points, intensity, ground, shape, {*channels, *shaded})
 
     if config.style == "reference":
-        image = np.zeros((rows, columns, 3), np.uint8)
-        _paint(points, scale, image, np.array(_POINT, np.uint8))
+        image = np.zeros((*shape, 3), np.uint8)
+        _paint(cell, image.reshape(-1, 3), np.array(_POINT, np.uint8))
         if objects is not None:
             _draw_reference(image, objects, scale)
     else:
-        image = _background(rows, columns, config.range_x, config.range_y, config.resolution).copy()
+        image = _background(*shape, config.range_x, config.range_y, config.resolution).copy()
         bottom = _ground_level(points, ground)
+        seen = np.flatnonzero(grids["occupancy"] != UNKNOWN)
         _shade(
-            grids["density"],
-            grids["height"],
-            grids["occupancy"],
+            seen,
+            grids["density"].ravel(),
+            grids["height"].ravel(),
+            grids["occupancy"].ravel(),
             _obstacle_shades(),
             _ground_shades(),
             bottom,
             _HEIGHT_SPAN,
-            image,
+            image.reshape(-1, 3),
         )
         _draw_rich(image, objects, clusters, config)
 
@@ -107,81 +110,84 @@ def bev(
 # --- raster ------------------------------------------------------------------------------------
 
 
+@kernel
+def _cells(points: F32, scale: F32, rows: int, columns: int) -> I32:
+    """(N,) row * columns + column of each point, -1 off the raster."""
+    cell = np.empty(len(points), np.int32)
+    for i in range(len(points)):
+        row = np.floor((scale[0] - points[i, 0]) / scale[2])
+        column = np.floor((scale[1] - points[i, 1]) / scale[2])
+        inside = (row >= 0) & (row < rows) & (column >= 0) & (column < columns)
+        cell[i] = np.int32(row) * columns + np.int32(column) if inside else -1
+    return cell
+
+
 def _rasterise(
+    cell: I32,
     points: F32,
     intensity: NDArray[Any] | None,
     ground: Bool | None,
-    scale: F32,
     shape: tuple[int, int],
     wanted: set[str],
 ) -> dict[str, NDArray[Any]]:
-    if not wanted:
-        return {}
-    none = np.zeros((0, 0), np.float32)
-    density = np.zeros(shape, np.int32)
-    height = np.full(shape, np.nan, np.float32) if "height" in wanted else none
-    total = np.zeros(shape, np.float32) if "intensity" in wanted else none
-    occupancy = np.full(shape if "occupancy" in wanted else (0, 0), UNKNOWN, np.int8)
-    _fill(
-        points,
-        np.zeros(0, np.float32) if total.size == 0 else np.ascontiguousarray(intensity, np.float32),
-        np.zeros(0, np.bool_) if ground is None else ground,
-        scale,
-        density,
-        height,
-        total,
-        occupancy,
-    )
-    grids: dict[str, NDArray[Any]] = {"density": density, "height": height, "occupancy": occupancy}
+    grids: dict[str, NDArray[Any]] = {}
+    if wanted & {"density", "intensity"}:
+        grids["density"] = np.zeros(shape, np.int32)
+        _count(cell, grids["density"].ravel())
+    if "height" in wanted:
+        grids["height"] = np.full(shape, np.nan, np.float32)
+        _highest(cell, points, grids["height"].ravel())
+    if "occupancy" in wanted:
+        grids["occupancy"] = np.full(shape, UNKNOWN, np.int8)
+        _occupy(cell, np.zeros(len(cell), np.bool_) if ground is None else ground, grids["occupancy"].ravel())
     if "intensity" in wanted:
+        total = np.zeros(shape, np.float32)
+        _add(cell, np.ascontiguousarray(intensity, np.float32), total.ravel())
         with np.errstate(invalid="ignore"):
-            grids["intensity"] = np.divide(total, density, out=total, dtype=np.float32, casting="unsafe")
+            grids["intensity"] = np.divide(total, grids["density"], out=total, dtype=np.float32, casting="unsafe")
     return grids
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
-def _fill(
-    points: F32,
-    intensity: F32,
-    ground: Bool,
-    scale: F32,
-    density: I32,
-    height: F32,
-    total: F32,
-    occupancy: NDArray[np.int8],
-) -> None:
-    rows, columns = density.shape
-    with_height, with_total, with_occupancy = height.size > 0, total.size > 0, occupancy.size > 0
-    for i in range(len(points)):
-        row = np.floor((scale[0] - points[i, 0]) / scale[2])
-        column = np.floor((scale[1] - points[i, 1]) / scale[2])
-        if not (0 <= row < rows and 0 <= column < columns):
-            continue
-        v, u = int(row), int(column)
-        density[v, u] += 1
-        if with_height and not points[i, 2] <= height[v, u]:
-            height[v, u] = points[i, 2]
-        if with_total:
-            total[v, u] += intensity[i]
-        if with_occupancy:
-            if len(ground) > 0 and ground[i]:
-                occupancy[v, u] = max(occupancy[v, u], FREE)
-            else:
-                occupancy[v, u] = OCCUPIED
+@kernel
+def _paint(cell: I32, image: U8, color: U8) -> None:
+    for i in range(len(cell)):
+        if cell[i] >= 0:
+            image[cell[i]] = color
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
-def _paint(points: F32, scale: F32, image: U8, color: U8) -> None:
-    rows, columns, _ = image.shape
-    for i in range(len(points)):
-        row = np.floor((scale[0] - points[i, 0]) / scale[2])
-        column = np.floor((scale[1] - points[i, 1]) / scale[2])
-        if 0 <= row < rows and 0 <= column < columns:
-            image[int(row), int(column)] = color
+@kernel
+def _count(cell: I32, density: I32) -> None:
+    for i in range(len(cell)):
+        if cell[i] >= 0:
+            density[cell[i]] += 1
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@kernel
+def _highest(cell: I32, points: F32, height: F32) -> None:
+    for i in range(len(cell)):
+        if cell[i] >= 0:
+            # Written always: there is no branch to mispredict.
+            z, highest = points[i, 2], height[cell[i]]
+            height[cell[i]] = highest if z <= highest else z
+
+
+@kernel
+def _occupy(cell: I32, ground: Bool, occupancy: NDArray[np.int8]) -> None:
+    for i in range(len(cell)):
+        if cell[i] >= 0:
+            occupancy[cell[i]] = max(occupancy[cell[i]], FREE if ground[i] else OCCUPIED)
+
+
+@kernel
+def _add(cell: I32, intensity: F32, total: F32) -> None:
+    for i in range(len(cell)):
+        if cell[i] >= 0:
+            total[cell[i]] += intensity[i]
+
+
+@kernel
 def _shade(
+    cells: I64,
     density: I32,
     height: F32,
     occupancy: NDArray[np.int8],
@@ -191,18 +197,13 @@ def _shade(
     span: float,
     image: U8,
 ) -> None:
-    """Ground by density, obstacles by their height above ``bottom``. Empty cells keep the background."""
-    rows, columns = density.shape
-    for v in range(rows):
-        for u in range(columns):
-            if density[v, u] == 0:
-                continue
-            if occupancy[v, u] == OCCUPIED:
-                level = (height[v, u] - bottom) / span * len(heights)
-                color = heights[max(0, min(len(heights) - 1, int(level)))]
-                image[v, u] = color
-            else:
-                image[v, u] = ground[min(density[v, u], len(ground)) - 1]
+    """Ground by density, obstacles by their height above ``bottom``."""
+    for cell in cells:
+        if occupancy[cell] == OCCUPIED:
+            level = (height[cell] - bottom) / span * len(heights)
+            image[cell] = heights[max(0, min(len(heights) - 1, int(level)))]
+        else:
+            image[cell] = ground[min(density[cell], len(ground)) - 1]
 
 
 # --- drawing -----------------------------------------------------------------------------------
@@ -291,7 +292,7 @@ def _background(rows: int, columns: int, range_x: float, range_y: float, resolut
 
 def _ground_level(points: F32, ground: Bool | None) -> float:
     """Median z of the ground, else the height that a sensor on a car stands at."""
-    sample = slice(None, None, 1 + len(points) // 10_000)
+    sample = slice(None, None, 1 + len(points) // 2_000)
     below = points[sample, 2][ground[sample]] if ground is not None else points[:0, 2]
     return float(np.median(below)) if len(below) else -1.7
 

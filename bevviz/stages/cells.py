@@ -23,7 +23,7 @@ def cell_keys(points: F32, size: float, shift: float = 0.0, reach: int = 0) -> t
         keys: (N,) the packed cells; unequal cells have unequal keys.
         strides: (3,) ``keys + offset @ strides`` are the keys at an offset of up to ``reach`` cells.
     """
-    low, high = _bounds(points)
+    low, high = bounds(points)
     origin = low - shift * size
     counts = np.floor((high - origin) / size) + 1 + 2 * reach
     if math.prod(counts.tolist()) < 2**62:
@@ -96,23 +96,24 @@ def sort_by(number: I32, count: int) -> tuple[I32, I32]:
 
 
 @kernel
-def _bounds(points: F32) -> tuple[F64, F64]:
-    low = points[0].astype(np.float64)
-    high = low.copy()
+def bounds(points: F32) -> tuple[F64, F64]:
+    """(3,) lowest and (3,) highest coordinates of one point or more."""
+    x0, y0, z0 = points[0]
+    x1, y1, z1 = points[0]
     for i in range(len(points)):
-        for axis in range(3):
-            low[axis] = min(low[axis], points[i, axis])
-            high[axis] = max(high[axis], points[i, axis])
-    return low, high
+        x, y, z = points[i]
+        x0, y0, z0 = min(x, x0), min(y, y0), min(z, z0)
+        x1, y1, z1 = max(x, x1), max(y, y1), max(z, z1)
+    return np.array([x0, y0, z0], np.float64), np.array([x1, y1, z1], np.float64)
 
 
 @kernel
 def _pack(points: F32, origin: F64, size: float, strides: I64) -> I64:
     keys = np.empty(len(points), np.int64)
     for i in range(len(points)):
-        key = 0
-        for axis in range(3):
-            # The coordinate is not negative, so that truncation is the floor.
-            key += np.int64((points[i, axis] - origin[axis]) / size) * strides[axis]
-        keys[i] = key
+        # The coordinates are not negative, so that truncation is the floor.
+        x = np.int64((points[i, 0] - origin[0]) / size)
+        y = np.int64((points[i, 1] - origin[1]) / size)
+        z = np.int64((points[i, 2] - origin[2]) / size)
+        keys[i] = x * strides[0] + y * strides[1] + z * strides[2]
     return keys

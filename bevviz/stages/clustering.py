@@ -8,7 +8,7 @@ import numpy as np
 
 from bevviz.config import ClusteringConfig
 from bevviz.frame import F32, F64, I32, I64, Boxes3D, Clusters, ClusterState
-from bevviz.stages.cells import cell_keys, group, sort_by
+from bevviz.stages.cells import bounds, cell_keys, group, sort_by
 from bevviz.stages.kernel import kernel
 
 MIN_SIZE = 0.01  # metres: no box is thinner, so that each has a volume and can be drawn and hit
@@ -61,7 +61,8 @@ def dbscan(points: F32, eps: float, min_points: int) -> I32:
         return np.zeros(0, np.int32)
     # A hair less than eps / sqrt(3), so that rounding never puts points eps apart into one cell.
     # The longest axis first and the shortest last, so that a row of neighbouring cells holds few others.
-    axes = np.argsort(points.min(axis=0) - points.max(axis=0))
+    low, high = bounds(points)
+    axes = np.argsort(low - high)
     keys, strides = cell_keys(points[:, axes], eps / math.sqrt(3) * (1 - 1e-6), reach=2)
     cell, first = group(keys)
     keys = keys[first]
@@ -69,7 +70,7 @@ def dbscan(points: F32, eps: float, min_points: int) -> I32:
     rank = np.empty(len(by_key), np.int32)
     rank[by_key] = np.arange(len(by_key), dtype=np.int32)
     order, start = sort_by(rank[cell], len(rank))
-    x, y, z = np.ascontiguousarray(points[order].T)
+    x, y, z = np.ascontiguousarray(points.take(order, axis=0).T)
     box = _cell_boxes(x, y, z, start)
     near, neighbours = _adjacent(keys[by_key], strides, box, eps * eps)
     cores = _core_points(x, y, z, order, start, box, near, neighbours, eps * eps, min_points)

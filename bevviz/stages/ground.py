@@ -51,7 +51,7 @@ def _ransac(points: F32, config: GroundConfig) -> Ground:
     inliers = _largest_plane(points, config.distance_threshold, config)
     if not inliers.any():
         return _unknown(len(points))
-    plane = _fit(points[inliers])
+    plane = _fit(points.compress(inliers, axis=0))
     return Ground(inliers, _above(points, plane), plane)
 
 
@@ -139,7 +139,7 @@ def _polar(points: F32, config: GroundConfig) -> Ground:
 
 def _first_plane(points: F32, order: I32, start: I32, config: GroundConfig) -> F64 | None:
     """The ground around the sensor as a plane, from the lowest points of the bins."""
-    low = points[_lowest(points, order, start)]
+    low = points.take(_lowest(points, order, start), axis=0)
     distance = np.hypot(low[:, 0], low[:, 1])
     steepest = math.radians(config.max_slope)
     if config.sensor_height is not None:
@@ -151,20 +151,14 @@ def _first_plane(points: F32, order: I32, start: I32, config: GroundConfig) -> F
     return _fit(low[inliers]) if inliers.any() else None
 
 
-@kernel
 def _place(points: F32, sectors: int) -> tuple[F32, F32]:
     """Ring and sector of each point, with the fraction of the way through it."""
-    ring = np.empty(len(points), np.float32)
-    sector = np.empty(len(points), np.float32)
-    scale, count = np.float32(1 / RING_SCALE), np.float32(RING_COUNT)
-    turn, whole = np.float32(sectors / (2 * math.pi)), np.float32(sectors)
-    for i in range(len(points)):
-        x, y = points[i, 0], points[i, 1]
-        ring[i] = count * np.arcsinh(scale * np.sqrt(x * x + y * y))
-        angle = turn * np.arctan2(y, x)
-        # Rounding takes a tiny negative angle to the whole turn, which is the first sector again.
-        angle = angle + whole if angle < 0 else angle
-        sector[i] = angle if angle < whole else np.float32(0)
+    x, y = points[:, 0], points[:, 1]
+    ring: F32 = np.float32(RING_COUNT) * np.arcsinh(np.float32(1 / RING_SCALE) * np.sqrt(x * x + y * y))
+    sector: F32 = np.float32(sectors / (2 * math.pi)) * np.arctan2(y, x)
+    sector[sector < 0] += np.float32(sectors)
+    # Rounding takes a tiny negative angle to the whole turn, which is the first sector again.
+    sector[sector >= sectors] = 0
     return ring, sector
 
 
