@@ -17,7 +17,7 @@ check: $(VENV)/.tested
 	$(BIN)/mypy
 
 bench: $(VENV)/.installed
-	$(BIN)/python -m benchmarks.pipeline
+	$(BIN)/python -m benchmarks.performance --write docs/performance.md
 
 accuracy: $(VENV)/.installed
 	$(BIN)/python -m benchmarks.accuracy --write docs/accuracy.md

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bevviz import o3d
+from bevviz.frame import Objects
 
 
 def read_points(message: Any) -> Iterator[tuple[float, float, float]]:
@@ -39,23 +40,30 @@ class Stages:
         self.o3d = o3d.load()
 
     def voxel(self, points: NDArray[np.float32]) -> Any:
-        vector = self.o3d.utility.Vector3dVector(points.astype(np.float64))
-        return self.o3d.geometry.PointCloud(vector).voxel_down_sample(0.05)
+        return self.cloud(points).voxel_down_sample(0.05)
 
     def ground(self, cloud: Any) -> Any:
         _, inliers = cloud.segment_plane(0.5, 3, 100)
         return cloud.select_by_index(inliers, invert=True)
 
     def clustering(self, cloud: Any) -> list[Any]:
-        labels = np.asarray(cloud.cluster_dbscan(0.5, 50))
+        labels = self.labels(cloud)
         return [
             cloud.select_by_index(np.flatnonzero(labels == label)).get_axis_aligned_bounding_box()
             for label in range(labels.max(initial=-1) + 1)
         ]
 
+    def cloud(self, points: NDArray[np.float32]) -> Any:
+        vector = self.o3d.utility.Vector3dVector(points.astype(np.float64))
+        return self.o3d.geometry.PointCloud(vector)
 
-def bev(points: NDArray[np.float32], range_x: float, range_y: float, resolution: float) -> NDArray[np.uint8]:
-    """The raster of bev_visualizer_node, boxes left out."""
+    def labels(self, cloud: Any) -> NDArray[np.int32]:
+        return np.asarray(cloud.cluster_dbscan(0.5, 50), np.int32)
+
+
+def bev(points: NDArray[np.float32], objects: Objects | None) -> NDArray[np.uint8]:
+    """The image of bev_visualizer_node with its default parameters."""
+    range_x, range_y, resolution = 10.0, 10.0, 0.05
     width, height = int(2 * range_y / resolution), int(2 * range_x / resolution)
     image = np.zeros((height, width, 3), np.uint8)
     mask = (np.abs(points[:, 0]) < range_x) & (np.abs(points[:, 1]) < range_y)
@@ -64,5 +72,13 @@ def bev(points: NDArray[np.float32], range_x: float, range_y: float, resolution:
     v = ((range_x - inside[:, 0]) / resolution).astype(int)
     valid = (u >= 0) & (u < width) & (v >= 0) & (v < height)
     image[v[valid], u[valid]] = (200, 200, 200)
-    cv2.circle(image, (width // 2, height // 2), 3, (255, 0, 0), -1)
+    if objects is not None:
+        for name, (x, y, _), (length, breadth, _) in zip(
+            objects.names, objects.boxes.center, objects.boxes.size, strict=True
+        ):
+            u, v = math.floor((range_y - y) / resolution), math.floor((range_x - x) / resolution)
+            w, h = int(breadth / resolution) // 2, int(length / resolution) // 2
+            cv2.rectangle(image, (u - w, v - h), (u + w, v + h), (0, 0, 255), 2)
+            font = cv2.FONT_HERSHEY_SIMPLEX
+            cv2.putText(image, f"ID:{name}", (u - w, v - h - 5), font, 0.4, (0, 255, 0), 1)
     return image

@@ -35,6 +35,6 @@ def test_no_more_is_made_than_was_asked_and_the_thread_ends() -> None:
 
     ahead = prefetch(items(), 2)
     assert next(ahead) == 0
-    ahead.close()  # type: ignore[attr-defined]
+    ahead.close()
     assert len(made) <= 5  # one taken, two waiting, one in each hand
     assert all(thread.name != "prefetch" for thread in threading.enumerate())

@@ -7,7 +7,7 @@ import os
 import signal
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 from threading import Event
 from typing import TYPE_CHECKING, NoReturn
@@ -59,9 +59,11 @@ def process(source: Source, config: Config, options: argparse.Namespace, default
             with (
                 terminable() as ended,
                 tqdm(total=source.total, unit="frame", desc=source.scene.name, disable=None) as bar,
+                closing(prefetch(source, 2)) as ahead,
+                closing(prefetch(map(pipeline.run, ahead), 2)) as results,
             ):
-                for frame in prefetch(source, 2):
-                    logger.log(pipeline.run(frame))
+                for result in results:
+                    logger.log(result)
                     frames += 1
                     bar.update()
                     if ended.is_set():

@@ -144,7 +144,9 @@ def _rasterise(
         total = np.zeros(shape, np.float32)
         _add(cell, np.ascontiguousarray(intensity, np.float32), total.ravel())
         with np.errstate(invalid="ignore"):
-            grids["intensity"] = np.divide(total, grids["density"], out=total, dtype=np.float32, casting="unsafe")
+            grids["intensity"] = np.divide(
+                total, grids["density"], out=total, dtype=np.float32, casting="unsafe"
+            )
     return grids
 
 

@@ -28,7 +28,8 @@ def voxel_grid(points: F32, config: VoxelConfig) -> Voxels:
         return Voxels(points, np.arange(len(points), dtype=np.int32))
     keys, _ = cell_keys(points, config.size, shift=0.5)
     inverse, first = group(keys)
-    return Voxels(_means(points, inverse, len(first)) if config.average else points.take(first, axis=0), inverse)
+    kept = _means(points, inverse, len(first)) if config.average else points.take(first, axis=0)
+    return Voxels(kept, inverse)
 
 
 @kernel

@@ -1,0 +1,78 @@
+"""How things are timed: both sides of a comparison take turns, so that the machine's moods meet both."""
+
+from __future__ import annotations
+
+import os
+import platform
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import median
+
+
+@dataclass(frozen=True, slots=True)
+class Times:
+    """Seconds of each repetition."""
+
+    all: Sequence[float]
+
+    @property
+    def median(self) -> float:
+        return median(self.all)
+
+    @property
+    def best(self) -> float:
+        return min(self.all)
+
+    def __str__(self) -> str:
+        scale, unit = (1, "s") if self.best > 0.1 else (1e3, "ms")
+        return f"{scale * self.median:.3g} {unit} ({scale * self.best:.3g})"
+
+
+def interleaved(repetitions: int, *sides: Callable[[], object]) -> list[Times]:
+    """Run the sides in turns. Each is run once before, so that nothing is compiled or loaded meanwhile."""
+    for side in sides:
+        side()
+    times: list[list[float]] = [[] for _ in sides]
+    for _ in range(repetitions):
+        for found, side in zip(times, sides, strict=True):
+            start = time.perf_counter()
+            side()
+            found.append(time.perf_counter() - start)
+    return [Times(found) for found in times]
+
+
+@dataclass(frozen=True, slots=True)
+class Finished:
+    seconds: float
+    memory: float  # MB at most, in the process's own pages
+
+
+def run(*command: str) -> Finished:
+    """Run a program of this environment to its end.
+
+    Raises:
+        SystemExit: it failed.
+    """
+    program = Path(sys.executable).with_name(command[0])
+    start = time.perf_counter()
+    process = subprocess.Popen([program, *command[1:]], stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
+    assert process.stderr is not None
+    said = process.stderr.read()
+    _, status, usage = os.wait4(process.pid, 0)
+    seconds = time.perf_counter() - start
+    process.returncode = os.waitstatus_to_exitcode(status)
+    if process.returncode != 0:
+        raise SystemExit(f"{' '.join(command)}: {said.decode().strip()}")
+    return Finished(seconds, usage.ru_maxrss / 1e3)
+
+
+def machine() -> str:
+    """Processor, cores and Python version in a line."""
+    info = Path("/proc/cpuinfo").read_text() if Path("/proc/cpuinfo").exists() else ""
+    names = [line.partition(":")[2].strip() for line in info.splitlines() if line.startswith("model name")]
+    name = names[0] if names else platform.processor() or platform.machine()
+    return f"{name}, {os.cpu_count()} cores, {platform.system()}, Python {platform.python_version()}"

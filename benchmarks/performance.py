@@ -1,0 +1,78 @@
+"""How fast bevviz is, against what the tutorial's users run today and against Rerun's own converter.
+
+Both sides of each ratio process the same frames of the synthetic drive in this one run, in turns, and what
+they make is compared. Prints the tables of docs/performance.md.
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+from datetime import UTC, datetime
+from pathlib import Path
+
+import cv2
+
+from benchmarks import bags, runs, stages
+from benchmarks.measure import machine
+from bevviz.config import load
+from bevviz.sources.bag import BagSource
+
+BEGIN, END = "<!-- make bench: begin -->", "<!-- make bench: end -->"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--quick", action="store_true", help="fewer frames and repetitions, a smaller bag")
+    parser.add_argument("--model", type=Path, default=_default_model(), help="detector (default: yolox_nano)")
+    parser.add_argument("--write", type=Path, help="page whose marked part is replaced, instead of printing")
+    options = parser.parse_args()
+    cv2.setNumThreads(2)
+
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        drive = bags.simulate(10 if options.quick else 40, folder / "drive.mcap")
+        messages = bags.clouds(drive)
+        with BagSource([drive], load()) as source:
+            frames, scene = list(source), source.scene
+        repetitions = 3 if options.quick else 15
+        rows = stages.compare(messages, frames, scene, repetitions)
+        table = stages.profile(messages, frames, scene)
+        bag = bags.repeat(drive, folder / "repeated", 200_000_000 if options.quick else 1_000_000_000)
+        rows += runs.compare(bag, 1 if options.quick else 3)
+        rows += stages.growth(messages, frames, scene, repetitions)
+        rows += runs.growth(bag)
+        networks = runs.networks(drive, len(frames), options.model)
+
+    page = "\n".join(
+        [
+            f"Measured on {datetime.now(UTC):%Y-%m-%d}: {machine()}. Medians, the best of the repetitions in "
+            "brackets.",
+            "",
+            "| what | against | theirs | bevviz | ratio | wanted | the same |",
+            "| --- | --- | ---: | ---: | ---: | ---: | --- |",
+            *rows,
+            "",
+            *table,
+            "",
+            *networks,
+        ]
+    )
+    if options.write is None:
+        print(page)
+        return
+    text = options.write.read_text()
+    before, _, rest = text.partition(BEGIN)
+    _, _, after = rest.partition(END)
+    options.write.write_text(f"{before}{BEGIN}\n\n{page}\n\n{END}{after}")
+
+
+def _default_model() -> Path | None:
+    model = Path(__file__).resolve().parents[2] / "shared/data/models/yolox_nano.onnx"
+    return model if model.exists() else None
+
+
+if __name__ == "__main__":
+    main()
