@@ -51,7 +51,7 @@ def compare(bag: Path, repetitions: int) -> list[str]:
 def growth(bag: Path) -> list[str]:
     """The row of frames x 10: seconds for each frame beyond the first one, and memory."""
     with Recording([bag]) as recording:
-        scans = max(topic.count for topic in recording.topics if topic.type.endswith("PointCloud2"))
+        scans = max(topic.count or 0 for topic in recording.topics if topic.type.endswith("PointCloud2"))
     counts = [1, scans // 10, scans]
     saved = bag.with_name("growth.rrd")
     one, few, many = (

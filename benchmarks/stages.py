@@ -7,6 +7,7 @@ from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from statistics import median
 from tempfile import TemporaryDirectory
@@ -73,7 +74,7 @@ def compare(messages: Sequence[Any], frames: Sequence[Frame], scene: Scene, repe
         points = side_by_side(obstacles, count)
         cloud = reference.cloud(points)
         times = interleaved(
-            repetitions, lambda c=cloud: reference.labels(c), lambda p=points: dbscan(p, EPS, MIN_POINTS)
+            repetitions, partial(reference.labels, cloud), partial(dbscan, points, EPS, MIN_POINTS)
         )
         same = same_clusters(points, dbscan(points, EPS, MIN_POINTS), reference.labels(cloud))
         what = f"clustering, {count} points"
@@ -127,7 +128,7 @@ def side_by_side(clouds: Sequence[F32], count: int) -> F32:
     """(count, 3) points of several scans, each moved away from the others: no denser than one."""
     parts: list[F32] = []
     while sum(map(len, parts)) < count:
-        parts.append(clouds[len(parts) % len(clouds)] + np.float32([0, 300 * len(parts), 0]))
+        parts.append(clouds[len(parts) % len(clouds)] + np.array([0, 300 * len(parts), 0], np.float32))
     return np.ascontiguousarray(np.concatenate(parts)[:count])
 
 
@@ -206,7 +207,7 @@ def growth(messages: Sequence[Any], frames: Sequence[Frame], scene: Scene, repet
             pipeline.detector = lambda _: found  # type: ignore[assignment]
             logger.log(pipeline.run(frame))
 
-        few, many = interleaved(repetitions, *(lambda n=n: detect(n) for n in counts))
+        few, many = interleaved(repetitions, *(partial(detect, n) for n in counts))
     return [
         *rows,
         _growth(f"time, detections x 10 ({counts[0]}, {counts[1]}), all of a frame", few, many, 10),

@@ -16,8 +16,8 @@ import numpy as np
 import pytest
 
 from bevviz.cli import main
-from bevviz.frame import Frame, FrameResult
-from bevviz.pipeline import Pipeline
+from bevviz.frame import FrameResult
+from bevviz.logging.logger import Logger
 from tests import bags
 from tests.recordings import Recording
 
@@ -293,15 +293,15 @@ def test_an_interrupted_run_leaves_a_readable_recording(tmp_path: Path, number: 
 def test_an_interrupt_that_gets_lost_in_a_library(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capture
 ) -> None:
-    run = Pipeline.run
+    log = Logger.log
 
-    def deaf(self: Pipeline, frame: Frame) -> FrameResult:
-        if frame.index == 3:
+    def deaf(self: Logger, result: FrameResult) -> None:
+        if result.frame.index == 3:
             with suppress(KeyboardInterrupt):
                 os.kill(os.getpid(), signal.SIGTERM)
-        return run(self, frame)
+        log(self, result)
 
-    monkeypatch.setattr(Pipeline, "run", deaf)
+    monkeypatch.setattr(Logger, "log", deaf)
     small_bag(scans=40)
     assert main(["bag", "drive", "--save", "out.rrd"]) == 130
     assert "interrupted after 4 frames" in capsys.readouterr().err
