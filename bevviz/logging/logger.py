@@ -239,13 +239,13 @@ class Logger:
             classes = np.zeros(len(frame.points), np.uint16)
             if result.voxels is not None and result.ground is not None:
                 of_voxel = np.where(result.ground.mask, ClassId.GROUND, ClassId.OBSTACLE).astype(np.uint16)
-                classes = of_voxel[result.voxels.inverse]
+                classes = of_voxel.take(result.voxels.inverse)
             if len(frame.clouds) > 1:
                 self._log_merged(frame, world_from_points, classes)
             elif len(frame.points):
                 self._put(entities.points(frame.lidar), rr.Points3D(frame.points, class_ids=classes))
         if result.voxels is not None and result.ground is not None:
-            road = self._rounded(result.voxels.points[result.ground.mask])
+            road = self._rounded(result.voxels.points.compress(result.ground.mask, axis=0))
             self._put_points(entities.ground(frame.lidar), road, ClassId.GROUND)
 
     def _log_merged(self, frame: Frame, world_from_points: F64, classes: np.ndarray[Any, Any]) -> None:
@@ -273,12 +273,14 @@ class Logger:
         tracks = self._tracks.update(geometry.apply(_pose(frame), clusters.centroid))
         colors = (ClassId.TRACK + tracks % entities.TRACK_COLORS).astype(np.uint16)
         kept = np.flatnonzero(clusters.state == ClusterState.KEPT)
-        member = clusters.labels >= 0
-        member[member] = (clusters.state == ClusterState.KEPT)[clusters.labels[member]]
+        member = np.append(clusters.state == ClusterState.KEPT, False).take(clusters.labels)  # -1 is noise
         if len(kept):
             self._put(
                 entities.clusters(frame.lidar),
-                rr.Points3D(obstacles[member], class_ids=colors[clusters.labels[member]]),
+                rr.Points3D(
+                    obstacles.compress(member, axis=0),
+                    class_ids=colors.take(clusters.labels.compress(member)),
+                ),
                 _boxes(boxes, kept, [f"{k}" for k in kept], class_ids=colors[kept]),
             )
         aside = np.flatnonzero(clusters.state != ClusterState.KEPT)
@@ -436,8 +438,9 @@ class Logger:
         """The occupancy laid on the ground. The pose of a grid map is that of its lower left corner."""
         grid = bev.channels["occupancy"]
         level = 0.0
-        if result.ground is not None and result.voxels is not None and result.ground.mask.any():
-            level = float(np.median(result.voxels.points[::8, 2][result.ground.mask[::8]]))
+        if result.ground is not None and result.voxels is not None:
+            heights = result.voxels.points[::32, 2].compress(result.ground.mask[::32])
+            level = float(np.median(heights)) if len(heights) else 0.0
         self._put(
             entities.GRID,
             _transform(_pose(result.frame)),

@@ -9,7 +9,7 @@ import numpy as np
 from bevviz.config import ClusteringConfig
 from bevviz.frame import F32, F64, I32, I64, Boxes3D, Clusters, ClusterState
 from bevviz.stages.cells import bounds, cell_keys, group, sort_by
-from bevviz.stages.kernel import kernel
+from bevviz.stages.kernel import kernel, unordered_kernel
 
 MIN_SIZE = 0.01  # metres: no box is thinner, so that each has a volume and can be drawn and hit
 
@@ -284,7 +284,7 @@ def _upright(oriented: F32) -> Boxes3D:
     return Boxes3D(oriented[:, :3], size, yaw)
 
 
-@kernel
+@unordered_kernel
 def _closeness(x: F64, y: F64, angle: float) -> float:
     """Zhang's closeness: how near the points lie to the sides of the tightest rectangle at this angle."""
     c, s = math.cos(angle), math.sin(angle)

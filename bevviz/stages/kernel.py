@@ -14,3 +14,10 @@ def kernel(function: F) -> F:
     """Compile ``function`` at its first call; division by zero is IEEE's, as in numpy."""
     compiled: F = numba.njit(cache=True, nogil=True, error_model="numpy")(function)
     return compiled
+
+
+def unordered_kernel(function: F) -> F:
+    """The same with sums in any order and no NaN: several turns of a loop at once, other last digits."""
+    allowed = {"reassoc", "nsz", "nnan"}
+    compiled: F = numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=allowed)(function)
+    return compiled
