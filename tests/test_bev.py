@@ -13,7 +13,7 @@ from hypothesis.extra import numpy as hnp
 
 from bevviz.config import BevConfig, load
 from bevviz.frame import F32, I32, U8, Boxes3D, Clusters, Objects
-from bevviz.stages.bev import bev
+from bevviz.stages.bev import _ground_shades, _obstacle_shades, bev
 
 REFERENCE = load(preset="reference").bev
 
@@ -164,6 +164,27 @@ def test_rich_style_turns_the_boxes() -> None:
     assert abs(np.ptp(columns) * 0.1 - 2 * 2.83) < 0.25
     assert abs((rows.mean() + 0.5) * 0.1 - 10) < 0.1  # 10 m ahead of 20
     assert abs((columns.mean() + 0.5) * 0.1 - 20) < 0.1
+
+
+@given(clouds, st.data())
+@settings(max_examples=15, deadline=None)
+def test_rich_style_against_plain_python(points: F32, data: st.DataObject) -> None:
+    ground = data.draw(hnp.arrays(np.bool_, len(points)))
+    config = BevConfig(range_x=8, range_y=5, resolution=0.5, channels=CHANNELS)
+    result = bev(points, np.zeros(len(points)), ground, None, None, config)
+    empty = bev(points[:0], np.zeros(0), ground[:0], None, None, config).image
+    level = float(np.median(points[ground, 2])) if ground.any() else -1.7
+    heights, shades = _obstacle_shades(), _ground_shades()
+    for cell in np.ndindex(32, 20):
+        count = int(result.channels["density"][cell])
+        if count == 0:
+            color = empty[cell]
+        elif result.channels["occupancy"][cell] == 100:
+            step = (float(result.channels["height"][cell]) - level) / 3 * len(heights)
+            color = heights[int(np.clip(step, 0, len(heights) - 1))]
+        else:
+            color = shades[min(count, len(shades)) - 1]
+        np.testing.assert_array_equal(result.image[cell], color)
 
 
 def test_rich_style_tells_ground_from_obstacles_and_does_not_spoil_its_background() -> None:

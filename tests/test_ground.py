@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,12 +11,13 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
 
 from bevviz.config import GroundConfig
 from bevviz.frame import F32, F64, Bool
 from bevviz.o3d import load
 from bevviz.stages.clustering import dbscan
-from bevviz.stages.ground import segment_ground
+from bevviz.stages.ground import RING_COUNT, RING_SCALE, _place, segment_ground
 
 Terrain = Callable[[F64, F64], F64]
 
@@ -152,6 +154,22 @@ def test_kerb_makes_no_cluster() -> None:
     near = np.hypot(found.points[:, 0], found.points[:, 1]) < 30
     ground = segment_ground(found.points, GroundConfig())
     assert dbscan(found.points[near & ~ground.mask], 0.5, 10).max(initial=-1) == -1
+
+
+coordinates = st.floats(-99, 99, width=32)
+
+
+@settings(deadline=None)
+@given(hnp.arrays(np.float32, st.tuples(st.integers(1, 50), st.just(3)), elements=coordinates))
+def test_places_in_the_polar_grid(points: F32) -> None:
+    sectors = 180
+    ring, sector = _place(points, sectors)
+    assert ring.dtype == sector.dtype == np.float32
+    assert ((sector >= 0) & (sector < sectors)).all()
+    for (x, y, _), r, s in zip(points.tolist(), ring.tolist(), sector.tolist(), strict=True):
+        assert r == pytest.approx(RING_COUNT * math.asinh(math.hypot(x, y) / RING_SCALE), rel=1e-4, abs=1e-4)
+        turn = abs(s - math.atan2(y, x) % math.tau / math.tau * sectors)
+        assert min(turn, sectors - turn) < 1e-3
 
 
 @settings(deadline=None, max_examples=15)

@@ -1,0 +1,81 @@
+"""The benchmark's own parts: a ratio is worth as much as the comparison behind it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from benchmarks.bags import repeat
+from benchmarks.measure import interleaved, run
+from benchmarks.runs import counted, logged_points
+from benchmarks.stages import same_clusters, side_by_side
+from bevviz.cli import main
+from bevviz.sources.recording import Recording
+from bevviz.stages.clustering import dbscan
+from tests import bags
+
+
+def test_a_repeated_bag_goes_on_in_time(tmp_path: Path) -> None:
+    folder = bags.write(tmp_path / "drive", bags.small_items(scans=5))
+    drive = next(folder.glob("*.mcap"))
+    longer = repeat(drive, tmp_path / "longer", 3 * drive.stat().st_size)
+    with Recording([longer]) as recording:
+        times = recording.times(bags.CLOUD)
+        stamps = [message.header()[0] for message in recording.messages([bags.CLOUD])]
+        poses = [recording.decode(m).transforms[0].header.stamp.sec for m in recording.messages(["/tf"])]
+    assert len(times) == 15
+    np.testing.assert_array_equal(np.diff(stamps), bags.PERIOD)
+    np.testing.assert_array_equal(np.diff(times), bags.PERIOD)
+    assert poses == sorted(poses)
+    assert poses[-1] == stamps[-1] // 10**9
+
+
+def test_every_point_of_a_bag_is_counted_in_its_recording(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    folder = bags.write(tmp_path / "drive", bags.small_items(scans=3, points=500))
+    assert counted(folder) == (3, 1500)
+    assert main(["bag", str(folder), "--save", "whole.rrd"]) == 0
+    assert logged_points(Path("whole.rrd")) == 1500
+    assert main(["bag", str(folder), "--frames", ":2", "--save", "part.rrd"]) == 0
+    assert logged_points(Path("part.rrd")) == 1000
+
+
+def test_what_counts_as_the_same_clusters() -> None:
+    rng = np.random.default_rng(0)
+    points = np.concatenate([rng.normal(at, 0.2, (200, 3)) for at in (0, 5, 10)]).astype(np.float32)
+    labels = dbscan(points, 0.5, 50)
+    assert labels.max() == 2
+    renamed = np.where(labels < 0, -1, (labels + 1) % 3).astype(np.int32)
+    assert same_clusters(points, labels, renamed)
+    merged = np.minimum(labels, 1).astype(np.int32)
+    assert not same_clusters(points, labels, merged)
+    assert not same_clusters(points, merged, labels)
+    lost = labels.copy()
+    lost[0] = -1
+    assert not same_clusters(points, labels, lost)
+
+
+def test_scans_side_by_side_are_no_denser_than_one() -> None:
+    scan = np.random.default_rng(0).uniform(-100, 100, (400, 3)).astype(np.float32)
+    points = side_by_side([scan], 1000)
+    assert len(points) == 1000
+    np.testing.assert_array_equal(points[400:800, [0, 2]], scan[:, [0, 2]])
+    assert points[400:800, 1].min() > points[:400, 1].max()
+
+
+def test_sides_take_turns() -> None:
+    said: list[str] = []
+    times = interleaved(2, lambda: said.append("a"), lambda: said.append("b"))
+    assert "".join(said) == "ab" + "abab"
+    assert [len(t.all) for t in times] == [2, 2]
+    assert all(t.best <= t.median for t in times)
+
+
+def test_a_program_that_fails_ends_the_benchmark() -> None:
+    with pytest.raises(SystemExit, match=r"(?i)unknown option"):
+        run("python", "--no-such-option")
+    assert run("python", "-c", "x = bytearray(50_000_000)").memory > 50
