@@ -8,7 +8,7 @@ import sys
 from collections.abc import Callable, Sequence
 
 from bevviz import __version__
-from bevviz.cli import bag, config, demo, info, live, report
+from bevviz.cli import bag, config, demo, info, live, report, why
 from bevviz.errors import UserError
 
 EPILOG = """examples:
@@ -16,6 +16,7 @@ EPILOG = """examples:
   bevviz info drive.mcap                      what is in a bag, and what is missing for a full run
   bevviz bag drive.mcap --model yolo11n.onnx  run the pipeline over a bag, in the viewer
   bevviz bag drive.mcap --save drive.rrd      the same, saved to send with a bug report
+  bevviz why drive.mcap --at 12.5             why an object was not reported then
   bevviz report drive.mcap --at 12.5          a bug report that stands on its own
   bevviz live --model yolo11n.onnx --serve    the same beside a running robot, in a browser
   bevviz snap                                 save what it saw in the last 30 seconds
@@ -46,6 +47,6 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=f"bevviz {__version__}")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
-    for command in (bag, info, report, demo, live, config):
+    for command in (bag, info, why, report, demo, live, config):
         command.add(commands)
     return parser

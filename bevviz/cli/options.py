@@ -87,7 +87,7 @@ def add_output(parser: argparse.ArgumentParser, blueprint: str = "debug") -> arg
         "--blueprint",
         default=blueprint,
         metavar="NAME|FILE",
-        help=f"layout: debug, live, bug_report, a .py or a .rbl (default: {blueprint})",
+        help=f"layout: debug, live, explain, bug_report, a .py or a .rbl (default: {blueprint})",
     )
     return group
 

@@ -24,6 +24,7 @@ ROBOT = "/robot"
 EXPLAIN = "/explain"
 EXPLAIN_LOG = "/explain/log"
 STATES = "/explain/states"
+WHY = "/explain/why"
 HEALTH = "/health"
 CONFIG = "/config"
 REPORT = "/report"
@@ -88,6 +89,11 @@ def robot(topic: str) -> str:
 
 def state(*lane: str) -> str:
     return "/".join((STATES, *lane))
+
+
+def why(what: str) -> str:
+    """The chain of what ``bevviz why`` explains: points by their fate, boxes, frustums."""
+    return f"{WHY}/{what}"
 
 
 def stage_time(stage: str) -> str:

@@ -11,7 +11,7 @@ _DARK = (13, 14, 18)
 _HIDDEN = rrb.EntityBehavior(visible=False)
 
 
-def space(scene: Scene, *, raw: bool = True, grid: bool = True) -> rrb.Spatial3DView:
+def space(scene: Scene, *, raw: bool = True, grid: bool = True, why: bool = False) -> rrb.Spatial3DView:
     """Points, boxes, frusta and poses around the robot, seen from behind and above it.
 
     The origin is the LiDAR: the robot stays where it is and the world moves, whichever way it drives.
@@ -20,41 +20,48 @@ def space(scene: Scene, *, raw: bool = True, grid: bool = True) -> rrb.Spatial3D
         scene: names of the sensors.
         raw: with every raw point, coloured as ground or obstacle.
         grid: with the occupancy on the ground.
+        why: with the chain of what ``bevviz why`` explains.
     """
     hidden = [entities.ground(scene.lidar), entities.set_aside(scene.lidar)]
     # The coloured points of the clusters and the raw cloud already show what is obstacle.
     hidden += [entities.obstacles(scene.lidar)] if raw else []
     hidden += [] if raw else [entities.points(lidar) for lidar in scene.lidars or (scene.lidar,)]
     hidden += [] if grid else [entities.GRID]
+    # The points of what is explained stand out by their colours, which tell another story than the clusters'.
+    hidden += [entities.clusters(scene.lidar), entities.FRUSTUMS] if why else []
     return rrb.Spatial3DView(
         name="3D",
         origin=entities.sensor(scene.lidar),
-        contents=[f"{entities.WORLD}/**", f"{entities.ROBOT}/**"],
+        contents=[f"{entities.WORLD}/**", f"{entities.ROBOT}/**", *([f"{entities.WHY}/**"] if why else [])],
         background=_DARK,
         line_grid=False,
         eye_controls=rrb.EyeControls3D(
             kind=rrb.Eye3DKind.Orbital,
-            position=(-16.0, 5.0, 11.0),
-            look_target=(10.0, 0.0, -1.0),
+            position=(-3.0, 2.0, 5.0) if why else (-16.0, 5.0, 11.0),
+            look_target=(10.0, -0.5, -1.0) if why else (10.0, 0.0, -1.0),
             eye_up=(0.0, 0.0, 1.0),
         ),
         overrides=dict.fromkeys(hidden, _HIDDEN),
     )
 
 
-def camera(scene: Scene, name: str) -> rrb.Spatial2DView:
-    """The image with detections and the projected points; what the robot itself detected there, too."""
+def camera(scene: Scene, name: str, *, why: bool = False) -> rrb.Spatial2DView:
+    """The image with detections and the projected points; what the robot itself detected there, too.
+
+    ``why``: with the weak detections and what ``bevviz why`` explains instead of the points.
+    """
+    contents = ["$origin/**", *([f"{entities.ROBOT}/**"] if scene.robot else [])]
     return rrb.Spatial2DView(
         name=name,
         origin=entities.sensor(name),
-        contents=["$origin/**", *([f"{entities.ROBOT}/**"] if scene.robot else [])],
-        overrides={entities.weak(name): _HIDDEN},
+        contents=[*contents, *([f"{entities.why(name)}/**"] if why else [])],
+        overrides={entities.projected(name) if why else entities.weak(name): _HIDDEN},
     )
 
 
-def cameras(scene: Scene) -> rrb.Container | rrb.View:
+def cameras(scene: Scene, *, why: bool = False) -> rrb.Container | rrb.View:
     """Every camera; tabs where there are more than two."""
-    views = [camera(scene, name) for name in scene.cameras]
+    views = [camera(scene, name, why=why) for name in scene.cameras]
     if len(views) == 1:
         return views[0]
     return rrb.Tabs(*views, name="Cameras") if len(views) > 2 else rrb.Vertical(*views, name="Cameras")
@@ -71,6 +78,11 @@ def birds_eye() -> rrb.Spatial2DView:
 def explain() -> rrb.TextDocumentView:
     """Every decision of the frame in words."""
     return rrb.TextDocumentView(name="Explain", origin=entities.EXPLAIN, contents=["$origin"])
+
+
+def why() -> rrb.TextDocumentView:
+    """What ``bevviz why`` answered."""
+    return rrb.TextDocumentView(name="Why", origin=entities.WHY, contents=["$origin"])
 
 
 def log() -> rrb.TextLogView:

@@ -1,0 +1,108 @@
+"""Logs what ``bevviz why`` answered: the words, and the chain over the frame."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+import rerun as rr
+
+from bevviz import geometry
+from bevviz.frame import F32, F64, Boxes3D, Camera, Frame
+from bevviz.logging import entities
+from bevviz.why.answer import Answer
+from bevviz.why.evidence import Fate
+from bevviz.why.subject import projected
+from bevviz.why.text import markdown
+
+COLORS = {
+    Fate.GROUND: (170, 110, 60),
+    Fate.NOISE: (255, 60, 60),
+    Fate.SET_ASIDE: (255, 150, 40),
+    Fate.CLUSTERED: (255, 230, 60),
+    Fate.REPORTED: (80, 230, 110),
+    Fate.IN_FRONT: (80, 140, 255),
+}
+_SUBJECT = (255, 60, 200)
+_CORNER = 0.5  # pixels: Rerun counts from the corner of the first pixel, bevviz from its centre
+_EDGES = [0, 1, 2, 3, 0, 4, 5, 1, 5, 6, 2, 6, 7, 3, 7, 4]  # every edge of a frustum in one stroke
+_DEPTH = 20.0  # metres that a frustum is drawn to where the distance is unknown
+
+
+def log_answers(recording: rr.RecordingStream, frame: Frame, answers: Sequence[Answer], shown: int) -> None:
+    """The first answers over the frame, at the recording's current time; the words of all.
+
+    Args:
+        recording: where the frame itself was just logged to.
+        frame: what was explained.
+        answers: worst first.
+        shown: how many of them are drawn.
+    """
+    recording.log(entities.WHY, rr.TextDocument(markdown(answers, shown), media_type=rr.MediaType.MARKDOWN))
+    pose = np.eye(4) if frame.world_from_points is None else frame.world_from_points
+    drawn = answers[:shown]
+    fate = np.zeros(len(frame.points), np.uint8)
+    for answer in reversed(drawn):
+        fate = np.where(answer.fate > 0, answer.fate, fate).astype(np.uint8)
+    known = fate > 0
+    if known.any():
+        colors = np.zeros((len(Fate), 3), np.uint8)
+        colors[list(COLORS)] = list(COLORS.values())
+        points = rr.Points3D(frame.points[known], colors=colors[fate[known]], radii=rr.Radius.ui_points(4.0))
+        recording.log(entities.why("points"), _pose(pose), points)
+    strips = [_edges(a.subject.box, a.subject.name) for a in drawn if a.subject.box is not None]
+    strips += [strip for camera in frame.cameras for strip in _frustums(camera, drawn)]
+    if strips:
+        lines, names = zip(*strips, strict=True)
+        place = rr.LineStrips3D(
+            lines, colors=[_SUBJECT], radii=rr.Radius.ui_points(2.0), labels=names, show_labels=True
+        )
+        recording.log(entities.why("place"), _pose(pose), place)
+    for camera in frame.cameras:
+        _log_image(recording, camera, drawn)
+
+
+def _edges(box: Boxes3D, name: str) -> tuple[F32, str]:
+    return geometry.corners(box)[0][_EDGES], name
+
+
+def _frustums(camera: Camera, answers: Sequence[Answer]) -> Iterator[tuple[F32, str]]:
+    """In Frame.points_frame."""
+    if camera.intrinsics is None or camera.camera_from_points is None:
+        return
+    points_from_camera = geometry.inverse(camera.camera_from_points)
+    for answer in answers:
+        s = answer.subject
+        if s.xyxy is not None and s.camera == camera.name:
+            far = _DEPTH if np.isnan(answer.distance) else answer.distance
+            corners = geometry.frustum(s.xyxy[None], camera.intrinsics, 0.5, far)[0]
+            yield geometry.apply(points_from_camera, corners)[_EDGES], s.name
+
+
+def _log_image(recording: rr.RecordingStream, camera: Camera, answers: Sequence[Answer]) -> None:
+    boxes, names = [], []
+    for s in (answer.subject for answer in answers):
+        own = s.xyxy if s.camera == camera.name else None
+        box = projected(s.box, camera) if s.box is not None else own
+        if box is not None:
+            boxes.append(box + _CORNER)
+            names.append(s.name)
+    if boxes:
+        recording.log(
+            entities.why(f"{camera.name}/place"),
+            rr.CoordinateFrame(f"tf#{entities.image(camera.name)}"),
+            rr.Boxes2D(
+                array=np.array(boxes),
+                array_format=rr.Box2DFormat.XYXY,
+                labels=names,
+                colors=[_SUBJECT],
+                draw_order=40.0,
+            ),
+        )
+
+
+def _pose(world_from_points: F64) -> rr.Transform3D:
+    return rr.Transform3D(
+        translation=world_from_points[:3, 3],
+        quaternion=rr.Quaternion(xyzw=geometry.quaternion(world_from_points)),
+    )

@@ -1,0 +1,24 @@
+"""One object and its chain through the stages: where its points went, in words, in 3D and in the image."""
+
+from __future__ import annotations
+
+import rerun.blueprint as rrb
+
+from bevviz.logging import views
+from bevviz.sources import Scene
+
+
+def blueprint(scene: Scene) -> rrb.Blueprint:
+    side: list[rrb.Container | rrb.View] = [views.cameras(scene, why=True)] if scene.cameras else []
+    return rrb.Blueprint(
+        rrb.Horizontal(
+            rrb.Vertical(
+                views.why(), rrb.Tabs(views.explain(), views.log(), views.config()), row_shares=[3, 2]
+            ),
+            views.space(scene, grid=False, why=True),
+            rrb.Vertical(*side, views.birds_eye(), row_shares=[*[3] * len(side), 2]),
+            column_shares=[4, 4, 5],
+        ),
+        views.time_panel(),
+        *views.panels(),
+    )

@@ -1,0 +1,375 @@
+"""What ``bevviz why`` answers: the planted faults, KITTI object by object, and what cannot be asked."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from bevviz import geometry
+from bevviz.cli import main
+from bevviz.config import Config, load
+from bevviz.errors import UserError
+from bevviz.frame import Boxes3D, DetectionState, FrameResult, LabelledBoxes3D
+from bevviz.pipeline import Pipeline
+from bevviz.sources.bag import BagSource
+from bevviz.sources.synthetic import BagWriter
+from bevviz.why import Answer, Selection, why
+from bevviz.why.evidence import Fate
+from bevviz.why.subject import projected, truth_box
+from bevviz.why.verdict import Reason
+from tests import bags
+from tests.recordings import Recording
+from tests.test_faults import at, drive, planted, run
+
+CLASSES = ("car", "person", "cyclist")
+Capture = pytest.CaptureFixture[str]
+
+
+def config_of(preset: str, *settings: str) -> Config:
+    return load(None, ["detector.model=demo", *settings], "reference" if preset == "reference" else "default")
+
+
+@cache
+def asked(name: str, preset: str, label: str = "") -> list[Answer]:
+    return why(run(name, preset), config_of(preset), Selection(label=label), CLASSES, hints=0)
+
+
+def of_truth(answers: list[Answer], row: int) -> Answer:
+    return next(a for a in answers if a.subject.kind == "truth" and a.subject.row == row)
+
+
+def about(name: str, preset: str, row: int) -> Answer:
+    """The answer about one object, with hints: asked for by its place in the image."""
+    result = run(name, preset)
+    box = projected(truth_box(result.frame, row), result.frame.cameras[0])
+    assert box is not None
+    (answer,) = why(result, config_of(preset), Selection(box=tuple(box.tolist())), CLASSES, hints=1)
+    assert (answer.subject.kind, answer.subject.row) == ("truth", row)
+    return answer
+
+
+def numbers(answer: Answer, stage: str) -> dict[str, object]:
+    return dict(next(step for step in answer.steps if step.stage == stage).numbers)
+
+
+# --- planted faults ----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("preset", ["default", "reference"])
+def test_a_hidden_person(preset: str) -> None:
+    (row,) = planted("hidden_person", "person", 16.3)
+    answer = of_truth(asked("hidden_person", preset, "person"), row)
+    assert answer.verdict.reason is Reason.HIDDEN and not answer.verdict.reported
+    assert answer.verdict.text.startswith(
+        "The person at 16.6 m was not reported because it is hidden: no points"
+    )
+    assert "end in front of it, most of them on cluster" in answer.verdict.text
+    occlusion = numbers(answer, "occlusion")
+    assert occlusion["in_front"] == occlusion["aimed"]
+    van = at("hidden_person").point_object[answer.fate == Fate.IN_FRONT]
+    (car,) = planted("hidden_person", "car", 11.9)
+    assert np.mean(van == at("hidden_person").truth_object[car]) > 0.9
+
+
+def test_a_flat_car_taken_for_ground() -> None:
+    (row,) = planted("flat_car", "car", 10.0)
+    assert of_truth(asked("flat_car", "default", "car"), row).verdict.reason is Reason.REPORTED
+    answer = about("flat_car", "reference", row)
+    assert answer.verdict.reason is Reason.GROUND
+    assert "it was taken for ground" in answer.verdict.text
+    assert "ground.distance_threshold is 0.5 m" in answer.verdict.text
+    assert answer.hints[0].settings[0].startswith("ground.distance_threshold=")
+    ground = numbers(answer, "ground")
+    assert ground["threshold"] == 0.5 and 0.35 < float(str(ground["highest"])) < 0.5
+    assert (answer.fate == Fate.GROUND).sum() > 300
+    # The hint is true: with that setting the very car is an object.
+    config = config_of("reference", *answer.hints[0].settings)
+    with Pipeline(config) as pipeline:
+        again = why(pipeline.run(at("flat_car").frame), config, Selection(label="car"), CLASSES, hints=0)
+    assert of_truth(again, row).verdict.reported
+
+
+@pytest.mark.parametrize("preset", ["default", "reference"])
+def test_two_people_in_one_cluster(preset: str) -> None:
+    answers = [
+        of_truth(asked("merged_people", preset, "person"), r) for r in planted("merged_people", "person", 9.9)
+    ]
+    assert [a.verdict.reason for a in answers] == [Reason.MERGED] * 2
+    assert sorted(a.verdict.reported for a in answers) == [False, True]
+    lost = next(a for a in answers if not a.verdict.reported)
+    merged = numbers(lost, "merged")
+    assert 0.1 < float(str(merged["gap"])) < 0.5
+    assert 0.1 < float(str(merged["eps_that_parts"])) < 0.5
+    assert "too: the gap between them is 0." in lost.verdict.text
+    assert "clustering.eps is 0.5 m" in lost.verdict.text
+
+
+def test_the_hint_that_parts_two_people_is_proved() -> None:
+    result, config = run("merged_people", "default"), config_of("default")
+    answers = why(result, config, Selection(label="person"), CLASSES, hints=1)
+    lost = next(a for a in answers if a.verdict.reason is Reason.MERGED and not a.verdict.reported)
+    assert lost is answers[0]
+    assert lost.hints[0].settings[0].startswith("clustering.eps=0.")
+    assert f"; change {lost.hints[0].settings[0]}: it is cluster " in lost.verdict.text
+    better = config_of("default", *lost.hints[0].settings)
+    with Pipeline(better) as pipeline:
+        again = why(pipeline.run(result.frame), better, Selection(label="person"), CLASSES, hints=0)
+    assert all(
+        of_truth(again, row).verdict.reason is Reason.REPORTED
+        for row in planted("merged_people", "person", 9.9)
+    )
+
+
+def test_two_people_without_ground_truth() -> None:
+    result = run("merged_people", "default")
+    blind = replace(result, frame=replace(result.frame, truth=None))
+    answers = why(blind, config_of("default"), Selection(label="person"), CLASSES, hints=0)
+    merged = [a for a in answers if a.verdict.reason is Reason.MERGED]
+    assert merged and all(a.subject.kind == "detection" for a in merged)
+    assert any("was not reported because cluster" in a.verdict.text for a in merged)
+
+
+def test_a_box_that_names_two_clusters() -> None:
+    (row,) = planted("shared_box", "person", 8.7)
+    assert of_truth(asked("shared_box", "default", "person"), row).verdict.reason is Reason.REPORTED
+    answer = about("shared_box", "reference", row)
+    assert answer.verdict.reason is Reason.SHARED_BOX and answer.verdict.reported
+    assert "was reported, but its box also names cluster" in answer.verdict.text
+    assert answer.hints[0].settings == ("fusion.method=frustum",)
+    cabinet = Selection(point=(10.0, -3.9, -0.8))
+    (other,) = why(run("shared_box", "reference"), config_of("reference"), cabinet, CLASSES)
+    assert other.verdict.reason is Reason.BORROWED
+    assert "is named person by a box" in other.verdict.text
+    assert other.hints[0].text == "it is not named any more"
+    (rightly,) = why(run("shared_box", "default"), config_of("default"), cabinet, CLASSES, hints=0)
+    assert not rightly.verdict.reported
+
+
+# --- selections --------------------------------------------------------------------------------
+
+
+def test_without_a_selection_what_went_wrong_comes_worst_first() -> None:
+    answers = asked("merged_people", "default")
+    assert all(a.verdict.reason is not Reason.REPORTED for a in answers)
+    reported = [a.verdict.reported for a in answers]
+    assert reported == sorted(reported) and not reported[0]
+    lost = [a.distance for a in answers if not a.verdict.reported and not np.isnan(a.distance)]
+    assert lost == sorted(lost)
+
+
+def test_a_pixel_is_the_detection_there() -> None:
+    result = run("merged_people", "default")
+    seen = result.cameras[0].detections
+    assert seen is not None
+    person = next(d for d, name in enumerate(seen.names) if name == "person" and seen.score[d] > 0.6)
+    u, v = (seen.xyxy[person, :2] + seen.xyxy[person, 2:]) / 2
+    (known,) = why(result, config_of("default"), Selection(box=(float(u), float(v))), CLASSES, hints=0)
+    assert known.subject.kind == "truth", "what is known of it says more than the detection"
+    result = replace(result, frame=replace(result.frame, truth=None))
+    detections = result.cameras[0].detections
+    assert detections is not None
+    best = int(np.flatnonzero(detections.state == DetectionState.KEPT)[0])
+    u, v = (detections.xyxy[best, :2] + detections.xyxy[best, 2:]) / 2
+    (answer,) = why(result, config_of("default"), Selection(box=(float(u), float(v))), CLASSES, hints=0)
+    assert (answer.subject.kind, answer.subject.row) == ("detection", best)
+    (same,) = why(
+        result, config_of("default"), Selection(box=tuple(detections.xyxy[best].tolist())), CLASSES, hints=0
+    )
+    assert same.subject.row == best
+    (sky,) = why(result, config_of("default"), Selection(box=(320.0, 5.0)), CLASSES, hints=0)
+    assert sky.subject.kind == "pixel"
+    assert sky.verdict.reason is Reason.NO_POINTS
+
+
+def test_the_fates_add_up() -> None:
+    """Every raw point at the place has one fate, and nothing else has any but what hides it."""
+    shot = at("merged_people")
+    for answer in asked("merged_people", "default", "person"):
+        there = answer.subject.place(shot.frame, shot.frame.points)
+        others = answer.fate[~there]
+        assert set(np.unique(others)) <= {Fate.ELSEWHERE, Fate.IN_FRONT}
+        assert not np.isin(answer.fate[there], [Fate.ELSEWHERE, Fate.IN_FRONT]).any()
+        assert numbers(answer, "raw cloud")["points"] == there.sum()
+
+
+@pytest.mark.parametrize(
+    ("selection", "message"),
+    [
+        (Selection(label="preson"), "--class preson: no such class; did you mean 'person'"),
+        (Selection(label="zebra"), "no such class; there are car, cyclist, person"),
+        (Selection(box=(700.0, 10.0)), "outside the image of zed, which has 640 x 360 pixels"),
+        (Selection(box=(50.0, 50.0, 40.0, 60.0)), "outside the image of zed"),
+        (
+            Selection(box=(5.0, 5.0), camera="left"),
+            "--camera left: there is none of that name; there are zed",
+        ),
+        (Selection(camera="left"), "--camera left: there is none"),
+    ],
+)
+def test_what_cannot_be_asked(selection: Selection, message: str) -> None:
+    with pytest.raises(UserError, match=message) as caught:
+        why(run("merged_people", "default"), config_of("default"), selection, CLASSES, hints=0)
+    assert "\n" not in str(caught.value)
+
+
+def test_several_cameras_and_none() -> None:
+    result = run("merged_people", "default")
+    other = replace(result.cameras[0], camera=replace(result.cameras[0].camera, name="left"))
+    both = replace(result, cameras=(*result.cameras, other))
+    with pytest.raises(UserError, match="several cameras: say which with --camera, one of zed, left"):
+        why(both, config_of("default"), Selection(box=(5.0, 5.0)), CLASSES, hints=0)
+    with pytest.raises(UserError, match="no camera: ask with --point"):
+        why(replace(result, cameras=()), config_of("default"), Selection(box=(5.0, 5.0)), CLASSES, hints=0)
+
+
+def test_a_failed_stage_is_the_reason() -> None:
+    config = config_of("default")
+    with Pipeline(config) as pipeline:
+        result = pipeline.run(replace(at("flat_car").frame, points=np.zeros((0, 3), np.float32)))
+    answers = why(result, config, Selection(label="car"), CLASSES, hints=0)
+    assert answers and {a.verdict.reason for a in answers} == {Reason.FAILED}
+    assert "the cloud holds no finite point" in answers[0].verdict.text
+
+
+# --- KITTI -------------------------------------------------------------------------------------
+
+
+def kitti_truth(shared: Path, result: FrameResult, name: str) -> FrameResult:
+    """The result with the label file as ground truth."""
+    kitti = bags.kitti(shared, name)
+    lidar_from_camera = geometry.inverse(kitti.camera_from_lidar)
+    p2 = kitti.pixels_from_lidar @ lidar_from_camera
+    assert np.allclose(p2[:, 3], 0, atol=1e-3)  # camera_from_lidar goes to image_2's own centre
+    rows = (shared / "kitti/calib" / f"{name}.txt").read_text().splitlines()
+    values = np.array(next(r for r in rows if r.startswith("P2:")).split()[1:], float).reshape(3, 4)
+    shift = np.linalg.solve(values[:, :3], values[:, 3])
+    labels, centers, sizes, yaws = [], [], [], []
+    for line in (shared / "kitti/label_2" / f"{name}.txt").read_text().splitlines():
+        kind, *rest = line.split()
+        if kind == "DontCare":
+            continue
+        height, width, length, x, y, z, turn = np.array(rest, float)[7:14]
+        centre = np.array([x, y - height / 2, z]) + shift
+        labels.append(kind)
+        centers.append((lidar_from_camera @ [*centre, 1])[:3])
+        sizes.append((length, width, height))
+        yaws.append(-turn - np.pi / 2)
+    boxes = Boxes3D(np.array(centers, np.float32), np.array(sizes, np.float32), np.array(yaws, np.float32))
+    truth = LabelledBoxes3D(
+        "labels",
+        result.frame.stamp,
+        result.frame.points_frame,
+        boxes,
+        tuple(labels),
+        np.ones(len(labels), np.float32),
+    )
+    return replace(result, frame=replace(result.frame, truth=truth))
+
+
+@pytest.fixture(scope="module")
+def kitti(shared: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[Answer]]:
+    bag = bags.write(tmp_path_factory.mktemp("kitti") / "kitti", bags.kitti_items(shared))
+    config = load(settings=[f"detector.model={shared / 'models/yolox_nano.onnx'}"])
+    with BagSource([bag], config) as source, Pipeline(config) as pipeline:
+        assert pipeline.detector is not None
+        names, found = pipeline.detector.names, {}
+        for name, frame in zip(("000000", "000001"), source, strict=True):
+            result = kitti_truth(shared, pipeline.run(frame), name)
+            wrong = why(result, config, Selection(), names, hints=8)
+            found[name] = wrong + why(result, config, Selection(label="person"), names, hints=0)
+        return found
+
+
+def test_kitti_000000_the_pedestrian_is_reported(kitti: dict[str, list[Answer]]) -> None:
+    answer = next(a for a in kitti["000000"] if a.subject.label == "Pedestrian")
+    assert answer.verdict.reason is Reason.REPORTED
+    assert (
+        "was reported: cluster" in answer.verdict.text
+        and "is named person by person 0." in answer.verdict.text
+    )
+    assert int(str(numbers(answer, "raw cloud")["points"])) > 300
+
+
+def test_kitti_000001_each_object_has_its_reason(kitti: dict[str, list[Answer]]) -> None:
+    by_label = {a.subject.label: a for a in kitti["000001"] if a.subject.kind == "truth"}
+    assert {label: a.verdict.reason for label, a in by_label.items()} == {
+        "Cyclist": Reason.NOT_DETECTED,  # 46 m away: it has a cluster and no detection
+        "Car": Reason.GROUND,  # 61 m: 9 points, of which more than half are on the road's level
+        "Truck": Reason.BELOW_THRESHOLD,  # 70 m: it has a cluster, and a detection of 0.01
+    }
+    assert not any(a.verdict.reported for a in by_label.values())
+    assert "5 of its 9 voxels" in by_label["Car"].verdict.text
+    assert "car 0.0125, detector.conf_threshold is 0.25" in by_label["Truck"].verdict.text
+    assert "no candidate of its class" in by_label["Cyclist"].verdict.text
+    raw = {label: numbers(a, "raw cloud")["points"] for label, a in by_label.items()}
+    assert raw == {"Cyclist": 18, "Car": 9, "Truck": 73}
+
+
+# --- the command -------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("why") / "drive.mcap"
+    with BagWriter(drive(), path) as writer:
+        writer.write(at("flat_car").frame)
+        writer.write(drive().snapshot(31).frame)
+    return path
+
+
+def test_the_command_answers_and_draws(bag: Path, tmp_path: Path, capsys: Capture) -> None:
+    saved = tmp_path / "why.rrd"
+    command = ["why", str(bag), "--at", "0", "--class", "car", "--model", "demo", "--preset", "reference"]
+    assert main([*command, "--limit", "1", "--save", str(saved)]) == 0
+    said = capsys.readouterr().out
+    assert "The car at 10.3 m was not reported because it was taken for ground" in said
+    assert "  ground       " in said and "more, without their chains" in said
+    recording = Recording(saved)
+    (text,) = recording.text("/explain/why")
+    assert "it was taken for ground" in text
+    (points,) = recording.column("/explain/why/points", "Points3D:positions")
+    assert len(points) > 300
+    assert recording.column("/explain/why/place", "LineStrips3D:strips")
+    assert recording.column("/explain/why/zed/place", "Boxes2D:half_sizes")
+    assert recording.column("/explain", "TextDocument:text"), "the frame itself is there, too"
+
+
+def test_the_command_for_machines(bag: Path, capsys: Capture) -> None:
+    command = ["why", str(bag), "--at", "0", "--model", "demo", "--json", "--point", "10,-2.7,-1.6"]
+    assert main(command) == 0
+    found = json.loads(capsys.readouterr().out)
+    (answer,) = found["answers"]
+    assert found["preset"] == "default" and answer["kind"] == "point"
+    assert answer["reported"] and answer["reason"] == "reported"
+    assert [step["stage"] for step in answer["chain"]][:3] == ["camera zed", "raw cloud", "occlusion"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--at", "100"], "100 is outside the recording"),
+        (["--at", "noon"], "'noon' is no time"),
+        (["--at", "0", "--class", "zebra", "--model", "demo"], "--class zebra: no such class"),
+        (["--at", "0", "--box", "1000,1000"], "outside the image of zed"),
+    ],
+)
+def test_wrong_questions(bag: Path, capsys: Capture, arguments: list[str], message: str) -> None:
+    assert main(["why", str(bag), *arguments]) == 2
+    said = capsys.readouterr().err
+    assert said.count("bevviz: error: ") == 1 and message in said
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [["--box", "1,2,3"], ["--point", "a,b,c"], ["--radius", "-1"], ["--class", "a", "--box", "1,2"]],
+)
+def test_wrong_numbers(bag: Path, capsys: Capture, arguments: list[str]) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main(["why", str(bag), "--at", "0", *arguments])
+    assert ended.value.code == 2
+    assert "error: argument" in capsys.readouterr().err
