@@ -15,6 +15,7 @@ import numpy as np
 from tqdm import tqdm
 
 from bevviz.config import Preset, load
+from bevviz.evaluate import MAX_DISTANCE, MIN_HITS, RANGE, pair_in_order
 from bevviz.frame import DetectionState, FrameResult
 from bevviz.geometry import iou
 from bevviz.pipeline import Pipeline
@@ -22,10 +23,7 @@ from bevviz.sources.synthetic import Snapshot, SyntheticSource
 
 PRESETS: tuple[Preset, ...] = ("reference", "default")
 CLASSES = ("person", "cyclist", "car")
-MIN_HITS = 10  # LiDAR points on an object that must be found
 MIN_HEIGHT = 20  # visible pixels in height of an object that must be found
-MAX_DISTANCE = 2.0  # metres between the centres, on the ground plane, of a box and its object
-RANGE = 40.0  # metres
 
 INTRO = f"""# Accuracy
 
@@ -178,20 +176,12 @@ def add_objects(tally: Tally, shot: Snapshot, result: FrameResult) -> None:
 
 def count(counts: Counter[str], distance: np.ndarray, must: np.ndarray, limit: float) -> list[float]:
     """Greedy one-to-one matches, best first; one with an object that need not be found counts for nothing."""
-    free = np.ones(distance.shape[1], bool)
-    errors = []
-    for row in distance:
-        candidates = np.flatnonzero(free & (row <= limit))
-        if len(candidates) == 0:
-            counts["fp"] += 1
-            continue
-        best = candidates[row[candidates].argmin()]
-        free[best] = False
-        if must[best]:
-            counts["tp"] += 1
-            errors.append(float(row[best]))
+    partners, free = pair_in_order(distance, limit)
+    right = (partners >= 0) & np.append(must, False)[partners]
+    counts["tp"] += int(right.sum())
+    counts["fp"] += int((partners < 0).sum())
     counts["fn"] += int((free & must).sum())
-    return errors
+    return [float(distance[row, partners[row]]) for row in np.flatnonzero(right)]
 
 
 def tables(tallies: dict[Preset, Tally]) -> str:

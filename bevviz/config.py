@@ -9,7 +9,7 @@ from __future__ import annotations
 import difflib
 import json
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args
@@ -273,18 +273,21 @@ def keys(model: type[BaseModel] = Config, prefix: str = "") -> dict[str, str]:
 
 
 def load(
-    file: str | Path | None = None, settings: Iterable[str] = (), preset: Preset | None = None
+    file: str | Path | Sequence[Path] | None = None,
+    settings: Iterable[str] = (),
+    preset: Preset | None = None,
 ) -> Config:
-    """The effective configuration: preset, then the file, then each ``key=value``, later ones winning.
+    """The effective configuration: preset, then the files, then each ``key=value``, later ones winning.
 
     Raises:
         UserError: unreadable file, unknown key, wrong unit or value out of range, in one line.
     """
     stated: dict[str, Any] = {}
     origin: dict[str, str] = {}
-    if file is not None:
-        for key, value in _flatten(_read_yaml(Path(file))).items():
-            _put(stated, origin, key, value, str(file))
+    files = [Path(file)] if isinstance(file, str | Path) else file or ()
+    for path in files:
+        for key, value in _flatten(_read_yaml(path)).items():
+            _put(stated, origin, key, value, str(path))
     for text in settings:
         key, sep, value = text.partition("=")
         if not sep:
@@ -324,6 +327,15 @@ def dump(config: Config) -> str:
             note = (f"in {unit}; " if unit else "") + about[f"{section}.{name}"]
             lines.append(f"  {name}: {json.dumps(value)}  # {note}")
     return "\n".join(lines) + "\n"
+
+
+def flat_yaml(text: str, where: str) -> dict[str, Any]:
+    """Dotted keys and values of what ``dump`` has written, by this version or another.
+
+    Raises:
+        UserError: no YAML; ``where`` says whose.
+    """
+    return _flatten(_yaml_value(text, where) or {})
 
 
 def _lower(message: str) -> str:

@@ -80,6 +80,7 @@ class Camera:
     sync_error: float = float("nan")  # seconds, image stamp - cloud stamp
     tf_age: float = float("nan")  # seconds between the asked stamp and the nearest TF sample used
     motion_compensated: bool = False
+    mounting: F64 | None = None  # camera_from_points without the motion that is compensated
     problems: tuple[str, ...] = ()
 
 

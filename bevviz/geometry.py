@@ -227,3 +227,41 @@ def corners(boxes: Boxes3D) -> F32:
         [c * local[..., 0] - s * local[..., 1], s * local[..., 0] + c * local[..., 1], local[..., 2]], -1
     )
     return np.asarray(turned + boxes.center[:, None], np.float32)
+
+
+def bev_iou(a: Boxes3D, b: Boxes3D) -> F32:
+    """(A, B) intersection over union, seen from above, of A and B upright boxes however they are turned."""
+    ratio = np.zeros((len(a), len(b)), np.float32)
+    reach_a, reach_b = (np.hypot(boxes.size[:, 0], boxes.size[:, 1]) / 2 for boxes in (a, b))
+    away = np.linalg.norm(a.center[:, None, :2] - b.center[None, :, :2], axis=2)
+    outlines_a, outlines_b = (np.asarray(corners(boxes)[:, :4, :2], np.float64) for boxes in (a, b))
+    for i, j in np.argwhere(away < reach_a[:, None] + reach_b[None, :]):
+        shared = _area(_clip(outlines_a[i], outlines_b[j]))
+        whole = float(np.prod(a.size[i, :2]) + np.prod(b.size[j, :2])) - shared
+        ratio[i, j] = shared / whole if whole > 0 else 0.0
+    return ratio
+
+
+def _clip(polygon: F64, window: F64) -> F64:
+    """The part of a convex polygon inside another, counter-clockwise one (Sutherland and Hodgman 1974)."""
+    for start, end in zip(window, np.roll(window, -1, axis=0), strict=True):
+        if len(polygon) == 0:
+            break
+        (dx, dy), offset = end - start, polygon - start
+        inside = dx * offset[:, 1] - dy * offset[:, 0]  # how far to the left of the edge, times its length
+        kept: list[F64] = []
+        for k in range(len(polygon)):
+            before = k - 1
+            if (inside[k] >= 0) != (inside[before] >= 0):
+                t = inside[before] / (inside[before] - inside[k])
+                kept.append(polygon[before] + t * (polygon[k] - polygon[before]))
+            if inside[k] >= 0:
+                kept.append(polygon[k])
+        polygon = np.array(kept).reshape(-1, 2)
+    return polygon
+
+
+def _area(polygon: F64) -> float:
+    """Of a counter-clockwise polygon (shoelace formula)."""
+    x, y = polygon.T
+    return float(x @ np.roll(y, -1) - y @ np.roll(x, -1)) / 2

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import threading
 import time
+from collections import OrderedDict
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from types import TracebackType
-from typing import ParamSpec, Self, TypeVar
+from typing import Any, Self, TypeVar, TypeVarTuple, cast
 
 import numpy as np
+from pydantic import BaseModel
 
 from bevviz import geometry
 from bevviz.config import Config
@@ -16,6 +19,7 @@ from bevviz.errors import UserError
 from bevviz.explain import explain
 from bevviz.frame import (
     F32,
+    Bool,
     Camera,
     CameraResult,
     Clusters,
@@ -24,6 +28,8 @@ from bevviz.frame import (
     Frame,
     FrameResult,
     Fusion,
+    Ground,
+    Voxels,
 )
 from bevviz.stages.bev import bev
 from bevviz.stages.clustering import cluster
@@ -32,28 +38,84 @@ from bevviz.stages.fusion import fuse, merge
 from bevviz.stages.ground import segment_ground
 from bevviz.stages.voxel import voxel_grid
 
-P = ParamSpec("P")
 T = TypeVar("T")
+Ts = TypeVarTuple("Ts")
+
+
+class Memo:
+    """What stages made of one frame, for runs of other configurations on the same frame.
+
+    A stage that gets the same arrays and an equal configuration is not run again. To be cleared from one
+    frame to the next.
+
+    Args:
+        size: results that are kept; the one that was not asked for the longest goes.
+    """
+
+    def __init__(self, size: int = 200) -> None:
+        self._size = size
+        self._made: OrderedDict[tuple[object, ...], tuple[tuple[object, ...], Any, float]] = OrderedDict()
+        self._local = threading.local()
+
+    @property
+    def spared(self) -> float:
+        """Seconds that this thread was spared so far."""
+        return getattr(self._local, "spared", 0.0)
+
+    def clear(self) -> None:
+        self._made.clear()
+
+    def call(self, function: Callable[[*Ts], T], *args: *Ts) -> T:
+        """The function's result, made now or before. A function may ask for others in turn."""
+        key = (function, *map(_identity, args))
+        if key in self._made:
+            _, known, seconds = self._made[key]
+            self._made.move_to_end(key)
+            self._local.spared = self.spared + seconds
+            return cast(T, known)
+        start, before = time.perf_counter(), self.spared
+        result = function(*args)
+        seconds = time.perf_counter() - start + self.spared - before
+        # The arguments are kept as well: nothing else can get their ids then.
+        self._made[key] = args, result, seconds
+        if len(self._made) > self._size:
+            self._made.popitem(last=False)
+        return result
+
+
+def _identity(argument: object) -> object:
+    """Parameters are the same when they are equal, arrays only when they are one."""
+    parameters = isinstance(argument, BaseModel) and not isinstance(argument, Config)  # holds mappings
+    return argument if parameters else id(argument)
 
 
 class StageLog:
-    """Runs stages; keeps how long each took and why it failed."""
+    """Runs stages; keeps how long each took and why it failed.
 
-    def __init__(self) -> None:
+    Args:
+        memo: where to look for results; a stage that was spared counts with the time that it once took.
+    """
+
+    def __init__(self, memo: Memo | None = None) -> None:
         self.timings: dict[str, float] = {}
         self.failures: list[Failure] = []
+        self.spared = 0.0
+        self._memo = memo
 
-    def run(self, stage: str, function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T | None:
+    def run(self, stage: str, function: Callable[[*Ts], T], *args: *Ts) -> T | None:
         """The function's result, or None where it failed: one bad stage must not take the frame with it."""
-        start = time.perf_counter()
+        memo = self._memo
+        start, before = time.perf_counter(), memo.spared if memo else 0.0
         try:
-            return function(*args, **kwargs)
+            return function(*args) if memo is None else memo.call(function, *args)
         except UserError as error:
             self.failures.append(Failure(stage, str(error)))
         except Exception as error:
             self.failures.append(Failure(stage, f"{type(error).__name__}: {error}"))
         finally:
-            self.timings[stage] = self.timings.get(stage, 0.0) + time.perf_counter() - start
+            spared = memo.spared - before if memo else 0.0
+            self.timings[stage] = self.timings.get(stage, 0.0) + time.perf_counter() - start + spared
+            self.spared += spared
         return None
 
 
@@ -63,15 +125,25 @@ class Pipeline:
     Args:
         config: the whole configuration.
         detect: what finds the objects in a camera's image instead of the detector's model.
+        memo: shared by pipelines that run on the same frames.
+        draw: with the bird's-eye view and the explanations.
 
     Raises:
         UserError: the detector's model cannot be used.
     """
 
-    def __init__(self, config: Config, detect: Callable[[Camera], Detections | None] | None = None) -> None:
+    def __init__(
+        self,
+        config: Config,
+        detect: Callable[[Camera], Detections | None] | None = None,
+        *,
+        memo: Memo | None = None,
+        draw: bool = True,
+    ) -> None:
         self.config = config
         self.detector = Detector(config.detector) if config.detector.model and detect is None else None
         self._detect_with = detect
+        self._memo, self._draw = memo, draw
         self._network = ThreadPoolExecutor(1, "network")
 
     def __enter__(self) -> Self:
@@ -87,11 +159,11 @@ class Pipeline:
 
     def run(self, frame: Frame) -> FrameResult:
         """Everything that can be made of the frame. Never raises for what the frame holds."""
-        config, log = self.config, StageLog()
+        config, log = self.config, StageLog(self._memo)
         start = time.perf_counter()
 
         # The network releases the GIL: it runs beside the LiDAR stages.
-        network = StageLog()
+        network = StageLog(self._memo)
         waiting = [self._network.submit(self._detect, camera, network) for camera in frame.cameras]
 
         voxels = ground = obstacles = clusters = raw_ground = None
@@ -102,8 +174,8 @@ class Pipeline:
         if voxels is not None:
             ground = log.run("ground", segment_ground, voxels.points, config.ground)
         if voxels is not None and ground is not None:
-            obstacles = voxels.points.compress(~ground.mask, axis=0)
-            raw_ground = ground.mask.take(voxels.inverse)
+            obstacles, raw_ground = log.run("ground", _split, voxels, ground) or (None, None)
+        if obstacles is not None:
             clusters = log.run("clustering", cluster, obstacles, config.clustering)
 
         cameras = []
@@ -123,9 +195,12 @@ class Pipeline:
         if clusters is not None:
             objects = log.run("fusion", merge, clusters, cameras, config.clustering)
         intensity = frame.fields.get("intensity")
-        image = log.run("bev", bev, frame.points, intensity, raw_ground, objects, clusters, config.bev)
-        explanations = log.run("explain", explain, cameras, clusters, config)
-        log.timings["total"] = time.perf_counter() - start
+        image = explanations = None
+        if self._draw:
+            image = log.run("bev", bev, frame.points, intensity, raw_ground, objects, clusters, config.bev)
+            explanations = log.run("explain", explain, cameras, clusters, config)
+        wall = time.perf_counter() - start + log.spared
+        log.timings["total"] = max(wall, sum(network.timings.values()))
         return FrameResult(
             frame=frame,
             voxels=voxels,
@@ -161,6 +236,11 @@ class Pipeline:
             camera.camera_from_points,
             self.config.fusion,
         )
+
+
+def _split(voxels: Voxels, ground: Ground) -> tuple[F32, Bool]:
+    """The voxels that are not ground, and for every raw point whether it is."""
+    return voxels.points.compress(~ground.mask, axis=0), ground.mask.take(voxels.inverse)
 
 
 def _project(points: F32, camera: Camera) -> tuple[F32, F32] | None:

@@ -50,7 +50,7 @@ def test_names() -> None:
 
 
 @pytest.mark.parametrize("scene", SCENES.values(), ids=SCENES.keys())
-@pytest.mark.parametrize("name", blueprints.names())
+@pytest.mark.parametrize("name", sorted({*blueprints.names()} - {"compare", "tune"}))
 def test_every_layout_fits_every_scene(name: str, scene: Scene, tmp_path: Path) -> None:
     found = views(save(blueprints.load(name, scene), tmp_path / "layout.rbl"))
     assert {"3D", "Bird's-eye view", *scene.cameras} <= set(found)
@@ -65,6 +65,26 @@ def test_the_explained_chain_is_in_its_layout_alone(tmp_path: Path) -> None:
     assert "Why" in explain
     debug = views(save(blueprints.load("debug", scene), tmp_path / "debug.rbl"))
     assert not any("/explain/why/**" in contents for contents in debug.values())
+
+
+@pytest.mark.parametrize("scene", SCENES.values(), ids=SCENES.keys())
+def test_compare_has_both_sides(scene: Scene, tmp_path: Path) -> None:
+    found = views(save(blueprints.load("compare", scene), tmp_path / "layout.rbl"))
+    for side, root, other in (("A", "", "b"), ("B", "/b", "a")):
+        assert {f"{name} {side}" for name in ("3D", "Bird's-eye view", *scene.cameras)} <= set(found)
+        assert f"{root}/world/**" in found[f"3D {side}"]
+        assert f"/compare/objects/only_{other}/**" not in found[f"3D {side}"]
+        for camera in scene.cameras:
+            image = f"/world/{camera}/image"
+            assert found[f"{camera} {side}"][:2] == [image, f"{root}{image}/**"]
+    assert "Differences" in found
+
+
+@pytest.mark.parametrize("scene", SCENES.values(), ids=SCENES.keys())
+def test_tune_has_the_differences_too(scene: Scene, tmp_path: Path) -> None:
+    found = views(save(blueprints.load("tune", scene), tmp_path / "layout.rbl"))
+    assert {"3D", "Bird's-eye view", "Version", "Differences", *scene.cameras} <= set(found)
+    assert {"/world/**", "/compare/objects/only_a/**", "/compare/objects/moved/**"} <= set(found["3D"])
 
 
 def test_a_users_own_python_file(tmp_path: Path) -> None:

@@ -210,3 +210,55 @@ def test_corners_of_a_turned_box(center: tuple[float, ...], size: tuple[float, .
     assert area == pytest.approx(size[0] * size[1], rel=0.05, abs=0.01), "counter-clockwise, of that size"
     along = lower[0] - lower[1]
     np.testing.assert_allclose(along, size[0] * np.array([np.cos(angle), np.sin(angle)]), atol=1e-3)
+
+
+def upright(*rows: tuple[float, ...]) -> Boxes3D:
+    """Boxes of x, y, length, width, yaw."""
+    values = np.array(rows, np.float32).reshape(-1, 5)
+    height = np.ones(len(values), np.float32)
+    center, size = np.c_[values[:, :2], 0 * height], np.c_[values[:, 2:4], height]
+    return Boxes3D(center, size, values[:, 4])
+
+
+places = st.tuples(st.floats(-3, 3), st.floats(-3, 3), st.floats(0.5, 5), st.floats(0.5, 5), st.floats(-4, 4))
+
+
+@settings(deadline=None)
+@given(places, places, st.floats(-4, 4), st.floats(-60, 60))
+def test_bev_iou_counts_points(a: tuple[float, ...], b: tuple[float, ...], turn: float, shift: float) -> None:
+    boxes = upright(a, b)
+    value = geometry.bev_iou(boxes, boxes)
+    np.testing.assert_allclose(np.diag(value), 1, atol=1e-4)
+    assert value[0, 1] == pytest.approx(value[1, 0], abs=1e-4)
+    grid = np.stack(np.meshgrid(*[np.arange(-7, 7, 0.05)] * 2), -1).reshape(-1, 2)
+    inside = []
+    for x, y, length, width, angle in (a, b):
+        c, s = np.cos(angle), np.sin(angle)
+        local = (grid - [x, y]) @ np.array([[c, -s], [s, c]])
+        inside.append((np.abs(local) <= [length / 2, width / 2]).all(axis=1))
+    expected = (inside[0] & inside[1]).sum() / max((inside[0] | inside[1]).sum(), 1)
+    assert value[0, 1] == pytest.approx(expected, abs=0.08)
+    # The same wherever the two are, and however they are turned together.
+    c, s = np.cos(turn), np.sin(turn)
+    moved = [(c * x - s * y + shift, s * x + c * y, w, h, angle + turn) for x, y, w, h, angle in (a, b)]
+    assert geometry.bev_iou(upright(moved[0]), upright(moved[1]))[0, 0] == pytest.approx(
+        value[0, 1], abs=1e-3
+    )
+
+
+@pytest.mark.parametrize(
+    ("a", "b", "expected"),
+    [
+        ((0, 0, 4, 2, 0), (0, 0, 4, 2, np.pi), 1.0),
+        ((0, 0, 4, 2, 0), (2, 0, 4, 2, 0), 1 / 3),
+        ((0, 0, 2, 2, 0), (0, 0, 2, 2, np.pi / 2), 1.0),
+        ((0, 0, 2, 2, 0), (2, 0, 2, 2, 0), 0.0),  # an edge in common
+        ((0, 0, 0, 0, 0), (0, 0, 2, 2, 0), 0.0),
+    ],
+)
+def test_bev_iou(a: tuple[float, ...], b: tuple[float, ...], expected: float) -> None:
+    assert geometry.bev_iou(upright(a), upright(b))[0, 0] == pytest.approx(expected, abs=1e-5)
+
+
+def test_bev_iou_of_none() -> None:
+    assert geometry.bev_iou(Boxes3D.empty(), upright((0, 0, 1, 1, 0))).shape == (0, 1)

@@ -8,7 +8,7 @@ import sys
 from collections.abc import Callable, Sequence
 
 from bevviz import __version__
-from bevviz.cli import bag, config, demo, info, live, report, why
+from bevviz.cli import bag, compare, config, demo, info, live, report, sweep, tune, why
 from bevviz.errors import UserError
 
 EPILOG = """examples:
@@ -18,6 +18,9 @@ EPILOG = """examples:
   bevviz bag drive.mcap --save drive.rrd      the same, saved to send with a bug report
   bevviz why drive.mcap --at 12.5             why an object was not reported then
   bevviz report drive.mcap --at 12.5          a bug report that stands on its own
+  bevviz compare drive.mcap --model yolo11n.onnx --set-b clustering.eps=0.8   what if?
+  bevviz sweep drive.mcap --model yolo11n.onnx --set clustering.eps=0.3:0.9:0.1   which value?
+  bevviz tune drive.mcap --at 12.5 --model yolo11n.onnx --config my.yaml          run at each save
   bevviz live --model yolo11n.onnx --serve    the same beside a running robot, in a browser
   bevviz snap                                 save what it saw in the last 30 seconds
   bevviz config --preset reference            every parameter, with its unit and meaning
@@ -47,6 +50,6 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=f"bevviz {__version__}")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
-    for command in (bag, info, why, report, demo, live, config):
+    for command in (bag, info, why, report, compare, sweep, tune, demo, live, config):
         command.add(commands)
     return parser

@@ -66,7 +66,8 @@ def add_config(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def add_output(parser: argparse.ArgumentParser, blueprint: str = "debug") -> argparse._ArgumentGroup:
+def add_output(parser: argparse.ArgumentParser, blueprint: str | None = "debug") -> argparse._ArgumentGroup:
+    """Where to, and in which layout; None: the command has one of its own."""
     group = parser.add_argument_group(
         "output", "The viewer, where there is a display. Several can be given at once."
     )
@@ -83,12 +84,13 @@ def add_output(parser: argparse.ArgumentParser, blueprint: str = "debug") -> arg
         "--connect", metavar="URL", help="a viewer elsewhere, e.g. rerun+http://laptop:9876/proxy"
     )
     group.add_argument("--viewer", action="store_true", help="open the viewer, beside the other outputs")
-    group.add_argument(
-        "--blueprint",
-        default=blueprint,
-        metavar="NAME|FILE",
-        help=f"layout: debug, live, explain, bug_report, a .py or a .rbl (default: {blueprint})",
-    )
+    if blueprint is not None:
+        group.add_argument(
+            "--blueprint",
+            default=blueprint,
+            metavar="NAME|FILE",
+            help=f"debug, live, explain, bug_report, compare, tune, a .py or a .rbl (default: {blueprint})",
+        )
     return group
 
 

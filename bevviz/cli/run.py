@@ -6,25 +6,79 @@ import argparse
 import os
 import signal
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 from threading import Event
-from typing import TYPE_CHECKING, NoReturn
+from typing import TYPE_CHECKING, NoReturn, Protocol, TypeVar
 
 if TYPE_CHECKING:
+    from rerun import RecordingStream
+
     from bevviz.config import Config
-    from bevviz.sources import Source
+    from bevviz.frame import FrameResult
+    from bevviz.sources import Scene, Source
+
+T = TypeVar("T")
+R = TypeVar("R")
+T_co = TypeVar("T_co", covariant=True)
+
+
+class Items(Protocol[T_co]):
+    """What ``run`` works through: a ``Source``, or something like it that is not of frames."""
+
+    @property
+    def scene(self) -> Scene: ...
+
+    @property
+    def total(self) -> int | None: ...
+
+    @property
+    def warnings(self) -> Sequence[str]: ...
+
+    def __iter__(self) -> Iterator[T_co]: ...
 
 
 def process(source: Source, config: Config, options: argparse.Namespace, default: Path) -> int:
     """Run the pipeline over the source into every output that was asked for."""
-    from tqdm import tqdm
-
     from bevviz.logging.logger import Logger
-    from bevviz.logging.sinks import open_recording
     from bevviz.pipeline import Pipeline
-    from bevviz.sources.prefetch import prefetch
+
+    with Pipeline(config) as pipeline:
+
+        def begin(recording: RecordingStream) -> Callable[[FrameResult], None]:
+            hint(source.scene, config)
+            logger = Logger(recording, config, source.scene)
+            logger.log_static()
+            return logger.log
+
+        return run(source, config, options, default, pipeline.run, begin)
+
+
+def run(
+    items: Items[T],
+    config: Config,
+    options: argparse.Namespace,
+    default: Path,
+    work: Callable[[T], R],
+    begin: Callable[[RecordingStream], Callable[[R], None]],
+    finish: Callable[[], None] = lambda: None,
+) -> int:
+    """Log what is made of each item into every output that was asked for.
+
+    Args:
+        items: frames, or what there is of each.
+        config: how they are made.
+        options: of ``add_output``.
+        default: file that is saved where nothing is asked for and nothing can be shown.
+        work: what is to be made of an item.
+        begin: called with the recording; returns what logs that.
+        finish: called after the last one, before what was made is served.
+
+    Returns:
+        The exit status.
+    """
+    from bevviz.logging.sinks import open_recording
 
     save, viewer = options.save, options.viewer
     unsaid = save is None and options.serve is None and options.connect is None and not viewer
@@ -33,45 +87,24 @@ def process(source: Source, config: Config, options: argparse.Namespace, default
     elif unsaid:
         save = default
 
-    frames = 0
-    interrupted = False
-    with (
-        Pipeline(config) as pipeline,
-        open_recording(
-            source.scene,
-            config,
-            save=save,
-            serve=options.serve,
-            connect=options.connect,
-            spawn=viewer,
-            blueprint=options.blueprint,
-        ) as sinks,
-    ):
+    with open_recording(
+        items.scene,
+        config,
+        save=save,
+        serve=options.serve,
+        connect=options.connect,
+        spawn=viewer,
+        blueprint=options.blueprint,
+    ) as sinks:
         if unsaid and not viewer:
             say(f"no display: saving {save} (--serve shows it in a browser)")
         for url in sinks.urls:
             say(f"viewer at {url}")
-        if source.scene.cameras and not config.detector.model:
-            say("no detector: give --model FILE.onnx to find objects in the images")
-        logger = Logger(sinks.recording, config, source.scene)
-        logger.log_static()
-        try:
-            with (
-                terminable() as ended,
-                tqdm(total=source.total, unit="frame", desc=source.scene.name, disable=None) as bar,
-                closing(prefetch(source, 2)) as ahead,
-                closing(prefetch(map(pipeline.run, ahead), 2)) as results,
-            ):
-                for result in results:
-                    logger.log(result)
-                    frames += 1
-                    bar.update()
-                    if ended.is_set():
-                        raise KeyboardInterrupt
-        except KeyboardInterrupt:
-            interrupted = True
-        for warning in source.warnings:
+        handle = begin(sinks.recording)
+        frames, interrupted = through(items, work, handle)
+        for warning in items.warnings:
             say(f"warning: {warning}")
+        finish()
         if options.serve is not None and frames and not interrupted:
             say(f"{frames} frames; serving until Ctrl-C")
             sinks.recording.flush()
@@ -82,6 +115,41 @@ def process(source: Source, config: Config, options: argparse.Namespace, default
         return 130
     say(f"{frames} frames{target}")
     return 0 if frames else 1
+
+
+def through(items: Items[T], work: Callable[[T], R], handle: Callable[[R], None]) -> tuple[int, bool]:
+    """Items are made, worked on and handled in a thread each, in order, with a progress bar.
+
+    Returns:
+        How many there were, and whether that was interrupted.
+    """
+    from tqdm import tqdm
+
+    from bevviz.sources.prefetch import prefetch
+
+    done = 0
+    try:
+        with (
+            terminable() as ended,
+            tqdm(total=items.total, unit="frame", desc=items.scene.name, disable=None) as bar,
+            closing(prefetch(items, 2)) as ahead,
+            closing(prefetch(map(work, ahead), 2)) as results,
+        ):
+            for result in results:
+                handle(result)
+                done += 1
+                bar.update()
+                if ended.is_set():
+                    raise KeyboardInterrupt
+    except KeyboardInterrupt:
+        return done, True
+    return done, False
+
+
+def hint(scene: Scene, config: Config) -> None:
+    """Say what would give the user more."""
+    if scene.cameras and not config.detector.model:
+        say("no detector: give --model FILE.onnx to find objects in the images")
 
 
 def say(line: str) -> None:

@@ -10,6 +10,7 @@ from bevviz.frame import ClusterState, DetectionState
 
 STAMP = "stamp"  # sensor time, from the header of the cloud
 FRAME = "frame"  # sequence
+VERSION = "version"  # sequence: of the configuration, in bevviz tune
 RECEIVED = "received"  # when the cloud was received, or logged into the bag
 
 # --- entities ----------------------------------------------------------------------------------
@@ -29,6 +30,14 @@ HEALTH = "/health"
 CONFIG = "/config"
 REPORT = "/report"
 DIGEST = "/report/digest"  # fingerprints of each frame's results
+PROPERTY = "bevviz"  # the recording's property that says how it was made
+B = "/b"  # root of the same tree again, for the other one of two runs that are compared
+SWEEP = "/sweep"
+TUNE = "/tune"
+COMPARE = "/compare"
+COMPARE_ABOUT = "/compare/about"
+COMPARE_LOG = "/compare/log"
+COMPARE_STATES = "/compare/states"
 
 
 def sensor(name: str) -> str:
@@ -94,6 +103,28 @@ def state(*lane: str) -> str:
 def why(what: str) -> str:
     """The chain of what ``bevviz why`` explains: points by their fate, boxes, frustums."""
     return f"{WHY}/{what}"
+
+
+def difference(change: str) -> str:
+    """Objects that differ in this way between two runs."""
+    return f"{COMPARE}/objects/{change.replace(' ', '_').lower()}"
+
+
+def image_difference(camera: str, change: str) -> str:
+    return f"{COMPARE}/{camera}/{change.replace(' ', '_').lower()}"
+
+
+def difference_count(change: str) -> str:
+    return f"{COMPARE}/count/{change.replace(' ', '_').lower()}"
+
+
+def difference_state(class_name: str) -> str:
+    return f"{COMPARE_STATES}/{class_name.replace(' ', '_')}"
+
+
+def sweep(metric: str) -> str:
+    """A number over the parameter that was swept."""
+    return f"{SWEEP}/{metric.replace(' ', '_')}"
 
 
 def stage_time(stage: str) -> str:

@@ -22,7 +22,6 @@ from bevviz.frame import (
     F64,
     U8,
     Bev,
-    Boxes3D,
     CameraResult,
     Clusters,
     ClusterState,
@@ -39,8 +38,10 @@ from bevviz.frame import (
 )
 from bevviz.logging import entities
 from bevviz.logging.entities import ClassId
+from bevviz.logging.pieces import CORNER, boxes3d, transform, world_pose
 from bevviz.logging.text import markdown
 from bevviz.logging.tracks import Tracks
+from bevviz.logging.writer import Writer
 from bevviz.sources import Scene
 
 _OUTLINE = rr.components.FillMode.MajorWireframe
@@ -48,7 +49,6 @@ _TRUTH_COLOR = (215, 215, 215)
 _ROBOT_COLOR = (255, 210, 0)
 _FAINT = (150, 150, 160, 110)
 _UNMATCHED = (80, 80, 92)
-_CORNER = 0.5  # pixels: Rerun counts from the corner of the first pixel, bevviz from its centre
 _UNMATCHED_DEPTH = 20.0  # metres that the frustum of a detection without a match is drawn to
 
 _STATES = {
@@ -76,7 +76,7 @@ class Context:
     lanes: Mapping[str, str] = field(default_factory=dict)  # state lane -> its state
 
 
-class Logger:
+class Logger(Writer):
     """Writes frames to a recording, on the timelines ``stamp``, ``frame`` and ``received``.
 
     Call ``log_static`` once, then ``log`` for each frame.
@@ -85,19 +85,18 @@ class Logger:
         recording: where to; it may have any number of sinks.
         config: how the results were made; stored in the recording.
         scene: names of the sensors.
+        root: entity that everything goes under. With one, this is what else was made of frames that
+            another logger writes: what the sensors and the robot brought is not written twice.
     """
 
-    def __init__(self, recording: rr.RecordingStream, config: Config, scene: Scene) -> None:
-        self._recording = recording
+    def __init__(self, recording: rr.RecordingStream, config: Config, scene: Scene, root: str = "") -> None:
+        super().__init__(recording, root)
         self._config = config
         self._scene = scene
         self._tracks = Tracks()
         self._intrinsics: dict[str, Intrinsics] = {}
         self._image_stamps: dict[str, int] = {}
         self._lanes: dict[str, str] = {}  # state lane -> its latest state
-        self._known: set[str] = set()  # entities that any frame had
-        self._shown: set[str] = set()  # entities with something of the frame before
-        self._now: set[str] = set()
         self._last: Frame | None = None
 
     @property
@@ -130,6 +129,9 @@ class Logger:
                 rr.Points2D.from_fields(radii=rr.Radius.ui_points(1.5), show_labels=False, draw_order=10.0),
             )
             self._static(entities.detections(camera), rr.Boxes2D.from_fields(draw_order=30.0))
+            if self._root:  # over the one image
+                for path in (entities.projected(camera), entities.detections(camera), entities.weak(camera)):
+                    self._static(path, rr.CoordinateFrame(f"tf#{entities.image(camera)}"))
             self._static(
                 entities.weak(camera),
                 rr.Boxes2D.from_fields(
@@ -178,9 +180,10 @@ class Logger:
                 media_type=rr.MediaType.MARKDOWN,
             ),
         )
-        self._recording.send_recording_name(self._scene.name)
+        if not self._root:
+            self._recording.send_recording_name(self._scene.name)
         self._recording.send_property(
-            "bevviz",
+            entities.PROPERTY + self._root.replace("/", "_"),
             rr.AnyValues(
                 source=self._scene.name,
                 preset=self._config.preset,
@@ -207,8 +210,7 @@ class Logger:
             notes: further lines of the log: level and text.
         """
         frame = result.frame
-        self._now = set()
-        self._set_time(frame.index, frame.stamp, frame.received)
+        self._begin(frame.index, frame.stamp, frame.received)
         self._log_cloud(result)
         if result.obstacles is not None:
             obstacles = self._rounded(result.obstacles)
@@ -222,20 +224,18 @@ class Logger:
         self._log_frustums(frame, result.cameras)
         if result.bev is not None:
             self._log_bev(result, result.bev)
-        self._log_others(frame)
+        if not self._root:
+            self._log_others(frame)
         self._log_decisions(result, notes)
         self._log_health(result, health)
-        self._known |= self._now
-        for path in self._shown - self._now:
-            self._recording.log(path, rr.Clear(recursive=False))
-        self._shown = self._now
+        self._end()
         self._last = frame
 
     def _log_cloud(self, result: FrameResult) -> None:
         frame = result.frame
-        world_from_points = _pose(frame)
-        self._put(entities.sensor(frame.lidar), _transform(world_from_points))
-        if self._config.logging.raw_cloud:
+        world_from_points = world_pose(frame)
+        self._put(entities.sensor(frame.lidar), transform(world_from_points))
+        if self._config.logging.raw_cloud and not self._root:
             classes = np.zeros(len(frame.points), np.uint16)
             if result.voxels is not None and result.ground is not None:
                 of_voxel = np.where(result.ground.mask, ClassId.GROUND, ClassId.OBSTACLE).astype(np.uint16)
@@ -253,7 +253,7 @@ class Logger:
         end = 0
         for cloud, points_from_cloud in zip(frame.clouds, frame.points_from_clouds, strict=True):
             start, end = end, end + len(cloud.xyz)
-            self._put(entities.sensor(cloud.name), _transform(world_from_points @ points_from_cloud))
+            self._put(entities.sensor(cloud.name), transform(world_from_points @ points_from_cloud))
             if len(cloud.xyz):
                 self._put(entities.points(cloud.name), rr.Points3D(cloud.xyz, class_ids=classes[start:end]))
 
@@ -270,7 +270,7 @@ class Logger:
 
     def _log_clusters(self, frame: Frame, clusters: Clusters, obstacles: F32) -> None:
         boxes = clusters.obb if self._config.clustering.boxes == "oriented" else clusters.aabb
-        tracks = self._tracks.update(geometry.apply(_pose(frame), clusters.centroid))
+        tracks = self._tracks.update(geometry.apply(world_pose(frame), clusters.centroid))
         colors = (ClassId.TRACK + tracks % entities.TRACK_COLORS).astype(np.uint16)
         kept = np.flatnonzero(clusters.state == ClusterState.KEPT)
         member = np.append(clusters.state == ClusterState.KEPT, False).take(clusters.labels)  # -1 is noise
@@ -281,14 +281,14 @@ class Logger:
                     obstacles.compress(member, axis=0),
                     class_ids=colors.take(clusters.labels.compress(member)),
                 ),
-                _boxes(boxes, kept, [f"{k}" for k in kept], class_ids=colors[kept]),
+                boxes3d(boxes, kept, [f"{k}" for k in kept], class_ids=colors[kept]),
             )
         aside = np.flatnonzero(clusters.state != ClusterState.KEPT)
         if len(aside):
             states = [ClusterState(s) for s in clusters.state[aside].tolist()]
             self._put(
                 entities.set_aside(frame.lidar),
-                _boxes(
+                boxes3d(
                     boxes,
                     aside,
                     [f"{k}: {n} points" for k, n in zip(aside, clusters.count[aside], strict=True)],
@@ -300,13 +300,14 @@ class Logger:
 
     def _log_camera(self, frame: Frame, result: CameraResult) -> None:
         camera = result.camera
-        world_from_camera = _camera_pose(frame, result)
-        if world_from_camera is not None:
-            self._put(entities.sensor(camera.name), _transform(world_from_camera))
-        if camera.intrinsics is not None:
-            self._log_intrinsics(camera.name, camera.intrinsics)
-        if camera.image is not None:
-            self._log_image(camera.name, camera.image)
+        if not self._root:
+            world_from_camera = _camera_pose(frame, result)
+            if world_from_camera is not None:
+                self._put(entities.sensor(camera.name), transform(world_from_camera))
+            if camera.intrinsics is not None:
+                self._log_intrinsics(camera.name, camera.intrinsics)
+            if camera.image is not None:
+                self._log_image(camera.name, camera.image)
         if result.detections is not None:
             self._log_detections(camera.name, result.detections)
         if self._config.logging.projected_points and result.uv is not None and result.depth is not None:
@@ -314,7 +315,7 @@ class Logger:
             if seen.any():
                 depth = bins(result.depth[seen], 0, entities.DEPTH_RANGE, entities.DEPTH_BINS)
                 self._put(
-                    entities.projected(camera.name), rr.Points2D(result.uv[seen] + _CORNER, class_ids=depth)
+                    entities.projected(camera.name), rr.Points2D(result.uv[seen] + CORNER, class_ids=depth)
                 )
 
     def _log_intrinsics(self, name: str, intrinsics: Intrinsics) -> None:
@@ -328,7 +329,7 @@ class Logger:
             self._static(
                 entities.sensor(name),
                 rr.Pinhole(
-                    image_from_camera=intrinsics.K + np.array([[0, 0, _CORNER], [0, 0, _CORNER], [0, 0, 0]]),
+                    image_from_camera=intrinsics.K + np.array([[0, 0, CORNER], [0, 0, CORNER], [0, 0, 0]]),
                     resolution=size,
                     camera_xyz=rr.ViewCoordinates.RDF,
                     image_plane_distance=1.5,
@@ -357,7 +358,7 @@ class Logger:
             self._put(
                 path,
                 rr.Boxes2D(
-                    array=detections.xyxy[rows] + _CORNER,
+                    array=detections.xyxy[rows] + CORNER,
                     array_format=rr.Box2DFormat.XYXY,
                     labels=[f"{n} {s:.2f}" for n, s in zip(names, detections.score[rows], strict=True)],
                     colors=[class_color(n) for n in names] if path == entities.detections(name) else None,
@@ -371,8 +372,8 @@ class Logger:
         reasons = {(e.camera, e.row): e.text for e in result.explanations if e.subject == "detection"}
         self._put(
             entities.FUSED,
-            _transform(_pose(result.frame)),
-            _boxes(
+            transform(world_pose(result.frame)),
+            boxes3d(
                 objects.boxes,
                 np.arange(len(objects)),
                 [f"{n} {s:.2f}" for n, s in zip(objects.names, objects.score, strict=True)],
@@ -443,7 +444,7 @@ class Logger:
             level = float(np.median(heights)) if len(heights) else 0.0
         self._put(
             entities.GRID,
-            _transform(_pose(result.frame)),
+            transform(world_pose(result.frame)),
             rr.GridMap(
                 data=grid.tobytes(),
                 format=rr.components.ImageFormat(
@@ -460,7 +461,7 @@ class Logger:
     # --- what others state ---------------------------------------------------------------------
 
     def _log_others(self, frame: Frame) -> None:
-        world_from_points = _pose(frame)
+        world_from_points = world_pose(frame)
         if frame.truth is not None and len(frame.truth.boxes):
             self._log_stated(entities.TRUTH, frame.truth, None)
             self._log_outlines("ground_truth", frame.truth, world_from_points, _TRUTH_COLOR)
@@ -476,8 +477,8 @@ class Logger:
         pose = np.eye(4) if stated.world_from_boxes is None else stated.world_from_boxes
         self._put(
             path,
-            _transform(pose),
-            _boxes(
+            transform(pose),
+            boxes3d(
                 stated.boxes,
                 np.arange(len(stated.boxes)),
                 [f"{n} {s:.2f}" for n, s in zip(stated.labels, stated.scores, strict=True)],
@@ -492,7 +493,7 @@ class Logger:
             entities.robot(found.topic),
             *([frame] if frame else []),
             rr.Boxes2D(
-                array=found.xyxy + _CORNER,
+                array=found.xyxy + CORNER,
                 array_format=rr.Box2DFormat.XYXY,
                 labels=[f"{n} {s:.2f}" for n, s in zip(found.labels, found.scores, strict=True)],
                 colors=[_ROBOT_COLOR],
@@ -542,7 +543,7 @@ class Logger:
         if lines:
             levels, texts = zip(*lines, strict=True)
             rr.send_columns(
-                entities.EXPLAIN_LOG,
+                self._root + entities.EXPLAIN_LOG,
                 self._times(result.frame, len(lines)),
                 rr.TextLog.columns(text=texts, level=levels),
                 recording=self._recording,
@@ -573,7 +574,7 @@ class Logger:
             if lane not in self._lanes:
                 self._static(lane, rr.StateConfiguration(values=list(_STATES), colors=list(_STATES.values())))
             if self._lanes.get(lane) != value:
-                self._recording.log(lane, rr.StateChange(state=value))
+                self._log(lane, rr.StateChange(state=value))
         self._lanes = dict(lanes)
 
     # --- health --------------------------------------------------------------------------------
@@ -581,29 +582,15 @@ class Logger:
     def _log_health(self, result: FrameResult, more: Mapping[str, float]) -> None:
         for path, value in (*health(result, self._last), *more.items()):
             if np.isfinite(value):
-                self._recording.log(path, rr.Scalars(float(value)))
+                self._log(path, rr.Scalars(float(value)))
 
     # --- plumbing ------------------------------------------------------------------------------
-
-    def _static(self, path: str, *archetypes: rr.AsComponents) -> None:
-        for archetype in archetypes:
-            self._recording.log(path, archetype, static=True)
-
-    def _put(self, path: str, *archetypes: rr.AsComponents) -> None:
-        self._recording.log(path, *archetypes)
-        self._now.add(path)
-
-    def _set_time(self, index: int, stamp: int, received: int) -> None:
-        self._recording.reset_time()
-        self._recording.set_time(entities.FRAME, sequence=index)
-        self._recording.set_time(entities.STAMP, timestamp=np.datetime64(stamp, "ns"))
-        if received:
-            self._recording.set_time(entities.RECEIVED, timestamp=np.datetime64(received, "ns"))
 
     def _times(self, frame: Frame, rows: int) -> list[rr.TimeColumn]:
         columns = [
             rr.TimeColumn(entities.FRAME, sequence=[frame.index] * rows),
             rr.TimeColumn(entities.STAMP, timestamp=np.full(rows, frame.stamp, "datetime64[ns]")),
+            *(rr.TimeColumn(name, sequence=[number] * rows) for name, number in self.sequences.items()),
         ]
         if frame.received:
             columns.append(
@@ -656,33 +643,13 @@ def _depth_annotations() -> rr.AnnotationContext:
     )
 
 
-def _pose(frame: Frame) -> F64:
-    return np.eye(4) if frame.world_from_points is None else frame.world_from_points
-
-
 def _camera_pose(frame: Frame, result: CameraResult) -> F64 | None:
     camera = result.camera
     if camera.world_from_camera is not None:
         return camera.world_from_camera
     if camera.camera_from_points is not None:
-        return _pose(frame) @ geometry.inverse(camera.camera_from_points)
+        return world_pose(frame) @ geometry.inverse(camera.camera_from_points)
     return None
-
-
-def _transform(world_from_entity: F64) -> rr.Transform3D:
-    return rr.Transform3D(
-        translation=world_from_entity[:3, 3],
-        quaternion=rr.Quaternion(xyzw=geometry.quaternion(world_from_entity)),
-    )
-
-
-def _boxes(boxes: Boxes3D, rows: np.ndarray[Any, Any], labels: list[str], **looks: Any) -> rr.Boxes3D:
-    half = boxes.yaw[rows] / 2
-    turns = np.zeros((len(rows), 4), np.float32)
-    turns[:, 2], turns[:, 3] = np.sin(half), np.cos(half)
-    return rr.Boxes3D(
-        centers=boxes.center[rows], sizes=boxes.size[rows], quaternions=turns, labels=labels, **looks
-    )
 
 
 def _jpeg(bgr: U8, quality: int) -> rr.EncodedImage:
@@ -719,7 +686,7 @@ def health(result: FrameResult, last: Frame | None) -> Iterator[tuple[str, float
             yield entities.rate("sensor"), 1e9 / (frame.stamp - last.stamp)
         if frame.received > last.received > 0:
             yield entities.rate("received"), 1e9 / (frame.received - last.received)
-    for what, number in _counts(result, last).items():
+    for what, number in counts_of(result, last).items():
         yield entities.count(what), number
     yield entities.tf_age(frame.lidar), frame.tf_age * 1e3
     for camera in result.cameras:
@@ -727,7 +694,8 @@ def health(result: FrameResult, last: Frame | None) -> Iterator[tuple[str, float
         yield entities.tf_age(camera.camera.name), camera.camera.tf_age * 1e3
 
 
-def _counts(result: FrameResult, last: Frame | None) -> Mapping[str, int]:
+def counts_of(result: FrameResult, last: Frame | None = None) -> Mapping[str, int]:
+    """How much of everything there is in a frame; ``last`` is the frame before it."""
     frame = result.frame
     counts: Counter[str] = Counter(
         points=len(frame.points),

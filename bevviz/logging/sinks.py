@@ -11,6 +11,7 @@ from pathlib import Path
 from urllib.parse import quote, urlsplit
 
 import rerun as rr
+import rerun.blueprint as rrb
 
 from bevviz.config import Config
 from bevviz.errors import UserError
@@ -38,7 +39,7 @@ def open_recording(
     serve: int | None = None,
     connect: str | None = None,
     spawn: bool = False,
-    blueprint: str = "debug",
+    blueprint: str | rrb.Blueprint = "debug",
 ) -> Iterator[Sinks]:
     """Open a recording that goes to everything that is asked for, with the blueprint.
 
@@ -51,13 +52,13 @@ def open_recording(
         serve: port of the web viewer on this machine.
         connect: URL of a viewer that listens, rerun+http://host:9876/proxy.
         spawn: open the viewer on this machine.
-        blueprint: name of a layout, or a .py or .rbl file.
+        blueprint: name of a layout, a .py or .rbl file, or a layout.
 
     Raises:
         UserError: unknown blueprint, file that cannot be written, port in use, no viewer found or reached;
             on leaving, when not everything could be written.
     """
-    layout = blueprints.load(blueprint, scene)
+    layout = blueprints.load(blueprint, scene) if isinstance(blueprint, str) else blueprint
     sinks: list[rr.FileSink | rr.GrpcSink | rr.GrpcServerSink] = []
     urls: list[str] = []
     if save is not None:

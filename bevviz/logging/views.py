@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import rerun.blueprint as rrb
 
 from bevviz.logging import entities
@@ -11,7 +13,16 @@ _DARK = (13, 14, 18)
 _HIDDEN = rrb.EntityBehavior(visible=False)
 
 
-def space(scene: Scene, *, raw: bool = True, grid: bool = True, why: bool = False) -> rrb.Spatial3DView:
+def space(
+    scene: Scene,
+    *,
+    raw: bool = True,
+    grid: bool = True,
+    why: bool = False,
+    name: str = "3D",
+    root: str = "",
+    beside: Sequence[str] = (f"{entities.ROBOT}/**",),
+) -> rrb.Spatial3DView:
     """Points, boxes, frusta and poses around the robot, seen from behind and above it.
 
     The origin is the LiDAR: the robot stays where it is and the world moves, whichever way it drives.
@@ -21,6 +32,9 @@ def space(scene: Scene, *, raw: bool = True, grid: bool = True, why: bool = Fals
         raw: with every raw point, coloured as ground or obstacle.
         grid: with the occupancy on the ground.
         why: with the chain of what ``bevviz why`` explains.
+        name: of the view.
+        root: entity that the run is logged under.
+        beside: what else is shown.
     """
     hidden = [entities.ground(scene.lidar), entities.set_aside(scene.lidar)]
     # The coloured points of the clusters and the raw cloud already show what is obstacle.
@@ -30,9 +44,9 @@ def space(scene: Scene, *, raw: bool = True, grid: bool = True, why: bool = Fals
     # The points of what is explained stand out by their colours, which tell another story than the clusters'.
     hidden += [entities.clusters(scene.lidar), entities.FRUSTUMS] if why else []
     return rrb.Spatial3DView(
-        name="3D",
-        origin=entities.sensor(scene.lidar),
-        contents=[f"{entities.WORLD}/**", f"{entities.ROBOT}/**", *([f"{entities.WHY}/**"] if why else [])],
+        name=name,
+        origin=root + entities.sensor(scene.lidar),
+        contents=[f"{root}{entities.WORLD}/**", *beside, *([f"{entities.WHY}/**"] if why else [])],
         background=_DARK,
         line_grid=False,
         eye_controls=rrb.EyeControls3D(
@@ -41,7 +55,7 @@ def space(scene: Scene, *, raw: bool = True, grid: bool = True, why: bool = Fals
             look_target=(10.0, -0.5, -1.0) if why else (10.0, 0.0, -1.0),
             eye_up=(0.0, 0.0, 1.0),
         ),
-        overrides=dict.fromkeys(hidden, _HIDDEN),
+        overrides=dict.fromkeys((root + path for path in hidden), _HIDDEN),
     )
 
 
@@ -67,17 +81,18 @@ def cameras(scene: Scene, *, why: bool = False) -> rrb.Container | rrb.View:
     return rrb.Tabs(*views, name="Cameras") if len(views) > 2 else rrb.Vertical(*views, name="Cameras")
 
 
-def birds_eye() -> rrb.Spatial2DView:
+def birds_eye(root: str = "", name: str = "Bird's-eye view") -> rrb.Spatial2DView:
     """The bird's-eye image with the outlines of ground truth and of the robot's own boxes."""
-    channels = [f"- {entities.channel(name)}/**" for name in ("density", "height", "intensity", "occupancy")]
-    return rrb.Spatial2DView(
-        name="Bird's-eye view", origin=entities.BEV, contents=["$origin/**", *channels], background=_DARK
-    )
+    bev = root + entities.BEV
+    channels = [
+        f"- {root}{entities.channel(name)}/**" for name in ("density", "height", "intensity", "occupancy")
+    ]
+    return rrb.Spatial2DView(name=name, origin=bev, contents=["$origin/**", *channels], background=_DARK)
 
 
-def explain() -> rrb.TextDocumentView:
+def explain(root: str = "", name: str = "Explain") -> rrb.TextDocumentView:
     """Every decision of the frame in words."""
-    return rrb.TextDocumentView(name="Explain", origin=entities.EXPLAIN, contents=["$origin"])
+    return rrb.TextDocumentView(name=name, origin=root + entities.EXPLAIN, contents=["$origin"])
 
 
 def why() -> rrb.TextDocumentView:
@@ -131,15 +146,105 @@ def health() -> rrb.Tabs:
     return rrb.Tabs(stage_times(), clocks(), counts(), rates(), name="Health")
 
 
+# --- two runs that are compared ------------------------------------------------------------------
+
+_LINKED = rrb.archetypes.TimeAxis(link=rrb.components.LinkAxis.LinkToGlobal)
+_SIDES = {"": ("A", "only A"), entities.B: ("B", "only B")}
+
+
+def side_space(scene: Scene, root: str) -> rrb.Spatial3DView:
+    """What one run has found, with the differences that concern it: obstacles, clusters, objects."""
+    name, only = _SIDES[root]
+    changes = [f"{entities.difference(change)}/**" for change in (only, "moved", "other class")]
+    return space(
+        scene, raw=False, grid=False, name=f"3D {name}", root=root, beside=[entities.TRUTH, *changes]
+    )
+
+
+def side_camera(camera_name: str, root: str) -> rrb.Spatial2DView:
+    """The one image, with the detections of one run and those that the other one has not."""
+    name, only = _SIDES[root]
+    image = entities.image(camera_name)
+    changes = [entities.image_difference(camera_name, change) for change in (only, "other class")]
+    return rrb.Spatial2DView(
+        name=f"{camera_name} {name}",
+        origin=entities.sensor(camera_name),
+        contents=[image, f"{root}{image}/**", *changes],
+        overrides={root + entities.weak(camera_name): _HIDDEN},
+    )
+
+
+def side_pictures(scene: Scene, root: str) -> rrb.Tabs:
+    """The cameras and the bird's-eye view of one run."""
+    name = _SIDES[root][0]
+    cameras = [side_camera(camera_name, root) for camera_name in scene.cameras]
+    return rrb.Tabs(*cameras, birds_eye(root, f"Bird's-eye view {name}"))
+
+
+def differences() -> rrb.TextDocumentView:
+    """How the runs differ in the frame, in words."""
+    return rrb.TextDocumentView(name="Differences", origin=entities.COMPARE, contents=["$origin"])
+
+
+def changes() -> list[str]:
+    """Contents: objects that differ, to be shown beside a run."""
+    return [f"{entities.difference(change)}/**" for change in ("only A", "only B", "moved", "other class")]
+
+
+def version() -> rrb.TextDocumentView:
+    """What was changed in the configuration."""
+    return rrb.TextDocumentView(name="Version", origin=entities.TUNE)
+
+
+def compared() -> rrb.TextDocumentView:
+    """What the two runs are."""
+    return rrb.TextDocumentView(name="A and B", origin=entities.COMPARE_ABOUT)
+
+
+def difference_log() -> rrb.TextLogView:
+    return rrb.TextLogView(name="Log of differences", origin=entities.COMPARE_LOG)
+
+
+def difference_counts() -> rrb.TimeSeriesView:
+    """Objects that differ, by how."""
+    return rrb.TimeSeriesView(
+        name="Objects that differ",
+        origin=entities.COMPARE,
+        contents=[entities.difference_count(what) for what in ("only A", "only B", "moved", "other class")],
+        plot_legend=rrb.Corner2D.LeftTop,
+        axis_x=_LINKED,
+    )
+
+
+def side_counts() -> rrb.TimeSeriesView:
+    """Objects and clusters of both."""
+    return rrb.TimeSeriesView(
+        name="Objects and clusters",
+        origin=entities.COMPARE,
+        contents=[
+            entities.difference_count(f"{what}_{side}") for what in ("objects", "clusters") for side in "ab"
+        ],
+        plot_legend=rrb.Corner2D.LeftTop,
+        axis_x=_LINKED,
+    )
+
+
+def difference_states() -> rrb.StateTimelineView:
+    """For each class the worst that has become of it, over time."""
+    return rrb.StateTimelineView(
+        name="Worst of each class", origin=entities.COMPARE_STATES, time_view=_LINKED
+    )
+
+
 def config() -> rrb.TextDocumentView:
     """How the recording was made."""
     return rrb.TextDocumentView(name="Configuration", origin=entities.CONFIG)
 
 
-def time_panel(*, follow: bool = False) -> rrb.TimePanel:
+def time_panel(*, follow: bool = False, timeline: str = entities.STAMP) -> rrb.TimePanel:
     """Sensor time, collapsed. ``follow``: stay at the newest frame."""
     play = rrb.components.PlayState.Following if follow else None
-    return rrb.TimePanel(state="collapsed", timeline=entities.STAMP, play_state=play)
+    return rrb.TimePanel(state="collapsed", timeline=timeline, play_state=play)
 
 
 def panels() -> tuple[rrb.BlueprintPanel, rrb.SelectionPanel]:

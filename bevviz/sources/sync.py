@@ -522,8 +522,17 @@ class Synchronizer:
             world_from_camera=world @ found.matrix,
             tf_age=found.age,
             motion_compensated=compensated,
+            mounting=self._mounting(place, frame) if compensated else None,
             problems=tuple(problems),
         )
+
+    def _mounting(self, place: _Place, frame: str) -> F64 | None:
+        """frame from points at the cloud's stamp, None where TF does not say."""
+        try:
+            found = self.tf.lookup(place.points_frame, frame, place.stamp, self._config.sync.tf_tolerance)
+        except TransformError:
+            return None
+        return geometry.inverse(found.matrix)
 
     def _image(self, role: CameraRole, stamp: int, problems: list[str]) -> tuple[Image | None, int]:
         """The decoded image nearest to ``stamp``, and its stamp; without one, ``stamp``."""

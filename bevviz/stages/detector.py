@@ -5,6 +5,8 @@ from __future__ import annotations
 import ast
 import difflib
 from collections.abc import Mapping, Sequence
+from copy import copy
+from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
 from typing import Any
@@ -52,6 +54,17 @@ SUPPORTED = (
     "[1, 4 + classes, N] (YOLOv8, 11), [1, N, 5 + classes] (YOLOv5, YOLOX raw grid), "
     "[1, N, 6] (end-to-end YOLOv10, 26)"
 )
+
+
+@dataclass(frozen=True, slots=True)
+class Inference:
+    """What a network said of an image, before any threshold."""
+
+    output: Any
+    input_size: tuple[int, int]  # height, width of the network's input
+    scale: F32  # (2,) x, y: from the image to that input ...
+    offset: F32  # (2,) ... and then its shift
+    image_size: tuple[int, int]  # width, height
 
 
 class Detector:
@@ -120,19 +133,35 @@ class Detector:
             BELOW_THRESHOLD are exactly what a lower ``detector.conf_threshold`` would keep: a weak
             candidate that overlaps a stronger one of its class is SUPPRESSED.
         """
-        config = self._config
-        height, width = bgr.shape[:2]
-        if height == 0 or width == 0:
-            return Detections.empty()
+        return self.interpret(self.infer(bgr)) if bgr.size else Detections.empty()
+
+    def restated(self, config: DetectorConfig) -> Detector:
+        """The same network with other thresholds or classes; it is not loaded again.
+
+        Raises:
+            UserError: wrong class names.
+        """
+        other = copy(self)
+        other._config = config
+        other._wanted = other._wanted_classes()
+        return other
+
+    def infer(self, bgr: U8) -> Inference:
+        """Run the network alone, on an image that is not empty."""
         blob, scale, offset = self._letterbox(bgr)
         output = self._session.run([self._output], {self._input: blob})[0][0]
-        xyxy, score, class_id = self._decode(output, blob.shape[2:])
+        return Inference(output, blob.shape[2:], scale, offset, (bgr.shape[1], bgr.shape[0]))
+
+    def interpret(self, found: Inference) -> Detections:
+        """What the thresholds make of the network's output; ``__call__`` says what."""
+        config = self._config
+        xyxy, score, class_id = self._decode(found.output, found.input_size)
         # Networks count from the corner of the first pixel, bevviz from its centre.
-        xyxy -= np.tile(offset, 2)
-        xyxy /= np.tile(scale, 2)
+        xyxy -= np.tile(found.offset, 2)
+        xyxy /= np.tile(found.scale, 2)
         xyxy -= 0.5
         finite = np.isfinite(xyxy).all(axis=1)
-        np.clip(xyxy, -0.5, np.array([width, height] * 2, np.float32) - 0.5, out=xyxy)
+        np.clip(xyxy, -0.5, np.array(found.image_size * 2, np.float32) - 0.5, out=xyxy)
         sound = finite & (xyxy[:, 2] > xyxy[:, 0]) & (xyxy[:, 3] > xyxy[:, 1])
         if self._wanted is not None:
             sound &= np.isin(class_id, self._wanted)

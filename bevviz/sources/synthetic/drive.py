@@ -143,6 +143,7 @@ class SyntheticSource:
             sync_error=(shot - stamp) * 1e-9,
             tf_age=0.0,
             motion_compensated=True,
+            mounting=geometry.inverse(self.base_from_camera) @ self.base_from_lidar,
         )
         truth, numbers = self._truth(stamp, at_scan, map_from_lidar)
         frame = Frame(

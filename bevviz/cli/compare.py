@@ -1,0 +1,153 @@
+"""``bevviz compare``."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, cast
+
+from bevviz.cli.options import Commands, add_bag, add_config, add_output, add_selection, open_bag
+from bevviz.cli.run import hint, run, say
+from bevviz.errors import UserError
+
+if TYPE_CHECKING:
+    from rerun import RecordingStream
+
+    from bevviz.compare.sides import Comparison, Results
+    from bevviz.compare.summary import Summary
+    from bevviz.config import Config, Preset
+    from bevviz.sources.bag import BagSource
+
+DESCRIPTION = """Run two configurations on the same frames and show how the results differ: objects that only
+A or only B has, that have moved, or that have another class. Without --a, --b, --set-a, --set-b, --preset
+and --config it is the reference preset (A) against the default one (B). Two .rrd files: what was
+saved, old (A) against new (B)."""
+
+
+def add(commands: Commands) -> None:
+    compare = commands.add_parser(
+        "compare", help="what if? two configurations, two saved runs, or the robot", description=DESCRIPTION
+    )
+    group = add_bag(compare)
+    add_selection(group)
+    add_config(compare)
+    sides = compare.add_argument_group("the two sides", "What --set, --config and --preset say is for both.")
+    for side in "ab":
+        sides.add_argument(f"--{side}", metavar="FILE|PRESET", help=f"configuration of {side.upper()}")
+        sides.add_argument(
+            f"--set-{side}",
+            action="append",
+            default=[],
+            metavar="KEY=VALUE",
+            help=f"one parameter of {side.upper()}",
+        )
+    sides.add_argument(
+        "--robot",
+        nargs="?",
+        const="",
+        metavar="TOPIC",
+        help="A is bevviz, B what the robot published (default: its fused Detection3DArray)",
+    )
+    output = add_output(compare, blueprint="compare")
+    output.add_argument("--json", type=Path, metavar="FILE", help="the table and every difference")
+    output.add_argument("--csv", type=Path, metavar="FILE", help="a row for each object that differs")
+    compare.set_defaults(run=_compare)
+
+
+def _compare(options: argparse.Namespace) -> int:
+    saved = [path.suffix == ".rrd" for path in options.paths]
+    if any(saved):
+        if not all(saved) or len(saved) != 2:
+            raise UserError("compare: expected a bag, or two .rrd files: bevviz compare OLD.rrd NEW.rrd")
+        return _saved(options)
+    if options.robot is not None:
+        return _robot(options)
+    return _configurations(options)
+
+
+def _configurations(options: argparse.Namespace) -> int:
+    from bevviz.compare.sides import configured
+
+    names, configs = _sides(options)
+    comparison, decoded = configured(names, configs)
+    with open_bag(options, decoded) as source:
+        return _run(comparison, source, decoded, options)
+
+
+def _robot(options: argparse.Namespace) -> int:
+    from bevviz.cli.options import load_config
+    from bevviz.compare.sides import against_robot, robot_topic
+
+    if options.a or options.b or options.set_a or options.set_b:
+        raise UserError("--robot: A is bevviz as --set, --config and --preset say; leave --a and --b out")
+    config = load_config(options)
+    with open_bag(options, config) as source:
+        comparison = against_robot(config, robot_topic(source.roles.robot_detections_3d, options.robot))
+
+        return _run(comparison, source, config, options)
+
+
+def _run(comparison: Comparison, source: BagSource, config: Config, options: argparse.Namespace) -> int:
+    def begin(recording: RecordingStream) -> Callable[[Results], None]:
+        hint(source.scene, config)
+        return comparison.begin(recording, source.scene)
+
+    def finish() -> None:
+        if comparison.without:
+            say(f"{comparison.without} frames for which the robot published nothing are left out")
+        _report(comparison.summary, options)
+
+    return run(source, config, options, _default(options), comparison.run, begin, finish)
+
+
+def _saved(options: argparse.Namespace) -> int:
+    from bevviz.compare.saved import SavedPair
+    from bevviz.config import Config
+
+    if options.robot is not None or options.a or options.b or options.set_a or options.set_b:
+        raise UserError("compare: two .rrd files are compared as they were saved; leave the sides out")
+    pair = SavedPair(*options.paths)
+    return run(
+        pair,
+        Config(),
+        options,
+        _default(options),
+        pair.compare,
+        pair.begin,
+        lambda: _report(pair.summary, options),
+    )
+
+
+def _default(options: argparse.Namespace) -> Path:
+    return Path(f"{options.paths[0].stem}_compare.rrd")
+
+
+def _report(summary: Summary, options: argparse.Namespace) -> None:
+    print(summary.table(), flush=True)
+    if options.json is not None:
+        summary.write_json(options.json)
+    if options.csv is not None:
+        summary.write_csv(options.csv)
+
+
+def _sides(options: argparse.Namespace) -> tuple[tuple[str, str], tuple[Config, Config]]:
+    """What the sides are called and their configurations."""
+    own = options.a, options.b, options.set_a, options.set_b
+    if not any(own) and options.preset is None and options.config is None:
+        options.a, options.b = "reference", "default"
+    a = _side(options, options.a, options.set_a)
+    b = _side(options, options.b, options.set_b)
+    return (a[0], b[0]), (a[1], b[1])
+
+
+def _side(options: argparse.Namespace, base: str | None, settings: list[str]) -> tuple[str, Config]:
+    from bevviz.config import load
+
+    presets = ("default", "reference")
+    preset = options.preset if base not in presets else cast("Preset", base)
+    files = [] if options.config is None else [options.config]
+    files += [] if base is None or base in presets else [Path(base)]
+    model = [f"detector.model={options.model}"] if options.model else []
+    config = load(files, [*options.set, *model, *settings], preset)
+    return " ".join([base or str(options.config or config.preset), *settings]), config

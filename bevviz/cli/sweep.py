@@ -1,0 +1,95 @@
+"""``bevviz sweep``."""
+
+from __future__ import annotations
+
+import argparse
+from contextlib import AbstractContextManager, ExitStack
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from bevviz.cli.options import Commands, add_bag, add_config, add_output, add_selection, open_bag
+from bevviz.cli.run import hint, say, through, wait_for_interrupt
+
+if TYPE_CHECKING:
+    from bevviz.config import Config
+    from bevviz.logging.sinks import Sinks
+    from bevviz.sources.bag import BagSource
+    from bevviz.sweep import Sweep
+
+
+def add(commands: Commands) -> None:
+    sweep = commands.add_parser(
+        "sweep",
+        help="a parameter over a range: counts, times, precision and recall",
+        description="Run every value of one or two parameters on the same frames. --set takes ranges "
+        "(clustering.eps=0.3:0.9:0.1) and lists (ground.method=polar,ransac) besides plain values.",
+    )
+    group = add_bag(sweep)
+    add_selection(group)
+    truth = sweep.add_argument_group("ground truth", "The bag's own (.../ground_truth) is found by itself.")
+    truth.add_argument("--truth", metavar="TOPIC", help="a Detection3DArray that states what is there")
+    truth.add_argument(
+        "--kitti-labels",
+        type=Path,
+        metavar="FILE|DIR",
+        help="label_2 of KITTI, calib beside it; scan by scan",
+    )
+    add_config(sweep)
+    output = add_output(sweep, blueprint=None)
+    output.add_argument("--csv", type=Path, metavar="FILE", help="the table, with each stage and class")
+    sweep.set_defaults(run=_sweep)
+
+
+def _sweep(options: argparse.Namespace) -> int:
+    from bevviz.config import load
+    from bevviz.evaluate import truth_source
+    from bevviz.sweep import Sweep, combine, parse
+    from bevviz.variants import common_frames
+
+    parameters, constant = parse(options.set)
+    model = [f"detector.model={options.model}"] if options.model else []
+
+    def configured(settings: list[str]) -> Config:
+        return load(options.config, [*constant, *model, *settings], options.preset)
+
+    configs = combine(parameters, configured)
+    config = common_frames(configs.values())
+    with open_bag(options, config) as source:
+        truth = truth_source(source.roles, options.truth, options.kitti_labels)
+        sweep = Sweep(parameters, configs, truth)
+        wanted = options.save or options.serve or options.connect or options.viewer
+        with ExitStack() as stack:
+            sinks = stack.enter_context(_outputs(options, source, sweep)) if wanted else None
+            for url in sinks.urls if sinks else ():
+                say(f"viewer at {url}")
+            hint(source.scene, config)
+            frames, interrupted = through(source, lambda frame: frame, sweep.add)
+            for warning in source.warnings:
+                say(f"warning: {warning}")
+            print(sweep.table())
+            if options.csv is not None:
+                sweep.write_csv(options.csv)
+            if sinks is not None:
+                sweep.log(sinks.recording, source.scene.name)
+                if options.serve is not None and not interrupted:
+                    say("serving until Ctrl-C")
+                    sinks.recording.flush()
+                    wait_for_interrupt()
+    if interrupted:
+        say(f"interrupted after {frames} frames; the table is of these")
+        return 130
+    return 0 if frames else 1
+
+
+def _outputs(options: argparse.Namespace, source: BagSource, sweep: Sweep) -> AbstractContextManager[Sinks]:
+    from bevviz.logging.sinks import open_recording
+
+    return open_recording(
+        source.scene,
+        source.config,
+        save=options.save,
+        serve=options.serve,
+        connect=options.connect,
+        spawn=options.viewer,
+        blueprint=sweep.layout(),
+    )

@@ -1,0 +1,176 @@
+"""Which object of one side is which of the other, and how they differ."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from enum import StrEnum
+
+import numpy as np
+
+from bevviz import geometry
+from bevviz.frame import F32, F64, Boxes3D, ClusterState, DetectionState, FrameResult
+from bevviz.stages.fusion import assign
+
+REACH = 2.0  # metres between the centres of one object, seen from above
+OVERLAP = 0.1  # least IoU, seen from above, of one object that has two classes
+MOVED = 0.2  # metres: what is further away has moved
+IMAGE_OVERLAP = 0.5  # least IoU of one detection in the image
+
+
+class Change(StrEnum):
+    SAME = "same"
+    MOVED = "moved"
+    CLASS = "other class"
+    ONLY_A = "only A"
+    ONLY_B = "only B"
+
+
+WORST_FIRST = (Change.ONLY_A, Change.ONLY_B, Change.CLASS, Change.MOVED, Change.SAME)
+DIFFERENT = WORST_FIRST[:-1]
+
+
+@dataclass(frozen=True, slots=True)
+class ImageBoxes:
+    """Detections in one image."""
+
+    xyxy: F32  # (D, 4)
+    names: tuple[str, ...]
+
+    @staticmethod
+    def empty() -> ImageBoxes:
+        return ImageBoxes(np.zeros((0, 4), np.float32), ())
+
+
+@dataclass(frozen=True, slots=True)
+class Seen:
+    """What one side has found in a frame. Boxes in ``Frame.points_frame``."""
+
+    boxes: Boxes3D
+    names: tuple[str, ...]
+    scores: F32
+    images: Mapping[str, ImageBoxes] = field(default_factory=dict)  # by camera, where detections were made
+    clusters: int | None = None  # None: not known
+
+
+@dataclass(frozen=True, slots=True)
+class Difference:
+    """One object of either side or of both. Row -1 and an empty name where a side has it not."""
+
+    change: Change
+    row_a: int
+    row_b: int
+    name_a: str
+    name_b: str
+    distance: float = float("nan")  # between the centres: metres seen from above, in an image pixels
+    iou: float = 0.0
+
+    @property
+    def text(self) -> str:
+        """In words, without the place."""
+        if self.change is Change.CLASS:
+            return f"{self.name_a} in A is {self.name_b} in B"
+        if self.change is Change.MOVED:
+            return f"{self.name_b} moved by {self.distance:.2f} m, IoU {self.iou:.2f}"
+        return f"{self.name_a or self.name_b}: {self.change}"
+
+
+@dataclass(frozen=True, slots=True)
+class FrameDifferences:
+    """How two sides differ in one frame."""
+
+    index: int
+    stamp: int
+    a: Seen
+    b: Seen
+    objects: tuple[Difference, ...]
+    images: Mapping[str, tuple[Difference, ...]]  # by camera
+
+    @property
+    def counts(self) -> Counter[Change]:
+        """Objects by what has become of them."""
+        return Counter(difference.change for difference in self.objects)
+
+    @property
+    def number(self) -> int:
+        """Objects that differ, and detections that do."""
+        pairs = [*self.objects, *(d for found in self.images.values() for d in found)]
+        return sum(difference.change is not Change.SAME for difference in pairs)
+
+
+def seen(result: FrameResult) -> Seen:
+    """What a run has found."""
+    images = {}
+    for camera in result.cameras:
+        if (found := camera.detections) is not None:
+            kept = np.flatnonzero(found.state == DetectionState.KEPT)
+            images[camera.camera.name] = ImageBoxes(found.xyxy[kept], tuple(found.names[d] for d in kept))
+    clusters = None
+    if result.clusters is not None:
+        clusters = int((result.clusters.state == ClusterState.KEPT).sum())
+    if result.objects is None:
+        return Seen(Boxes3D.empty(), (), np.zeros(0, np.float32), images, clusters)
+    return Seen(result.objects.boxes, result.objects.names, result.objects.score, images, clusters)
+
+
+def differences(index: int, stamp: int, a: Seen, b: Seen) -> FrameDifferences:
+    """How two sides differ in the frame."""
+    both = [camera for camera in a.images if camera in b.images]
+    return FrameDifferences(
+        index,
+        stamp,
+        a,
+        b,
+        compare_objects(a, b),
+        {camera: compare_images(a.images[camera], b.images[camera]) for camera in both},
+    )
+
+
+def compare_objects(a: Seen, b: Seen) -> tuple[Difference, ...]:
+    """Each object of both sides once.
+
+    Two boxes may be one object if they have the same class and their centres are within 2 m seen from
+    above, or another class and an IoU of 0.1 or more seen from above. Among these the pairs are the
+    one-to-one assignment with most pairs of least total cost ::
+
+        distance / 2 m + (1 - IoU) + (1 if the class differs)
+
+    A pair of one class has moved if its centres are more than 0.2 m apart.
+    """
+    distance = np.linalg.norm(a.boxes.center[:, None, :2] - b.boxes.center[None, :, :2], axis=2)
+    iou = geometry.bev_iou(a.boxes, b.boxes)
+    other = _other(a.names, b.names)
+    allowed = np.where(other, iou >= OVERLAP, distance <= REACH)
+    cost = np.where(allowed, np.minimum(distance / REACH, 1) + (1 - iou) + other, np.inf)
+    return _paired(a.names, b.names, cost, distance, iou, MOVED)
+
+
+def compare_images(a: ImageBoxes, b: ImageBoxes) -> tuple[Difference, ...]:
+    """Each detection of both sides once; two are one where their boxes have an IoU of 0.5 or more."""
+    iou = geometry.iou(a.xyxy, b.xyxy)
+    middle_a, middle_b = ((boxes.xyxy[:, :2] + boxes.xyxy[:, 2:]) / 2 for boxes in (a, b))
+    distance = np.linalg.norm(middle_a[:, None] - middle_b[None], axis=2)
+    cost = np.where(iou >= IMAGE_OVERLAP, 1 - iou + _other(a.names, b.names), np.inf)
+    return _paired(a.names, b.names, cost, distance, iou, np.inf)
+
+
+def _other(a: Sequence[str], b: Sequence[str]) -> np.ndarray[tuple[int, int], np.dtype[np.bool_]]:
+    return np.array([[x != y for y in b] for x in a], bool).reshape(len(a), len(b))
+
+
+def _paired(
+    a: Sequence[str], b: Sequence[str], cost: F64, distance: F32, iou: F32, moved: float
+) -> tuple[Difference, ...]:
+    # Two that stay alone cost more than any pair, so that nothing stays alone that needs not.
+    column = assign(np.asarray(cost, np.float64), unmatched=10.0)
+    found = []
+    for i, j in enumerate(column.tolist()):
+        if j < 0:
+            found.append(Difference(Change.ONLY_A, i, -1, a[i], ""))
+            continue
+        away = float(distance[i, j])
+        change = Change.CLASS if a[i] != b[j] else Change.MOVED if away > moved else Change.SAME
+        found.append(Difference(change, i, j, a[i], b[j], away, float(iou[i, j])))
+    alone = sorted(set(range(len(b))) - set(column.tolist()))
+    return (*found, *(Difference(Change.ONLY_B, -1, j, "", b[j]) for j in alone))

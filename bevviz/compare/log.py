@@ -1,0 +1,203 @@
+"""Logs how two sides differ: boxes in the colour of the difference, counts, words and states."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+
+import numpy as np
+import rerun as rr
+
+from bevviz.compare.differences import DIFFERENT, WORST_FIRST, Change, Difference, FrameDifferences
+from bevviz.frame import F64
+from bevviz.logging import entities
+from bevviz.logging.pieces import CORNER, boxes3d, transform
+from bevviz.logging.writer import Writer
+
+COLORS = {
+    Change.SAME: (70, 160, 90),
+    Change.MOVED: (255, 215, 60),
+    Change.CLASS: (200, 120, 255),
+    Change.ONLY_A: (255, 110, 70),
+    Change.ONLY_B: (60, 190, 255),
+}
+
+
+class DifferenceLogger(Writer):
+    """Writes differences to the recording that the two sides are written to.
+
+    Args:
+        recording: where to.
+        names: what the two sides are.
+        summary: Markdown that says what was compared.
+    """
+
+    def __init__(self, recording: rr.RecordingStream, names: tuple[str, str], summary: str) -> None:
+        super().__init__(recording)
+        self._names = names
+        self._lanes: dict[str, str] = {}
+        self._recording.send_property("compare", rr.AnyValues(a=names[0], b=names[1]))
+        text = f"# What was compared\n\n- **A**: {names[0]}\n- **B**: {names[1]}\n\n{summary}"
+        self._static(entities.COMPARE_ABOUT, rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN))
+        for change in DIFFERENT:
+            self._static(
+                entities.difference(change),
+                rr.Boxes3D.from_fields(
+                    colors=[COLORS[change]], radii=rr.Radius.ui_points(2.5), show_labels=True
+                ),
+            )
+            self._static(
+                entities.difference_count(change),
+                rr.SeriesLines(colors=[COLORS[change]], names=[change], widths=[2]),
+            )
+        for what, color in (("a", COLORS[Change.ONLY_A]), ("b", COLORS[Change.ONLY_B])):
+            for series in ("objects", "clusters"):
+                self._static(
+                    entities.difference_count(f"{series}_{what}"),
+                    rr.SeriesLines(colors=[color], names=[f"{series} {what.upper()}"]),
+                )
+
+    def log(self, found: FrameDifferences, received: int, world_from_points: F64) -> None:
+        """One frame. Times in nanoseconds; ``received`` is 0 where it is not known."""
+        self._begin(found.index, found.stamp, received)
+        for change in DIFFERENT:
+            mine = [d for d in found.objects if d.change is change]
+            if mine:
+                self._log_boxes(change, mine, found, world_from_points)
+        for camera, pairs in found.images.items():
+            self._log_image(camera, pairs, found)
+        for name, value in _counts(found).items():
+            self._log(entities.difference_count(name), rr.Scalars(float(value)))
+        page = rr.TextDocument(markdown(found), media_type=rr.MediaType.MARKDOWN)
+        self._put(entities.COMPARE, page)
+        for difference in found.objects:
+            if difference.change is not Change.SAME:
+                text = f"{difference.text} {place(difference, found)}"
+                self._log(entities.COMPARE_LOG, rr.TextLog(text, level="INFO"))
+        self._log_states(found)
+        self._end()
+
+    def _log_boxes(
+        self, change: Change, mine: list[Difference], found: FrameDifferences, world_from_points: F64
+    ) -> None:
+        side, rows = (found.a, [d.row_a for d in mine])
+        if change is not Change.ONLY_A:
+            side, rows = (found.b, [d.row_b for d in mine])
+        path = entities.difference(change)
+        what = boxes3d(side.boxes, np.array(rows), [_label(d) for d in mine])
+        self._put(path, transform(world_from_points), what)
+        if change is Change.MOVED:
+            start = found.a.boxes.center[[d.row_a for d in mine]]
+            end = found.b.boxes.center[rows]
+            arrows = rr.Arrows3D(origins=start, vectors=end - start, colors=[COLORS[change]])
+            self._put(f"{path}/from_a", arrows)
+
+    def _log_image(self, camera: str, pairs: tuple[Difference, ...], found: FrameDifferences) -> None:
+        for change in (Change.CLASS, Change.ONLY_A, Change.ONLY_B):
+            mine = [d for d in pairs if d.change is change]
+            if not mine:
+                continue
+            if change is Change.ONLY_A:
+                boxes = found.a.images[camera].xyxy[[d.row_a for d in mine]]
+            else:
+                boxes = found.b.images[camera].xyxy[[d.row_b for d in mine]]
+            self._put(
+                entities.image_difference(camera, change),
+                rr.CoordinateFrame(f"tf#{entities.image(camera)}"),
+                rr.Boxes2D(
+                    array=boxes + CORNER,
+                    array_format=rr.Box2DFormat.XYXY,
+                    labels=[_label(d) for d in mine],
+                    colors=[COLORS[change]],
+                    radii=rr.Radius.ui_points(2.5),
+                    draw_order=40.0,
+                ),
+            )
+
+    def _log_states(self, found: FrameDifferences) -> None:
+        """One lane for each class: the worst that has become of it in the frame."""
+        lanes = dict.fromkeys(self._lanes, "")
+        for name, change in worst_of_each_class(found.objects).items():
+            lanes[entities.difference_state(name)] = change
+        for lane, value in lanes.items():
+            if lane not in self._lanes:
+                values, colors = list(COLORS), list(COLORS.values())
+                self._static(lane, rr.StateConfiguration(values=values, colors=colors))
+            if self._lanes.get(lane) != value:
+                self._log(lane, rr.StateChange(state=value))
+        self._lanes = lanes
+
+
+def worst_of_each_class(objects: tuple[Difference, ...]) -> Mapping[str, Change]:
+    """By class, of either side: an object that one side lacks is worse than one that has moved."""
+    worst: dict[str, Change] = {}
+    for difference in sorted(objects, key=lambda d: WORST_FIRST.index(d.change)):
+        for name in {difference.name_a, difference.name_b} - {""}:
+            worst.setdefault(name, difference.change)
+    return worst
+
+
+def place(difference: Difference, found: FrameDifferences) -> str:
+    """Where the object is, from the origin of its frame: ``at 12.3 m, 4 degrees left``."""
+    boxes, row = (
+        (found.a.boxes, difference.row_a) if difference.row_b < 0 else (found.b.boxes, difference.row_b)
+    )
+    x, y = boxes.center[row, :2].tolist()
+    angle = float(np.degrees(np.arctan2(y, x)))
+    side = "left" if angle >= 0 else "right"
+    return f"at {np.hypot(x, y):.1f} m, {abs(angle):.0f}° {side}"
+
+
+def markdown(found: FrameDifferences) -> str:
+    """The differences of one frame as a page."""
+    return "\n".join(_lines(found))
+
+
+def _lines(found: FrameDifferences) -> Iterator[str]:
+    yield f"### Frame {found.index}"
+    yield ""
+    yield "| | A | B |"
+    yield "| --- | ---: | ---: |"
+    yield f"| objects | {len(found.a.names)} | {len(found.b.names)} |"
+    if found.a.clusters is not None or found.b.clusters is not None:
+        clusters = ["-" if side.clusters is None else str(side.clusters) for side in (found.a, found.b)]
+        yield f"| clusters | {clusters[0]} | {clusters[1]} |"
+    for camera in found.images:
+        a, b = found.a.images[camera], found.b.images[camera]
+        yield f"| detections, {camera} | {len(a.names)} | {len(b.names)} |"
+    for change in (*DIFFERENT, Change.SAME):
+        mine = [d for d in found.objects if d.change is change]
+        if mine:
+            yield ""
+            yield f"#### {change[0].upper() + change[1:]}: {len(mine)}"
+            yield ""
+            yield from (f"- {_item(d)} {place(d, found)}" for d in mine)
+    for camera, pairs in found.images.items():
+        rows = [d for d in pairs if d.change is not Change.SAME]
+        if rows:
+            yield ""
+            yield f"#### Detections, {camera}"
+            yield ""
+            yield from (f"- {d.text}" for d in rows)
+
+
+def _item(difference: Difference) -> str:
+    if difference.change in (Change.ONLY_A, Change.ONLY_B, Change.SAME):
+        return difference.name_a or difference.name_b
+    return difference.text
+
+
+def _label(difference: Difference) -> str:
+    if difference.change is Change.CLASS:
+        return f"{difference.name_a} -> {difference.name_b}"
+    if difference.change is Change.MOVED:
+        return f"{difference.name_b} moved {difference.distance:.2f} m"
+    return f"{difference.name_a or difference.name_b}: {difference.change}"
+
+
+def _counts(found: FrameDifferences) -> dict[str, int]:
+    counts: dict[str, int] = {change: found.counts[change] for change in DIFFERENT}
+    for what, side in (("a", found.a), ("b", found.b)):
+        counts[f"objects_{what}"] = len(side.names)
+        if side.clusters is not None:
+            counts[f"clusters_{what}"] = side.clusters
+    return counts

@@ -1,0 +1,196 @@
+"""The differences of all frames as a table, as JSON and as CSV."""
+
+from __future__ import annotations
+
+import csv
+import json
+from collections import Counter, defaultdict
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from bevviz.compare.differences import DIFFERENT, WORST_FIRST, Change, Difference, FrameDifferences
+from bevviz.compare.log import place
+from bevviz.errors import UserError
+
+WORST = 10  # frames in the table
+COLUMNS = ("objects A", "objects B", *(change.value for change in (Change.SAME, *DIFFERENT)))
+
+
+class Summary:
+    """Counts frame after frame.
+
+    Args:
+        names: what the two sides are.
+        config: dotted key -> ``a -> b``, where their configurations differ.
+    """
+
+    def __init__(self, names: tuple[str, str], config: Mapping[str, str]) -> None:
+        self.names, self.config = names, config
+        self.frames: list[dict[str, Any]] = []
+        self._classes: dict[str, Counter[str]] = defaultdict(Counter)
+        self._detections: dict[str, Counter[str]] = defaultdict(Counter)
+        self._clusters: Counter[str] = Counter()
+        self._moved: list[float] = []
+
+    def add(self, found: FrameDifferences) -> None:
+        for difference in found.objects:
+            _count(self._classes, difference)
+            if difference.change is Change.MOVED:
+                self._moved.append(difference.distance)
+        for pairs in found.images.values():
+            for difference in pairs:
+                _count(self._detections, difference)
+        for side, what in ((found.a, "objects A"), (found.b, "objects B")):
+            if side.clusters is not None:
+                self._clusters[what] += side.clusters
+        differing = [d for d in found.objects if d.change is not Change.SAME]
+        self.frames.append(
+            {
+                "frame": found.index,
+                "stamp": found.stamp,
+                "number": found.number,
+                "objects": [_row(d, found) for d in differing],
+                "detections": [
+                    {
+                        "change": d.change.value,
+                        "class_a": d.name_a,
+                        "class_b": d.name_b,
+                        "camera": camera,
+                        "text": d.text,
+                        "place": f"in {camera}",
+                    }
+                    for camera, pairs in found.images.items()
+                    for d in pairs
+                    if d.change is not Change.SAME
+                ],
+            }
+        )
+
+    @property
+    def worst(self) -> Sequence[Mapping[str, Any]]:
+        """Frames that differ, those with most differences first."""
+        return sorted((f for f in self.frames if f["number"]), key=lambda f: (-f["number"], f["frame"]))
+
+    def table(self) -> str:
+        """For the terminal."""
+        return "\n".join(self._lines())
+
+    def _lines(self) -> Iterator[str]:
+        yield f"A: {self.names[0]}"
+        yield f"B: {self.names[1]}"
+        yield from parameters(self.config)
+        yield ""
+        yield from columns([("objects", *COLUMNS), *_rows(self._classes)])
+        if self._moved:
+            yield f"moved: {np.median(self._moved):.2f} m (median), {max(self._moved):.2f} m at most"
+        if self._detections:
+            yield ""
+            without = tuple(c for c in COLUMNS if c != Change.MOVED)
+            yield from columns([("detections", *without), *_rows(self._detections, without)])
+        if self._clusters:
+            yield ""
+            yield f"clusters: {self._clusters['objects A']} in A, {self._clusters['objects B']} in B"
+        yield ""
+        worst = self.worst
+        if not worst:
+            yield f"no difference in {len(self.frames)} frames"
+            return
+        yield f"{len(worst)} of {len(self.frames)} frames differ; the worst:"
+        for frame in worst[:WORST]:
+            found = [*frame["objects"], *frame["detections"]]
+            counts = Counter(d["change"] for d in found)
+            how = ", ".join(f"{counts[change]} {change}" for change in WORST_FIRST if counts[change])
+            found.sort(key=lambda d: WORST_FIRST.index(d["change"]))
+            examples = "; ".join(f"{d['text']} {d['place']}" for d in found[:2])
+            yield f"  frame {frame['frame']}: {how} ({examples}{'; ...' if found[2:] else ''})"
+
+    def write_json(self, path: Path) -> None:
+        """Everything that the table is made of, and each difference.
+
+        Raises:
+            UserError: the file cannot be written.
+        """
+        tree = {
+            "a": self.names[0],
+            "b": self.names[1],
+            "config": self.config,
+            "objects": self._classes,
+            "detections": self._detections,
+            "clusters": {"A": self._clusters["objects A"], "B": self._clusters["objects B"]},
+            "frames": self.frames,
+        }
+        try:
+            path.write_text(json.dumps(tree, indent=1))
+        except OSError as error:
+            raise UserError(f"--json {path}: cannot be written: {error.strerror}") from None
+
+    def write_csv(self, path: Path) -> None:
+        """A row for each object that differs.
+
+        Raises:
+            UserError: the file cannot be written.
+        """
+        header = ("frame", "stamp", "change", "class_a", "class_b", "x", "y", "z", "distance", "iou")
+        try:
+            with path.open("w", newline="") as file:
+                writer = csv.DictWriter(file, header, extrasaction="ignore")
+                writer.writeheader()
+                for frame in self.frames:
+                    writer.writerows({**frame, **row} for row in frame["objects"])
+        except OSError as error:
+            raise UserError(f"--csv {path}: cannot be written: {error.strerror}") from None
+
+
+def parameters(config: Mapping[str, str]) -> Iterator[str]:
+    """The parameters that differ, one a line."""
+    if not config:
+        yield "parameters: no difference"
+        return
+    width = max(map(len, config))
+    yield "parameters that differ, A -> B:"
+    yield from (f"  {key:{width}}  {change}" for key, change in config.items())
+
+
+def columns(rows: Sequence[Sequence[str]]) -> Iterator[str]:
+    """A table: the first column to the left, the others to the right."""
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    for row in rows:
+        cells = [row[0].ljust(widths[0]), *(c.rjust(w) for c, w in zip(row[1:], widths[1:], strict=True))]
+        yield "  ".join(cells).rstrip()
+
+
+def _count(counts: Mapping[str, Counter[str]], difference: Difference) -> None:
+    """Under the class that B has, or A where B has none."""
+    counts[difference.name_b or difference.name_a][difference.change.value] += 1
+    if difference.name_a:
+        counts[difference.name_a]["objects A"] += 1
+    if difference.name_b:
+        counts[difference.name_b]["objects B"] += 1
+
+
+def _rows(counts: Mapping[str, Counter[str]], which: Sequence[str] = COLUMNS) -> Iterator[tuple[str, ...]]:
+    for name in sorted(counts):
+        yield (name, *(str(counts[name][column]) for column in which))
+    total: Counter[str] = sum(counts.values(), Counter())
+    yield ("all", *(str(total[column]) for column in which))
+
+
+def _row(difference: Difference, found: FrameDifferences) -> dict[str, Any]:
+    side, row = (found.a, difference.row_a) if difference.row_b < 0 else (found.b, difference.row_b)
+    x, y, z = (round(v, 3) for v in side.boxes.center[row].tolist())
+    pair = difference.row_a >= 0 and difference.row_b >= 0
+    return {
+        "change": difference.change.value,
+        "class_a": difference.name_a,
+        "class_b": difference.name_b,
+        "x": x,
+        "y": y,
+        "z": z,
+        "distance": round(difference.distance, 3) if pair else None,
+        "iou": round(difference.iou, 3) if pair else None,
+        "text": difference.text,
+        "place": place(difference, found),
+    }

@@ -1,0 +1,35 @@
+"""Two runs on the same frames side by side: A, B, and how they differ."""
+
+from __future__ import annotations
+
+import rerun.blueprint as rrb
+
+from bevviz.logging import entities, views
+from bevviz.sources import Scene
+
+
+def blueprint(scene: Scene) -> rrb.Blueprint:
+    sides = [
+        rrb.Vertical(views.side_space(scene, root), views.side_pictures(scene, root), row_shares=[3, 2])
+        for root in ("", entities.B)
+    ]
+    words = rrb.Tabs(
+        views.differences(),
+        views.compared(),
+        views.explain(name="Explain A"),
+        views.explain(entities.B, "Explain B"),
+    )
+    return rrb.Blueprint(
+        rrb.Vertical(
+            rrb.Horizontal(*sides, words, column_shares=[4, 4, 3]),
+            rrb.Horizontal(
+                views.difference_counts(),
+                views.side_counts(),
+                views.difference_states(),
+                views.difference_log(),
+            ),
+            row_shares=[4, 1],
+        ),
+        views.time_panel(),
+        *views.panels(),
+    )

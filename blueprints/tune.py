@@ -1,0 +1,29 @@
+"""One frame under a configuration that changes: the newest version, and what is new in it."""
+
+from __future__ import annotations
+
+import rerun.blueprint as rrb
+
+from bevviz.logging import entities, views
+from bevviz.sources import Scene
+
+
+def blueprint(scene: Scene) -> rrb.Blueprint:
+    side: list[rrb.Container | rrb.View] = [views.cameras(scene)] if scene.cameras else []
+    words = rrb.Tabs(views.explain(), views.difference_log(), views.log(), views.config())
+    return rrb.Blueprint(
+        rrb.Vertical(
+            rrb.Horizontal(
+                views.space(scene, beside=[f"{entities.ROBOT}/**", *views.changes()]),
+                rrb.Vertical(*side, views.birds_eye(), row_shares=[*[2] * len(side), 3]),
+                rrb.Vertical(views.version(), views.differences(), words, row_shares=[1, 3, 2]),
+                column_shares=[5, 4, 3],
+            ),
+            rrb.Horizontal(
+                views.difference_counts(), views.side_counts(), views.counts(), views.stage_times()
+            ),
+            row_shares=[4, 1],
+        ),
+        views.time_panel(follow=True, timeline=entities.VERSION),
+        *views.panels(),
+    )

@@ -1,0 +1,420 @@
+"""What if? Planted differences are found and named; sides share what they have in common."""
+
+from __future__ import annotations
+
+import csv
+import json
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from bevviz.cli import main
+from bevviz.compare.differences import (
+    Change,
+    ImageBoxes,
+    Seen,
+    compare_images,
+    compare_objects,
+    differences,
+    seen,
+)
+from bevviz.compare.sides import published, robot_topic
+from bevviz.config import load
+from bevviz.errors import UserError
+from bevviz.frame import Boxes3D, Frame, FrameResult, LabelledBoxes3D
+from bevviz.geometry import transform
+from bevviz.pipeline import Memo, Pipeline
+from bevviz.sources.synthetic import SyntheticSource
+from bevviz.stages import detector
+from bevviz.variants import Variants, check_same_frames, without_motion
+from tests import bags
+from tests.recordings import Recording, verify
+
+Capture = pytest.CaptureFixture[str]
+DEFAULT, REFERENCE = (load(settings=["detector.model=demo"], preset=p) for p in ("default", "reference"))
+
+
+@cache
+def frame() -> Frame:
+    return SyntheticSource(20, 3).snapshot(12).frame
+
+
+@cache
+def result() -> FrameResult:
+    with Pipeline(DEFAULT) as pipeline:
+        return pipeline.run(frame())
+
+
+def objects(*rows: tuple[str, float, float]) -> Seen:
+    """Objects of 2 x 1 m: class, x, y."""
+    centre = np.array([(x, y, 0) for _, x, y in rows], np.float32).reshape(-1, 3)
+    size = np.tile(np.array([2, 1, 1.5], np.float32), (len(rows), 1))
+    boxes = Boxes3D(centre, size, np.zeros(len(rows), np.float32))
+    return Seen(boxes, tuple(name for name, _, _ in rows), np.ones(len(rows), np.float32))
+
+
+def changed(a: Seen, b: Seen) -> list[tuple[Change, int, int]]:
+    return [(d.change, d.row_a, d.row_b) for d in compare_objects(a, b)]
+
+
+# --- what differs ------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("a", "b", "expected"),
+    [
+        ([], [], []),
+        ([("car", 5, 0)], [("car", 5.1, 0)], [(Change.SAME, 0, 0)]),
+        ([("car", 5, 0)], [("car", 5.5, 0)], [(Change.MOVED, 0, 0)]),
+        ([("car", 5, 0)], [("car", 7.5, 0)], [(Change.ONLY_A, 0, -1), (Change.ONLY_B, -1, 0)]),
+        ([("car", 5, 0)], [("truck", 5.3, 0)], [(Change.CLASS, 0, 0)]),
+        # Another class beside it is another object.
+        ([("car", 5, 0)], [("person", 5, 1.2)], [(Change.ONLY_A, 0, -1), (Change.ONLY_B, -1, 0)]),
+        ([("car", 5, 0)], [], [(Change.ONLY_A, 0, -1)]),
+        ([], [("car", 5, 0)], [(Change.ONLY_B, -1, 0)]),
+        # The nearer of two would take the one that the other one needs.
+        (
+            [("car", 0, 0), ("car", 1.9, 0)],
+            [("car", 1, 0), ("car", 3.8, 0)],
+            [(Change.MOVED, 0, 0), (Change.MOVED, 1, 1)],
+        ),
+        # Where the rider and the bicycle are in one place, each goes to its own.
+        (
+            [("person", 5, 0), ("bicycle", 5.1, 0)],
+            [("bicycle", 5, 0), ("person", 5.1, 0)],
+            [(Change.SAME, 0, 1), (Change.SAME, 1, 0)],
+        ),
+    ],
+)
+def test_planted_differences(a: Any, b: Any, expected: list[tuple[Change, int, int]]) -> None:
+    assert changed(objects(*a), objects(*b)) == expected
+
+
+@given(st.integers(0, 1000), st.integers(0, 12), st.integers(0, 12))
+def test_each_object_once_and_the_sides_are_alike(seed: int, count_a: int, count_b: int) -> None:
+    rng = np.random.default_rng(seed)
+
+    def random(count: int) -> Seen:
+        names = rng.choice(["car", "person"], count)
+        return objects(*zip(names, rng.uniform(-5, 5, count), rng.uniform(-5, 5, count), strict=True))
+
+    a, b = random(count_a), random(count_b)
+    found = compare_objects(a, b)
+    assert sorted(d.row_a for d in found if d.row_a >= 0) == list(range(count_a))
+    assert sorted(d.row_b for d in found if d.row_b >= 0) == list(range(count_b))
+    again = compare_objects(b, a)
+    assert len(again) == len(found)
+    assert {d.change for d in compare_objects(a, a)} <= {Change.SAME}
+
+
+def test_text_has_the_numbers() -> None:
+    (moved,) = compare_objects(objects(("car", 5, 0)), objects(("car", 5.5, 0)))
+    assert moved.text == "car moved by 0.50 m, IoU 0.60"
+    (other,) = compare_objects(objects(("car", 5, 0)), objects(("truck", 5, 0)))
+    assert other.text == "car in A is truck in B"
+
+
+def test_detections_are_paired_in_the_image() -> None:
+    box = np.array([[0, 0, 10, 10], [20, 20, 40, 40], [60, 0, 80, 10]], np.float32)
+    a = ImageBoxes(box[:2], ("person", "car"))
+    b = ImageBoxes(box + np.float32(1), ("person", "truck", "car"))
+    found = compare_images(a, b)
+    assert [d.change for d in found] == [Change.SAME, Change.CLASS, Change.ONLY_B]
+    assert found[1].name_b == "truck"
+
+
+def test_a_run_does_not_differ_from_itself() -> None:
+    ours = seen(result())
+    assert len(ours.names) > 3
+    found = differences(0, 0, ours, ours)
+    assert found.number == 0
+    assert len(found.objects) == len(ours.names)
+    assert len(found.images["zed"]) == len(ours.images["zed"].names) > 0
+
+
+# --- several configurations on one frame -------------------------------------------------------
+
+
+def same_results(a: FrameResult, b: FrameResult) -> None:
+    assert a.failures == b.failures == ()
+    assert a.objects is not None
+    assert b.objects is not None
+    assert a.objects.names == b.objects.names
+    np.testing.assert_array_equal(a.objects.boxes.center, b.objects.boxes.center)
+    assert a.clusters is not None
+    assert b.clusters is not None
+    np.testing.assert_array_equal(a.clusters.labels, b.clusters.labels)
+    np.testing.assert_array_equal(a.cameras[0].uv, b.cameras[0].uv)
+    assert a.explanations == b.explanations
+
+
+def test_variants_make_what_a_pipeline_alone_makes() -> None:
+    low = load(settings=["detector.model=demo", "detector.conf_threshold=0.1"])
+    variants = Variants()
+    for config in (REFERENCE, DEFAULT, low, REFERENCE):
+        seen_by = without_motion(frame()) if config is REFERENCE else frame()
+        with Pipeline(config) as pipeline:
+            same_results(variants.run(frame(), config), pipeline.run(seen_by))
+
+
+def test_what_is_common_runs_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    runs: list[int] = []
+    infer = detector.Detector.infer
+
+    def counted(self: detector.Detector, bgr: Any) -> Any:
+        runs.append(id(bgr))
+        return infer(self, bgr)
+
+    monkeypatch.setattr(detector.Detector, "infer", counted)
+    variants = Variants()
+    configs = [
+        load(settings=["detector.model=demo", f"clustering.eps={eps}", f"detector.conf_threshold={eps}"])
+        for eps in (0.4, 0.5, 0.6)
+    ]
+    results = [variants.run(frame(), config) for config in configs]
+    assert len(runs) == 1
+    first, *others = results
+    assert all(other.voxels is first.voxels and other.ground is first.ground for other in others)
+    assert len({id(r.clusters) for r in results}) == 3
+    # What is spared is told with the time that it took.
+    assert all(r.timings["voxel"] >= first.timings["voxel"] * 0.5 for r in others)
+    variants.run(replace(frame(), index=99), configs[0])
+    assert len(runs) == 2  # another frame
+
+
+def test_memo_forgets_the_oldest() -> None:
+    memo = Memo(size=2)
+    made: list[int] = []
+
+    def make(value: tuple[int, ...]) -> int:
+        made.append(value[0])
+        return value[0]
+
+    one, two, three = (1,), (2,), (3,)
+    for value in (one, two, one, three, one, two):
+        assert memo.call(make, value) == value[0]
+    assert made == [1, 2, 3, 2]
+
+
+def test_cameras_without_motion_are_where_they_are_mounted() -> None:
+    moving, still = frame().cameras[0], without_motion(frame()).cameras[0]
+    assert moving.camera_from_points is not None
+    assert still.camera_from_points is not None
+    away = np.linalg.norm((moving.camera_from_points - still.camera_from_points)[:3, 3])
+    assert 0.05 < away < 0.15  # 12 ms at 8 m/s
+    assert not still.motion_compensated
+
+
+def test_what_frames_are_made_of_is_common() -> None:
+    other = load(settings=["sync.tolerance=0.05"])
+    with pytest.raises(UserError, match=r"A and B differ in sync.tolerance \(0.1 -> 0.05\)"):
+        check_same_frames({"A": load(), "B": other})
+    check_same_frames({"A": load(), "B": load(preset="reference")})
+
+
+# --- the robot ---------------------------------------------------------------------------------
+
+
+def test_the_robots_boxes_are_compared_in_our_frame() -> None:
+    ours = result().objects
+    assert ours is not None
+    stated = LabelledBoxes3D(
+        "/detection/fused_3d", 0, "map", ours.boxes, ours.names, ours.score, frame().world_from_points
+    )
+    robot = published(replace(frame(), robot_boxes=(stated,)), "/detection/fused_3d")
+    assert robot is not None
+    assert {d.change for d in compare_objects(seen(result()), seen(robot))} == {Change.SAME}
+    world = np.asarray(frame().world_from_points)
+    shifted = replace(
+        stated, world_from_boxes=world @ transform(np.array([1.0, 0, 0]), np.array([0, 0, 0, 1.0]))
+    )
+    robot = published(replace(frame(), robot_boxes=(shifted,)), "/detection/fused_3d")
+    assert robot is not None
+    moved = [d for d in compare_objects(seen(result()), seen(robot)) if d.change is Change.MOVED]
+    assert len(moved) > len(ours) / 2
+    np.testing.assert_allclose(np.median([d.distance for d in moved]), 1.0, atol=1e-3)
+    assert published(frame(), "/detection/fused_3d") is None
+
+
+@pytest.mark.parametrize(
+    ("topics", "asked", "expected"),
+    [
+        (("/lidar_clusters", "/fused_3d"), "", "/fused_3d"),
+        (("/lidar_clusters", "/objects"), "", "/objects"),
+        (("/a", "/b"), "/b", "/b"),
+    ],
+)
+def test_the_robots_topic(topics: tuple[str, ...], asked: str, expected: str) -> None:
+    assert robot_topic(topics, asked) == expected
+
+
+@pytest.mark.parametrize(
+    ("topics", "asked", "message"),
+    [
+        ((), "", "--robot: the bag has no vision_msgs/Detection3DArray"),
+        (("/a", "/b"), "", "--robot: which of its topics.*: --robot TOPIC, of /a, /b"),
+        (("/a",), "/c", "--robot /c: no such Detection3DArray topic; there are: /a"),
+    ],
+)
+def test_no_topic_of_the_robot(topics: tuple[str, ...], asked: str, message: str) -> None:
+    with pytest.raises(UserError, match=message):
+        robot_topic(topics, asked)
+
+
+# --- as a user runs it -------------------------------------------------------------------------
+
+
+@pytest.fixture(autouse=True)
+def elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+
+
+@pytest.fixture(scope="module")
+def kitti(shared: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[str, str]:
+    """A bag and a model."""
+    bag = bags.write(tmp_path_factory.mktemp("kitti") / "kitti", bags.kitti_items(shared))
+    return str(bag), str(shared / "models/yolox_nano.onnx")
+
+
+def test_two_configurations_on_kitti(kitti: tuple[str, str], capsys: Capture) -> None:
+    bag, model = kitti
+    # The pedestrian of 000000 has some hundred points: B asks for more.
+    planted = "clustering.min_cluster_points=2000"
+    files = ["--save", "c.rrd", "--json", "c.json", "--csv", "c.csv"]
+    assert main(["compare", bag, "--model", model, "--set-b", planted, *files]) == 0
+    said = capsys.readouterr().out
+    assert "clustering.min_cluster_points  10 -> 2000" in said
+    tree = json.loads(Path("c.json").read_text())
+    first = tree["frames"][0]["objects"]
+    assert {(o["change"], o["class_a"]) for o in first} >= {("only A", "person")}
+    assert tree["objects"]["person"]["only A"] >= 1
+    rows = list(csv.DictReader(Path("c.csv").read_text().splitlines()))
+    assert [row["change"] for row in rows if row["frame"] == "0"] == [o["change"] for o in first]
+    person = next(o for o in first if o["class_a"] == "person")
+    assert np.hypot(person["x"], person["y"]) < 12  # where the label is
+
+    verify(Path("c.rrd"))
+    recording = Recording(Path("c.rrd"))
+    boxes = recording.at["/compare/objects/only_a"]["Boxes3D:labels"][0]
+    assert "person: only A" in boxes
+    # Both sides, and what the sensors brought once.
+    assert "/world/fused" in recording.at
+    assert 0 in recording.at["/b/explain"]["TextDocument:text"]
+    assert "EncodedImage:blob" in recording.at["/world/camera/image"]
+    assert "EncodedImage:blob" not in recording.at["/b/world/camera/image"]
+    assert "Points3D:positions" not in recording.at["/b/world/velodyne/points"]
+    assert recording.at["/compare/states/person"]["StateChange:state"][0] == ["only A"]
+    assert recording.at["/compare/count/only_a"]["Scalars:scalars"][0][0] == len(
+        [o for o in first if o["change"] == "only A"]
+    )
+    assert recording.static["/compare/about"]["TextDocument:text"]
+
+
+def test_two_saved_runs_of_kitti(kitti: tuple[str, str], capsys: Capture) -> None:
+    bag, model = kitti
+    assert main(["bag", bag, "--model", model, "--save", "old.rrd"]) == 0
+    changed = ["--set", "clustering.min_cluster_points=2000", "--frames", ":1"]
+    assert main(["bag", bag, "--model", model, *changed, "--save", "new.rrd"]) == 0
+    assert main(["compare", "old.rrd", "old.rrd", "--save", "same.rrd"]) == 0
+    assert "no difference in 2 frames" in capsys.readouterr().out
+    assert main(["compare", "old.rrd", "new.rrd", "--save", "c.rrd", "--json", "c.json"]) == 0
+    told = capsys.readouterr()
+    assert "clustering.min_cluster_points  10 -> 2000" in told.out
+    assert "old.rrd: 1 of 2 frames are not in the other one" in told.err
+    saved = json.loads(Path("c.json").read_text())
+    # The same as when both are run.
+    both = ["--set-b", changed[1], "--save", "both.rrd", "--json", "both.json"]
+    assert main(["compare", bag, "--model", model, *both]) == 0
+    run = json.loads(Path("both.json").read_text())
+    assert saved["frames"][0] == run["frames"][0]
+    assert saved["frames"][0]["objects"]
+    recording = Recording(Path("c.rrd"))
+    assert "Points3D:positions" in recording.at["/b/world/velodyne/points/obstacles"]
+    assert "Points3D:positions" not in recording.at["/b/world/velodyne/points"]
+    assert "person: only A" in recording.at["/compare/objects/only_a"]["Boxes3D:labels"][0]
+    assert "EncodedImage:blob" not in recording.at["/b/world/camera/image"]
+    # A comparison can itself be one of the two.
+    assert main(["compare", "both.rrd", "new.rrd", "--save", "again.rrd"]) == 0
+
+
+def test_ours_against_the_robots(capsys: Capture) -> None:
+    """A bag in which the robot publishes one box; bevviz without a detector names none."""
+    messages = bags.Messages()
+    items = bags.small_items(messages, scans=3)
+    store = messages
+    for i in range(2):
+        stamp = bags.START + i * bags.PERIOD
+        items.append(
+            bags.Item(
+                "/fused_3d", "vision_msgs/msg/Detection3DArray", stamp, detection(store, stamp, "person")
+            )
+        )
+    bags.write(Path("drive"), items, messages)
+    assert main(["compare", "drive", "--robot", "--save", "c.rrd"]) == 0
+    told = capsys.readouterr()
+    assert "B: the robot's /fused_3d" in told.out
+    line = next(line for line in told.out.splitlines() if line.startswith("person"))
+    columns = ["objects A", "objects B", "same", "only A", "only B", "other class", "moved"]
+    assert dict(zip(columns, line.split()[1:], strict=True))["only B"] == "2"
+    recording = Recording(Path("c.rrd"))
+    assert recording.at["/b/world/fused"]["class_name"][0] == ["person"]
+    assert recording.at["/compare/objects/only_b"]["Boxes3D:labels"][0] == ["person: only B"]
+
+
+def detection(messages: bags.Messages, stamp: int, label: str) -> Any:
+    make = messages.make
+    point = make("geometry_msgs/msg/Point", x=5.0, y=1.0, z=0.0)
+    turn = make("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=0.0, w=1.0)
+    pose = make("geometry_msgs/msg/Pose", position=point, orientation=turn)
+    size = make("geometry_msgs/msg/Vector3", x=0.5, y=0.5, z=1.7)
+    box = make("vision_msgs/msg/BoundingBox3D", center=pose, size=size)
+    hypothesis = make("vision_msgs/msg/ObjectHypothesis", class_id=label, score=0.8)
+    covariance = make("geometry_msgs/msg/PoseWithCovariance", pose=pose, covariance=np.zeros(36))
+    result = make("vision_msgs/msg/ObjectHypothesisWithPose", hypothesis=hypothesis, pose=covariance)
+    header = messages.header(stamp, bags.LIDAR_FRAME)
+    one = make("vision_msgs/msg/Detection3D", header=header, results=[result], bbox=box, id="")
+    return make("vision_msgs/msg/Detection3DArray", header=header, detections=[one])
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["a.rrd"], "compare OLD.rrd NEW.rrd"),
+        (["drive", "a.rrd"], "compare OLD.rrd NEW.rrd"),
+        (["a.rrd", "b.rrd"], "a.rrd: cannot be read"),
+        (["a.rrd", "b.rrd", "--set-a", "voxel.size=0.2"], "leave the sides out"),
+        (["drive", "--robot", "--set-a", "voxel.size=0.2"], "leave --a and --b out"),
+        (["drive", "--robot"], "the bag has no vision_msgs/Detection3DArray"),
+        (["drive", "--set-b", "sync.tolerance=0.05"], "A and B differ in sync.tolerance"),
+        (["drive", "--b", "none.yaml"], "none.yaml: cannot read the configuration"),
+        (["drive", "--set-a", "clustering.epsilon=1"], "unknown key 'clustering.epsilon'"),
+        (["drive", "--json", "none/c.json", "--save", "c.rrd"], "--json none/c.json: cannot be written"),
+    ],
+)
+def test_wrong_calls(arguments: list[str], message: str, capsys: Capture) -> None:
+    if arguments[0] == "drive":
+        messages = bags.Messages()
+        bags.write(Path("drive"), bags.small_items(messages, scans=2), messages)
+    assert main(["compare", *arguments]) == 2
+    said = capsys.readouterr().err.splitlines()[-1]
+    assert said.startswith("bevviz: error: ")
+    assert message in said
+
+
+def test_files_and_presets_as_sides(capsys: Capture) -> None:
+    messages = bags.Messages()
+    bags.write(Path("drive"), bags.small_items(messages, scans=2), messages)
+    Path("b.yaml").write_text("clustering:\n  eps: 0.9\n")
+    assert main(["compare", "drive", "--b", "b.yaml", "--set", "voxel.size=0.2", "--save", "c.rrd"]) == 0
+    said = capsys.readouterr().out
+    assert "A: default\nB: b.yaml\nparameters that differ, A -> B:\n  clustering.eps  0.5 -> 0.9\n\n" in said
+    assert main(["compare", "drive", "--save", "c.rrd"]) == 0
+    assert capsys.readouterr().out.startswith("A: reference\nB: default\n")

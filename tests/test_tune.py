@@ -1,0 +1,181 @@
+"""A configuration that is watched: each save is run on the one frame, and what is wrong with it is told."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from bevviz.cli import main
+from bevviz.compare.differences import Change
+from bevviz.config import dump, load
+from bevviz.errors import UserError
+from bevviz.frame import Frame
+from bevviz.live.settings import Settings
+from bevviz.logging.sinks import open_recording
+from bevviz.sources.synthetic import SyntheticSource
+from bevviz.stages import detector
+from bevviz.tune import Tuner, Version, create
+from tests import bags
+from tests.recordings import Recording, verify
+
+MODEL = "detector.model=demo"
+
+
+@cache
+def source() -> SyntheticSource:
+    return SyntheticSource(20, 3)
+
+
+@cache
+def frame() -> Frame:
+    return source().snapshot(12).frame
+
+
+@contextmanager
+def tuned(folder: Path, text: str = "") -> Iterator[tuple[Tuner, Callable[[str], Version | None]]]:
+    """A tuner of ``my.yaml``, logging to ``t.rrd``, and what saves the file and polls until it is seen."""
+    file = folder / "my.yaml"
+    file.write_text(text)
+    settings = Settings(file, [MODEL])
+
+    def save(text: str) -> Version | None:
+        file.write_text(text)
+        os.utime(file)  # seen as new, however coarse the file system's clock
+        for _ in range(3):
+            version = tuner.poll()
+            if version is not None:
+                return version
+        return None
+
+    with open_recording(source().scene, settings.config, save=folder / "t.rrd", blueprint="tune") as sinks:
+        tuner = Tuner(frame(), settings, sinks.recording, source().scene)
+        yield tuner, save
+
+
+def test_versions(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    inferred: list[int] = []
+    infer = detector.Detector.infer
+
+    def counted(self: detector.Detector, bgr: Any) -> Any:
+        inferred.append(1)
+        return infer(self, bgr)
+
+    monkeypatch.setattr(detector.Detector, "infer", counted)
+    with tuned(tmp_path) as (tuner, save):
+        first = tuner.last
+        assert first.number == 0
+        assert first.text.startswith(f"version 0: as it is: {len(first.found.b.names)} objects")
+        assert tuner.poll() is None
+        one = save("clustering:\n  min_cluster_points: 100000\n")
+        assert one is not None
+        assert one.changes == {"clustering.min_cluster_points": "10 -> 100000"}
+        assert one.found.counts == {Change.ONLY_A: len(first.found.b.names)}
+        assert one.text.endswith(f": 0 objects ({len(first.found.b.names)} gone)")
+        assert save("") is None, "an editor has only begun to write"
+        two = save("detector:\n  conf_threshold: 0.9\n")
+        assert two is not None
+        assert two.number == 2
+        assert set(two.changes) == {"clustering.min_cluster_points", "detector.conf_threshold"}
+        assert save("detector:\n  conf_threshold: 0.9\n") is None, "saved, but as it was"
+    assert len(inferred) == 1
+    verify(tmp_path / "t.rrd")
+    recording = Recording(tmp_path / "t.rrd")
+    assert [row["version"] for row in recording.rows["/tune"]] == [0, 1, 2]
+    assert [row["version"] for row in recording.rows["/bev"]] == [0, 1, 2]
+    pages = [row["TextDocument:text"][0] for row in recording.rows["/tune"]]
+    assert "- clustering.min_cluster_points: 10 -> 100000" in pages[1]
+    gone = recording.rows["/compare/objects/only_a"][0]
+    assert gone["version"] == 1
+    assert len(gone["Boxes3D:centers"]) == len(first.found.b.names)
+    assert {row["version"] for row in recording.rows["/explain/log"]} <= {0, 1, 2}
+
+
+def test_what_is_no_configuration_is_not_taken(tmp_path: Path) -> None:
+    with tuned(tmp_path) as (tuner, save):
+        for text, message in (
+            ("clustering:\n  eps: -1\n", "clustering.eps must be greater than 0"),
+            ("clustering:\n  epsilon: 1\n", "unknown key"),
+            ("clustering: [", "not valid YAML"),
+            ("sync:\n  tolerance: 0.05\n", "differ in sync.tolerance"),
+            ("detector:\n  classes: [dragon]\n", "the model has no class 'dragon'"),
+        ):
+            with pytest.raises(UserError, match=message) as caught:
+                save(text)
+            assert "\n" not in str(caught.value)
+            assert tuner.last.number == 0
+        version = save("clustering:\n  eps: 0.8\n")
+        assert version is not None
+        assert version.number == 1
+        (tmp_path / "my.yaml").unlink()
+        assert tuner.poll() is None
+        assert tuner.poll() is None
+
+
+def test_a_file_is_made_once(tmp_path: Path) -> None:
+    file = tmp_path / "my.yaml"
+    config = load(settings=["clustering.eps=0.7"], preset="reference")
+    assert create(file, dump(config))
+    assert load(file) == config
+    assert not create(file, "")
+    assert load(file) == config
+    with pytest.raises(UserError, match="cannot be written"):
+        create(tmp_path / "none" / "my.yaml", "")
+
+
+def test_as_a_user_runs_it(tmp_path: Path) -> None:
+    messages = bags.Messages()
+    bags.write(tmp_path / "drive", bags.small_items(messages, scans=3), messages)
+    command = [sys.executable, "-m", "bevviz.cli", "tune", "drive", "--at", "0.1", "--save", "t.rrd"]
+    process = subprocess.Popen(
+        command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+    )
+    assert process.stdout is not None
+    said: list[str] = []
+
+    def until(words: str) -> str:
+        assert process.stdout is not None
+        for line in process.stdout:
+            said.append(line)
+            if words in line:
+                return line
+        raise AssertionError("".join(said))
+
+    try:
+        until("save bevviz.yaml to run it again")
+        file = tmp_path / "bevviz.yaml"
+        text = file.read_text()
+        file.write_text(text.replace("  eps: 0.5 ", "  eps: 0.75 "))
+        assert "clustering.eps 0.5 -> 0.75" in until("version 1")
+        time.sleep(0.05)
+        file.write_text(text.replace("  eps: 0.5 ", "  eps: -1 "))
+        assert "clustering.eps must be greater than 0" in until("not taken")
+    finally:
+        process.send_signal(signal.SIGINT)
+        rest, _ = process.communicate(timeout=60)
+    assert process.returncode == 0, rest
+    assert "ended at version 1" in rest
+    assert len(Recording(tmp_path / "t.rrd").rows["/tune"]) == 2
+
+
+def test_wrong_calls(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any) -> None:
+    monkeypatch.chdir(tmp_path)
+    messages = bags.Messages()
+    bags.write(tmp_path / "drive", bags.small_items(messages, scans=2), messages)
+    for arguments, message in (
+        (["drive", "--at", "100"], "100 is outside the recording"),
+        (["drive", "--config", "none/my.yaml"], "--config none/my.yaml: cannot be written"),
+        (["drive", "--model", "none.onnx"], "detector.model none.onnx: no such file"),
+    ):
+        assert main(["tune", *arguments]) == 2
+        assert message in capsys.readouterr().err.splitlines()[-1]
+        Path("bevviz.yaml").unlink(missing_ok=True)
