@@ -247,7 +247,11 @@ class Sweep:
         if len(self.parameters) == 2:
             shape = [len(parameter.values) for parameter in self.parameters]
             names = [f"{p.key}: {p.values[0]} ... {p.values[-1]}" for p in self.parameters]
-            recording.log(path, rr.Tensor(values.reshape(shape), dim_names=names), static=True)
+            known = values[np.isfinite(values)]
+            low, high = (float(known.min()), float(known.max())) if len(known) else (0.0, 1.0)
+            span = [low, high if high > low else low + 1.0]
+            tensor = rr.Tensor(values.reshape(shape), dim_names=names, value_range=span)
+            recording.log(path, tensor, static=True)
             return
         at = self.parameters[0].numbers
         step = float(np.diff(at).min()) if len(at) > 1 else 1.0

@@ -249,7 +249,10 @@ def test_a_sweep_of_the_synthetic_drive(drive: str, capsys: Capture) -> None:
 def test_a_grid_is_a_heat_map(drive: str) -> None:
     swept = ["--set", "clustering.eps=0.4,0.6", "--set", "fusion.min_points=1,3,5"]
     assert main(["sweep", drive, "--model", "demo", "--frames", ":1", *swept, "--save", "s.rrd"]) == 0
-    tensor = Recording(Path("s.rrd")).static["/sweep/clusters"]["Tensor:data"][0]
+    logged = Recording(Path("s.rrd")).static["/sweep/clusters"]
+    low, high = logged["Tensor:value_range"][0]
+    assert 0 < low < high
+    tensor = logged["Tensor:data"][0]
     assert tensor["shape"] == [2, 3]
     assert tensor["names"] == ["clustering.eps: 0.4 ... 0.6", "fusion.min_points: 1 ... 5"]
 
