@@ -160,8 +160,11 @@ class Logger(Writer):
 
     def reconfigure(self, config: Config, scene: Scene) -> None:
         """From here on the results are made in another way, or of other sensors."""
-        self._config, self._scene = config, scene
-        self.log_static()
+        same, self._config, self._scene = scene == self._scene, config, scene
+        if same:  # the viewer loses class colours that are logged twice
+            self._log_origin()
+        else:
+            self.log_static()
 
     def refresh(self) -> None:
         """Make the next frame whole without those before: what it lacks is cleared, images come again."""
