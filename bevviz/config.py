@@ -18,6 +18,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationEr
 from pydantic_core import PydanticCustomError
 
 from bevviz.errors import UserError
+from bevviz.frame import AnomalyKind
 
 Preset = Literal["default", "reference"]
 
@@ -162,6 +163,38 @@ class FusionConfig(Section):
     max_depth: Metres = Field(120.0, gt=0, description="frustum: farther clusters are out of range")
 
 
+class TrackingConfig(Section):
+    method: Literal["kalman", "none"] = Field(
+        "kalman", description="kalman: objects keep an id, with speed and trail; none: each frame for itself"
+    )
+    gate: Metres = Field(1.5, gt=0, le=20, description="farthest on the ground from where it is expected")
+    position_noise: Metres = Field(0.2, gt=0, le=5, description="one sigma of the centre of a box")
+    acceleration: float = Field(2.0, gt=0, le=50, description="one sigma of an object's, in m/s^2")
+    min_hits: int = Field(3, ge=1, le=100, description="frames with a name until a track is shown")
+    max_coast: Seconds = Field(1.0, ge=0, le=60, description="a track that is unseen for longer ends")
+    class_memory: Seconds = Field(1.0, gt=0, le=60, description="time that the vote of a class decays in")
+    reset_after: Seconds = Field(3.0, gt=0, le=3600, description="a longer gap in the stamps ends all tracks")
+    trail: Seconds = Field(3.0, ge=0, le=60, description="how far back the trails go")
+
+
+class AnomaliesConfig(Section):
+    """What is worth a look, frame after frame."""
+
+    flicker_frames: int = Field(
+        5, ge=1, le=1000, description="longest gap, in frames, after as many frames with the object"
+    )
+    jump: Metres = Field(
+        1.0, gt=0, le=20, description="of a box from where it was expected, or of its longer side"
+    )
+    alone_frames: int = Field(
+        5, ge=1, le=1000, description="frames until what only one sensor sees is an anomaly"
+    )
+    sync_error: Seconds = Field(0.05, gt=0, description="|image stamp - cloud stamp|")
+    tf_age: Seconds = Field(0.1, gt=0, description="from a stamp to the nearest transform")
+    stage_time: Seconds | None = Field(None, gt=0, description="of any stage, or 'total'; empty: no limit")
+    hold: Seconds = Field(1.0, ge=0, le=60, description="how long one that is over goes on being shown")
+
+
 class BevConfig(Section):
     range_x: Metres = Field(40.0, gt=0, le=500, description="range ahead and behind")
     range_y: Metres = Field(40.0, gt=0, le=500, description="range to the left and right")
@@ -201,15 +234,8 @@ class LiveConfig(Section):
     flight_time: Seconds = Field(30.0, ge=0, le=3600, description="flight recorder: the last seconds; 0: off")
     flight_size: Megabytes = Field(500.0, ge=1, description="flight recorder: memory at most")
     flight_folder: str = Field("", description="where its recordings go; empty: the working directory")
-    trigger_no_cluster: int = Field(
-        0, ge=0, description="save when a class is detected without a cluster for so many frames; 0: never"
-    )
-    trigger_stage_time: Seconds | None = Field(
-        None, gt=0, description="save when a stage takes longer; empty: never"
-    )
-    trigger_tf_lost: bool = Field(False, description="save when a transform that was there is missing")
-    trigger_sync_error: Seconds | None = Field(
-        None, gt=0, description="save when |image stamp - cloud stamp| is greater; empty: never"
+    triggers: tuple[AnomalyKind, ...] = Field(
+        (), description="save when such an anomaly begins: " + ", ".join(get_args(AnomalyKind))
     )
     trigger_pause: Seconds = Field(60.0, ge=0, description="least time from one automatic save to the next")
 
@@ -225,6 +251,8 @@ class Config(Section):
     clustering: ClusteringConfig = ClusteringConfig()
     detector: DetectorConfig = DetectorConfig()
     fusion: FusionConfig = FusionConfig()
+    tracking: TrackingConfig = TrackingConfig()
+    anomalies: AnomaliesConfig = AnomaliesConfig()
     bev: BevConfig = BevConfig()
     logging: LoggingConfig = LoggingConfig()
     live: LiveConfig = LiveConfig()
@@ -242,6 +270,7 @@ REFERENCE: dict[str, dict[str, Any]] = {
     },
     "detector": {"conf_threshold": 0.25},
     "fusion": {"method": "centroid", "match_radius": 150.0},
+    "tracking": {"method": "none"},
     "bev": {"range_x": 10.0, "range_y": 10.0, "resolution": 0.05, "style": "reference"},
     "sync": {"motion_compensation": False},
 }

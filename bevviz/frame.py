@@ -14,7 +14,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import IntEnum
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -289,6 +289,38 @@ class Objects:
 
 
 @dataclass(frozen=True, slots=True)
+class Tracks:
+    """Objects over time: one row for each track that lives, also those that have no name yet.
+
+    In ``frame_id``: the fixed frame, or (not ``absolute``) that of the points, where speeds are relative
+    to the robot.
+    """
+
+    frame_id: str
+    absolute: bool
+    id: I64  # (T,) never given twice
+    boxes: Boxes3D  # smoothed
+    velocity: F32  # (T, 3) m/s
+    age: F32  # (T,) seconds since it was first seen
+    coasting: F32  # (T,) seconds since it was last seen, 0: it is now
+    innovation: F32  # (T,) metres on the ground from where it was expected; NaN: not seen now, or new
+    hits: I32  # (T,) frames that it was seen in
+    names: tuple[str, ...]  # (T,) class, "" where none was ever given
+    confirmed: Bool  # (T,) named in ``tracking.min_hits`` frames or more, and lately
+    cluster: I32  # (T,) row in this frame's clusters, -1: not seen
+    object: I32  # (T,) row in this frame's objects, -1: not named now
+    trail: F32  # (T, L, 3) where it was in the last frames, this one included; NaN before it was born
+
+    def __len__(self) -> int:
+        return len(self.id)
+
+    @property
+    def speed(self) -> F32:
+        """(T,) m/s on the ground."""
+        return np.hypot(self.velocity[:, 0], self.velocity[:, 1])
+
+
+@dataclass(frozen=True, slots=True)
 class Bev:
     """Bird's-eye view. Channels are (rows, columns); row 0 is range_x ahead, column 0 range_y to the left."""
 
@@ -320,6 +352,8 @@ class FrameResult:
     explanations: tuple[Explanation, ...] = ()
     timings: Mapping[str, float] = field(default_factory=dict)  # stage -> seconds
     failures: tuple[Failure, ...] = ()
+    tracks: Tracks | None = None
+    anomalies: tuple[Anomaly, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -331,3 +365,17 @@ class Explanation:
     row: int
     state: str
     text: str
+
+
+AnomalyKind = Literal["flicker", "jump", "one_sensor", "sync", "tf", "stage"]
+
+
+@dataclass(frozen=True, slots=True)
+class Anomaly:
+    """Something that is worth a look, in words and numbers."""
+
+    kind: AnomalyKind
+    subject: str  # "person #12", the name of a sensor or of a stage
+    text: str
+    severity: Literal["WARN", "ERROR"] = "WARN"
+    since: int = 0  # stamp of the frame that it began in

@@ -7,6 +7,7 @@ import time
 from collections import OrderedDict
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from types import TracebackType
 from typing import Any, Self, TypeVar, TypeVarTuple, cast
 
@@ -14,6 +15,7 @@ import numpy as np
 from pydantic import BaseModel
 
 from bevviz import geometry
+from bevviz.anomalies import AnomalyDetector
 from bevviz.config import Config
 from bevviz.errors import UserError
 from bevviz.explain import explain
@@ -34,8 +36,9 @@ from bevviz.frame import (
 from bevviz.stages.bev import bev
 from bevviz.stages.clustering import cluster
 from bevviz.stages.detector import Detector
-from bevviz.stages.fusion import fuse, merge
+from bevviz.stages.fusion import fuse, in_view, merge
 from bevviz.stages.ground import segment_ground
+from bevviz.stages.tracking import Tracker
 from bevviz.stages.voxel import voxel_grid
 
 T = TypeVar("T")
@@ -144,6 +147,8 @@ class Pipeline:
         self.detector = Detector(config.detector) if config.detector.model and detect is None else None
         self._detect_with = detect
         self._memo, self._draw = memo, draw
+        self._tracker = Tracker()
+        self._anomalies = AnomalyDetector()
         self._network = ThreadPoolExecutor(1, "network")
 
     def __enter__(self) -> Self:
@@ -191,9 +196,15 @@ class Pipeline:
         log.timings.update(network.timings)
         log.failures.extend(network.failures)
 
-        objects = None
+        objects = tracks = None
         if clusters is not None:
             objects = log.run("fusion", merge, clusters, cameras, config.clustering)
+            if config.tracking.method != "none":
+                # Made anew each time, so that what has a memory never comes out of the memo.
+                seen = in_view(cameras, len(clusters))
+                tracks = log.run(
+                    "tracking", self._tracker.update, frame, clusters, seen, objects, config.tracking
+                )
         intensity = frame.fields.get("intensity")
         image = explanations = None
         if self._draw:
@@ -201,7 +212,7 @@ class Pipeline:
             explanations = log.run("explain", explain, cameras, clusters, config)
         wall = time.perf_counter() - start + log.spared
         log.timings["total"] = max(wall, sum(network.timings.values()))
-        return FrameResult(
+        result = FrameResult(
             frame=frame,
             voxels=voxels,
             ground=ground,
@@ -213,7 +224,9 @@ class Pipeline:
             explanations=explanations or (),
             timings=log.timings,
             failures=tuple(log.failures),
+            tracks=tracks,
         )
+        return replace(result, anomalies=self._anomalies.update(result, config.anomalies))
 
     def _detect(self, camera: Camera, log: StageLog) -> Detections | None:
         if self._detect_with is not None:

@@ -12,8 +12,10 @@ def blueprint(scene: Scene) -> rrb.Blueprint:
     side: list[rrb.Container | rrb.View] = [views.cameras(scene)] if scene.cameras else []
     return rrb.Blueprint(
         rrb.Horizontal(
-            rrb.Vertical(views.explain(), rrb.Tabs(views.log(), views.config()), row_shares=[3, 1]),
-            rrb.Vertical(views.space(scene), views.states(), row_shares=[3, 1]),
+            rrb.Vertical(
+                views.explain(), rrb.Tabs(views.log(), views.anomaly_log(), views.config()), row_shares=[3, 1]
+            ),
+            rrb.Vertical(views.space(scene), views.over_time(), row_shares=[3, 1]),
             rrb.Vertical(*side, views.birds_eye(), row_shares=[*[2] * len(side), 3]),
             column_shares=[3, 5, 4],
         ),

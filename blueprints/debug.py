@@ -15,10 +15,10 @@ def blueprint(scene: Scene) -> rrb.Blueprint:
             rrb.Horizontal(
                 views.space(scene),
                 rrb.Vertical(*side, views.birds_eye(), row_shares=[*[2] * len(side), 3]),
-                rrb.Tabs(views.explain(), views.log(), views.config(), name="Decisions"),
+                rrb.Tabs(views.explain(), views.log(), views.anomaly_log(), views.config(), name="Decisions"),
                 column_shares=[5, 4, 3],
             ),
-            rrb.Horizontal(views.stage_times(), views.clocks(), views.counts(), views.states()),
+            rrb.Horizontal(views.stage_times(), views.clocks(), views.counts(), views.over_time()),
             row_shares=[4, 1],
         ),
         views.time_panel(),

@@ -16,7 +16,15 @@ def blueprint(scene: Scene) -> rrb.Blueprint:
             rrb.Vertical(
                 *side,
                 views.birds_eye(),
-                rrb.Tabs(views.rates(), views.stage_times(), views.clocks(), views.states(), views.log()),
+                rrb.Tabs(
+                    views.rates(),
+                    views.stage_times(),
+                    views.clocks(),
+                    views.anomalies(),
+                    views.states(),
+                    views.tracks(),
+                    views.log(),
+                ),
                 row_shares=[*[2] * len(side), 3, 2],
             ),
             column_shares=[3, 2],

@@ -21,6 +21,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from bevviz.anomalies import AnomalyDetector
 from bevviz.config import load
 from bevviz.errors import UserError
 from bevviz.frame import CameraResult, Decision, Detections, Frame, FrameResult, Fusion, Pairs
@@ -341,7 +342,7 @@ def result_of(frame: Frame, *decisions: Decision, total: float = 0.05) -> FrameR
     n = len(decisions)
     none = np.zeros(n, np.int32)
     found = Detections(
-        np.zeros((n, 4), np.float32),
+        np.tile(np.array([10, 10, 30, 50], np.float32), (n, 1)),
         np.ones(n, np.float32),
         none,
         ("pedestrian",) * n,
@@ -356,49 +357,62 @@ def result_of(frame: Frame, *decisions: Decision, total: float = 0.05) -> FrameR
     return replace(observed(frame), cameras=cameras, timings={"total": total})
 
 
-def triggers(*settings: str) -> Triggers:
-    return Triggers(load(settings=["live.trigger_pause=0", *settings]).live)
+def triggers(*settings: str) -> Callable[[FrameResult], str | None]:
+    """What is said of each result."""
+    config = load(settings=["live.trigger_pause=0", *settings])
+    watch, detector = Triggers(config.live), AnomalyDetector()
+    return lambda r: watch.check(replace(r, anomalies=detector.update(r, config.anomalies)))
 
 
 def test_trigger_of_a_detection_without_a_cluster(frames: list[Frame]) -> None:
-    watch = triggers("live.trigger_no_cluster=3")
+    watch = triggers("live.triggers=[one_sensor]", "anomalies.alone_frames=3")
     alone, matched = result_of(frames[0], Decision.NO_CLUSTER), result_of(frames[0], Decision.MATCHED)
-    said = [watch.check(r) for r in [alone, alone, matched, alone, alone, alone, alone]]
-    assert said == [None] * 5 + ["pedestrian in zed without a cluster for 3 frames", None]
+    said = [watch(r) for r in [alone, alone, matched, alone, alone, alone, alone]]
+    assert said == [None] * 5 + ["zed: pedestrian 1.00, for 3 frames", None]
 
 
 def test_trigger_of_a_slow_stage(frames: list[Frame]) -> None:
-    watch = triggers("live.trigger_stage_time=100 ms")
-    assert watch.check(result_of(frames[0], total=0.09)) is None
-    assert watch.check(result_of(frames[0], total=0.15)) == "total took 150 ms"
+    watch = triggers("live.triggers=[stage]", "anomalies.stage_time=100 ms")
+    assert watch(result_of(frames[0], total=0.09)) is None
+    assert watch(result_of(frames[0], total=0.15)) == "total took 150 ms"
 
 
 def test_trigger_of_a_lost_transform(frames: list[Frame]) -> None:
-    watch = triggers("live.trigger_tf_lost=true")
+    watch = triggers("live.triggers=[tf]")
     (camera,) = frames[0].cameras
     lost = replace(frames[0], cameras=(replace(camera, camera_from_points=None),))
-    said = [watch.check(result_of(f)) for f in (lost, frames[0], lost, lost, frames[0])]
-    assert said == [None, None, "transform of zed lost", None, None]
+    said = [watch(result_of(f)) for f in (lost, frames[0], lost, lost, frames[0])]
+    assert said == [None, None, "the transform of zed is lost", None, None]
 
 
 def test_trigger_of_the_sync_error(frames: list[Frame]) -> None:
-    watch = triggers("live.trigger_sync_error=50 ms")
+    watch = triggers("live.triggers=[sync]")
     (camera,) = frames[0].cameras
     late = replace(frames[0], cameras=(replace(camera, sync_error=-0.06),))
-    assert watch.check(result_of(frames[0])) is None
-    assert watch.check(result_of(late)) == "zed is -60 ms off the cloud"
+    assert watch(result_of(frames[0])) is None
+    assert watch(result_of(late)) == "zed is -60 ms off the cloud"
+
+
+def test_only_what_was_asked_for_triggers(frames: list[Frame]) -> None:
+    watch = triggers("live.triggers=[sync, tf]", "anomalies.stage_time=1 ms")
+    assert watch(result_of(frames[0])) is None
 
 
 def test_triggers_pause(frames: list[Frame]) -> None:
-    watch = triggers("live.trigger_stage_time=10 ms", "live.trigger_pause=1000")
-    assert [bool(watch.check(result_of(frames[0]))) for _ in range(3)] == [True, False, False]
+    watch = triggers(
+        "live.triggers=[stage]", "live.trigger_pause=1000", "anomalies.stage_time=1 ms", "anomalies.hold=0"
+    )
+    later = replace(frames[0], stamp=frames[0].stamp + 10**9)
+    results = [result_of(frames[0]), result_of(frames[0], total=0.0), result_of(later)]
+    assert [bool(watch(r)) for r in results] == [True, False, False]
 
 
 def test_a_trigger_saves(run: Run) -> None:
-    outcome = run(["live.trigger_stage_time=1 us", "live.flight_folder=flights"], total=20)
+    asked = ["live.triggers=[stage]", "anomalies.stage_time=1 us", "live.flight_folder=flights"]
+    outcome = run(asked, total=20)
     assert len(outcome.told("not saved")) == 1  # no such folder: said, and everything goes on
     Path("flights").mkdir()
-    outcome = run(["live.trigger_stage_time=1 us", "live.flight_folder=flights"], total=20)
+    outcome = run(asked, total=20)
     (saved,) = Path("flights").glob("*.rrd")
     assert len(outcome.told(f"saved in {saved} (")) == 1
     verify(saved)

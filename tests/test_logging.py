@@ -17,14 +17,13 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from bevviz import geometry
 from bevviz.config import Config, load
 from bevviz.errors import UserError
 from bevviz.explain import explain
 from bevviz.frame import (
+    Anomaly,
     Boxes3D,
     Camera,
     CameraResult,
@@ -44,14 +43,17 @@ from bevviz.frame import (
     LabelledBoxes3D,
     Objects,
     Pairs,
+    Tracks,
     Voxels,
 )
 from bevviz.logging.entities import DEPTH_BINS, DEPTH_RANGE, TRACK_COLORS, ClassId
 from bevviz.logging.logger import Logger
 from bevviz.logging.sinks import open_recording
-from bevviz.logging.tracks import Tracks
+from bevviz.logging.tracks import LANES, Lanes
 from bevviz.sources import Scene
 from bevviz.stages.bev import bev
+from bevviz.stages.fusion import in_view
+from bevviz.stages.tracking import Tracker
 from tests.recordings import Recording, verify
 
 SCENE = Scene("drive", "lidar", ("lidar",), ("zed",), robot=True, truth=True)
@@ -506,32 +508,6 @@ def test_a_recording_says_how_it_was_made(record: Callable[..., Recording]) -> N
 # --- colours that stay -------------------------------------------------------------------------
 
 
-@given(
-    st.lists(st.tuples(st.integers(-20, 20), st.integers(-20, 20)), min_size=1, max_size=30, unique=True),
-    st.randoms(use_true_random=False),
-)
-@settings(deadline=None)
-def test_a_cluster_keeps_its_number_whatever_its_row(cells: list[tuple[int, int]], random: Any) -> None:
-    before = np.array([(4 * x, 4 * y, 0) for x, y in cells], np.float32)
-    order = list(range(len(cells)))
-    random.shuffle(order)
-    moved = before[order] + f32(0.6, -0.6, 0.1)
-    tracks = Tracks(gate=1.5)
-    first = tracks.update(before)
-    assert len(set(first.tolist())) == len(cells)
-    np.testing.assert_array_equal(tracks.update(moved), first[order])
-
-
-def test_what_leaves_gives_its_number_to_nobody() -> None:
-    tracks = Tracks()
-    near, far = f32([0, 0, 0]), f32([50, 0, 0])
-    (first,) = tracks.update(near)
-    (second,) = tracks.update(far)
-    assert len(tracks.update(np.zeros((0, 3), np.float32))) == 0
-    (third,) = tracks.update(near)
-    assert len({first, second, third}) == 3
-
-
 def test_colours_follow_the_object_not_the_row(record: Callable[..., Recording]) -> None:
     first, second = make(0), make(1)
     assert second.clusters is not None
@@ -543,10 +519,84 @@ def test_colours_follow_the_object_not_the_row(record: Callable[..., Recording])
         second.clusters.aabb,
         Boxes3D(*(np.ascontiguousarray(a[::-1]) for a in dataclasses.astuple(second.clusters.obb))),
     )
-    found = record([first, dataclasses.replace(second, clusters=swapped)])
+    found = record(tracked([first, dataclasses.replace(second, clusters=swapped)]))
     classes = found.at["/world/lidar/clusters"]["Boxes3D:class_ids"]
     assert classes[1] == classes[0][::-1]
     assert max(classes[0]) < ClassId.TRACK + TRACK_COLORS
+
+
+# --- tracks and anomalies ----------------------------------------------------------------------
+
+
+def tracked(results: Iterable[FrameResult]) -> list[FrameResult]:
+    tracker, config, found = Tracker(), load().tracking, []
+    for r in results:
+        assert r.clusters is not None
+        seen = in_view(r.cameras, len(r.clusters))
+        found.append(
+            dataclasses.replace(r, tracks=tracker.update(r.frame, r.clusters, seen, r.objects, config))
+        )
+    return found
+
+
+def test_tracks(record: Callable[..., Recording]) -> None:
+    results = tracked(make(i) for i in range(4))
+    results[3] = dataclasses.replace(results[3], objects=None)
+    last = results[3].tracks
+    assert last is not None
+    results[3] = dataclasses.replace(results[3], tracks=dataclasses.replace(last, object=last.object * 0 - 1))
+    found = record(results)
+    assert found.column("/world/fused", "Boxes3D:labels") == [
+        ["person 0.90"],
+        ["person 0.90"],
+        ["person #0 0.0 m/s"],
+    ]
+    assert found.column("/world/fused", "track") == [[-1], [-1], [0]]
+    assert found.at["/world/tracks"]["Boxes3D:labels"] == {2: ["person #0 0.0 m/s"]}
+    assert found.at["/world/tracks/unseen"]["Boxes3D:labels"] == {3: ["person #0, not named"]}
+    assert found.cleared("/world/tracks") == {3}
+    (center,) = found.at["/world/tracks"]["Boxes3D:centers"][2]
+    np.testing.assert_allclose(center, geometry.apply(WORLD_FROM_LIDAR, f32([8, 0.5, -0.8]))[0], atol=1e-3)
+    (trail,) = found.at["/world/tracks/trails"]["LineStrips3D:strips"][3]
+    assert len(trail) == 4
+    (trail,) = found.at["/bev/overlay/trails"]["LineStrips2D:strips"][3]
+    np.testing.assert_allclose(trail, [[395.0, 320.0]] * 4, atol=0.1)
+    assert found.at["/bev/overlay/tracks"]["LineStrips2D:labels"][3] == ["#0 0.0 m/s"]
+    assert found.column("/tracks/states/00", "StateChange:state") == [["person #0"]]
+    assert set(found.at["/tracks/speed_m_s/00"]["Scalars:scalars"]) == {2, 3}
+
+
+def test_lanes_are_few_and_are_kept() -> None:
+    tracks = tracked(make(i) for i in range(3))[-1].tracks
+    assert tracks is not None
+
+    def crowd(*ids: int) -> Tracks:
+        rows = np.zeros(len(ids), np.int64)
+        return dataclasses.replace(tracks, id=np.array(ids), confirmed=tracks.confirmed[rows])
+
+    lanes = Lanes()
+    assert lanes.update(crowd(4, 7)) == {0: 0, 1: 1}
+    assert lanes.update(crowd(7, 9)) == {1: 0, 0: 1}
+    assert len(lanes.update(crowd(*range(100, 150)))) == LANES
+    assert lanes.update(None) == {}
+
+
+def test_anomalies(record: Callable[..., Recording]) -> None:
+    stamps = [make(i).frame.stamp for i in range(4)]
+    late = Anomaly("sync", "zed", "zed is +60 ms off the cloud", since=stamps[1])
+    lost = [Anomaly("tf", name, f"{name} is lost", "ERROR", since=stamps[2]) for name in ("zed", "lidar")]
+    found = record(
+        dataclasses.replace(make(i), anomalies=anomalies)
+        for i, anomalies in enumerate([(), (late,), (late, *lost), ()])
+    )
+    assert found.column("/anomalies/states/sync", "StateChange:state") == [[""], ["zed"], [""]]
+    assert found.column("/anomalies/states/tf", "StateChange:state") == [[""], ["zed +1"], [""]]
+    assert [row["TextLog:text"] for row in found.rows["/anomalies/log"]] == [
+        ["sync: zed is +60 ms off the cloud"],
+        ["tf: zed is lost"],
+        ["tf: lidar is lost"],
+    ]
+    assert found.column("/anomalies/count/tf", "Scalars:scalars") == [[0], [0], [2], [0]]
 
 
 # --- sinks -------------------------------------------------------------------------------------

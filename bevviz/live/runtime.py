@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from bevviz.anomalies import AnomalyDetector
 from bevviz.config import Config
 from bevviz.errors import UserError
 from bevviz.frame import CameraResult, Frame, FrameResult
@@ -104,6 +105,7 @@ class Live:
 
         self._nice(live.nice)
         self._pipeline = None if observe else Pipeline(self.config)
+        self._anomalies = AnomalyDetector()  # of frames that go through no pipeline
         self._encoder = Encoder(self.config, source.scene, outputs.blueprint)
         self._indexer = Indexer()
         self._saves = ThreadPoolExecutor(1, "save")
@@ -263,7 +265,12 @@ class Live:
                     used.close()
                 used = pipeline
                 frame = thin(frame, config.live.points)
-                result = observed(frame) if pipeline is None else pipeline.run(frame)
+                if pipeline is None:
+                    result = observed(frame)
+                    found = self._anomalies.update(result, config.anomalies)
+                    result = replace(result, anomalies=found)
+                else:
+                    result = pipeline.run(frame)
                 self._results.put((result, config))
                 if self._on_result is not None:
                     self._published.put(result)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from enum import IntEnum
 
-from bevviz.frame import ClusterState, DetectionState
+from bevviz.frame import AnomalyKind, ClusterState, DetectionState
 
 # --- timelines ---------------------------------------------------------------------------------
 
@@ -22,6 +22,14 @@ GRID = "/world/bev"
 TRUTH = "/world/ground_truth"
 BEV = "/bev"
 ROBOT = "/robot"
+TRACKS = "/world/tracks"
+UNSEEN = "/world/tracks/unseen"
+TRAILS = "/world/tracks/trails"
+TRACK_STATES = "/tracks/states"
+TRACK_SPEEDS = "/tracks/speed_m_s"
+ANOMALIES = "/anomalies"
+ANOMALY_LOG = "/anomalies/log"
+ANOMALY_STATES = "/anomalies/states"
 EXPLAIN = "/explain"
 EXPLAIN_LOG = "/explain/log"
 STATES = "/explain/states"
@@ -88,7 +96,7 @@ def channel(name: str) -> str:
 
 
 def overlay(what: str) -> str:
-    """Outlines over the bird's-eye image: of the ground truth, or of what the robot published."""
+    """Over the bird's-eye image: tracks, their trails, the ground truth, what the robot published."""
     return f"{BEV}/overlay/{what}"
 
 
@@ -125,6 +133,22 @@ def difference_state(class_name: str) -> str:
 def sweep(metric: str) -> str:
     """A number over the parameter that was swept."""
     return f"{SWEEP}/{metric.replace(' ', '_')}"
+
+
+def track_state(lane: int) -> str:
+    return f"{TRACK_STATES}/{lane:02}"
+
+
+def track_speed(lane: int) -> str:
+    return f"{TRACK_SPEEDS}/{lane:02}"
+
+
+def anomaly_state(kind: AnomalyKind) -> str:
+    return f"{ANOMALY_STATES}/{kind}"
+
+
+def anomaly_count(kind: AnomalyKind) -> str:
+    return f"{ANOMALIES}/count/{kind}"
 
 
 def stage_time(stage: str) -> str:
@@ -173,7 +197,7 @@ class ClassId(IntEnum):
     OBSTACLE = 2
     DETECTION = 10  # + DetectionState
     CLUSTER = 20  # + ClusterState, for clusters outside the size limits
-    TRACK = 100  # + number of the cluster's colour
+    TRACK = 100  # + number of the colour of the track
 
 
 TRACK_COLORS = 64

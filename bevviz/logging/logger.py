@@ -15,6 +15,7 @@ import numpy as np
 import rerun as rr
 
 from bevviz import __version__, geometry
+from bevviz.anomalies import KINDS, News, label
 from bevviz.colors import bins, class_color, palette, turbo
 from bevviz.config import Config, dump
 from bevviz.frame import (
@@ -35,12 +36,12 @@ from bevviz.frame import (
     LabelledBoxes2D,
     LabelledBoxes3D,
     Objects,
+    Tracks,
 )
-from bevviz.logging import entities
+from bevviz.logging import entities, tracks
 from bevviz.logging.entities import ClassId
 from bevviz.logging.pieces import CORNER, boxes3d, transform, world_pose
 from bevviz.logging.text import markdown
-from bevviz.logging.tracks import Tracks
 from bevviz.logging.writer import Writer
 from bevviz.sources import Scene
 
@@ -93,7 +94,9 @@ class Logger(Writer):
         super().__init__(recording, root)
         self._config = config
         self._scene = scene
-        self._tracks = Tracks()
+        self._track_lanes = tracks.Lanes()
+        self._speeds: set[int] = set()  # lanes with a speed in the frame before
+        self._news = News()
         self._intrinsics: dict[str, Intrinsics] = {}
         self._image_stamps: dict[str, int] = {}
         self._lanes: dict[str, str] = {}  # state lane -> its latest state
@@ -139,6 +142,21 @@ class Logger(Writer):
                 ),
             )
         self._static(entities.FUSED, rr.Boxes3D.from_fields(radii=rr.Radius.ui_points(2.0), show_labels=True))
+        self._static(
+            entities.TRACKS,
+            rr.Boxes3D.from_fields(radii=rr.Radius.ui_points(0.75), show_labels=False, fill_mode=_OUTLINE),
+        )
+        self._static(
+            entities.UNSEEN,
+            rr.Boxes3D.from_fields(radii=rr.Radius.ui_points(0.75), show_labels=True, fill_mode=_OUTLINE),
+        )
+        self._static(entities.TRAILS, rr.LineStrips3D.from_fields(radii=rr.Radius.ui_points(1.5)))
+        for name, radius in (("tracks", 1.0), ("trails", 1.5)):
+            self._static(
+                entities.overlay(name),
+                _annotations(),
+                rr.LineStrips2D.from_fields(radii=rr.Radius.ui_points(radius), draw_order=20.0),
+            )
         self._static(
             entities.TRUTH,
             rr.Boxes3D.from_fields(
@@ -219,17 +237,21 @@ class Logger(Writer):
             obstacles = self._rounded(result.obstacles)
             self._put_points(entities.obstacles(frame.lidar), obstacles, ClassId.OBSTACLE)
             if result.clusters is not None:
-                self._log_clusters(frame, result.clusters, obstacles)
+                self._log_clusters(frame, result.clusters, result.tracks, obstacles)
         for camera in result.cameras:
             self._log_camera(frame, camera)
         if result.objects is not None and len(result.objects):
             self._log_objects(result, result.objects)
+        if result.tracks is not None:
+            self._log_tracks(frame, result.tracks)
         self._log_frustums(frame, result.cameras)
         if result.bev is not None:
             self._log_bev(result, result.bev)
         if not self._root:
             self._log_others(frame)
         self._log_decisions(result, notes)
+        self._log_anomalies(result)
+        self._log_states(result)
         self._log_health(result, health)
         self._end()
         self._last = frame
@@ -271,10 +293,9 @@ class Logger(Writer):
         if len(points):
             self._put(path, rr.Points3D(points, class_ids=class_id))
 
-    def _log_clusters(self, frame: Frame, clusters: Clusters, obstacles: F32) -> None:
+    def _log_clusters(self, frame: Frame, clusters: Clusters, tracked: Tracks | None, obstacles: F32) -> None:
         boxes = clusters.obb if self._config.clustering.boxes == "oriented" else clusters.aabb
-        tracks = self._tracks.update(geometry.apply(world_pose(frame), clusters.centroid))
-        colors = (ClassId.TRACK + tracks % entities.TRACK_COLORS).astype(np.uint16)
+        colors = tracks.class_ids(tracks.of_clusters(tracked, len(clusters)))
         kept = np.flatnonzero(clusters.state == ClusterState.KEPT)
         member = np.append(clusters.state == ClusterState.KEPT, False).take(clusters.labels)  # -1 is noise
         if len(kept):
@@ -373,23 +394,63 @@ class Logger(Writer):
 
     def _log_objects(self, result: FrameResult, objects: Objects) -> None:
         reasons = {(e.camera, e.row): e.text for e in result.explanations if e.subject == "detection"}
+        labels = [f"{n} {s:.2f}" for n, s in zip(objects.names, objects.score, strict=True)]
+        ids, speeds = np.full(len(objects), -1), np.full(len(objects), np.nan, np.float32)
+        for j, row in enumerate(tracks.of_objects(result.tracks, len(objects))):
+            if row is not None and result.tracks is not None:
+                labels[j] = tracks.label(result.tracks, row)
+                ids[j], speeds[j] = result.tracks.id[row], result.tracks.speed[row]
         self._put(
             entities.FUSED,
             transform(world_pose(result.frame)),
             boxes3d(
                 objects.boxes,
                 np.arange(len(objects)),
-                [f"{n} {s:.2f}" for n, s in zip(objects.names, objects.score, strict=True)],
+                labels,
                 colors=[class_color(n) for n in objects.names],
             ),
             rr.AnyValues(
                 class_name=list(objects.names),
                 score=objects.score,
+                track=ids,
+                speed=speeds,
                 cluster=objects.cluster,
                 camera=list(objects.camera),
                 reason=[
                     reasons.get((c, d), "") for c, d in zip(objects.camera, objects.detection, strict=True)
                 ],
+            ),
+        )
+
+    def _log_tracks(self, frame: Frame, tracked: Tracks) -> None:
+        """In the fixed frame, and seen from above over the bird's-eye image."""
+        rows = tracks.shown(tracked)
+        named = tracked.object[rows] >= 0
+        for path, chosen, text in (
+            (entities.TRACKS, rows[named], tracks.label),
+            (entities.UNSEEN, rows[~named], tracks.unseen),
+        ):
+            if len(chosen):
+                labels = [text(tracked, row) for row in chosen.tolist()]
+                colors = tracks.class_ids(tracked.id[chosen])
+                self._put(path, _boxes(tracked.boxes, chosen, labels, class_ids=colors))
+        if len(rows) == 0:
+            return
+        trails, colors = tracks.trails(tracked, rows), tracks.class_ids(tracked.id[rows])
+        self._put(entities.TRAILS, rr.LineStrips3D(trails, class_ids=colors))
+        points_from_world = geometry.inverse(_pose(frame))
+        self._put(
+            entities.overlay("trails"),
+            rr.LineStrips2D([self._seen_from_above(points_from_world, t) for t in trails], class_ids=colors),
+        )
+        outlines = geometry.corners(tracked.boxes)[rows][:, [0, 1, 2, 3, 0]]
+        self._put(
+            entities.overlay("tracks"),
+            rr.LineStrips2D(
+                self._seen_from_above(points_from_world, outlines.reshape(-1, 3)).reshape(-1, 5, 2),
+                class_ids=colors,
+                labels=[f"#{tracked.id[row]} {tracked.speed[row]:.1f} m/s" for row in rows],
+                show_labels=True,
             ),
         )
 
@@ -516,11 +577,10 @@ class Logger(Writer):
         if not inside.any():
             return
         corners = geometry.corners(stated.boxes)[inside][:, [0, 1, 2, 3, 0]]
-        xy = geometry.apply(points_from_boxes, corners.reshape(-1, 3))[:, :2]
         self._put(
             entities.overlay(what),
             rr.LineStrips2D(
-                ((reach - xy) / np.float32(config.resolution))[:, ::-1].reshape(-1, 5, 2),
+                self._seen_from_above(points_from_boxes, corners.reshape(-1, 3)).reshape(-1, 5, 2),
                 colors=[color],
                 radii=rr.Radius.ui_points(0.75),
                 labels=[stated.labels[k] for k in np.flatnonzero(inside)],
@@ -528,6 +588,13 @@ class Logger(Writer):
                 draw_order=10.0,
             ),
         )
+
+    def _seen_from_above(self, points_from_those: F64, those: F32) -> F32:
+        """(N, 2) pixels of the bird's-eye image."""
+        config = self._config.bev
+        reach = np.array([config.range_x, config.range_y], np.float32)
+        xy = geometry.apply(points_from_those, those)[:, :2]
+        return np.asarray(((reach - xy) / np.float32(config.resolution))[:, ::-1], np.float32)
 
     # --- decisions -----------------------------------------------------------------------------
 
@@ -543,18 +610,30 @@ class Logger(Writer):
             for e in result.explanations
             if e.subject == "detection" and e.state not in quiet
         ]
+        self._log_lines(entities.EXPLAIN_LOG, result.frame, lines)
+
+    def _log_anomalies(self, result: FrameResult) -> None:
+        news = self._news.of(result.anomalies)
+        self._log_lines(
+            entities.ANOMALY_LOG, result.frame, [(a.severity, f"{a.kind}: {a.text}") for a in news]
+        )
+        count = Counter(anomaly.kind for anomaly in result.anomalies)
+        for kind in KINDS:
+            self._log(entities.anomaly_count(kind), rr.Scalars(float(count[kind])))
+
+    def _log_lines(self, path: str, frame: Frame, lines: Sequence[tuple[str, str]]) -> None:
+        """Level and text of each line."""
         if lines:
             levels, texts = zip(*lines, strict=True)
             rr.send_columns(
-                self._root + entities.EXPLAIN_LOG,
-                self._times(result.frame, len(lines)),
+                self._root + path,
+                self._times(frame, len(lines)),
                 rr.TextLog.columns(text=texts, level=levels),
                 recording=self._recording,
             )
-        self._log_states(result)
 
     def _log_states(self, result: FrameResult) -> None:
-        """One lane for the pipeline, one for each camera, one for each class that a camera has seen."""
+        """Lanes: the pipeline, each camera, each class that it has seen; anomalies by kind; tracks."""
         lanes = dict.fromkeys(self._lanes, "")
         degraded = result.frame.problems or any(c.camera.problems for c in result.cameras)
         lanes[entities.state("pipeline")] = "failed" if result.failures else "degraded" if degraded else "ok"
@@ -570,7 +649,24 @@ class Logger(Writer):
             )
             for class_name, decision in _best_decisions(camera):
                 lanes[entities.state(name, class_name.replace(" ", "_"))] = decision
+        for kind in KINDS:
+            subjects = [anomaly.subject for anomaly in result.anomalies if anomaly.kind == kind]
+            more = f" +{len(subjects) - 1}" if subjects[1:] else ""
+            lanes[entities.anomaly_state(kind)] = f"{subjects[0]}{more}" if subjects else ""
+        lanes |= self._log_track_lanes(result.tracks)
         self._change_states(lanes)
+
+    def _log_track_lanes(self, tracked: Tracks | None) -> Mapping[str, str]:
+        """Speeds; the states of the lanes."""
+        rows = self._track_lanes.update(tracked)
+        for lane in self._speeds - set(rows):
+            self._log(entities.track_speed(lane), rr.Clear(recursive=False))
+        self._speeds = set(rows)
+        if tracked is None:
+            return {}
+        for lane, row in rows.items():
+            self._log(entities.track_speed(lane), rr.Scalars(float(tracked.speed[row])))
+        return {entities.track_state(lane): label(tracked, row) for lane, row in rows.items()}
 
     def _change_states(self, lanes: Mapping[str, str]) -> None:
         for lane, value in lanes.items():

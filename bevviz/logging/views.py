@@ -110,6 +110,33 @@ def states() -> rrb.StateTimelineView:
     return rrb.StateTimelineView(name="States", origin=entities.STATES)
 
 
+def anomalies() -> rrb.StateTimelineView:
+    """What was worth a look, by kind, over time."""
+    return rrb.StateTimelineView(name="Anomalies", origin=entities.ANOMALY_STATES)
+
+
+def anomaly_log() -> rrb.TextLogView:
+    """Each anomaly when it began, with its numbers."""
+    return rrb.TextLogView(name="Anomaly log", origin=entities.ANOMALY_LOG)
+
+
+def tracks() -> rrb.StateTimelineView:
+    """Who was tracked when."""
+    return rrb.StateTimelineView(name="Tracks", origin=entities.TRACK_STATES)
+
+
+def speeds() -> rrb.TimeSeriesView:
+    """Of the tracks, in the same lanes."""
+    return rrb.TimeSeriesView(
+        name="Speeds, m/s", origin=entities.TRACK_SPEEDS, plot_legend=rrb.PlotLegend(visible=False)
+    )
+
+
+def over_time() -> rrb.Tabs:
+    """Lanes of anomalies, decisions and tracks, and the speeds of these."""
+    return rrb.Tabs(anomalies(), states(), tracks(), speeds(), name="Over time")
+
+
 def stage_times() -> rrb.TimeSeriesView:
     return rrb.TimeSeriesView(
         name="Stage times, ms", origin=entities.stage_time(""), plot_legend=rrb.Corner2D.LeftTop

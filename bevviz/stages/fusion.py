@@ -12,6 +12,7 @@ from bevviz.frame import (
     F64,
     I32,
     I64,
+    Bool,
     Boxes3D,
     CameraResult,
     Clusters,
@@ -151,6 +152,16 @@ def merge(clusters: Clusters, cameras: Sequence[CameraResult], config: Clusterin
         camera=tuple(best[k][2] for k in rows),
         detection=np.array([best[k][3] for k in rows], np.int32),
     )
+
+
+def in_view(cameras: Sequence[CameraResult], count: int) -> Bool:
+    """(count,) clusters that are in the image of a camera whose detections were compared with them."""
+    seen = np.zeros(count, bool)
+    for result in cameras:
+        if result.fusion is not None:
+            decisions = result.fusion.cluster_decision
+            seen |= (decisions != Decision.OUT_OF_VIEW) & (decisions != Decision.NOT_KEPT)
+    return seen
 
 
 def assign(cost: F64, unmatched: float) -> I32:

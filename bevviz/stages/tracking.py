@@ -1,0 +1,278 @@
+"""Which cluster is which object of the frames before: a constant-velocity Kalman filter for each."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bevviz import geometry
+from bevviz.config import TrackingConfig
+from bevviz.frame import F32, F64, I32, I64, Bool, Boxes3D, Clusters, ClusterState, Frame, Objects, Tracks
+from bevviz.stages.fusion import assign
+
+INITIAL_SPEED = 5.0  # m/s, one sigma of what is seen for the first time
+SHAPE_GAIN = 0.2  # share of the newest box in the smoothed size and heading
+SIZE_WEIGHT = 1.0  # of a box that is e times larger or smaller, against a distance as large as the gate
+LEAST_VOTE = 1.0  # below it a name is forgotten: scores of a class, decayed
+HEADING_SPEED = 1.0  # m/s from which the direction of motion tells front from back
+
+
+@dataclass(slots=True)
+class _State:
+    """One row for each track. Arrays only, so that rows are chosen and added in one place."""
+
+    id: I64
+    mean: F64  # (T, 2, 3) position and velocity
+    covariance: F64  # (T, 2, 2) the same for each axis
+    size: F64  # (T, 3)
+    yaw: F64
+    hits: I32
+    sightings: I32
+    born: I64  # stamp
+    seen: I64  # stamp
+    votes: F64  # (T, classes)
+    trail: F32  # (T, L, 3) NaN before it was born
+
+    @staticmethod
+    def empty() -> _State:
+        return _State.new(np.zeros(0, np.int64), Boxes3D.empty(), 0, 0, 0, TrackingConfig())
+
+    @staticmethod
+    def new(
+        ids: I64, boxes: Boxes3D, stamp: int, classes: int, length: int, config: TrackingConfig
+    ) -> _State:
+        n = len(ids)
+        mean = np.zeros((n, 2, 3))
+        mean[:, 0] = boxes.center
+        return _State(
+            id=ids,
+            mean=mean,
+            covariance=np.tile(np.diag([config.position_noise**2, INITIAL_SPEED**2]), (n, 1, 1)),
+            size=boxes.size.astype(np.float64),
+            yaw=boxes.yaw.astype(np.float64),
+            hits=np.ones(n, np.int32),
+            sightings=np.zeros(n, np.int32),
+            born=np.full(n, stamp, np.int64),
+            seen=np.full(n, stamp, np.int64),
+            votes=np.zeros((n, classes)),
+            trail=np.full((n, length, 3), np.nan, np.float32),
+        )
+
+    def __len__(self) -> int:
+        return len(self.id)
+
+    def chosen(self, rows: NDArray[Any]) -> _State:
+        return _State(*(getattr(self, field.name)[rows] for field in fields(self)))
+
+    def joined(self, other: _State) -> _State:
+        return _State(
+            *(np.concatenate([getattr(s, field.name) for s in (self, other)]) for field in fields(self))
+        )
+
+
+class Tracker:
+    """Tracks the clusters of consecutive frames; the fused objects give them their classes.
+
+    After SORT (Bewley et al. 2016) and AB3DMOT (Weng et al. 2020): predict, assign, update, with what they
+    track in the image or in 3D boxes taken from the clusters, so that a track lives on while the detector
+    misses its object or the camera does not see it.
+
+    Positions are those of the fixed frame, where there is one: what stands still then has speed zero however
+    the robot moves. It begins anew, with ids that were never given, where stamps jump or the frame changes.
+    """
+
+    def __init__(self) -> None:
+        self._state = _State.empty()
+        self._classes: list[str] = []
+        self._stamps: list[int] = []  # of the columns of the trails
+        self._frame: tuple[str, bool] | None = None
+        self._next = 0
+
+    def update(
+        self,
+        frame: Frame,
+        clusters: Clusters,
+        in_view: Bool,
+        objects: Objects | None,
+        config: TrackingConfig,
+    ) -> Tracks:
+        """The tracks after this frame.
+
+        Args:
+            frame: for its stamp and pose. A stamp twice is the same instant seen again.
+            clusters: only those that were kept are tracked, by their oriented boxes.
+            in_view: (K,) clusters that some camera could name: without a name they lose the one they had.
+            objects: names of clusters.
+            config: noise, gate, birth and death.
+
+        Returns:
+            Every track that lives, also those without a name.
+        """
+        absolute = frame.world_from_points is not None
+        place = (frame.world_frame if absolute else frame.points_frame, absolute)
+        dt = (frame.stamp - self._stamps[-1]) * 1e-9 if self._stamps else 0.0
+        if not 0 <= dt <= config.reset_after or place != self._frame:
+            self._state, self._stamps, self._frame, dt = _State.empty(), [], place, 0.0
+            self._state.votes = np.zeros((0, len(self._classes)))
+        kept = np.flatnonzero(clusters.state == ClusterState.KEPT)
+        pose = np.eye(4) if frame.world_from_points is None else frame.world_from_points
+        boxes = _placed(clusters.obb, kept, pose)
+
+        self._predict(dt, config)
+        column = self._assign(boxes, dt, config)
+        old = np.flatnonzero(column >= 0)
+        innovation = np.full(len(column), np.nan, np.float32)
+        innovation[old] = self._correct(old, boxes, column[old], config)
+        self._state.hits[old] += 1
+        self._state.seen[old] = frame.stamp
+        cluster = np.where(column >= 0, np.append(kept, -1)[column], -1)
+
+        missed = (frame.stamp - self._state.seen) * 1e-9
+        young = (self._state.hits < config.min_hits) & (column < 0)
+        alive = (missed <= config.max_coast) & ~young
+        self._state, cluster, innovation = self._state.chosen(alive), cluster[alive], innovation[alive]
+        fresh = np.setdiff1d(np.arange(len(boxes)), column)
+        ids = self._next + np.arange(len(fresh))
+        self._next += len(fresh)
+        rows = Boxes3D(boxes.center[fresh], boxes.size[fresh], boxes.yaw[fresh])
+        length, classes = len(self._stamps), len(self._classes)
+        self._state = self._state.joined(_State.new(ids, rows, frame.stamp, classes, length, config))
+        cluster = np.concatenate([cluster, kept[fresh]])
+        innovation = np.concatenate([innovation, np.full(len(fresh), np.nan, np.float32)])
+
+        self._remember(frame.stamp, config)
+        named = self._vote(cluster, in_view, objects, dt, config)
+        return self._tracks(frame.stamp, place, cluster, named, innovation, config)
+
+    def _predict(self, dt: float, config: TrackingConfig) -> None:
+        """Constant velocity, disturbed by accelerations that are constant from frame to frame."""
+        step = np.array([[1.0, dt], [0.0, 1.0]])
+        disturbed = config.acceleration * np.array([dt**2 / 2, dt])
+        self._state.mean = step @ self._state.mean
+        self._state.covariance = step @ self._state.covariance @ step.T + np.outer(disturbed, disturbed)
+
+    def _assign(self, boxes: Boxes3D, dt: float, config: TrackingConfig) -> I32:
+        """(T,) box of each track, -1: none. Least squared distance on the ground, relative to the gate.
+
+        The gate is ``tracking.gate``, wider where the place is uncertain to more than a third of it (three
+        sigma). Sizes that differ cost as well.
+        """
+        state = self._state
+        column = np.full(len(state), -1, np.int32)
+        if len(state) == 0 or len(boxes) == 0:
+            return column
+        offset = state.mean[:, None, 0, :2] - boxes.center[None, :, :2]
+        gate = np.maximum(config.gate**2, 9 * (state.covariance[:, 0, 0] + config.position_noise**2))
+        cost = (offset**2).sum(2) / gate[:, None]
+        inside = cost <= 1
+        extent = np.log(np.maximum(np.sort(state.size[:, :2]), 0.1))
+        measured = np.log(np.maximum(np.sort(boxes.size[:, :2]), 0.1))
+        cost += SIZE_WEIGHT * np.abs(extent[:, None] - measured[None]).mean(2)
+        cost[~inside] = np.inf
+        # Most boxes have one track near, and it has no other: only the rest has to be assigned.
+        alone = inside & (inside.sum(1) == 1)[:, None] & (inside.sum(0) == 1)[None]
+        rows, columns = np.nonzero(alone)
+        column[rows] = columns
+        inside &= ~alone
+        rows, columns = np.flatnonzero(inside.any(1)), np.flatnonzero(inside.any(0))
+        chosen = assign(cost[np.ix_(rows, columns)], unmatched=2.0)
+        column[rows] = np.where(chosen >= 0, np.append(columns, -1)[chosen], -1)
+        return column
+
+    def _correct(self, rows: NDArray[Any], boxes: Boxes3D, measured: I32, config: TrackingConfig) -> F32:
+        """Update with the measured boxes; how far on the ground they are from where they were expected."""
+        state = self._state
+        covariance = state.covariance[rows]
+        gain = covariance[:, :, 0] / (covariance[:, :1, 0] + config.position_noise**2)
+        innovation = boxes.center[measured] - state.mean[rows, 0]
+        state.mean[rows] += gain[:, :, None] * innovation[:, None]
+        state.covariance[rows] = covariance - gain[:, :, None] * covariance[:, :1]
+
+        # A fitted rectangle has no front: of its four headings the nearest is meant.
+        turn = boxes.yaw[measured] - state.yaw[rows]
+        quarters = np.round(turn / (np.pi / 2)).astype(np.int64)
+        size = boxes.size[measured].astype(np.float64)
+        size[:, :2] = np.where((quarters % 2 == 1)[:, None], size[:, 1::-1], size[:, :2])
+        state.yaw[rows] += SHAPE_GAIN * (turn - quarters * (np.pi / 2))
+        state.size[rows] += SHAPE_GAIN * (size - state.size[rows])
+        velocity = state.mean[rows, 1]
+        backwards = np.cos(state.yaw[rows] - np.arctan2(velocity[:, 1], velocity[:, 0])) < 0
+        state.yaw[rows] += np.pi * (backwards & (np.hypot(*velocity[:, :2].T) > HEADING_SPEED))
+        return np.asarray(np.hypot(innovation[:, 0], innovation[:, 1]), np.float32)
+
+    def _remember(self, stamp: int, config: TrackingConfig) -> None:
+        self._stamps.append(stamp)
+        state = self._state
+        here = state.mean[:, :1].astype(np.float32)
+        recent = np.array(self._stamps) >= stamp - config.trail * 1e9
+        recent[-1] = True
+        state.trail = np.concatenate([state.trail, here], axis=1)[:, recent]
+        self._stamps = [s for s, kept in zip(self._stamps, recent, strict=True) if kept]
+
+    def _vote(
+        self,
+        cluster: NDArray[Any],
+        in_view: Bool,
+        objects: Objects | None,
+        dt: float,
+        config: TrackingConfig,
+    ) -> I32:
+        """(T,) row of the object that names each track in this frame, -1: none."""
+        state = self._state
+        looked_at = np.append(in_view, False)[cluster]
+        state.votes[looked_at] *= np.exp(-dt / config.class_memory)
+        named = np.full(len(state), -1, np.int32)
+        if objects is None or len(objects) == 0:
+            return named
+        new = sorted(set(objects.names) - set(self._classes))
+        self._classes += new
+        state.votes = np.hstack([state.votes, np.zeros((len(state), len(new)))])
+        row_of = {int(k): row for row, k in enumerate(cluster) if k >= 0}
+        for j, (name, score, k) in enumerate(
+            zip(objects.names, objects.score.tolist(), objects.cluster.tolist(), strict=True)
+        ):
+            if k in row_of:
+                named[row_of[k]] = j
+                state.votes[row_of[k], self._classes.index(name)] += score
+        state.sightings += named >= 0
+        return named
+
+    def _tracks(
+        self,
+        stamp: int,
+        place: tuple[str, bool],
+        cluster: NDArray[Any],
+        named: I32,
+        innovation: F32,
+        config: TrackingConfig,
+    ) -> Tracks:
+        state = self._state
+        best = state.votes.argmax(1) if len(self._classes) else np.zeros(len(state), np.int64)
+        yaw = np.arctan2(np.sin(state.yaw), np.cos(state.yaw))
+        return Tracks(
+            frame_id=place[0],
+            absolute=place[1],
+            id=state.id.copy(),
+            boxes=Boxes3D(*(a.astype(np.float32) for a in (state.mean[:, 0], state.size, yaw))),
+            velocity=state.mean[:, 1].astype(np.float32),
+            age=((stamp - state.born) * 1e-9).astype(np.float32),
+            coasting=((stamp - state.seen) * 1e-9).astype(np.float32),
+            innovation=innovation,
+            hits=state.hits.copy(),
+            names=tuple(
+                self._classes[c] if n else "" for c, n in zip(best.tolist(), state.sightings, strict=True)
+            ),
+            confirmed=(state.sightings >= config.min_hits) & (state.votes.sum(1) >= LEAST_VOTE),
+            cluster=cluster.astype(np.int32),
+            object=named,
+            trail=state.trail,
+        )
+
+
+def _placed(boxes: Boxes3D, rows: NDArray[Any], pose: F64) -> Boxes3D:
+    """Upright boxes in another upright frame."""
+    yaw = boxes.yaw[rows] + np.float32(geometry.yaw(pose))
+    return Boxes3D(geometry.apply(pose, boxes.center[rows]), boxes.size[rows], yaw)
