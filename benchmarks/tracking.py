@@ -8,8 +8,9 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from bevviz import geometry
-from bevviz.frame import F32, F64, I32, Bool, LabelledBoxes3D, Tracks
-from bevviz.sources.synthetic import SyntheticSource
+from bevviz.frame import F32, F64, I32, Bool, Tracks
+from bevviz.sources.synthetic import Snapshot, SyntheticSource
+from bevviz.sources.synthetic.drive import START
 from bevviz.stages.fusion import assign
 
 MAX_DISTANCE = 2.0  # metres between the centres, on the ground plane, of a track and its object
@@ -89,22 +90,25 @@ class Truth:
     must: Bool  # (K,)
 
 
-def truth_of(
-    source: SyntheticSource, stated: LabelledBoxes3D, numbers: I32, must: Bool, time: float
-) -> Truth:
-    assert stated.world_from_boxes is not None
+def truth_of(source: SyntheticSource, shot: Snapshot, must: Bool) -> Truth:
+    """Of a snapshot, with exact velocities. ``must``: (K,) what has to be found."""
+    stated, time = shot.frame.truth, (shot.frame.stamp - START) * 1e-9
+    assert stated is not None and stated.world_from_boxes is not None
     world, step = source.world, 0.05
     places = [
         [world.actors[number - 1].pose(world.street, time + sign * step)[:3, 3] for sign in (-1, 1)]
-        for number in numbers.tolist()
+        for number in shot.truth_object.tolist()
     ]
     ends = np.array(places).reshape(-1, 2, 3)
     velocity = (ends[:, 1] - ends[:, 0]) / (2 * step)
     center = geometry.apply(stated.world_from_boxes, stated.boxes.center)
-    return Truth(center, velocity, numbers, stated.labels, must)
+    return Truth(center, velocity, shot.truth_object, stated.labels, must)
 
 
-def add_tracks(tallies: defaultdict[str, TrackTally], seed: int, tracks: Tracks, truth: Truth) -> None:
+Tallies = defaultdict[str, TrackTally]  # by class
+
+
+def add_tracks(tallies: Tallies, seed: int, tracks: Tracks, truth: Truth) -> None:
     """Tracks that are shown and seen in this frame, whether or not the detector names them in it."""
     shown = tracks.confirmed & (tracks.cluster >= 0)
     for name in set(truth.labels) | set(tracks.names):

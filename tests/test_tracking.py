@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import defaultdict
 from dataclasses import replace
 from typing import Any
 
@@ -11,12 +10,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from benchmarks.tracking import TrackTally, Truth, add_tracks, truth_of
+from benchmarks.tracking import Tallies, TrackTally, Truth, add_tracks, truth_of
 from bevviz import geometry
 from bevviz.config import TrackingConfig, load
 from bevviz.frame import F32, F64, Boxes3D, Clusters, Frame, LabelledBoxes3D, Objects, Tracks
 from bevviz.pipeline import Pipeline
 from bevviz.sources.synthetic import SyntheticSource
+from bevviz.sources.synthetic.sensors import Lidar, PinholeCamera
 from bevviz.stages.tracking import Tracker
 
 CONFIG = TrackingConfig()
@@ -290,17 +290,17 @@ def test_figures_of_a_known_mix_up() -> None:
 
 def test_true_boxes_of_the_synthetic_drive_are_tracked_without_a_mistake() -> None:
     """The tracker alone: what it is given is exact, so every switch and every speed error is its own."""
-    source = SyntheticSource(frames=20, seed=3)
-    tracker, tallies = Tracker(), defaultdict[str, TrackTally](TrackTally)
+    few = Lidar(beams=2, azimuths=8), PinholeCamera(width=8, height=4, focal=5.0)
+    source = SyntheticSource(frames=20, seed=3, lidar=few[0], camera=few[1])
+    tracker, tallies = Tracker(), Tallies(TrackTally)
     for i in range(20):
-        stamp, time = START + i * 100_000_000, 0.1 * i
-        map_from_lidar = source.world.ego(time) @ source.base_from_lidar
-        stated, numbers = source._truth(stamp, time, map_from_lidar)
-        frame, clusters, objects = of_truth(i, stated)
-        seen = np.ones(len(numbers), bool)
+        shot = source.snapshot(i)
+        assert shot.frame.truth is not None
+        frame, clusters, objects = of_truth(i, shot.frame.truth)
+        seen = np.ones(len(clusters), bool)
         tracks = tracker.update(frame, clusters, seen, objects, CONFIG)
         check(tracks, clusters, objects)
-        add_tracks(tallies, 0, tracks, truth_of(source, stated, numbers, seen & (i > 2), time))
+        add_tracks(tallies, 0, tracks, truth_of(source, shot, seen & (i > 2)))
     for name in ("person", "cyclist", "car"):
         tally = tallies[name]
         assert tally.counts["switches"] == 0
