@@ -249,10 +249,10 @@ def tables(tallies: dict[Preset, Tally]) -> str:
 def track_table(tallies: Tallies, frames: int) -> str:
     lines = [
         "\n## Tracks: ids and speeds, `default` preset\n",
-        f"{frames} scans in a row of each drive. All tracks count that are shown and have a cluster, named in",
-        "that scan or not, in the camera's view or not: a track outside of it can be false but not right, and a car",
-        "of which only the rear is seen has its centre too far from the true one. Speed errors are those of the",
-        "velocity vector, of tracks older than a second.\n",
+        f"{frames} scans in a row of each drive. All tracks count that are shown and have a cluster, be",
+        "they named in that scan or not, in view of the camera or not: outside of it one can be false, but",
+        "not right. A car of which only the rear is seen has its centre too far from the true one. Speed",
+        "errors are those of the velocity vector, of tracks older than a second.\n",
         "| class | MOTA | IDF1 | precision | recall | id switches | speed error, median m/s | 90 % m/s |",
         "| --- | ---: | ---: | ---: | ---: | ---: | ---: | ---: |",
     ]

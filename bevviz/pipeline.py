@@ -199,8 +199,7 @@ class Pipeline:
         objects = tracks = None
         if clusters is not None:
             objects = log.run("fusion", merge, clusters, cameras, config.clustering)
-            if config.tracking.method != "none":
-                # Made anew each time, so that what has a memory never comes out of the memo.
+            if config.tracking.method != "none" and self._memo is None:  # variants see one frame each
                 seen = in_view(cameras, len(clusters))
                 tracks = log.run(
                     "tracking", self._tracker.update, frame, clusters, seen, objects, config.tracking

@@ -27,7 +27,7 @@ UNSEEN = "/world/tracks/unseen"
 TRAILS = "/world/tracks/trails"
 TRACK_STATES = "/tracks/states"
 TRACK_SPEEDS = "/tracks/speed_m_s"
-ANOMALIES = "/anomalies"
+ANOMALY_COUNTS = "/anomalies/count"
 ANOMALY_LOG = "/anomalies/log"
 ANOMALY_STATES = "/anomalies/states"
 EXPLAIN = "/explain"
@@ -139,16 +139,8 @@ def track_state(lane: int) -> str:
     return f"{TRACK_STATES}/{lane:02}"
 
 
-def track_speed(lane: int) -> str:
-    return f"{TRACK_SPEEDS}/{lane:02}"
-
-
 def anomaly_state(kind: AnomalyKind) -> str:
     return f"{ANOMALY_STATES}/{kind}"
-
-
-def anomaly_count(kind: AnomalyKind) -> str:
-    return f"{ANOMALIES}/count/{kind}"
 
 
 def stage_time(stage: str) -> str:

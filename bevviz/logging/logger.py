@@ -95,7 +95,6 @@ class Logger(Writer):
         self._config = config
         self._scene = scene
         self._track_lanes = tracks.Lanes()
-        self._speeds: set[int] = set()  # lanes with a speed in the frame before
         self._news = News()
         self._intrinsics: dict[str, Intrinsics] = {}
         self._image_stamps: dict[str, int] = {}
@@ -151,6 +150,8 @@ class Logger(Writer):
             rr.Boxes3D.from_fields(radii=rr.Radius.ui_points(0.75), show_labels=True, fill_mode=_OUTLINE),
         )
         self._static(entities.TRAILS, rr.LineStrips3D.from_fields(radii=rr.Radius.ui_points(1.5)))
+        self._static(entities.TRACK_SPEEDS, rr.SeriesLines(names=[f"{n:02}" for n in range(tracks.LANES)]))
+        self._static(entities.ANOMALY_COUNTS, rr.SeriesLines(names=list(KINDS)))
         for name, radius in (("tracks", 1.0), ("trails", 1.5)):
             self._static(
                 entities.overlay(name),
@@ -618,8 +619,7 @@ class Logger(Writer):
             entities.ANOMALY_LOG, result.frame, [(a.severity, f"{a.kind}: {a.text}") for a in news]
         )
         count = Counter(anomaly.kind for anomaly in result.anomalies)
-        for kind in KINDS:
-            self._log(entities.anomaly_count(kind), rr.Scalars(float(count[kind])))
+        self._log(entities.ANOMALY_COUNTS, rr.Scalars([float(count[kind]) for kind in KINDS]))
 
     def _log_lines(self, path: str, frame: Frame, lines: Sequence[tuple[str, str]]) -> None:
         """Level and text of each line."""
@@ -659,13 +659,11 @@ class Logger(Writer):
     def _log_track_lanes(self, tracked: Tracks | None) -> Mapping[str, str]:
         """Speeds; the states of the lanes."""
         rows = self._track_lanes.update(tracked)
-        for lane in self._speeds - set(rows):
-            self._log(entities.track_speed(lane), rr.Clear(recursive=False))
-        self._speeds = set(rows)
         if tracked is None:
             return {}
-        for lane, row in rows.items():
-            self._log(entities.track_speed(lane), rr.Scalars(float(tracked.speed[row])))
+        speeds = np.full(tracks.LANES, np.nan)
+        speeds[list(rows)] = tracked.speed[list(rows.values())]
+        self._log(entities.TRACK_SPEEDS, rr.Scalars(speeds))
         return {entities.track_state(lane): label(tracked, row) for lane, row in rows.items()}
 
     def _change_states(self, lanes: Mapping[str, str]) -> None:
