@@ -41,18 +41,28 @@ class Items(Protocol[T_co]):
 
 def process(source: Source, config: Config, options: argparse.Namespace, default: Path) -> int:
     """Run the pipeline over the source into every output that was asked for."""
+    from bevviz.anomalies import Summary
     from bevviz.logging.logger import Logger
     from bevviz.pipeline import Pipeline
 
+    anomalies = Summary()
     with Pipeline(config) as pipeline:
 
         def begin(recording: RecordingStream) -> Callable[[FrameResult], None]:
             hint(source.scene, config)
             logger = Logger(recording, config, source.scene)
             logger.log_static()
-            return logger.log
 
-        return run(source, config, options, default, pipeline.run, begin)
+            def handle(result: FrameResult) -> None:
+                logger.log(result)
+                anomalies.add(result)
+
+            return handle
+
+        def finish() -> None:
+            say(f"anomalies: {anomalies}")
+
+        return run(source, config, options, default, pipeline.run, begin, finish)
 
 
 def run(

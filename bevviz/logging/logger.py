@@ -434,12 +434,12 @@ class Logger(Writer):
             if len(chosen):
                 labels = [text(tracked, row) for row in chosen.tolist()]
                 colors = tracks.class_ids(tracked.id[chosen])
-                self._put(path, _boxes(tracked.boxes, chosen, labels, class_ids=colors))
+                self._put(path, boxes3d(tracked.boxes, chosen, labels, class_ids=colors))
         if len(rows) == 0:
             return
         trails, colors = tracks.trails(tracked, rows), tracks.class_ids(tracked.id[rows])
         self._put(entities.TRAILS, rr.LineStrips3D(trails, class_ids=colors))
-        points_from_world = geometry.inverse(_pose(frame))
+        points_from_world = geometry.inverse(world_pose(frame))
         self._put(
             entities.overlay("trails"),
             rr.LineStrips2D([self._seen_from_above(points_from_world, t) for t in trails], class_ids=colors),
