@@ -50,7 +50,7 @@ def test_names() -> None:
 
 
 @pytest.mark.parametrize("scene", SCENES.values(), ids=SCENES.keys())
-@pytest.mark.parametrize("name", sorted({*blueprints.names()} - {"compare", "tune"}))
+@pytest.mark.parametrize("name", sorted({*blueprints.names()} - {"calib", "compare", "tune"}))
 def test_every_layout_fits_every_scene(name: str, scene: Scene, tmp_path: Path) -> None:
     found = views(save(blueprints.load(name, scene), tmp_path / "layout.rbl"))
     assert {"3D", "Bird's-eye view", *scene.cameras} <= set(found)
@@ -85,6 +85,15 @@ def test_tune_has_the_differences_too(scene: Scene, tmp_path: Path) -> None:
     found = views(save(blueprints.load("tune", scene), tmp_path / "layout.rbl"))
     assert {"3D", "Bird's-eye view", "Version", "Differences", *scene.cameras} <= set(found)
     assert {"/world/**", "/compare/objects/only_a/**", "/compare/objects/moved/**"} <= set(found["3D"])
+
+
+@pytest.mark.parametrize("scene", SCENES.values(), ids=SCENES.keys())
+def test_the_layout_of_a_calibration_has_every_camera(scene: Scene, tmp_path: Path) -> None:
+    found = views(save(blueprints.load("calib", scene), tmp_path / "layout.rbl"))
+    assert {f"{camera}, {how}" for camera in scene.cameras for how in ("as stated", "corrected")} <= set(
+        found
+    )
+    assert ("time of the image, ms" in found) == bool(scene.cameras)
 
 
 def test_a_users_own_python_file(tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ from bevviz.config import load
 from bevviz.errors import UserError
 from bevviz.frame import I32, Decision, FrameResult
 from bevviz.pipeline import Pipeline
-from bevviz.sources.synthetic import FAULTS, Snapshot, SyntheticSource
+from bevviz.sources.synthetic import FAULTS, SENSOR_FAULTS, Snapshot, SyntheticSource
 
 
 @cache
@@ -117,7 +117,7 @@ def test_demo_teaches_and_plants_every_fault(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     taught = [line.split()[0] for line in demo.PLANTS.splitlines() if line.startswith("  ")]
-    assert taught == list(FAULTS)
+    assert taught == [*FAULTS, *SENSOR_FAULTS]
     monkeypatch.chdir(tmp_path)
     assert main(["demo", "--frames", "11", "--plant", "hidden_person", "--bag", "a.mcap"]) == 0
     assert Path("a.mcap").exists()

@@ -8,7 +8,7 @@ import sys
 from collections.abc import Callable, Sequence
 
 from bevviz import __version__
-from bevviz.cli import bag, compare, config, demo, info, live, report, sweep, tune, why
+from bevviz.cli import bag, calib, compare, config, demo, info, live, report, sweep, tune, why
 from bevviz.errors import UserError
 
 EPILOG = """examples:
@@ -23,6 +23,7 @@ EPILOG = """examples:
   bevviz tune drive.mcap --at 12.5 --model yolo11n.onnx --config my.yaml          run at each save
   bevviz live --model yolo11n.onnx --serve    the same beside a running robot, in a browser
   bevviz snap                                 save what it saw in the last 30 seconds
+  bevviz calib drive.mcap                     is it the calibration or the clock?
   bevviz config --preset reference            every parameter, with its unit and meaning
 """
 
@@ -50,6 +51,6 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=f"bevviz {__version__}")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
-    for command in (bag, info, why, report, compare, sweep, tune, demo, live, config):
+    for command in (bag, info, why, compare, sweep, tune, calib, report, demo, live, config):
         command.add(commands)
     return parser

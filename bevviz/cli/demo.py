@@ -8,14 +8,18 @@ from pathlib import Path
 from bevviz.cli.options import Commands, add_config, add_output, load_config, positive
 from bevviz.cli.run import process
 
-# Held to bevviz.sources.synthetic.FAULTS by a test: importing that takes as long as a command should.
+# Held to bevviz.sources.synthetic.faults by a test: importing that takes as long as a command should.
 PLANTS = """faults to --plant:
   hidden_person   at 1 s: a person hidden behind a parked van: no point, no pixel
   flat_car        at 3 s: a car half a metre high, which the reference preset takes for ground
   merged_people   at 5 s: two people a hand's breadth apart: one cluster
   shared_box      at 7 s: a person beside a switch cabinet: the reference preset names both 'person'
+  turned_camera   always: the camera is stated 1 degree too far right
+  shifted_camera  always: the camera is stated 5 cm too far right
+  late_image      always: the stamps of the images are 40 ms late
 'bevviz why' explains them: bevviz demo --plant flat_car --bag flat.mcap, then
-bevviz why flat.mcap --at 3 --class car --model demo --preset reference"""
+bevviz why flat.mcap --at 3 --class car --model demo --preset reference
+'bevviz calib' finds the last three: bevviz demo --weave --plant late_image --bag late.mcap"""
 
 
 def add(commands: Commands) -> None:
@@ -36,6 +40,9 @@ def add(commands: Commands) -> None:
         help="plant a fault that perception gets wrong, see below; several times for several",
     )
     demo.add_argument(
+        "--weave", action="store_true", help="swerve, brake and speed up, as a drive to calibrate with should"
+    )
+    demo.add_argument(
         "--bag",
         type=Path,
         metavar="FILE.mcap",
@@ -52,7 +59,7 @@ def _demo(options: argparse.Namespace) -> int:
     from bevviz.config import load
     from bevviz.sources.synthetic import SyntheticSource, write_bag
 
-    source = SyntheticSource(options.frames, options.seed, plant=options.plant)
+    source = SyntheticSource(options.frames, options.seed, plant=options.plant, weave=options.weave)
     if options.bag is not None:
         from tqdm import tqdm
 

@@ -17,15 +17,16 @@ TIMES = """A time is in seconds from the start of the bag (12.5), since 1970 (17
 ISO 8601 (2026-11-21T10:00:00)."""
 
 
-def add_bag(parser: argparse.ArgumentParser) -> argparse._ArgumentGroup:
-    """The bag and the detector. Returns the group that says what of it is run."""
+def add_bag(parser: argparse.ArgumentParser, *, detector: bool = True) -> argparse._ArgumentGroup:
+    """The bag and the detector, where one is run. Returns the group that says what of it is run."""
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
     parser.epilog = f"{parser.epilog}\n\n{TIMES}" if parser.epilog else TIMES
     parser.add_argument(
         "paths", nargs="+", type=Path, metavar="PATH", help="bag file or folder; several are one drive"
     )
     group = parser.add_argument_group("what to run")
-    group.add_argument("--model", metavar="FILE.onnx", help="detector: YOLOv5, v8, v10, 11, 26 or YOLOX")
+    if detector:
+        group.add_argument("--model", metavar="FILE.onnx", help="detector: YOLOv5, v8, v10, 11, 26 or YOLOX")
     return group
 
 

@@ -46,6 +46,7 @@ COMPARE = "/compare"
 COMPARE_ABOUT = "/compare/about"
 COMPARE_LOG = "/compare/log"
 COMPARE_STATES = "/compare/states"
+CALIB = "/calib"
 
 
 def sensor(name: str) -> str:
@@ -176,6 +177,26 @@ def drops(where: str) -> str:
 def process(what: str) -> str:
     """What the process itself takes."""
     return f"{HEALTH}/process/{what}"
+
+
+def calib_result(camera: str) -> str:
+    """What ``bevviz calib`` found, in words."""
+    return f"{CALIB}/{camera}/result"
+
+
+def calib_curve(camera: str, axis: str) -> str:
+    """The score over the offset along one axis."""
+    return f"{CALIB}/{camera}/score/{axis}"
+
+
+def calib_stated(camera: str) -> str:
+    """Image, points and edges with the calibration as stated."""
+    return f"{CALIB}/{camera}/stated"
+
+
+def calib_corrected(camera: str) -> str:
+    """The same with what is off put right."""
+    return f"{CALIB}/{camera}/corrected"
 
 
 # --- class ids ---------------------------------------------------------------------------------

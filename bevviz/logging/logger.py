@@ -127,7 +127,7 @@ class Logger(Writer):
         for camera in self._scene.cameras:
             self._static(
                 entities.projected(camera),
-                _depth_annotations(),
+                depth_annotations(),
                 rr.Points2D.from_fields(radii=rr.Radius.ui_points(1.5), show_labels=False, draw_order=10.0),
             )
             self._static(entities.detections(camera), rr.Boxes2D.from_fields(draw_order=30.0))
@@ -367,10 +367,7 @@ class Logger(Writer):
         if self._image_stamps.get(name) == image.stamp and path in self._shown:
             return  # the camera is slower than the LiDAR: the image is already there
         self._image_stamps[name] = image.stamp
-        if image.encoded is not None:
-            self._put(path, rr.EncodedImage(contents=image.encoded, media_type=image.media_type or None))
-        else:
-            self._put(path, _jpeg(image.bgr, self._config.logging.jpeg_quality))
+        self._put(path, encode_image(image, self._config.logging.jpeg_quality))
 
     def _log_detections(self, name: str, detections: Detections) -> None:
         for path, rows in (
@@ -729,7 +726,8 @@ def _annotations() -> rr.AnnotationContext:
     )
 
 
-def _depth_annotations() -> rr.AnnotationContext:
+def depth_annotations() -> rr.AnnotationContext:
+    """Colours of the depth bins: near is red, far is blue."""
     width = entities.DEPTH_RANGE / entities.DEPTH_BINS
     near_is_red = turbo(entities.DEPTH_BINS)[::-1].tolist()
     return rr.AnnotationContext(
@@ -747,6 +745,13 @@ def _camera_pose(frame: Frame, result: CameraResult) -> F64 | None:
     if camera.camera_from_points is not None:
         return world_pose(frame) @ geometry.inverse(camera.camera_from_points)
     return None
+
+
+def encode_image(image: Image, quality: int) -> rr.EncodedImage:
+    """As it came where it came encoded, else as JPEG of that quality."""
+    if image.encoded is not None:
+        return rr.EncodedImage(contents=image.encoded, media_type=image.media_type or None)
+    return _jpeg(image.bgr, quality)
 
 
 def _jpeg(bgr: U8, quality: int) -> rr.EncodedImage:

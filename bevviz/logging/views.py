@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import rerun.blueprint as rrb
 
+from bevviz.calib.axes import AXES
 from bevviz.logging import entities
 from bevviz.sources import Scene
 
@@ -266,6 +267,30 @@ def difference_states() -> rrb.StateTimelineView:
 def config() -> rrb.TextDocumentView:
     """How the recording was made."""
     return rrb.TextDocumentView(name="Configuration", origin=entities.CONFIG)
+
+
+def alignment(camera: str) -> tuple[rrb.Spatial2DView, rrb.Spatial2DView]:
+    """Points by depth and the edges of the cloud over the image: as stated, and as corrected."""
+    return (
+        rrb.Spatial2DView(name=f"{camera}, as stated", origin=entities.calib_stated(camera)),
+        rrb.Spatial2DView(name=f"{camera}, corrected", origin=entities.calib_corrected(camera)),
+    )
+
+
+def calibration(camera: str) -> rrb.TextDocumentView:
+    """What 'bevviz calib' found."""
+    return rrb.TextDocumentView(name="Calibration", origin=entities.calib_result(camera))
+
+
+def score_curves(camera: str) -> rrb.Grid:
+    """How well the edges meet over the offset along each axis."""
+    return rrb.Grid(
+        *(
+            rrb.BarChartView(name=f"{axis.what}, {axis.unit}", origin=entities.calib_curve(camera, axis.name))
+            for axis in AXES
+        ),
+        grid_columns=2,
+    )
 
 
 def time_panel(*, follow: bool = False, timeline: str = entities.STAMP) -> rrb.TimePanel:

@@ -14,7 +14,7 @@ import numpy as np
 
 from bevviz.config import Config
 from bevviz.errors import UserError
-from bevviz.frame import Frame
+from bevviz.frame import F64, Frame
 from bevviz.sources import Scene
 from bevviz.sources.feed import Handler, make_handlers
 from bevviz.sources.messages import MessageError, decode_transforms
@@ -116,6 +116,13 @@ class BagSource:
     def tree(self) -> Mapping[str, str]:
         """Child to parent of the transforms met so far."""
         return self._sync.tf.tree() if self._sync else {}
+
+    def pose(self, frame: Frame, stamp: int) -> F64 | None:
+        """(4, 4) fixed_from_points at a stamp near that of a frame that was read last or a little before.
+
+        None: no fixed frame above the points, or the transforms read so far do not reach the stamp.
+        """
+        return self._sync.pose(frame.points_frame, stamp) if self._sync else None
 
     def __iter__(self) -> Iterator[Frame]:
         sync = self._sync = Synchronizer(self.roles, self.config)

@@ -430,12 +430,8 @@ class Synchronizer:
         base = self._config.source.base_frame
         if self._partners and self.tf.knows(base, points_frame):
             points_frame = base
-        path = self.tf.ancestors(points_frame)
-        fixed = [f for f in path if f in self._odometry_frames or _words(f) & FIXED_FRAMES]
-        near = [f for f in fixed if not _words(f) & GLOBE_FRAMES] or fixed
-        stated = self._config.source.fixed_frame.lstrip("/")
-        world = stated or (near[-1] if near else "")
-        place = _Place(cloud.stamp, points_frame, world, near[0] if near else stated)
+        world, inertial = self._fixed(points_frame)
+        place = _Place(cloud.stamp, points_frame, world, inertial)
         if problems is None:
             return place
         if self._partners and points_frame != base:
@@ -456,6 +452,24 @@ class Synchronizer:
             self._complain(problems, f"{error}: the cloud has no place in the world")
             return place
         return replace(place, world_from_points=found.matrix, tf_age=found.age)
+
+    def _fixed(self, points_frame: str) -> tuple[str, str]:
+        """The world's frame and the smoothest fixed frame above ``points_frame``; "" where there is none."""
+        path = self.tf.ancestors(points_frame)
+        fixed = [f for f in path if f in self._odometry_frames or _words(f) & FIXED_FRAMES]
+        near = [f for f in fixed if not _words(f) & GLOBE_FRAMES] or fixed
+        stated = self._config.source.fixed_frame.lstrip("/")
+        return stated or (near[-1] if near else ""), near[0] if near else stated
+
+    def pose(self, points_frame: str, stamp: int) -> F64 | None:
+        """(4, 4) where a frame is in the smoothest fixed frame, as far as the transforms reach so far."""
+        inertial = self._fixed(points_frame)[1]
+        if not inertial:
+            return None
+        try:
+            return self.tf.lookup(inertial, points_frame, stamp, self._config.sync.tf_tolerance).matrix
+        except TransformError:
+            return None
 
     def _gather(
         self, cloud: Cloud, place: _Place, problems: list[str]

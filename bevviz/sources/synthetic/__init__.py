@@ -2,6 +2,6 @@
 
 from bevviz.sources.synthetic.bag import BagWriter, write_bag
 from bevviz.sources.synthetic.drive import Snapshot, SyntheticSource
-from bevviz.sources.synthetic.faults import FAULTS
+from bevviz.sources.synthetic.faults import FAULTS, SENSOR_FAULTS
 
-__all__ = ["FAULTS", "BagWriter", "Snapshot", "SyntheticSource", "write_bag"]
+__all__ = ["FAULTS", "SENSOR_FAULTS", "BagWriter", "Snapshot", "SyntheticSource", "write_bag"]

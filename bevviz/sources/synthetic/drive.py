@@ -58,6 +58,9 @@ class SyntheticSource:
         frames: length of the drive.
         seed: of street, traffic, light and sensor noise.
         plant: names of faults to plant, see ``bevviz.sources.synthetic.faults``.
+        weave: the vehicle swerves, brakes and speeds up, as to calibrate its sensors with.
+        camera_error: (4, 4) true_camera_from_stated_camera, how wrong the stated mounting of the camera is.
+        image_late: seconds by which the stamps of the images are late.
 
     Raises:
         UserError: ``frames`` below 1, no such fault, or a drive too short for it.
@@ -69,6 +72,9 @@ class SyntheticSource:
         seed: int = 0,
         *,
         plant: Sequence[str] = (),
+        weave: bool = False,
+        camera_error: F64 | None = None,
+        image_late: float = 0.0,
         lidar: Lidar | None = None,
         camera: PinholeCamera | None = None,
     ) -> None:
@@ -86,13 +92,22 @@ class SyntheticSource:
         )
         self.warnings: tuple[str, ...] = ()
         self.base_from_lidar = geometry.transform(np.array([0.2, 0.0, 1.9]), np.array([0, 0, 0, 1.0]))
-        self.base_from_camera = optical((0.7, 0.06, 1.55), np.radians(3.0))
+        self._base_from_true_camera = optical((0.7, 0.06, 1.55), np.radians(3.0))
+        self.base_from_camera = self._base_from_true_camera  # as stated
+        if camera_error is not None:
+            self.base_from_camera = self.base_from_camera @ camera_error
+        for fault in faults.find_sensors(plant):
+            error = np.array(fault.camera_error)
+            self.base_from_camera = self.base_from_camera @ geometry.transform(error[:3], error[3:])
+            image_late += fault.image_late
+        self._image_late = round(image_late * 1e9)
+        self._weave = weave
         self._lidar, self._camera = lidar or Lidar(), camera or PinholeCamera()
 
     @cached_property
     def world(self) -> World:
         scenes = [(fault.time, fault.scene) for fault in self.faults]
-        return World(self.seed, self.total * PERIOD * 1e-9, scenes)
+        return World(self.seed, self.total * PERIOD * 1e-9, scenes, weave=self._weave)
 
     @cached_property
     def _static(self) -> Caster:
@@ -121,15 +136,15 @@ class SyntheticSource:
         shot = stamp + IMAGE_DELAY
         map_from_lidar = self.map_from_base(stamp) @ self.base_from_lidar
         map_from_camera = self.map_from_base(shot) @ self.base_from_camera
-        at_scan, at_image = ((t - START) * 1e-9 for t in (stamp, shot))
+        taken = shot - self._image_late
+        map_from_lens = self.map_from_base(taken) @ self._base_from_true_camera
+        at_scan, at_image = ((t - START) * 1e-9 for t in (stamp, taken))
 
         moving = self.world.moving(at_scan, map_from_lidar[:3, 3], self._lidar.reach)
         scan = self._lidar.scan(View(self._static, moving), map_from_lidar, rng)
-        ahead = (
-            map_from_camera[:3, 3] + 50.0 * map_from_camera[:3, 2]
-        )  # what is far behind casts no shadow here
+        ahead = map_from_lens[:3, 3] + 50.0 * map_from_lens[:3, 2]  # what is far behind casts no shadow here
         seen = View(self._static, self.world.moving(at_image, ahead, 70.0))
-        picture = self._camera.picture(seen, map_from_camera, self.world.light, rng)
+        picture = self._camera.picture(seen, map_from_lens, self.world.light, rng)
 
         fields: dict[str, NDArray[Any]] = {"intensity": scan.intensity, "ring": scan.ring, "time": scan.time}
         cloud = Cloud(stamp, LIDAR_FRAME, scan.xyz, fields, LIDAR_TOPIC, stamp + LATENCY, name=LIDAR_FRAME)

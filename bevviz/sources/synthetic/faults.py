@@ -1,6 +1,7 @@
-"""Scenes that perception gets wrong, planted into the drive at known places and times.
+"""What is wrong with a drive, planted on purpose: scenes that perception gets wrong, and sensors that lie.
 
-Each is real geometry that both sensors see and that the ground truth holds; nothing is pretended.
+A scene is real geometry that both sensors see and that the ground truth holds; nothing is pretended. A faulty
+sensor sees the world as it is; what is stated of its mounting or of its time is wrong.
 """
 
 from __future__ import annotations
@@ -72,11 +73,43 @@ FAULTS: Mapping[str, Fault] = {
 }
 
 
+@dataclass(frozen=True, slots=True)
+class SensorFault:
+    """What is stated wrongly, in frames and bag alike.
+
+    Attributes:
+        description: what is wrong.
+        camera_error: translation in metres and quaternion x y z w of true_camera_from_stated_camera.
+        image_late: seconds by which the stamps of the images are late.
+    """
+
+    description: str
+    camera_error: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
+    image_late: float = 0.0
+
+
+_HALF = np.radians(1.0) / 2
+
+SENSOR_FAULTS: Mapping[str, SensorFault] = {
+    "turned_camera": SensorFault(
+        "the camera is stated 1 degree too far right",
+        (0, 0, 0, 0, float(np.sin(_HALF)), 0, float(np.cos(_HALF))),
+    ),
+    "shifted_camera": SensorFault("the camera is stated 5 cm too far right", (0.05, 0, 0, 0, 0, 0, 1)),
+    "late_image": SensorFault("the stamps of the images are 40 ms late", image_late=0.04),
+}
+
+
+def find_sensors(names: Sequence[str]) -> list[SensorFault]:
+    """Those among the names that are keys of ``SENSOR_FAULTS``."""
+    return [SENSOR_FAULTS[name] for name in names if name in SENSOR_FAULTS]
+
+
 def find(names: Sequence[str], duration: float) -> list[Fault]:
-    """The faults of these names.
+    """The scenes of these names.
 
     Args:
-        names: keys of ``FAULTS``.
+        names: keys of ``FAULTS``; those of ``SENSOR_FAULTS`` are left out.
         duration: seconds of the drive.
 
     Raises:
@@ -84,9 +117,12 @@ def find(names: Sequence[str], duration: float) -> list[Fault]:
     """
     found = []
     for name in names:
+        if name in SENSOR_FAULTS:
+            continue
         if name not in FAULTS:
-            near = difflib.get_close_matches(name, FAULTS, 1, 0.4)
-            hint = f"did you mean '{near[0]}'?" if near else f"there are {', '.join(FAULTS)}"
+            known = [*FAULTS, *SENSOR_FAULTS]
+            near = difflib.get_close_matches(name, known, 1, 0.4)
+            hint = f"did you mean '{near[0]}'?" if near else f"there are {', '.join(known)}"
             raise UserError(f"plant {name}: unknown; {hint}")
         fault = FAULTS[name]
         if fault.time > duration:

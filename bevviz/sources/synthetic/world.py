@@ -20,6 +20,8 @@ ROAD, PAVEMENT, KERB = (
     0.14,
 )  # metres: half width of the road, edge of the pavement, height of the kerb
 
+_PACE = 2 * np.pi / 8.0  # radians per second at which a weaving vehicle brakes and speeds up
+
 
 class Street:
     """A centre line that turns, climbs and falls. ``s`` is the way along it, ``lateral`` to its left."""
@@ -99,13 +101,20 @@ class World:
         duration: seconds that the ego vehicle drives.
         scenes: what else is put into it: seconds into the drive, and who puts it there. All else stays as
             it is without, but for those who are in the way.
+        weave: it swerves, brakes and speeds up; where it is on average stays the same.
     """
 
     def __init__(
-        self, seed: int, duration: float, scenes: Sequence[tuple[float, Callable[[Stage], None]]] = ()
+        self,
+        seed: int,
+        duration: float,
+        scenes: Sequence[tuple[float, Callable[[Stage], None]]] = (),
+        *,
+        weave: bool = False,
     ) -> None:
         rng = np.random.default_rng(seed)
         self.length = SPEED * duration + 10.0
+        self._weave = weave
         self.street = Street(rng, self.length)
         self.light = _light(rng)
         self._sway = rng.uniform(0, 2 * np.pi, 2)
@@ -125,14 +134,25 @@ class World:
 
     def ego(self, time: float) -> F64:
         """(4, 4) map_from_base_link: on the road below the middle of the vehicle."""
+        if self._weave:
+            return self._weaving(time)
         s = self._way(time)
         rate = 2 * np.pi / 6.0
         lateral = -1.7 + 0.2 * np.sin(rate * time + self._sway[1])
         turn = np.arctan2(0.2 * rate * np.cos(rate * time + self._sway[1]), SPEED)
         return self.street.pose(s, lateral, turn=turn, upright=False)
 
+    def _weaving(self, time: float) -> F64:
+        """Between 2 and 14 m/s in 8 s, 0.7 m to either side in 5 s: up to 12 degrees a second."""
+        swing = 2 * np.pi / 5.0
+        phase, pace = swing * time + self._sway[1], SPEED + 6.0 * np.cos(_PACE * time)
+        turn = np.arctan2(0.7 * swing * np.cos(phase), pace)
+        return self.street.pose(self._way(time), -1.7 + 0.7 * np.sin(phase), turn=turn, upright=False)
+
     def _way(self, time: float) -> float:
         """Metres along the street that the ego vehicle is at."""
+        if self._weave:
+            return SPEED * time + 6.0 / _PACE * float(np.sin(_PACE * time))
         return SPEED * time + 1.5 * float(np.sin(0.5 * time + self._sway[0]) - np.sin(self._sway[0]))
 
     def moving(self, time: float, centre: F64, reach: float) -> Mesh:

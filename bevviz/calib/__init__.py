@@ -1,0 +1,18 @@
+"""Is it the calibration or the clock? Where the edges of cloud and image meet best, and how surely."""
+
+from bevviz.calib.axes import AXES, Axis
+from bevviz.calib.result import AxisResult, Calibration, Verdict
+from bevviz.calib.shots import Shot, Shots, gather
+from bevviz.calib.solve import calibrate
+
+__all__ = [
+    "AXES",
+    "Axis",
+    "AxisResult",
+    "Calibration",
+    "Shot",
+    "Shots",
+    "Verdict",
+    "calibrate",
+    "gather",
+]

@@ -1,0 +1,136 @@
+"""What came out, and how it is told: a sentence, a table, JSON and the corrected configuration."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Any
+
+from bevviz import geometry
+from bevviz.calib.axes import AXES, TIME, Axis
+from bevviz.frame import F64
+
+
+class Verdict(StrEnum):
+    FINE = "fine"
+    OFF = "off"
+    UNKNOWN = "cannot tell"
+
+
+@dataclass(frozen=True, slots=True)
+class AxisResult:
+    """One axis, in its own unit. ``interval`` is two standard deviations to either side of ``offset``."""
+
+    axis: Axis
+    offset: float  # of what is stated from what fits best
+    interval: float
+    verdict: Verdict
+    reason: str  # of a verdict UNKNOWN
+    abscissa: F64  # (S,) offsets along this axis, the other axes being as they fit best
+    score: F64  # (S,)
+
+    @property
+    def measured(self) -> str:
+        n = self.axis.decimals
+        return f"{self.offset:+.{n}f} +- {self.interval:.{n}f} {self.axis.unit}"
+
+    @property
+    def told(self) -> str:
+        """The verdict in words."""
+        if self.verdict is Verdict.OFF:
+            return f"off: {self.axis.positive if self.offset > 0 else self.axis.negative}"
+        return f"{self.verdict}: {self.reason}" if self.reason else str(self.verdict)
+
+
+@dataclass(frozen=True, slots=True)
+class Calibration:
+    """Of one camera against the cloud."""
+
+    camera: str
+    parent: str  # frame of the points
+    child: str  # optical frame
+    axes: tuple[AxisResult, ...]
+    frames: int
+    edges: int
+    stated: F64  # (4, 4) parent_from_child
+    corrected: F64  # (4, 4) the same with the axes that are off put right, the others as stated
+    correction: F64  # (7,) what was put right: radians, metres, seconds
+    score_stated: float
+    score_corrected: float
+    notes: tuple[str, ...] = ()
+
+    def by(self, verdict: Verdict) -> list[AxisResult]:
+        return [axis for axis in self.axes if axis.verdict is verdict]
+
+    @property
+    def answer(self) -> str:
+        """The whole result in one or two sentences."""
+        off, unknown = self.by(Verdict.OFF), self.by(Verdict.UNKNOWN)
+        if len(unknown) == len(self.axes):
+            reasons = dict.fromkeys(axis.reason for axis in unknown)
+            return f"Camera '{self.camera}': cannot tell: {'; '.join(reasons)}."
+        if off:
+            said = f"Camera '{self.camera}' is off: {'; '.join(_error(axis) for axis in off)}."
+        else:
+            said = f"Camera '{self.camera}': calibration and clock are fine, as far as this drive shows."
+        if unknown:
+            said += f" It cannot tell the {', '.join(axis.axis.what for axis in unknown)}."
+        return said
+
+    @property
+    def config(self) -> str:
+        """The corrected extrinsics as a configuration, in YAML."""
+        return configuration([self])
+
+    def table(self) -> str:
+        """The axes in lines of fixed width."""
+        rows = [("axis", "offset of what is stated", "verdict")]
+        rows += [(f"{axis.axis.name}  {axis.axis.what}", axis.measured, axis.told) for axis in self.axes]
+        widths = [max(len(row[i]) for row in rows) for i in range(2)]
+        return "\n".join(f"{a:<{widths[0]}}  {b:>{widths[1]}}  {c}" for a, b, c in rows)
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        return {
+            "camera": self.camera,
+            "answer": self.answer,
+            "frames": self.frames,
+            "edges": self.edges,
+            "score": {"stated": self.score_stated, "corrected": self.score_corrected},
+            "axes": {
+                axis.axis.name: {
+                    "what": axis.axis.what,
+                    "unit": axis.axis.unit,
+                    "offset": axis.offset,
+                    "interval": axis.interval,
+                    "verdict": str(axis.verdict),
+                    "reason": axis.reason,
+                }
+                for axis in self.axes
+            },
+            "parent": self.parent,
+            "child": self.child,
+            "extrinsics": {"stated": self.stated.tolist(), "corrected": self.corrected.tolist()},
+            "notes": list(self.notes),
+        }
+
+
+def configuration(results: Sequence[Calibration]) -> str:
+    """The corrected extrinsics of several cameras as one configuration, in YAML."""
+    lines = ["source:", "  extrinsics:"]
+    for result in results:
+        pose = [*result.corrected[:3, 3], *geometry.quaternion(result.corrected)]
+        numbers = ", ".join(f"{float(number):.6f}" for number in pose)
+        lines.append(f"    {result.parent} {result.child}: [{numbers}]")
+    return "\n".join(lines) + "\n"
+
+
+def _error(result: AxisResult) -> str:
+    """``it looks too high, by 1.02 +- 0.05 deg (turn about the camera's x axis)``."""
+    axis, n = result.axis, result.axis.decimals
+    size = f"{abs(result.offset):.{n}f} +- {result.interval:.{n}f} {axis.unit}"
+    how = axis.positive if result.offset > 0 else axis.negative
+    if axis is AXES[TIME]:
+        return f"{how}, by {size}"
+    return f"it {how}, by {size} ({axis.what})"

@@ -1,0 +1,153 @@
+"""``bevviz calib``."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from bevviz.cli.options import Commands, add_bag, add_config, add_output, add_selection, load_config, open_bag
+from bevviz.cli.run import has_display, say, terminable, wait_for_interrupt
+
+if TYPE_CHECKING:
+    from bevviz.calib import Calibration, Shots
+    from bevviz.config import Config
+    from bevviz.sources import Scene
+
+FRAMES = 30  # that are taken where --every does not say
+
+
+def add(commands: Commands) -> None:
+    calib = commands.add_parser(
+        "calib",
+        help="is it the calibration or the clock?",
+        description="Compare the edges of clouds and images: how wrong are the camera's mounting and stamps?",
+    )
+    group = add_bag(calib, detector=False)
+    add_selection(group)
+    calib.set_defaults(every=None)
+    group.add_argument("--camera", metavar="NAME", help="only this camera, as 'bevviz info' names it")
+    add_config(calib)
+    output = add_output(calib, blueprint="calib")
+    output.add_argument("--write", type=Path, metavar="FILE.yaml", help="write the corrected configuration")
+    output.add_argument("--json", action="store_true", help="print the result as JSON")
+    calib.set_defaults(run=_calib)
+
+
+def _calib(options: argparse.Namespace) -> int:
+    from tqdm import tqdm
+
+    from bevviz.calib import calibrate, gather
+    from bevviz.errors import UserError
+
+    config = load_config(options)
+    if options.write is not None and options.write.suffix not in (".yaml", ".yml"):
+        raise UserError(f"--write {options.write}: expected a file name that ends in .yaml")
+    chosen = options.every
+    options.every = chosen or 1
+    with terminable():
+        try:
+            with open_bag(options, config) as source:
+                scene, total = source.scene, source.total
+            names = _cameras(scene, options.camera)
+            options.every = chosen or max(1, total // FRAMES)
+            with open_bag(options, config) as source:
+                bar = tqdm(source, total=source.total, unit="frame", desc="find edges", disable=None)
+                shots = gather(bar, names, source.pose)
+                for warning in source.warnings:
+                    say(f"warning: {warning}")
+            results = []
+            for name in names:
+                with tqdm(unit="step", desc=f"align {name}", disable=None) as steps:
+
+                    def show(what: str, steps: tqdm = steps) -> None:
+                        steps.set_postfix_str(what, refresh=False)
+                        steps.update()
+
+                    results.append(calibrate(shots[name], show))
+        except KeyboardInterrupt:
+            say("interrupted: nothing was found yet")
+            return 130
+    _print(results, options.json)
+    if options.write is not None:
+        _write(results, options.write)
+    _log(results, shots, scene, config, options)
+    return 0
+
+
+def _cameras(scene: Scene, wanted: str | None) -> tuple[str, ...]:
+    from bevviz.errors import UserError
+
+    if not scene.cameras:
+        raise UserError(
+            f"{scene.name}: no camera to calibrate (no Image topic was found); "
+            "name one with --set source.camera_topics=[/topic]"
+        )
+    if wanted is None:
+        return scene.cameras
+    if wanted not in scene.cameras:
+        raise UserError(f"--camera {wanted}: there is no such camera; there are {', '.join(scene.cameras)}")
+    return (wanted,)
+
+
+def _print(results: list[Calibration], as_json: bool) -> None:
+    import json
+
+    if as_json:
+        print(json.dumps([result.to_dict() for result in results], indent=2))
+        return
+    for result in results:
+        print(result.answer)
+        print(f"\n{result.table()}\n")
+        print(f"{result.frames} frames, {result.edges} edges; an interval is two standard deviations wide")
+        for note in result.notes:
+            print(note)
+        if result.correction[:6].any():
+            print(f"\nThe mounting with that put right, for --config:\n\n{result.config}")
+
+
+def _write(results: list[Calibration], path: Path) -> None:
+    from bevviz.calib.result import configuration
+    from bevviz.errors import UserError
+
+    try:
+        path.write_text(configuration(results))
+    except OSError as error:
+        raise UserError(f"--write {path}: {error.strerror}") from None
+    say(f"configuration in {path}")
+
+
+def _log(
+    results: list[Calibration],
+    shots: dict[str, Shots],
+    scene: Scene,
+    config: Config,
+    options: argparse.Namespace,
+) -> None:
+    """Into every output that was asked for; without one, only the text was."""
+    from bevviz.logging.calib import log_calibration
+    from bevviz.logging.sinks import open_recording
+
+    if not (options.save or options.serve or options.connect or options.viewer or has_display()):
+        say("no display: --save FILE.rrd keeps the pictures and curves, --serve shows them in a browser")
+        return
+    spawn = options.viewer or not (options.save or options.serve or options.connect)
+    with open_recording(
+        scene,
+        config,
+        save=options.save,
+        serve=options.serve,
+        connect=options.connect,
+        spawn=spawn,
+        blueprint=options.blueprint,
+    ) as sinks:
+        for url in sinks.urls:
+            say(f"viewer at {url}")
+        for result in results:
+            log_calibration(sinks.recording, result, shots[result.camera].shots, config.logging)
+        if options.save is not None:
+            say(f"pictures and curves in {options.save}")
+        if options.serve is not None:
+            say("serving until Ctrl-C")
+            sinks.recording.flush()
+            wait_for_interrupt()

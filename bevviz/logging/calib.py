@@ -1,0 +1,112 @@
+"""What ``bevviz calib`` found: points over the image as stated and as corrected, and the score curves."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import rerun as rr
+
+from bevviz import geometry
+from bevviz.calib.axes import TIME, error_pose
+from bevviz.calib.result import Calibration, Verdict
+from bevviz.calib.shots import Shot
+from bevviz.colors import bins
+from bevviz.config import LoggingConfig
+from bevviz.frame import F32, F64, Bool, Intrinsics
+from bevviz.logging import entities
+from bevviz.logging.logger import depth_annotations, encode_image
+from bevviz.logging.pieces import CORNER
+
+_STATED, _CORRECTED = (255, 80, 80), (90, 230, 120)
+_COLORS = {Verdict.FINE: (70, 160, 90), Verdict.OFF: (210, 70, 70), Verdict.UNKNOWN: (130, 130, 145)}
+
+
+def log_calibration(
+    recording: rr.RecordingStream, result: Calibration, shots: Sequence[Shot], config: LoggingConfig
+) -> None:
+    """Log one camera.
+
+    Args:
+        recording: where to.
+        result: what was found.
+        shots: what it was found from.
+        config: quality of the images.
+    """
+    camera = result.camera
+    recording.log(
+        entities.calib_result(camera), rr.TextDocument(_text(result), media_type="text/markdown"), static=True
+    )
+    for axis in result.axes:
+        path = entities.calib_curve(camera, axis.axis.name)
+        width = np.full(len(axis.score), axis.abscissa[1] - axis.abscissa[0], np.float32)
+        height = axis.score - min(curve.score.min() for curve in result.axes)
+        bars = rr.BarChart(height, abscissa=axis.abscissa, widths=width, color=_COLORS[axis.verdict])
+        recording.log(path, bars, static=True)
+    for path in (entities.calib_stated(camera), entities.calib_corrected(camera)):
+        recording.log(f"{path}/points", depth_annotations(), static=True)
+    correction = error_pose(result.correction)
+    for shot in shots:
+        recording.set_time(entities.STAMP, timestamp=np.datetime64(shot.frame.stamp, "ns"))
+        recording.set_time(entities.FRAME, sequence=shot.frame.index)
+        stated = shot.camera_from_points(0.0)
+        corrected = correction @ shot.camera_from_points(float(result.correction[TIME]))
+        _log_pair(recording, entities.calib_stated(camera), shot, stated, config, _STATED)
+        _log_pair(recording, entities.calib_corrected(camera), shot, corrected, config, _CORRECTED)
+
+
+def _log_pair(
+    recording: rr.RecordingStream,
+    path: str,
+    shot: Shot,
+    camera_from_points: F64,
+    config: LoggingConfig,
+    color: tuple[int, int, int],
+) -> None:
+    """The image, every point over it by depth, and the edges of the cloud."""
+    assert shot.camera.image is not None and shot.camera.intrinsics is not None
+    recording.log(f"{path}/image", encode_image(shot.camera.image, config.jpeg_quality))
+    intrinsics = shot.camera.intrinsics
+    uv, depth = geometry.project(geometry.apply(camera_from_points, shot.frame.points), intrinsics)
+    seen = _inside(uv, intrinsics)
+    classes = bins(depth[seen], 0, entities.DEPTH_RANGE, entities.DEPTH_BINS)
+    recording.log(
+        f"{path}/points",
+        rr.Points2D(
+            uv[seen] + CORNER,
+            class_ids=classes,
+            radii=rr.Radius.ui_points(1.0),
+            show_labels=False,
+            draw_order=10.0,
+        ),
+    )
+    uv, _ = geometry.project(geometry.apply(camera_from_points, shot.xyz), intrinsics)
+    recording.log(
+        f"{path}/edges",
+        rr.Points2D(
+            uv[_inside(uv, intrinsics)] + CORNER,
+            colors=[color],
+            radii=rr.Radius.ui_points(1.5),
+            draw_order=20.0,
+        ),
+    )
+
+
+def _inside(uv: F32, intrinsics: Intrinsics) -> Bool:
+    with np.errstate(invalid="ignore"):
+        return np.asarray(((uv > -CORNER) & (uv < [intrinsics.width, intrinsics.height])).all(axis=1))
+
+
+def _text(result: Calibration) -> str:
+    rows = [f"| {axis.axis.name} | {axis.measured} | {axis.told} |" for axis in result.axes]
+    return "\n".join(
+        [
+            f"## {result.answer}\n",
+            "| axis | offset of what is stated | verdict |\n|---|---|---|",
+            *rows,
+            f"\n{result.frames} frames, {result.edges} edges. Score {result.score_stated:.3f} as stated, "
+            f"{result.score_corrected:.3f} as corrected.\n",
+            *result.notes,
+            f"\n```yaml\n{result.config}```",
+        ]
+    )

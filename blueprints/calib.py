@@ -1,0 +1,23 @@
+"""Is it the calibration? The points over the image as stated and as corrected, and the score of each axis."""
+
+from __future__ import annotations
+
+import rerun.blueprint as rrb
+
+from bevviz.logging import views
+from bevviz.sources import Scene
+
+
+def blueprint(scene: Scene) -> rrb.Blueprint:
+    pages: list[rrb.Container | rrb.View] = [
+        rrb.Horizontal(
+            rrb.Vertical(*views.alignment(name)),
+            rrb.Vertical(views.calibration(name), views.score_curves(name), row_shares=[2, 3]),
+            column_shares=[5, 4],
+            name=name,
+        )
+        for name in scene.cameras
+    ]
+    return rrb.Blueprint(
+        rrb.Tabs(*pages) if len(pages) != 1 else pages[0], views.time_panel(), *views.panels()
+    )
