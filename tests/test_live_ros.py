@@ -39,7 +39,7 @@ from bevviz.ros.publish import TOPICS as TOPICS_PUBLISHED
 from bevviz.ros.session import Session
 from bevviz.sources.live import LiveSource
 
-PATIENCE = 30.0  # seconds for what takes one or two on an idle machine
+PATIENCE = 60.0  # seconds for what takes one or two on an idle machine
 LIGHT = Play(frames=3, points=20_000)
 
 
