@@ -8,7 +8,7 @@ import sys
 from collections.abc import Callable, Sequence
 
 from bevviz import __version__
-from bevviz.cli import bag, calib, compare, config, demo, info, live, report, sweep, tune, why
+from bevviz.cli import bag, batch, calib, compare, config, demo, info, live, report, sweep, tune, why
 from bevviz.errors import UserError
 
 EPILOG = """examples:
@@ -21,6 +21,7 @@ EPILOG = """examples:
   bevviz compare drive.mcap --model yolo11n.onnx --set-b clustering.eps=0.8   what if?
   bevviz sweep drive.mcap --model yolo11n.onnx --set clustering.eps=0.3:0.9:0.1   which value?
   bevviz tune drive.mcap --at 12.5 --model yolo11n.onnx --config my.yaml          run at each save
+  bevviz batch bags/ -o runs                  many bags, and the worst frames of all of them
   bevviz live --model yolo11n.onnx --serve    the same beside a running robot, in a browser
   bevviz snap                                 save what it saw in the last 30 seconds
   bevviz calib drive.mcap                     is it the calibration or the clock?
@@ -51,6 +52,6 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=f"bevviz {__version__}")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
-    for command in (bag, info, why, compare, sweep, tune, calib, report, demo, live, config):
+    for command in (bag, batch, info, why, compare, sweep, tune, calib, report, demo, live, config):
         command.add(commands)
     return parser

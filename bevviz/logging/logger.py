@@ -41,7 +41,7 @@ from bevviz.frame import (
 from bevviz.logging import entities, tracks
 from bevviz.logging.entities import ClassId
 from bevviz.logging.pieces import CORNER, boxes3d, transform, world_pose
-from bevviz.logging.text import markdown
+from bevviz.logging.text import markdown, remarks
 from bevviz.logging.writer import Writer
 from bevviz.sources import Scene
 
@@ -598,17 +598,7 @@ class Logger(Writer):
 
     def _log_decisions(self, result: FrameResult, notes: Sequence[tuple[str, str]]) -> None:
         self._put(entities.EXPLAIN, rr.TextDocument(markdown(result), media_type=rr.MediaType.MARKDOWN))
-        lines = [*notes, *(("ERROR", f"{f.stage}: {f.reason}") for f in result.failures)]
-        lines += [("WARN", problem) for problem in result.frame.problems]
-        for camera in result.cameras:
-            lines += [("WARN", f"{camera.camera.name}: {problem}") for problem in camera.camera.problems]
-        quiet = {"matched", "not_kept", "below_threshold", "suppressed"}
-        lines += [
-            ("INFO", f"{e.camera}: {e.text}")
-            for e in result.explanations
-            if e.subject == "detection" and e.state not in quiet
-        ]
-        self._log_lines(entities.EXPLAIN_LOG, result.frame, lines)
+        self._log_lines(entities.EXPLAIN_LOG, result.frame, [*notes, *remarks(result)])
 
     def _log_anomalies(self, result: FrameResult) -> None:
         news = self._news.of(result.anomalies)

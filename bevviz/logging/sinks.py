@@ -40,6 +40,7 @@ def open_recording(
     connect: str | None = None,
     spawn: bool = False,
     blueprint: str | rrb.Blueprint = "debug",
+    recording_id: str | None = None,
 ) -> Iterator[Sinks]:
     """Open a recording that goes to everything that is asked for, with the blueprint.
 
@@ -53,6 +54,8 @@ def open_recording(
         connect: URL of a viewer that listens, rerun+http://host:9876/proxy.
         spawn: open the viewer on this machine.
         blueprint: name of a layout, a .py or .rbl file, or a layout.
+        recording_id: viewers and catalogs take two recordings with the same one for the same; None: a
+            random one, the same for all recordings of a process.
 
     Raises:
         UserError: unknown blueprint, file that cannot be written, port in use, no viewer found or reached;
@@ -71,7 +74,7 @@ def open_recording(
         server, address = _server(serve)
         sinks.append(server)
         urls.append(address)
-    recording = rr.RecordingStream(APPLICATION)
+    recording = rr.RecordingStream(APPLICATION, recording_id=recording_id)
     recording.set_log_time_enabled(False)  # frames have their own clocks
     try:
         recording.set_sinks(*sinks, default_blueprint=layout)
@@ -183,10 +186,10 @@ def viewer_address(host: str, port: int, data_port: int) -> str:
     return f"http://{host}:{port}/?url={quote(f'rerun+http://{host}:{data_port}/proxy', safe='')}"
 
 
-def check_port(port: int) -> None:
+def check_port(port: int, option: str = "--serve") -> None:
     """Raises UserError with a free port where this one is in use."""
     if not _is_free(port):
-        raise UserError(f"--serve {port}: the port is in use; another one: --serve {free_port(port + 1)}")
+        raise UserError(f"{option} {port}: the port is in use; another one: {option} {free_port(port + 1)}")
 
 
 def _is_free(port: int) -> bool:

@@ -15,6 +15,20 @@ def markdown(result: FrameResult) -> str:
     return "\n".join(_lines(result))
 
 
+def remarks(result: FrameResult) -> list[tuple[str, str]]:
+    """Level and text of what went wrong: failures, problems, detections without a match."""
+    lines = [("ERROR", f"{f.stage}: {f.reason}") for f in result.failures]
+    lines += [("WARN", problem) for problem in result.frame.problems]
+    for camera in result.cameras:
+        lines += [("WARN", f"{camera.camera.name}: {problem}") for problem in camera.camera.problems]
+    lines += [
+        ("INFO", f"{e.camera}: {e.text}")
+        for e in result.explanations
+        if e.subject == "detection" and e.state not in _WEAK and e.state != "matched"
+    ]
+    return lines
+
+
 def _lines(result: FrameResult) -> Iterator[str]:
     frame = result.frame
     yield f"### Frame {frame.index}"

@@ -128,7 +128,7 @@ class Recording:
     @cached_property
     def size(self) -> int:
         """Bytes on disk."""
-        files = [f for p in self.paths for f in (_bag_files(p) if p.is_dir() else [p])]
+        files = [f for p in self.paths for f in (bag_files(p) if p.is_dir() else [p])]
         return sum(f.stat().st_size for f in files)
 
     @cached_property
@@ -283,9 +283,9 @@ class Recording:
             raise UserError(f"{path}: cannot be read: {error.strerror or error}") from None
 
     def _open_folder(self, folder: Path) -> None:
-        files = _bag_files(folder)
+        files = bag_files(folder)
         if not files:
-            within = sorted(d.name for d in folder.iterdir() if d.is_dir() and _bag_files(d))
+            within = sorted(d.name for d in folder.iterdir() if d.is_dir() and bag_files(d))
             hint = f"; there are bags in its folders: {', '.join(within[:5])}" if within else ""
             raise UserError(f"{folder}: a folder without a bag (no .mcap, .db3 or .bag file){hint}")
         metadata = self._read_metadata(folder)
@@ -319,7 +319,7 @@ class Recording:
 
         path = folder / METADATA
         if not path.exists():
-            if not any(f.suffix == ".bag" for f in _bag_files(folder)):
+            if not any(f.suffix == ".bag" for f in bag_files(folder)):
                 self._notes.append(
                     f"{folder}: {METADATA} is missing: read without ('ros2 bag reindex' makes one)"
                 )
@@ -380,7 +380,7 @@ class Recording:
         return target
 
 
-def _bag_files(folder: Path) -> list[Path]:
+def bag_files(folder: Path) -> list[Path]:
     """Bag files of a folder by suffix, compressed ones too."""
     suffixes = {".mcap", ".db3", ".bag", ".active"}
     return sorted(

@@ -1,0 +1,77 @@
+"""Workers of a Dask cluster, which share the file system with this machine."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+from urllib.parse import urlsplit
+
+from bevviz.batch.jobs import Job
+from bevviz.batch.work import Outcome, Outcomes
+from bevviz.errors import UserError
+from bevviz.logging.sinks import answers
+
+
+def run_dask(jobs: Sequence[Job], address: str, retries: int, on_frame: Callable[[], None]) -> Outcomes:
+    """Run the jobs on a cluster, each once, and yield how they ended, as they end.
+
+    A job whose worker dies is run again on another one, as often as the cluster's setting
+    ``distributed.scheduler.allowed-failures`` has it.
+
+    Args:
+        jobs: what to do; the first ones first.
+        address: of the scheduler, tcp://host:8786.
+        retries: how often a job is run again that failed for no fault of its bag.
+        on_frame: called for each frame of a job when it has ended.
+
+    Raises:
+        UserError: Dask is not installed, or nobody answers at the address.
+    """
+    if not jobs:
+        return
+    try:
+        from distributed import Client, as_completed
+    except ImportError:
+        raise UserError("--dask needs Dask: pip install 'bevviz[dask]'") from None
+    where = urlsplit(address)
+    if where.hostname and where.port and not answers(where.hostname, where.port):
+        raise UserError(f"--dask {address}: nobody answers there; 'dask scheduler' starts one")
+    try:
+        client = Client(address, timeout="10s")
+    except (OSError, ValueError, TimeoutError) as error:
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise UserError(f"--dask {address}: no scheduler answers there ({reason})") from None
+    with client:
+        # The scheduler runs nothing twice that has the same key, not even for two clients.
+        futures: dict[Any, Job] = {
+            client.submit(_work, job, key=f"bevviz-{job.folder}-{job.name}-{job.key}", retries=retries): job
+            for job in jobs
+        }
+        try:
+            for future in as_completed(list(futures)):
+                outcome = _outcome(futures[future], future)
+                for _ in range(outcome.frames):
+                    on_frame()
+                future.release()
+                yield outcome
+        finally:
+            client.cancel([future for future in futures if not future.done()])
+
+
+def _outcome(job: Job, future: Any) -> Outcome:
+    if future.status == "finished":
+        outcome: Outcome = future.result()
+        return outcome
+    error = future.exception() if future.status == "error" else None
+    if type(error).__name__ == "KilledWorker":
+        return Outcome(job.name, error="the workers that ran it died; out of memory?")
+    return Outcome(job.name, error=f"{type(error).__name__}: {error}" if error else "cancelled")
+
+
+def _work(job: Job) -> Outcome:
+    """On the worker."""
+    from distributed import get_worker
+
+    from bevviz.batch.work import run
+
+    return run(job, get_worker().state.nthreads)

@@ -1,0 +1,219 @@
+"""Which bags, under which name, and what makes the result of one out of date."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from functools import cached_property, lru_cache
+from pathlib import Path
+
+from bevviz.batch.table import About, read_about
+from bevviz.config import Config
+from bevviz.errors import UserError
+from bevviz.logging.logger import versions
+from bevviz.sources.recording import METADATA, bag_files
+
+PARTIAL = ".partial"  # folder of what is not complete
+
+
+@dataclass(frozen=True)
+class Selection:
+    """Which frames of each bag, as in ``BagSource``."""
+
+    start: str | None = None
+    end: str | None = None
+    every: int = 1
+    frames: tuple[int | None, int | None] | None = None
+
+
+@dataclass(frozen=True)
+class Job:
+    """One bag. Everything that a worker needs, also one on another machine that shares the file system."""
+
+    name: str
+    bag: Path  # absolute
+    folder: Path  # absolute, for the results
+    config: Config
+    selection: Selection
+    blueprint: str
+
+    @property
+    def recording(self) -> Path:
+        return self.folder / f"{self.name}.rrd"
+
+    @property
+    def table(self) -> Path:
+        """The frames as rows. It is written last: where it is, the recording is complete."""
+        return self.folder / f"{self.name}.parquet"
+
+    @property
+    def size(self) -> int:
+        """Bytes of the bag."""
+        return sum(file.stat().st_size for file in _files(self.bag))
+
+    @cached_property
+    def key(self) -> str:
+        """Another one for another bag, selection, configuration, model, layout or version."""
+        config = self.config.model_dump(mode="json", exclude={"live"})
+        config["detector"] |= {name: _content(config["detector"][name]) for name in ("model", "names")}
+        parts = {
+            "bag": [[file.name, file.stat().st_size, file.stat().st_mtime_ns] for file in _files(self.bag)],
+            "selection": asdict(self.selection),
+            "config": config,
+            "blueprint": _content(self.blueprint),
+            "versions": versions(),
+        }
+        return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()
+
+    @property
+    def recording_id(self) -> str:
+        """Another one for another result: a viewer takes recordings with the same one for the same."""
+        return f"{self.name}-{self.key[:8]}"
+
+    def complete(self) -> About | None:
+        """What is known of the result, None where it is missing or out of date."""
+        about = read_about(self.table)
+        if about is None or about.key != self.key or not self.recording.is_file():
+            return None
+        return about
+
+
+def make_jobs(
+    paths: Sequence[Path], folder: Path, config: Config, selection: Selection, blueprint: str
+) -> list[Job]:
+    """A job for each bag that the paths name.
+
+    Raises:
+        UserError: a path that does not exist, or no bag at all.
+    """
+    bags = find_bags(paths)
+    detector = config.detector
+    config = config.model_copy(
+        update={
+            "detector": detector.model_copy(
+                update={"model": _absolute(detector.model), "names": _absolute(detector.names)}
+            )
+        }
+    )
+    folder = folder.resolve()
+    blueprint = _absolute(blueprint)
+    owners = {about.bag: table.stem for table, about in tables(folder)}
+    names = name_bags(bags, owners)
+    return [Job(names[bag], bag, folder, config, selection, blueprint) for bag in bags]
+
+
+def tables(folder: Path) -> Iterator[tuple[Path, About]]:
+    """The results of all bags in a folder, by name."""
+    for path in sorted(folder.glob("*.parquet")):
+        if (about := read_about(path)) is not None:
+            yield path, about
+
+
+# --- bags --------------------------------------------------------------------------------------
+
+
+def find_bags(paths: Sequence[Path]) -> list[Path]:
+    """Bag files and folders: those given, those that a pattern fits, those somewhere in a folder.
+
+    A folder with a metadata.yaml is one bag; in any other one each bag file is a bag of its own.
+
+    Raises:
+        UserError: a path that does not exist, or a folder without bags.
+    """
+    found: dict[Path, None] = {}
+    for path in paths:
+        matches = (
+            [path] if path.exists() else sorted(Path(path.anchor).glob(str(path.relative_to(path.anchor))))
+        )
+        if not matches:
+            raise UserError(f"{path}: no such file or folder")
+        for match in matches:
+            bags = [bag.resolve() for bag in _bags(match)]
+            if not bags and match == path:
+                raise UserError(f"{path}: no bag in this folder (no .mcap, .db3 or .bag file)")
+            found.update(dict.fromkeys(bags))
+    if not found:
+        raise UserError("no bag among " + ", ".join(map(str, paths)))
+    return list(found)
+
+
+def _bags(path: Path) -> Iterator[Path]:
+    if path.name == METADATA:
+        path = path.parent
+    if not path.is_dir() or (path / METADATA).is_file():
+        yield path
+        return
+    yield from bag_files(path)
+    for inner in sorted(path.iterdir()):
+        if inner.is_dir() and not inner.name.startswith("."):
+            yield from _bags(inner)
+
+
+def name_bags(bags: Sequence[Path], owners: Mapping[str, str]) -> dict[Path, str]:
+    """A name for each bag, which stays with it from run to run.
+
+    A bag that already has a result keeps its name. Of bags with the same name, each is named with as many of
+    its folders as tell them apart.
+
+    Args:
+        bags: absolute paths, each once.
+        owners: bag -> name of the results that are there.
+    """
+    names = {bag: owners[str(bag)] for bag in bags if str(bag) in owners}
+    taken = {"summary", *owners.values()}
+    new = [bag for bag in bags if bag not in names]
+    deepest = max((len(bag.parts) for bag in new), default=0)
+    for depth in range(1, deepest + 1):
+        candidates = {bag: _name(bag, depth) for bag in new}
+        often = Counter(candidates.values())
+        names |= {bag: n for bag, n in candidates.items() if often[n] == 1 and n not in taken}
+        new = [bag for bag in new if bag not in names]
+        taken |= set(names.values())
+    for bag in new:  # same letters, apart from those that no file name should have
+        names[bag] = f"{_name(bag, 1)}-{hashlib.sha256(str(bag).encode()).hexdigest()[:8]}"
+    return names
+
+
+def _name(bag: Path, depth: int) -> str:
+    stem = bag.name if bag.is_dir() else re.sub(r"(\.(mcap|db3|bag|active|zstd|zst))+$", "", bag.name)
+    parts = [*bag.parts[-depth:-1], stem]
+    return re.sub(r"[^\w.-]+", "_", "-".join(parts), flags=re.ASCII).strip("._") or "bag"
+
+
+# --- content -----------------------------------------------------------------------------------
+
+
+def _files(bag: Path) -> list[Path]:
+    if not bag.is_dir():
+        return [bag]
+    metadata = bag / METADATA
+    return [*bag_files(bag), *([metadata] if metadata.is_file() else [])]
+
+
+def _absolute(text: str) -> str:
+    """Of a file; a name that something is known by stays as it is."""
+    return str(Path(text).resolve()) if _is_file(text) else text
+
+
+def _content(text: str) -> str:
+    """Of a file its hash; a name that something is known by stays as it is."""
+    if not _is_file(text):
+        return text
+    path = Path(text)
+    stat = path.stat()
+    return _hash(path, stat.st_size, stat.st_mtime_ns)
+
+
+def _is_file(text: str) -> bool:
+    """Whether it is a path; "debug" and "demo" are names, whatever lies in the working directory."""
+    return bool(Path(text).suffix) and Path(text).is_file()
+
+
+@lru_cache
+def _hash(path: Path, size: int, mtime: int) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()

@@ -1,0 +1,144 @@
+"""Worker processes on this machine. One that dies takes no other job with it, and its own is run again."""
+
+from __future__ import annotations
+
+import os
+import signal
+from collections import deque
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from multiprocessing import get_context
+from multiprocessing.connection import Connection, wait
+from multiprocessing.context import SpawnProcess
+
+from bevviz.batch.jobs import Job
+from bevviz.batch.work import Outcome, Outcomes
+
+# concurrent.futures is of no use here: a worker that dies breaks the pool and every job that was on its way.
+
+
+@dataclass
+class _Worker:
+    process: SpawnProcess
+    pipe: Connection
+    job: Job
+
+
+def run_local(jobs: Sequence[Job], workers: int, retries: int, on_frame: Callable[[], None]) -> Outcomes:
+    """Run the jobs, each once, and yield how they ended, as they end.
+
+    Args:
+        jobs: what to do; the first ones first.
+        workers: processes at the same time.
+        retries: how often a job is run again whose process died, or that failed for no fault of its bag.
+        on_frame: called for each frame of any of them.
+    """
+    if not jobs:
+        return
+    workers = min(workers, len(jobs))
+    threads = max(1, (os.cpu_count() or 1) // workers)
+    waiting = deque(jobs)
+    attempts = dict.fromkeys((job.name for job in jobs), 0)
+    busy: list[_Worker] = []
+    try:
+        while waiting and len(busy) < workers:
+            busy.append(_start(waiting.popleft(), threads))
+        while busy:
+            ready = wait([worker.pipe for worker in busy])
+            for worker in [w for w in busy if w.pipe in ready]:
+                try:
+                    said = worker.pipe.recv()
+                except (EOFError, OSError):
+                    said = None
+                if said == _FRAME:
+                    on_frame()
+                    continue
+                busy.remove(worker)
+                again, outcome = _judge(worker, said)
+                if again and attempts[worker.job.name] < retries:
+                    attempts[worker.job.name] += 1
+                    waiting.append(worker.job)
+                else:
+                    yield outcome
+                if waiting:
+                    busy.append(_next(worker, waiting.popleft(), threads))
+                else:
+                    _end(worker)
+    finally:
+        for worker in busy:
+            worker.process.terminate()
+        for worker in busy:
+            _end(worker)
+
+
+_FRAME = "frame"
+
+
+def _judge(worker: _Worker, said: Outcome | str | None) -> tuple[bool, Outcome]:
+    """Whether the job may go better another time, and how it ended."""
+    if isinstance(said, Outcome):
+        return False, said
+    if said is not None:
+        return True, Outcome(worker.job.name, error=said)
+    worker.process.join()
+    code = worker.process.exitcode or 0
+    why = f"by {signal.Signals(-code).name}" if code < 0 else f"with status {code}"
+    hint = "; out of memory?" if code == -signal.SIGKILL else ""
+    return True, Outcome(worker.job.name, error=f"its process ended {why}{hint}")
+
+
+def _start(job: Job, threads: int) -> _Worker:
+    context = get_context("spawn")  # a fork would copy threads of Rerun and onnxruntime in the midst of work
+    ours, theirs = context.Pipe()
+    process = context.Process(target=_work, args=(theirs, threads), name="bevviz batch", daemon=True)
+    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # inherited: Ctrl-C is for the batch alone,
+    try:  # which ends its workers
+        process.start()
+    finally:
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
+    theirs.close()  # so that its end is seen as soon as the process has gone
+    ours.send(job)
+    return _Worker(process, ours, job)
+
+
+def _next(worker: _Worker, job: Job, threads: int) -> _Worker:
+    """The same process goes on with another job; a new one where it has gone."""
+    if worker.process.exitcode is None:
+        try:
+            worker.pipe.send(job)
+        except OSError:
+            pass
+        else:
+            return _Worker(worker.process, worker.pipe, job)
+    _end(worker)
+    return _start(job, threads)
+
+
+def _end(worker: _Worker) -> None:
+    worker.pipe.close()  # it ends when there is nothing more to receive
+    worker.process.join(10)
+    if worker.process.exitcode is None:
+        worker.process.kill()
+        worker.process.join()
+
+
+def _work(pipe: Connection, threads: int) -> None:
+    """The process: one job after another, until the other end of the pipe is closed."""
+    os.environ["OMP_NUM_THREADS"] = str(threads)  # before Open3D is loaded
+    import cv2
+
+    from bevviz.batch.work import run
+
+    cv2.setNumThreads(threads)
+    while True:
+        try:
+            job = pipe.recv()
+        except EOFError:
+            return
+        try:
+            outcome: Outcome | str = run(job, threads, lambda: pipe.send(_FRAME))
+        except BrokenPipeError:
+            return  # the batch has gone
+        except Exception as error:
+            outcome = f"{type(error).__name__}: {error}"
+        pipe.send(outcome)

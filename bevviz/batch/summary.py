@@ -1,0 +1,99 @@
+"""One table of the frames of all bags, worst first, and the page that shows it."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from bevviz.batch.page import Drive, render
+from bevviz.batch.table import SCHEMA, About
+
+NAME = "summary"
+
+Link = Callable[[str, int], str]  # recording id, frame -> what opens it
+
+
+def collect(results: Sequence[tuple[Path, About]], link: Link | None) -> tuple[pa.Table, list[Drive]]:
+    """The frames of all bags, worst first, and the totals of each bag in the order given.
+
+    Args:
+        results: table and its description for each bag.
+        link: fills the column ``link``; None leaves it empty.
+    """
+    parts, drives = [], []
+    for path, about in results:
+        part = pq.read_table(path, schema=SCHEMA)
+        drives.append(_drive(path.stem, about, part))
+        links = [link(about.recording_id, f) if link else None for f in part["frame"].to_pylist()]
+        parts.append(part.append_column("link", pa.array(links, pa.string())))
+    empty = SCHEMA.append(pa.field("link", pa.string())).empty_table()
+    frames = pa.concat_tables([empty, *(p.replace_schema_metadata(None) for p in parts)])
+    order = [("badness", "descending"), ("recording", "ascending"), ("frame", "ascending")]
+    return frames.sort_by(order), drives
+
+
+def head(frames: pa.Table, count: int) -> list[dict[str, Any]]:
+    """The first rows; stamps in nanoseconds."""
+    at = frames.schema.get_field_index("stamp")
+    stamps = frames["stamp"].cast(pa.int64())
+    rows: list[dict[str, Any]] = frames.set_column(at, "stamp", stamps).slice(0, count).to_pylist()
+    return rows
+
+
+def _drive(name: str, about: About, part: pa.Table) -> Drive:
+    stamps = np.sort(part["stamp"].to_numpy().astype(np.int64))
+    times = part["time_ms_total"].to_numpy()
+    counts = [field.name for field in SCHEMA if field.type == pa.int32()]
+    return Drive(
+        name=name,
+        about=about,
+        first=int(stamps[0]),
+        duration=float(stamps[-1] - stamps[0]) / 1e9,
+        totals={count: int(part[count].to_numpy().sum(dtype=np.int64)) for count in counts},
+        median_ms=float(np.median(times)),
+        p95_ms=float(np.percentile(times, 95)),
+        bad=sum(map(bool, part["remarks"].to_pylist())),
+        worst=float(part["badness"].to_numpy().max()),
+    )
+
+
+def write_summary(
+    folder: Path,
+    results: Sequence[tuple[Path, About]],
+    failed: Sequence[tuple[str, str]],
+    top: int,
+    link: Link | None,
+    viewer: str,
+) -> Path:
+    """Write both. Returns where the page is.
+
+    Args:
+        folder: where to.
+        results: table and its description for each bag.
+        failed: name of each bag that failed, and why.
+        top: worst frames on the page.
+        link: what opens a frame; None: recordings are in no catalog.
+        viewer: address of a web viewer; empty: none is served.
+    """
+    frames, drives = collect(results, link)
+    page = folder / f"{NAME}.html"
+    text = render(folder.resolve().name, drives, head(frames, top), failed, viewer)
+    _write_whole(folder / f"{NAME}.parquet", lambda path: pq.write_table(frames, path))
+    _write_whole(page, lambda path: path.write_text(text))
+    return page
+
+
+def _write_whole(path: Path, write: Callable[[Path], object]) -> None:
+    """Have a file written that is there either as a whole or not at all."""
+    unfinished = path.with_name(f".{path.name}.{os.getpid()}")
+    try:
+        write(unfinished)
+        unfinished.replace(path)
+    finally:
+        unfinished.unlink(missing_ok=True)

@@ -1,0 +1,139 @@
+"""The frames of a recording as the rows of a table: counts, times and what went wrong."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+from pydantic import TypeAdapter
+
+from bevviz.config import Config
+from bevviz.frame import ClusterState, Decision, DetectionState, FrameResult
+from bevviz.logging.logger import counts_of
+from bevviz.logging.text import remarks
+from bevviz.sources import Scene
+
+DECISIONS = tuple(d.name.lower() for d in Decision if d.value in (0, 1, 2, 3, 4, 8))  # what a kept one can be
+STAGES = (
+    *("voxel", "ground", "clustering", "detector", "projection", "fusion", "tracking", "bev", "explain"),
+    "total",
+)
+
+FAILURE, PROBLEM, ANOMALY = 10.0, 3.0, 0.5
+UNMATCHED = {"no_cluster": 2.0, "too_few_points": 1.5, "low_overlap": 1.0, "taken": 1.0, "too_far": 0.5}
+
+_integers = (
+    *("points", "invalid_points", "voxels", "ground_points", "obstacle_points", "clusters", "set_aside"),
+    *("detections", "below_threshold", "suppressed", *DECISIONS, "not_compared", "objects"),
+    *("problems", "failures", "anomalies"),
+)
+SCHEMA = pa.schema(
+    [
+        ("bag", pa.string()),
+        ("recording", pa.string()),
+        ("frame", pa.int64()),
+        ("stamp", pa.timestamp("ns", "UTC")),
+        *((name, pa.int32()) for name in _integers),
+        ("sync_error_ms", pa.float64()),
+        ("tf_age_ms", pa.float64()),
+        *((f"time_ms_{stage}", pa.float64()) for stage in STAGES),
+        ("unmatched", pa.list_(pa.string())),
+        ("remarks", pa.list_(pa.string())),
+        ("badness", pa.float64()),
+    ]
+)
+
+
+@dataclass(frozen=True, slots=True)
+class About:
+    """What a table was made from and how; kept in it."""
+
+    key: str
+    bag: str
+    recording_id: str
+    frames: int
+    seconds: float  # that the run took
+    scene: Scene
+    warnings: tuple[str, ...] = ()
+
+
+_ABOUT = TypeAdapter(About)
+
+
+def row(result: FrameResult, config: Config) -> dict[str, Any]:
+    """One frame. ``bag`` and ``recording`` are for the caller to say.
+
+    ``sync_error_ms`` and ``tf_age_ms`` are those of the worst sensor, None where no sensor has one.
+    """
+    frame = result.frame
+    found: Counter[str] = Counter(dict.fromkeys(_integers, 0))
+    found.update(counts_of(result))
+    if result.ground is not None:
+        found["ground_points"] = int(result.ground.mask.sum())
+    if result.clusters is not None:
+        found["set_aside"] = int((result.clusters.state != ClusterState.KEPT).sum())
+    if result.objects is not None:
+        found["objects"] = len(result.objects)
+    found["anomalies"] = len(result.anomalies)
+    unmatched: list[str] = []
+    weights = 0.0
+    for camera in result.cameras:
+        if camera.detections is None:
+            continue
+        for d, state in enumerate(camera.detections.state.tolist()):
+            if state != DetectionState.KEPT:
+                found[DetectionState(state).name.lower()] += 1
+            elif camera.fusion is None:
+                found["not_compared"] += 1
+            else:
+                decision = Decision(int(camera.fusion.detection_decision[d])).name.lower()
+                found[decision] += 1
+                if decision in UNMATCHED:
+                    unmatched.append(camera.detections.names[d])
+                    weights += UNMATCHED[decision] * float(camera.detections.score[d])
+    sync = _worst([abs(c.camera.sync_error) for c in result.cameras])
+    tf_age = _worst([frame.tf_age, *(c.camera.tf_age for c in result.cameras)])
+    badness = (
+        FAILURE * found["failures"]
+        + PROBLEM * found["problems"]
+        + ANOMALY * found["anomalies"]
+        + weights
+        + (sync or 0) / config.sync.tolerance
+        + (tf_age or 0) / max(config.sync.tf_tolerance, 0.001)
+    )
+    return {
+        "frame": frame.index,
+        "stamp": frame.stamp,
+        **{name: found[name] for name in _integers},
+        "sync_error_ms": None if sync is None else 1e3 * sync,
+        "tf_age_ms": None if tf_age is None else 1e3 * tf_age,
+        **{f"time_ms_{s}": 1e3 * result.timings[s] for s in STAGES if s in result.timings},
+        "unmatched": unmatched,
+        "remarks": [text for _, text in remarks(result)] + [anomaly.text for anomaly in result.anomalies],
+        "badness": round(badness, 6),
+    }
+
+
+def write(path: Path, rows: Sequence[Mapping[str, Any]], about: About) -> None:
+    table = pa.Table.from_pylist([dict(r) for r in rows], schema=SCHEMA)
+    pq.write_table(table.replace_schema_metadata({"bevviz": _ABOUT.dump_json(about)}), path)
+
+
+def read_about(path: Path) -> About | None:
+    """What is known of a table; None where there is none, or a broken or foreign one."""
+    try:
+        metadata = pq.read_schema(path).metadata or {}
+        return _ABOUT.validate_json(metadata[b"bevviz"])
+    except (OSError, KeyError, ValueError):  # ArrowInvalid and ValidationError are values too
+        return None
+
+
+def _worst(seconds: Sequence[float]) -> float | None:
+    known = [s for s in seconds if np.isfinite(s)]
+    return max(known) if known else None

@@ -1,0 +1,192 @@
+"""``bevviz batch``."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+from collections.abc import Callable
+from contextlib import ExitStack, closing
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from bevviz.cli.options import (
+    TIMES,
+    Commands,
+    add_config,
+    add_selection,
+    load_config,
+    port,
+    positive,
+)
+from bevviz.cli.run import hint, say, terminable, wait_for_interrupt
+from bevviz.errors import UserError
+
+if TYPE_CHECKING:
+    from bevviz.batch.jobs import Job
+    from bevviz.batch.table import About
+    from bevviz.batch.work import Outcomes
+
+
+def add(commands: Commands) -> None:
+    batch = commands.add_parser(
+        "batch",
+        help="run the pipeline over many bags",
+        description="Run the pipeline over many bags, each by itself, and sum up. Run again, it goes on.",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        epilog=TIMES,
+    )
+    batch.add_argument(
+        "paths",
+        nargs="*",
+        type=Path,
+        metavar="BAG",
+        help="bag file or folder, a pattern, or a folder that has bags in it; none: what -o has already",
+    )
+    batch.add_argument("-o", "--output", type=Path, required=True, metavar="DIR", help="where results go")
+    group = batch.add_argument_group("what to run")
+    group.add_argument("--model", metavar="FILE.onnx", help="detector: YOLOv5, v8, v10, 11, 26 or YOLOX")
+    add_selection(group)
+    group.add_argument("--force", action="store_true", help="also what is complete and up to date")
+    where = batch.add_argument_group("where")
+    where.add_argument("--jobs", type=positive, metavar="N", help="processes (default: half the cores)")
+    where.add_argument("--dask", metavar="ADDRESS", help="on a Dask cluster, e.g. tcp://host:8786")
+    where.add_argument(
+        "--retries", type=int, default=2, metavar="N", help="again, where a process dies (default: 2)"
+    )
+    results = batch.add_argument_group("results")
+    results.add_argument("--blueprint", default="debug", metavar="NAME|FILE", help="layout (default: debug)")
+    results.add_argument(
+        "--top", type=positive, default=100, metavar="N", help="worst frames shown (default: 100)"
+    )
+    results.add_argument("--catalog", metavar="URL", help="register with this Rerun catalog server")
+    results.add_argument(
+        "--serve-catalog",
+        nargs="?",
+        type=port,
+        const=51234,
+        metavar="PORT",
+        help="start one here (default: 51234), and a web viewer; until Ctrl-C",
+    )
+    results.add_argument("--dataset", metavar="NAME", help="in the catalog (default: name of DIR)")
+    add_config(batch)
+    batch.set_defaults(run=_batch)
+
+
+def _batch(options: argparse.Namespace) -> int:
+    from bevviz.batch.batch import claimed
+    from bevviz.batch.jobs import tables
+
+    if options.catalog and options.serve_catalog:
+        raise UserError("--catalog and --serve-catalog: give one of them")
+    failed: list[tuple[str, str]] = []
+    with claimed(options.output):
+        if options.paths:
+            jobs = _jobs(options)
+            interrupted = _run(jobs, options, failed)
+            complete = [(job.table, about) for job in jobs if (about := job.complete())]
+        else:
+            interrupted = False
+            found = tables(options.output.resolve())
+            complete = [(table, about) for table, about in found if table.with_suffix(".rrd").is_file()]
+        return _sum_up(complete, failed, options, interrupted)
+
+
+def _jobs(options: argparse.Namespace) -> list[Job]:
+    from bevviz.batch.jobs import Selection, make_jobs
+    from bevviz.logging import blueprints
+    from bevviz.sources import Scene
+    from bevviz.stages.detector import Detector
+
+    config = load_config(options)
+    selection = Selection(options.start, options.end, options.every, options.frames)
+    jobs = make_jobs(options.paths, options.output, config, selection, options.blueprint)
+    # What is wrong for every bag is told once.
+    blueprints.load(options.blueprint, Scene("", "lidar"))
+    if config.detector.model:
+        Detector(config.detector)
+    hint(Scene("", "lidar", cameras=("any",)), config)
+    return jobs
+
+
+def _run(jobs: list[Job], options: argparse.Namespace, failed: list[tuple[str, str]]) -> bool:
+    """Do what is left. Returns whether it was interrupted."""
+    from tqdm import tqdm
+
+    from bevviz.batch.batch import left_to_do
+
+    todo = left_to_do(jobs, options.force)
+    if len(todo) < len(jobs):
+        say(f"{len(jobs) - len(todo)} of {len(jobs)} bags are complete and up to date")
+    frames = 0
+    try:
+        with (
+            terminable() as ended,
+            tqdm(total=len(jobs), initial=len(jobs) - len(todo), unit="bag", disable=None) as bar,
+        ):
+
+            def on_frame() -> None:
+                nonlocal frames
+                frames += 1
+                bar.set_postfix_str(f"{frames} frames", False)
+                bar.update(0)
+                if ended.is_set():
+                    raise KeyboardInterrupt
+
+            with closing(_execute(todo, options, on_frame)) as outcomes:
+                for outcome in outcomes:
+                    bar.update()
+                    if outcome.error:
+                        failed.append((outcome.name, outcome.error))
+                        bar.write(f"bevviz: {outcome.name}: {outcome.error}", file=sys.stderr)
+    except KeyboardInterrupt:
+        return True
+    return False
+
+
+def _execute(todo: list[Job], options: argparse.Namespace, on_frame: Callable[[], None]) -> Outcomes:
+    if options.dask:
+        from bevviz.batch.dask import run_dask
+
+        return run_dask(todo, options.dask, options.retries, on_frame)
+    from bevviz.batch.local import run_local
+
+    workers = options.jobs or max(1, (os.cpu_count() or 1) // 2)
+    return run_local(todo, workers, options.retries, on_frame)
+
+
+def _sum_up(
+    complete: list[tuple[Path, About]],
+    failed: list[tuple[str, str]],
+    options: argparse.Namespace,
+    interrupted: bool,
+) -> int:
+    """Summary and catalog of what is complete."""
+    from bevviz.batch.summary import write_summary
+
+    folder: Path = options.output
+    recordings = [(table.with_suffix(".rrd"), about) for table, about in complete]
+    with ExitStack() as stack:
+        link, url, viewer = None, options.catalog, ""
+        if interrupted:
+            url = None
+        elif options.serve_catalog:
+            from bevviz.batch.catalog import served
+
+            url, viewer = stack.enter_context(served(options.serve_catalog))
+        if url:
+            from bevviz.batch.catalog import register
+
+            dataset = options.dataset or folder.resolve().name
+            link = register(url, dataset, recordings, options.blueprint)
+            say(f"{len(complete)} recordings in dataset '{dataset}' at {url}")
+        page = write_summary(folder, complete, failed, options.top, link, viewer)
+        if interrupted:
+            say(f"interrupted; {len(complete)} bags are complete, the same command goes on. Summary: {page}")
+            return 130
+        frames = sum(about.frames for _, about in complete)
+        say(f"{len(complete)} bags complete, {len(failed)} failed, {frames} frames. Summary: {page}")
+        if viewer:
+            say(f"catalog at {url}, viewer at {viewer}; serving until Ctrl-C")
+            wait_for_interrupt()
+    return 1 if failed or not complete else 0

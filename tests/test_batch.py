@@ -1,0 +1,417 @@
+"""Many bags: nothing is lost or done twice, whatever dies; the summary says what the frames say."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, redirect_stderr
+from dataclasses import dataclass, replace
+from html.parser import HTMLParser
+from io import StringIO
+from pathlib import Path
+from threading import Event, Thread
+from typing import Any
+
+import pyarrow.parquet as pq
+import pytest
+import rerun as rr
+from hypothesis import given
+from hypothesis import strategies as st
+
+from bevviz.batch.batch import claimed, left_to_do
+from bevviz.batch.jobs import PARTIAL, Job, Selection, find_bags, make_jobs, name_bags, tables
+from bevviz.batch.table import row
+from bevviz.cli import main
+from bevviz.config import Config, load
+from bevviz.errors import UserError
+from bevviz.frame import DetectionState
+from bevviz.pipeline import Pipeline
+from bevviz.sources.bag import BagSource
+from tests import bags
+from tests.recordings import Recording, verify
+
+GOOD = ("kitti", "one-drive", "two_b_-drive")
+SCANS = 8
+WEAK = "detector.conf_threshold=0.05"  # so that KITTI has persons that match nothing
+
+
+@dataclass
+class Batch:
+    """What a batch over good bags and a bad one left, of whose workers one was killed at work."""
+
+    root: Path
+    status: int
+    said: str
+    killed: list[int]
+
+    @property
+    def folder(self) -> Path:
+        return self.root / "runs"
+
+    @property
+    def arguments(self) -> list[str]:
+        return ["batch", str(self.root / "bags"), "-o", str(self.folder)]
+
+
+@contextmanager
+def killing(folder: Path, name: str) -> Iterator[list[int]]:
+    """Kill the first process that works on the bag of this name, when it has got under way."""
+    killed: list[int] = []
+    stopped = Event()
+
+    def work() -> None:
+        while not stopped.wait(0.005):
+            for path in (folder / PARTIAL).glob(f"{name}-*.rrd"):
+                if not killed and path.stat().st_size:
+                    killed.append(int(path.stem.split("-")[-2]))
+                    os.kill(killed[0], signal.SIGKILL)
+
+    thread = Thread(target=work)
+    thread.start()
+    try:
+        yield killed
+    finally:
+        stopped.set()
+        thread.join()
+
+
+def write_bags(root: Path, shared: Path) -> None:
+    bags.write(root / "kitti", bags.kitti_items(shared, step=2))
+    for folder in ("one", "two<b>"):
+        (root / folder).mkdir()
+        bags.write(root / folder / "drive", bags.small_items(scans=SCANS))
+    (root / "bad.mcap").write_text("not a bag")
+
+
+@pytest.fixture(scope="module")
+def model(shared: Path) -> str:
+    return str(shared / "models/yolox_nano.onnx")
+
+
+@pytest.fixture(scope="module")
+def batch(shared: Path, model: str, tmp_path_factory: pytest.TempPathFactory) -> Batch:
+    root = tmp_path_factory.mktemp("batch")
+    (root / "bags").mkdir()
+    write_bags(root / "bags", shared)
+    done = Batch(root, 0, "", [])
+    said = StringIO()
+    with redirect_stderr(said), killing(done.folder, "one-drive") as done.killed:
+        done.status = main([*done.arguments, "--jobs", "2", "--model", model, "--set", WEAK])
+    done.said = said.getvalue()
+    return done
+
+
+def jobs_of(batch: Batch, model: str, **settings: Any) -> list[Job]:
+    config = load(None, [f"detector.model={model}", WEAK, *(f"{k}={v}" for k, v in settings.items())])
+    return make_jobs([batch.root / "bags"], batch.folder, config, Selection(), "debug")
+
+
+# --- what is done ------------------------------------------------------------------------------
+
+
+def test_a_worker_that_dies_and_a_bad_bag_cost_nothing_else(batch: Batch) -> None:
+    assert batch.killed
+    assert batch.status == 1
+    assert "bad: " in batch.said and "not a bag" in batch.said
+    assert "3 bags complete, 1 failed" in batch.said
+    assert {path.name for path in batch.folder.iterdir()} == {
+        "summary.html",
+        "summary.parquet",
+        *(f"{name}.{kind}" for name in GOOD for kind in ("rrd", "parquet")),
+    }
+    for name in GOOD:
+        verify(batch.folder / f"{name}.rrd")
+    assert len(Recording(batch.folder / "one-drive.rrd").rows["/bev"]) == SCANS
+
+
+def test_only_what_is_missing_or_out_of_date_is_left_to_do(batch: Batch, model: str) -> None:
+    def left(**settings: Any) -> set[str]:
+        return {job.name for job in left_to_do(jobs_of(batch, model, **settings), force=False)}
+
+    assert left() == {"bad"}
+    assert left(**{"live.nice": 5}) == {"bad"}
+    assert left(**{"clustering.eps": 0.7}) == {"bad", *GOOD}
+    bag = next((batch.root / "bags/kitti").glob("*.mcap"))
+    before = bag.stat()
+    os.utime(bag, ns=(before.st_atime_ns, before.st_mtime_ns + 1))
+    assert left() == {"bad", "kitti"}
+    os.utime(bag, ns=(before.st_atime_ns, before.st_mtime_ns))
+    assert left() == {"bad"}
+
+
+def test_without_its_recording_a_table_counts_for_nothing(batch: Batch, model: str, tmp_path: Path) -> None:
+    shutil.copytree(batch.folder, tmp_path / "runs")
+    other = Batch(batch.root, 0, "", [])
+    jobs = [
+        Job(j.name, j.bag, tmp_path / "runs", j.config, j.selection, j.blueprint)
+        for j in jobs_of(other, model)
+    ]
+    (tmp_path / "runs/kitti.rrd").unlink()
+    (tmp_path / "runs/one-drive.parquet").write_bytes(b"cut off")
+    assert {job.name for job in left_to_do(jobs, force=False)} == {"bad", "kitti", "one-drive"}
+    assert {job.name for job in left_to_do(jobs, force=True)} == {"bad", *GOOD}
+
+
+def test_an_interrupted_batch_goes_on(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for name, scans in (("long", 400), ("short", 2)):
+        bags.write(tmp_path / "bags" / name, bags.small_items(scans=scans))
+    arguments = ["batch", str(tmp_path / "bags"), "-o", str(tmp_path / "runs"), "--jobs", "2"]
+
+    def interrupt() -> None:
+        while not (tmp_path / "runs/short.parquet").exists():
+            time.sleep(0.01)
+        os.kill(os.getpid(), signal.SIGINT)
+
+    thread = Thread(target=interrupt)
+    thread.start()
+    assert main([*arguments, "--every", "2"]) == 130
+    thread.join()
+    assert "1 bags are complete" in capsys.readouterr().err
+    assert {path.name for path in (tmp_path / "runs").iterdir()} == {
+        *("short.rrd", "short.parquet", "summary.html", "summary.parquet")
+    }
+    before = (tmp_path / "runs/short.rrd").stat()
+    assert main([*arguments, "--every", "2"]) == 0
+    assert "1 of 2 bags are complete" in capsys.readouterr().err
+    assert (tmp_path / "runs/short.rrd").stat().st_mtime_ns == before.st_mtime_ns
+    assert pq.read_metadata(tmp_path / "runs/long.parquet").num_rows == 200
+
+
+@pytest.fixture(scope="module")
+def cluster() -> Iterator[Any]:
+    distributed = pytest.importorskip("distributed", reason="needs Dask: pip install 'bevviz[dask]'")
+    with distributed.LocalCluster(
+        n_workers=3, threads_per_worker=1, processes=True, dashboard_address=None
+    ) as started:
+        yield started
+
+
+def test_a_dask_worker_that_dies_loses_no_bag_and_does_none_twice(
+    cluster: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scans = {"a": 6, "b": 120, "c": 4, "d": 5, "e": 3}
+    for name, count in scans.items():
+        bags.write(tmp_path / "bags" / name, bags.small_items(scans=count))
+    (tmp_path / "bags/bad.db3").write_text("not a bag")
+    folder = tmp_path / "runs"
+    written: dict[str, set[tuple[int, int]]] = {}  # each version of each table that was ever there
+
+    def watch() -> None:
+        while not ended.wait(0.002):
+            for table in folder.glob("*.parquet"):
+                stat = table.stat()
+                written.setdefault(table.stem, set()).add((stat.st_ino, stat.st_mtime_ns))
+
+    ended = Event()
+    watcher = Thread(target=watch)
+    watcher.start()
+    with killing(folder, "b") as killed:
+        status = main(
+            ["batch", str(tmp_path / "bags"), "-o", str(folder), "--dask", cluster.scheduler_address]
+        )
+    ended.set()
+    watcher.join()
+    assert status == 1
+    said = capsys.readouterr().err
+    assert killed
+    assert "bevviz: bad: " in said and "5 bags complete, 1 failed" in said
+    assert {name: len(versions) for name, versions in written.items() if name != "summary"} == dict.fromkeys(
+        scans, 1
+    )
+    rows = pq.read_table(folder / "summary.parquet", columns=["recording", "frame"]).to_pylist()
+    assert sorted((r["recording"], r["frame"]) for r in rows) == [
+        (name, i) for name, count in scans.items() for i in range(count)
+    ]
+    assert not (folder / PARTIAL).exists()
+
+
+# --- the summary -------------------------------------------------------------------------------
+
+
+def test_the_summary_says_what_a_direct_run_says(batch: Batch, model: str) -> None:
+    config = load(None, [f"detector.model={model}", WEAK])
+    with BagSource([batch.root / "bags/kitti"], config) as source, Pipeline(config) as pipeline:
+        results = [pipeline.run(frame) for frame in source]
+    summary = pq.read_table(batch.folder / "summary.parquet")
+    badness = summary["badness"].to_pylist()
+    assert badness == sorted(badness, reverse=True)
+    assert summary.num_rows == 2 + 2 * SCANS
+    found = {r["frame"]: r for r in summary.drop_columns("stamp").to_pylist() if r["recording"] == "kitti"}
+    for result in results:
+        mine = found[result.frame.index]
+        wanted = row(result, config)
+        assert mine["bag"] == str(batch.root / "bags/kitti")
+        assert {k: mine[k] for k in wanted if not k.startswith("time_ms_") and k != "stamp"} == {
+            k: v for k, v in wanted.items() if not k.startswith("time_ms_") and k != "stamp"
+        }
+        detections = result.cameras[0].detections
+        assert detections is not None and result.objects is not None and result.clusters is not None
+        kept = int((detections.state == DetectionState.KEPT).sum())
+        assert mine["detections"] == kept
+        assert mine["matched"] == len(result.objects) == kept - len(mine["unmatched"])
+        assert mine["points"] == len(result.frame.points)
+        assert mine["clusters"] + mine["set_aside"] == len(result.clusters)
+        assert mine["time_ms_total"] > 0
+    assert found[0]["matched"] > 0 and "person" in found[0]["unmatched"]
+
+
+def test_badness_weighs_what_went_wrong(batch: Batch) -> None:
+    config = Config()
+    with BagSource([batch.root / "bags/one/drive"], config) as source, Pipeline(config) as pipeline:
+        frame = next(iter(source))
+        good = row(pipeline.run(frame), config)
+        empty = row(pipeline.run(replace(frame, points=frame.points[:0], problems=("late",))), config)
+    assert good["failures"] == good["anomalies"] == 0 and good["remarks"] == []
+    assert empty["failures"] >= 1
+    assert good["badness"] == pytest.approx(
+        good["sync_error_ms"] / 100 + good["tf_age_ms"] / 1000 / config.sync.tf_tolerance
+    )
+    assert empty["badness"] == pytest.approx(
+        good["badness"] + 10 * empty["failures"] + 3 + 0.5 * empty["anomalies"]
+    )
+    assert empty["remarks"][0] == "cloud: the cloud holds no finite point"
+    assert "late" in empty["remarks"]
+
+
+class Page(HTMLParser):
+    """The elements and the text of a page."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.tags: list[tuple[str, dict[str, str | None]]] = []
+        self.text = ""
+        self.feed(text)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append((tag, dict(attrs)))
+
+    def handle_data(self, data: str) -> None:
+        self.text += data
+
+
+def test_the_page_stands_on_its_own(batch: Batch) -> None:
+    text = (batch.folder / "summary.html").read_text()
+    page = Page(text)
+    assert not {"script", "link", "img", "iframe", "b>", "object"} & {tag for tag, _ in page.tags}
+    assert not [attrs for _, attrs in page.tags if {"src", "href", "onclick"} & set(attrs)]
+    assert "url(" not in text and "@import" not in text
+    assert str(batch.root / "bags/two<b>/drive") in [attrs.get("title") for _, attrs in page.tags]
+    assert "not a bag" in page.text
+    worst = pq.read_table(batch.folder / "summary.parquet", columns=["remarks", "recording"]).to_pylist()[0]
+    assert worst["remarks"][0] in page.text
+    assert page.text.index(worst["remarks"][0]) > page.text.index("Worst frames")
+    assert f"rerun {worst['recording']}.rrd" in page.text
+
+
+# --- the catalog -------------------------------------------------------------------------------
+
+
+def test_a_query_across_the_recordings_of_a_catalog(
+    batch: Batch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    pytest.importorskip("datafusion", reason="needs datafusion: pip install 'bevviz[catalog]'")
+    from datafusion import col, functions, lit
+
+    folder = tmp_path / "fleet"
+    shutil.copytree(batch.folder, folder)
+    with rr.server.Server(host="127.0.0.1") as server:
+        for _ in range(2):
+            assert main(["batch", "-o", str(folder), "--catalog", server.url()]) == 0
+            assert "3 recordings in dataset 'fleet'" in capsys.readouterr().err
+        dataset = server.client().get_dataset("fleet")
+        ids = {about.recording_id: table.stem for table, about in tables(folder)}
+        assert sorted(dataset.segment_ids()) == sorted(ids)
+        assert len(dataset.blueprints()) == 1
+
+        explained = dataset.filter_contents(["/explain"]).reader(index="frame")
+        lost = explained.filter(
+            functions.regexp_like(col('"/explain:TextDocument:text"')[0], lit(r"\*\*low overlap\*\* person"))
+        ).select("rerun_segment_id", "frame")
+        answer = {(ids[r["rerun_segment_id"]], r["frame"]) for r in lost.to_pylist()}
+
+        summary = pq.read_table(folder / "summary.parquet").drop_columns("stamp").to_pylist()
+        for mine in summary:
+            id_ = next(i for i, name in ids.items() if name == mine["recording"])
+            assert mine["link"] == f"{dataset.segment_url(id_)}#when=frame@{mine['frame']}"
+        links = [a["href"] for tag, a in Page((folder / "summary.html").read_text()).tags if tag == "a"]
+        assert links == [mine["link"] for mine in summary]
+    wanted = {
+        (mine["recording"], mine["frame"])
+        for mine in summary
+        if any("camera: person" in text and "fusion.min_iou" in text for text in mine["remarks"])
+    }
+    assert answer == wanted != set()
+
+
+def test_a_recording_made_anew_takes_the_place_of_the_old_one(batch: Batch, tmp_path: Path) -> None:
+    pytest.importorskip("datafusion", reason="needs datafusion: pip install 'bevviz[catalog]'")
+    from bevviz.batch.catalog import register
+
+    with rr.server.Server(host="127.0.0.1") as server:
+        ((table, about), *_) = tables(batch.folder)
+        path = table.with_suffix(".rrd")
+        register(server.url(), "fleet", [(path, about)], "debug")
+        dataset = server.client().get_dataset("fleet")
+        dataset.unregister(segments_to_drop=dataset.segment_ids(), layers_to_drop=[]).wait()
+        with rr.RecordingStream("bevviz", recording_id=f"{table.stem}-0123abcd") as old:
+            old.save(tmp_path / "old.rrd")
+            old.log("/bev", rr.TextDocument("old"))
+        dataset.register([(tmp_path / "old.rrd").as_uri()]).wait()
+        register(server.url(), "fleet", [(path, about)], "debug")
+        assert dataset.segment_ids() == [about.recording_id]
+
+
+# --- names and bags ----------------------------------------------------------------------------
+
+
+parts = st.text("ab-_. <é", min_size=1, max_size=3).filter(lambda p: p not in (".", ".."))
+paths = st.lists(st.builds(lambda *p: Path("/", *p), parts, parts, parts), unique=True, max_size=8)
+
+
+@given(paths, paths)
+def test_names_are_unique_safe_and_stay(first: list[Path], second: list[Path]) -> None:
+    names = name_bags(first, {})
+    assert set(names) == set(first)
+    assert len(set(names.values())) == len(first)
+    assert all(
+        "/" not in n and not n.startswith(".") and n.isascii() and n != "summary" for n in names.values()
+    )
+    both = list(dict.fromkeys([*second, *first]))
+    after = name_bags(both, {str(bag): name for bag, name in names.items()})
+    assert {bag: after[bag] for bag in first} == names
+    assert len(set(after.values())) == len(both)
+
+
+def test_bags_are_found_in_folders_and_by_pattern(tmp_path: Path) -> None:
+    (tmp_path / "x/y/drive").mkdir(parents=True)
+    for name in ("x/a.mcap", "x/b.bag", "x/b.txt", "x/y/c.db3.zstd", "x/y/drive/drive_0.mcap"):
+        (tmp_path / name).touch()
+    (tmp_path / "x/y/drive/metadata.yaml").touch()
+    found = [str(bag.relative_to(tmp_path)) for bag in find_bags([tmp_path / "x", tmp_path / "x/a.mcap"])]
+    assert found == ["x/a.mcap", "x/b.bag", "x/y/c.db3.zstd", "x/y/drive"]
+    assert [bag.name for bag in find_bags([tmp_path / "**/*.mcap"])] == ["a.mcap", "drive_0.mcap"]
+
+
+def test_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    bag = bags.write(tmp_path / "drive", bags.small_items(scans=1))
+    runs = tmp_path / "runs"
+
+    def error_of(*arguments: str | Path) -> str:
+        assert main(["batch", *map(str, arguments)]) == 2
+        said = capsys.readouterr().err
+        assert said.splitlines()[-1].startswith("bevviz: error: ")
+        return said
+
+    assert "no such file" in error_of(tmp_path / "none", "-o", runs)
+    (tmp_path / "empty").mkdir()
+    assert "no bag in this folder" in error_of(tmp_path / "empty", "-o", runs)
+    assert "give one of them" in error_of("-o", runs, "--catalog", "rerun+http://a", "--serve-catalog")
+    assert "unknown; did you mean" in error_of(bag, "-o", runs, "--blueprint", "debg")
+    assert "no such file" in error_of(bag, "-o", runs, "--model", "none.onnx")
+    assert "nobody answers" in error_of(bag, "-o", runs, "--dask", "tcp://127.0.0.1:1")
+    assert "Not a directory" in error_of(bag, "-o", bag / "metadata.yaml" / "runs")
+    with claimed(runs), pytest.raises(UserError, match="another batch is running"), claimed(runs):
+        pass
