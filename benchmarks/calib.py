@@ -79,11 +79,11 @@ def row(name: str, offsets: F64, result: Calibration) -> str:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--frames", type=int, default=90, help="length of each drive (default: 90)")
-    parser.add_argument("--seeds", type=int, default=1, help="drives of each kind (default: 1)")
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0], help="drives of each kind (default: 0)")
     parser.add_argument("--only", choices=("weave", "cruise"), help="one kind of drive")
     options = parser.parse_args()
     for kind in [options.only] if options.only else ["weave", "cruise"]:
-        for seed in range(options.seeds):
+        for seed in options.seeds:
             drive = Drive(options.frames, seed, kind == "weave")
             print(f"\n{kind}, seed {seed}, {len(drive.frames)} frames\n")
             print(HEADER)

@@ -181,7 +181,8 @@ def _watch(
         say(f"warning: {warning}")
     where = live.saver.paths if live.saver is not None else []
     target = f" in {where[0]}" + (f" and {len(where) - 1} more" if where[1:] else "") if where else ""
-    say(f"{live.frames} frames{target}, {sum(live.status.drops.values())} dropped")
+    drops = [f"{count} ({place})" for place, count in live.status.drops.items() if count]
+    say(f"{live.frames} frames{target}, {' + '.join(drops) or 'none'} dropped")
     return 0 if live.frames else 1
 
 
