@@ -39,7 +39,6 @@ def main() -> int:
     )
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="as for bevviz live")
     options = parser.parse_args()
-    os.environ.setdefault("RUST_LOG", "warn,re_log_encoding=error")  # as bevviz live does
 
     simulated = SyntheticSource(frames=options.frames)
     drive = list(tqdm(simulated, total=simulated.total, unit="scan", desc="simulate", disable=None))
