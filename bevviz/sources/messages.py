@@ -82,11 +82,8 @@ def decode_cloud(msg: Any, topic: str, received: int) -> Cloud:
     """
     layout = _point_layout(msg, topic)
     grid = _point_grid(msg, layout)
-    xyz = np.empty((*grid.shape, 3), np.float32)
     with np.errstate(over="ignore", invalid="ignore"):  # a float64 beyond float32 is infinite, and dropped
-        for axis, name in enumerate(_AXES):
-            xyz[..., axis] = grid[name]
-        xyz = xyz.reshape(-1, 3)
+        xyz = _positions(grid)
         finite = np.isfinite(xyz[:, 0] + xyz[:, 1] + xyz[:, 2])
     kept = None if finite.all() else np.flatnonzero(finite)
     fields: dict[str, NDArray[Any]] = {}
@@ -107,6 +104,23 @@ def decode_cloud(msg: Any, topic: str, received: int) -> Cloud:
         received=received,
         dropped=int(msg.height) * int(msg.width) - len(xyz),
     )
+
+
+def _positions(grid: NDArray[np.void]) -> F32:
+    """(N, 3) coordinates of the points, a copy."""
+    layout = grid.dtype
+    assert layout.fields is not None
+    formats, offsets = zip(*(layout.fields[name][:2] for name in _AXES), strict=True)
+    if set(formats) == {np.dtype(np.float32)} and np.diff(offsets).tolist() == [4, 4]:
+        # Side by side, as most drivers have them, they are copied in one piece.
+        together = np.dtype(
+            {"names": ["xyz"], "formats": ["V12"], "offsets": offsets[:1], "itemsize": layout.itemsize}
+        )
+        return grid.view(together)["xyz"].copy().view(np.float32).reshape(-1, 3)
+    xyz = np.empty((*grid.shape, 3), np.float32)
+    for axis, name in enumerate(_AXES):
+        xyz[..., axis] = grid[name]
+    return xyz.reshape(-1, 3)
 
 
 def _point_layout(msg: Any, topic: str) -> np.dtype[np.void]:
