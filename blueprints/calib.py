@@ -19,5 +19,7 @@ def blueprint(scene: Scene) -> rrb.Blueprint:
         for name in scene.cameras
     ]
     return rrb.Blueprint(
-        rrb.Tabs(*pages) if len(pages) != 1 else pages[0], views.time_panel(), *views.panels()
+        rrb.Tabs(*pages) if len(pages) != 1 else pages[0],
+        views.time_panel(play=rrb.components.PlayState.Paused),
+        *views.panels(),
     )

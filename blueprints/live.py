@@ -29,6 +29,6 @@ def blueprint(scene: Scene) -> rrb.Blueprint:
             ),
             column_shares=[3, 2],
         ),
-        views.time_panel(follow=True),
+        views.time_panel(play=rrb.components.PlayState.Following),
         *views.panels(),
     )

@@ -24,6 +24,6 @@ def blueprint(scene: Scene) -> rrb.Blueprint:
             ),
             row_shares=[4, 1],
         ),
-        views.time_panel(follow=True, timeline=entities.VERSION),
+        views.time_panel(play=rrb.components.PlayState.Following, timeline=entities.VERSION),
         *views.panels(),
     )

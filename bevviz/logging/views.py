@@ -293,9 +293,10 @@ def score_curves(camera: str) -> rrb.Grid:
     )
 
 
-def time_panel(*, follow: bool = False, timeline: str = entities.STAMP) -> rrb.TimePanel:
-    """Sensor time, collapsed. ``follow``: stay at the newest frame."""
-    play = rrb.components.PlayState.Following if follow else None
+def time_panel(
+    *, play: rrb.components.PlayState | None = None, timeline: str = entities.STAMP
+) -> rrb.TimePanel:
+    """Sensor time, collapsed."""
     return rrb.TimePanel(state="collapsed", timeline=timeline, play_state=play)
 
 
