@@ -169,8 +169,7 @@ def in_points_frame(frame: Frame, stated: LabelledBoxes3D) -> Boxes3D:
     """Boxes that somebody else states, in the frame of the points."""
     if stated.world_from_boxes is None:
         return stated.boxes
-    world_from_points = np.eye(4) if frame.world_from_points is None else frame.world_from_points
-    points_from_boxes = geometry.inverse(world_from_points) @ stated.world_from_boxes
+    points_from_boxes = geometry.inverse(frame.pose) @ stated.world_from_boxes
     turned = stated.boxes.yaw + np.float32(geometry.yaw(points_from_boxes))
     return Boxes3D(geometry.apply(points_from_boxes, stated.boxes.center), stated.boxes.size, turned)
 

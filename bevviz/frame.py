@@ -154,6 +154,11 @@ class Frame:
     tf_age: float = float("nan")
     problems: tuple[str, ...] = ()  # one clear sentence each
 
+    @property
+    def pose(self) -> F64:
+        """(4, 4) ``world_from_points``, the identity where there is no TF to the fixed frame."""
+        return np.eye(4) if self.world_from_points is None else self.world_from_points
+
 
 # --- results -----------------------------------------------------------------------------------
 

@@ -18,7 +18,6 @@ from bevviz.live.settings import Settings
 from bevviz.live.settings import differences as config_differences
 from bevviz.logging import entities
 from bevviz.logging.logger import Logger
-from bevviz.logging.pieces import world_pose
 from bevviz.sources import Scene
 from bevviz.variants import Variants, check_same_frames
 
@@ -111,7 +110,7 @@ class Tuner:
         for writer in (self._logger, self._differences):
             writer.sequences = {entities.VERSION: number}
         self._logger.log(result)
-        self._differences.log(found, self._frame.received, world_pose(self._frame))
+        self._differences.log(found, self._frame.received, self._frame.pose)
         lines = [f"- {key}: {change}" for key, change in changes.items()] or ["- the first one"]
         page = "\n".join([f"# Version {number}", "", *lines])
         self._recording.log(entities.TUNE, rr.TextDocument(page, media_type=rr.MediaType.MARKDOWN))

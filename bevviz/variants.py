@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import replace
 
-import numpy as np
-
 from bevviz import geometry
 from bevviz.config import Config, DetectorConfig
 from bevviz.errors import UserError
@@ -103,7 +101,6 @@ def common_frames(configs: Iterable[Config]) -> Config:
 
 def without_motion(frame: Frame) -> Frame:
     """The frame as it is with ``sync.motion_compensation`` off: its cameras where they are mounted."""
-    world = np.eye(4) if frame.world_from_points is None else frame.world_from_points
 
     def still(camera: Camera) -> Camera:
         if camera.mounting is None:
@@ -111,7 +108,7 @@ def without_motion(frame: Frame) -> Frame:
         return replace(
             camera,
             camera_from_points=camera.mounting,
-            world_from_camera=world @ geometry.inverse(camera.mounting),
+            world_from_camera=frame.pose @ geometry.inverse(camera.mounting),
             motion_compensated=False,
         )
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from bevviz.cli.options import Commands, add_bag, add_config, add_output, add_selection, load_config, open_bag
-from bevviz.cli.run import has_display, say, terminable, wait_for_interrupt
+from bevviz.cli.run import has_display, outputs, say, serve, terminable
 
 if TYPE_CHECKING:
     from bevviz.calib import Calibration, Shots
@@ -126,28 +126,15 @@ def _log(
 ) -> None:
     """Into every output that was asked for; without one, only the text was."""
     from bevviz.logging.calib import log_calibration
-    from bevviz.logging.sinks import open_recording
 
     if not (options.save or options.serve or options.connect or options.viewer or has_display()):
         say("no display: --save FILE.rrd keeps the pictures and curves, --serve shows them in a browser")
         return
     spawn = options.viewer or not (options.save or options.serve or options.connect)
-    with open_recording(
-        scene,
-        config,
-        save=options.save,
-        serve=options.serve,
-        connect=options.connect,
-        spawn=spawn,
-        blueprint=options.blueprint,
-    ) as sinks:
-        for url in sinks.urls:
-            say(f"viewer at {url}")
+    with outputs(scene, config, options, spawn=spawn) as sinks:
         for result in results:
             log_calibration(sinks.recording, result, shots[result.camera].shots, config.logging)
         if options.save is not None:
             say(f"pictures and curves in {options.save}")
         if options.serve is not None:
-            say("serving until Ctrl-C")
-            sinks.recording.flush()
-            wait_for_interrupt()
+            serve(sinks.recording)

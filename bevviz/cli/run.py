@@ -10,13 +10,15 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 from threading import Event
-from typing import TYPE_CHECKING, NoReturn, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any, NoReturn, Protocol, TypeVar
 
 if TYPE_CHECKING:
     from rerun import RecordingStream
+    from rerun.blueprint import Blueprint
 
     from bevviz.config import Config
     from bevviz.frame import FrameResult
+    from bevviz.logging.sinks import Sinks
     from bevviz.sources import Scene, Source
 
 T = TypeVar("T")
@@ -88,8 +90,6 @@ def run(
     Returns:
         The exit status.
     """
-    from bevviz.logging.sinks import open_recording
-
     save, viewer = options.save, options.viewer
     unsaid = save is None and options.serve is None and options.connect is None and not viewer
     if unsaid and has_display():
@@ -97,34 +97,53 @@ def run(
     elif unsaid:
         save = default
 
-    with open_recording(
-        items.scene,
-        config,
-        save=save,
-        serve=options.serve,
-        connect=options.connect,
-        spawn=viewer,
-        blueprint=options.blueprint,
-    ) as sinks:
+    with outputs(items.scene, config, options, save=save, spawn=viewer) as sinks:
         if unsaid and not viewer:
             say(f"no display: saving {save} (--serve shows it in a browser)")
-        for url in sinks.urls:
-            say(f"viewer at {url}")
         handle = begin(sinks.recording)
         frames, interrupted = through(items, work, handle)
         for warning in items.warnings:
             say(f"warning: {warning}")
         finish()
         if options.serve is not None and frames and not interrupted:
-            say(f"{frames} frames; serving until Ctrl-C")
-            sinks.recording.flush()
-            wait_for_interrupt()
+            serve(sinks.recording, f"{frames} frames; ")
     target = f" in {save}" if save is not None else ""
     if interrupted:
         say(f"interrupted after {frames} frames; what was made until then is complete{target}")
         return 130
     say(f"{frames} frames{target}")
     return 0 if frames else 1
+
+
+@contextmanager
+def outputs(
+    scene: Scene,
+    config: Config,
+    options: argparse.Namespace,
+    blueprint: Blueprint | None = None,
+    **instead: Any,
+) -> Iterator[Sinks]:
+    """What the options of ``add_output`` ask for, or ``instead``, opened; addresses are said."""
+    from bevviz.logging.sinks import open_recording
+
+    asked = {
+        "save": options.save,
+        "serve": options.serve,
+        "connect": options.connect,
+        "spawn": options.viewer,
+        "blueprint": blueprint or options.blueprint,
+    }
+    with open_recording(scene, config, **asked | instead) as sinks:
+        for url in sinks.urls:
+            say(f"viewer at {url}")
+        yield sinks
+
+
+def serve(recording: RecordingStream, what: str = "") -> None:
+    """Until the user ends it."""
+    say(f"{what}serving until Ctrl-C")
+    recording.flush()
+    wait_for_interrupt()
 
 
 def through(items: Items[T], work: Callable[[T], R], handle: Callable[[R], None]) -> tuple[int, bool]:

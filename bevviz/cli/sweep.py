@@ -3,18 +3,15 @@
 from __future__ import annotations
 
 import argparse
-from contextlib import AbstractContextManager, ExitStack
+from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from bevviz.cli.options import Commands, add_bag, add_config, add_output, add_selection, open_bag
-from bevviz.cli.run import hint, say, through, wait_for_interrupt
+from bevviz.cli.run import hint, outputs, say, serve, through
 
 if TYPE_CHECKING:
     from bevviz.config import Config
-    from bevviz.logging.sinks import Sinks
-    from bevviz.sources.bag import BagSource
-    from bevviz.sweep import Sweep
 
 
 def add(commands: Commands) -> None:
@@ -59,9 +56,10 @@ def _sweep(options: argparse.Namespace) -> int:
         sweep = Sweep(parameters, configs, truth)
         wanted = options.save or options.serve or options.connect or options.viewer
         with ExitStack() as stack:
-            sinks = stack.enter_context(_outputs(options, source, sweep)) if wanted else None
-            for url in sinks.urls if sinks else ():
-                say(f"viewer at {url}")
+            sinks = None
+            if wanted:
+                opened = outputs(source.scene, source.config, options, blueprint=sweep.layout())
+                sinks = stack.enter_context(opened)
             hint(source.scene, config)
             frames, interrupted = through(source, lambda frame: frame, sweep.add)
             for warning in source.warnings:
@@ -72,24 +70,8 @@ def _sweep(options: argparse.Namespace) -> int:
             if sinks is not None:
                 sweep.log(sinks.recording, source.scene.name)
                 if options.serve is not None and not interrupted:
-                    say("serving until Ctrl-C")
-                    sinks.recording.flush()
-                    wait_for_interrupt()
+                    serve(sinks.recording)
     if interrupted:
         say(f"interrupted after {frames} frames; the table is of these")
         return 130
     return 0 if frames else 1
-
-
-def _outputs(options: argparse.Namespace, source: BagSource, sweep: Sweep) -> AbstractContextManager[Sinks]:
-    from bevviz.logging.sinks import open_recording
-
-    return open_recording(
-        source.scene,
-        source.config,
-        save=options.save,
-        serve=options.serve,
-        connect=options.connect,
-        spawn=options.viewer,
-        blueprint=sweep.layout(),
-    )

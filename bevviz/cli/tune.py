@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from bevviz.cli.options import Commands, add_bag, add_config, add_output
-from bevviz.cli.run import has_display, hint, say, terminable
+from bevviz.cli.run import has_display, hint, outputs, say, terminable
 from bevviz.errors import UserError
 
 if TYPE_CHECKING:
@@ -39,7 +39,7 @@ def add(commands: Commands) -> None:
 def _tune(options: argparse.Namespace) -> int:
     from bevviz.config import dump, load
     from bevviz.live.settings import Settings
-    from bevviz.logging.sinks import free_port, open_recording
+    from bevviz.logging.sinks import free_port
     from bevviz.tune import Tuner, create
 
     model = [f"detector.model={options.model}"] if options.model else []
@@ -53,17 +53,7 @@ def _tune(options: argparse.Namespace) -> int:
     if options.save is None and serve is None and options.connect is None and not viewer:
         viewer = has_display()
         serve = None if viewer else free_port(9090)
-    with open_recording(
-        scene,
-        settings.config,
-        save=options.save,
-        serve=serve,
-        connect=options.connect,
-        spawn=viewer,
-        blueprint=options.blueprint,
-    ) as sinks:
-        for url in sinks.urls:
-            say(f"viewer at {url}")
+    with outputs(scene, settings.config, options, serve=serve, spawn=viewer) as sinks:
         hint(scene, settings.config)
         for warning in warnings:
             say(f"warning: {warning}")

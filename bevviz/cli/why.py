@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import TYPE_CHECKING
 
 from bevviz.cli.options import Commands, add_bag, add_config, add_output, load_config, positive
-from bevviz.cli.run import say, terminable, wait_for_interrupt
+from bevviz.cli.run import outputs, say, serve, terminable
 from bevviz.errors import UserError
 
 if TYPE_CHECKING:
@@ -138,20 +138,9 @@ def _show(
     result: FrameResult, config: Config, answers: Sequence[Answer], scene: Scene, options: argparse.Namespace
 ) -> None:
     from bevviz.logging.logger import Logger
-    from bevviz.logging.sinks import open_recording
     from bevviz.logging.why import log_answers
 
-    with open_recording(
-        scene,
-        config,
-        save=options.save,
-        serve=options.serve,
-        connect=options.connect,
-        spawn=options.viewer,
-        blueprint=options.blueprint,
-    ) as sinks:
-        for url in sinks.urls:
-            say(f"viewer at {url}")
+    with outputs(scene, config, options) as sinks:
         logger = Logger(sinks.recording, config, scene)
         logger.log_static()
         logger.log(result)
@@ -159,6 +148,4 @@ def _show(
         if options.save is not None:
             say(f"saved in {options.save}")
         if options.serve is not None:
-            say("serving until Ctrl-C")
-            sinks.recording.flush()
-            wait_for_interrupt()
+            serve(sinks.recording)

@@ -28,7 +28,6 @@ from bevviz.frame import (
 from bevviz.live.settings import differences as config_differences
 from bevviz.logging import entities
 from bevviz.logging.logger import Logger
-from bevviz.logging.pieces import world_pose
 from bevviz.sources import Scene
 from bevviz.variants import Variants, check_same_frames, common_frames
 
@@ -80,7 +79,7 @@ class Comparison:
                 self.without += 1
                 return
             found = differences(frame.index, frame.stamp, seen(a), seen(b))
-            log.log(found, frame.received, world_pose(frame))
+            log.log(found, frame.received, frame.pose)
             self.summary.add(found)
 
         return handle

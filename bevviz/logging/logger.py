@@ -40,7 +40,7 @@ from bevviz.frame import (
 )
 from bevviz.logging import entities, tracks
 from bevviz.logging.entities import ClassId
-from bevviz.logging.pieces import CORNER, boxes3d, transform, world_pose
+from bevviz.logging.pieces import CORNER, boxes3d, transform
 from bevviz.logging.text import markdown, remarks
 from bevviz.logging.writer import Writer
 from bevviz.sources import Scene
@@ -259,7 +259,7 @@ class Logger(Writer):
 
     def _log_cloud(self, result: FrameResult) -> None:
         frame = result.frame
-        world_from_points = world_pose(frame)
+        world_from_points = frame.pose
         self._put(entities.sensor(frame.lidar), transform(world_from_points))
         if self._config.logging.raw_cloud and not self._root:
             classes = np.zeros(len(frame.points), np.uint16)
@@ -400,7 +400,7 @@ class Logger(Writer):
                 ids[j], speeds[j] = result.tracks.id[row], result.tracks.speed[row]
         self._put(
             entities.FUSED,
-            transform(world_pose(result.frame)),
+            transform(result.frame.pose),
             boxes3d(
                 objects.boxes,
                 np.arange(len(objects)),
@@ -436,7 +436,7 @@ class Logger(Writer):
             return
         trails, colors = tracks.trails(tracked, rows), tracks.class_ids(tracked.id[rows])
         self._put(entities.TRAILS, rr.LineStrips3D(trails, class_ids=colors))
-        points_from_world = geometry.inverse(world_pose(frame))
+        points_from_world = geometry.inverse(frame.pose)
         self._put(
             entities.overlay("trails"),
             rr.LineStrips2D([self._seen_from_above(points_from_world, t) for t in trails], class_ids=colors),
@@ -506,7 +506,7 @@ class Logger(Writer):
             level = float(np.median(heights)) if len(heights) else 0.0
         self._put(
             entities.GRID,
-            transform(world_pose(result.frame)),
+            transform(result.frame.pose),
             rr.GridMap(
                 data=grid.tobytes(),
                 format=rr.components.ImageFormat(
@@ -523,7 +523,7 @@ class Logger(Writer):
     # --- what others state ---------------------------------------------------------------------
 
     def _log_others(self, frame: Frame) -> None:
-        world_from_points = world_pose(frame)
+        world_from_points = frame.pose
         if frame.truth is not None and len(frame.truth.boxes):
             self._log_stated(entities.TRUTH, frame.truth, None)
             self._log_outlines("ground_truth", frame.truth, world_from_points, _TRUTH_COLOR)
@@ -733,7 +733,7 @@ def _camera_pose(frame: Frame, result: CameraResult) -> F64 | None:
     if camera.world_from_camera is not None:
         return camera.world_from_camera
     if camera.camera_from_points is not None:
-        return world_pose(frame) @ geometry.inverse(camera.camera_from_points)
+        return frame.pose @ geometry.inverse(camera.camera_from_points)
     return None
 
 

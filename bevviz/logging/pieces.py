@@ -8,13 +8,9 @@ import numpy as np
 import rerun as rr
 
 from bevviz import geometry
-from bevviz.frame import F64, Boxes3D, Frame
+from bevviz.frame import F64, Boxes3D
 
 CORNER = 0.5  # pixels: Rerun counts from the corner of the first pixel, bevviz from its centre
-
-
-def world_pose(frame: Frame) -> F64:
-    return np.eye(4) if frame.world_from_points is None else frame.world_from_points
 
 
 def transform(world_from_entity: F64) -> rr.Transform3D:

@@ -8,8 +8,9 @@ import numpy as np
 import rerun as rr
 
 from bevviz import geometry
-from bevviz.frame import F32, F64, Boxes3D, Camera, Frame
+from bevviz.frame import F32, Boxes3D, Camera, Frame
 from bevviz.logging import entities
+from bevviz.logging.pieces import CORNER, transform
 from bevviz.why.answer import Answer
 from bevviz.why.evidence import Fate
 from bevviz.why.subject import projected
@@ -24,7 +25,6 @@ COLORS = {
     Fate.IN_FRONT: (80, 140, 255),
 }
 _SUBJECT = (255, 60, 200)
-_CORNER = 0.5  # pixels: Rerun counts from the corner of the first pixel, bevviz from its centre
 _EDGES = [0, 1, 2, 3, 0, 4, 5, 1, 5, 6, 2, 6, 7, 3, 7, 4]  # every edge of a frustum in one stroke
 _DEPTH = 20.0  # metres that a frustum is drawn to where the distance is unknown
 
@@ -39,7 +39,7 @@ def log_answers(recording: rr.RecordingStream, frame: Frame, answers: Sequence[A
         shown: how many of them are drawn.
     """
     recording.log(entities.WHY, rr.TextDocument(markdown(answers, shown), media_type=rr.MediaType.MARKDOWN))
-    pose = np.eye(4) if frame.world_from_points is None else frame.world_from_points
+    pose = transform(frame.pose)
     drawn = answers[:shown]
     fate = np.zeros(len(frame.points), np.uint8)
     for answer in reversed(drawn):
@@ -49,7 +49,7 @@ def log_answers(recording: rr.RecordingStream, frame: Frame, answers: Sequence[A
         colors = np.zeros((len(Fate), 3), np.uint8)
         colors[list(COLORS)] = list(COLORS.values())
         points = rr.Points3D(frame.points[known], colors=colors[fate[known]], radii=rr.Radius.ui_points(4.0))
-        recording.log(entities.why("points"), _pose(pose), points)
+        recording.log(entities.why("points"), pose, points)
     strips = [_edges(a.subject.box, a.subject.name) for a in drawn if a.subject.box is not None]
     strips += [strip for camera in frame.cameras for strip in _frustums(camera, drawn)]
     if strips:
@@ -57,7 +57,7 @@ def log_answers(recording: rr.RecordingStream, frame: Frame, answers: Sequence[A
         place = rr.LineStrips3D(
             lines, colors=[_SUBJECT], radii=rr.Radius.ui_points(2.0), labels=names, show_labels=True
         )
-        recording.log(entities.why("place"), _pose(pose), place)
+        recording.log(entities.why("place"), pose, place)
     for camera in frame.cameras:
         _log_image(recording, camera, drawn)
 
@@ -85,7 +85,7 @@ def _log_image(recording: rr.RecordingStream, camera: Camera, answers: Sequence[
         own = s.xyxy if s.camera == camera.name else None
         box = projected(s.box, camera) if s.box is not None else own
         if box is not None:
-            boxes.append(box + _CORNER)
+            boxes.append(box + CORNER)
             names.append(s.name)
     if boxes:
         recording.log(
@@ -99,10 +99,3 @@ def _log_image(recording: rr.RecordingStream, camera: Camera, answers: Sequence[
                 draw_order=40.0,
             ),
         )
-
-
-def _pose(world_from_points: F64) -> rr.Transform3D:
-    return rr.Transform3D(
-        translation=world_from_points[:3, 3],
-        quaternion=rr.Quaternion(xyzw=geometry.quaternion(world_from_points)),
-    )

@@ -118,7 +118,7 @@ class Tracker:
             self._state, self._stamps, self._frame, dt = _State.empty(), [], place, 0.0
             self._state.votes = np.zeros((0, len(self._classes)))
         kept = np.flatnonzero(clusters.state == ClusterState.KEPT)
-        pose = np.eye(4) if frame.world_from_points is None else frame.world_from_points
+        pose = frame.pose
         boxes = _placed(clusters.obb, kept, pose)
 
         self._predict(dt, config)
