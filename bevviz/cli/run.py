@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import gc
 import os
 import signal
 import sys
@@ -157,6 +158,7 @@ def through(items: Items[T], work: Callable[[T], R], handle: Callable[[R], None]
     from bevviz.sources.prefetch import prefetch
 
     done = 0
+    gc.freeze()  # what was imported stays: it need not be looked through again and again
     try:
         with (
             terminable() as ended,

@@ -26,6 +26,7 @@ from bevviz.frame import (
     Pairs,
 )
 from bevviz.geometry import apply, iou
+from bevviz.stages.kernel import kernel
 
 # What makes a cluster look like a detection, each from 0 to 1 (see ``fuse``).
 IOU_WEIGHT, SHARE_WEIGHT, NEARNESS_WEIGHT = 0.6, 0.25, 0.15
@@ -164,6 +165,7 @@ def in_view(cameras: Sequence[CameraResult], count: int) -> Bool:
     return seen
 
 
+@kernel
 def assign(cost: F64, unmatched: float) -> I32:
     """Optimal one-to-one assignment in which a row may also stay alone.
 
@@ -179,34 +181,42 @@ def assign(cost: F64, unmatched: float) -> I32:
         (R,) column of each row, -1 for alone, of least total cost.
     """
     rows, columns = cost.shape
-    cost = np.hstack([cost, np.full((rows, rows), unmatched)])
     u, v = np.zeros(rows), np.zeros(columns + rows)
-    column_of, row_of = np.full(rows, -1), np.full(columns + rows, -1)
+    column_of = np.full(rows, -1, np.int32)
+    row_of = np.full(columns + rows, -1, np.int32)
+    shortest = np.empty(columns + rows)  # path costs from a start to each column
+    before = np.empty(columns + rows, np.int32)  # row before each column on that path
+    done = np.empty(columns + rows, np.bool_)
     for start in range(rows):
-        shortest = np.full(columns + rows, np.inf)  # path costs from start to each column
-        before = np.full(columns + rows, -1)  # row before each column on that path
-        done = np.zeros(columns + rows, bool)
+        shortest[:], before[:], done[:] = np.inf, -1, False
         row, length = start, 0.0
         while True:
-            through = length + cost[row] - u[row] - v
-            shorter = ~done & (through < shortest)
-            shortest[shorter], before[shorter] = through[shorter], row
-            sink = int(np.argmin(np.where(done, np.inf, shortest)))
+            sink = -1
+            for c in range(columns + rows):
+                if done[c]:
+                    continue
+                through = length + (cost[row, c] if c < columns else unmatched) - u[row] - v[c]
+                if through < shortest[c]:
+                    shortest[c], before[c] = through, row
+                if sink < 0 or shortest[c] < shortest[sink]:
+                    sink = c
             length = shortest[sink]
             if row_of[sink] < 0:
                 break
             done[sink] = True
             row = row_of[sink]
         u[start] += length
-        u[row_of[done]] += length - shortest[done]
-        v[done] -= length - shortest[done]
+        for c in np.flatnonzero(done):
+            u[row_of[c]] += length - shortest[c]
+            v[c] -= length - shortest[c]
         while True:
             row = before[sink]
             row_of[sink] = row
             column_of[row], sink = sink, column_of[row]
             if row == start:
                 break
-    return np.where(column_of < columns, column_of, -1).astype(np.int32)
+    column_of[column_of >= columns] = -1
+    return column_of
 
 
 def _boxes_around(uv: F32, labels: I32, count: int) -> F32:
