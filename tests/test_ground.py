@@ -162,14 +162,17 @@ coordinates = st.floats(-99, 99, width=32)
 @settings(deadline=None)
 @given(hnp.arrays(np.float32, st.tuples(st.integers(1, 50), st.just(3)), elements=coordinates))
 def test_places_in_the_polar_grid(points: F32) -> None:
-    sectors = 180
-    ring, sector = _place(points, sectors)
+    rings, sectors = 30, 180
+    ring, sector, order, start = _place(points, rings, sectors)
     assert ring.dtype == sector.dtype == np.float32
     assert ((sector >= 0) & (sector < sectors)).all()
     for (x, y, _), r, s in zip(points.tolist(), ring.tolist(), sector.tolist(), strict=True):
         assert r == pytest.approx(RING_COUNT * math.asinh(math.hypot(x, y) / RING_SCALE), rel=1e-4, abs=1e-4)
         turn = abs(s - math.atan2(y, x) % math.tau / math.tau * sectors)
         assert min(turn, sectors - turn) < 1e-3
+    bins = np.minimum(ring.astype(int), rings - 1) * sectors + sector.astype(int)
+    assert sorted(order.tolist()) == list(range(len(points)))
+    assert bins[order].tolist() == np.repeat(np.arange(rings * sectors), np.diff(start)).tolist()
 
 
 @settings(deadline=None, max_examples=15)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from bevviz.colors import class_color, turbo
 from bevviz.config import BevConfig
-from bevviz.frame import F32, I32, I64, U8, Bev, Bool, Boxes3D, Clusters, ClusterState, Objects
+from bevviz.frame import F32, I32, U8, Bev, Bool, Boxes3D, Clusters, ClusterState, Objects
 from bevviz.geometry import corners
 from bevviz.stages.kernel import kernel
 
@@ -73,30 +73,28 @@ def bev(
     if ground is None:
         missing.add("occupancy")
     channels = [name for name in config.channels if name not in missing]
-    shaded = ("density", "height", "occupancy") if config.style == "rich" else ()
-    grids = _rasterise(cell, points, intensity, ground, shape, {*channels, *shaded})
-
     if config.style == "reference":
         image = np.zeros((*shape, 3), np.uint8)
-        _paint(cell, image.reshape(-1, 3), np.array(_POINT, np.uint8))
+        _paint(cell, image, np.array(_POINT, np.uint8))
         if objects is not None:
             _draw_reference(image, objects, scale)
     else:
         image = _background(*shape, config.range_x, config.range_y, config.resolution).copy()
-        bottom = _ground_level(points, ground)
-        seen = np.flatnonzero(grids["occupancy"] != UNKNOWN)
-        _shade(
-            seen,
-            grids["density"].ravel(),
-            grids["height"].ravel(),
-            grids["occupancy"].ravel(),
-            _obstacle_shades(),
-            _ground_shades(),
-            bottom,
-            _HEIGHT_SPAN,
-            image.reshape(-1, 3),
+    grids: dict[str, NDArray[Any]] = {}
+    if channels or config.style == "rich":
+        known = np.zeros(0, np.bool_) if ground is None else ground
+        wanted = {"density", "height", "occupancy"} if config.style == "rich" else set(channels)
+        count, top = bool(wanted & {"density", "intensity"}), "height" in wanted
+        density, height, occupancy, seen = _raster(
+            cell, points, known, *shape, count, top, "occupancy" in wanted
         )
-        _draw_rich(image, objects, clusters, config)
+        grids = {"density": density, "height": height, "occupancy": occupancy}
+        if intensity is not None and "intensity" in channels:
+            grids["intensity"] = _mean(cell, np.ascontiguousarray(intensity, np.float32), density)
+        if config.style == "rich":
+            shades, level = (_obstacle_shades(), _ground_shades()), _ground_level(points, known)
+            _shade(seen, density, height, occupancy, *shades, level, _HEIGHT_SPAN, image)
+            _draw_rich(image, objects, clusters, config)
 
     return Bev(
         resolution=config.resolution,
@@ -122,53 +120,51 @@ def _cells(points: F32, scale: F32, rows: int, columns: int) -> I32:
     return cell
 
 
-def _rasterise(
-    cell: I32,
-    points: F32,
-    intensity: NDArray[Any] | None,
-    ground: Bool | None,
-    shape: tuple[int, int],
-    wanted: set[str],
-) -> dict[str, NDArray[Any]]:
-    grids: dict[str, NDArray[Any]] = {}
-    if wanted & {"density", "intensity"}:
-        grids["density"] = np.zeros(shape, np.int32)
-        _count(cell, grids["density"].ravel())
-    if "height" in wanted:
-        grids["height"] = np.full(shape, np.nan, np.float32)
-        _highest(cell, points, grids["height"].ravel())
-    if "occupancy" in wanted:
-        grids["occupancy"] = np.full(shape, UNKNOWN, np.int8)
-        _occupy(cell, np.zeros(len(cell), np.bool_) if ground is None else ground, grids["occupancy"].ravel())
-    if "intensity" in wanted:
-        total = np.zeros(shape, np.float32)
-        _add(cell, np.ascontiguousarray(intensity, np.float32), total.ravel())
-        with np.errstate(invalid="ignore"):
-            grids["intensity"] = np.divide(
-                total, grids["density"], out=total, dtype=np.float32, casting="unsafe"
-            )
-    return grids
-
-
 @kernel
 def _paint(cell: I32, image: U8, color: U8) -> None:
+    pixels = image.reshape(-1, 3)
     for i in range(len(cell)):
         if cell[i] >= 0:
-            image[cell[i]] = color
+            pixels[cell[i]] = color
 
 
 @kernel
-def _count(cell: I32, density: I32) -> None:
+def _raster(
+    cell: I32, points: F32, ground: Bool, rows: int, columns: int, count: bool, top: bool, state: bool
+) -> tuple[I32, F32, NDArray[np.int8], I32]:
+    """Density, height and occupancy, each where it is wanted, and, counted, the cells that hold a point.
+
+    Without ``ground`` all is obstacle.
+    """
+    cells = rows * columns
+    density, seen = np.zeros(cells if count else 0, np.int32), np.empty(cells if count else 0, np.int32)
+    height = np.full(cells if top else 0, np.nan, np.float32)
+    occupancy = np.full(cells if state else 0, UNKNOWN, np.int8)
+    found = _count(cell, density, seen) if count else 0
+    if top:
+        _highest(cell, points, height)
+    if state:
+        _occupy(cell, ground if len(ground) else np.zeros(len(cell), np.bool_), occupancy)
+    shape = -1, columns
+    return density.reshape(shape), height.reshape(shape), occupancy.reshape(shape), seen[:found]
+
+
+@kernel
+def _count(cell: I32, density: I32, seen: I32) -> int:
+    found = 0
     for i in range(len(cell)):
         if cell[i] >= 0:
+            # Written always: there is no branch to mispredict.
+            seen[min(found, len(seen) - 1)] = cell[i]
+            found += density[cell[i]] == 0
             density[cell[i]] += 1
+    return found
 
 
 @kernel
 def _highest(cell: I32, points: F32, height: F32) -> None:
     for i in range(len(cell)):
         if cell[i] >= 0:
-            # Written always: there is no branch to mispredict.
             z, highest = points[i, 2], height[cell[i]]
             height[cell[i]] = highest if z <= highest else z
 
@@ -181,15 +177,19 @@ def _occupy(cell: I32, ground: Bool, occupancy: NDArray[np.int8]) -> None:
 
 
 @kernel
-def _add(cell: I32, intensity: F32, total: F32) -> None:
+def _mean(cell: I32, intensity: F32, density: I32) -> F32:
+    total, count = np.zeros(density.size, np.float32), density.ravel()
     for i in range(len(cell)):
         if cell[i] >= 0:
             total[cell[i]] += intensity[i]
+    for c in range(len(total)):
+        total[c] /= np.float32(count[c])
+    return total.reshape(density.shape)
 
 
 @kernel
 def _shade(
-    cells: I64,
+    seen: I32,
     density: I32,
     height: F32,
     occupancy: NDArray[np.int8],
@@ -200,12 +200,26 @@ def _shade(
     image: U8,
 ) -> None:
     """Ground by density, obstacles by their height above ``bottom``."""
-    for cell in cells:
-        if occupancy[cell] == OCCUPIED:
-            level = (height[cell] - bottom) / span * len(heights)
-            image[cell] = heights[max(0, min(len(heights) - 1, int(level)))]
+    points, top, state = density.ravel(), height.ravel(), occupancy.ravel()
+    pixels = image.reshape(-1, 3)
+    for cell in seen:
+        if state[cell] == OCCUPIED:
+            level = (top[cell] - bottom) / span * len(heights)
+            pixels[cell] = heights[max(0, min(len(heights) - 1, int(level)))]
         else:
-            image[cell] = ground[min(density[cell], len(ground)) - 1]
+            pixels[cell] = ground[min(points[cell], len(ground)) - 1]
+
+
+@kernel
+def _ground_level(points: F32, ground: Bool) -> float:
+    """Median z of the ground, else the height that a sensor on a car stands at."""
+    below = np.empty(len(ground))
+    count = 0
+    for i in range(0, len(ground), 1 + len(ground) // 2_000):
+        if ground[i]:
+            below[count] = points[i, 2]
+            count += 1
+    return np.median(below[:count]) if count > 0 else -1.7
 
 
 # --- drawing -----------------------------------------------------------------------------------
@@ -290,13 +304,6 @@ def _background(rows: int, columns: int, range_x: float, range_y: float, resolut
     cv2.fillPoly(image, [arrow.astype(np.int32)], (255, 255, 255), cv2.LINE_AA)
     image.flags.writeable = False
     return image
-
-
-def _ground_level(points: F32, ground: Bool | None) -> float:
-    """Median z of the ground, else the height that a sensor on a car stands at."""
-    sample = slice(None, None, 1 + len(points) // 2_000)
-    below = points[sample, 2][ground[sample]] if ground is not None else points[:0, 2]
-    return float(np.median(below)) if len(below) else -1.7
 
 
 @lru_cache(maxsize=1)

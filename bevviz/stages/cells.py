@@ -1,17 +1,19 @@
-"""Points binned in cells: packed keys, their numbering and a counting sort."""
+"""Points binned in cells: packed keys, their numbering, and sorts by them."""
 
 from __future__ import annotations
-
-import math
 
 import numpy as np
 
 from bevviz.frame import F32, F64, I32, I64
 from bevviz.stages.kernel import kernel
 
+DIGIT = 11  # bits that one pass of a radix sort looks at: its counters stay in the first cache
+
 
 def cell_keys(points: F32, size: float, shift: float = 0.0, reach: int = 0) -> tuple[I64, I64]:
-    """Pack the integer cell of each point into one int64, z fastest.
+    """Pack the integer cell of each point into one int64, the longest axis slowest, the shortest fastest.
+
+    So a row of neighbouring cells holds few others.
 
     Args:
         points: (N, 3) float32 finite points, N > 0.
@@ -20,24 +22,72 @@ def cell_keys(points: F32, size: float, shift: float = 0.0, reach: int = 0) -> t
         reach: largest offset in cells that the caller will add to a key.
 
     Returns:
-        keys: (N,) the packed cells; unequal cells have unequal keys.
-        strides: (3,) ``keys + offset @ strides`` are the keys at an offset of up to ``reach`` cells.
+        keys: (N,) the packed cells, not negative; unequal cells have unequal keys.
+        strides: (3,) for x, y, z: ``keys + offset @ strides`` are the keys at an offset of up to ``reach``
+            cells.
     """
+    keys, strides = _pack(points, size, shift, reach)
+    if strides.any():
+        return keys, strides
+    # Scattered too widely for 64 bits: shorten the gaps along each axis that nothing reaches over.
+    low, _ = bounds(points)
+    columns = []
+    for axis in range(3):
+        cells = np.floor((points[:, axis] - (low[axis] - shift * size)) / size)
+        layers, layer = np.unique(cells, return_inverse=True)
+        steps = np.minimum(np.diff(layers, prepend=layers[0]), reach + 1)
+        columns.append(np.cumsum(steps).astype(np.int64)[layer])
+    strides = _strides(np.array([column.max() + 1.0 + 2 * reach for column in columns]))
+    return np.stack(columns, axis=1) @ strides, strides
+
+
+@kernel
+def _pack(points: F32, size: float, shift: float, reach: int) -> tuple[I64, I64]:
+    """The keys, and strides that are zero where 64 bits are too few for them."""
     low, high = bounds(points)
     origin = low - shift * size
     counts = np.floor((high - origin) / size) + 1 + 2 * reach
-    if math.prod(counts.tolist()) < 2**62:
-        strides = np.array([counts[1] * counts[2], counts[2], 1], np.int64)
-        return _pack(points, origin, size, strides), strides
-    # Scattered too widely for 64 bits: shorten the gaps along each axis that nothing reaches over.
-    columns = []
-    for axis in range(3):
-        layers, layer = np.unique(np.floor((points[:, axis] - origin[axis]) / size), return_inverse=True)
-        steps = np.minimum(np.diff(layers, prepend=layers[0]), reach + 1)
-        columns.append(np.cumsum(steps).astype(np.int64)[layer])
-    _, ny, nz = (int(column.max()) + 1 + 2 * reach for column in columns)
-    strides = np.array([ny * nz, nz, 1], np.int64)
-    return np.stack(columns, axis=1) @ strides, strides
+    keys = np.empty(len(points), np.int64)
+    if counts[0] * counts[1] * counts[2] >= 2.0**62:
+        return keys, np.zeros(3, np.int64)
+    strides = _strides(counts)
+    for i in range(len(points)):
+        # The coordinates are not negative, so that truncation is the floor.
+        x = np.int64((points[i, 0] - origin[0]) / size)
+        y = np.int64((points[i, 1] - origin[1]) / size)
+        z = np.int64((points[i, 2] - origin[2]) / size)
+        keys[i] = x * strides[0] + y * strides[1] + z * strides[2]
+    return keys, strides
+
+
+@kernel
+def _strides(counts: F64) -> I64:
+    slow, fast = 0, 2
+    for axis in range(1, 3):
+        if counts[axis] > counts[slow]:
+            slow = axis
+    for axis in range(1, -1, -1):
+        if counts[axis] < counts[fast]:
+            fast = axis
+    if slow == fast:  # all alike
+        slow, fast = 0, 2
+    middle = 3 - slow - fast
+    strides = np.ones(3, np.int64)
+    strides[middle] = np.int64(counts[fast])
+    strides[slow] = np.int64(counts[fast]) * np.int64(counts[middle])
+    return strides
+
+
+@kernel
+def bounds(points: F32) -> tuple[F64, F64]:
+    """(3,) lowest and (3,) highest coordinates of one point or more."""
+    x0, y0, z0 = points[0]
+    x1, y1, z1 = points[0]
+    for i in range(len(points)):
+        x, y, z = points[i]
+        x0, y0, z0 = min(x, x0), min(y, y0), min(z, z0)
+        x1, y1, z1 = max(x, x1), max(y, y1), max(z, z1)
+    return np.array([x0, y0, z0], np.float64), np.array([x1, y1, z1], np.float64)
 
 
 @kernel
@@ -75,6 +125,40 @@ def group(keys: I64) -> tuple[I32, I32]:
 
 
 @kernel
+def sort_by_key(keys: I64) -> tuple[I32, I32]:
+    """Sort indices by keys that are not negative, by radix; stable.
+
+    Returns:
+        order: (N,) int32 indices, equal keys side by side.
+        start: (M + 1,) int32, ``order[start[k]:start[k + 1]]`` are the indices with the k-th unequal key.
+    """
+    n = len(keys)
+    order, other = np.arange(n).astype(np.int32), np.empty(n, np.int32)
+    highest = keys.max()
+    shift = 0
+    while highest >> shift > 0:
+        end = np.zeros((1 << DIGIT) + 1, np.int32)
+        for i in range(n):
+            end[((keys[i] >> shift) & ((1 << DIGIT) - 1)) + 1] += 1
+        for k in range(1 << DIGIT):
+            end[k + 1] += end[k]
+        for point in order:
+            digit = (keys[point] >> shift) & ((1 << DIGIT) - 1)
+            other[end[digit]] = point
+            end[digit] += 1
+        order, other = other, order
+        shift += DIGIT
+    start = np.empty(n + 1, np.int32)
+    found = 0
+    for k in range(n):
+        if k == 0 or keys[order[k]] != keys[order[k - 1]]:
+            start[found] = k
+            found += 1
+    start[found] = n
+    return order, start[: found + 1].copy()
+
+
+@kernel
 def sort_by(number: I32, count: int) -> tuple[I32, I32]:
     """Sort indices by the number of each, numbers in [0, count), by counting; stable.
 
@@ -93,27 +177,3 @@ def sort_by(number: I32, count: int) -> tuple[I32, I32]:
         order[end[number[i]]] = i
         end[number[i]] += 1
     return order, start
-
-
-@kernel
-def bounds(points: F32) -> tuple[F64, F64]:
-    """(3,) lowest and (3,) highest coordinates of one point or more."""
-    x0, y0, z0 = points[0]
-    x1, y1, z1 = points[0]
-    for i in range(len(points)):
-        x, y, z = points[i]
-        x0, y0, z0 = min(x, x0), min(y, y0), min(z, z0)
-        x1, y1, z1 = max(x, x1), max(y, y1), max(z, z1)
-    return np.array([x0, y0, z0], np.float64), np.array([x1, y1, z1], np.float64)
-
-
-@kernel
-def _pack(points: F32, origin: F64, size: float, strides: I64) -> I64:
-    keys = np.empty(len(points), np.int64)
-    for i in range(len(points)):
-        # The coordinates are not negative, so that truncation is the floor.
-        x = np.int64((points[i, 0] - origin[0]) / size)
-        y = np.int64((points[i, 1] - origin[1]) / size)
-        z = np.int64((points[i, 2] - origin[2]) / size)
-        keys[i] = x * strides[0] + y * strides[1] + z * strides[2]
-    return keys

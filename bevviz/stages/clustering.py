@@ -8,7 +8,7 @@ import numpy as np
 
 from bevviz.config import ClusteringConfig
 from bevviz.frame import F32, F64, I32, I64, Boxes3D, Clusters, ClusterState
-from bevviz.stages.cells import bounds, cell_keys, group, sort_by
+from bevviz.stages.cells import cell_keys, sort_by, sort_by_key
 from bevviz.stages.kernel import kernel, unordered_kernel
 
 MIN_SIZE = 0.01  # metres: no box is thinner, so that each has a volume and can be drawn and hit
@@ -27,9 +27,7 @@ def cluster(points: F32, config: ClusteringConfig) -> Clusters:
         shorter than ``MIN_SIZE``.
     """
     labels = dbscan(points, config.eps, config.min_points)
-    order, start = sort_by(labels + 1, int(labels.max(initial=-1)) + 2)
-    centroid, low, high, oriented = _boxes(points, order, start[1:])
-    count = np.diff(start[1:])
+    count, centroid, low, high, oriented = _boxes(points, labels)
     state = np.full(len(count), ClusterState.KEPT, np.int32)
     state[count < config.min_cluster_points] = ClusterState.TOO_SMALL
     if config.max_cluster_points is not None:
@@ -60,27 +58,26 @@ def dbscan(points: F32, eps: float, min_points: int) -> I32:
     if len(points) == 0:
         return np.zeros(0, np.int32)
     # A hair less than eps / sqrt(3), so that rounding never puts points eps apart into one cell.
-    # The longest axis first and the shortest last, so that a row of neighbouring cells holds few others.
-    low, high = bounds(points)
-    axes = np.argsort(low - high)
-    keys, strides = cell_keys(points[:, axes], eps / math.sqrt(3) * (1 - 1e-6), reach=2)
-    cell, first = group(keys)
-    keys = keys[first]
-    by_key = np.argsort(keys)
-    rank = np.empty(len(by_key), np.int32)
-    rank[by_key] = np.arange(len(by_key), dtype=np.int32)
-    order, start = sort_by(rank[cell], len(rank))
-    x, y, z = np.ascontiguousarray(points.take(order, axis=0).T)
-    box = _cell_boxes(x, y, z, start)
-    near, neighbours = _adjacent(keys[by_key], strides, box, eps * eps)
-    cores = _core_points(x, y, z, order, start, box, near, neighbours, eps * eps, min_points)
-    parent = _join(x, y, z, start, cores, box, near, neighbours, eps * eps)
-    return _label(x, y, z, order, start, cores, parent, near, neighbours, eps * eps)
+    keys, strides = cell_keys(points, eps / math.sqrt(3) * (1 - 1e-6), reach=2)
+    return _dbscan(points, keys, np.sort(strides)[::-1], eps * eps, min_points)
 
 
 # --- DBSCAN ------------------------------------------------------------------------------------
 # Points are sorted by cell: those of cell c are start[c]:start[c + 1], its core points come first. The cells
 # that may hold neighbours of c's points are neighbours[near[c]:near[c + 1]].
+
+
+@kernel
+def _dbscan(points: F32, keys: I64, strides: I64, eps2: float, min_points: int) -> I32:
+    order, start = sort_by_key(keys)
+    x, y, z = np.empty_like(points[:, 0]), np.empty_like(points[:, 1]), np.empty_like(points[:, 2])
+    for i in range(len(order)):
+        x[i], y[i], z[i] = points[order[i]]
+    box = _cell_boxes(x, y, z, start)
+    near, neighbours = _adjacent(keys[order[start[:-1]]], strides, box, eps2)
+    cores = _core_points(x, y, z, order, start, box, near, neighbours, eps2, min_points)
+    parent = _join(x, y, z, start, cores, box, near, neighbours, eps2)
+    return _label(x, y, z, order, start, cores, parent, near, neighbours, eps2)
 
 
 @kernel
@@ -330,12 +327,14 @@ def _heading(x: F64, y: F64) -> float:
 
 
 @kernel
-def _boxes(points: F32, order: I32, start: I32) -> tuple[F32, F32, F32, F32]:
-    """Centroid, lowest and highest corner, and oriented box (centre, size, yaw) of each cluster.
+def _boxes(points: F32, labels: I32) -> tuple[I32, F32, F32, F32, F32]:
+    """Points, centroid, lowest and highest corner, and oriented box (centre, size, yaw) of each cluster.
 
     The heading is found by L-shape fitting with the closeness criterion (Zhang et al. 2017), on at most
     about 256 points of a cluster spread evenly over it; the extent is that of all of them.
     """
+    order, start = sort_by(labels + np.int32(1), max(labels) + 2 if len(labels) else 1)
+    start = start[1:]  # the first are noise
     clusters = len(start) - 1
     centroid = np.empty((clusters, 3), np.float32)
     low = np.full((clusters, 3), np.inf, np.float32)
@@ -376,4 +375,4 @@ def _boxes(points: F32, order: I32, start: I32) -> tuple[F32, F32, F32, F32]:
             high[k, 2] - low[k, 2],
         )
         oriented[k, 6] = yaw
-    return centroid, low, high, oriented
+    return start[1:] - start[:-1], centroid, low, high, oriented

@@ -204,13 +204,13 @@ def assign(cost: F64, unmatched: float) -> I32:
             if row_of[sink] < 0:
                 break
             done[sink] = True
-            row = row_of[sink]
+            row = int(row_of[sink])
         u[start] += length
-        for c in np.flatnonzero(done):
-            u[row_of[c]] += length - shortest[c]
-            v[c] -= length - shortest[c]
+        for passed in np.flatnonzero(done):
+            u[row_of[passed]] += length - shortest[passed]
+            v[passed] -= length - shortest[passed]
         while True:
-            row = before[sink]
+            row = int(before[sink])
             row_of[sink] = row
             column_of[row], sink = sink, column_of[row]
             if row == start:

@@ -51,7 +51,7 @@ def _ransac(points: F32, config: GroundConfig) -> Ground:
     inliers = _largest_plane(points, config.distance_threshold, config)
     if not inliers.any():
         return _unknown(len(points))
-    plane = _fit(points.compress(inliers, axis=0))
+    plane = _fit(points, inliers)
     return Ground(inliers, _above(points, plane), plane)
 
 
@@ -59,9 +59,13 @@ def _unknown(count: int) -> Ground:
     return Ground(np.zeros(count, np.bool_), np.full(count, np.nan, np.float32))
 
 
+@kernel
 def _above(points: F32, plane: F64) -> F32:
     """(N,) signed distance of points from a plane a, b, c, d of unit normal."""
-    distance: F32 = points @ plane[:3].astype(np.float32) + np.float32(plane[3])
+    a, b, c, d = np.float32(plane[0]), np.float32(plane[1]), np.float32(plane[2]), np.float32(plane[3])
+    distance = np.empty(len(points), np.float32)
+    for i in range(len(points)):
+        distance[i] = a * points[i, 0] + b * points[i, 1] + c * points[i, 2] + d
     return distance
 
 
@@ -104,11 +108,9 @@ def _best_support(points: F32, anchor: F32, normal: F32, threshold: np.float32) 
     return near
 
 
-def _fit(points: F32) -> F64:
+def _fit(points: F32, inliers: Bool) -> F64:
     """(4,) plane, unit normal upwards, by least squares along the axis nearest to its normal, as Open3D's."""
-    center = points.mean(axis=0, dtype=np.float64)
-    r = points - center
-    scatter = r.T @ r
+    center, scatter = _moments(points, inliers)
     # The cofactors of the scatter matrix: the row with the largest diagonal one is the normal.
     cofactors = np.cross(scatter[[1, 2, 0]], scatter[[2, 0, 1]])
     normal = cofactors[np.argmax(np.diagonal(cofactors))]
@@ -116,50 +118,149 @@ def _fit(points: F32) -> F64:
     return np.append(normal, -normal @ center)
 
 
+@kernel
+def _moments(points: F32, chosen: Bool) -> tuple[F64, F64]:
+    """(3,) mean and (3, 3) scatter about it of the chosen points."""
+    center, scatter = np.zeros(3), np.zeros((3, 3))
+    count = 0
+    for i in range(len(points)):
+        if chosen[i]:
+            count += 1
+            for axis in range(3):
+                center[axis] += points[i, axis]
+    center /= count
+    for i in range(len(points)):
+        if chosen[i]:
+            x, y, z = points[i, 0] - center[0], points[i, 1] - center[1], points[i, 2] - center[2]
+            scatter[0, 0] += x * x
+            scatter[0, 1] += x * y
+            scatter[0, 2] += x * z
+            scatter[1, 1] += y * y
+            scatter[1, 2] += y * z
+            scatter[2, 2] += z * z
+    scatter[1, 0], scatter[2, 0], scatter[2, 1] = scatter[0, 1], scatter[0, 2], scatter[1, 2]
+    return center, scatter
+
+
 # --- a surface over rings and sectors ----------------------------------------------------------
 
 
 def _polar(points: F32, config: GroundConfig) -> Ground:
-    ring, sector = _place(points, config.sectors)
     rings = math.ceil(RING_COUNT * math.asinh(config.max_range / RING_SCALE))
-    # Beyond max_range the last ring goes on.
-    row = np.minimum(ring.astype(np.int32), rings - 1)
-    order, start = sort_by(row * config.sectors + sector.astype(np.int32), rings * config.sectors)
+    ring, sector, order, start = _place(points, rings, config.sectors)
     plane = _first_plane(points, order, start, config)
     if plane is None:
         return _unknown(len(points))
-    rise = _above(points, plane) / np.float32(plane[2])
     radius = RING_SCALE * np.sinh(np.arange(0.5, rings) / RING_COUNT)
     steepest = math.tan(math.radians(config.max_slope))
-    surface = _follow(rise, order, start, radius, config.sectors, config.max_step, steepest)
-    _settle(surface, rise, order, start, config.distance_threshold / 2)
-    height = _height(rise, ring, sector, surface)
-    return Ground(height < config.distance_threshold, height)
+    height, below = _heights(
+        points,
+        plane,
+        ring,
+        sector,
+        order,
+        start,
+        radius,
+        config.sectors,
+        config.max_step,
+        steepest,
+        config.distance_threshold,
+    )
+    return Ground(below, height)
 
 
 def _first_plane(points: F32, order: I32, start: I32, config: GroundConfig) -> F64 | None:
     """The ground around the sensor as a plane, from the lowest points of the bins."""
-    low = points.take(_lowest(points, order, start), axis=0)
-    distance = np.hypot(low[:, 0], low[:, 1])
     steepest = math.radians(config.max_slope)
-    if config.sensor_height is not None:
-        low = low[np.abs(low[:, 2] + config.sensor_height) < config.max_step + math.tan(steepest) * distance]
-        distance = np.hypot(low[:, 0], low[:, 1])
-    if np.count_nonzero(distance < NEAR) >= 3:
-        low = low[distance < NEAR]
+    expected = math.nan if config.sensor_height is None else -config.sensor_height
+    low = _near_ground(points, _lowest(points, order, start), expected, config.max_step, math.tan(steepest))
     inliers = _largest_plane(low, config.distance_threshold, config, math.cos(steepest))
-    return _fit(low[inliers]) if inliers.any() else None
+    return _fit(low, inliers) if inliers.any() else None
 
 
-def _place(points: F32, sectors: int) -> tuple[F32, F32]:
-    """Ring and sector of each point, with the fraction of the way through it."""
-    x, y = points[:, 0], points[:, 1]
-    ring: F32 = np.float32(RING_COUNT) * np.arcsinh(np.float32(1 / RING_SCALE) * np.sqrt(x * x + y * y))
-    sector: F32 = np.float32(sectors / (2 * math.pi)) * np.arctan2(y, x)
-    sector[sector < 0] += np.float32(sectors)
-    # Rounding takes a tiny negative angle to the whole turn, which is the first sector again.
-    sector[sector >= sectors] = 0
-    return ring, sector
+def _place(points: F32, rings: int, sectors: int) -> tuple[F32, F32, I32, I32]:
+    """Ring and sector of each point, with the fraction of the way through it; the points sorted by both."""
+    # NumPy has vectorised arcsinh and arctan2, which compiled loops have not.
+    ring, turn = np.arcsinh(_range(points)), np.arctan2(points[:, 1], points[:, 0])
+    return (ring, *_bin(ring, turn, rings, sectors))
+
+
+@kernel
+def _range(points: F32) -> F32:
+    """(N,) horizontal distance from the sensor, in units of RING_SCALE."""
+    scale = np.float32(1 / RING_SCALE)
+    found = np.empty(len(points), np.float32)
+    for i in range(len(points)):
+        found[i] = scale * np.sqrt(points[i, 0] * points[i, 0] + points[i, 1] * points[i, 1])
+    return found
+
+
+@kernel
+def _bin(ring: F32, turn: F32, rings: int, sectors: int) -> tuple[F32, I32, I32]:
+    """Sector of each point, and the points sorted by ring and sector.
+
+    ``ring`` comes in as arcsinh of the range and is scaled in place, ``turn`` in radians.
+    """
+    scale, whole = np.float32(sectors / (2 * math.pi)), np.float32(sectors)
+    sector = np.empty(len(ring), np.float32)
+    row = np.empty(len(ring), np.int32)
+    for i in range(len(ring)):
+        ring[i] *= np.float32(RING_COUNT)
+        s = scale * turn[i]
+        s += whole if s < 0 else np.float32(0)
+        # Rounding takes a tiny negative angle to the whole turn, which is the first sector again.
+        sector[i] = s if s < whole else np.float32(0)
+        # Beyond max_range the last ring goes on.
+        row[i] = min(int(ring[i]), rings - 1) * sectors + np.int32(sector[i])
+    order, start = sort_by(row, rings * sectors)
+    return sector, order, start
+
+
+@kernel
+def _near_ground(points: F32, lowest: I32, expected: float, max_step: float, steepest: float) -> F32:
+    """The lowest points that the first plane is sought in: those around the sensor where there are any.
+
+    ``expected``: height of the ground below the sensor, NaN where it is not known.
+    """
+    chosen = np.empty(len(lowest), np.int32)
+    distance = np.empty(len(lowest))
+    count = near = 0
+    for i in lowest:
+        reach = math.hypot(points[i, 0], points[i, 1])
+        if abs(points[i, 2] - expected) >= max_step + steepest * reach:
+            continue
+        chosen[count], distance[count] = i, reach
+        near += reach < NEAR
+        count += 1
+    low = np.empty((near if near >= 3 else count, 3), np.float32)
+    kept = 0
+    for k in range(count):
+        if near < 3 or distance[k] < NEAR:
+            low[kept] = points[chosen[k]]
+            kept += 1
+    return low
+
+
+@kernel
+def _heights(
+    points: F32,
+    plane: F64,
+    ring: F32,
+    sector: F32,
+    order: I32,
+    start: I32,
+    radius: F64,
+    sectors: int,
+    max_step: float,
+    steepest: float,
+    threshold: float,
+) -> tuple[F32, Bool]:
+    """(N,) height above the ground, and whether it is below the threshold."""
+    rise = _above(points, plane) / np.float32(plane[2])
+    surface = _follow(rise, order, start, radius, sectors, max_step, steepest)
+    _settle(surface, rise, order, start, threshold / 2)
+    height = _height(rise, ring, sector, surface)
+    return height, height < threshold
 
 
 @kernel

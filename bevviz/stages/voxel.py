@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from bevviz.config import VoxelConfig
-from bevviz.frame import F32, I32, Voxels
+from bevviz.frame import F32, I32, I64, Voxels
 from bevviz.stages.cells import cell_keys, group
 from bevviz.stages.kernel import kernel
 
@@ -27,21 +27,25 @@ def voxel_grid(points: F32, config: VoxelConfig) -> Voxels:
     if config.size == 0 or len(points) == 0:
         return Voxels(points, np.arange(len(points), dtype=np.int32))
     keys, _ = cell_keys(points, config.size, shift=0.5)
-    inverse, first = group(keys)
-    kept = _means(points, inverse, len(first)) if config.average else points.take(first, axis=0)
+    kept, inverse = _thin(points, keys, config.average)
     return Voxels(kept, inverse)
 
 
 @kernel
-def _means(points: F32, number: I32, count: int) -> F32:
-    total = np.zeros((count, 3))
-    size = np.zeros(count)
-    for i in range(len(points)):
-        size[number[i]] += 1
-        for axis in range(3):
-            total[number[i], axis] += points[i, axis]
-    means = np.empty((count, 3), np.float32)
-    for k in range(count):
-        for axis in range(3):
-            means[k, axis] = total[k, axis] / size[k]
-    return means
+def _thin(points: F32, keys: I64, average: bool) -> tuple[F32, I32]:
+    """One point for each unequal key, and which of them stands for each point."""
+    number, first = group(keys)
+    kept = np.empty((len(first), 3), np.float32)
+    for k in range(len(first)):
+        kept[k] = points[first[k]]
+    if average:
+        total = np.zeros((len(first), 3))
+        size = np.zeros(len(first))
+        for i in range(len(points)):
+            size[number[i]] += 1
+            for axis in range(3):
+                total[number[i], axis] += points[i, axis]
+        for k in range(len(first)):
+            for axis in range(3):
+                kept[k, axis] = total[k, axis] / size[k]
+    return kept, number
