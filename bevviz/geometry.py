@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -18,7 +20,7 @@ FISHEYE = ("equidistant", "fisheye")
 # --- rigid transforms --------------------------------------------------------------------------
 
 
-def transform(translation: FloatArray, quaternion_xyzw: FloatArray) -> F64:
+def transform(translation: Iterable[float], quaternion_xyzw: Iterable[float]) -> F64:
     """The (4, 4) matrix of a translation in metres and a rotation as quaternion x, y, z, w.
 
     The quaternion need not be of unit length, as published ones seldom are to the last digit.
@@ -26,19 +28,21 @@ def transform(translation: FloatArray, quaternion_xyzw: FloatArray) -> F64:
     Raises:
         ValueError: quaternion of zero length or not finite.
     """
-    q = np.asarray(quaternion_xyzw, np.float64)
-    norm = np.linalg.norm(q)
-    if not np.isfinite(norm) or norm < 1e-9:
-        raise ValueError(f"{tuple(float(v) for v in q)} is no rotation")
-    x, y, z, w = q / norm
-    m = np.eye(4)
-    m[:3, :3] = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-    ]
-    m[:3, 3] = translation
-    return m
+    q = tuple(map(float, quaternion_xyzw))
+    norm = math.hypot(*q)
+    if not math.isfinite(norm) or norm < 1e-9:
+        raise ValueError(f"{q} is no rotation")
+    # Number by number: a robot publishes hundreds a second, and for so few numbers NumPy's calls are slow.
+    x, y, z, w = (value / norm for value in q)
+    tx, ty, tz = map(float, translation)
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w), tx],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w), ty],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y), tz],
+            [0.0, 0.0, 0.0, 1.0],
+        ]
+    )
 
 
 def inverse(a_from_b: F64) -> F64:

@@ -62,6 +62,15 @@ def make_handlers(sync: Synchronizer, roles: Roles, decode: Callable[[M], Any]) 
         info = decode_camera_info(decode(message), rectified, message.topic)
         sync.add_camera_info(message.topic, info)
 
+    followed: list[str] = []  # the frame that odometry places
+
+    def add_odometry(message: M) -> None:
+        if followed and not sync.tf.needs_odometry(followed[0]):
+            return
+        transform = decode_odometry(decode(message), message.topic)
+        followed[:] = [transform.child]
+        sync.add_transform(transform, fallback=True)
+
     handlers: dict[str, Handler[M]] = {}
     for topic in roles.lidars:
         handlers[topic] = lambda m: sync.add_cloud(decode_cloud(decode(m), m.topic, m.received))
@@ -74,9 +83,7 @@ def make_handlers(sync: Synchronizer, roles: Roles, decode: Callable[[M], Any]) 
     for topic in roles.tf_static:
         handlers[topic] = partial(add_transforms, static=True)
     if roles.odometry:
-        handlers[roles.odometry] = lambda m: sync.add_transform(
-            decode_odometry(decode(m), m.topic), fallback=True
-        )
+        handlers[roles.odometry] = add_odometry
     for topic in roles.robot_detections_2d:
         handlers[topic] = lambda m: sync.add_detections(decode_detections_2d(decode(m), m.topic, m.received))
     for topic in roles.robot_detections_3d:

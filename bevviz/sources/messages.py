@@ -410,18 +410,14 @@ def _stamped(header: Any, child: str, translation: Any, rotation: Any, topic: st
     parent, child = _frame(header.frame_id), _frame(child)
     if not parent or not child or parent == child:
         raise MessageError(f"{topic}: '{parent}' and '{child}' cannot be parent and child frame")
-    xyz = np.array([translation.x, translation.y, translation.z], np.float64)
+    xyz = translation.x, translation.y, translation.z
     try:
-        matrix = geometry.transform(xyz, _xyzw(rotation))
+        matrix = geometry.transform(xyz, (rotation.x, rotation.y, rotation.z, rotation.w))
     except ValueError as error:
         raise MessageError(f"{topic}: rotation from '{child}' to '{parent}': {error}") from None
-    if not np.isfinite(xyz).all():
+    if not all(map(math.isfinite, xyz)):
         raise MessageError(f"{topic}: the translation from '{child}' to '{parent}' is not finite")
     return StampedTransform(stamp_ns(header.stamp), parent, child, matrix)
-
-
-def _xyzw(rotation: Any) -> F64:
-    return np.array([rotation.x, rotation.y, rotation.z, rotation.w], np.float64)
 
 
 # --- detections --------------------------------------------------------------------------------

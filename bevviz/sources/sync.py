@@ -6,7 +6,7 @@ import math
 import re
 from bisect import bisect_left
 from collections import Counter, deque
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Generic, TypeVar
 
@@ -49,7 +49,7 @@ class SyncReport:
     without_image: Counter[str] = field(default_factory=Counter)  # camera -> frames
     undecodable: Counter[str] = field(default_factory=Counter)  # camera -> images
     problems: Counter[str] = field(default_factory=Counter)  # missing transforms and CameraInfo -> frames
-    transforms: tuple[str, ...] = ()  # what looked wrong in the transforms
+    transforms: Callable[[], Sequence[str]] = tuple  # what looked wrong in the transforms
 
     def warnings(self) -> tuple[str, ...]:
         """One sentence each."""
@@ -80,7 +80,7 @@ class SyncReport:
         for camera, n in self.undecodable.items():
             found.append(f"camera '{camera}': an image could not be decoded {_times(n)}")
         found += [f"{text} ({n} of {self.frames} frames)" for text, n in self.problems.items()]
-        return (*found, *self.transforms)
+        return (*found, *self.transforms())
 
 
 def _times(n: int) -> str:
@@ -173,6 +173,7 @@ class Synchronizer:
         self.report = SyncReport()
         self.absent: frozenset[str] = frozenset()  # topics that nobody publishes now: not waited for
         self.tf = TransformBuffer()
+        self.report.transforms = lambda: self.tf.problems
         self._roles = roles
         self._config = config
         self._tolerance = round(config.sync.tolerance * 1e9)
@@ -250,7 +251,6 @@ class Synchronizer:
         if fallback:
             self._odometry_frames.add(transform.parent.lstrip("/"))
         self.tf.add(transform, static, Origin.ODOMETRY if fallback else Origin.TF)
-        self.report.transforms = self.tf.problems
 
     def add_boxes(self, boxes: LabelledBoxes3D) -> None:
         """The robot's own 3D boxes."""
