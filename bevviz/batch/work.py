@@ -15,9 +15,10 @@ from bevviz.batch.table import About, row, write
 from bevviz.errors import UserError
 from bevviz.logging.logger import Logger
 from bevviz.logging.sinks import open_recording
+from bevviz.logging.writer import TOGETHER
 from bevviz.pipeline import Pipeline
 from bevviz.sources.bag import BagSource
-from bevviz.sources.prefetch import prefetch
+from bevviz.sources.prefetch import overlap
 
 
 class WithdrawnError(Exception):
@@ -83,10 +84,9 @@ def run(job: Job, threads: int, on_frame: Callable[[], None] = lambda: None) -> 
                     blueprint=job.blueprint,
                     recording_id=job.recording_id,
                 ) as sinks,
-                closing(prefetch(source, 2)) as ahead,
-                closing(prefetch(map(pipeline.run, ahead), 2)) as results,
+                closing(overlap(source, pipeline.run, 2)) as results,
+                Logger(sinks.recording, config, source.scene, together=TOGETHER) as logger,
             ):
-                logger = Logger(sinks.recording, config, source.scene)
                 logger.log_static()
                 for result in results:
                     logger.log(result)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
@@ -89,9 +90,9 @@ def _robot(options: argparse.Namespace) -> int:
 
 
 def _run(comparison: Comparison, source: BagSource, config: Config, options: argparse.Namespace) -> int:
-    def begin(recording: RecordingStream) -> Callable[[Results], None]:
+    def begin(recording: RecordingStream) -> AbstractContextManager[Callable[[Results], None]]:
         hint(source.scene, config)
-        return comparison.begin(recording, source.scene)
+        return nullcontext(comparison.begin(recording, source.scene))
 
     def finish() -> None:
         if comparison.without:
@@ -114,7 +115,7 @@ def _saved(options: argparse.Namespace) -> int:
         options,
         _default(options),
         pair.compare,
-        pair.begin,
+        lambda recording: nullcontext(pair.begin(recording)),
         lambda: _report(pair.summary, options),
     )
 

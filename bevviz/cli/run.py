@@ -8,7 +8,7 @@ import os
 import signal
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import closing, contextmanager, suppress
+from contextlib import AbstractContextManager, closing, contextmanager, suppress
 from pathlib import Path
 from threading import Event
 from typing import TYPE_CHECKING, Any, NoReturn, Protocol, TypeVar
@@ -46,21 +46,23 @@ def process(source: Source, config: Config, options: argparse.Namespace, default
     """Run the pipeline over the source into every output that was asked for."""
     from bevviz.anomalies import Summary
     from bevviz.logging.logger import Logger
+    from bevviz.logging.writer import TOGETHER
     from bevviz.pipeline import Pipeline
 
     anomalies = Summary()
     with Pipeline(config) as pipeline:
 
-        def begin(recording: RecordingStream) -> Callable[[FrameResult], None]:
+        @contextmanager
+        def begin(recording: RecordingStream) -> Iterator[Callable[[FrameResult], None]]:
             hint(source.scene, config)
-            logger = Logger(recording, config, source.scene)
-            logger.log_static()
+            with Logger(recording, config, source.scene, together=TOGETHER) as logger:
+                logger.log_static()
 
-            def handle(result: FrameResult) -> None:
-                logger.log(result)
-                anomalies.add(result)
+                def handle(result: FrameResult) -> None:
+                    logger.log(result)
+                    anomalies.add(result)
 
-            return handle
+                yield handle
 
         def finish() -> None:
             say(f"anomalies: {anomalies}")
@@ -74,7 +76,7 @@ def run(
     options: argparse.Namespace,
     default: Path,
     work: Callable[[T], R],
-    begin: Callable[[RecordingStream], Callable[[R], None]],
+    begin: Callable[[RecordingStream], AbstractContextManager[Callable[[R], None]]],
     finish: Callable[[], None] = lambda: None,
 ) -> int:
     """Log what is made of each item into every output that was asked for.
@@ -85,7 +87,7 @@ def run(
         options: of ``add_output``.
         default: file that is saved where nothing is asked for and nothing can be shown.
         work: what is to be made of an item.
-        begin: called with the recording; returns what logs that.
+        begin: called with the recording; its context is what logs that.
         finish: called after the last one, before what was made is served.
 
     Returns:
@@ -101,8 +103,8 @@ def run(
     with outputs(items.scene, config, options, save=save, spawn=viewer) as sinks:
         if unsaid and not viewer:
             say(f"no display: saving {save} (--serve shows it in a browser)")
-        handle = begin(sinks.recording)
-        frames, interrupted = through(items, work, handle)
+        with begin(sinks.recording) as handle:
+            frames, interrupted = through(items, work, handle)
         for warning in items.warnings:
             say(f"warning: {warning}")
         finish()
@@ -148,14 +150,14 @@ def serve(recording: RecordingStream, what: str = "") -> None:
 
 
 def through(items: Items[T], work: Callable[[T], R], handle: Callable[[R], None]) -> tuple[int, bool]:
-    """Items are made, worked on and handled in a thread each, in order, with a progress bar.
+    """Items are worked on in a thread, while the next are made and the last handled, with a progress bar.
 
     Returns:
         How many there were, and whether that was interrupted.
     """
     from tqdm import tqdm
 
-    from bevviz.sources.prefetch import prefetch
+    from bevviz.sources.prefetch import overlap
 
     done = 0
     gc.freeze()  # what was imported stays: it need not be looked through again and again
@@ -163,8 +165,7 @@ def through(items: Items[T], work: Callable[[T], R], handle: Callable[[R], None]
         with (
             terminable() as ended,
             tqdm(total=items.total, unit="frame", desc=items.scene.name, disable=None) as bar,
-            closing(prefetch(items, 2)) as ahead,
-            closing(prefetch(map(work, ahead), 2)) as results,
+            closing(overlap(items, work, 2)) as results,
         ):
             for result in results:
                 handle(result)

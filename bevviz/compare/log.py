@@ -66,7 +66,7 @@ class DifferenceLogger(Writer):
         for camera, pairs in found.images.items():
             self._log_image(camera, pairs, found)
         for name, value in _counts(found).items():
-            self._log(entities.difference_count(name), rr.Scalars(float(value)))
+            self._scalar(entities.difference_count(name), float(value))
         page = rr.TextDocument(markdown(found), media_type=rr.MediaType.MARKDOWN)
         self._put(entities.COMPARE, page)
         for difference in found.objects:

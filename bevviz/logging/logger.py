@@ -88,10 +88,18 @@ class Logger(Writer):
         scene: names of the sensors.
         root: entity that everything goes under. With one, this is what else was made of frames that
             another logger writes: what the sensors and the robot brought is not written twice.
+        together: as of ``Writer``.
     """
 
-    def __init__(self, recording: rr.RecordingStream, config: Config, scene: Scene, root: str = "") -> None:
-        super().__init__(recording, root)
+    def __init__(
+        self,
+        recording: rr.RecordingStream,
+        config: Config,
+        scene: Scene,
+        root: str = "",
+        together: int = 1,
+    ) -> None:
+        super().__init__(recording, root, together)
         self._config = config
         self._scene = scene
         self._track_lanes = tracks.Lanes()
@@ -598,26 +606,19 @@ class Logger(Writer):
 
     def _log_decisions(self, result: FrameResult, notes: Sequence[tuple[str, str]]) -> None:
         self._put(entities.EXPLAIN, rr.TextDocument(markdown(result), media_type=rr.MediaType.MARKDOWN))
-        self._log_lines(entities.EXPLAIN_LOG, result.frame, [*notes, *remarks(result)])
+        self._log_lines(entities.EXPLAIN_LOG, [*notes, *remarks(result)])
 
     def _log_anomalies(self, result: FrameResult) -> None:
         news = self._news.of(result.anomalies)
-        self._log_lines(
-            entities.ANOMALY_LOG, result.frame, [(a.severity, f"{a.kind}: {a.text}") for a in news]
-        )
+        self._log_lines(entities.ANOMALY_LOG, [(a.severity, f"{a.kind}: {a.text}") for a in news])
         count = Counter(anomaly.kind for anomaly in result.anomalies)
         self._log(entities.ANOMALY_COUNTS, rr.Scalars([float(count[kind]) for kind in KINDS]))
 
-    def _log_lines(self, path: str, frame: Frame, lines: Sequence[tuple[str, str]]) -> None:
+    def _log_lines(self, path: str, lines: Sequence[tuple[str, str]]) -> None:
         """Level and text of each line."""
         if lines:
             levels, texts = zip(*lines, strict=True)
-            rr.send_columns(
-                self._root + path,
-                self._times(frame, len(lines)),
-                rr.TextLog.columns(text=texts, level=levels),
-                recording=self._recording,
-            )
+            self._columns(path, [self._clock] * len(lines), rr.TextLog.columns(text=texts, level=levels))
 
     def _log_states(self, result: FrameResult) -> None:
         """Lanes: the pipeline, each camera, each class that it has seen; anomalies by kind; tracks."""
@@ -666,21 +667,7 @@ class Logger(Writer):
     def _log_health(self, result: FrameResult, more: Mapping[str, float]) -> None:
         for path, value in (*health(result, self._last), *more.items()):
             if np.isfinite(value):
-                self._log(path, rr.Scalars(float(value)))
-
-    # --- plumbing ------------------------------------------------------------------------------
-
-    def _times(self, frame: Frame, rows: int) -> list[rr.TimeColumn]:
-        columns = [
-            rr.TimeColumn(entities.FRAME, sequence=[frame.index] * rows),
-            rr.TimeColumn(entities.STAMP, timestamp=np.full(rows, frame.stamp, "datetime64[ns]")),
-            *(rr.TimeColumn(name, sequence=[number] * rows) for name, number in self.sequences.items()),
-        ]
-        if frame.received:
-            columns.append(
-                rr.TimeColumn(entities.RECEIVED, timestamp=np.full(rows, frame.received, "datetime64[ns]"))
-            )
-        return columns
+                self._scalar(path, float(value))
 
 
 def versions() -> list[str]:

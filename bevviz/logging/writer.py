@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from types import TracebackType
+from typing import Self
 
 import numpy as np
 import rerun as rr
 
 from bevviz.logging import entities
+
+TOGETHER = 64  # frames, where nobody waits for each
 
 
 class Writer:
@@ -16,20 +21,36 @@ class Writer:
     Args:
         recording: where to; it may have any number of sinks.
         root: entity that everything goes under; empty: paths are as they are.
+        together: numbers to plot are sent as columns, of so many frames at once, which is several times
+            faster. With more than one use it as a context manager, which sends the last of them.
     """
 
-    def __init__(self, recording: rr.RecordingStream, root: str = "") -> None:
+    def __init__(self, recording: rr.RecordingStream, root: str = "", together: int = 1) -> None:
         self._recording = recording
         self._root = root
+        self._together = together
+        self._clock: dict[str, int] = {}  # timeline -> where on it this frame is
+        self._scalars: dict[str, list[tuple[dict[str, int], float]]] = defaultdict(list)
+        self._unsent = 0  # frames that have scalars there
         self._known: set[str] = set()  # entities that any frame had
         self._shown: set[str] = set()  # entities with something of the frame before
         self._now: set[str] = set()
         self.sequences: Mapping[str, int] = {}  # further timelines, and where on them what comes next is
 
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.flush()
+
     def _begin(self, index: int, stamp: int, received: int) -> None:
         """Start a frame. Stamps in nanoseconds, ``received`` 0 where it is not known."""
         self._now = set()
         self._set_time(index, stamp, received)
+        if any(rows[-1][0].keys() != self._clock.keys() for rows in self._scalars.values()):
+            self.flush()  # a column has the same timelines from end to end
 
     def _end(self) -> None:
         """Clear what the frame before had and this one has not."""
@@ -37,6 +58,17 @@ class Writer:
         for path in self._shown - self._now:
             self._log(path, rr.Clear(recursive=False))
         self._shown = self._now
+        self._unsent += 1
+        if self._unsent >= self._together:
+            self.flush()
+
+    def flush(self) -> None:
+        """Send what waits for more of its kind."""
+        for path, rows in self._scalars.items():
+            clocks, values = zip(*rows, strict=True)
+            self._columns(path, clocks, rr.Scalars.columns(scalars=values))
+        self._scalars.clear()
+        self._unsent = 0
 
     def _static(self, path: str, *archetypes: rr.AsComponents) -> None:
         for archetype in archetypes:
@@ -50,11 +82,31 @@ class Writer:
     def _log(self, path: str, *archetypes: rr.AsComponents) -> None:
         self._recording.log(self._root + path, *archetypes)
 
+    def _scalar(self, path: str, value: float) -> None:
+        if self._together > 1:
+            self._scalars[path].append((self._clock, value))
+        else:
+            self._log(path, rr.Scalars(value))
+
+    def _columns(self, path: str, clocks: Sequence[dict[str, int]], columns: rr.ComponentColumnList) -> None:
+        """Several rows of one entity, each with its place on the timelines."""
+        times = [
+            rr.TimeColumn(name, timestamp=np.array(numbers, "datetime64[ns]"))
+            if name in (entities.STAMP, entities.RECEIVED)
+            else rr.TimeColumn(name, sequence=numbers)
+            for name in clocks[0]
+            if (numbers := [clock[name] for clock in clocks])
+        ]
+        rr.send_columns(self._root + path, times, columns, recording=self._recording)
+
     def _set_time(self, index: int, stamp: int, received: int) -> None:
-        self._recording.reset_time()
-        self._recording.set_time(entities.FRAME, sequence=index)
-        self._recording.set_time(entities.STAMP, timestamp=np.datetime64(stamp, "ns"))
+        self._clock = {entities.FRAME: index, entities.STAMP: stamp}
         if received:
-            self._recording.set_time(entities.RECEIVED, timestamp=np.datetime64(received, "ns"))
-        for name, number in self.sequences.items():
-            self._recording.set_time(name, sequence=number)
+            self._clock[entities.RECEIVED] = received
+        self._clock |= self.sequences
+        self._recording.reset_time()
+        for name, number in self._clock.items():
+            if name in (entities.STAMP, entities.RECEIVED):
+                self._recording.set_time(name, timestamp=np.datetime64(number, "ns"))
+            else:
+                self._recording.set_time(name, sequence=number)

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Generator, Iterable
+from collections import deque
+from collections.abc import Callable, Generator, Iterable
+from concurrent.futures import Future, ThreadPoolExecutor
 from queue import Empty, Full, Queue
 from threading import Event, Thread
 from typing import TypeVar
 
 T = TypeVar("T")
+R = TypeVar("R")
 
 
 def prefetch(items: Iterable[T], depth: int) -> Generator[T, None, None]:
@@ -54,3 +57,38 @@ def prefetch(items: Iterable[T], depth: int) -> Generator[T, None, None]:
     finally:
         stopped.set()
         thread.join()
+
+
+def overlap(items: Iterable[T], work: Callable[[T], R], depth: int) -> Generator[R, None, None]:
+    """Yield what is made of each item, in order. A thread works on it while the caller makes the next ones.
+
+    One thread beside the caller's and not two: they would wait for Python's lock more than they gain.
+
+    An exception of the source is raised after what is made of the items that came before it. Closing the
+    iterator ends the thread.
+
+    Args:
+        items: drawn in the caller's thread.
+        work: called in the other one.
+        depth: items that are drawn ahead of what is yielded.
+    """
+    waiting: deque[Future[R]] = deque()
+    cut: Exception | None = None
+    source = iter(items)
+    worker = ThreadPoolExecutor(1, "overlap")
+    try:
+        while cut is None:
+            try:
+                waiting.append(worker.submit(work, next(source)))
+            except StopIteration:
+                break
+            except Exception as error:
+                cut = error
+            if len(waiting) > depth:
+                yield waiting.popleft().result()
+        while waiting:
+            yield waiting.popleft().result()
+        if cut is not None:
+            raise cut
+    finally:
+        worker.shutdown(cancel_futures=True)

@@ -137,7 +137,7 @@ def _raster(
     Without ``ground`` all is obstacle.
     """
     cells = rows * columns
-    density, seen = np.zeros(cells if count else 0, np.int32), np.empty(cells if count else 0, np.int32)
+    density, seen = np.zeros(cells if count else 0, np.int32), np.empty(len(cell), np.int32)
     height = np.full(cells if top else 0, np.nan, np.float32)
     occupancy = np.full(cells if state else 0, UNKNOWN, np.int8)
     found = _count(cell, density, seen) if count else 0
@@ -155,7 +155,7 @@ def _count(cell: I32, density: I32, seen: I32) -> int:
     for i in range(len(cell)):
         if cell[i] >= 0:
             # Written always: there is no branch to mispredict.
-            seen[min(found, len(seen) - 1)] = cell[i]
+            seen[found] = cell[i]
             found += density[cell[i]] == 0
             density[cell[i]] += 1
     return found
