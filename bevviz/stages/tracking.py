@@ -12,6 +12,7 @@ from bevviz import geometry
 from bevviz.config import TrackingConfig
 from bevviz.frame import F32, F64, I32, I64, Bool, Boxes3D, Clusters, ClusterState, Frame, Objects, Tracks
 from bevviz.stages.fusion import assign
+from bevviz.stages.kernel import kernel
 
 INITIAL_SPEED = 5.0  # m/s, one sigma of what is seen for the first time
 SHAPE_GAIN = 0.2  # share of the newest box in the smoothed size and heading
@@ -164,20 +165,16 @@ class Tracker:
         column = np.full(len(state), -1, np.int32)
         if len(state) == 0 or len(boxes) == 0:
             return column
-        offset = state.mean[:, None, 0, :2] - boxes.center[None, :, :2]
         gate = np.maximum(config.gate**2, 9 * (state.covariance[:, 0, 0] + config.position_noise**2))
-        cost = (offset**2).sum(2) / gate[:, None]
-        inside = cost <= 1
         extent = np.log(np.maximum(np.sort(state.size[:, :2]), 0.1))
         measured = np.log(np.maximum(np.sort(boxes.size[:, :2]), 0.1))
-        cost += SIZE_WEIGHT * np.abs(extent[:, None] - measured[None]).mean(2)
-        cost[~inside] = np.inf
+        cost, near_track, near_box = _costs(state.mean[:, 0], gate, extent, boxes.center, measured)
         # Most boxes have one track near, and it has no other: only the rest has to be assigned.
-        alone = inside & (inside.sum(1) == 1)[:, None] & (inside.sum(0) == 1)[None]
-        rows, columns = np.nonzero(alone)
-        column[rows] = columns
-        inside &= ~alone
-        rows, columns = np.flatnonzero(inside.any(1)), np.flatnonzero(inside.any(0))
+        nearest = cost.argmin(1)
+        alone = (near_track == 1) & (near_box[nearest] == 1)
+        column[alone] = nearest[alone]
+        near_box[nearest[alone]] = 0
+        rows, columns = np.flatnonzero((near_track > 0) & ~alone), np.flatnonzero(near_box)
         chosen = assign(cost[np.ix_(rows, columns)], unmatched=2.0)
         column[rows] = np.where(chosen >= 0, np.append(columns, -1)[chosen], -1)
         return column
@@ -270,6 +267,23 @@ class Tracker:
             object=named,
             trail=state.trail,
         )
+
+
+@kernel
+def _costs(place: F64, gate: F64, extent: F64, center: F32, measured: F64) -> tuple[F64, I32, I32]:
+    """(T, K) costs, inf beyond the squared gate, and how many of the others are near each track and box."""
+    cost = np.full((len(place), len(center)), np.inf)
+    near_track, near_box = np.zeros(len(place), np.int32), np.zeros(len(center), np.int32)
+    for t in range(len(place)):
+        for k in range(len(center)):
+            dx, dy = place[t, 0] - center[k, 0], place[t, 1] - center[k, 1]
+            distance = (dx * dx + dy * dy) / gate[t]
+            if distance <= 1:
+                size = abs(extent[t, 0] - measured[k, 0]) + abs(extent[t, 1] - measured[k, 1])
+                cost[t, k] = distance + SIZE_WEIGHT * size / 2
+                near_track[t] += 1
+                near_box[k] += 1
+    return cost, near_track, near_box
 
 
 def _placed(boxes: Boxes3D, rows: NDArray[Any], pose: F64) -> Boxes3D:
