@@ -164,6 +164,10 @@ class Pipeline:
 
     def run(self, frame: Frame) -> FrameResult:
         """Everything that can be made of the frame. Never raises for what the frame holds."""
+        return self.finish(self.perceive(frame))
+
+    def perceive(self, frame: Frame) -> FrameResult:
+        """What the stages make of the frame; ``finish`` may follow in another thread, in the same order."""
         config, log = self.config, StageLog(self._memo)
         start = time.perf_counter()
 
@@ -171,7 +175,7 @@ class Pipeline:
         network = StageLog(self._memo)
         waiting = [self._network.submit(self._detect, camera, network) for camera in frame.cameras]
 
-        voxels = ground = obstacles = clusters = raw_ground = None
+        voxels = ground = obstacles = clusters = None
         if len(frame.points) == 0:
             log.failures.append(Failure("cloud", "the cloud holds no finite point"))
         else:
@@ -179,7 +183,7 @@ class Pipeline:
         if voxels is not None:
             ground = log.run("ground", segment_ground, voxels.points, config.ground)
         if voxels is not None and ground is not None:
-            obstacles, raw_ground = log.run("ground", _split, voxels, ground) or (None, None)
+            obstacles = log.run("ground", _obstacles, voxels, ground)
         if obstacles is not None:
             clusters = log.run("clustering", cluster, obstacles, config.clustering)
 
@@ -204,14 +208,9 @@ class Pipeline:
                 tracks = log.run(
                     "tracking", self._tracker.update, frame, clusters, seen, objects, config.tracking
                 )
-        intensity = frame.fields.get("intensity")
-        image = explanations = None
-        if self._draw:
-            image = log.run("bev", bev, frame.points, intensity, raw_ground, objects, clusters, config.bev)
-            explanations = log.run("explain", explain, cameras, clusters, config)
         wall = time.perf_counter() - start + log.spared
         log.timings["total"] = max(wall, sum(network.timings.values()))
-        result = FrameResult(
+        return FrameResult(
             frame=frame,
             voxels=voxels,
             ground=ground,
@@ -219,12 +218,31 @@ class Pipeline:
             clusters=clusters,
             cameras=tuple(cameras),
             objects=objects,
-            bev=image,
-            explanations=explanations or (),
+            bev=None,
             timings=log.timings,
             failures=tuple(log.failures),
             tracks=tracks,
         )
+
+    def finish(self, result: FrameResult) -> FrameResult:
+        """The result with what makes it understood: the bird's-eye view, explanations, anomalies."""
+        config, frame, log = self.config, result.frame, StageLog(self._memo)
+        start = time.perf_counter()
+        if self._draw:
+            intensity, raw_ground = frame.fields.get("intensity"), None
+            if result.voxels is not None and result.ground is not None:
+                raw_ground = log.run("bev", _raw_ground, result.voxels, result.ground)
+            objects, clusters = result.objects, result.clusters
+            image = log.run("bev", bev, frame.points, intensity, raw_ground, objects, clusters, config.bev)
+            explanations = log.run("explain", explain, result.cameras, result.clusters, config)
+            wall = time.perf_counter() - start + log.spared
+            result = replace(
+                result,
+                bev=image,
+                explanations=explanations or (),
+                timings={**result.timings, **log.timings, "total": result.timings["total"] + wall},
+                failures=(*result.failures, *log.failures),
+            )
         return replace(result, anomalies=self._anomalies.update(result, config.anomalies))
 
     def _detect(self, camera: Camera, log: StageLog) -> Detections | None:
@@ -250,9 +268,14 @@ class Pipeline:
         )
 
 
-def _split(voxels: Voxels, ground: Ground) -> tuple[F32, Bool]:
-    """The voxels that are not ground, and for every raw point whether it is."""
-    return voxels.points.compress(~ground.mask, axis=0), ground.mask.take(voxels.inverse)
+def _obstacles(voxels: Voxels, ground: Ground) -> F32:
+    """The voxels that are not ground."""
+    return voxels.points.compress(~ground.mask, axis=0)
+
+
+def _raw_ground(voxels: Voxels, ground: Ground) -> Bool:
+    """For every raw point whether it is ground."""
+    return ground.mask.take(voxels.inverse)
 
 
 def _project(points: F32, camera: Camera) -> tuple[F32, F32] | None:

@@ -84,11 +84,11 @@ def run(job: Job, threads: int, on_frame: Callable[[], None] = lambda: None) -> 
                     blueprint=job.blueprint,
                     recording_id=job.recording_id,
                 ) as sinks,
-                closing(overlap(source, pipeline.run, 2)) as results,
+                closing(overlap(source, pipeline.perceive, 2)) as results,
                 Logger(sinks.recording, config, source.scene, together=TOGETHER) as logger,
             ):
                 logger.log_static()
-                for result in results:
+                for result in map(pipeline.finish, results):
                     logger.log(result)
                     rows.append({**row(result, config), "bag": str(job.bag), "recording": job.name})
                     on_frame()

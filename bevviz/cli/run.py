@@ -59,6 +59,7 @@ def process(source: Source, config: Config, options: argparse.Namespace, default
                 logger.log_static()
 
                 def handle(result: FrameResult) -> None:
+                    result = pipeline.finish(result)
                     logger.log(result)
                     anomalies.add(result)
 
@@ -67,7 +68,7 @@ def process(source: Source, config: Config, options: argparse.Namespace, default
         def finish() -> None:
             say(f"anomalies: {anomalies}")
 
-        return run(source, config, options, default, pipeline.run, begin, finish)
+        return run(source, config, options, default, pipeline.perceive, begin, finish)
 
 
 def run(
