@@ -6,11 +6,13 @@ import os
 import platform
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
+from threading import Thread
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,16 +60,36 @@ def run(*command: str) -> Finished:
         SystemExit: it failed.
     """
     program = Path(sys.executable).with_name(command[0])
-    start = time.perf_counter()
-    process = subprocess.Popen([program, *command[1:]], stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
-    assert process.stderr is not None
-    said = process.stderr.read()
-    _, status, usage = os.wait4(process.pid, 0)
-    seconds = time.perf_counter() - start
-    process.returncode = os.waitstatus_to_exitcode(status)
-    if process.returncode != 0:
-        raise SystemExit(f"{' '.join(command)}: {said.decode().strip()}")
-    return Finished(seconds, usage.ru_maxrss / 1e3)
+    with tempfile.TemporaryFile() as said:
+        start = time.perf_counter()
+        process = subprocess.Popen([program, *command[1:]], stdout=subprocess.DEVNULL, stderr=said)
+        # Not what wait4 tells: a child that was forked has its parent's peak in it.
+        looks: list[float] = [0.0]
+        watch = Thread(target=_watch, args=(process, looks))
+        watch.start()
+        process.wait()
+        seconds = time.perf_counter() - start
+        watch.join()
+        if process.returncode != 0:
+            said.seek(0)
+            raise SystemExit(f"{' '.join(command)}: {said.read().decode().strip()}")
+    return Finished(seconds, max(looks))
+
+
+def _watch(process: subprocess.Popen[bytes], looks: list[float]) -> None:
+    while process.returncode is None:
+        looks.append(_peak(process.pid))
+        time.sleep(0.05)
+
+
+def _peak(pid: int) -> float:
+    """Most memory in MB that a running process had so far; 0 where it cannot be told."""
+    try:
+        status = Path(f"/proc/{pid}/status").read_text()
+    except OSError:
+        return 0.0
+    found = [line for line in status.splitlines() if line.startswith("VmHWM:")]
+    return int(found[0].split()[1]) / 1e3 if found else 0.0
 
 
 def machine() -> str:
