@@ -6,6 +6,7 @@ import platform
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import lru_cache
 from importlib.metadata import version
 from types import MappingProxyType
 from typing import Any
@@ -40,7 +41,7 @@ from bevviz.frame import (
 )
 from bevviz.logging import entities, tracks
 from bevviz.logging.entities import ClassId
-from bevviz.logging.pieces import CORNER, boxes3d, transform
+from bevviz.logging.pieces import CORNER, blob, boxes3d, classes, picked, transform
 from bevviz.logging.text import markdown, remarks
 from bevviz.logging.writer import Writer
 from bevviz.sources import Scene
@@ -242,8 +243,8 @@ class Logger(Writer):
         frame = result.frame
         self._begin(frame.index, frame.stamp, frame.received)
         self._log_cloud(result)
-        if result.obstacles is not None:
-            obstacles = self._rounded(result.obstacles)
+        if result.obstacles is not None and result.voxels is not None and result.ground is not None:
+            obstacles = picked(result.voxels.points, result.ground.mask, False, self._rounding)
             self._put_points(entities.obstacles(frame.lidar), obstacles, ClassId.OBSTACLE)
             if result.clusters is not None:
                 self._log_clusters(frame, result.clusters, result.tracks, obstacles)
@@ -270,33 +271,32 @@ class Logger(Writer):
         world_from_points = frame.pose
         self._put(entities.sensor(frame.lidar), transform(world_from_points))
         if self._config.logging.raw_cloud and not self._root:
-            classes = np.zeros(len(frame.points), np.uint16)
+            class_ids = np.zeros(len(frame.points), np.uint16)
             if result.voxels is not None and result.ground is not None:
-                of_voxel = np.where(result.ground.mask, ClassId.GROUND, ClassId.OBSTACLE).astype(np.uint16)
-                classes = of_voxel.take(result.voxels.inverse)
+                ground, inverse = result.ground.mask, result.voxels.inverse
+                class_ids = classes(ground, inverse, int(ClassId.GROUND), int(ClassId.OBSTACLE))
             if len(frame.clouds) > 1:
-                self._log_merged(frame, world_from_points, classes)
+                self._log_merged(frame, world_from_points, class_ids)
             elif len(frame.points):
-                self._put(entities.points(frame.lidar), rr.Points3D(frame.points, class_ids=classes))
+                self._put(entities.points(frame.lidar), rr.Points3D(frame.points, class_ids=class_ids))
         if result.voxels is not None and result.ground is not None:
-            road = self._rounded(result.voxels.points.compress(result.ground.mask, axis=0))
+            road = picked(result.voxels.points, result.ground.mask, True, self._rounding)
             self._put_points(entities.ground(frame.lidar), road, ClassId.GROUND)
 
-    def _log_merged(self, frame: Frame, world_from_points: F64, classes: np.ndarray[Any, Any]) -> None:
+    def _log_merged(self, frame: Frame, world_from_points: F64, class_ids: np.ndarray[Any, Any]) -> None:
         """Several LiDARs: each raw cloud in the frame of its own sensor."""
         end = 0
         for cloud, points_from_cloud in zip(frame.clouds, frame.points_from_clouds, strict=True):
             start, end = end, end + len(cloud.xyz)
             self._put(entities.sensor(cloud.name), transform(world_from_points @ points_from_cloud))
             if len(cloud.xyz):
-                self._put(entities.points(cloud.name), rr.Points3D(cloud.xyz, class_ids=classes[start:end]))
+                self._put(entities.points(cloud.name), rr.Points3D(cloud.xyz, class_ids=class_ids[start:end]))
 
-    def _rounded(self, points: F32) -> F32:
-        """Voxelised points to a fraction of a voxel, which compresses to half. The raw cloud stays exact."""
-        if self._config.voxel.size == 0:
-            return points
-        scale = np.float32(2.0 ** np.floor(np.log2(8 / self._config.voxel.size)))
-        return np.asarray(np.round(points * scale) / scale, np.float32)
+    @property
+    def _rounding(self) -> float:
+        """Voxelised points are rounded to a fraction of a voxel: 1 over it. The raw cloud stays exact."""
+        size = self._config.voxel.size
+        return float(2.0 ** np.floor(np.log2(8 / size))) if size > 0 else 0.0
 
     def _put_points(self, path: str, points: F32, class_id: int) -> None:
         if len(points):
@@ -515,16 +515,9 @@ class Logger(Writer):
         self._put(
             entities.GRID,
             transform(result.frame.pose),
-            rr.GridMap(
-                data=grid.tobytes(),
-                format=rr.components.ImageFormat(
-                    width=grid.shape[1], height=grid.shape[0], color_model="L", channel_datatype="U8"
-                ),
-                cell_size=bev.resolution,
-                translation=[-bev.range_x, bev.range_y, level - 0.05],
-                rotation_axis_angle=rr.RotationAxisAngle([0, 0, 1], radians=-np.pi / 2),
-                opacity=0.2,
-                colormap=rr.components.Colormap.RvizMap,
+            _grid_looks(*grid.shape, bev.resolution),
+            rr.GridMap.from_fields(
+                data=blob(grid.view(np.uint8).ravel()), translation=[-bev.range_x, bev.range_y, level - 0.05]
             ),
         )
 
@@ -715,6 +708,17 @@ def depth_annotations() -> rr.AnnotationContext:
     )
 
 
+@lru_cache(maxsize=2)
+def _grid_looks(rows: int, columns: int, resolution: float) -> rr.GridMap:
+    return rr.GridMap.from_fields(
+        format=rr.components.ImageFormat(width=columns, height=rows, color_model="L", channel_datatype="U8"),
+        cell_size=resolution,
+        rotation_axis_angle=rr.RotationAxisAngle([0, 0, 1], radians=-np.pi / 2),
+        opacity=0.2,
+        colormap=rr.components.Colormap.RvizMap,
+    )
+
+
 def _camera_pose(frame: Frame, result: CameraResult) -> F64 | None:
     camera = result.camera
     if camera.world_from_camera is not None:
@@ -733,12 +737,12 @@ def encode_image(image: Image, quality: int) -> rr.EncodedImage:
 
 def _jpeg(bgr: U8, quality: int) -> rr.EncodedImage:
     _, data = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, quality])
-    return rr.EncodedImage(contents=data.tobytes(), media_type="image/jpeg")
+    return rr.EncodedImage(contents=blob(data), media_type="image/jpeg")
 
 
 def _png(bgr: U8) -> rr.EncodedImage:
     _, data = cv2.imencode(".png", bgr, [cv2.IMWRITE_PNG_COMPRESSION, 1])
-    return rr.EncodedImage(contents=data.tobytes(), media_type="image/png")
+    return rr.EncodedImage(contents=blob(data), media_type="image/png")
 
 
 def _best_decisions(camera: CameraResult) -> Iterator[tuple[str, str]]:
