@@ -79,7 +79,7 @@ def run(*command: str) -> Finished:
 def _watch(process: subprocess.Popen[bytes], looks: list[float]) -> None:
     while process.returncode is None:
         looks.append(_peak(process.pid))
-        time.sleep(0.05)
+        time.sleep(0.02)
 
 
 def _peak(pid: int) -> float:

@@ -26,6 +26,7 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--quick", action="store_true", help="fewer frames and repetitions, a smaller bag")
+    parser.add_argument("--size", type=float, default=1.0, help="GB of the bag of whole runs (default: 1)")
     parser.add_argument("--model", type=Path, default=_default_model(), help="detector (default: yolox_nano)")
     parser.add_argument("--write", type=Path, help="page whose marked part is replaced, instead of printing")
     options = parser.parse_args()
@@ -40,10 +41,9 @@ def main() -> None:
         repetitions = 3 if options.quick else 15
         rows = stages.compare(messages, frames, scene, repetitions)
         table = stages.profile(messages, frames, scene)
-        bag = bags.repeat(drive, folder / "repeated", 200_000_000 if options.quick else 1_000_000_000)
+        bag = bags.repeat(drive, folder / "repeated", int(1e9 * (0.2 if options.quick else options.size)))
         rows += runs.compare(bag, 1 if options.quick else 3)
         rows += stages.growth(messages, frames, scene, repetitions)
-        rows += runs.growth(bag)
         networks = runs.networks(drive, len(frames), options.model)
 
     page = "\n".join(

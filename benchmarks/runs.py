@@ -15,11 +15,17 @@ from bevviz.sources.recording import Recording
 
 
 def compare(bag: Path, repetitions: int) -> list[str]:
-    """Rows of the bag as a recording, against ``rerun mcap convert``, and of the start."""
-    converted, saved = bag.with_name("converted.rrd"), bag.with_name("saved.rrd")
+    """Rows of the bag as a recording, against ``rerun mcap convert``, of its growth, and of the start."""
+    converted, saved, short = (bag.with_name(f"{name}.rrd") for name in ("converted", "saved", "short"))
+    scans, points, received = counted(bag)
+    few = scans // 10
+    convert, run_bag = ("rerun", "mcap", "convert", str(bag), "-o"), ("bevviz", "bag", str(bag), "--save")
     commands = {
-        "theirs": ("rerun", "mcap", "convert", str(bag), "-o", str(converted)),
-        "ours": ("bevviz", "bag", str(bag), "--save", str(saved)),
+        "theirs": (*convert, str(converted)),
+        "ours": (*run_bag, str(saved)),
+        "their few": (*convert, str(short), "--end-time", str(received[few])),
+        "our few": (*run_bag, str(short), "--frames", f":{few}"),
+        "our first": (*run_bag, str(short), "--frames", ":1"),
         "help": ("bevviz", "--help"),
         "info": ("bevviz", "info", str(bag)),
     }
@@ -28,41 +34,35 @@ def compare(bag: Path, repetitions: int) -> list[str]:
     found: dict[str, list[Finished]] = {name: [] for name in commands}
     for _ in tqdm(range(repetitions), unit="run", desc="bag to .rrd", disable=None):
         for name, command in commands.items():
-            for _ in range(1 if name in ("theirs", "ours") else 3):
+            for _ in range(3 if name in ("help", "info") else 1):
                 found[name].append(run(*command))
     times = {name: Times([f.seconds for f in all_]) for name, all_ in found.items()}
-
-    scans, points = counted(bag)
+    memory = {name: max(f.memory for f in all_) for name, all_ in found.items()}
     if logged_points(saved) != points:
         raise SystemExit("points of the bag are missing in the recording")
+
+    def further(more: str, fewer: str, number: int) -> float:
+        """Milliseconds for each scan beyond the fewer ones."""
+        return 1e3 * (times[more].median - times[fewer].median) / number
+
     about = f"{scans} scans, {bag.stat().st_size / 1e9:.2f} GB"
     theirs, ours = times["theirs"], times["ours"]
     big, small = converted.stat().st_size, saved.stat().st_size
+    slope, our_slope = further("theirs", "their few", scans - few), further("ours", "our few", scans - few)
+    early, late = further("our few", "our first", few - 1), further("ours", "our first", scans - 1)
+    least, most = memory["our few"], memory["ours"]
     return [
         f"| bag to .rrd, no network, {about} | rerun mcap convert | {theirs} | {ours} "
         f"| {theirs.median / ours.median:.2f} x | 1 x | |",
+        f"| each further scan of it | rerun mcap convert | {slope:.1f} ms | {our_slope:.1f} ms "
+        f"| {slope / our_slope:.2f} x | 1 x | |",
         f"| .rrd, everything in it | rerun mcap convert | {big / 1e6:.0f} MB | {small / 1e6:.0f} MB "
         f"| {small / big:.2f} | 0.5 | every point there |",
+        f"| time, frames x 10 ({few}, {scans}), beyond the start of {times['our first'].median:.2g} s | "
+        f"| {early:.1f} ms a frame | {late:.1f} ms a frame | {late / early:.2f} x | 1 x | |",
+        f"| memory, frames x 10 | | {least:.0f} MB | {most:.0f} MB | {most / least:.2f} x | 1 x | |",
         f"| `bevviz --help` | | | {times['help']} | | 0.3 s | |",
         f"| `bevviz info`, the same bag | | | {times['info']} | | 1 s | |",
-    ]
-
-
-def growth(bag: Path) -> list[str]:
-    """The row of frames x 10: seconds for each frame beyond the first one, and memory."""
-    with Recording([bag]) as recording:
-        scans = max(topic.count or 0 for topic in recording.topics if topic.type.endswith("PointCloud2"))
-    counts = [1, scans // 10, scans]
-    saved = bag.with_name("growth.rrd")
-    one, few, many = (
-        run("bevviz", "bag", str(bag), "--frames", f":{n}", "--save", str(saved)) for n in counts
-    )
-    slow, fast = ((f.seconds - one.seconds) / (n - 1) for f, n in ((few, counts[1]), (many, counts[2])))
-    return [
-        f"| time, frames x 10 ({counts[1]}, {counts[2]}), beyond the start of {one.seconds:.2g} s | "
-        f"| {1e3 * slow:.1f} ms a frame | {1e3 * fast:.1f} ms a frame | {fast / slow:.2f} x | 1 x | |",
-        f"| memory, frames x 10 | | {few.memory:.0f} MB | {many.memory:.0f} MB "
-        f"| {many.memory / few.memory:.2f} x | 1 x | |",
     ]
 
 
@@ -79,12 +79,15 @@ def networks(bag: Path, frames: int, model: Path | None) -> list[str]:
     return rows
 
 
-def counted(bag: Path) -> tuple[int, int]:
-    """Scans, and finite points in all of them."""
+def counted(bag: Path) -> tuple[int, int, list[int]]:
+    """Scans, finite points in all of them, and when each was received, in nanoseconds."""
+    points, received = 0, []
     with Recording([bag]) as recording:
         topics = [t.name for t in recording.topics if t.type.endswith("PointCloud2")]
-        sizes = [len(decode_cloud(recording.decode(m), m.topic, 0).xyz) for m in recording.messages(topics)]
-    return len(sizes), sum(sizes)
+        for message in recording.messages(topics):
+            points += len(decode_cloud(recording.decode(message), message.topic, 0).xyz)
+            received.append(message.received)
+    return len(received), points, received
 
 
 def logged_points(recording: Path) -> int:

@@ -37,7 +37,9 @@ def test_every_point_of_a_bag_is_counted_in_its_recording(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     folder = bags.write(tmp_path / "drive", bags.small_items(scans=3, points=500))
-    assert counted(folder) == (3, 1500)
+    scans, points, received = counted(folder)
+    assert (scans, points) == (3, 1500)
+    assert np.diff(received).tolist() == [bags.PERIOD, bags.PERIOD]
     assert main(["bag", str(folder), "--save", "whole.rrd"]) == 0
     assert logged_points(Path("whole.rrd")) == 1500
     assert main(["bag", str(folder), "--frames", ":2", "--save", "part.rrd"]) == 0
@@ -78,4 +80,11 @@ def test_sides_take_turns() -> None:
 def test_a_program_that_fails_ends_the_benchmark() -> None:
     with pytest.raises(SystemExit, match=r"(?i)unknown option"):
         run("python", "--no-such-option")
-    assert run("python", "-c", "x = bytearray(50_000_000)").memory > 50
+
+
+def test_memory_is_that_of_the_program_alone() -> None:
+    mine = np.ones(40_000_000)  # 320 MB, which a child that is forked has for a moment
+    small = run("python", "-c", "import time; time.sleep(0.3)")
+    large = run("python", "-c", "import time; held = bytearray(b'1') * 200_000_000; time.sleep(0.3)")
+    assert small.memory < 100 < 200 < large.memory < 300
+    assert mine.all()
