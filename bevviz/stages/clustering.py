@@ -105,17 +105,19 @@ def _adjacent(keys: I64, strides: I64, box: F64, eps2: float) -> tuple[I32, I32]
 
     Cells come sorted by key. The neighbours of a cell lie in five rows, one for each offset along the
     slowest axis, and each row is a range of keys that moves forward with the cell: no search is needed.
+    Only those behind a cell in that order are looked at: it is their neighbour as well.
     """
     cells = len(keys)
     reach = 2 * strides[1] + 2
-    begin = np.zeros(5, np.int64)
+    begin = np.zeros(3, np.int64)
     near = np.zeros(cells + 1, np.int32)
-    found = np.empty(16 * cells, np.int32)
+    found = np.empty(8 * cells, np.int32)  # those of cell c end at last[c]
+    last = np.empty(cells, np.int32)
     used = 0
     for c in range(cells):
-        for row in range(5):
-            middle = keys[c] + (row - 2) * strides[0]
-            o = begin[row]
+        for row in range(3):
+            middle = keys[c] + row * strides[0]
+            o = max(begin[row], c + 1)
             while o < cells and keys[o] < middle - reach:
                 o += 1
             begin[row] = o
@@ -129,10 +131,27 @@ def _adjacent(keys: I64, strides: I64, box: F64, eps2: float) -> tuple[I32, I32]
                 dz = _gap(box[c, 2], box[c, 5], box[o, 2], box[o, 5])
                 # Written always and kept sometimes: there is no branch to mispredict.
                 found[used] = o
-                used += (o != c) & (dx * dx + dy * dy + dz * dz < eps2)
+                used += dx * dx + dy * dy + dz * dz < eps2
                 o += 1
-        near[c + 1] = used
-    return near, found[:used]
+        last[c] = used
+    k = 0
+    for c in range(cells):
+        while k < last[c]:
+            near[c + 1] += 1
+            near[found[k] + 1] += 1
+            k += 1
+    for c in range(cells):
+        near[c + 1] += near[c]
+    end, neighbours = near[:-1].copy(), np.empty(2 * used, np.int32)
+    k = 0
+    for c in range(cells):
+        while k < last[c]:
+            o = found[k]
+            neighbours[end[c]], neighbours[end[o]] = o, c
+            end[c] += 1
+            end[o] += 1
+            k += 1
+    return near, neighbours
 
 
 @kernel
