@@ -56,18 +56,18 @@ def inverse(a_from_b: F64) -> F64:
 
 def quaternion(a_from_b: F64) -> F64:
     """(4,) unit quaternion x, y, z, w, w >= 0, of a (4, 4) transform (Shepperd 1978)."""
-    r = a_from_b[:3, :3]
-    trace = float(np.trace(r))
-    squared = np.array([2 * r[0, 0] - trace, 2 * r[1, 1] - trace, 2 * r[2, 2] - trace, trace]) + 1.0
-    largest = int(np.argmax(squared))
-    if largest == 3:
-        q = np.array([r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1], squared[3]])
-    else:
-        i, j, k = largest, (largest + 1) % 3, (largest + 2) % 3
-        q = np.zeros(4)
-        q[i], q[j], q[k], q[3] = squared[i], r[j, i] + r[i, j], r[k, i] + r[i, k], r[k, j] - r[j, k]
-    q /= np.linalg.norm(q)
-    return q if q[3] >= 0 else -q
+    (a, b, c), (d, e, f), (g, h, i) = a_from_b[:3, :3].tolist()  # number by number, as ``transform``
+    squared = a - e - i, e - a - i, i - a - e, a + e + i
+    largest = squared.index(max(squared))
+    root = squared[largest] + 1
+    q = (
+        (root, b + d, c + g, h - f),
+        (b + d, root, f + h, c - g),
+        (c + g, f + h, root, d - b),
+        (h - f, c - g, d - b, root),
+    )[largest]
+    scale = math.copysign(1 / math.hypot(*q), q[3])
+    return np.array([value * scale for value in q])
 
 
 def interpolate(a_from_b0: F64, a_from_b1: F64, t: float) -> F64:
