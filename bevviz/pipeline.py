@@ -21,7 +21,6 @@ from bevviz.errors import UserError
 from bevviz.explain import explain
 from bevviz.frame import (
     F32,
-    Bool,
     Camera,
     CameraResult,
     Clusters,
@@ -39,7 +38,7 @@ from bevviz.stages.detector import Detector
 from bevviz.stages.fusion import fuse, in_view, merge
 from bevviz.stages.ground import segment_ground
 from bevviz.stages.tracking import Tracker
-from bevviz.stages.voxel import voxel_grid
+from bevviz.stages.voxel import of_points, voxel_grid
 
 T = TypeVar("T")
 Ts = TypeVarTuple("Ts")
@@ -231,7 +230,7 @@ class Pipeline:
         if self._draw:
             intensity, raw_ground = frame.fields.get("intensity"), None
             if result.voxels is not None and result.ground is not None:
-                raw_ground = log.run("bev", _raw_ground, result.voxels, result.ground)
+                raw_ground = log.run("bev", of_points, result.ground.mask, result.voxels.inverse)
             objects, clusters = result.objects, result.clusters
             image = log.run("bev", bev, frame.points, intensity, raw_ground, objects, clusters, config.bev)
             explanations = log.run("explain", explain, result.cameras, result.clusters, config)
@@ -271,11 +270,6 @@ class Pipeline:
 def _obstacles(voxels: Voxels, ground: Ground) -> F32:
     """The voxels that are not ground."""
     return voxels.points.compress(~ground.mask, axis=0)
-
-
-def _raw_ground(voxels: Voxels, ground: Ground) -> Bool:
-    """For every raw point whether it is ground."""
-    return ground.mask.take(voxels.inverse)
 
 
 def _project(points: F32, camera: Camera) -> tuple[F32, F32] | None:

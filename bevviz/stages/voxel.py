@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from bevviz.config import VoxelConfig
-from bevviz.frame import F32, I32, I64, Voxels
+from bevviz.frame import F32, I32, I64, Bool, Voxels
 from bevviz.stages.cells import cell_keys, group
 from bevviz.stages.kernel import kernel
 
@@ -49,3 +49,12 @@ def _thin(points: F32, keys: I64, average: bool) -> tuple[F32, I32]:
             for axis in range(3):
                 kept[k, axis] = total[k, axis] / size[k]
     return kept, number
+
+
+@kernel
+def of_points(mask: Bool, inverse: I32) -> Bool:
+    """(N,) for each point what is said of its voxel."""
+    found = np.empty(len(inverse), np.bool_)
+    for i in range(len(inverse)):
+        found[i] = mask[inverse[i]]
+    return found
