@@ -461,6 +461,31 @@ def test_health(record: Callable[..., Recording]) -> None:
     }
 
 
+def test_numbers_that_wait_for_others_are_the_same(tmp_path: Path) -> None:
+    """Also across a frame without a time of receipt, and where the run ends with an error."""
+    results = [make(0), make(1), nothing(2, received=0), make(3), make(4)]
+    found = []
+    for wait in (0.0, 1e9):
+        path = tmp_path / f"{wait}.rrd"
+        with (
+            pytest.raises(ValueError, match="cut"),
+            open_recording(SCENE, load(), save=path) as sinks,
+            Logger(sinks.recording, load(), SCENE, wait=wait) as logger,
+        ):
+            logger.log_static()
+            for result in results:
+                logger.log(result)
+            raise ValueError("cut")
+        verify(path)
+        rows = {e: r for e, r in Recording(path).rows.items() if e.startswith("/health")}
+        found.append({e: sorted(r, key=lambda row: int(row["frame"])) for e, r in rows.items()})
+    at_once, waited = found
+    assert at_once == waited
+    assert [row["frame"] for row in waited["/health/time_ms/total"]] == [0, 1, 2, 3, 4]
+    received = [row.get("received") for row in waited["/health/count/failures"]]
+    assert received[1:4] == [START + 130_000_000, None, START + 330_000_000]
+
+
 def test_what_a_frame_lacks_is_cleared(record: Callable[..., Recording]) -> None:
     found = record([make(0), nothing(1), make(2)])
     for entity in (

@@ -15,7 +15,7 @@ from bevviz.batch.table import About, row, write
 from bevviz.errors import UserError
 from bevviz.logging.logger import Logger
 from bevviz.logging.sinks import open_recording
-from bevviz.logging.writer import TOGETHER
+from bevviz.logging.writer import WAIT
 from bevviz.pipeline import Pipeline
 from bevviz.sources.bag import BagSource
 from bevviz.sources.prefetch import overlap
@@ -85,7 +85,7 @@ def run(job: Job, threads: int, on_frame: Callable[[], None] = lambda: None) -> 
                     recording_id=job.recording_id,
                 ) as sinks,
                 closing(overlap(source, pipeline.perceive, 2)) as results,
-                Logger(sinks.recording, config, source.scene, together=TOGETHER) as logger,
+                Logger(sinks.recording, config, source.scene, wait=WAIT) as logger,
             ):
                 logger.log_static()
                 for result in map(pipeline.finish, results):

@@ -46,7 +46,7 @@ def process(source: Source, config: Config, options: argparse.Namespace, default
     """Run the pipeline over the source into every output that was asked for."""
     from bevviz.anomalies import Summary
     from bevviz.logging.logger import Logger
-    from bevviz.logging.writer import TOGETHER
+    from bevviz.logging.writer import WAIT
     from bevviz.pipeline import Pipeline
 
     anomalies = Summary()
@@ -55,7 +55,7 @@ def process(source: Source, config: Config, options: argparse.Namespace, default
         @contextmanager
         def begin(recording: RecordingStream) -> Iterator[Callable[[FrameResult], None]]:
             hint(source.scene, config)
-            with Logger(recording, config, source.scene, together=TOGETHER) as logger:
+            with Logger(recording, config, source.scene, wait=WAIT) as logger:
                 logger.log_static()
 
                 def handle(result: FrameResult) -> None:

@@ -89,7 +89,7 @@ class Logger(Writer):
         scene: names of the sensors.
         root: entity that everything goes under. With one, this is what else was made of frames that
             another logger writes: what the sensors and the robot brought is not written twice.
-        together: as of ``Writer``.
+        wait: as of ``Writer``.
     """
 
     def __init__(
@@ -98,9 +98,9 @@ class Logger(Writer):
         config: Config,
         scene: Scene,
         root: str = "",
-        together: int = 1,
+        wait: float = 0.0,
     ) -> None:
-        super().__init__(recording, root, together)
+        super().__init__(recording, root, wait)
         self._config = config
         self._scene = scene
         self._track_lanes = tracks.Lanes()

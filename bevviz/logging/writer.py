@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from types import TracebackType
@@ -12,7 +13,7 @@ import rerun as rr
 
 from bevviz.logging import entities
 
-TOGETHER = 64  # frames, where nobody waits for each
+WAIT = 1.0  # seconds, for a recording rather than for a robot's operator
 
 
 class Writer:
@@ -21,17 +22,17 @@ class Writer:
     Args:
         recording: where to; it may have any number of sinks.
         root: entity that everything goes under; empty: paths are as they are.
-        together: numbers to plot are sent as columns, of so many frames at once, which is several times
-            faster. With more than one use it as a context manager, which sends the last of them.
+        wait: seconds that numbers to plot may wait for those of the next frames: sent together, as columns,
+            they take a fraction of the time. Then use it as a context manager, which sends the last of them.
     """
 
-    def __init__(self, recording: rr.RecordingStream, root: str = "", together: int = 1) -> None:
+    def __init__(self, recording: rr.RecordingStream, root: str = "", wait: float = 0.0) -> None:
         self._recording = recording
         self._root = root
-        self._together = together
+        self._wait = wait
         self._clock: dict[str, int] = {}  # timeline -> where on it this frame is
         self._scalars: dict[str, list[tuple[dict[str, int], float]]] = defaultdict(list)
-        self._unsent = 0  # frames that have scalars there
+        self._sent = time.monotonic()
         self._known: set[str] = set()  # entities that any frame had
         self._shown: set[str] = set()  # entities with something of the frame before
         self._now: set[str] = set()
@@ -58,8 +59,7 @@ class Writer:
         for path in self._shown - self._now:
             self._log(path, rr.Clear(recursive=False))
         self._shown = self._now
-        self._unsent += 1
-        if self._unsent >= self._together:
+        if time.monotonic() - self._sent >= self._wait:
             self.flush()
 
     def flush(self) -> None:
@@ -68,7 +68,7 @@ class Writer:
             clocks, values = zip(*rows, strict=True)
             self._columns(path, clocks, rr.Scalars.columns(scalars=values))
         self._scalars.clear()
-        self._unsent = 0
+        self._sent = time.monotonic()
 
     def _static(self, path: str, *archetypes: rr.AsComponents) -> None:
         for archetype in archetypes:
@@ -83,7 +83,7 @@ class Writer:
         self._recording.log(self._root + path, *archetypes)
 
     def _scalar(self, path: str, value: float) -> None:
-        if self._together > 1:
+        if self._wait > 0:
             self._scalars[path].append((self._clock, value))
         else:
             self._log(path, rr.Scalars(value))
