@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -24,6 +25,7 @@ from bevviz.frame import (
     LabelledBoxes2D,
     LabelledBoxes3D,
 )
+from bevviz.sources.feed import make_handlers
 from bevviz.sources.messages import StampedTransform
 from bevviz.sources.roles import CameraRole, Roles
 from bevviz.sources.sync import Synchronizer
@@ -596,3 +598,33 @@ def test_memory_is_bounded() -> None:
     for i in range(10_000):  # now only the camera is alive
         feed.image(1000 + i * 0.03)
     assert len(feed.sync._images[LEFT.topic]) < 100
+
+
+def test_odometry_is_decoded_only_while_tf_says_nothing() -> None:
+    sync = Synchronizer(replace(ONE, odometry="/odometry"), Config())
+    decoded = []
+
+    def decode(message: Any) -> Any:
+        decoded.append(message.received)
+        stamp = SimpleNamespace(sec=message.received, nanosec=0)
+        place = SimpleNamespace(
+            position=SimpleNamespace(x=1.0, y=2.0, z=0.0), orientation=SimpleNamespace(x=0, y=0, z=0, w=1)
+        )
+        return SimpleNamespace(
+            header=SimpleNamespace(stamp=stamp, frame_id="odom"),
+            child_frame_id="base_link",
+            pose=SimpleNamespace(pose=place),
+        )
+
+    handle: Any = make_handlers(sync, replace(ONE, odometry="/odometry"), decode)["/odometry"]
+    for second in (1, 2):
+        handle(SimpleNamespace(topic="/odometry", received=second))
+    assert decoded == [1, 2]
+    assert sync.tf.needs_odometry("base_link")
+    sync.add_transform(StampedTransform(2 * SECOND, "odom", "base_link", pose(3.0)))
+    handle(SimpleNamespace(topic="/odometry", received=3))
+    assert decoded == [1, 2]
+    assert sync.tf.lookup("odom", "base_link", 2 * SECOND, 0.0).matrix[0, 3] == 3.0
+    sync.tf.forget_after(0)  # the clock went back, and /tf may not come again
+    handle(SimpleNamespace(topic="/odometry", received=1))
+    assert decoded == [1, 2, 1]
