@@ -210,16 +210,12 @@ def _shade(
             pixels[cell] = ground[min(points[cell], len(ground)) - 1]
 
 
-@kernel
 def _ground_level(points: F32, ground: Bool) -> float:
     """Median z of the ground, else the height that a sensor on a car stands at."""
-    below = np.empty(len(ground))
-    count = 0
-    for i in range(0, len(ground), 1 + len(ground) // 2_000):
-        if ground[i]:
-            below[count] = points[i, 2]
-            count += 1
-    return np.median(below[:count]) if count > 0 else -1.7
+    # Not compiled: a median takes longer to compile than all of the raster.
+    sample = slice(None, len(ground), 1 + len(points) // 2_000)
+    below = points[sample, 2][ground[sample]]
+    return float(np.median(below)) if len(below) else -1.7
 
 
 # --- drawing -----------------------------------------------------------------------------------
