@@ -5,3 +5,8 @@ from __future__ import annotations
 
 class UserError(Exception):
     """What is wrong, in which file, topic or field, and what to do. The command exits with status 2."""
+
+
+def first_line(error: object) -> str:
+    """What a library says of an error, for the end of a sentence of ours."""
+    return (str(error).strip() or type(error).__name__).splitlines()[0].rstrip(".")

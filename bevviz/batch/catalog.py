@@ -11,7 +11,7 @@ import rerun as rr
 
 from bevviz.batch.summary import Link
 from bevviz.batch.table import About
-from bevviz.errors import UserError
+from bevviz.errors import UserError, first_line
 from bevviz.logging import blueprints, entities
 from bevviz.logging.sinks import APPLICATION, check_port, free_port
 
@@ -48,7 +48,7 @@ def register(url: str, name: str, results: Sequence[tuple[Path, About]], bluepri
             replace = OnDuplicateSegmentLayer.REPLACE
             for result in dataset.register(uris, on_duplicate=replace).iter_results(TIMEOUT):
                 if result.error is not None:
-                    raise UserError(f"--catalog {url}: {result.uri}: {_first_line(result.error)}")
+                    raise UserError(f"--catalog {url}: {result.uri}: {first_line(result.error)}")
             if dataset.default_blueprint() is None:
                 with TemporaryDirectory() as folder:
                     layout = Path(folder) / "layout.rbl"
@@ -57,7 +57,7 @@ def register(url: str, name: str, results: Sequence[tuple[Path, About]], bluepri
     except RerunMissingDependencyError:
         raise UserError("a catalog needs more packages: pip install 'bevviz[catalog]'") from None
     except (OSError, RuntimeError, ValueError, LookupError) as error:
-        raise UserError(f"--catalog {url}: {_first_line(error)}") from None
+        raise UserError(f"--catalog {url}: {first_line(error)}") from None
 
     def link(recording_id: str, frame: int) -> str:
         return f"{dataset.segment_url(recording_id)}#when={entities.FRAME}@{frame}"
@@ -78,10 +78,6 @@ def served(port: int) -> Iterator[tuple[str, str]]:
         server = rr.server.Server(host="127.0.0.1", port=port)
         rr.serve_web_viewer(web_port=web_port, open_browser=False)
     except (RuntimeError, ValueError, OSError) as error:
-        raise UserError(f"--serve-catalog {port}: {_first_line(error)}") from None
+        raise UserError(f"--serve-catalog {port}: {first_line(error)}") from None
     with server:
         yield f"rerun+http://127.0.0.1:{port}", f"http://localhost:{web_port}"
-
-
-def _first_line(error: object) -> str:
-    return (str(error).strip() or type(error).__name__).splitlines()[0].rstrip(".")

@@ -8,7 +8,7 @@ from urllib.parse import urlsplit
 
 from bevviz.batch.jobs import Job
 from bevviz.batch.work import Outcome, Outcomes
-from bevviz.errors import UserError
+from bevviz.errors import UserError, first_line
 from bevviz.logging.sinks import answers
 
 
@@ -39,8 +39,7 @@ def run_dask(jobs: Sequence[Job], address: str, retries: int, on_frame: Callable
     try:
         client = Client(address, timeout="10s")
     except (OSError, ValueError, TimeoutError) as error:
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise UserError(f"--dask {address}: no scheduler answers there ({reason})") from None
+        raise UserError(f"--dask {address}: no scheduler answers there ({first_line(error)})") from None
     with client:
         # The scheduler runs nothing twice that has the same key, not even for two clients.
         futures: dict[Any, Job] = {

@@ -14,7 +14,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from bevviz.config import Config
-from bevviz.errors import UserError
+from bevviz.errors import UserError, first_line
 from bevviz.logging import blueprints
 from bevviz.sources import Scene
 
@@ -162,7 +162,7 @@ def _viewer() -> rr.GrpcSink:
         )
     except RuntimeError as error:
         raise UserError(
-            f"cannot start the viewer: {_first_line(error)}; --save or --serve need none"
+            f"cannot start the viewer: {first_line(error)}; --save or --serve need none"
         ) from None
     return rr.GrpcSink(f"rerun+http://127.0.0.1:{port}/proxy")
 
@@ -177,7 +177,7 @@ def _server(port: int) -> tuple[rr.GrpcServerSink, str]:
     try:
         rr.serve_web_viewer(web_port=port, open_browser=False)
     except RuntimeError as error:
-        raise UserError(f"--serve {port}: {_first_line(error)}") from None
+        raise UserError(f"--serve {port}: {first_line(error)}") from None
     return server, viewer_address("localhost", port, data_port)
 
 
@@ -205,7 +205,3 @@ def _is_free(port: int) -> bool:
 def free_port(port: int, but: int = 0) -> int:
     """The port, or the next one that is free."""
     return next(p for p in range(port, 65536) if p != but and _is_free(p))
-
-
-def _first_line(error: Exception) -> str:
-    return str(error).strip().splitlines()[0].rstrip(".")
