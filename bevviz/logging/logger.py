@@ -41,10 +41,11 @@ from bevviz.frame import (
 )
 from bevviz.logging import entities, tracks
 from bevviz.logging.entities import ClassId
-from bevviz.logging.pieces import CORNER, blob, boxes3d, classes, picked, transform
+from bevviz.logging.pieces import CORNER, blob, boxes3d, rounded, transform
 from bevviz.logging.text import markdown, remarks
 from bevviz.logging.writer import Writer
 from bevviz.sources import Scene
+from bevviz.stages.voxel import of_points
 
 _OUTLINE = rr.components.FillMode.MajorWireframe
 _TRUTH_COLOR = (215, 215, 215)
@@ -243,8 +244,8 @@ class Logger(Writer):
         frame = result.frame
         self._begin(frame.index, frame.stamp, frame.received)
         self._log_cloud(result)
-        if result.obstacles is not None and result.voxels is not None and result.ground is not None:
-            obstacles = picked(result.voxels.points, result.ground.mask, False, self._rounding)
+        if result.obstacles is not None:
+            obstacles = self._rounded(result.obstacles)
             self._put_points(entities.obstacles(frame.lidar), obstacles, ClassId.OBSTACLE)
             if result.clusters is not None:
                 self._log_clusters(frame, result.clusters, result.tracks, obstacles)
@@ -273,14 +274,14 @@ class Logger(Writer):
         if self._config.logging.raw_cloud and not self._root:
             class_ids = np.zeros(len(frame.points), np.uint16)
             if result.voxels is not None and result.ground is not None:
-                ground, inverse = result.ground.mask, result.voxels.inverse
-                class_ids = classes(ground, inverse, int(ClassId.GROUND), int(ClassId.OBSTACLE))
+                of_voxels = np.where(result.ground.mask, ClassId.GROUND, ClassId.OBSTACLE).astype(np.uint16)
+                class_ids = of_points(of_voxels, result.voxels.inverse)
             if len(frame.clouds) > 1:
                 self._log_merged(frame, world_from_points, class_ids)
             elif len(frame.points):
                 self._put(entities.points(frame.lidar), rr.Points3D(frame.points, class_ids=class_ids))
         if result.voxels is not None and result.ground is not None:
-            road = picked(result.voxels.points, result.ground.mask, True, self._rounding)
+            road = self._rounded(result.voxels.points.compress(result.ground.mask, axis=0))
             self._put_points(entities.ground(frame.lidar), road, ClassId.GROUND)
 
     def _log_merged(self, frame: Frame, world_from_points: F64, class_ids: np.ndarray[Any, Any]) -> None:
@@ -292,11 +293,11 @@ class Logger(Writer):
             if len(cloud.xyz):
                 self._put(entities.points(cloud.name), rr.Points3D(cloud.xyz, class_ids=class_ids[start:end]))
 
-    @property
-    def _rounding(self) -> float:
-        """Voxelised points are rounded to a fraction of a voxel: 1 over it. The raw cloud stays exact."""
-        size = self._config.voxel.size
-        return float(2.0 ** np.floor(np.log2(8 / size))) if size > 0 else 0.0
+    def _rounded(self, points: F32) -> F32:
+        """Voxelised points to a fraction of a voxel, which compresses to half. The raw cloud stays exact."""
+        if self._config.voxel.size == 0:
+            return points
+        return rounded(points, 2.0 ** np.floor(np.log2(8 / self._config.voxel.size)))
 
     def _put_points(self, path: str, points: F32, class_id: int) -> None:
         if len(points):

@@ -7,10 +7,9 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 import rerun as rr
-from numpy.typing import NDArray
 
 from bevviz import geometry
-from bevviz.frame import F32, F64, I32, U8, Bool, Boxes3D
+from bevviz.frame import F32, F64, U8, Boxes3D
 from bevviz.stages.kernel import kernel
 
 CORNER = 0.5  # pixels: Rerun counts from the corner of the first pixel, bevviz from its centre
@@ -38,31 +37,11 @@ def blob(data: U8) -> pa.Array:
     return pa.ListArray.from_arrays(pa.array([0, len(data)], pa.int32()), pa.array(data), type=one)
 
 
-# --- points ------------------------------------------------------------------------------------
-# In one pass each, as they are made for every frame.
-
-
 @kernel
-def picked(points: F32, mask: Bool, wanted: bool, scale: float) -> F32:
-    """The points whose mask is ``wanted``, rounded to 1 / scale, which compresses to half; 0: exact."""
-    count = 0
+def rounded(points: F32, scale: float) -> F32:
+    """To the nearest 1 / scale, in one pass, as it is done to every frame."""
+    found, factor = np.empty_like(points), np.float32(scale)
     for i in range(len(points)):
-        count += mask[i] == wanted
-    found = np.empty((count, 3), np.float32)
-    factor, count = np.float32(scale), 0
-    for i in range(len(points)):
-        if mask[i] == wanted:
-            for axis in range(3):
-                value = points[i, axis]
-                found[count, axis] = np.rint(value * factor) / factor if factor > 0 else value
-            count += 1
-    return found
-
-
-@kernel
-def classes(mask: Bool, inverse: I32, yes: int, no: int) -> NDArray[np.uint16]:
-    """(N,) class of each raw point, by whether its voxel is in the mask."""
-    found = np.empty(len(inverse), np.uint16)
-    for i in range(len(inverse)):
-        found[i] = yes if mask[inverse[i]] else no
+        for axis in range(3):
+            found[i, axis] = np.rint(points[i, axis] * factor) / factor
     return found

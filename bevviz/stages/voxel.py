@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+from typing import TypeVar
+
 import numpy as np
+from numpy.typing import NDArray
 
 from bevviz.config import VoxelConfig
-from bevviz.frame import F32, I32, I64, Bool, Voxels
+from bevviz.frame import F32, I32, I64, Voxels
 from bevviz.stages.cells import cell_keys, group
 from bevviz.stages.kernel import kernel
+
+S = TypeVar("S", bound=np.generic)
 
 
 def voxel_grid(points: F32, config: VoxelConfig) -> Voxels:
@@ -52,9 +57,9 @@ def _thin(points: F32, keys: I64, average: bool) -> tuple[F32, I32]:
 
 
 @kernel
-def of_points(mask: Bool, inverse: I32) -> Bool:
+def of_points(said: NDArray[S], inverse: I32) -> NDArray[S]:
     """(N,) for each point what is said of its voxel."""
-    found = np.empty(len(inverse), np.bool_)
+    found = np.empty(len(inverse), said.dtype)
     for i in range(len(inverse)):
-        found[i] = mask[inverse[i]]
+        found[i] = said[inverse[i]]
     return found
