@@ -13,6 +13,7 @@ import rerun as rr
 
 from bevviz.logging import entities
 
+STAMPS = (entities.STAMP, entities.RECEIVED)  # timelines in nanoseconds; the others count
 WAIT = 1.0  # seconds, for a recording rather than for a robot's operator
 
 
@@ -49,8 +50,9 @@ class Writer:
     def _begin(self, index: int, stamp: int, received: int) -> None:
         """Start a frame. Stamps in nanoseconds, ``received`` 0 where it is not known."""
         self._now = set()
+        before = self._clock
         self._set_time(index, stamp, received)
-        if any(rows[-1][0].keys() != self._clock.keys() for rows in self._scalars.values()):
+        if before.keys() != self._clock.keys():
             self.flush()  # a column has the same timelines from end to end
 
     def _end(self) -> None:
@@ -90,13 +92,13 @@ class Writer:
 
     def _columns(self, path: str, clocks: Sequence[dict[str, int]], columns: rr.ComponentColumnList) -> None:
         """Several rows of one entity, each with its place on the timelines."""
-        times = [
-            rr.TimeColumn(name, timestamp=np.array(numbers, "datetime64[ns]"))
-            if name in (entities.STAMP, entities.RECEIVED)
-            else rr.TimeColumn(name, sequence=numbers)
-            for name in clocks[0]
-            if (numbers := [clock[name] for clock in clocks])
-        ]
+        times = []
+        for name in clocks[0]:
+            numbers = [clock[name] for clock in clocks]
+            if name in STAMPS:
+                times.append(rr.TimeColumn(name, timestamp=np.array(numbers, "datetime64[ns]")))
+            else:
+                times.append(rr.TimeColumn(name, sequence=numbers))
         rr.send_columns(self._root + path, times, columns, recording=self._recording)
 
     def _set_time(self, index: int, stamp: int, received: int) -> None:
@@ -106,7 +108,7 @@ class Writer:
         self._clock |= self.sequences
         self._recording.reset_time()
         for name, number in self._clock.items():
-            if name in (entities.STAMP, entities.RECEIVED):
+            if name in STAMPS:
                 self._recording.set_time(name, timestamp=np.datetime64(number, "ns"))
             else:
                 self._recording.set_time(name, sequence=number)

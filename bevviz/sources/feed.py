@@ -62,13 +62,14 @@ def make_handlers(sync: Synchronizer, roles: Roles, decode: Callable[[M], Any]) 
         info = decode_camera_info(decode(message), rectified, message.topic)
         sync.add_camera_info(message.topic, info)
 
-    followed: list[str] = []  # the frame that odometry places
+    followed = ""  # the frame that odometry places
 
     def add_odometry(message: M) -> None:
-        if followed and not sync.tf.needs_odometry(followed[0]):
+        nonlocal followed
+        if followed and not sync.tf.needs_odometry(followed):
             return
         transform = decode_odometry(decode(message), message.topic)
-        followed[:] = [transform.child]
+        followed = transform.child
         sync.add_transform(transform, fallback=True)
 
     handlers: dict[str, Handler[M]] = {}

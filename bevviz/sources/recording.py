@@ -54,6 +54,8 @@ OTHERS = {
 }
 METADATA = "metadata.yaml"
 
+_normalized = cache(normalize_msgtype)  # which takes as long as decoding a small message
+
 
 @dataclass(frozen=True, slots=True)
 class RawMessage:
@@ -167,7 +169,7 @@ class Recording:
         return tuple(
             Topic(
                 name,
-                normalize_msgtype(first[name].msgtype),
+                _normalized(first[name].msgtype),
                 counts[name],
                 self._frame_id(name) if counts[name] and self._has_header(first[name]) else "",
                 (counts[name] - 1) / duration if counts[name] > 1 and duration else None,
@@ -216,7 +218,7 @@ class Recording:
 
     def encode(self, message: RawMessage, content: Any) -> memoryview:
         """``content``, as ``decode`` gave it and changed since, serialised as the message was."""
-        store, msgtype = self._store(message.connection), normalize_msgtype(message.connection.msgtype)
+        store, msgtype = self._store(message.connection), _normalized(message.connection.msgtype)
         if is_ros1(message.connection):
             return store.serialize_ros1(content, msgtype)
         return store.serialize_cdr(content, msgtype)
@@ -227,7 +229,7 @@ class Recording:
             return connection.msgdef
         version: Literal[1, 2] = 1 if is_ros1(connection) else 2
         try:
-            msgtype = normalize_msgtype(connection.msgtype)
+            msgtype = _normalized(connection.msgtype)
             text, _ = self._store(connection).generate_msgdef(msgtype, ros_version=version)
         except (KeyError, TypesysError):
             return connection.msgdef
@@ -255,7 +257,7 @@ class Recording:
 
     def _has_header(self, connection: Connection) -> bool:
         try:
-            _, fields = self._store(connection).fielddefs[normalize_msgtype(connection.msgtype)]
+            _, fields = self._store(connection).fielddefs[_normalized(connection.msgtype)]
         except KeyError:
             return False
         return bool(fields) and fields[0][1][1] == "std_msgs/msg/Header"
@@ -420,7 +422,7 @@ def _lazily(
 
 def _defined(connection: Connection) -> Typestore:
     """A store of the types that a connection's own definition lists."""
-    text, msgtype = connection.msgdef.data, normalize_msgtype(connection.msgtype)
+    text, msgtype = connection.msgdef.data, _normalized(connection.msgtype)
     if connection.msgdef.format == MessageDefinitionFormat.MSG:
         types = get_types_from_msg(text, msgtype)
     else:
@@ -430,9 +432,3 @@ def _defined(connection: Connection) -> Typestore:
     store = get_typestore(Stores.EMPTY)
     store.register(types)
     return store
-
-
-@cache
-def _normalized(msgtype: str) -> str:
-    """As rosbags has it, which takes as long over it as over a small message."""
-    return normalize_msgtype(msgtype)

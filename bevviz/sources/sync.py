@@ -6,7 +6,7 @@ import math
 import re
 from bisect import bisect_left
 from collections import Counter, deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, Generic, TypeVar
 
@@ -49,7 +49,7 @@ class SyncReport:
     without_image: Counter[str] = field(default_factory=Counter)  # camera -> frames
     undecodable: Counter[str] = field(default_factory=Counter)  # camera -> images
     problems: Counter[str] = field(default_factory=Counter)  # missing transforms and CameraInfo -> frames
-    transforms: Callable[[], Sequence[str]] = tuple  # what looked wrong in the transforms
+    tf: TransformBuffer = field(default_factory=TransformBuffer)  # for what looked wrong in the transforms
 
     def warnings(self) -> tuple[str, ...]:
         """One sentence each."""
@@ -80,7 +80,7 @@ class SyncReport:
         for camera, n in self.undecodable.items():
             found.append(f"camera '{camera}': an image could not be decoded {_times(n)}")
         found += [f"{text} ({n} of {self.frames} frames)" for text, n in self.problems.items()]
-        return (*found, *self.transforms())
+        return (*found, *self.tf.problems)
 
 
 def _times(n: int) -> str:
@@ -172,8 +172,7 @@ class Synchronizer:
     def __init__(self, roles: Roles, config: Config) -> None:
         self.report = SyncReport()
         self.absent: frozenset[str] = frozenset()  # topics that nobody publishes now: not waited for
-        self.tf = TransformBuffer()
-        self.report.transforms = lambda: self.tf.problems
+        self.tf = self.report.tf
         self._roles = roles
         self._config = config
         self._tolerance = round(config.sync.tolerance * 1e9)
