@@ -20,7 +20,7 @@ from bevviz.evaluate import MAX_DISTANCE, MIN_HITS, RANGE, pair_in_order
 from bevviz.frame import DetectionState, FrameResult
 from bevviz.geometry import iou
 from bevviz.pipeline import Pipeline
-from bevviz.sources.synthetic import Snapshot, SyntheticSource
+from bevviz.synthetic import Snapshot, SyntheticSource
 
 PRESETS: tuple[Preset, ...] = ("reference", "default")
 CLASSES = ("person", "cyclist", "car")

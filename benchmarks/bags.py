@@ -10,8 +10,8 @@ from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import StoragePlugin, Writer
 from tqdm import tqdm
 
-from bevviz.sources.encode import typestore
-from bevviz.sources.synthetic import SyntheticSource, write_bag
+from bevviz.ros.encode import typestore
+from bevviz.synthetic import SyntheticSource, write_bag
 
 SECOND = 1_000_000_000
 

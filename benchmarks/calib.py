@@ -17,7 +17,7 @@ from bevviz import geometry
 from bevviz.calib import AXES, Calibration, Verdict, calibrate, gather
 from bevviz.calib.axes import SCALES, TIME, error_pose
 from bevviz.frame import F64, Frame
-from bevviz.sources.synthetic import SyntheticSource
+from bevviz.synthetic import SyntheticSource
 
 PLANTED = {"rx": 1.0, "ry": 1.0, "rz": 1.0, "tx": 5.0, "ty": 5.0, "tz": 5.0, "dt": 40.0}
 EVERY = 3

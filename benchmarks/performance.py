@@ -15,8 +15,8 @@ import cv2
 
 from benchmarks import bags, runs, stages
 from benchmarks.measure import machine
+from bevviz.bags.source import BagSource
 from bevviz.config import load
-from bevviz.sources.bag import BagSource
 
 BEGIN, END = "<!-- make bench: begin -->", "<!-- make bench: end -->"
 

@@ -9,9 +9,9 @@ from rerun.chunk import RrdReader
 from tqdm import tqdm
 
 from benchmarks.measure import Finished, Times, run
+from bevviz.bags.recording import Recording
 from bevviz.logging import entities
-from bevviz.sources.messages import decode_cloud
-from bevviz.sources.recording import Recording
+from bevviz.ros.messages import decode_cloud
 
 
 def compare(bag: Path, repetitions: int) -> list[str]:

@@ -17,9 +17,11 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
-from bevviz.live import Live, Notes, Outputs, Settings, Status
-from bevviz.sources.replay import Replay
-from bevviz.sources.synthetic import SyntheticSource
+from bevviz.live.notes import Notes
+from bevviz.live.replay import Replay
+from bevviz.live.runtime import Live, Outputs, Status
+from bevviz.live.settings import Settings
+from bevviz.synthetic import SyntheticSource
 
 WARM = 10.0  # seconds at the start that are left out: kernels are loaded, buffers fill
 GROWTH = 1.1  # memory at the end to memory when the flight recorder was full

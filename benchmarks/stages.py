@@ -19,12 +19,11 @@ from tqdm import tqdm
 from benchmarks import tutorial
 from benchmarks.measure import Times, interleaved
 from bevviz.config import load
-from bevviz.frame import F32, I32, Detections, Frame
+from bevviz.frame import F32, I32, Detections, Frame, Scene
 from bevviz.logging.logger import Logger
 from bevviz.logging.sinks import open_recording
 from bevviz.pipeline import Pipeline
-from bevviz.sources import Scene
-from bevviz.sources.messages import decode_cloud
+from bevviz.ros.messages import decode_cloud
 from bevviz.stages.bev import bev
 from bevviz.stages.clustering import cluster, dbscan
 from bevviz.stages.ground import segment_ground

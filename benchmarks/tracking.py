@@ -9,9 +9,9 @@ import numpy as np
 
 from bevviz import geometry
 from bevviz.frame import F32, F64, I32, Bool, Tracks
-from bevviz.sources.synthetic import Snapshot, SyntheticSource
-from bevviz.sources.synthetic.drive import START
 from bevviz.stages.fusion import assign
+from bevviz.synthetic import Snapshot, SyntheticSource
+from bevviz.synthetic.drive import START
 
 MAX_DISTANCE = 2.0  # metres between the centres, on the ground plane, of a track and its object
 SETTLED = 1.0  # seconds from which on a track's speed is measured

@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 
 from bevviz import geometry
+from bevviz.datasets.kitti import ACCEPTED, label_files, read_labels
 from bevviz.errors import UserError
 from bevviz.frame import F32, Bool, Boxes3D, Frame, LabelledBoxes3D, Objects
-from bevviz.sources.kitti import ACCEPTED, label_files, read_labels
-from bevviz.sources.roles import Roles
+from bevviz.ros.roles import Roles
 
 MIN_HITS = 10  # LiDAR points on an object that must be found
 MAX_DISTANCE = 2.0  # metres between the centres, on the ground plane, of a box and its object

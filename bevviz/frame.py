@@ -11,10 +11,10 @@ Conventions, everywhere in the project:
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import IntEnum
-from typing import Any, Literal
+from typing import Any, Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -158,6 +158,40 @@ class Frame:
     def pose(self) -> F64:
         """(4, 4) ``world_from_points``, the identity where there is no TF to the fixed frame."""
         return np.eye(4) if self.world_from_points is None else self.world_from_points
+
+
+# --- sources -----------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class Scene:
+    """What a source will deliver: the names that entities and blueprints are made from."""
+
+    name: str  # of the bag or drive, for the recording's title
+    lidar: str  # entity name of Frame.points
+    lidars: tuple[str, ...] = ()  # entity name of each LiDAR; the same as lidar where there is one
+    cameras: tuple[str, ...] = ()
+    robot: bool = False  # the robot's own results come along
+    truth: bool = False  # ground truth comes along
+
+
+class Source(Protocol):
+    """An iterable of frames, in order of stamp: a bag, the synthetic drive, or a running robot."""
+
+    @property
+    def scene(self) -> Scene: ...
+
+    @property
+    def total(self) -> int | None:
+        """Frames to expect, for a progress bar; None where unknown."""
+        ...
+
+    @property
+    def warnings(self) -> Sequence[str]:
+        """What was lost or looked wrong so far, one sentence each."""
+        ...
+
+    def __iter__(self) -> Iterator[Frame]: ...
 
 
 # --- results -----------------------------------------------------------------------------------

@@ -13,12 +13,11 @@ from bevviz.compare.differences import DIFFERENT, Change, FrameDifferences, diff
 from bevviz.compare.log import DifferenceLogger
 from bevviz.config import Config
 from bevviz.errors import UserError
-from bevviz.frame import Frame, FrameResult
+from bevviz.frame import Frame, FrameResult, Scene
 from bevviz.live.settings import Settings
 from bevviz.live.settings import differences as config_differences
 from bevviz.logging import entities
 from bevviz.logging.logger import Logger
-from bevviz.sources import Scene
 from bevviz.variants import Variants, check_same_frames
 
 ABOUT = "A is the version before, B the one that is shown."

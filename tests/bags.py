@@ -14,7 +14,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from bevviz import geometry
 from bevviz.frame import F32, F64, Intrinsics
-from bevviz.sources import vision_msgs
+from bevviz.ros import vision_msgs
 
 START = 1_700_000_000_000_000_000
 PERIOD = 100_000_000

@@ -13,11 +13,11 @@ from typing import Any
 
 import numpy as np
 
+from bevviz.ros.encode import typestore
 from bevviz.ros.typesupport import message_type
-from bevviz.sources.encode import typestore
-from bevviz.sources.synthetic import SyntheticSource
-from bevviz.sources.synthetic.bag import TOPICS, messages, mounting
-from bevviz.sources.synthetic.drive import CAMERA_INFO_TOPIC, IMAGE_TOPIC, LIDAR_TOPIC, PERIOD, START
+from bevviz.synthetic import SyntheticSource
+from bevviz.synthetic.bag import TOPICS, messages, mounting
+from bevviz.synthetic.drive import CAMERA_INFO_TOPIC, IMAGE_TOPIC, LIDAR_TOPIC, PERIOD, START
 
 SENSORS = (LIDAR_TOPIC, IMAGE_TOPIC, CAMERA_INFO_TOPIC)
 

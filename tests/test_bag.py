@@ -15,11 +15,11 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from bevviz import geometry
+from bevviz.bags.recording import Recording
+from bevviz.bags.source import BagSource, iso, parse_time
 from bevviz.config import Config, load
 from bevviz.errors import UserError
 from bevviz.frame import Frame
-from bevviz.sources.bag import BagSource, iso, parse_time
-from bevviz.sources.recording import Recording
 from tests import bags
 
 FORMATS = [

@@ -21,6 +21,7 @@ import rerun as rr
 from hypothesis import given
 from hypothesis import strategies as st
 
+from bevviz.bags.source import BagSource
 from bevviz.batch.batch import claimed, left_to_do
 from bevviz.batch.jobs import PARTIAL, Job, Selection, find_bags, make_jobs, name_bags, tables
 from bevviz.batch.table import row
@@ -29,7 +30,6 @@ from bevviz.config import Config, load
 from bevviz.errors import UserError
 from bevviz.frame import DetectionState
 from bevviz.pipeline import Pipeline
-from bevviz.sources.bag import BagSource
 from tests import bags
 from tests.recordings import Recording, verify
 

@@ -11,8 +11,8 @@ from benchmarks.bags import repeat
 from benchmarks.measure import interleaved, run
 from benchmarks.runs import counted, logged_points
 from benchmarks.stages import same_clusters, side_by_side
+from bevviz.bags.recording import Recording
 from bevviz.cli import main
-from bevviz.sources.recording import Recording
 from bevviz.stages.clustering import dbscan
 from tests import bags
 

@@ -11,8 +11,8 @@ import rerun.blueprint as rrb
 from rerun.chunk import RrdReader
 
 from bevviz.errors import UserError
+from bevviz.frame import Scene
 from bevviz.logging import blueprints
-from bevviz.sources import Scene
 
 SCENES = {
     "lidar only": Scene("a", "lidar", ("lidar",)),

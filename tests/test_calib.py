@@ -12,6 +12,7 @@ import pytest
 
 from benchmarks.calib import Drive
 from bevviz import geometry
+from bevviz.bags.source import BagSource
 from bevviz.calib import AXES, Calibration, Verdict, calibrate, gather
 from bevviz.calib.axes import SCALES, TIME, error_pose
 from bevviz.calib.edges import cloud_edges
@@ -20,9 +21,8 @@ from bevviz.cli import main
 from bevviz.config import Config, load
 from bevviz.errors import UserError
 from bevviz.frame import F64, Cloud, Frame
-from bevviz.sources.bag import BagSource
-from bevviz.sources.synthetic import SyntheticSource, write_bag
-from bevviz.sources.synthetic.drive import PERIOD, START
+from bevviz.synthetic import SyntheticSource, write_bag
+from bevviz.synthetic.drive import PERIOD, START
 from tests import bags
 from tests.recordings import Recording, verify
 

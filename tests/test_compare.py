@@ -30,8 +30,8 @@ from bevviz.errors import UserError
 from bevviz.frame import Boxes3D, Frame, FrameResult, LabelledBoxes3D
 from bevviz.geometry import transform
 from bevviz.pipeline import Memo, Pipeline
-from bevviz.sources.synthetic import SyntheticSource
 from bevviz.stages import detector
+from bevviz.synthetic import SyntheticSource
 from bevviz.variants import Variants, check_same_frames, without_motion
 from tests import bags
 from tests.recordings import Recording, verify

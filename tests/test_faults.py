@@ -13,7 +13,7 @@ from bevviz.config import load
 from bevviz.errors import UserError
 from bevviz.frame import I32, Decision, FrameResult
 from bevviz.pipeline import Pipeline
-from bevviz.sources.synthetic import FAULTS, SENSOR_FAULTS, Snapshot, SyntheticSource
+from bevviz.synthetic import FAULTS, SENSOR_FAULTS, Snapshot, SyntheticSource
 
 
 @cache

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
+from bevviz.bags.info import WIDTH, describe, render
 from bevviz.config import Config, load
 from bevviz.errors import UserError
-from bevviz.sources.info import WIDTH, describe, render
 from tests import bags
 
 

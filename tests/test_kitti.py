@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from bevviz import geometry
+from bevviz.bags.source import BagSource
 from bevviz.config import load
 from bevviz.frame import F64, Decision, FrameResult
 from bevviz.pipeline import Pipeline
-from bevviz.sources.bag import BagSource
 from tests import bags
 from tests.recordings import Recording
 

@@ -24,18 +24,18 @@ from hypothesis import strategies as st
 from bevviz.anomalies import AnomalyDetector
 from bevviz.config import load
 from bevviz.errors import UserError
-from bevviz.frame import CameraResult, Decision, Detections, Frame, FrameResult, Fusion, Pairs
-from bevviz.live import Live, Notes, Outputs, Settings
+from bevviz.frame import CameraResult, Decision, Detections, Frame, FrameResult, Fusion, Pairs, Scene
 from bevviz.live.encoder import WHOLE, Encoder, Packet
 from bevviz.live.files import Indexer, Saver
+from bevviz.live.notes import Notes
 from bevviz.live.queue import NewestQueue
-from bevviz.live.runtime import observed, thin
+from bevviz.live.replay import Replay
+from bevviz.live.runtime import Live, Outputs, observed, thin
+from bevviz.live.settings import Settings
 from bevviz.live.triggers import Triggers
 from bevviz.pipeline import Pipeline
-from bevviz.sources import Scene
-from bevviz.sources.replay import Replay
-from bevviz.sources.synthetic import SyntheticSource
-from bevviz.sources.synthetic.sensors import Lidar, PinholeCamera
+from bevviz.synthetic import SyntheticSource
+from bevviz.synthetic.sensors import Lidar, PinholeCamera
 from tests.recordings import Recording, verify
 
 Run = Callable[..., "Outcome"]

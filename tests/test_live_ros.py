@@ -22,22 +22,23 @@ from bevviz.config import Config, load
 from bevviz.errors import UserError
 from bevviz.frame import Boxes3D, CameraResult, Detections, Frame, FrameResult, Objects
 from bevviz.pipeline import Pipeline
-from bevviz.sources.encode import encode_camera_info, typestore
-from bevviz.sources.messages import decode_cloud, decode_detections_2d, decode_detections_3d, decode_image
-from bevviz.sources.synthetic import SyntheticSource
-from bevviz.sources.synthetic.bag import TOPICS
-from bevviz.sources.synthetic.drive import LIDAR_TOPIC, TRUTH_TOPIC
+from bevviz.ros.encode import encode_camera_info, typestore
+from bevviz.ros.messages import decode_cloud, decode_detections_2d, decode_detections_3d, decode_image
+from bevviz.synthetic import SyntheticSource
+from bevviz.synthetic.bag import TOPICS
+from bevviz.synthetic.drive import LIDAR_TOPIC, TRUTH_TOPIC
 from tests.recordings import Recording, verify
 from tests.ros_player import Play
 
 pytest.importorskip("rclpy", reason="needs rclpy: pip install 'bevviz[ros]'")
 
-from bevviz.ros import info, typesupport
+from bevviz.live import info
+from bevviz.live.source import LiveSource
+from bevviz.ros import typesupport
 from bevviz.ros.orders import Orders
 from bevviz.ros.publish import BEV, CLUSTERS, DETECTIONS, FUSED, OBSTACLES, Publisher
 from bevviz.ros.publish import TOPICS as TOPICS_PUBLISHED
 from bevviz.ros.session import Session
-from bevviz.sources.live import LiveSource
 
 PATIENCE = 60.0  # seconds for what takes one or two on an idle machine
 LIGHT = Play(frames=3, points=20_000)
@@ -160,7 +161,7 @@ def test_what_cannot_be_received_is_told_and_not_waited_for(
             raise UserError("vision_msgs is not installed")
         return typesupport.message_type(name)
 
-    monkeypatch.setattr("bevviz.sources.live.message_type", without_vision_msgs)
+    monkeypatch.setattr("bevviz.live.source.message_type", without_vision_msgs)
     said: list[str] = []
     with LiveSource(load(settings=["sync.max_wait=20"]), tell=said.append) as source:
         heard = list(islice(frames(source), 3))

@@ -44,6 +44,7 @@ from bevviz.frame import (
     LabelledBoxes3D,
     Objects,
     Pairs,
+    Scene,
     Tracks,
     Voxels,
 )
@@ -51,7 +52,6 @@ from bevviz.logging.entities import DEPTH_BINS, DEPTH_RANGE, TRACK_COLORS, Class
 from bevviz.logging.logger import Logger
 from bevviz.logging.sinks import open_recording
 from bevviz.logging.tracks import LANES, Lanes
-from bevviz.sources import Scene
 from bevviz.stages.bev import bev
 from bevviz.stages.fusion import in_view
 from bevviz.stages.tracking import Tracker

@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
-from bevviz.sources import messages, vision_msgs
-from bevviz.sources.messages import MessageError
+from bevviz.ros import messages, vision_msgs
+from bevviz.ros.messages import MessageError
 
 SEC, NANOSEC = 1_700_000_000, 123_456_789
 STAMP = SEC * 1_000_000_000 + NANOSEC

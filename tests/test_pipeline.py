@@ -8,7 +8,7 @@ import pytest
 from bevviz.config import load
 from bevviz.frame import Frame
 from bevviz.pipeline import Pipeline
-from bevviz.sources.synthetic import SyntheticSource
+from bevviz.synthetic import SyntheticSource
 
 
 @pytest.fixture(scope="module")

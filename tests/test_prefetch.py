@@ -5,7 +5,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from bevviz.sources.prefetch import overlap, prefetch
+from bevviz.prefetch import overlap, prefetch
 
 
 def test_order_is_kept() -> None:

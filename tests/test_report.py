@@ -18,14 +18,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from bevviz import pipeline
+from bevviz.bags.mcap_writer import McapWriter
+from bevviz.bags.recording import RawMessage
+from bevviz.bags.recording import Recording as Bag
 from bevviz.cli import main
 from bevviz.frame import Detections, Frame, FrameResult
 from bevviz.report.digest import Stage, compare, detections_of, pack, unpack
 from bevviz.report.page import spans
 from bevviz.report.plots import plot, ticks
-from bevviz.sources.mcap_writer import McapWriter
-from bevviz.sources.recording import RawMessage
-from bevviz.sources.recording import Recording as Bag
 from tests import bags
 from tests.recordings import Recording, verify
 from tests.test_cli import Capture, error_of

@@ -14,13 +14,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from bevviz.bags.recording import Recording as Bag
 from bevviz.cli import main
 from bevviz.frame import F32, U8
 from bevviz.report.pictures import shrink
 from bevviz.report.redact import CELLS, Redactor, grown, hide
 from bevviz.report.story import STRIP_WIDTH
-from bevviz.sources.messages import decode_compressed_image, decode_image
-from bevviz.sources.recording import Recording as Bag
+from bevviz.ros.messages import decode_compressed_image, decode_image
 from tests import bags
 from tests.recordings import Recording, verify
 from tests.test_cli import Capture, error_of

@@ -12,14 +12,14 @@ import pytest
 from rosbags.interfaces import Qos
 from rosbags.rosbag2 import Reader, StoragePlugin, Writer
 
+from bevviz.bags.recording import Recording
+from bevviz.bags.source import MARGIN, SECOND, BagSource
 from bevviz.config import Config, load
 from bevviz.errors import UserError
 from bevviz.pipeline import Pipeline
 from bevviz.report.digest import Stage, compare, digest
 from bevviz.report.window import Cut, Edit, Window, choose_topics, cut, find_window, open_window
-from bevviz.sources.bag import MARGIN, SECOND, BagSource
-from bevviz.sources.recording import Recording
-from bevviz.sources.synthetic.bag import _qos
+from bevviz.synthetic.bag import _qos
 from tests import bags
 
 CONFIG = Config()

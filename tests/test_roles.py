@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from bevviz.config import SourceConfig
 from bevviz.errors import UserError
-from bevviz.sources.roles import Roles, Topic, entity_name, find_roles
+from bevviz.ros.roles import Roles, Topic, entity_name, find_roles
 
 CLOUD = "sensor_msgs/msg/PointCloud2"
 IMAGE = "sensor_msgs/msg/Image"

@@ -12,14 +12,14 @@ import pytest
 
 from bevviz.cli import main
 from bevviz.config import load
+from bevviz.datasets.kitti import label_files, read_labels
 from bevviz.errors import UserError
 from bevviz.evaluate import Score, Truth, pair_in_order, truth_of
 from bevviz.frame import Boxes3D, Frame, LabelledBoxes3D, Objects
 from bevviz.geometry import apply as move
 from bevviz.geometry import corners, project
-from bevviz.sources.kitti import label_files, read_labels
-from bevviz.sources.synthetic import SyntheticSource, write_bag
 from bevviz.sweep import Parameter, Sweep, combine, parse
+from bevviz.synthetic import SyntheticSource, write_bag
 from tests import bags
 from tests.recordings import Recording, verify
 from tests.test_kitti import labels

@@ -25,10 +25,10 @@ from bevviz.frame import (
     LabelledBoxes2D,
     LabelledBoxes3D,
 )
-from bevviz.sources.feed import make_handlers
-from bevviz.sources.messages import StampedTransform
-from bevviz.sources.roles import CameraRole, Roles
-from bevviz.sources.sync import Synchronizer
+from bevviz.ros.messages import StampedTransform
+from bevviz.ros.roles import CameraRole, Roles
+from bevviz.sync.feed import make_handlers
+from bevviz.sync.synchronizer import Synchronizer
 
 SECOND = 1_000_000_000
 T0 = 1_700_000_000 * SECOND  # stamps as a robot has them

@@ -12,15 +12,14 @@ from rosbags.highlevel import AnyReader
 from rosbags.rosbag2.storage_mcap import McapWriter
 
 from bevviz import geometry
+from bevviz.bags.source import BagSource
 from bevviz.config import Config, DetectorConfig
 from bevviz.errors import UserError
-from bevviz.frame import DetectionState
-from bevviz.sources import Source
-from bevviz.sources.bag import BagSource
-from bevviz.sources.synthetic import BagWriter, Snapshot, SyntheticSource, write_bag
-from bevviz.sources.synthetic.bag import TOPICS
-from bevviz.sources.synthetic.drive import PERIOD, START
+from bevviz.frame import DetectionState, Source
 from bevviz.stages.detector import Detector
+from bevviz.synthetic import BagWriter, Snapshot, SyntheticSource, write_bag
+from bevviz.synthetic.bag import TOPICS
+from bevviz.synthetic.drive import PERIOD, START
 
 
 @pytest.fixture(scope="module")

@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 
 from bevviz import geometry
 from bevviz.frame import F64
-from bevviz.sources.messages import StampedTransform
-from bevviz.sources.tf import Origin, TransformBuffer, TransformError
+from bevviz.ros.messages import StampedTransform
+from bevviz.sync.tf import Origin, TransformBuffer, TransformError
 
 SECOND = 1_000_000_000
 

@@ -15,9 +15,9 @@ from bevviz import geometry
 from bevviz.config import TrackingConfig, load
 from bevviz.frame import F32, F64, Boxes3D, Clusters, Frame, LabelledBoxes3D, Objects, Tracks
 from bevviz.pipeline import Pipeline
-from bevviz.sources.synthetic import SyntheticSource
-from bevviz.sources.synthetic.sensors import Lidar, PinholeCamera
 from bevviz.stages.tracking import Tracker
+from bevviz.synthetic import SyntheticSource
+from bevviz.synthetic.sensors import Lidar, PinholeCamera
 
 CONFIG = TrackingConfig()
 PERSON, CAR = (0.6, 0.5, 1.7), (4.4, 1.8, 1.5)

@@ -22,8 +22,8 @@ from bevviz.errors import UserError
 from bevviz.frame import Frame
 from bevviz.live.settings import Settings
 from bevviz.logging.sinks import open_recording
-from bevviz.sources.synthetic import SyntheticSource
 from bevviz.stages import detector
+from bevviz.synthetic import SyntheticSource
 from bevviz.tune import Tuner, Version, create
 from tests import bags
 from tests.recordings import Recording, verify

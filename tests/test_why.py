@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 
 from bevviz import geometry
+from bevviz.bags.source import BagSource
 from bevviz.cli import main
 from bevviz.config import Config, load
 from bevviz.errors import UserError
 from bevviz.frame import Boxes3D, DetectionState, FrameResult, LabelledBoxes3D
 from bevviz.pipeline import Pipeline
-from bevviz.sources.bag import BagSource
-from bevviz.sources.synthetic import BagWriter
+from bevviz.synthetic import BagWriter
 from bevviz.why import Answer, Selection, why
 from bevviz.why.evidence import Fate
 from bevviz.why.subject import projected, truth_box

@@ -33,8 +33,8 @@ from torch.nn import functional as F  # noqa: N812
 
 from bevviz import geometry
 from bevviz.frame import F32, I32, U8
-from bevviz.sources.synthetic.sensors import Caster, PinholeCamera, View, optical
-from bevviz.sources.synthetic.world import World
+from bevviz.synthetic.sensors import Caster, PinholeCamera, View, optical
+from bevviz.synthetic.world import World
 
 NAMES = ("person", "car", "cyclist")
 WIDTH, HEIGHT = 640, 384  # of the exported input

@@ -11,11 +11,11 @@ from dataclasses import asdict, dataclass
 from functools import cached_property, lru_cache
 from pathlib import Path
 
+from bevviz.bags.recording import METADATA, bag_files
 from bevviz.batch.table import About, read_about
 from bevviz.config import Config
 from bevviz.errors import UserError
 from bevviz.logging.logger import versions
-from bevviz.sources.recording import METADATA, bag_files
 
 PARTIAL = ".partial"  # folder of what is not complete
 

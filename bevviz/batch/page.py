@@ -9,8 +9,8 @@ from html import escape
 from typing import Any
 from urllib.parse import quote, urlsplit
 
+from bevviz.bags.source import iso
 from bevviz.batch.table import About
-from bevviz.sources.bag import iso
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from typing import TypeAlias
 from uuid import uuid4
 
+from bevviz.bags.source import BagSource
 from bevviz.batch.jobs import PARTIAL, Job
 from bevviz.batch.table import About, row, write
 from bevviz.errors import UserError
@@ -17,8 +18,7 @@ from bevviz.logging.logger import Logger
 from bevviz.logging.sinks import open_recording
 from bevviz.logging.writer import WAIT
 from bevviz.pipeline import Pipeline
-from bevviz.sources.bag import BagSource
-from bevviz.sources.prefetch import overlap
+from bevviz.prefetch import overlap
 
 
 class WithdrawnError(Exception):

@@ -9,7 +9,21 @@ import sys
 from collections.abc import Callable, Sequence
 
 from bevviz import __version__
-from bevviz.cli import bag, batch, calib, compare, config, demo, info, live, report, sweep, tune, why
+from bevviz.cli import (
+    bag,
+    batch,
+    calib,
+    compare,
+    config,
+    demo,
+    info,
+    interrupts,
+    live,
+    report,
+    sweep,
+    tune,
+    why,
+)
 from bevviz.errors import UserError
 
 EPILOG = """examples:
@@ -35,16 +49,24 @@ def main(arguments: Sequence[str] | None = None) -> int:
     # Imports and frames make many objects and few cycles: at Python's default of 700 between two looks for
     # cycles these take a tenth of all the time.
     gc.set_threshold(50_000, 10, 10)
-    options = _parser().parse_args(arguments)
-    run: Callable[[argparse.Namespace], int] = options.run
+    if arguments is None:
+        interrupts.install()
     try:
+        options = _parser().parse_args(arguments)
+        run: Callable[[argparse.Namespace], int] = options.run
         return run(options)
     except UserError as error:
         print(f"bevviz: error: {error}", file=sys.stderr)
         return 2
+    except KeyboardInterrupt:
+        print("bevviz: interrupted", file=sys.stderr)
+        return 130
     except BrokenPipeError:  # the reader of our output has gone, as in `bevviz info bag | head`
         sys.stdout = open(os.devnull, "w")  # noqa: SIM115, PTH123
         return 0
+    finally:
+        if arguments is None:
+            interrupts.ignore()
 
 
 def _parser() -> argparse.ArgumentParser:

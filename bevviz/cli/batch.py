@@ -10,6 +10,7 @@ from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from bevviz.cli.interrupts import terminable, wait_for_interrupt
 from bevviz.cli.options import (
     TIMES,
     Commands,
@@ -19,7 +20,7 @@ from bevviz.cli.options import (
     port,
     positive,
 )
-from bevviz.cli.run import hint, say, terminable, wait_for_interrupt
+from bevviz.cli.run import hint, say
 from bevviz.errors import UserError
 
 if TYPE_CHECKING:
@@ -94,8 +95,8 @@ def _batch(options: argparse.Namespace) -> int:
 
 def _jobs(options: argparse.Namespace) -> list[Job]:
     from bevviz.batch.jobs import Selection, make_jobs
+    from bevviz.frame import Scene
     from bevviz.logging import blueprints
-    from bevviz.sources import Scene
     from bevviz.stages.detector import Detector
 
     config = load_config(options)

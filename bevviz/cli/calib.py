@@ -6,13 +6,14 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from bevviz.cli.interrupts import terminable
 from bevviz.cli.options import Commands, add_bag, add_config, add_output, add_selection, load_config, open_bag
-from bevviz.cli.run import has_display, outputs, say, serve, terminable
+from bevviz.cli.run import has_display, outputs, say, serve
 
 if TYPE_CHECKING:
     from bevviz.calib import Calibration, Shots
     from bevviz.config import Config
-    from bevviz.sources import Scene
+    from bevviz.frame import Scene
 
 FRAMES = 30  # that are taken where --every does not say
 

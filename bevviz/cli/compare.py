@@ -15,10 +15,10 @@ from bevviz.errors import UserError
 if TYPE_CHECKING:
     from rerun import RecordingStream
 
+    from bevviz.bags.source import BagSource
     from bevviz.compare.sides import Comparison, Results
     from bevviz.compare.summary import Summary
     from bevviz.config import Config, Preset
-    from bevviz.sources.bag import BagSource
 
 DESCRIPTION = """Run two configurations on the same frames and show how the results differ: objects that only
 A or only B has, that have moved, or that have another class. Without --a, --b, --set-a, --set-b, --preset

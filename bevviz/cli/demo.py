@@ -8,7 +8,7 @@ from pathlib import Path
 from bevviz.cli.options import Commands, add_config, add_output, load_config, positive
 from bevviz.cli.run import process
 
-# Held to bevviz.sources.synthetic.faults by a test: importing that takes as long as a command should.
+# Held to bevviz.synthetic.faults by a test: importing that takes as long as a command should.
 PLANTS = """faults to --plant:
   hidden_person   at 1 s: a person hidden behind a parked van: no point, no pixel
   flat_car        at 3 s: a car half a metre high, which the reference preset takes for ground
@@ -57,7 +57,7 @@ def add(commands: Commands) -> None:
 
 def _demo(options: argparse.Namespace) -> int:
     from bevviz.config import load
-    from bevviz.sources.synthetic import SyntheticSource, write_bag
+    from bevviz.synthetic import SyntheticSource, write_bag
 
     source = SyntheticSource(options.frames, options.seed, plant=options.plant, weave=options.weave)
     if options.bag is not None:

@@ -23,10 +23,10 @@ def add(commands: Commands) -> None:
 
 
 def _info(options: argparse.Namespace) -> int:
-    from bevviz.sources.info import describe, render
+    from bevviz.bags.info import describe, render
 
     if options.live:
-        from bevviz.ros import info
+        from bevviz.live import info
 
         print(info.render(info.describe(load_config(options), options.ros_args)))
         return 0

@@ -9,16 +9,18 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from bevviz.cli.interrupts import terminable
 from bevviz.cli.options import Commands, add_config, add_output, add_ros_args, positive
-from bevviz.cli.run import has_display, say, terminable
+from bevviz.cli.run import has_display, say
 
 if TYPE_CHECKING:
     from bevviz.config import Config
-    from bevviz.frame import FrameResult
-    from bevviz.live import Live, Notes, Settings, Status
-    from bevviz.sources import Source
-    from bevviz.sources.live import LiveSource
-    from bevviz.sources.replay import Replay
+    from bevviz.frame import FrameResult, Source
+    from bevviz.live.notes import Notes
+    from bevviz.live.replay import Replay
+    from bevviz.live.runtime import Live, Status
+    from bevviz.live.settings import Settings
+    from bevviz.live.source import LiveSource
 
 
 def add(commands: Commands) -> None:
@@ -79,7 +81,8 @@ def _split(text: str) -> str:
 def _live(options: argparse.Namespace) -> int:
     # What Rerun would warn of is meant: files are indexed when they are complete.
     os.environ.setdefault("RUST_LOG", "warn,re_log_encoding=error")
-    from bevviz.live import Notes, Settings
+    from bevviz.live.notes import Notes
+    from bevviz.live.settings import Settings
     from bevviz.logging.sinks import check_port
 
     given = {
@@ -100,7 +103,7 @@ def _live(options: argparse.Namespace) -> int:
     with terminable():
         if options.synthetic:
             return _watch(_replay(options.synthetic), settings, options, notes)
-        from bevviz.sources.live import LiveSource
+        from bevviz.live.source import LiveSource
 
         with LiveSource(settings.config, arguments=options.ros_args, tell=notes.info) as source:
             return _watch_robot(source, settings, options, notes)
@@ -137,8 +140,8 @@ def _watch_robot(source: LiveSource, settings: Settings, options: argparse.Names
 def _replay(frames: int) -> Replay:
     from tqdm import tqdm
 
-    from bevviz.sources.replay import Replay
-    from bevviz.sources.synthetic import SyntheticSource
+    from bevviz.live.replay import Replay
+    from bevviz.synthetic import SyntheticSource
 
     source = SyntheticSource(frames=frames)
     drive = list(tqdm(source, total=source.total, unit="scan", desc="simulate", disable=None))
@@ -156,7 +159,7 @@ def _watch(
     """The live run, until the source ends or the user ends it."""
     from tqdm import tqdm
 
-    from bevviz.live import Live, Outputs
+    from bevviz.live.runtime import Live, Outputs
 
     window = options.viewer
     unsaid = options.save is None and options.serve is None and options.connect is None and not window

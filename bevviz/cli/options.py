@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, TypeAlias
 
 if TYPE_CHECKING:
+    from bevviz.bags.source import BagSource
     from bevviz.config import Config
-    from bevviz.sources.bag import BagSource
 
 Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
 
@@ -40,7 +40,7 @@ def add_selection(group: argparse._ArgumentGroup) -> None:
 
 def open_bag(options: argparse.Namespace, config: Config) -> BagSource:
     """What ``add_bag`` and ``add_selection`` ask for."""
-    from bevviz.sources.bag import BagSource
+    from bevviz.bags.source import BagSource
 
     return BagSource(
         options.paths,

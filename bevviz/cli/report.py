@@ -5,8 +5,9 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from bevviz.cli.interrupts import terminable
 from bevviz.cli.options import Commands, add_bag, add_config, load_config
-from bevviz.cli.run import say, terminable
+from bevviz.cli.run import say
 from bevviz.errors import UserError
 
 
@@ -60,8 +61,8 @@ def _report(options: argparse.Namespace) -> int:
 
 
 def _make(options: argparse.Namespace) -> int:
+    from bevviz.bags.mcap import megabytes
     from bevviz.report.make import Order, make
-    from bevviz.sources.mcap import megabytes
 
     if options.at is None:
         raise UserError("--at TIME is missing: the time that the report is about")

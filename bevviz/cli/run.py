@@ -5,22 +5,21 @@ from __future__ import annotations
 import argparse
 import gc
 import os
-import signal
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, closing, contextmanager, suppress
+from contextlib import AbstractContextManager, closing, contextmanager
 from pathlib import Path
-from threading import Event
-from typing import TYPE_CHECKING, Any, NoReturn, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any, Protocol, TypeVar
+
+from bevviz.cli.interrupts import terminable, wait_for_interrupt
 
 if TYPE_CHECKING:
     from rerun import RecordingStream
     from rerun.blueprint import Blueprint
 
     from bevviz.config import Config
-    from bevviz.frame import FrameResult
+    from bevviz.frame import FrameResult, Scene, Source
     from bevviz.logging.sinks import Sinks
-    from bevviz.sources import Scene, Source
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -158,7 +157,7 @@ def through(items: Items[T], work: Callable[[T], R], handle: Callable[[R], None]
     """
     from tqdm import tqdm
 
-    from bevviz.sources.prefetch import overlap
+    from bevviz.prefetch import overlap
 
     done = 0
     gc.freeze()  # what was imported stays: it need not be looked through again and again
@@ -191,29 +190,3 @@ def say(line: str) -> None:
 
 def has_display() -> bool:
     return sys.platform != "linux" or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
-
-
-@contextmanager
-def terminable() -> Iterator[Event]:
-    """SIGTERM ends a run as Ctrl-C does: with a readable recording.
-
-    Both raise KeyboardInterrupt and set the event: an exception that comes while a library calls back
-    into Python can get lost there.
-    """
-    ended = Event()
-
-    def interrupt(number: int, stack: object) -> NoReturn:
-        ended.set()
-        raise KeyboardInterrupt
-
-    before = {number: signal.signal(number, interrupt) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield ended
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
-
-
-def wait_for_interrupt() -> None:
-    with suppress(KeyboardInterrupt), terminable():
-        signal.pause()

@@ -8,14 +8,14 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from bevviz.cli.interrupts import terminable
 from bevviz.cli.options import Commands, add_bag, add_config, add_output
-from bevviz.cli.run import has_display, hint, outputs, say, terminable
+from bevviz.cli.run import has_display, hint, outputs, say
 from bevviz.errors import UserError
 
 if TYPE_CHECKING:
-    from bevviz.frame import Frame
+    from bevviz.frame import Frame, Scene
     from bevviz.live.settings import Settings
-    from bevviz.sources import Scene
     from bevviz.tune import Tuner
 
 LOOK = 0.01  # seconds between two looks at the file
@@ -63,7 +63,7 @@ def _tune(options: argparse.Namespace) -> int:
 
 def _frame(options: argparse.Namespace, settings: Settings) -> tuple[Frame, Scene, Sequence[str]]:
     """The frame, decoded once, with the sensors' names and what is to be said of the bag."""
-    from bevviz.sources.bag import BagSource
+    from bevviz.bags.source import BagSource
 
     at = {"at": options.at} if options.at is not None else {"frames": (0, 1)}
     with BagSource(options.paths, settings.config, **at) as source:

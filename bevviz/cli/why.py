@@ -6,14 +6,14 @@ import argparse
 from collections.abc import Callable, Iterable, Sequence
 from typing import TYPE_CHECKING
 
+from bevviz.cli.interrupts import terminable
 from bevviz.cli.options import Commands, add_bag, add_config, add_output, load_config, positive
-from bevviz.cli.run import outputs, say, serve, terminable
+from bevviz.cli.run import outputs, say, serve
 from bevviz.errors import UserError
 
 if TYPE_CHECKING:
     from bevviz.config import Config
-    from bevviz.frame import FrameResult
-    from bevviz.sources import Scene
+    from bevviz.frame import FrameResult, Scene
     from bevviz.why import Answer
 
 EXAMPLES = """examples:
@@ -84,8 +84,8 @@ def _metres(text: str) -> float:
 
 
 def _why(options: argparse.Namespace) -> int:
+    from bevviz.bags.source import BagSource
     from bevviz.pipeline import Pipeline
-    from bevviz.sources.bag import BagSource
     from bevviz.why import Selection, why
     from bevviz.why.text import plain
 

@@ -18,10 +18,9 @@ from bevviz.compare.log import DifferenceLogger
 from bevviz.compare.summary import Summary, parameters
 from bevviz.config import flat_yaml
 from bevviz.errors import UserError
-from bevviz.frame import F64, Boxes3D
+from bevviz.frame import F64, Boxes3D, Scene
 from bevviz.logging import entities
 from bevviz.logging.pieces import CORNER
-from bevviz.sources import Scene
 
 Row = Mapping[str, Any]
 

@@ -24,11 +24,11 @@ from bevviz.frame import (
     LabelledBoxes2D,
     LabelledBoxes3D,
     Objects,
+    Scene,
 )
 from bevviz.live.settings import differences as config_differences
 from bevviz.logging import entities
 from bevviz.logging.logger import Logger
-from bevviz.sources import Scene
 from bevviz.variants import Variants, check_same_frames, common_frames
 
 Results = tuple[Frame, FrameResult | None, FrameResult | None]

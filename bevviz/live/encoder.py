@@ -16,11 +16,10 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from bevviz.config import Config
-from bevviz.frame import FrameResult
+from bevviz.frame import FrameResult, Scene
 from bevviz.logging import blueprints
 from bevviz.logging.logger import Context, Logger
 from bevviz.logging.sinks import APPLICATION
-from bevviz.sources import Scene
 
 WHOLE = 1.0  # seconds from one frame that needs none before it to the next
 

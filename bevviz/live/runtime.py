@@ -18,7 +18,7 @@ import numpy as np
 from bevviz.anomalies import AnomalyDetector
 from bevviz.config import Config
 from bevviz.errors import UserError
-from bevviz.frame import CameraResult, Frame, FrameResult
+from bevviz.frame import CameraResult, Frame, FrameResult, Source
 from bevviz.live.control import Control
 from bevviz.live.encoder import Encoder
 from bevviz.live.files import Indexer, Saver
@@ -32,7 +32,6 @@ from bevviz.live.triggers import Triggers
 from bevviz.live.viewers import Viewer, remote, server, window
 from bevviz.logging import entities
 from bevviz.pipeline import Pipeline
-from bevviz.sources import Source
 
 TICK = 0.2  # seconds between two looks at signals
 LOOK = 1.0  # seconds between two looks at the configuration file and the clock

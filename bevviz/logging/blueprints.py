@@ -11,7 +11,7 @@ from rerun.recording_stream import RecordingStream
 
 import bevviz
 from bevviz.errors import UserError
-from bevviz.sources import Scene
+from bevviz.frame import Scene
 
 
 def _folder() -> Path:

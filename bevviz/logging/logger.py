@@ -37,6 +37,7 @@ from bevviz.frame import (
     LabelledBoxes2D,
     LabelledBoxes3D,
     Objects,
+    Scene,
     Tracks,
 )
 from bevviz.logging import entities, tracks
@@ -44,7 +45,6 @@ from bevviz.logging.entities import ClassId
 from bevviz.logging.pieces import CORNER, blob, boxes3d, rounded, transform
 from bevviz.logging.text import markdown, remarks
 from bevviz.logging.writer import Writer
-from bevviz.sources import Scene
 from bevviz.stages.voxel import of_points
 
 _OUTLINE = rr.components.FillMode.MajorWireframe

@@ -15,8 +15,8 @@ import rerun.blueprint as rrb
 
 from bevviz.config import Config
 from bevviz.errors import UserError, first_line
+from bevviz.frame import Scene
 from bevviz.logging import blueprints
-from bevviz.sources import Scene
 
 APPLICATION = "bevviz"
 MEMORY = "25%"  # of the machine's, for what a server keeps for those who join late, and for the viewer

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import rerun.blueprint as rrb
 
 from bevviz.calib.axes import AXES
+from bevviz.frame import Scene
 from bevviz.logging import entities
-from bevviz.sources import Scene
 
 _DARK = (13, 14, 18)
 _HIDDEN = rrb.EntityBehavior(visible=False)

@@ -17,11 +17,11 @@ from bevviz.errors import UserError
 from bevviz.logging import entities
 from bevviz.logging.logger import versions
 from bevviz.pipeline import Pipeline
+from bevviz.prefetch import prefetch
 from bevviz.report.digest import ROUNDING, Difference, Stage, compare, detections_of, digest, unpack
 from bevviz.report.make import replay
 from bevviz.report.origin import About, changes, file_hash, hardware, model_of
 from bevviz.report.window import open_window
-from bevviz.sources.prefetch import prefetch
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,10 +9,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from bevviz import __version__
+from bevviz.bags.source import SECOND, iso
 from bevviz.config import Config
 from bevviz.report.origin import Model, changes
 from bevviz.report.window import Window
-from bevviz.sources.bag import SECOND, iso
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -11,6 +11,9 @@ from pathlib import Path
 import rerun as rr
 from tqdm import tqdm
 
+from bevviz.bags.mcap import megabytes
+from bevviz.bags.recording import RawMessage
+from bevviz.bags.source import MARGIN, BagSource
 from bevviz.config import Config
 from bevviz.errors import UserError
 from bevviz.frame import Camera, Detections
@@ -18,6 +21,7 @@ from bevviz.logging import entities
 from bevviz.logging.logger import Logger, versions
 from bevviz.logging.sinks import open_recording
 from bevviz.pipeline import Pipeline
+from bevviz.prefetch import prefetch
 from bevviz.report.digest import digest, pack
 from bevviz.report.facts import Facts, commands, file_lines, window_text
 from bevviz.report.origin import (
@@ -34,10 +38,6 @@ from bevviz.report.page import page
 from bevviz.report.redact import Redactor
 from bevviz.report.story import Story
 from bevviz.report.window import Cut, Window, choose_topics, cut, find_window, open_window
-from bevviz.sources.bag import MARGIN, BagSource
-from bevviz.sources.mcap import megabytes
-from bevviz.sources.prefetch import prefetch
-from bevviz.sources.recording import RawMessage
 from bevviz.stages.detector import Detector
 
 Found = Mapping[tuple[str, int], Detections]  # by camera and stamp of the image

@@ -8,13 +8,13 @@ from collections.abc import Iterable, Iterator, Sequence
 from html import escape
 from importlib.resources import files
 
+from bevviz.bags.source import SECOND
 from bevviz.frame import Explanation, FrameResult
 from bevviz.logging import entities
 from bevviz.report.facts import Facts
 from bevviz.report.pictures import camera_picture, jpeg, shrink
 from bevviz.report.plots import Series, plot
 from bevviz.report.story import Story
-from bevviz.sources.bag import SECOND
 
 PICTURE_WIDTH = 960
 

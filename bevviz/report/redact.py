@@ -11,11 +11,11 @@ from typing import Any
 import cv2
 import numpy as np
 
+from bevviz.bags.recording import RawMessage, Recording
 from bevviz.config import DetectorConfig
 from bevviz.errors import UserError
 from bevviz.frame import F32, U8
-from bevviz.sources.messages import MessageError, decode_compressed_image, decode_image
-from bevviz.sources.recording import RawMessage, Recording
+from bevviz.ros.messages import MessageError, decode_compressed_image, decode_image
 from bevviz.stages.detector import Detector
 
 SCORE = 0.01  # candidates from here on are hidden: rather too much than too little

@@ -11,12 +11,12 @@ from pathlib import Path
 import numpy as np
 from backports import zstd
 
+from bevviz.bags.mcap_writer import McapWriter
+from bevviz.bags.recording import RawMessage, Recording, is_ros1
+from bevviz.bags.source import MARGIN, SECOND, BagSource, iso
 from bevviz.config import Config
 from bevviz.errors import UserError
-from bevviz.sources.bag import MARGIN, SECOND, BagSource, iso
-from bevviz.sources.mcap_writer import McapWriter
-from bevviz.sources.recording import RawMessage, Recording, is_ros1
-from bevviz.sources.roles import Roles
+from bevviz.ros.roles import Roles
 
 MILLISECOND = 1_000_000
 

@@ -1,1 +1,1 @@
-"""The parts of bevviz that meet a running ROS 2 graph; nothing else imports rclpy."""
+"""ROS: messages and the roles of their topics; and, in what imports rclpy, a running graph."""

@@ -10,8 +10,8 @@ import numpy as np
 from bevviz.config import Config
 from bevviz.errors import UserError
 from bevviz.frame import I64, Boxes3D, Cloud, Clusters, ClusterState, DetectionState, FrameResult, Image
+from bevviz.ros.encode import encode_boxes_2d, encode_boxes_3d, encode_cloud, encode_image, typestore
 from bevviz.ros.typesupport import message_type
-from bevviz.sources.encode import encode_boxes_2d, encode_boxes_3d, encode_cloud, encode_image, typestore
 
 BEV = "/visualization/bev_image"
 OBSTACLES = "/lidar/points_no_ground"

@@ -15,7 +15,7 @@ from functools import cache
 from typing import Any
 
 from bevviz.errors import UserError
-from bevviz.sources.encode import typestore
+from bevviz.ros.encode import typestore
 
 FAST_DDS = "rmw_fastrtps_cpp"
 _UNBOUNDED = b"\x00"

@@ -14,7 +14,7 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 from bevviz import geometry
 from bevviz.errors import UserError
 from bevviz.frame import Frame
-from bevviz.sources.encode import (
+from bevviz.ros.encode import (
     encode_boxes_3d,
     encode_camera_info,
     encode_cloud,
@@ -23,8 +23,8 @@ from bevviz.sources.encode import (
     encode_transforms,
     typestore,
 )
-from bevviz.sources.synthetic import drive
-from bevviz.sources.synthetic.drive import SyntheticSource
+from bevviz.synthetic import drive
+from bevviz.synthetic.drive import SyntheticSource
 
 TOPICS = {
     drive.LIDAR_TOPIC: "sensor_msgs/msg/PointCloud2",

@@ -8,11 +8,11 @@ from collections import Counter, deque
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from bevviz.bags.info import Contents, TopicInfo, find_missing, render_contents
 from bevviz.config import Config
 from bevviz.frame import Frame
+from bevviz.live.source import LiveSource
 from bevviz.ros.graph import PublishedTopic, describe_qos
-from bevviz.sources.info import Contents, TopicInfo, find_missing, render_contents
-from bevviz.sources.live import LiveSource
 
 PATIENCE = 10.0  # seconds until what is there so far is shown
 

@@ -12,15 +12,14 @@ from types import TracebackType
 
 import numpy as np
 
+from bevviz.bags.recording import RawMessage, Recording
 from bevviz.config import Config
 from bevviz.errors import UserError
-from bevviz.frame import F64, Frame
-from bevviz.sources import Scene
-from bevviz.sources.feed import Handler, make_handlers
-from bevviz.sources.messages import MessageError, decode_transforms
-from bevviz.sources.recording import RawMessage, Recording
-from bevviz.sources.roles import find_roles
-from bevviz.sources.sync import Synchronizer
+from bevviz.frame import F64, Frame, Scene
+from bevviz.ros.messages import MessageError, decode_transforms
+from bevviz.ros.roles import find_roles
+from bevviz.sync.feed import Handler, make_handlers
+from bevviz.sync.synchronizer import Synchronizer
 
 SECOND = 1_000_000_000
 MARGIN = 2 * SECOND  # what else belongs to the first and the last cloud is looked for this far outside

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from bevviz.errors import UserError
-from bevviz.sources.synthetic import models
-from bevviz.sources.synthetic.world import Stage
+from bevviz.synthetic import models
+from bevviz.synthetic.world import Stage
 
 
 @dataclass(frozen=True, slots=True)

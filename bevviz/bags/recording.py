@@ -26,14 +26,15 @@ from rosbags.typesys import Stores, TypesysError, get_types_from_idl, get_types_
 from rosbags.typesys.msg import normalize_msgtype
 from rosbags.typesys.store import Typestore
 
+from bevviz.bags import mcap, ros1, sqlite
+from bevviz.bags.mcap import McapFile, megabytes
+from bevviz.bags.ros1 import Ros1File
+from bevviz.bags.sqlite import SqliteFile
 from bevviz.errors import UserError
 from bevviz.frame import I64
-from bevviz.sources import mcap, ros1, sqlite, vision_msgs
-from bevviz.sources.mcap import McapFile, megabytes
-from bevviz.sources.messages import MessageError, read_header
-from bevviz.sources.roles import Topic
-from bevviz.sources.ros1 import Ros1File
-from bevviz.sources.sqlite import SqliteFile
+from bevviz.ros import vision_msgs
+from bevviz.ros.messages import MessageError, read_header
+from bevviz.ros.roles import Topic
 
 BagFile = McapFile | SqliteFile | Ros1File
 

@@ -12,7 +12,7 @@ from rosbags.typesys.store import Typestore
 
 from bevviz import geometry
 from bevviz.frame import F32, F64, Boxes3D, Cloud, Image, Intrinsics
-from bevviz.sources import vision_msgs
+from bevviz.ros import vision_msgs
 
 
 @cache

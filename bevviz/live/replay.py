@@ -7,8 +7,7 @@ import time
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
-from bevviz.frame import Frame
-from bevviz.sources import Scene
+from bevviz.frame import Frame, Scene
 
 
 class Replay:

@@ -33,9 +33,9 @@ from rosbags.rosbag1.reader import (
 )
 from rosbags.typesys.msg import normalize_msgtype
 
+from bevviz.bags.mcap import megabytes
 from bevviz.errors import UserError
 from bevviz.frame import I64
-from bevviz.sources.mcap import megabytes
 
 MAGIC = b"#ROSBAG V2.0\n"
 # Unlike the one-shot functions these give what there is of a stream whose end is missing.

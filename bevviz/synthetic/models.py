@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from bevviz.frame import F64
-from bevviz.sources.synthetic.mesh import (
+from bevviz.synthetic.mesh import (
     Material,
     Mesh,
     box,

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from bevviz import geometry, o3d
 from bevviz.frame import F32, F64, I32, U8, Intrinsics
-from bevviz.sources.synthetic.mesh import Material, Mesh
-from bevviz.sources.synthetic.world import Light
+from bevviz.synthetic.mesh import Material, Mesh
+from bevviz.synthetic.world import Light
 
 # Share of the emitted light that comes back, and amplitude of the texture.
 _SURFACE: Mapping[Material, tuple[float, float]] = {

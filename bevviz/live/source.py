@@ -12,16 +12,15 @@ from typing import Any
 
 from bevviz.config import Config, SourceConfig
 from bevviz.errors import UserError
-from bevviz.frame import Frame, Intrinsics
+from bevviz.frame import Frame, Intrinsics, Scene
+from bevviz.ros.encode import typestore
 from bevviz.ros.graph import PublishedTopic, matched_qos, mismatches, published_topics
+from bevviz.ros.messages import MessageError, read_header
+from bevviz.ros.roles import Roles, Topic, find_roles
 from bevviz.ros.session import Session
 from bevviz.ros.typesupport import message_type
-from bevviz.sources import Scene
-from bevviz.sources.encode import typestore
-from bevviz.sources.feed import Handler, make_handlers
-from bevviz.sources.messages import MessageError, read_header
-from bevviz.sources.roles import Roles, Topic, find_roles
-from bevviz.sources.sync import Synchronizer
+from bevviz.sync.feed import Handler, make_handlers
+from bevviz.sync.synchronizer import Synchronizer
 
 LOOK = 0.5  # seconds between two looks at the graph
 TICK = 0.05  # seconds between two looks at the clouds that have waited long enough

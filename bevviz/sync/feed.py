@@ -7,7 +7,7 @@ from functools import partial
 from typing import Any, Protocol, TypeVar
 
 from bevviz.frame import Image
-from bevviz.sources.messages import (
+from bevviz.ros.messages import (
     decode_camera_info,
     decode_cloud,
     decode_compressed_image,
@@ -17,8 +17,8 @@ from bevviz.sources.messages import (
     decode_odometry,
     decode_transforms,
 )
-from bevviz.sources.roles import CameraRole, Roles
-from bevviz.sources.sync import Synchronizer
+from bevviz.ros.roles import CameraRole, Roles
+from bevviz.sync.synchronizer import Synchronizer
 
 
 class Message(Protocol):

@@ -9,8 +9,8 @@ import numpy as np
 
 from bevviz import geometry
 from bevviz.frame import F32, F64
-from bevviz.sources.synthetic import models
-from bevviz.sources.synthetic.mesh import Material, Mesh, grid, merge
+from bevviz.synthetic import models
+from bevviz.synthetic.mesh import Material, Mesh, grid, merge
 
 SPEED = 8.0  # metres per second, the ego vehicle's mean
 MARGIN = 140.0  # metres of street before the start and beyond the end: more than the LiDAR's range

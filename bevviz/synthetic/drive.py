@@ -12,12 +12,23 @@ from numpy.typing import NDArray
 
 from bevviz import geometry
 from bevviz.errors import UserError
-from bevviz.frame import F64, I32, Bool, Boxes3D, Camera, Cloud, Frame, Image, Intrinsics, LabelledBoxes3D
-from bevviz.sources import Scene
-from bevviz.sources.synthetic import faults
-from bevviz.sources.synthetic.mesh import Material
-from bevviz.sources.synthetic.sensors import Caster, Lidar, PinholeCamera, View, optical
-from bevviz.sources.synthetic.world import World, bounds
+from bevviz.frame import (
+    F64,
+    I32,
+    Bool,
+    Boxes3D,
+    Camera,
+    Cloud,
+    Frame,
+    Image,
+    Intrinsics,
+    LabelledBoxes3D,
+    Scene,
+)
+from bevviz.synthetic import faults
+from bevviz.synthetic.mesh import Material
+from bevviz.synthetic.sensors import Caster, Lidar, PinholeCamera, View, optical
+from bevviz.synthetic.world import World, bounds
 
 LIDAR_TOPIC = "/rslidar_points"
 IMAGE_TOPIC = "/zed2/zed/rgb/image_rect_color"
@@ -57,7 +68,7 @@ class SyntheticSource:
     Args:
         frames: length of the drive.
         seed: of street, traffic, light and sensor noise.
-        plant: names of faults to plant, see ``bevviz.sources.synthetic.faults``.
+        plant: names of faults to plant, see ``bevviz.synthetic.faults``.
         weave: the vehicle swerves, brakes and speeds up, as to calibrate its sensors with.
         camera_error: (4, 4) true_camera_from_stated_camera, how wrong the stated mounting of the camera is.
         image_late: seconds by which the stamps of the images are late.

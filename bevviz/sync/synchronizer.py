@@ -17,9 +17,9 @@ from bevviz import geometry
 from bevviz.config import Config
 from bevviz.errors import UserError
 from bevviz.frame import F32, F64, Camera, Cloud, Frame, Image, Intrinsics, LabelledBoxes2D, LabelledBoxes3D
-from bevviz.sources.messages import StampedTransform
-from bevviz.sources.roles import CameraRole, Roles, entity_name
-from bevviz.sources.tf import Lookup, Origin, TransformBuffer, TransformError
+from bevviz.ros.messages import StampedTransform
+from bevviz.ros.roles import CameraRole, Roles, entity_name
+from bevviz.sync.tf import Lookup, Origin, TransformBuffer, TransformError
 
 T = TypeVar("T")
 

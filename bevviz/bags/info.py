@@ -10,13 +10,13 @@ from pathlib import Path
 
 import numpy as np
 
+from bevviz.bags.mcap import megabytes
+from bevviz.bags.recording import Recording
+from bevviz.bags.source import SECOND, BagSource, iso
 from bevviz.config import Config
 from bevviz.errors import UserError
 from bevviz.frame import Camera, Frame
-from bevviz.sources.bag import SECOND, BagSource, iso
-from bevviz.sources.mcap import megabytes
-from bevviz.sources.recording import Recording
-from bevviz.sources.roles import Roles, Topic, find_roles
+from bevviz.ros.roles import Roles, Topic, find_roles
 
 WIDTH = 100
 TRIAL = 5  # the scan that is tried out: at the first ones a camera or a transform may not have begun

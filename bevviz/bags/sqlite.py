@@ -16,9 +16,9 @@ from rosbags.rosbag2.errors import ReaderError
 from rosbags.rosbag2.metadata import ReaderMetadata
 from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader
 
+from bevviz.bags.mcap import FORMATS, megabytes
 from bevviz.errors import UserError
 from bevviz.frame import I64
-from bevviz.sources.mcap import FORMATS, megabytes
 
 MAGIC = b"SQLite format 3\0"
 LEAF = 0x0D  # first byte of a page with table rows

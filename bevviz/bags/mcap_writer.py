@@ -17,8 +17,7 @@ from rosbags.rosbag2.metadata import dump_qos_v9
 from ruamel.yaml import YAML
 
 from bevviz import __version__
-from bevviz.errors import UserError
-from bevviz.sources.mcap import (
+from bevviz.bags.mcap import (
     CHANNEL,
     CHUNK,
     CHUNK_HEAD,
@@ -31,6 +30,7 @@ from bevviz.sources.mcap import (
     RECORD,
     SCHEMA,
 )
+from bevviz.errors import UserError
 
 HEADER, CHUNK_INDEX, STATISTICS = 1, 8, 0x0B
 CHUNK_SIZE = 1 << 22  # bytes that a chunk is closed at
