@@ -19,7 +19,7 @@ from bevviz.config import Preset, load
 from bevviz.evaluate import MAX_DISTANCE, MIN_HITS, RANGE, pair_in_order
 from bevviz.frame import DetectionState, FrameResult
 from bevviz.geometry import iou
-from bevviz.pipeline import Pipeline
+from bevviz.session import Session
 from bevviz.synthetic import Snapshot, SyntheticSource
 
 PRESETS: tuple[Preset, ...] = ("reference", "default")
@@ -73,21 +73,19 @@ def main() -> None:
     options = parser.parse_args()
 
     tallies = {preset: Tally() for preset in PRESETS}
-    pipelines = {p: Pipeline(load(settings=["detector.model=demo"], preset=p)) for p in PRESETS}
+    sessions = {p: Session(load(settings=["detector.model=demo"], preset=p)) for p in PRESETS}
     shots = [(seed, index) for seed in options.seeds for index in range(0, options.frames, options.every)]
     sources = {seed: SyntheticSource(options.frames, seed) for seed in options.seeds}
     for seed, index in tqdm(shots, unit="frame", disable=None):
         shot = sources[seed].snapshot(index)
         for preset, tally in tallies.items():
-            result = pipelines[preset].run(shot.frame)
+            result = sessions[preset].run(shot.frame)
             if result.failures:
                 raise SystemExit(f"seed {seed}, frame {index}, {preset}: {result.failures}")
             add_ground(tally, shot, result)
             add_clusters(tally, shot, result)
             add_detections(tally, shot, result)
             add_objects(tally, shot, result)
-    for pipeline in pipelines.values():
-        pipeline.close()
     tracked = Tallies(TrackTally)
     for seed in options.tracked_seeds:
         track(tracked, SyntheticSource(options.frames, seed), options.tracked)
@@ -105,12 +103,12 @@ def main() -> None:
 
 def track(tallies: Tallies, source: SyntheticSource, frames: int) -> None:
     """The beginning of a drive, scan after scan, with the default preset."""
-    with Pipeline(load(settings=["detector.model=demo"])) as pipeline:
-        for index in tqdm(range(min(frames, source.total)), unit="scan", disable=None):
-            shot = source.snapshot(index)
-            tracks = pipeline.run(shot.frame).tracks
-            assert tracks is not None
-            add_tracks(tallies, source.seed, tracks, truth_of(source, shot, required(shot)[0]))
+    session = Session(load(settings=["detector.model=demo"]))
+    for index in tqdm(range(min(frames, source.total)), unit="scan", disable=None):
+        shot = source.snapshot(index)
+        tracks = session.run(shot.frame).tracks
+        assert tracks is not None
+        add_tracks(tallies, source.seed, tracks, truth_of(source, shot, required(shot)[0]))
 
 
 def add_ground(tally: Tally, shot: Snapshot, result: FrameResult) -> None:

@@ -19,11 +19,11 @@ from tqdm import tqdm
 from benchmarks import tutorial
 from benchmarks.measure import Times, interleaved
 from bevviz.config import load
-from bevviz.frame import F32, I32, Detections, Frame, Scene
+from bevviz.frame import F32, I32, Camera, Detections, Frame, Scene
 from bevviz.logging.logger import Logger
 from bevviz.logging.sinks import open_recording
-from bevviz.pipeline import Pipeline
 from bevviz.ros.messages import decode_cloud
+from bevviz.session import Session
 from bevviz.stages.bev import bev
 from bevviz.stages.clustering import cluster, dbscan
 from bevviz.stages.ground import segment_ground
@@ -54,8 +54,8 @@ def compare(messages: Sequence[Any], frames: Sequence[Frame], scene: Scene, repe
     rows.append(row(what, "a Python generator into np.fromiter", times, 50, _said(same, "arrays equal")))
 
     as_tutorial = load(settings=["detector.model=demo"], preset="reference")
-    with Pipeline(as_tutorial) as pipeline:
-        results = [pipeline.run(f) for f in frames[:: max(1, len(frames) // 5)]]
+    session = Session(as_tutorial)
+    results = [session.run(f) for f in frames[:: max(1, len(frames) // 5)]]
     drawn = next((r for r in results if r.objects), results[0])
     points, inverse = drawn.frame.points, drawn.voxels.inverse if drawn.voxels else np.zeros(0, np.int32)
     ground = drawn.ground.mask[inverse] if drawn.ground else None
@@ -106,16 +106,15 @@ def lidar_side(scene: Scene) -> Iterator[Any]:
     config = load()
     with (
         TemporaryDirectory() as folder,
-        Pipeline(config) as pipeline,
         open_recording(scene, config, save=Path(folder, "x.rrd")) as sinks,
     ):
-        logger = Logger(sinks.recording, config, scene)
+        session, logger = Session(config), Logger(sinks.recording, config, scene)
         logger.log_static()
 
         def process(message: Any, frame: Frame) -> None:
             cloud = decode_cloud(message, "/points", frame.received)
             logger.log(
-                pipeline.run(
+                session.run(
                     replace(frame, points=cloud.xyz, fields=cloud.fields, clouds=(cloud,), cameras=())
                 )
             )
@@ -156,19 +155,18 @@ def profile(messages: Sequence[Any], frames: Sequence[Frame], scene: Scene) -> l
     times: dict[str, list[float]] = defaultdict(list)
     config = load()
     with (
-        Pipeline(config) as pipeline,
         TemporaryDirectory() as folder,
         open_recording(scene, config, save=Path(folder, "x.rrd")) as sinks,
     ):
-        logger = Logger(sinks.recording, config, scene)
+        session, logger = Session(config), Logger(sinks.recording, config, scene)
         logger.log_static()
-        logger.log(pipeline.run(frames[0]))
+        logger.log(session.run(frames[0]))
         bar = tqdm(frames, unit="frame", desc="stages", disable=None)
         for frame, message in zip(bar, messages, strict=True):
             start = time.perf_counter()
             decode_cloud(message, "/points", 0)
             times["decode"].append(time.perf_counter() - start)
-            result = pipeline.run(frame)
+            result = session.run(frame)
             for stage in STAGES:
                 times[stage].append(result.timings.get(stage, 0.0))
             start = time.perf_counter()
@@ -187,8 +185,8 @@ def growth(messages: Sequence[Any], frames: Sequence[Frame], scene: Scene, repet
     frame = frames[0]
     half = replace(frame, points=np.ascontiguousarray(frame.points[::2]), fields={}, clouds=(), cameras=())
     whole = replace(frame, fields={}, clouds=(), cameras=())
-    with Pipeline(load()) as pipeline:
-        few, many = interleaved(repetitions, lambda: pipeline.run(half), lambda: pipeline.run(whole))
+    session = Session(load())
+    few, many = interleaved(repetitions, lambda: session.run(half), lambda: session.run(whole))
     what = f"time, points x 2 ({len(half.points)}, {len(whole.points)})"
     rows = [_growth(what, few, many, 2)]
 
@@ -196,15 +194,13 @@ def growth(messages: Sequence[Any], frames: Sequence[Frame], scene: Scene, repet
     counts = (20, 200)
     with (
         TemporaryDirectory() as folder,
-        Pipeline(config) as pipeline,
         open_recording(scene, config, save=Path(folder, "x.rrd")) as sinks,
     ):
         logger = Logger(sinks.recording, config, scene)
+        sessions = {n: Session(config, partial(_found, scattered(n, frame))) for n in counts}
 
         def detect(count: int) -> None:
-            found = scattered(count, frame)
-            pipeline.detector = lambda _: found  # type: ignore[assignment]
-            logger.log(pipeline.run(frame))
+            logger.log(sessions[count].run(frame))
 
         few, many = interleaved(repetitions, *(partial(detect, n) for n in counts))
     return [
@@ -231,6 +227,10 @@ def scattered(count: int, frame: Frame) -> Detections:
         suppressed_by=none - 1,
         overlap=np.zeros(count, np.float32),
     )
+
+
+def _found(detections: Detections, camera: Camera) -> Detections:
+    return detections
 
 
 def _growth(what: str, few: Times, many: Times, factor: int) -> str:

@@ -15,6 +15,7 @@ import numpy as np
 from bevviz.config import AnomaliesConfig
 from bevviz.frame import F32, Anomaly, AnomalyKind, Decision, DetectionState, FrameResult, Tracks
 from bevviz.geometry import iou
+from bevviz.run import Observer
 from bevviz.stages.fusion import in_view
 
 KINDS: tuple[AnomalyKind, ...] = get_args(AnomalyKind)
@@ -204,7 +205,7 @@ class News:
         return [a for a in anomalies if (a.kind, a.subject, a.since) not in known]
 
 
-class Summary:
+class AnomalySummary(Observer[FrameResult]):
     """How many anomalies of each kind a drive had, and when the first began."""
 
     def __init__(self) -> None:
@@ -213,7 +214,7 @@ class Summary:
         self._count: Counter[str] = Counter()
         self._first: dict[str, int] = {}
 
-    def add(self, result: FrameResult) -> None:
+    def see(self, result: FrameResult) -> None:
         self._start = result.frame.stamp if self._start is None else self._start
         for anomaly in self._news.of(result.anomalies):
             self._count[anomaly.kind] += 1

@@ -1,7 +1,8 @@
 """The whole configuration: pydantic models with units, two presets, YAML files and ``key=value`` settings.
 
 ``default`` is the better method at every stage, ``reference`` is what the ROS 2 tutorial pipeline
-computes. The tutorial's own parameter names (``cluster_tolerance`` ...) are accepted everywhere.
+computes. The tutorial's own parameter names (``cluster_tolerance`` ...) are accepted everywhere. Where a
+stage is somebody else's, its parameters are those of the model beside it, under ``SECTION.params``.
 """
 
 from __future__ import annotations
@@ -9,14 +10,16 @@ from __future__ import annotations
 import difflib
 import json
 import re
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
+from pydantic.fields import FieldInfo
 from pydantic_core import PydanticCustomError
 
+from bevviz import plugins
 from bevviz.errors import UserError
 from bevviz.frame import AnomalyKind
 
@@ -63,8 +66,46 @@ Pixels = Annotated[float, BeforeValidator(PIXELS.parse)]
 Megabytes = Annotated[float, BeforeValidator(MEGABYTES.parse)]
 
 
+@dataclass(frozen=True, slots=True)
+class Methods:
+    """What a stage can be: one of ours, ``module:function``, a registered name, or ``topic:NAME``."""
+
+    ours: tuple[str, ...]
+    former: Mapping[str, str] = field(default_factory=dict)  # names that ours once had
+
+    def check(self, value: str) -> str:
+        value = self.former.get(value, value)
+        if value in self.ours or ":" in value or value in plugins.registered():
+            return value
+        registered = f", {', '.join(plugins.registered())} (registered)" if plugins.registered() else ""
+        raise PydanticCustomError(
+            "method",
+            "must be one of {ours}{registered}, module:function, or topic:/name",
+            {"ours": ", ".join(self.ours), "registered": registered},
+        )
+
+
+GROUND = Methods(("polar", "plane"), {"ransac": "plane"})
+CLUSTERING = Methods(("dbscan",))
+OBJECTS = Methods(("frustum",))
+OURS = ("", "demo", *GROUND.ours, *GROUND.former, *CLUSTERING.ours, *OBJECTS.ours)
+
+STAGES = {  # section -> the key that names its function
+    "ground": "method",
+    "clustering": "method",
+    "detector": "model",
+    "objects": "method",
+}
+
+
 class Section(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, validate_default=True)
+
+
+class StageSection(Section):
+    """Of a stage that may be somebody else's."""
+
+    params: Mapping[str, Any] = Field({}, description="parameters of a function that is not bevviz's own")
 
 
 class SourceConfig(Section):
@@ -105,9 +146,11 @@ class VoxelConfig(Section):
     )
 
 
-class GroundConfig(Section):
-    method: Literal["polar", "ransac"] = Field(
-        "polar", description="polar: a surface that follows slopes and kerbs outwards; ransac: one plane"
+class GroundConfig(StageSection):
+    method: Annotated[str, AfterValidator(GROUND.check)] = Field(
+        "polar",
+        description="polar: a surface that follows slopes and kerbs outwards; plane: a single one by RANSAC; "
+        "or module:function, (N, 3) points -> (N,) True where ground; or topic:/obstacle_points",
     )
     distance_threshold: Metres = Field(
         0.2, gt=0, le=5, description="height above the ground still called ground"
@@ -125,7 +168,12 @@ class GroundConfig(Section):
     max_range: Metres = Field(100.0, gt=0, le=1000, description="polar: beyond it the ground goes on level")
 
 
-class ClusteringConfig(Section):
+class ClusteringConfig(StageSection):
+    method: Annotated[str, AfterValidator(CLUSTERING.check)] = Field(
+        "dbscan",
+        description="dbscan; or module:function, (P, 3) obstacle points -> (P,) labels, -1 noise; "
+        "or topic:/clusters of the robot",
+    )
     eps: Metres = Field(0.5, gt=0, le=20, description="DBSCAN neighbourhood radius")
     min_points: int = Field(
         10, ge=1, le=100_000, description="DBSCAN neighbours (itself included) of a core point"
@@ -135,9 +183,11 @@ class ClusteringConfig(Section):
     boxes: Literal["oriented", "axis_aligned"] = Field("oriented", description="box used downstream")
 
 
-class DetectorConfig(Section):
+class DetectorConfig(StageSection):
     model: str = Field(
-        "", description="ONNX file, or 'demo' for the simulator's own network; empty: no detector"
+        "",
+        description="ONNX file, or 'demo' for the simulator's own network; or module:function or class, "
+        "(H, W, 3) BGR -> xyxy, score, names; or topic:/detections of the robot; empty: no detector",
     )
     names: str = Field(
         "", description="file with one class name a line; empty: the model's metadata, else COCO"
@@ -161,6 +211,16 @@ class FusionConfig(Section):
     min_points: int = Field(3, ge=1, description="frustum: fewest points of a cluster inside")
     min_iou: float = Field(0.1, ge=0, le=1, description="frustum: least IoU of 2D box and projected cluster")
     max_depth: Metres = Field(120.0, gt=0, description="frustum: farther clusters are out of range")
+
+
+class ObjectsConfig(StageSection):
+    """What the named 3D boxes are made from."""
+
+    method: Annotated[str, AfterValidator(OBJECTS.check)] = Field(
+        "frustum",
+        description="frustum: clusters that detections name; or module:function, (N, 4) points and intensity "
+        "-> (K, 7) boxes x y z length width height yaw, score, names; or topic:/objects of the robot",
+    )
 
 
 class TrackingConfig(Section):
@@ -251,6 +311,7 @@ class Config(Section):
     clustering: ClusteringConfig = ClusteringConfig()
     detector: DetectorConfig = DetectorConfig()
     fusion: FusionConfig = FusionConfig()
+    objects: ObjectsConfig = ObjectsConfig()
     tracking: TrackingConfig = TrackingConfig()
     anomalies: AnomaliesConfig = AnomaliesConfig()
     bev: BevConfig = BevConfig()
@@ -260,7 +321,7 @@ class Config(Section):
 
 REFERENCE: dict[str, dict[str, Any]] = {
     "voxel": {"size": 0.05, "average": True},
-    "ground": {"method": "ransac", "distance_threshold": 0.5, "iterations": 100},
+    "ground": {"method": "plane", "distance_threshold": 0.5, "iterations": 100},
     "clustering": {
         "eps": 0.5,
         "min_points": 50,
@@ -289,16 +350,86 @@ TUTORIAL_NAMES = {
 }
 
 
-def keys(model: type[BaseModel] = Config, prefix: str = "") -> dict[str, str]:
-    """Every dotted key with its description, in order."""
+def keys(config: Config | None = None) -> dict[str, str]:
+    """Every dotted key with its description, in order; of a configuration, those of its plugins too."""
     found: dict[str, str] = {}
-    for name, info in model.model_fields.items():
-        inner = info.annotation
-        if isinstance(inner, type) and issubclass(inner, BaseModel):
-            found.update(keys(inner, f"{prefix}{name}."))
-        else:
-            found[prefix + name] = info.description or ""
+    for section, info in Config.model_fields.items():
+        model = _model(section)
+        if model is None:
+            found[section] = info.description or ""
+            continue
+        for name, inner in model.model_fields.items():
+            if name != "params":
+                found[f"{section}.{name}"] = inner.description or ""
+        if config is not None:
+            found |= {
+                f"{section}.params.{name}": inner.description or ""
+                for name, inner in _params_of(config, section).items()
+            }
     return found
+
+
+def values(config: Config) -> dict[str, Any]:
+    """The value of each dotted key, those of plugins included."""
+    found: dict[str, Any] = {}
+    for section, given in config:
+        if not isinstance(given, Section):
+            found[section] = given
+            continue
+        for name, value in given:
+            if name != "params":
+                found[f"{section}.{name}"] = value
+            else:
+                found |= {f"{section}.params.{key}": inner for key, inner in value.items()}
+    return found
+
+
+@dataclass(frozen=True, slots=True)
+class ParameterChange:
+    """Of one parameter."""
+
+    before: Any
+    after: Any
+
+    def __str__(self) -> str:
+        return f"{self.before} -> {self.after}"
+
+
+def changes(old: Config | Mapping[str, Any], new: Config | Mapping[str, Any]) -> dict[str, ParameterChange]:
+    """Each dotted key that differs. Mappings are of ``flat_yaml``, perhaps of another version."""
+    before, after = (values(side) if isinstance(side, Config) else side for side in (old, new))
+    return {
+        key: ParameterChange(before.get(key, "absent"), after.get(key, "absent"))
+        for key in dict.fromkeys([*before, *after])
+        if before.get(key, "absent") != after.get(key, "absent")
+    }
+
+
+def plugin_of(config: Config, section: str) -> plugins.Plugin | None:
+    """The function of somebody else's that a stage's section names; None: it is ours, or a topic's.
+
+    Raises:
+        UserError: it cannot be had.
+    """
+    key = STAGES[section]
+    return _plugin(section, getattr(getattr(config, section), key))
+
+
+def _plugin(section: str, method: str) -> plugins.Plugin | None:
+    if method in OURS or (section == "detector" and Path(method).exists()):
+        return None
+    name = method if ":" in method else plugins.registered().get(method, "")
+    if not plugins.is_foreign(name):
+        return None
+    try:
+        return plugins.find(name)
+    except UserError as error:
+        raise UserError(f"{section}.{STAGES[section]} {method}: {error}") from error.__cause__
+
+
+def _params_of(config: Config, section: str) -> Mapping[str, FieldInfo]:
+    plugin = plugin_of(config, section) if section in STAGES else None
+    return plugin.params.model_fields if plugin is not None and plugin.params is not None else {}
 
 
 def load(
@@ -311,51 +442,107 @@ def load(
     Raises:
         UserError: unreadable file, unknown key, wrong unit or value out of range, in one line.
     """
-    stated: dict[str, Any] = {}
-    origin: dict[str, str] = {}
+    given: list[tuple[str, Any, str]] = []  # key, value, and where it was stated
     files = [Path(file)] if isinstance(file, str | Path) else file or ()
     for path in files:
-        for key, value in _flatten(_read_yaml(path)).items():
-            _put(stated, origin, key, value, str(path))
+        given += [(key, value, str(path)) for key, value in _flatten(_read_yaml(path)).items()]
     for text in settings:
         key, sep, value = text.partition("=")
         if not sep:
             raise UserError(f"--set {text}: expected key=value, for example --set clustering.eps=0.6")
         parsed = _yaml_value(value, f"--set {text}") if value.strip() else ""
-        _put(stated, origin, key.strip(), parsed, f"--set {text}")
-    chosen = preset or stated.get("preset", "default")
-    tree: dict[str, Any] = {"preset": chosen}
+        given.append((key.strip(), parsed, f"--set {text}"))
+    given = [(TUTORIAL_NAMES.get(key, key), value, where) for key, value, where in given]
+    chosen = preset or next((value for key, value, _ in reversed(given) if key == "preset"), "default")
     base = _flatten(REFERENCE) if chosen == "reference" else {}
+    stated: dict[str, Any] = {}
+    origin: dict[str, str] = {}
+    for key, value, where in given:
+        section, _, name = key.partition(".")
+        if name == STAGES.get(section) and stated.get(key, value) != value:  # not the parameters of this one
+            stated = {k: v for k, v in stated.items() if not k.startswith(f"{section}.params.")}
+        stated[key], origin[key] = value, where
+    params = _params({**base, **stated}, origin)
+    known = [*keys(), *params]
+    tree: dict[str, Any] = {"preset": chosen}
     for key, value in {**base, **stated}.items():
-        if key != "preset":
-            _insert(tree, key, value)
+        full = key
+        if key not in known:
+            section, _, name = key.partition(".")
+            full = f"{section}.params.{name}"
+            if full not in params:
+                raise UserError(f"{origin[key]}: {_unknown(key, known)}")
+            origin[full] = origin[key]
+        if full != "preset":
+            _insert(tree, full, value)
     try:
+        for section, model in _param_models(tree):
+            prefix = f"{section}.params."
+            tree[section]["params"] = model.model_validate(tree[section].get("params", {})).model_dump(
+                mode="json"
+            )
+        prefix = ""
         return Config.model_validate(tree)
     except ValidationError as error:
         first = error.errors()[0]
-        key = next((k for k in _prefixes(first["loc"]) if k in origin), ".".join(map(str, first["loc"])))
+        loc = (*prefix.split(".")[:-1], *first["loc"])
+        key = next((k for k in _prefixes(loc) if k in origin), ".".join(map(str, loc)))
         where = origin.get(key, "configuration")
-        given = f" (given: {first['input']!r})" if first["type"] != "wrong_unit" else ""
-        about = keys().get(key, "")
+        silent = first["type"] in ("wrong_unit", "missing")
+        value = f" (given: {first['input']!r})" if not silent else ""
+        about = keys().get(key) or params.get(key, "")
         hint = f"; it is: {about}" if about else ""
-        unit = f", in {_unit(key)}" if _unit(key) and first["type"] != "wrong_unit" else ""
-        raise UserError(f"{where}: {key} {_lower(first['msg'])}{unit}{given}{hint}") from None
+        unit = f", in {_unit(key)}" if _unit(key) and not silent else ""
+        raise UserError(f"{where}: {key} {_lower(first['msg'])}{unit}{value}{hint}") from None
+
+
+def _params(stated: Mapping[str, Any], origin: Mapping[str, str]) -> dict[str, str]:
+    """Dotted keys and descriptions of the parameters of the plugins that are named."""
+    found: dict[str, str] = {}
+    for section, key in STAGES.items():
+        method = stated.get(f"{section}.{key}")
+        if not isinstance(method, str):
+            continue
+        try:
+            plugin = _plugin(section, method)
+        except UserError as error:
+            raise UserError(f"{origin[f'{section}.{key}']}: {error}") from error.__cause__
+        if plugin is not None and plugin.params is not None:
+            fields = plugin.params.model_fields
+            found |= {f"{section}.params.{name}": info.description or "" for name, info in fields.items()}
+    return found
+
+
+def _param_models(tree: Mapping[str, Any]) -> Iterator[tuple[str, type[BaseModel]]]:
+    """The sections whose functions have parameters of their own, with the model of these."""
+    for section, key in STAGES.items():
+        plugin = _plugin(section, str(tree.get(section, {}).get(key, "")))
+        if plugin is not None and plugin.params is not None:
+            yield section, plugin.params
 
 
 def dump(config: Config) -> str:
     """The configuration as YAML with each parameter's unit and meaning, readable back by ``load``."""
-    about = keys()
+    about = keys(config)
     lines = []
-    for section, values in config.model_dump(mode="json").items():
-        if not isinstance(values, dict):
-            lines.append(f"{section}: {json.dumps(values)}")
+    for section, content in config.model_dump(mode="json").items():
+        if not isinstance(content, dict):
+            lines.append(f"{section}: {json.dumps(content)}")
             continue
         lines.append(f"{section}:")
-        for name, value in values.items():
-            unit = _unit(f"{section}.{name}")
-            note = (f"in {unit}; " if unit else "") + about[f"{section}.{name}"]
-            lines.append(f"  {name}: {json.dumps(value)}  # {note}")
+        params = content.pop("params", {})
+        for name, value in content.items():
+            lines.append(f"  {name}: {json.dumps(value)}{_note(f'{section}.{name}', about)}")
+        if params:
+            lines.append("  params:")
+        for name, value in params.items():
+            lines.append(f"    {name}: {json.dumps(value)}{_note(f'{section}.params.{name}', about)}")
     return "\n".join(lines) + "\n"
+
+
+def _note(key: str, about: Mapping[str, str]) -> str:
+    text = (f"in {_unit(key)}; " if _unit(key) else "") + about.get(key, "")
+    return f"  # {text}" if text else ""
 
 
 def flat_yaml(text: str, where: str) -> dict[str, Any]:
@@ -375,8 +562,8 @@ def _lower(message: str) -> str:
 def _unit(key: str) -> str:
     """Name of the unit that the value of a dotted key is in; empty where it has none."""
     section, _, name = key.partition(".")
-    model = Config.model_fields[section].annotation if section in Config.model_fields else None
-    if not (isinstance(model, type) and issubclass(model, BaseModel)) or name not in model.model_fields:
+    model = _model(section)
+    if model is None or name not in model.model_fields:
         return ""
     info = model.model_fields[name]
     # An optional quantity carries its unit inside the union.
@@ -388,39 +575,44 @@ def _unit(key: str) -> str:
     return ""
 
 
+def _model(section: str) -> type[BaseModel] | None:
+    """Of a section; None: there is none of that name, or it is a value."""
+    model = Config.model_fields[section].annotation if section in Config.model_fields else None
+    return model if isinstance(model, type) and issubclass(model, BaseModel) else None
+
+
 def _prefixes(loc: tuple[int | str, ...]) -> Iterable[str]:
     for end in range(len(loc), 0, -1):
         yield ".".join(map(str, loc[:end]))
 
 
 def _insert(tree: dict[str, Any], key: str, value: Any) -> None:
-    *path, last = key.split(".", 1)
+    *path, last = key.split(".")
     for part in path:
         tree = tree.setdefault(part, {})
     tree[last] = value
 
 
-def _put(stated: dict[str, Any], origin: dict[str, str], key: str, value: Any, where: str) -> None:
-    known = keys()
-    full = TUTORIAL_NAMES.get(key, key)
-    if full not in known:
-        choices = [*known, *TUTORIAL_NAMES]
-        by_last = [k for k in choices if k.rsplit(".", 1)[-1] == key.rsplit(".", 1)[-1]]
-        near = by_last or difflib.get_close_matches(key, choices, 1, 0.3)
-        hint = f"; did you mean '{near[0]}'?" if near else ""
-        raise UserError(f"{where}: unknown key '{key}'{hint} ('bevviz config' lists all)")
-    stated[full] = value
-    origin[full] = where
+def _unknown(key: str, known: Sequence[str]) -> str:
+    choices = {k.replace(".params.", "."): k for k in [*known, *TUTORIAL_NAMES]}
+    by_last = [k for k in choices if k.rsplit(".", 1)[-1] == key.rsplit(".", 1)[-1]]
+    near = by_last or difflib.get_close_matches(key.replace(".params.", "."), choices, 1, 0.3)
+    hint = f"; did you mean '{choices[near[0]]}'?" if near else ""
+    return f"unknown key '{key}'{hint} ('bevviz config' lists all)"
 
 
 def _flatten(tree: Mapping[str, Any]) -> dict[str, Any]:
-    """Dotted keys of a two-level tree. What is deeper is a value."""
+    """Dotted keys of a tree of sections. What is deeper is a value, but for the parameters of plugins."""
     flat: dict[str, Any] = {}
     for name, value in tree.items():
-        if name in Config.model_fields and name != "preset" and isinstance(value, Mapping):
-            flat.update({f"{name}.{inner}": v for inner, v in value.items()})
-        else:
+        if name not in Config.model_fields or name == "preset" or not isinstance(value, Mapping):
             flat[str(name)] = value
+            continue
+        for inner, content in value.items():
+            if inner == "params" and isinstance(content, Mapping):
+                flat.update({f"{name}.params.{key}": v for key, v in content.items()})
+            else:
+                flat[f"{name}.{inner}"] = content
     return flat
 
 

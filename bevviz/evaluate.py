@@ -14,6 +14,7 @@ from bevviz.datasets.kitti import ACCEPTED, label_files, read_labels
 from bevviz.errors import UserError
 from bevviz.frame import F32, Bool, Boxes3D, Frame, LabelledBoxes3D, Objects
 from bevviz.ros.roles import Roles
+from bevviz.stages.robot import in_points_frame
 
 MIN_HITS = 10  # LiDAR points on an object that must be found
 MAX_DISTANCE = 2.0  # metres between the centres, on the ground plane, of a box and its object
@@ -160,18 +161,11 @@ def truth_of(
     """
     boxes = in_points_frame(frame, stated)
     must = (np.hypot(*boxes.center[:, :2].T) <= RANGE) & _in_view(frame, boxes)
-    must[must] = [_hits(frame.points, boxes, k) >= MIN_HITS for k in np.flatnonzero(must).tolist()]
+    must[must] = [
+        geometry.inside(frame.points, boxes, k).sum() >= MIN_HITS for k in np.flatnonzero(must).tolist()
+    ]
     own = [frozenset((label.lower(),)) for label in stated.labels]
     return Truth(boxes, stated.labels, tuple(accepted if accepted is not None else own), must)
-
-
-def in_points_frame(frame: Frame, stated: LabelledBoxes3D) -> Boxes3D:
-    """Boxes that somebody else states, in the frame of the points."""
-    if stated.world_from_boxes is None:
-        return stated.boxes
-    points_from_boxes = geometry.inverse(frame.pose) @ stated.world_from_boxes
-    turned = stated.boxes.yaw + np.float32(geometry.yaw(points_from_boxes))
-    return Boxes3D(geometry.apply(points_from_boxes, stated.boxes.center), stated.boxes.size, turned)
 
 
 def _in_view(frame: Frame, boxes: Boxes3D) -> Bool:
@@ -186,12 +180,3 @@ def _in_view(frame: Frame, boxes: Boxes3D) -> Bool:
         with np.errstate(invalid="ignore"):
             seen |= ((uv >= -0.5) & (uv < size - 0.5)).all(axis=1)
     return seen if asked else ~seen
-
-
-def _hits(points: F32, boxes: Boxes3D, k: int) -> int:
-    """LiDAR points in box k."""
-    offset = points - boxes.center[k]
-    near = offset[(np.abs(offset[:, :2]) <= np.hypot(*boxes.size[k, :2]) / 2).all(axis=1)]
-    c, s = np.cos(boxes.yaw[k]), np.sin(boxes.yaw[k])
-    local = np.column_stack([c * near[:, 0] + s * near[:, 1], c * near[:, 1] - s * near[:, 0], near[:, 2]])
-    return int((np.abs(local) <= boxes.size[k] / 2).all(axis=1).sum())

@@ -14,10 +14,13 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import IntEnum
-from typing import Any, Literal, Protocol
+from typing import TYPE_CHECKING, Any, Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from bevviz.config import Config
 
 Bool = NDArray[np.bool_]
 F32 = NDArray[np.float32]
@@ -150,6 +153,7 @@ class Frame:
     cameras: tuple[Camera, ...] = ()
     robot_boxes: tuple[LabelledBoxes3D, ...] = ()
     robot_detections: tuple[LabelledBoxes2D, ...] = ()
+    robot_clouds: tuple[Cloud, ...] = ()  # of obstacles, in the frame of the points
     truth: LabelledBoxes3D | None = None
     tf_age: float = float("nan")
     problems: tuple[str, ...] = ()  # one clear sentence each
@@ -374,13 +378,15 @@ class Bev:
 class Failure:
     stage: str
     reason: str  # one clear sentence
+    traceback: str = ""  # of an error that nobody foresaw
 
 
 @dataclass(frozen=True, slots=True)
 class FrameResult:
-    """Everything that the pipeline saw, made and decided for one frame. None: not run, see ``failures``."""
+    """Everything that was seen, made and decided for one frame. None: not run, see ``failures``."""
 
     frame: Frame
+    config: Config  # that it was made with, all of it
     voxels: Voxels | None
     ground: Ground | None
     obstacles: F32 | None  # (P, 3) the voxels that are not ground
@@ -393,6 +399,15 @@ class FrameResult:
     failures: tuple[Failure, ...] = ()
     tracks: Tracks | None = None
     anomalies: tuple[Anomaly, ...] = ()
+
+    @staticmethod
+    def unprocessed(
+        frame: Frame, config: Config, cameras: tuple[CameraResult, ...] | None = None
+    ) -> FrameResult:
+        """The frame as it came, no stage run on it."""
+        if cameras is None:
+            cameras = tuple(CameraResult(camera, None, None) for camera in frame.cameras)
+        return FrameResult(frame, config, None, None, None, None, cameras, None, None)
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.polynomial import Polynomial
 from numpy.typing import NDArray
 
-from bevviz.frame import F32, F64, Boxes3D, Intrinsics
+from bevviz.frame import F32, F64, Bool, Boxes3D, Intrinsics
 
 FloatArray = NDArray[Any]
 
@@ -231,6 +231,18 @@ def corners(boxes: Boxes3D) -> F32:
         [c * local[..., 0] - s * local[..., 1], s * local[..., 0] + c * local[..., 1], local[..., 2]], -1
     )
     return np.asarray(turned + boxes.center[:, None], np.float32)
+
+
+def inside(points: F32, boxes: Boxes3D, k: int) -> Bool:
+    """(N,) which points are in box k, its surface included."""
+    offset = points - boxes.center[k]
+    found = np.zeros(len(points), np.bool_)
+    near = np.flatnonzero((np.abs(offset[:, :2]) <= np.hypot(*boxes.size[k, :2]) / 2).all(axis=1))
+    x, y, z = offset[near].T
+    c, s = np.cos(boxes.yaw[k]), np.sin(boxes.yaw[k])
+    local = np.column_stack([c * x + s * y, c * y - s * x, z])
+    found[near] = (np.abs(local) <= boxes.size[k] / 2).all(axis=1)
+    return found
 
 
 def bev_iou(a: Boxes3D, b: Boxes3D) -> F32:

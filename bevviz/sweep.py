@@ -8,6 +8,7 @@ import math
 import re
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import Executor
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -88,7 +89,7 @@ def _range(text: str, first: float, last: float, step: float) -> Values:
 
 
 @dataclass
-class Outcome:
+class Tally:
     """What one combination of values has made of the frames."""
 
     frames: int = 0
@@ -162,46 +163,53 @@ class Sweep:
         truth: Callable[[Frame], Truth | None] | None = None,
     ) -> None:
         self.parameters, self.configs = parameters, configs
-        self.outcomes = {values: Outcome() for values in configs}
+        self.tallies = {values: Tally() for values in configs}
         self._truth = truth
         self._variants = Variants()
         for config in configs.values():
-            self._variants.prepare(config)
+            self._variants.check(config)
 
-    def add(self, frame: Frame) -> None:
-        """Run everything on the frame."""
+    def perceive(self, frame: Frame, network: Executor | None = None) -> int:
+        """Run everything on the frame. Returns its index."""
         truth = self._truth(frame) if self._truth else None
         for values, config in self.configs.items():
-            result = self._variants.run(frame, config, draw=False)
-            self.outcomes[values].add(result, truth)
+            self.tallies[values].add(self._variants.perceive(frame, config, network), truth)
+        return frame.index
+
+    def finish(self, index: int) -> int:
+        return index
 
     @property
     def best(self) -> Values | None:
         """The values with the greatest F1; None where nothing could be judged."""
-        rated = {v: o.score.f1 for v, o in self.outcomes.items() if o.judged and not math.isnan(o.score.f1)}
+        rated = {
+            v: tally.score.f1
+            for v, tally in self.tallies.items()
+            if tally.judged and not math.isnan(tally.score.f1)
+        }
         return max(rated, key=lambda values: rated[values]) if rated else None
 
     def table(self) -> str:
         """For the terminal."""
-        frames = max(outcome.frames for outcome in self.outcomes.values())
+        frames = max(tally.frames for tally in self.tallies.values())
         lines = [f"{frames} frames; means of a frame, median milliseconds", ""]
         lines += columns([*self._rows("time ms")])
         if self.best is not None:
             where = ", ".join(f"{p.key} = {v}" for p, v in zip(self.parameters, self.best, strict=True))
-            lines += ["", f"best F1: {self.outcomes[self.best].score.f1:.3f} at {where}"]
-        failures = sum(outcome.failures for outcome in self.outcomes.values())
+            lines += ["", f"best F1: {self.tallies[self.best].score.f1:.3f} at {where}"]
+        failures = sum(tally.failures for tally in self.tallies.values())
         return "\n".join([*lines, *([f"{failures} stages failed"] if failures else [])])
 
     def _rows(self, last: str) -> Iterator[tuple[str, ...]]:
         """The header and a row for each combination; of the times only ``last``."""
         names = [n for n in self._metrics() if not n.endswith(" ms") or n == last]
         yield (*(parameter.key for parameter in self.parameters), *names)
-        for values, outcome in self.outcomes.items():
-            metrics = outcome.metrics
+        for values, tally in self.tallies.items():
+            metrics = tally.metrics
             yield (*values, *(_number(name, metrics.get(name, math.nan)) for name in names))
 
     def _metrics(self) -> list[str]:
-        return max((list(outcome.metrics) for outcome in self.outcomes.values()), key=len)
+        return max((list(tally.metrics) for tally in self.tallies.values()), key=len)
 
     def write_csv(self, path: Path) -> None:
         """A row for each combination: every number of the table, each stage's time, counts by class.
@@ -210,7 +218,7 @@ class Sweep:
             UserError: the file cannot be written.
         """
         names = self._metrics()
-        classes = sorted({name for o in self.outcomes.values() for name in o.score.names})
+        classes = sorted({name for tally in self.tallies.values() for name in tally.score.names})
         kinds = ("tp", "fp", "fn")
         header = [p.key for p in self.parameters] + ["frames", *names]
         header += [f"{name} {kind}" for name in classes for kind in kinds]
@@ -218,11 +226,11 @@ class Sweep:
             with path.open("w", newline="") as file:
                 writer = csv.writer(file)
                 writer.writerow(header)
-                for values, outcome in self.outcomes.items():
-                    metrics = outcome.metrics
-                    by_class = [outcome.score.classes[name][kind] for name in classes for kind in kinds]
+                for values, tally in self.tallies.items():
+                    metrics = tally.metrics
+                    by_class = [tally.score.classes[name][kind] for name in classes for kind in kinds]
                     rounded = (f"{metrics.get(name, math.nan):.6g}" for name in names)
-                    writer.writerow([*values, outcome.frames, *rounded, *by_class])
+                    writer.writerow([*values, tally.frames, *rounded, *by_class])
         except OSError as error:
             raise UserError(f"--csv {path}: cannot be written: {error.strerror}") from None
 
@@ -237,7 +245,7 @@ class Sweep:
         recording.log(entities.SWEEP, rr.TextDocument(page, media_type=rr.MediaType.MARKDOWN), static=True)
         for series in self._plots().values():
             for place, metric in enumerate(series):
-                values = [o.metrics.get(metric, math.nan) for o in self.outcomes.values()]
+                values = [tally.metrics.get(metric, math.nan) for tally in self.tallies.values()]
                 self._log_metric(recording, metric, np.array(values), place, len(series))
 
     def _log_metric(

@@ -2,82 +2,79 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
+from concurrent.futures import Executor
 from dataclasses import replace
 
 from bevviz import geometry
-from bevviz.config import Config, DetectorConfig
+from bevviz.config import Config, changes
 from bevviz.errors import UserError
-from bevviz.frame import Camera, Detections, Frame, FrameResult
-from bevviz.live.settings import differences
-from bevviz.pipeline import Memo, Pipeline
-from bevviz.stages.detector import Detector
+from bevviz.frame import Camera, Frame, FrameResult
+from bevviz.perceive import Memo, StageLoader, perceive
+from bevviz.session import Session
 
 MOTION = "sync.motion_compensation"  # the one thing in how frames are made that variants may differ in
 
 
 class Variants:
-    """Runs any configuration on a frame, and no stage twice that gets the same input and parameters."""
+    """Configurations that share frames, networks, and what stages make of the same arrays."""
 
     def __init__(self) -> None:
-        self._memo = Memo()
+        self._memo, self._loader = Memo(), StageLoader()
         self._frame: Frame | None = None
-        self._networks: dict[tuple[str, str, str, int], Detector] = {}
-        self._detectors: dict[DetectorConfig, _Thresholds] = {}
         self._still: Frame | None = None
 
-    def prepare(self, config: Config) -> None:
-        """Load the network that the configuration wants.
+    def session(self, config: Config) -> Session:
+        """A drive of its own, with its own tracks and anomalies.
 
         Raises:
-            UserError: the detector's model cannot be used.
+            UserError: the detector's model or somebody's function cannot be used.
         """
-        self._detector(config.detector)
+        return Session(config, loader=self._loader, memo=self._memo)
 
-    def run(self, frame: Frame, config: Config, *, draw: bool = True) -> FrameResult:
-        """Everything that the configuration makes of the frame. A spared stage tells the time it took.
+    def check(self, config: Config) -> None:
+        """Raises UserError where the configuration's model or somebody's function cannot be used."""
+        self._loader.load(config)
 
-        ``draw``: with the bird's-eye view and the explanations.
-
-        Raises:
-            UserError: the detector's model cannot be used.
-        """
+    def frame(self, frame: Frame, config: Config) -> Frame:
+        """The frame as the configuration wants it made; a new frame ends what is shared of the last."""
         if frame is not self._frame:
             self._memo.clear()
             self._frame, self._still = frame, None
-        if not config.sync.motion_compensation:
-            frame = self._still = self._still or without_motion(frame)
-        detect = self._detector(config.detector)
-        with Pipeline(config, detect=detect, memo=self._memo, draw=draw) as pipeline:
-            return pipeline.run(frame)
+        if config.sync.motion_compensation:
+            return frame
+        self._still = self._still or without_motion(frame)
+        return self._still
 
-    def _detector(self, config: DetectorConfig) -> _Thresholds | None:
-        if not config.model:
-            return None
-        if config not in self._detectors:
-            network = (config.model, config.names, config.provider, config.threads)
-            if network not in self._networks:
-                self._networks[network] = Detector(config)
-            self._detectors[config] = _Thresholds(self._networks[network], config, self._memo)
-        return self._detectors[config]
+    def perceive(self, frame: Frame, config: Config, network: Executor | None = None) -> FrameResult:
+        """What the stages make of one frame, without what needs other frames. A stage that need not be run
+        again tells the time that it took.
 
-
-class _Thresholds:
-    """A detector whose network runs once on an image, whatever is made of its output."""
-
-    def __init__(self, network: Detector, config: DetectorConfig, memo: Memo) -> None:
-        self._network, self._memo = network, memo
-        self._detector = network.restated(config)
-
-    def __call__(self, camera: Camera) -> Detections | None:
-        if camera.image is None:
-            return None
-        if not camera.image.bgr.size:
-            return Detections.empty()
-        return self._detector.interpret(self._memo.call(self._network.infer, camera.image.bgr))
+        Raises:
+            UserError: the detector's model or somebody's function cannot be used.
+        """
+        stages = self._loader.load(config)
+        return perceive(self.frame(frame, config), config, stages, self._memo, network=network)
 
 
-def check_same_frames(configs: dict[str, Config]) -> None:
+class Sessions:
+    """Several sessions on the same frames, as one: a result is a tuple of theirs."""
+
+    def __init__(self, configs: Sequence[Config]) -> None:
+        self._variants = Variants()
+        self.sessions = [self._variants.session(config) for config in configs]
+
+    def perceive(self, frame: Frame, network: Executor | None = None) -> tuple[FrameResult, ...]:
+        return tuple(
+            session.perceive(self._variants.frame(frame, session.config), network)
+            for session in self.sessions
+        )
+
+    def finish(self, results: tuple[FrameResult, ...]) -> tuple[FrameResult, ...]:
+        return tuple(session.finish(result) for session, result in zip(self.sessions, results, strict=True))
+
+
+def check_same_frames(configs: Mapping[str, Config]) -> None:
     """Variants run on frames that are decoded once.
 
     Raises:
@@ -85,7 +82,7 @@ def check_same_frames(configs: dict[str, Config]) -> None:
     """
     first, *others = configs.items()
     for name, config in others:
-        for key, change in differences(first[1], config).items():
+        for key, change in changes(first[1], config).items():
             if key.startswith(("source.", "sync.")) and key != MOTION:
                 raise UserError(
                     f"{first[0]} and {name} differ in {key} ({change}), but are to run on the same frames; "

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from bevviz.anomalies import AnomalyDetector, News, Summary
+from bevviz.anomalies import AnomalyDetector, AnomalySummary, News
 from bevviz.config import AnomaliesConfig, load
 from bevviz.frame import (
     Anomaly,
@@ -26,7 +26,8 @@ from bevviz.stages.fusion import in_view
 from bevviz.stages.tracking import Tracker
 from tests.test_tracking import CAR, PERSON, scene
 
-TRACKING = load().tracking
+CONFIG = load()
+TRACKING = CONFIG.tracking
 NO_PAIRS = Pairs(*(np.zeros(0, np.int32),) * 3, *(np.zeros(0, np.float32),) * 4)
 IMAGE = Image(0, "zed", np.zeros((2, 2, 3), np.uint8))
 CAMERA = Camera("zed", IMAGE, None, np.eye(4), np.eye(4), sync_error=0.01, tf_age=0.001)
@@ -38,7 +39,7 @@ class Drive:
     def __init__(self, **limits: Any) -> None:
         self.config = AnomaliesConfig(**limits)
         self.said: list[tuple[int, str, str]] = []
-        self.summary = Summary()
+        self.summary = AnomalySummary()
         self._tracker, self._detector, self._news = Tracker(), AnomalyDetector(), News()
         self._index = -1
 
@@ -69,13 +70,13 @@ class Drive:
         alone_rows = np.full(n, Decision.NO_CLUSTER, np.int32)
         fusion = Fusion(alone_rows, rows - 1, rows, of_clusters, of_clusters * 0, NO_PAIRS, nowhere)
         cameras = () if camera is None else (CameraResult(camera, found, fusion),)
-        result = FrameResult(frame, None, None, None, clusters, cameras, objects, None)
+        result = FrameResult(frame, CONFIG, None, None, None, clusters, cameras, objects, None)
         looked_at = in_view(cameras, len(clusters))
         tracks = self._tracker.update(frame, clusters, looked_at, objects, TRACKING)
         result = replace(result, tracks=tracks, **changes)
         result = replace(result, anomalies=self._detector.update(result, self.config))
         self.said += [(self._index, a.kind, a.text) for a in self._news.of(result.anomalies)]
-        self.summary.add(result)
+        self.summary.see(result)
         return result.anomalies
 
     def person(self, frames: int, **more: Any) -> None:

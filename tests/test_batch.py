@@ -29,7 +29,7 @@ from bevviz.cli import main
 from bevviz.config import Config, load
 from bevviz.errors import UserError
 from bevviz.frame import DetectionState
-from bevviz.pipeline import Pipeline
+from bevviz.session import Session
 from tests import bags
 from tests.recordings import Recording, verify
 
@@ -233,8 +233,9 @@ def test_a_dask_worker_that_dies_loses_no_bag_and_does_none_twice(
 
 def test_the_summary_says_what_a_direct_run_says(batch: Batch, model: str) -> None:
     config = load(None, [f"detector.model={model}", WEAK])
-    with BagSource([batch.root / "bags/kitti"], config) as source, Pipeline(config) as pipeline:
-        results = [pipeline.run(frame) for frame in source]
+    with BagSource([batch.root / "bags/kitti"], config) as source:
+        session = Session(config)
+        results = [session.run(frame) for frame in source]
     summary = pq.read_table(batch.folder / "summary.parquet")
     badness = summary["badness"].to_pylist()
     assert badness == sorted(badness, reverse=True)
@@ -260,10 +261,11 @@ def test_the_summary_says_what_a_direct_run_says(batch: Batch, model: str) -> No
 
 def test_badness_weighs_what_went_wrong(batch: Batch) -> None:
     config = Config()
-    with BagSource([batch.root / "bags/one/drive"], config) as source, Pipeline(config) as pipeline:
+    with BagSource([batch.root / "bags/one/drive"], config) as source:
+        session = Session(config)
         frame = next(iter(source))
-        good = row(pipeline.run(frame), config)
-        empty = row(pipeline.run(replace(frame, points=frame.points[:0], problems=("late",))), config)
+        good = row(session.run(frame), config)
+        empty = row(session.run(replace(frame, points=frame.points[:0], problems=("late",))), config)
     assert good["failures"] == good["anomalies"] == 0 and good["remarks"] == []
     assert empty["failures"] >= 1
     assert good["badness"] == pytest.approx(

@@ -29,7 +29,8 @@ from bevviz.config import load
 from bevviz.errors import UserError
 from bevviz.frame import Boxes3D, Frame, FrameResult, LabelledBoxes3D
 from bevviz.geometry import transform
-from bevviz.pipeline import Memo, Pipeline
+from bevviz.perceive import Memo, describe
+from bevviz.session import Session
 from bevviz.stages import detector
 from bevviz.synthetic import SyntheticSource
 from bevviz.variants import Variants, check_same_frames, without_motion
@@ -47,8 +48,8 @@ def frame() -> Frame:
 
 @cache
 def result() -> FrameResult:
-    with Pipeline(DEFAULT) as pipeline:
-        return pipeline.run(frame())
+    session = Session(DEFAULT)
+    return session.run(frame())
 
 
 def objects(*rows: tuple[str, float, float]) -> Seen:
@@ -159,8 +160,8 @@ def test_variants_make_what_a_pipeline_alone_makes() -> None:
     variants = Variants()
     for config in (REFERENCE, DEFAULT, low, REFERENCE):
         seen_by = without_motion(frame()) if config is REFERENCE else frame()
-        with Pipeline(config) as pipeline:
-            same_results(variants.run(frame(), config), pipeline.run(seen_by))
+        session = Session(config)
+        same_results(describe(variants.perceive(frame(), config)), session.run(seen_by))
 
 
 def test_what_is_common_runs_once(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -177,14 +178,14 @@ def test_what_is_common_runs_once(monkeypatch: pytest.MonkeyPatch) -> None:
         load(settings=["detector.model=demo", f"clustering.eps={eps}", f"detector.conf_threshold={eps}"])
         for eps in (0.4, 0.5, 0.6)
     ]
-    results = [variants.run(frame(), config) for config in configs]
+    results = [variants.perceive(frame(), config) for config in configs]
     assert len(runs) == 1
     first, *others = results
     assert all(other.voxels is first.voxels and other.ground is first.ground for other in others)
     assert len({id(r.clusters) for r in results}) == 3
     # What is spared is told with the time that it took.
     assert all(r.timings["voxel"] >= first.timings["voxel"] * 0.5 for r in others)
-    variants.run(replace(frame(), index=99), configs[0])
+    variants.perceive(replace(frame(), index=99), configs[0])
     assert len(runs) == 2  # another frame
 
 
@@ -227,19 +228,19 @@ def test_the_robots_boxes_are_compared_in_our_frame() -> None:
     stated = LabelledBoxes3D(
         "/detection/fused_3d", 0, "map", ours.boxes, ours.names, ours.score, frame().world_from_points
     )
-    robot = published(replace(frame(), robot_boxes=(stated,)), "/detection/fused_3d")
+    robot = published(replace(frame(), robot_boxes=(stated,)), "/detection/fused_3d", DEFAULT)
     assert robot is not None
     assert {d.change for d in compare_objects(seen(result()), seen(robot))} == {Change.SAME}
     world = np.asarray(frame().world_from_points)
     shifted = replace(
         stated, world_from_boxes=world @ transform(np.array([1.0, 0, 0]), np.array([0, 0, 0, 1.0]))
     )
-    robot = published(replace(frame(), robot_boxes=(shifted,)), "/detection/fused_3d")
+    robot = published(replace(frame(), robot_boxes=(shifted,)), "/detection/fused_3d", DEFAULT)
     assert robot is not None
     moved = [d for d in compare_objects(seen(result()), seen(robot)) if d.change is Change.MOVED]
     assert len(moved) > len(ours) / 2
     np.testing.assert_allclose(np.median([d.distance for d in moved]), 1.0, atol=1e-3)
-    assert published(frame(), "/detection/fused_3d") is None
+    assert published(frame(), "/detection/fused_3d", DEFAULT) is None
 
 
 @pytest.mark.parametrize(

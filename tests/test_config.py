@@ -11,7 +11,7 @@ from bevviz.errors import UserError
 def test_reference_preset_is_the_tutorial() -> None:
     reference = config.load(preset="reference")
     assert reference.voxel.size == 0.05
-    assert reference.ground.method == "ransac"
+    assert reference.ground.method == "plane"
     assert reference.ground.distance_threshold == 0.5
     assert (reference.clustering.eps, reference.clustering.min_points) == (0.5, 50)
     assert reference.detector.conf_threshold == 0.25
@@ -76,7 +76,7 @@ def test_units_and_tutorial_names(setting: str, key: str, value: object) -> None
         ("sync.tolerance=100", "less than or equal to 10, in seconds (given: 100)"),
         ("clustering.eps=abc", "must be a valid number"),
         ("clustering.eps=-1", "must be greater than 0"),
-        ("ground.method=plane", "must be "),
+        ("ground.method=plan", "must be one of polar, plane, module:function, or topic:"),
         ("nonsense", "expected key=value"),
         ("detector.names=[a", "is not valid YAML"),
     ],

@@ -12,7 +12,7 @@ from bevviz.cli import demo, main
 from bevviz.config import load
 from bevviz.errors import UserError
 from bevviz.frame import I32, Decision, FrameResult
-from bevviz.pipeline import Pipeline
+from bevviz.session import Session
 from bevviz.synthetic import FAULTS, SENSOR_FAULTS, Snapshot, SyntheticSource
 
 
@@ -30,8 +30,8 @@ def at(name: str) -> Snapshot:
 @cache
 def run(name: str, preset: str) -> FrameResult:
     config = load(None, ["detector.model=demo"], "reference" if preset == "reference" else "default")
-    with Pipeline(config) as pipeline:
-        return pipeline.run(at(name).frame)
+    session = Session(config)
+    return session.run(at(name).frame)
 
 
 def planted(name: str, label: str, ahead: float) -> tuple[int, ...]:

@@ -184,7 +184,7 @@ def test_any_plane(along: float, across: float, sensor: float) -> None:
     assert np.median(np.abs(ground.height - found.height)) < 0.02
 
 
-@pytest.mark.parametrize("method", ["polar", "ransac"])
+@pytest.mark.parametrize("method", ["polar", "plane"])
 @pytest.mark.parametrize("count", [0, 1, 2, 50])
 def test_no_plane_to_start_from(method: str, count: int) -> None:
     line = np.linspace(1, 5, count)[:, None] * np.ones((1, 3))
@@ -254,10 +254,10 @@ def test_road_is_ground(shared: Path) -> None:
 
 
 @pytest.mark.parametrize("frame", ["000000", "000001"])
-def test_ransac_finds_open3ds_plane(shared: Path, frame: str) -> None:
+def test_plane_finds_open3ds_plane(shared: Path, frame: str) -> None:
     o3d = load()
     points = kitti(shared, frame)
-    ground = segment_ground(points, GroundConfig(method="ransac", distance_threshold=0.5, iterations=300))
+    ground = segment_ground(points, GroundConfig(method="plane", distance_threshold=0.5, iterations=300))
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points.astype(np.float64)))
     o3d.utility.random.seed(0)
     plane, inliers = cloud.segment_plane(0.5, 3, 300)
@@ -268,13 +268,13 @@ def test_ransac_finds_open3ds_plane(shared: Path, frame: str) -> None:
     assert ground.mask.sum() > 0.98 * len(inliers)
 
 
-def test_ransac_refits_as_open3d() -> None:
+def test_plane_refits_as_open3d() -> None:
     """With every point an inlier there is one plane to find, whatever the samples."""
     o3d = load()
     rng = np.random.default_rng(0)
     points = rng.uniform([-10, -10, 4.8], [10, 10, 5.2], (2000, 3)).astype(np.float32)
     points[:, 2] += np.float32(0.1) * points[:, 0]
-    ground = segment_ground(points, GroundConfig(method="ransac", distance_threshold=5, iterations=10))
+    ground = segment_ground(points, GroundConfig(method="plane", distance_threshold=5, iterations=10))
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points.astype(np.float64)))
     plane, inliers = cloud.segment_plane(5, 3, 10)
     assert ground.plane is not None
@@ -283,19 +283,19 @@ def test_ransac_refits_as_open3d() -> None:
     np.testing.assert_allclose(ground.height, points @ ground.plane[:3] + ground.plane[3], atol=1e-4)
 
 
-def test_ransac_takes_a_wall_as_the_reference_does() -> None:
+def test_plane_takes_a_wall_as_the_reference_does() -> None:
     rng = np.random.default_rng(0)
     wall = np.column_stack([np.full(3000, 5.0), rng.uniform(-9, 9, 3000), rng.uniform(0, 6, 3000)])
     floor = np.column_stack([rng.uniform(-9, 4, 500), rng.uniform(-9, 9, 500), np.zeros(500)])
     points = np.vstack([wall, floor]).astype(np.float32)
-    ground = segment_ground(points, GroundConfig(method="ransac", distance_threshold=0.1))
+    ground = segment_ground(points, GroundConfig(method="plane", distance_threshold=0.1))
     assert ground.mask[:3000].mean() > 0.5
     assert ground.mask[3000:].mean() < 0.1
 
 
-def test_ransac_is_repeatable() -> None:
+def test_plane_is_repeatable() -> None:
     points = scan(street, THINGS, beams=16).points
-    config = GroundConfig(method="ransac", iterations=5, seed=3)
+    config = GroundConfig(method="plane", iterations=5, seed=3)
     np.testing.assert_array_equal(segment_ground(points, config).mask, segment_ground(points, config).mask)
     other = segment_ground(points, config.model_copy(update={"seed": 4}))
     assert (other.mask != segment_ground(points, config).mask).any()

@@ -11,7 +11,7 @@ from bevviz import geometry
 from bevviz.bags.source import BagSource
 from bevviz.config import load
 from bevviz.frame import F64, Decision, FrameResult
-from bevviz.pipeline import Pipeline
+from bevviz.session import Session
 from tests import bags
 from tests.recordings import Recording
 
@@ -41,8 +41,9 @@ def preset(request: pytest.FixtureRequest) -> str:
 @pytest.fixture(scope="module")
 def results(bag: Path, model: Path) -> list[FrameResult]:
     config = load(settings=[f"detector.model={model}"])
-    with BagSource([bag], config) as source, Pipeline(config) as pipeline:
-        return [pipeline.run(frame) for frame in source]
+    with BagSource([bag], config) as source:
+        session = Session(config)
+        return [session.run(frame) for frame in source]
 
 
 def labels(shared: Path, name: str) -> list[tuple[str, F64]]:
@@ -132,8 +133,9 @@ def test_however_low_the_threshold_nothing_is_matched_far_from_a_label(
     """The small objects of 000001 do appear as weak detections: those that match must match rightly."""
     truth = labels(shared, "000001")
     config = load(settings=[f"detector.model={model}", "detector.conf_threshold=0.1"])
-    with BagSource([bag], config, frames=(1, 2)) as source, Pipeline(config) as pipeline:
-        (result,) = [pipeline.run(frame) for frame in source]
+    with BagSource([bag], config, frames=(1, 2)) as source:
+        session = Session(config)
+        (result,) = [session.run(frame) for frame in source]
     assert result.objects is not None
     for j, name in enumerate(result.objects.names):
         away = [

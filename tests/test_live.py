@@ -28,12 +28,12 @@ from bevviz.frame import CameraResult, Decision, Detections, Frame, FrameResult,
 from bevviz.live.encoder import WHOLE, Encoder, Packet
 from bevviz.live.files import Indexer, Saver
 from bevviz.live.notes import Notes
-from bevviz.live.queue import NewestQueue
 from bevviz.live.replay import Replay
-from bevviz.live.runtime import Live, Outputs, observed, thin
+from bevviz.live.runtime import Live, Outputs, thin
 from bevviz.live.settings import Settings
 from bevviz.live.triggers import Triggers
-from bevviz.pipeline import Pipeline
+from bevviz.queues import NewestQueue
+from bevviz.session import Session
 from bevviz.synthetic import SyntheticSource
 from bevviz.synthetic.sensors import Lidar, PinholeCamera
 from tests.recordings import Recording, verify
@@ -153,13 +153,13 @@ def test_a_queue_hands_out_the_newest_items_and_counts_the_others(moves: list[bo
 
 
 def test_a_slow_pipeline_takes_the_newest_frame(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
-    whole = Pipeline.run
+    whole = Session.perceive
 
-    def slow(self: Pipeline, frame: Frame) -> FrameResult:
+    def slow(self: Session, frame: Frame, network: Any = None) -> FrameResult:
         time.sleep(0.2)
-        return whole(self, frame)
+        return whole(self, frame, network)
 
-    monkeypatch.setattr(Pipeline, "run", slow)
+    monkeypatch.setattr(Session, "perceive", slow)
     outcome = run(total=40, rate=40, save=Path("out.rrd"))
     drops = outcome.live.status.drops
     logged = numbers(Path("out.rrd"))
@@ -317,12 +317,12 @@ def test_a_recording_may_start_at_any_whole_packet(
     """What an entity had before the cut is not left standing, and states are known from the first frame."""
     config = load()
     encoder = Encoder(config, drive.scene, "live")
-    with Pipeline(config) as pipeline:
-        full = pipeline.run(frames[0])
+    session = Session(config)
+    full = session.run(frames[0])
     gone = replace(full, frame=replace(frames[1], index=1), clusters=None, obstacles=None)
-    packets = [encoder.encode(full, config, drive.scene, {}, ())]
+    packets = [encoder.encode(full, drive.scene, {}, ())]
     time.sleep(WHOLE)
-    packets += [encoder.encode(gone, config, drive.scene, {}, [("WARN", "something was said")])]
+    packets += [encoder.encode(gone, drive.scene, {}, [("WARN", "something was said")])]
     path = tmp_path / "late.rrd"
     path.write_bytes(encoder.prelude(packets[1].context) + packets[1].data)
     encoder.close()
@@ -354,7 +354,7 @@ def result_of(frame: Frame, *decisions: Decision, total: float = 0.05) -> FrameR
     nowhere = np.zeros((0, 4), np.float32)
     fusion = Fusion(np.array(decisions, np.int32), none - 1, none, none[:0], none[:0], pairs, nowhere)
     cameras = tuple(CameraResult(camera, found, fusion) for camera in frame.cameras)
-    return replace(observed(frame), cameras=cameras, timings={"total": total})
+    return replace(FrameResult.unprocessed(frame, load(), cameras), timings={"total": total})
 
 
 def triggers(*settings: str) -> Callable[[FrameResult], str | None]:
@@ -479,8 +479,8 @@ def test_what_was_written_before_the_disk_was_full_is_readable(
 ) -> None:
     config = load()
     encoder = Encoder(config, drive.scene, "live")
-    with Pipeline(config) as pipeline:
-        packets = [encoder.encode(pipeline.run(frame), config, drive.scene, {}, ()) for frame in frames]
+    session = Session(config)
+    packets = [encoder.encode(session.run(frame), drive.scene, {}, ()) for frame in frames]
     size = len(encoder.prelude(packets[0].context)) + sum(len(p.data) for p in packets[:3])
     said: list[str] = []
     path = tmp_path / "out.rrd"

@@ -21,9 +21,9 @@ import pytest
 from bevviz.config import Config, load
 from bevviz.errors import UserError
 from bevviz.frame import Boxes3D, CameraResult, Detections, Frame, FrameResult, Objects
-from bevviz.pipeline import Pipeline
 from bevviz.ros.encode import encode_camera_info, typestore
 from bevviz.ros.messages import decode_cloud, decode_detections_2d, decode_detections_3d, decode_image
+from bevviz.session import Session
 from bevviz.synthetic import SyntheticSource
 from bevviz.synthetic.bag import TOPICS
 from bevviz.synthetic.drive import LIDAR_TOPIC, TRUTH_TOPIC
@@ -35,10 +35,10 @@ pytest.importorskip("rclpy", reason="needs rclpy: pip install 'bevviz[ros]'")
 from bevviz.live import info
 from bevviz.live.source import LiveSource
 from bevviz.ros import typesupport
+from bevviz.ros.node import Node
 from bevviz.ros.orders import Orders
 from bevviz.ros.publish import BEV, CLUSTERS, DETECTIONS, FUSED, OBSTACLES, Publisher
 from bevviz.ros.publish import TOPICS as TOPICS_PUBLISHED
-from bevviz.ros.session import Session
 
 PATIENCE = 60.0  # seconds for what takes one or two on an idle machine
 LIGHT = Play(frames=3, points=20_000)
@@ -214,15 +214,15 @@ def test_incompatible_publisher_is_told() -> None:
 
 
 @pytest.fixture
-def pair() -> Iterator[tuple[Session, Session]]:
+def pair() -> Iterator[tuple[Node, Node]]:
     """Two participants."""
-    with Session(name="one") as one, Session(name="two") as two:
+    with Node(name="one") as one, Node(name="two") as two:
         one.start()
         two.start()
         yield one, two
 
 
-def test_made_types_meet_compiled_ones(pair: tuple[Session, Session]) -> None:
+def test_made_types_meet_compiled_ones(pair: tuple[Node, Node]) -> None:
     from sensor_msgs.msg import CameraInfo
 
     kind = "sensor_msgs/msg/CameraInfo"
@@ -292,8 +292,8 @@ def test_unknown_type_without_its_package() -> None:
 def result() -> FrameResult:
     """A frame's result in which the detector found one car, on the first cluster."""
     config = load()
-    with Pipeline(config) as pipeline:
-        made = pipeline.run(SyntheticSource(frames=1).snapshot(0).frame)
+    session = Session(config)
+    made = session.run(SyntheticSource(frames=1).snapshot(0).frame)
     assert made.clusters is not None
     one, zero = np.ones(1, np.float32), np.zeros(1, np.int32)
     car = Detections(
@@ -310,7 +310,7 @@ def test_results_are_published_for_others_but_not_for_us(result: FrameResult) ->
     heard: dict[str, Any] = {}
     kinds = {BEV: "Image", OBSTACLES: "PointCloud2", CLUSTERS: "Detection3DArray", FUSED: "Detection3DArray"}
     kinds[DETECTIONS] = "Detection2DArray"
-    with LiveSource(load()) as source, Session(name="rviz") as rviz:
+    with LiveSource(load()) as source, Node(name="rviz") as rviz:
         publisher = Publisher(source.node, load())
         publisher.publish(result)  # for nobody
         for topic, short in kinds.items():
@@ -363,7 +363,7 @@ def call(node: Any, client: Any, request: Any) -> Any:
     return answer.result()
 
 
-def test_parameters_and_the_saving_of_the_recording(pair: tuple[Session, Session]) -> None:
+def test_parameters_and_the_saving_of_the_recording(pair: tuple[Node, Node]) -> None:
     from rcl_interfaces.srv import SetParameters
     from rclpy.parameter import Parameter
     from std_srvs.srv import Trigger
@@ -430,8 +430,9 @@ def test_the_command_beside_a_robot(robot: str, tmp_path: Path) -> None:
     command += ["--preset", "reference", "--ros-args", "-p", "range_x:=12.0", "-r", f"{BEV}:=/seen"]
     run = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, cwd=tmp_path, env=environment)
     heard: dict[str, list[Any]] = {"/seen": [], CLUSTERS: []}
+    answer: Any = None
     try:
-        with Session(name="operator") as operator:
+        with Node(name="operator") as operator:
             operator.start()
             node = operator.node
             for topic, kind in (("/seen", TOPICS_PUBLISHED[BEV]), (CLUSTERS, TOPICS_PUBLISHED[CLUSTERS])):
@@ -454,8 +455,13 @@ def test_the_command_beside_a_robot(robot: str, tmp_path: Path) -> None:
             until(lambda: heard["/seen"][-1].height == 240, "an image of the new range")
 
             client = node.create_client(Trigger, "/bevviz/save_recording")
-            answer = call(node, client, Trigger.Request())
-            assert answer.success, answer.message
+
+            def saved() -> bool:
+                nonlocal answer
+                answer = call(node, client, Trigger.Request())
+                return bool(answer.success)
+
+            until(saved, "a recording of what was published, once it is logged, too")
     finally:
         run.send_signal(signal.SIGTERM)
         _, said = run.communicate(timeout=60)
@@ -472,7 +478,7 @@ def test_the_command_beside_a_robot(robot: str, tmp_path: Path) -> None:
 def test_parameters_of_the_command_line() -> None:
     ordered: list[str] = []
     arguments = ["-p", "range_y:=12.5", "-r", "__node:=eye", "-r", "__ns:=/robot1"]
-    with Session(arguments) as session:
+    with Node(arguments) as session:
         Orders(session.node, Config(), ordered.extend)
         assert session.node.get_fully_qualified_name() == "/robot1/eye"
         assert session.resolve("points") == "/robot1/points"

@@ -134,6 +134,7 @@ def make(index: int = 0, **changes: Any) -> FrameResult:
     )
     result = FrameResult(
         frame=frame,
+        config=config,
         voxels=Voxels(points, np.arange(len(points), dtype=np.int32)),
         ground=Ground(ground, points[:, 2] + np.float32(1.7)),
         obstacles=obstacles,
@@ -153,7 +154,7 @@ def nothing(index: int, *failures: Failure, **changes: Any) -> FrameResult:
     frame = dataclasses.replace(
         empty.frame, points=np.zeros((0, 3), np.float32), clouds=(), cameras=(), **changes
     )
-    return FrameResult(frame, None, None, None, None, (), None, None, (), {"total": 0.001}, failures)
+    return FrameResult(frame, load(), None, None, None, None, (), None, None, (), {"total": 0.001}, failures)
 
 
 @pytest.fixture

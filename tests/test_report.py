@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 import signal
+import time
 from collections.abc import Callable
 from dataclasses import replace
 from html.parser import HTMLParser
@@ -17,15 +19,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bevviz import pipeline
+import bevviz
 from bevviz.bags.mcap_writer import McapWriter
 from bevviz.bags.recording import RawMessage
 from bevviz.bags.recording import Recording as Bag
 from bevviz.cli import main
-from bevviz.frame import Detections, Frame, FrameResult
+from bevviz.frame import Detections, FrameResult
 from bevviz.report.digest import Stage, compare, detections_of, pack, unpack
 from bevviz.report.page import spans
 from bevviz.report.plots import plot, ticks
+from bevviz.session import Session
 from tests import bags
 from tests.recordings import Recording, verify
 from tests.test_cli import Capture, error_of
@@ -141,7 +144,7 @@ def test_the_model_without_its_folder(tmp_path: Path, small: Path, capsys: Captu
     bag = bags.write(tmp_path / "drive", bags.small_items(scans=12))
     model = tmp_path / "secret" / "net.onnx"
     model.parent.mkdir()
-    model.write_bytes((Path(pipeline.__file__).parent / "data" / "demo_detector.onnx").read_bytes())
+    model.write_bytes((Path(bevviz.__file__).parent / "data" / "demo_detector.onnx").read_bytes())
     call = ["report", str(bag), "--at", "0.5", "--before", "0", "--after", "0", "--model", str(model)]
     assert main(call) == 0
     found = Recording(Path("bug.rrd"))
@@ -266,20 +269,22 @@ def test_an_interrupted_run_is_a_shorter_report(
     tmp_path: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     bag = bags.write(tmp_path / "drive", bags.small_items(scans=30))
-    run, done = pipeline.Pipeline.run, []
+    done: list[FrameResult] = []
+    finish = Session.finish
 
-    def interrupted(self: pipeline.Pipeline, frame: Frame) -> FrameResult:
-        done.append(frame)
+    def interrupted(self: Session, result: FrameResult) -> FrameResult:
+        done.append(result)
         if len(done) == 4:
-            signal.raise_signal(signal.SIGTERM)
-        return run(self, frame)
+            os.kill(os.getpid(), signal.SIGTERM)
+            time.sleep(1)  # it is the main thread's to see it
+        return finish(self, result)
 
     with monkeypatch.context() as patch:
-        patch.setattr(pipeline.Pipeline, "run", interrupted)
+        patch.setattr(Session, "finish", interrupted)
         assert main(["report", str(bag), "--at", "1", "--note", "x"]) == 130
-    assert "interrupted after 3 frames" in capsys.readouterr().err
+    assert "interrupted after 4 frames" in capsys.readouterr().err
     verify(Path("bug.rrd"))
-    assert "interrupted after 3 frames" in "".join(Page(Path("bug.html").read_text()).words)
+    assert "interrupted after 4 frames" in "".join(Page(Path("bug.html").read_text()).words)
     assert main(["report", "--check", "bug.rrd"]) == 0
 
 

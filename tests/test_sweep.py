@@ -55,7 +55,7 @@ def elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         ("clustering.min_points=5:14:4", ("5", "9", "13")),
         ("voxel.size=0.1:0.1:1", ("0.1",)),
         ("voxel.size=5 cm, 10 cm", ("5 cm", "10 cm")),
-        ("ground.method=polar,ransac", ("polar", "ransac")),
+        ("ground.method=polar,plane", ("polar", "plane")),
     ],
 )
 def test_values(text: str, values: tuple[str, ...]) -> None:
@@ -276,28 +276,28 @@ def test_another_topic_as_truth() -> None:
     other = run_with(
         lambda f: truth_of(f, LabelledBoxes3D("/x", 0, "map", own.boxes, own.labels, own.scores))
     )
-    assert sweep.outcomes["0.5",].score.classes == other.outcomes["0.5",].score.classes
+    assert sweep.tallies["0.5",].score.classes == other.tallies["0.5",].score.classes
 
 
 def run_with(judge: Any) -> Sweep:
     parameters, _ = parse(["clustering.eps=0.5,0.6"])
     configs = combine(parameters, lambda more: load(settings=["detector.model=demo", *more]))
     sweep = Sweep(parameters, configs, judge)
-    sweep.add(frame())
+    sweep.perceive(frame())
     return sweep
 
 
 def test_an_interrupted_sweep_tells_what_it_has(
     drive: str, capsys: Capture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    add = Sweep.add
+    perceive = Sweep.perceive
 
-    def interrupted(self: Sweep, frame: Frame) -> None:
-        if self.outcomes["0.5",].frames:
+    def interrupted(self: Sweep, frame: Frame, network: Any = None) -> int:
+        if self.tallies["0.5",].frames:
             raise KeyboardInterrupt
-        add(self, frame)
+        return perceive(self, frame, network)
 
-    monkeypatch.setattr(Sweep, "add", interrupted)
+    monkeypatch.setattr(Sweep, "perceive", interrupted)
     assert main(["sweep", drive, "--set", "clustering.eps=0.5,0.6"]) == 130
     told = capsys.readouterr()
     assert told.out.startswith("1 frames; means")

@@ -14,7 +14,7 @@ from benchmarks.tracking import Tallies, TrackTally, Truth, add_tracks, truth_of
 from bevviz import geometry
 from bevviz.config import TrackingConfig, load
 from bevviz.frame import F32, F64, Boxes3D, Clusters, Frame, LabelledBoxes3D, Objects, Tracks
-from bevviz.pipeline import Pipeline
+from bevviz.session import Session
 from bevviz.stages.tracking import Tracker
 from bevviz.synthetic import SyntheticSource
 from bevviz.synthetic.sensors import Lidar, PinholeCamera
@@ -322,8 +322,8 @@ def drive() -> list[Frame]:
 
 
 def test_in_the_pipeline(drive: list[Frame]) -> None:
-    with Pipeline(load(settings=["detector.model=demo"])) as pipeline:
-        results = [pipeline.run(frame) for frame in drive]
+    session = Session(load(settings=["detector.model=demo"]))
+    results = [session.run(frame) for frame in drive]
     last = results[-1]
     assert last.tracks is not None and last.objects is not None and last.clusters is not None
     assert "tracking" in last.timings
@@ -336,7 +336,7 @@ def test_in_the_pipeline(drive: list[Frame]) -> None:
 
 def test_the_reference_has_no_tracks(drive: list[Frame]) -> None:
     assert load(preset="reference").tracking.method == "none"
-    with Pipeline(load(settings=["tracking.method=none"])) as pipeline:
-        result = pipeline.run(drive[0])
+    session = Session(load(settings=["tracking.method=none"]))
+    result = session.run(drive[0])
     assert result.clusters is not None
     assert result.tracks is None

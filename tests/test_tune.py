@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import os
 import signal
 import subprocess
 import sys
+import threading
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
-from typing import Any
+from queue import Empty, Queue
+from typing import Any, Self
 
 import pytest
 
@@ -22,9 +21,10 @@ from bevviz.errors import UserError
 from bevviz.frame import Frame
 from bevviz.live.settings import Settings
 from bevviz.logging.sinks import open_recording
+from bevviz.run import Dropping, run
 from bevviz.stages import detector
 from bevviz.synthetic import SyntheticSource
-from bevviz.tune import Tuner, Version, create
+from bevviz.tune import OneFrame, Saves, Version, VersionRecorder, create
 from tests import bags
 from tests.recordings import Recording, verify
 
@@ -41,25 +41,50 @@ def frame() -> Frame:
     return source().snapshot(12).frame
 
 
-@contextmanager
-def tuned(folder: Path, text: str = "") -> Iterator[tuple[Tuner, Callable[[str], Version | None]]]:
-    """A tuner of ``my.yaml``, logging to ``t.rrd``, and what saves the file and polls until it is seen."""
-    file = folder / "my.yaml"
-    file.write_text(text)
-    settings = Settings(file, [MODEL])
+class Tuned:
+    """``bevviz tune`` on ``my.yaml``, logging to ``t.rrd``, beside the test."""
 
-    def save(text: str) -> Version | None:
-        file.write_text(text)
-        os.utime(file)  # seen as new, however coarse the file system's clock
-        for _ in range(3):
-            version = tuner.poll()
-            if version is not None:
-                return version
-        return None
+    def __init__(self, folder: Path) -> None:
+        self.file = folder / "my.yaml"
+        self.file.write_text("")
+        self.versions: Queue[Version | UserError] = Queue()
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run, args=(folder / "t.rrd",))
 
-    with open_recording(source().scene, settings.config, save=folder / "t.rrd", blueprint="tune") as sinks:
-        tuner = Tuner(frame(), settings, sinks.recording, source().scene)
-        yield tuner, save
+    def __enter__(self) -> Self:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._stop.set()
+        self._thread.join()
+
+    def _run(self, path: Path) -> None:
+        settings, one = Settings(self.file, [MODEL]), OneFrame(frame())
+        saves = Saves(settings, source().scene, one.check, self.versions.put)
+        with open_recording(source().scene, settings.config, save=path, blueprint="tune") as sinks:
+            recorder = VersionRecorder(
+                sinks.recording, settings.config, lambda version, seconds: self.versions.put(version)
+            )
+            run(saves, one, [recorder], dropping=Dropping(), stop=self._stop)
+
+    def save(self, text: str) -> None:
+        time.sleep(0.05)  # the file system's clock may be coarse
+        self.file.write_text(text)
+
+    def version(self) -> Version:
+        found = self.versions.get(timeout=60)
+        assert isinstance(found, Version), found
+        return found
+
+    def refusal(self) -> str:
+        found = self.versions.get(timeout=60)
+        assert isinstance(found, UserError), found
+        return str(found)
+
+    def silence(self) -> None:
+        with pytest.raises(Empty):
+            self.versions.get(timeout=0.5)
 
 
 def test_versions(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -71,22 +96,26 @@ def test_versions(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         return infer(self, bgr)
 
     monkeypatch.setattr(detector.Detector, "infer", counted)
-    with tuned(tmp_path) as (tuner, save):
-        first = tuner.last
+    with Tuned(tmp_path) as tuned:
+        first = tuned.version()
         assert first.number == 0
         assert first.text.startswith(f"version 0: as it is: {len(first.found.b.names)} objects")
-        assert tuner.poll() is None
-        one = save("clustering:\n  min_cluster_points: 100000\n")
-        assert one is not None
-        assert one.changes == {"clustering.min_cluster_points": "10 -> 100000"}
+        tuned.silence()
+        tuned.save("clustering:\n  min_cluster_points: 100000\n")
+        one = tuned.version()
+        assert {key: str(change) for key, change in one.save.changes.items()} == {
+            "clustering.min_cluster_points": "10 -> 100000"
+        }
         assert one.found.counts == {Change.ONLY_A: len(first.found.b.names)}
         assert one.text.endswith(f": 0 objects ({len(first.found.b.names)} gone)")
-        assert save("") is None, "an editor has only begun to write"
-        two = save("detector:\n  conf_threshold: 0.9\n")
-        assert two is not None
+        tuned.save("")  # an editor has only begun to write
+        tuned.silence()
+        tuned.save("detector:\n  conf_threshold: 0.9\n")
+        two = tuned.version()
         assert two.number == 2
-        assert set(two.changes) == {"clustering.min_cluster_points", "detector.conf_threshold"}
-        assert save("detector:\n  conf_threshold: 0.9\n") is None, "saved, but as it was"
+        assert set(two.save.changes) == {"clustering.min_cluster_points", "detector.conf_threshold"}
+        tuned.save("detector:\n  conf_threshold: 0.9\n")  # saved, but as it was
+        tuned.silence()
     assert len(inferred) == 1
     verify(tmp_path / "t.rrd")
     recording = Recording(tmp_path / "t.rrd")
@@ -101,7 +130,8 @@ def test_versions(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_what_is_no_configuration_is_not_taken(tmp_path: Path) -> None:
-    with tuned(tmp_path) as (tuner, save):
+    with Tuned(tmp_path) as tuned:
+        assert tuned.version().number == 0
         for text, message in (
             ("clustering:\n  eps: -1\n", "clustering.eps must be greater than 0"),
             ("clustering:\n  epsilon: 1\n", "unknown key"),
@@ -109,16 +139,14 @@ def test_what_is_no_configuration_is_not_taken(tmp_path: Path) -> None:
             ("sync:\n  tolerance: 0.05\n", "differ in sync.tolerance"),
             ("detector:\n  classes: [dragon]\n", "the model has no class 'dragon'"),
         ):
-            with pytest.raises(UserError, match=message) as caught:
-                save(text)
-            assert "\n" not in str(caught.value)
-            assert tuner.last.number == 0
-        version = save("clustering:\n  eps: 0.8\n")
-        assert version is not None
-        assert version.number == 1
+            tuned.save(text)
+            refusal = tuned.refusal()
+            assert message in refusal
+            assert "\n" not in refusal
+        tuned.save("clustering:\n  eps: 0.8\n")
+        assert tuned.version().number == 1
         (tmp_path / "my.yaml").unlink()
-        assert tuner.poll() is None
-        assert tuner.poll() is None
+        tuned.silence()
 
 
 def test_a_file_is_made_once(tmp_path: Path) -> None:

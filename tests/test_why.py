@@ -16,7 +16,7 @@ from bevviz.cli import main
 from bevviz.config import Config, load
 from bevviz.errors import UserError
 from bevviz.frame import Boxes3D, DetectionState, FrameResult, LabelledBoxes3D
-from bevviz.pipeline import Pipeline
+from bevviz.session import Session
 from bevviz.synthetic import BagWriter
 from bevviz.why import Answer, Selection, why
 from bevviz.why.evidence import Fate
@@ -36,7 +36,7 @@ def config_of(preset: str, *settings: str) -> Config:
 
 @cache
 def asked(name: str, preset: str, label: str = "") -> list[Answer]:
-    return why(run(name, preset), config_of(preset), Selection(label=label), CLASSES, hints=0)
+    return why(run(name, preset), Selection(label=label), CLASSES, hints=0)
 
 
 def of_truth(answers: list[Answer], row: int) -> Answer:
@@ -48,7 +48,7 @@ def about(name: str, preset: str, row: int) -> Answer:
     result = run(name, preset)
     box = projected(truth_box(result.frame, row), result.frame.cameras[0])
     assert box is not None
-    (answer,) = why(result, config_of(preset), Selection(box=tuple(box.tolist())), CLASSES, hints=1)
+    (answer,) = why(result, Selection(box=tuple(box.tolist())), CLASSES, hints=1)
     assert (answer.subject.kind, answer.subject.row) == ("truth", row)
     return answer
 
@@ -89,8 +89,8 @@ def test_a_flat_car_taken_for_ground() -> None:
     assert (answer.fate == Fate.GROUND).sum() > 300
     # The hint is true: with that setting the very car is an object.
     config = config_of("reference", *answer.hints[0].settings)
-    with Pipeline(config) as pipeline:
-        again = why(pipeline.run(at("flat_car").frame), config, Selection(label="car"), CLASSES, hints=0)
+    session = Session(config)
+    again = why(session.run(at("flat_car").frame), Selection(label="car"), CLASSES, hints=0)
     assert of_truth(again, row).verdict.reported
 
 
@@ -110,15 +110,15 @@ def test_two_people_in_one_cluster(preset: str) -> None:
 
 
 def test_the_hint_that_parts_two_people_is_proved() -> None:
-    result, config = run("merged_people", "default"), config_of("default")
-    answers = why(result, config, Selection(label="person"), CLASSES, hints=1)
+    result = run("merged_people", "default")
+    answers = why(result, Selection(label="person"), CLASSES, hints=1)
     lost = next(a for a in answers if a.verdict.reason is Reason.MERGED and not a.verdict.reported)
     assert lost is answers[0]
     assert lost.hints[0].settings[0].startswith("clustering.eps=0.")
     assert f"; change {lost.hints[0].settings[0]}: it is cluster " in lost.verdict.text
     better = config_of("default", *lost.hints[0].settings)
-    with Pipeline(better) as pipeline:
-        again = why(pipeline.run(result.frame), better, Selection(label="person"), CLASSES, hints=0)
+    session = Session(better)
+    again = why(session.run(result.frame), Selection(label="person"), CLASSES, hints=0)
     assert all(
         of_truth(again, row).verdict.reason is Reason.REPORTED
         for row in planted("merged_people", "person", 9.9)
@@ -128,7 +128,7 @@ def test_the_hint_that_parts_two_people_is_proved() -> None:
 def test_two_people_without_ground_truth() -> None:
     result = run("merged_people", "default")
     blind = replace(result, frame=replace(result.frame, truth=None))
-    answers = why(blind, config_of("default"), Selection(label="person"), CLASSES, hints=0)
+    answers = why(blind, Selection(label="person"), CLASSES, hints=0)
     merged = [a for a in answers if a.verdict.reason is Reason.MERGED]
     assert merged and all(a.subject.kind == "detection" for a in merged)
     assert any("was not reported because cluster" in a.verdict.text for a in merged)
@@ -142,11 +142,11 @@ def test_a_box_that_names_two_clusters() -> None:
     assert "was reported, but its box also names cluster" in answer.verdict.text
     assert answer.hints[0].settings == ("fusion.method=frustum",)
     cabinet = Selection(point=(10.0, -3.9, -0.8))
-    (other,) = why(run("shared_box", "reference"), config_of("reference"), cabinet, CLASSES)
+    (other,) = why(run("shared_box", "reference"), cabinet, CLASSES)
     assert other.verdict.reason is Reason.BORROWED
     assert "is named person by a box" in other.verdict.text
     assert other.hints[0].text == "it is not named any more"
-    (rightly,) = why(run("shared_box", "default"), config_of("default"), cabinet, CLASSES, hints=0)
+    (rightly,) = why(run("shared_box", "default"), cabinet, CLASSES, hints=0)
     assert not rightly.verdict.reported
 
 
@@ -168,20 +168,18 @@ def test_a_pixel_is_the_detection_there() -> None:
     assert seen is not None
     person = next(d for d, name in enumerate(seen.names) if name == "person" and seen.score[d] > 0.6)
     u, v = (seen.xyxy[person, :2] + seen.xyxy[person, 2:]) / 2
-    (known,) = why(result, config_of("default"), Selection(box=(float(u), float(v))), CLASSES, hints=0)
+    (known,) = why(result, Selection(box=(float(u), float(v))), CLASSES, hints=0)
     assert known.subject.kind == "truth", "what is known of it says more than the detection"
     result = replace(result, frame=replace(result.frame, truth=None))
     detections = result.cameras[0].detections
     assert detections is not None
     best = int(np.flatnonzero(detections.state == DetectionState.KEPT)[0])
     u, v = (detections.xyxy[best, :2] + detections.xyxy[best, 2:]) / 2
-    (answer,) = why(result, config_of("default"), Selection(box=(float(u), float(v))), CLASSES, hints=0)
+    (answer,) = why(result, Selection(box=(float(u), float(v))), CLASSES, hints=0)
     assert (answer.subject.kind, answer.subject.row) == ("detection", best)
-    (same,) = why(
-        result, config_of("default"), Selection(box=tuple(detections.xyxy[best].tolist())), CLASSES, hints=0
-    )
+    (same,) = why(result, Selection(box=tuple(detections.xyxy[best].tolist())), CLASSES, hints=0)
     assert same.subject.row == best
-    (sky,) = why(result, config_of("default"), Selection(box=(320.0, 5.0)), CLASSES, hints=0)
+    (sky,) = why(result, Selection(box=(320.0, 5.0)), CLASSES, hints=0)
     assert sky.subject.kind == "pixel"
     assert sky.verdict.reason is Reason.NO_POINTS
 
@@ -213,7 +211,7 @@ def test_the_fates_add_up() -> None:
 )
 def test_what_cannot_be_asked(selection: Selection, message: str) -> None:
     with pytest.raises(UserError, match=message) as caught:
-        why(run("merged_people", "default"), config_of("default"), selection, CLASSES, hints=0)
+        why(run("merged_people", "default"), selection, CLASSES, hints=0)
     assert "\n" not in str(caught.value)
 
 
@@ -222,16 +220,16 @@ def test_several_cameras_and_none() -> None:
     other = replace(result.cameras[0], camera=replace(result.cameras[0].camera, name="left"))
     both = replace(result, cameras=(*result.cameras, other))
     with pytest.raises(UserError, match="several cameras: say which with --camera, one of zed, left"):
-        why(both, config_of("default"), Selection(box=(5.0, 5.0)), CLASSES, hints=0)
+        why(both, Selection(box=(5.0, 5.0)), CLASSES, hints=0)
     with pytest.raises(UserError, match="no camera: ask with --point"):
-        why(replace(result, cameras=()), config_of("default"), Selection(box=(5.0, 5.0)), CLASSES, hints=0)
+        why(replace(result, cameras=()), Selection(box=(5.0, 5.0)), CLASSES, hints=0)
 
 
 def test_a_failed_stage_is_the_reason() -> None:
     config = config_of("default")
-    with Pipeline(config) as pipeline:
-        result = pipeline.run(replace(at("flat_car").frame, points=np.zeros((0, 3), np.float32)))
-    answers = why(result, config, Selection(label="car"), CLASSES, hints=0)
+    session = Session(config)
+    result = session.run(replace(at("flat_car").frame, points=np.zeros((0, 3), np.float32)))
+    answers = why(result, Selection(label="car"), CLASSES, hints=0)
     assert answers and {a.verdict.reason for a in answers} == {Reason.FAILED}
     assert "the cloud holds no finite point" in answers[0].verdict.text
 
@@ -275,13 +273,13 @@ def kitti_truth(shared: Path, result: FrameResult, name: str) -> FrameResult:
 def kitti(shared: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[Answer]]:
     bag = bags.write(tmp_path_factory.mktemp("kitti") / "kitti", bags.kitti_items(shared))
     config = load(settings=[f"detector.model={shared / 'models/yolox_nano.onnx'}"])
-    with BagSource([bag], config) as source, Pipeline(config) as pipeline:
-        assert pipeline.detector is not None
-        names, found = pipeline.detector.names, {}
+    with BagSource([bag], config) as source:
+        session = Session(config)
+        names, found = session.stages.class_names, {}
         for name, frame in zip(("000000", "000001"), source, strict=True):
-            result = kitti_truth(shared, pipeline.run(frame), name)
-            wrong = why(result, config, Selection(), names, hints=8)
-            found[name] = wrong + why(result, config, Selection(label="person"), names, hints=0)
+            result = kitti_truth(shared, session.run(frame), name)
+            wrong = why(result, Selection(), names, hints=8)
+            found[name] = wrong + why(result, Selection(label="person"), names, hints=0)
         return found
 
 

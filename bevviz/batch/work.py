@@ -5,20 +5,21 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Callable, Generator
-from contextlib import closing
 from dataclasses import dataclass
-from typing import TypeAlias
+from pathlib import Path
+from typing import Any, TypeAlias
 from uuid import uuid4
 
 from bevviz.bags.source import BagSource
 from bevviz.batch.jobs import PARTIAL, Job
 from bevviz.batch.table import About, row, write
 from bevviz.errors import UserError
-from bevviz.logging.logger import Logger
+from bevviz.frame import FrameResult
+from bevviz.logging.recorder import Recorder
 from bevviz.logging.sinks import open_recording
-from bevviz.logging.writer import WAIT
-from bevviz.pipeline import Pipeline
-from bevviz.prefetch import overlap
+from bevviz.run import Observer
+from bevviz.run import run as run_frames
+from bevviz.session import Session
 
 
 class WithdrawnError(Exception):
@@ -62,38 +63,29 @@ def run(job: Job, threads: int, on_frame: Callable[[], None] = lambda: None) -> 
     detector = job.config.detector
     detector = detector.model_copy(update={"threads": detector.threads or threads})
     config = job.config.model_copy(update={"detector": detector})
-    selection, rows = job.selection, []
+    selection, rows = job.selection, list[dict[str, Any]]()
     try:
         recording.parent.mkdir(parents=True, exist_ok=True)
-        with (
-            BagSource(
-                [job.bag],
+        with BagSource(
+            [job.bag],
+            config,
+            start=selection.start,
+            end=selection.end,
+            every=selection.every,
+            frames=selection.frames,
+        ) as source:
+            session = Session(config)
+            with open_recording(
+                source.scene,
                 config,
-                start=selection.start,
-                end=selection.end,
-                every=selection.every,
-                frames=selection.frames,
-            ) as source,
-            Pipeline(config) as pipeline,
-        ):
-            with (
-                open_recording(
-                    source.scene,
-                    config,
-                    save=recording,
-                    blueprint=job.blueprint,
-                    recording_id=job.recording_id,
-                ) as sinks,
-                closing(overlap(source, pipeline.perceive, 2)) as results,
-                Logger(sinks.recording, config, source.scene, wait=WAIT) as logger,
-            ):
-                logger.log_static()
-                for result in map(pipeline.finish, results):
-                    logger.log(result)
-                    rows.append({**row(result, config), "bag": str(job.bag), "recording": job.name})
-                    on_frame()
-                    if not recording.exists():
-                        raise WithdrawnError
+                save=recording,
+                blueprint=job.blueprint,
+                recording_id=job.recording_id,
+            ) as sinks:
+                table_rows = _Rows(job, recording, on_frame)
+                if run_frames(source, session, [Recorder(sinks.recording, config), table_rows]).interrupted:
+                    raise KeyboardInterrupt
+            rows = table_rows.rows
             scene, warnings = source.scene, tuple(source.warnings)
         if not rows:
             raise UserError("; ".join([f"{job.bag.name}: no frame in it", *warnings]))
@@ -109,3 +101,19 @@ def run(job: Job, threads: int, on_frame: Callable[[], None] = lambda: None) -> 
         for path in (recording, table):
             path.unlink(missing_ok=True)
     return Outcome(job.name, len(rows), seconds)
+
+
+class _Rows(Observer[FrameResult]):
+    """A row of the table for each frame; ends the run where its recording was removed."""
+
+    def __init__(self, job: Job, recording: Path, on_frame: Callable[[], None]) -> None:
+        self.rows: list[dict[str, Any]] = []
+        self._job, self._recording, self._on_frame = job, recording, on_frame
+
+    def see(self, result: FrameResult) -> None:
+        self.rows.append(
+            {**row(result, result.config), "bag": str(self._job.bag), "recording": self._job.name}
+        )
+        self._on_frame()
+        if not self._recording.exists():
+            raise WithdrawnError

@@ -6,6 +6,7 @@ import argparse
 from pathlib import Path
 
 from bevviz.cli.options import Commands, add_bag, add_config, add_output, add_selection, load_config, open_bag
+from bevviz.cli.outputs import Outputs
 from bevviz.cli.run import process
 
 
@@ -24,4 +25,4 @@ def add(commands: Commands) -> None:
 def _bag(options: argparse.Namespace) -> int:
     config = load_config(options)
     with open_bag(options, config) as source:
-        return process(source, config, options, Path(options.paths[0].stem + ".rrd"))
+        return process(source, config, Outputs.of(options), Path(options.paths[0].stem + ".rrd"))

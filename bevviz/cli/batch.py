@@ -20,7 +20,7 @@ from bevviz.cli.options import (
     port,
     positive,
 )
-from bevviz.cli.run import hint, say
+from bevviz.cli.outputs import hint, say
 from bevviz.errors import UserError
 
 if TYPE_CHECKING:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from bevviz.cli.interrupts import terminable
 from bevviz.cli.options import Commands, add_bag, add_config, add_output, add_selection, load_config, open_bag
-from bevviz.cli.run import has_display, outputs, say, serve
+from bevviz.cli.outputs import Outputs, say, warn
 
 if TYPE_CHECKING:
     from bevviz.calib import Calibration, Shots
@@ -55,8 +55,7 @@ def _calib(options: argparse.Namespace) -> int:
             with open_bag(options, config) as source:
                 bar = tqdm(source, total=source.total, unit="frame", desc="find edges", disable=None)
                 shots = gather(bar, names, source.pose)
-                for warning in source.warnings:
-                    say(f"warning: {warning}")
+                warn(source.warnings)
             results = []
             for name in names:
                 with tqdm(unit="step", desc=f"align {name}", disable=None) as steps:
@@ -128,14 +127,13 @@ def _log(
     """Into every output that was asked for; without one, only the text was."""
     from bevviz.logging.calib import log_calibration
 
-    if not (options.save or options.serve or options.connect or options.viewer or has_display()):
+    outputs = Outputs.of(options).or_viewer()
+    if not outputs:
         say("no display: --save FILE.rrd keeps the pictures and curves, --serve shows them in a browser")
         return
-    spawn = options.viewer or not (options.save or options.serve or options.connect)
-    with outputs(scene, config, options, spawn=spawn) as sinks:
+    with outputs.opened(scene, config) as sinks:
         for result in results:
             log_calibration(sinks.recording, result, shots[result.camera].shots, config.logging)
-        if options.save is not None:
-            say(f"pictures and curves in {options.save}")
-        if options.serve is not None:
-            serve(sinks.recording)
+        if outputs.save is not None:
+            say(f"pictures and curves in {outputs.save}")
+        outputs.keep_serving(sinks.recording)

@@ -3,22 +3,23 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable
-from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
 from bevviz.cli.options import Commands, add_bag, add_config, add_output, add_selection, open_bag
-from bevviz.cli.run import hint, run, say
+from bevviz.cli.outputs import Outputs, hint, say
+from bevviz.cli.run import logged
 from bevviz.errors import UserError
 
 if TYPE_CHECKING:
     from rerun import RecordingStream
 
     from bevviz.bags.source import BagSource
-    from bevviz.compare.sides import Comparison, Results
-    from bevviz.compare.summary import Summary
+    from bevviz.compare.sides import ComparedFrame
+    from bevviz.compare.summary import ComparisonSummary
     from bevviz.config import Config, Preset
+    from bevviz.frame import Frame
+    from bevviz.run import Observer, Processor
 
 DESCRIPTION = """Run two configurations on the same frames and show how the results differ: objects that only
 A or only B has, that have moved, or that have another class. Without --a, --b, --set-a, --set-b, --preset
@@ -68,54 +69,76 @@ def _compare(options: argparse.Namespace) -> int:
 
 
 def _configurations(options: argparse.Namespace) -> int:
-    from bevviz.compare.sides import configured
+    from bevviz.compare.sides import ComparedSessions
+    from bevviz.variants import common_frames
 
-    names, configs = _sides(options)
-    comparison, decoded = configured(names, configs)
+    names, (a, b) = _sides(options)
+    sessions, decoded = ComparedSessions(a, b), common_frames([a, b])
     with open_bag(options, decoded) as source:
-        return _run(comparison, source, decoded, options)
+        return _run(sessions, source, decoded, names, (a, b), options)
 
 
 def _robot(options: argparse.Namespace) -> int:
     from bevviz.cli.options import load_config
-    from bevviz.compare.sides import against_robot, robot_topic
+    from bevviz.compare.sides import ComparedRobot, robot_topic
+    from bevviz.session import Session
 
     if options.a or options.b or options.set_a or options.set_b:
         raise UserError("--robot: A is bevviz as --set, --config and --preset say; leave --a and --b out")
     config = load_config(options)
     with open_bag(options, config) as source:
-        comparison = against_robot(config, robot_topic(source.roles.robot_detections_3d, options.robot))
+        topic = robot_topic(source.roles.robot_detections_3d, options.robot)
+        names = "bevviz", f"the robot's {topic}"
+        compared = ComparedRobot(Session(config), topic)
+        return _run(compared, source, config, names, (config, config), options)
 
-        return _run(comparison, source, config, options)
 
+def _run(
+    processor: Processor[Frame, ComparedFrame],
+    source: BagSource,
+    config: Config,
+    names: tuple[str, str],
+    configs: tuple[Config, Config],
+    options: argparse.Namespace,
+) -> int:
+    from bevviz.compare.sides import ComparisonRecorder
+    from bevviz.compare.summary import ComparisonSummary
+    from bevviz.config import changes
 
-def _run(comparison: Comparison, source: BagSource, config: Config, options: argparse.Namespace) -> int:
-    def begin(recording: RecordingStream) -> AbstractContextManager[Callable[[Results], None]]:
+    summary = ComparisonSummary(names, changes(*configs))
+
+    def observers(recording: RecordingStream) -> list[Observer[ComparedFrame]]:
         hint(source.scene, config)
-        return nullcontext(comparison.begin(recording, source.scene))
+        return [ComparisonRecorder(recording, *configs, summary), summary]
 
     def finish() -> None:
-        if comparison.without:
-            say(f"{comparison.without} frames for which the robot published nothing are left out")
-        _report(comparison.summary, options)
+        if summary.without:
+            say(f"{summary.without} frames for which the robot published nothing are left out")
+        _report(summary, options)
 
-    return run(source, config, options, _default(options), comparison.run, begin, finish)
+    return logged(
+        source,
+        processor,
+        config,
+        Outputs.of(options).or_file(_default(options)),
+        observers,
+        finish,
+    )
 
 
 def _saved(options: argparse.Namespace) -> int:
-    from bevviz.compare.saved import SavedPair
+    from bevviz.compare.saved import SavedPair, SavedPairRecorder
     from bevviz.config import Config
 
     if options.robot is not None or options.a or options.b or options.set_a or options.set_b:
         raise UserError("compare: two .rrd files are compared as they were saved; leave the sides out")
     pair = SavedPair(*options.paths)
-    return run(
+    return logged(
+        pair,
         pair,
         Config(),
-        options,
-        _default(options),
-        pair.compare,
-        lambda recording: nullcontext(pair.begin(recording)),
+        Outputs.of(options).or_file(_default(options)),
+        lambda recording: [SavedPairRecorder(recording, pair), pair.summary],
         lambda: _report(pair.summary, options),
     )
 
@@ -124,7 +147,7 @@ def _default(options: argparse.Namespace) -> Path:
     return Path(f"{options.paths[0].stem}_compare.rrd")
 
 
-def _report(summary: Summary, options: argparse.Namespace) -> None:
+def _report(summary: ComparisonSummary, options: argparse.Namespace) -> None:
     print(summary.table(), flush=True)
     if options.json is not None:
         summary.write_json(options.json)

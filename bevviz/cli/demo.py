@@ -6,6 +6,7 @@ import argparse
 from pathlib import Path
 
 from bevviz.cli.options import Commands, add_config, add_output, load_config, positive
+from bevviz.cli.outputs import Outputs
 from bevviz.cli.run import process
 
 # Held to bevviz.synthetic.faults by a test: importing that takes as long as a command should.
@@ -72,4 +73,4 @@ def _demo(options: argparse.Namespace) -> int:
     if not config.detector.model:
         # The configuration is frozen: the demo's own network is one more setting under the user's.
         config = load(options.config, ["detector.model=demo", *options.set], options.preset)
-    return process(source, config, options, Path("demo.rrd"))
+    return process(source, config, Outputs.of(options), Path("demo.rrd"))

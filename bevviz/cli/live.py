@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from bevviz.cli.interrupts import terminable
 from bevviz.cli.options import Commands, add_config, add_output, add_ros_args, positive
-from bevviz.cli.run import has_display, say
+from bevviz.cli.outputs import has_display, say
 
 if TYPE_CHECKING:
     from bevviz.config import Config

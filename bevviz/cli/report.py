@@ -7,7 +7,7 @@ from pathlib import Path
 
 from bevviz.cli.interrupts import terminable
 from bevviz.cli.options import Commands, add_bag, add_config, load_config
-from bevviz.cli.run import say
+from bevviz.cli.outputs import say
 from bevviz.errors import UserError
 
 

@@ -1,192 +1,85 @@
-"""What the commands share while they run."""
+"""A run of the command line: with a progress bar, into the outputs that are asked for, until a signal."""
 
 from __future__ import annotations
 
-import argparse
-import gc
-import os
-import sys
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, closing, contextmanager
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol, TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
-from bevviz.cli.interrupts import terminable, wait_for_interrupt
+from bevviz.cli.interrupts import terminable
+from bevviz.cli.outputs import Outputs, hint, say, warn
+from bevviz.progress import Progress
+from bevviz.run import Items, Observer, Processor, RunEnd, run
 
 if TYPE_CHECKING:
     from rerun import RecordingStream
-    from rerun.blueprint import Blueprint
 
     from bevviz.config import Config
-    from bevviz.frame import FrameResult, Scene, Source
-    from bevviz.logging.sinks import Sinks
+    from bevviz.frame import FrameResult, Source
 
 T = TypeVar("T")
 R = TypeVar("R")
-T_co = TypeVar("T_co", covariant=True)
 
 
-class Items(Protocol[T_co]):
-    """What ``run`` works through: a ``Source``, or something like it that is not of frames."""
-
-    @property
-    def scene(self) -> Scene: ...
-
-    @property
-    def total(self) -> int | None: ...
-
-    @property
-    def warnings(self) -> Sequence[str]: ...
-
-    def __iter__(self) -> Iterator[T_co]: ...
+def through(items: Items[T], processor: Processor[T, R], observers: Sequence[Observer[R]]) -> RunEnd:
+    """The run, with a progress bar; a signal ends it after the frame at hand."""
+    with terminable() as ended:
+        return run(items, processor, [*observers, Progress()], stop=ended)
 
 
-def process(source: Source, config: Config, options: argparse.Namespace, default: Path) -> int:
-    """Run the pipeline over the source into every output that was asked for."""
-    from bevviz.anomalies import Summary
-    from bevviz.logging.logger import Logger
-    from bevviz.logging.writer import WAIT
-    from bevviz.pipeline import Pipeline
+def process(source: Source, config: Config, outputs: Outputs, default: Path) -> int:
+    """Every stage on every frame, logged to every output that is asked for."""
+    from bevviz.anomalies import AnomalySummary
+    from bevviz.logging.recorder import Recorder
+    from bevviz.session import Session
 
-    anomalies = Summary()
-    with Pipeline(config) as pipeline:
+    anomalies = AnomalySummary()
+    session = Session(config)
 
-        @contextmanager
-        def begin(recording: RecordingStream) -> Iterator[Callable[[FrameResult], None]]:
-            hint(source.scene, config)
-            with Logger(recording, config, source.scene, wait=WAIT) as logger:
-                logger.log_static()
+    def observers(recording: RecordingStream) -> list[Observer[FrameResult]]:
+        hint(source.scene, config)
+        return [Recorder(recording, config), anomalies]
 
-                def handle(result: FrameResult) -> None:
-                    result = pipeline.finish(result)
-                    logger.log(result)
-                    anomalies.add(result)
-
-                yield handle
-
-        def finish() -> None:
-            say(f"anomalies: {anomalies}")
-
-        return run(source, config, options, default, pipeline.perceive, begin, finish)
+    return logged(
+        source,
+        session,
+        config,
+        outputs.or_file(default),
+        observers,
+        lambda: say(f"anomalies: {anomalies}"),
+    )
 
 
-def run(
+def logged(
     items: Items[T],
+    processor: Processor[T, R],
     config: Config,
-    options: argparse.Namespace,
-    default: Path,
-    work: Callable[[T], R],
-    begin: Callable[[RecordingStream], AbstractContextManager[Callable[[R], None]]],
+    outputs: Outputs,
+    observers: Callable[[RecordingStream], Sequence[Observer[R]]],
     finish: Callable[[], None] = lambda: None,
 ) -> int:
-    """Log what is made of each item into every output that was asked for.
+    """A run whose observers log.
 
     Args:
         items: frames, or what there is of each.
+        processor: what makes a result of each.
         config: how they are made.
-        options: of ``add_output``.
-        default: file that is saved where nothing is asked for and nothing can be shown.
-        work: what is to be made of an item.
-        begin: called with the recording; its context is what logs that.
+        outputs: where what is logged goes.
+        observers: of the recording.
         finish: called after the last one, before what was made is served.
 
     Returns:
         The exit status.
     """
-    save, viewer = options.save, options.viewer
-    unsaid = save is None and options.serve is None and options.connect is None and not viewer
-    if unsaid and has_display():
-        viewer = True
-    elif unsaid:
-        save = default
-
-    with outputs(items.scene, config, options, save=save, spawn=viewer) as sinks:
-        if unsaid and not viewer:
-            say(f"no display: saving {save} (--serve shows it in a browser)")
-        with begin(sinks.recording) as handle:
-            frames, interrupted = through(items, work, handle)
-        for warning in items.warnings:
-            say(f"warning: {warning}")
+    with outputs.opened(items.scene, config) as sinks:
+        end = through(items, processor, observers(sinks.recording))
+        warn(items.warnings)
         finish()
-        if options.serve is not None and frames and not interrupted:
-            serve(sinks.recording, f"{frames} frames; ")
-    target = f" in {save}" if save is not None else ""
-    if interrupted:
-        say(f"interrupted after {frames} frames; what was made until then is complete{target}")
+        if end.frames and not end.interrupted:
+            outputs.keep_serving(sinks.recording, f"{end.frames} frames; ")
+    target = f" in {outputs.save}" if outputs.save is not None else ""
+    if end.interrupted:
+        say(f"interrupted after {end.frames} frames; what was made until then is complete{target}")
         return 130
-    say(f"{frames} frames{target}")
-    return 0 if frames else 1
-
-
-@contextmanager
-def outputs(
-    scene: Scene,
-    config: Config,
-    options: argparse.Namespace,
-    blueprint: Blueprint | None = None,
-    **instead: Any,
-) -> Iterator[Sinks]:
-    """What the options of ``add_output`` ask for, or ``instead``, opened; addresses are said."""
-    from bevviz.logging.sinks import open_recording
-
-    asked = {
-        "save": options.save,
-        "serve": options.serve,
-        "connect": options.connect,
-        "spawn": options.viewer,
-        "blueprint": blueprint or options.blueprint,
-    }
-    with open_recording(scene, config, **asked | instead) as sinks:
-        for url in sinks.urls:
-            say(f"viewer at {url}")
-        yield sinks
-
-
-def serve(recording: RecordingStream, what: str = "") -> None:
-    """Until the user ends it."""
-    say(f"{what}serving until Ctrl-C")
-    recording.flush()
-    wait_for_interrupt()
-
-
-def through(items: Items[T], work: Callable[[T], R], handle: Callable[[R], None]) -> tuple[int, bool]:
-    """Items are worked on in a thread, while the next are made and the last handled, with a progress bar.
-
-    Returns:
-        How many there were, and whether that was interrupted.
-    """
-    from tqdm import tqdm
-
-    from bevviz.prefetch import overlap
-
-    done = 0
-    gc.freeze()  # what was imported stays: it need not be looked through again and again
-    try:
-        with (
-            terminable() as ended,
-            tqdm(total=items.total, unit="frame", desc=items.scene.name, disable=None) as bar,
-            closing(overlap(items, work, 2)) as results,
-        ):
-            for result in results:
-                handle(result)
-                done += 1
-                bar.update()
-                if ended.is_set():
-                    raise KeyboardInterrupt
-    except KeyboardInterrupt:
-        return done, True
-    return done, False
-
-
-def hint(scene: Scene, config: Config) -> None:
-    """Say what would give the user more."""
-    if scene.cameras and not config.detector.model:
-        say("no detector: give --model FILE.onnx to find objects in the images")
-
-
-def say(line: str) -> None:
-    print(f"bevviz: {line}", file=sys.stderr)
-
-
-def has_display() -> bool:
-    return sys.platform != "linux" or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+    say(f"{end.frames} frames{target}")
+    return 0 if end.frames else 1

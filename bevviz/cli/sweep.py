@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import argparse
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from bevviz.cli.options import Commands, add_bag, add_config, add_output, add_selection, open_bag
-from bevviz.cli.run import hint, outputs, say, serve, through
+from bevviz.cli.outputs import Outputs, hint, say, warn
+from bevviz.cli.run import through
 
 if TYPE_CHECKING:
     from bevviz.config import Config
@@ -19,7 +21,7 @@ def add(commands: Commands) -> None:
         "sweep",
         help="a parameter over a range: counts, times, precision and recall",
         description="Run every value of one or two parameters on the same frames. --set takes ranges "
-        "(clustering.eps=0.3:0.9:0.1) and lists (ground.method=polar,ransac) besides plain values.",
+        "(clustering.eps=0.3:0.9:0.1) and lists (ground.method=polar,plane) besides plain values.",
     )
     group = add_bag(sweep)
     add_selection(group)
@@ -54,24 +56,21 @@ def _sweep(options: argparse.Namespace) -> int:
     with open_bag(options, config) as source:
         truth = truth_source(source.roles, options.truth, options.kitti_labels)
         sweep = Sweep(parameters, configs, truth)
-        wanted = options.save or options.serve or options.connect or options.viewer
+        outputs = replace(Outputs.of(options), blueprint=sweep.layout())
         with ExitStack() as stack:
-            sinks = None
-            if wanted:
-                opened = outputs(source.scene, source.config, options, blueprint=sweep.layout())
-                sinks = stack.enter_context(opened)
+            # Before the run, that may take long: what cannot be opened is told now.
+            sinks = stack.enter_context(outputs.opened(source.scene, source.config)) if outputs else None
             hint(source.scene, config)
-            frames, interrupted = through(source, lambda frame: frame, sweep.add)
-            for warning in source.warnings:
-                say(f"warning: {warning}")
+            end = through(source, sweep, [])
+            warn(source.warnings)
             print(sweep.table())
             if options.csv is not None:
                 sweep.write_csv(options.csv)
             if sinks is not None:
                 sweep.log(sinks.recording, source.scene.name)
-                if options.serve is not None and not interrupted:
-                    serve(sinks.recording)
-    if interrupted:
-        say(f"interrupted after {frames} frames; the table is of these")
+                if not end.interrupted:
+                    outputs.keep_serving(sinks.recording)
+    if end.interrupted:
+        say(f"interrupted after {end.frames} frames; the table is of these")
         return 130
-    return 0 if frames else 1
+    return 0 if end.frames else 1

@@ -4,21 +4,18 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
-from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from bevviz.cli.interrupts import terminable
 from bevviz.cli.options import Commands, add_bag, add_config, add_output
-from bevviz.cli.run import has_display, hint, outputs, say
+from bevviz.cli.outputs import Outputs, hint, say, warn
 from bevviz.errors import UserError
 
 if TYPE_CHECKING:
     from bevviz.frame import Frame, Scene
     from bevviz.live.settings import Settings
-    from bevviz.tune import Tuner
-
-LOOK = 0.01  # seconds between two looks at the file
 
 
 def add(commands: Commands) -> None:
@@ -40,7 +37,8 @@ def _tune(options: argparse.Namespace) -> int:
     from bevviz.config import dump, load
     from bevviz.live.settings import Settings
     from bevviz.logging.sinks import free_port
-    from bevviz.tune import Tuner, create
+    from bevviz.run import Dropping, run
+    from bevviz.tune import OneFrame, Saves, Version, VersionRecorder, create
 
     model = [f"detector.model={options.model}"] if options.model else []
     if not options.config.exists() and create(
@@ -49,15 +47,29 @@ def _tune(options: argparse.Namespace) -> int:
         say(f"{options.config}: made, with every parameter")
     settings = Settings(options.config, [*options.set, *model], options.preset)
     frame, scene, warnings = _frame(options, settings)
-    viewer, serve = options.viewer, options.serve
-    if options.save is None and serve is None and options.connect is None and not viewer:
-        viewer = has_display()
-        serve = None if viewer else free_port(9090)
-    with outputs(scene, settings.config, options, serve=serve, spawn=viewer) as sinks:
+    outputs = Outputs.of(options).or_viewer()
+    if not outputs:
+        outputs = replace(outputs, serve=free_port(9090))
+    one = OneFrame(frame)
+    one.check(settings.config)
+    last = 0
+
+    def tell(version: Version, seconds: float) -> None:
+        nonlocal last
+        last = version.number
+        after = f" ({seconds * 1e3:.0f} ms after the save)" if version.number else ""
+        print(f"{version.text}{after}", flush=True)
+        if not version.number:
+            say(f"save {options.config} to run it again; Ctrl-C ends")
+
+    with outputs.opened(scene, settings.config) as sinks:
         hint(scene, settings.config)
-        for warning in warnings:
-            say(f"warning: {warning}")
-        _watch(options.config, Tuner(frame, settings, sinks.recording, scene))
+        warn(warnings)
+        saves = Saves(settings, scene, one.check, lambda error: say(f"not taken: {error}"))
+        recorder = VersionRecorder(sinks.recording, settings.config, tell)
+        with terminable() as ended:
+            run(saves, one, [recorder], dropping=Dropping(), stop=ended)
+    say(f"ended at version {last}")
     return 0
 
 
@@ -70,20 +82,3 @@ def _frame(options: argparse.Namespace, settings: Settings) -> tuple[Frame, Scen
         for frame in source:
             return frame, source.scene, source.warnings
         raise UserError(f"{source.scene.name}: the scan cannot be used: {'; '.join(source.warnings)}")
-
-
-def _watch(file: Path, tuner: Tuner) -> None:
-    """Run each save until Ctrl-C."""
-    print(tuner.last.text, flush=True)
-    say(f"save {file} to run it again; Ctrl-C ends")
-    with suppress(KeyboardInterrupt), terminable() as ended:
-        while not ended.wait(LOOK):
-            try:
-                version = tuner.poll()
-            except UserError as error:
-                say(f"not taken: {error}")
-                continue
-            if version is not None:
-                print(f"{version.text} ({version.seconds * 1e3:.0f} ms after the save)", flush=True)
-    last = tuner.last
-    say(f"ended at version {last.number}")

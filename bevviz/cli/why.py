@@ -8,11 +8,10 @@ from typing import TYPE_CHECKING
 
 from bevviz.cli.interrupts import terminable
 from bevviz.cli.options import Commands, add_bag, add_config, add_output, load_config, positive
-from bevviz.cli.run import outputs, say, serve
+from bevviz.cli.outputs import Outputs, say, warn
 from bevviz.errors import UserError
 
 if TYPE_CHECKING:
-    from bevviz.config import Config
     from bevviz.frame import FrameResult, Scene
     from bevviz.why import Answer
 
@@ -85,32 +84,29 @@ def _metres(text: str) -> float:
 
 def _why(options: argparse.Namespace) -> int:
     from bevviz.bags.source import BagSource
-    from bevviz.pipeline import Pipeline
+    from bevviz.perceive import StageLoader
+    from bevviz.session import Session
     from bevviz.why import Selection, why
     from bevviz.why.text import plain
 
     config = load_config(options)
     selection = Selection(options.label, options.box, options.point, options.radius, options.camera)
-    with (
-        terminable(),
-        BagSource(options.paths, config, at=options.at) as source,
-        Pipeline(config) as pipeline,
-    ):
+    with terminable(), BagSource(options.paths, config, at=options.at) as source:
+        loader = StageLoader()
+        session = Session(config, loader=loader)
         frame = next(iter(source), None)
-        for warning in source.warnings:
-            say(f"warning: {warning}")
+        warn(source.warnings)
         if frame is None:
             raise UserError(f"--at {options.at}: the scan there cannot be read")
-        result = pipeline.run(frame)
-        names = pipeline.detector.names if pipeline.detector is not None else ()
-        answers = why(result, config, selection, names, options.limit, _progress)
+        result = session.run(frame)
+        answers = why(result, selection, session.stages.class_names, options.limit, _progress, loader)
         if options.json:
-            _print_json(result, config, answers)
+            _print_json(result, answers)
         else:
             print(f"frame {frame.index}, preset {config.preset}\n")
             print(plain(answers, options.limit) or _nothing(options.label))
-        if options.save or options.serve or options.connect or options.viewer:
-            _show(result, config, answers, source.scene, options)
+        if outputs := Outputs.of(options):
+            _show(result, answers, source.scene, outputs, options.limit)
     return 0
 
 
@@ -126,26 +122,23 @@ def _progress(answers: Sequence[Answer]) -> Iterable[Answer]:
     yield from tqdm(answers, unit="object", desc="what would change it", leave=False, disable=None)
 
 
-def _print_json(result: FrameResult, config: Config, answers: Sequence[Answer]) -> None:
+def _print_json(result: FrameResult, answers: Sequence[Answer]) -> None:
     import json
 
     frame = result.frame
-    head = {"frame": frame.index, "stamp": frame.stamp, "preset": config.preset}
+    head = {"frame": frame.index, "stamp": frame.stamp, "preset": result.config.preset}
     print(json.dumps({**head, "answers": [answer.as_dict() for answer in answers]}, indent=2))
 
 
-def _show(
-    result: FrameResult, config: Config, answers: Sequence[Answer], scene: Scene, options: argparse.Namespace
-) -> None:
+def _show(result: FrameResult, answers: Sequence[Answer], scene: Scene, outputs: Outputs, limit: int) -> None:
     from bevviz.logging.logger import Logger
     from bevviz.logging.why import log_answers
 
-    with outputs(scene, config, options) as sinks:
-        logger = Logger(sinks.recording, config, scene)
+    with outputs.opened(scene, result.config) as sinks:
+        logger = Logger(sinks.recording, result.config, scene)
         logger.log_static()
         logger.log(result)
-        log_answers(sinks.recording, result.frame, answers, options.limit)
-        if options.save is not None:
-            say(f"saved in {options.save}")
-        if options.serve is not None:
-            serve(sinks.recording)
+        log_answers(sinks.recording, result.frame, answers, limit)
+        if outputs.save is not None:
+            say(f"saved in {outputs.save}")
+        outputs.keep_serving(sinks.recording)

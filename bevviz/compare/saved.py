@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import Executor
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -15,12 +16,13 @@ from rerun.chunk import Chunk, RrdReader
 from bevviz import geometry
 from bevviz.compare.differences import FrameDifferences, ImageBoxes, Seen, differences
 from bevviz.compare.log import DifferenceLogger
-from bevviz.compare.summary import Summary, parameters
-from bevviz.config import flat_yaml
+from bevviz.compare.summary import ComparisonSummary
+from bevviz.config import changes, flat_yaml
 from bevviz.errors import UserError
 from bevviz.frame import F64, Boxes3D, Scene
 from bevviz.logging import entities
 from bevviz.logging.pieces import CORNER
+from bevviz.run import Items, Observer
 
 Row = Mapping[str, Any]
 
@@ -115,6 +117,15 @@ class SavedRun:
                 frame.clusters = int(row["Scalars:scalars"][0])
 
 
+@dataclass(frozen=True, slots=True)
+class SavedFrames:
+    """One frame of two runs, and how it differs."""
+
+    a: SavedFrame
+    b: SavedFrame
+    found: FrameDifferences
+
+
 class SavedPair:
     """Two runs, old and new, and the frames that both have; to be iterated over.
 
@@ -130,7 +141,7 @@ class SavedPair:
                 f"{old} and {new} have no scan in common: none of {len(self.a.frames)} stamps is among "
                 f"{len(self.b.frames)}"
             )
-        self.summary = Summary((self.a.name, self.b.name), _config_differences(self.a.config, self.b.config))
+        self.summary = ComparisonSummary((self.a.name, self.b.name), changes(self.a.config, self.b.config))
 
     @property
     def scene(self) -> Scene:
@@ -152,29 +163,35 @@ class SavedPair:
     def __iter__(self) -> Iterator[int]:
         return iter(self._stamps)
 
-    def compare(self, stamp: int) -> FrameDifferences:
+    def perceive(self, stamp: int, network: Executor | None = None) -> SavedFrames:
         """How the runs differ at one of the stamps."""
         a, b = self.a.frames[stamp], self.b.frames[stamp]
-        return differences(a.index, stamp, a.seen(self.a.cameras), b.seen(self.b.cameras))
+        found = differences(a.index, stamp, a.seen(self.a.cameras), b.seen(self.b.cameras))
+        return SavedFrames(a, b, found)
 
-    def begin(self, recording: rr.RecordingStream) -> Callable[[FrameDifferences], None]:
-        """Send both runs on, the new one under ``/b``. Returns what is to be called with the differences."""
-        recording.send_chunks(self.a.stream())
-        recording.send_chunks(_beside(self.b))
-        for camera in self.b.cameras:  # over the one image
+    def finish(self, frames: SavedFrames) -> SavedFrames:
+        return frames
+
+
+class SavedPairRecorder(Observer[SavedFrames]):
+    """Sends both runs on, the new one under ``/b``, and logs how they differ."""
+
+    def __init__(self, recording: rr.RecordingStream, pair: SavedPair) -> None:
+        self._recording, self._pair = recording, pair
+
+    def begin(self, items: Items[object]) -> None:
+        recording, pair = self._recording, self._pair
+        recording.send_chunks(pair.a.stream())
+        recording.send_chunks(_beside(pair.b))
+        for camera in pair.b.cameras:  # over the one image
             for path in (entities.projected(camera), entities.detections(camera), entities.weak(camera)):
                 over = rr.CoordinateFrame(f"tf#{entities.image(camera)}")
                 recording.log(entities.B + path, over, static=True)
-        about = "```\n" + "\n".join(parameters(self.summary.config)) + "\n```"
-        log = DifferenceLogger(recording, self.summary.names, about)
+        self._differences = DifferenceLogger(recording, pair.summary.names, pair.summary.about)
 
-        def handle(found: FrameDifferences) -> None:
-            frames = self.a.frames[found.stamp], self.b.frames[found.stamp]
-            posed = frames[0] if frames[0].fused else frames[1]
-            log.log(found, frames[0].received, posed.world_from_points)
-            self.summary.add(found)
-
-        return handle
+    def see(self, frames: SavedFrames) -> None:
+        posed = frames.a if frames.a.fused else frames.b
+        self._differences.log(frames.found, frames.a.received, posed.world_from_points)
 
 
 def _beside(run: SavedRun) -> Iterator[Chunk]:
@@ -221,12 +238,3 @@ def _image_boxes(row: Row) -> ImageBoxes:
     half = np.array(row["Boxes2D:half_sizes"], np.float32)
     names = tuple(label.rpartition(" ")[0] for label in row["Boxes2D:labels"])  # behind it the score
     return ImageBoxes(np.hstack([middle - half, middle + half]), names)
-
-
-def _config_differences(old: Mapping[str, Any], new: Mapping[str, Any]) -> dict[str, str]:
-    """Each dotted key that differs, with ``old -> new``; they may come from different versions."""
-    return {
-        key: f"{old.get(key, 'absent')} -> {new.get(key, 'absent')}"
-        for key in dict.fromkeys([*old, *new])
-        if old.get(key, "absent") != new.get(key, "absent")
-    }

@@ -2,120 +2,111 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from concurrent.futures import Executor
+from dataclasses import dataclass, replace
 
 import numpy as np
 import rerun as rr
 
-from bevviz.compare.differences import differences, seen
+from bevviz.compare.differences import FrameDifferences, differences, seen
 from bevviz.compare.log import DifferenceLogger
-from bevviz.compare.summary import Summary, parameters
+from bevviz.compare.summary import ComparisonSummary
 from bevviz.config import Config
 from bevviz.errors import UserError
-from bevviz.evaluate import in_points_frame
-from bevviz.frame import (
-    Camera,
-    CameraResult,
-    Detections,
-    DetectionState,
-    Frame,
-    FrameResult,
-    LabelledBoxes2D,
-    LabelledBoxes3D,
-    Objects,
-    Scene,
-)
-from bevviz.live.settings import differences as config_differences
+from bevviz.frame import Camera, CameraResult, Frame, FrameResult, LabelledBoxes3D, Objects
 from bevviz.logging import entities
 from bevviz.logging.logger import Logger
-from bevviz.variants import Variants, check_same_frames, common_frames
-
-Results = tuple[Frame, FrameResult | None, FrameResult | None]
+from bevviz.run import Items, Observer
+from bevviz.session import Session
+from bevviz.stages.robot import detections_of, in_points_frame
+from bevviz.variants import Sessions, check_same_frames
 
 
 @dataclass(frozen=True, slots=True)
-class Side:
-    """One of the two. ``run`` gives None where it says nothing of a frame."""
+class ComparedFrame:
+    """What both sides make of a frame, and how that differs; None where a side says nothing of it."""
 
-    name: str
-    config: Config
-    run: Callable[[Frame], FrameResult | None]
-
-
-class Comparison:
-    """Runs both sides on each frame, logs both and how they differ, and counts.
-
-    Args:
-        a, b: the sides. What A makes is logged where a run alone has it, what B makes under ``/b``.
-    """
-
-    def __init__(self, a: Side, b: Side) -> None:
-        self.a, self.b = a, b
-        self.summary = Summary((a.name, b.name), config_differences(a.config, b.config))
-        self.without = 0  # frames that a side says nothing of
-
-    def run(self, frame: Frame) -> Results:
-        """What both make of the frame."""
-        return frame, self.a.run(frame), self.b.run(frame)
-
-    def begin(self, recording: rr.RecordingStream, scene: Scene) -> Callable[[Results], None]:
-        """Log what no frame changes. Returns what is to be called with the results of each frame."""
-        loggers = [
-            Logger(recording, self.a.config, scene),
-            Logger(recording, self.b.config, scene, entities.B),
-        ]
-        for logger in loggers:
-            logger.log_static()
-        about = "```\n" + "\n".join(parameters(self.summary.config)) + "\n```"
-        log = DifferenceLogger(recording, self.summary.names, about)
-
-        def handle(results: Results) -> None:
-            frame, a, b = results
-            for logger, result in zip(loggers, (a, b), strict=True):
-                if result is not None:
-                    logger.log(result)
-            if a is None or b is None:
-                self.without += 1
-                return
-            found = differences(frame.index, frame.stamp, seen(a), seen(b))
-            log.log(found, frame.received, frame.pose)
-            self.summary.add(found)
-
-        return handle
+    frame: Frame
+    a: FrameResult | None
+    b: FrameResult | None
+    found: FrameDifferences | None = None
 
 
-def configured(names: tuple[str, str], configs: tuple[Config, Config]) -> tuple[Comparison, Config]:
-    """Two configurations, and how the frames for both are to be made.
+class ComparedSessions:
+    """Two configurations on the same frames.
 
     Raises:
         UserError: a detector's model cannot be used, or they need different frames.
     """
-    check_same_frames(dict(zip(("A", "B"), configs, strict=True)))
-    variants = Variants()
-    for config in configs:
-        variants.prepare(config)
 
-    def side(name: str, config: Config) -> Side:
-        return Side(name, config, lambda frame: variants.run(frame, config))
+    def __init__(self, a: Config, b: Config) -> None:
+        check_same_frames({"A": a, "B": b})
+        self._sessions = Sessions([a, b])
 
-    a, b = (side(name, config) for name, config in zip(names, configs, strict=True))
-    return Comparison(a, b), common_frames(configs)
+    def perceive(self, frame: Frame, network: Executor | None = None) -> ComparedFrame:
+        a, b = self._sessions.perceive(frame, network)
+        return ComparedFrame(frame, a, b)
+
+    def finish(self, compared: ComparedFrame) -> ComparedFrame:
+        assert compared.a is not None
+        assert compared.b is not None
+        return _differing(compared.frame, *self._sessions.finish((compared.a, compared.b)))
+
+
+class ComparedRobot:
+    """What a session makes, and what the robot published on a Detection3DArray topic."""
+
+    def __init__(self, session: Session, topic: str) -> None:
+        self._session, self._topic = session, topic
+
+    def perceive(self, frame: Frame, network: Executor | None = None) -> ComparedFrame:
+        return ComparedFrame(frame, self._session.perceive(frame, network), None)
+
+    def finish(self, compared: ComparedFrame) -> ComparedFrame:
+        assert compared.a is not None
+        theirs = published(compared.frame, self._topic, compared.a.config)
+        return _differing(compared.frame, self._session.finish(compared.a), theirs)
+
+
+def _differing(frame: Frame, a: FrameResult, b: FrameResult | None) -> ComparedFrame:
+    if b is None:
+        return ComparedFrame(frame, a, b)
+    return ComparedFrame(frame, a, b, differences(frame.index, frame.stamp, seen(a), seen(b)))
+
+
+class ComparisonRecorder(Observer[ComparedFrame]):
+    """Logs both sides and how they differ: what A makes where a run alone has it, what B makes under ``/b``.
+
+    Args:
+        recording: where to.
+        a, b: the configurations.
+        summary: of the same comparison.
+    """
+
+    def __init__(
+        self, recording: rr.RecordingStream, a: Config, b: Config, summary: ComparisonSummary
+    ) -> None:
+        self._recording, self._configs, self._summary = recording, (a, b), summary
+
+    def begin(self, items: Items[object]) -> None:
+        a, b = self._configs
+        self._loggers = (
+            Logger(self._recording, a, items.scene),
+            Logger(self._recording, b, items.scene, entities.B),
+        )
+        for logger in self._loggers:
+            logger.log_static()
+        self._differences = DifferenceLogger(self._recording, self._summary.names, self._summary.about)
+
+    def see(self, compared: ComparedFrame) -> None:
+        for logger, result in zip(self._loggers, (compared.a, compared.b), strict=True):
+            if result is not None:
+                logger.log(result)
+        if compared.found is not None:
+            self._differences.log(compared.found, compared.frame.received, compared.frame.pose)
 
 
 # --- the robot ---------------------------------------------------------------------------------
-
-
-def against_robot(config: Config, topic: str) -> Comparison:
-    """What the configuration makes, and what the robot published on a Detection3DArray topic.
-
-    Raises:
-        UserError: the detector's model cannot be used.
-    """
-    variants = Variants()
-    variants.prepare(config)
-    ours = Side("bevviz", config, lambda frame: variants.run(frame, config))
-    return Comparison(ours, Side(f"the robot's {topic}", config, lambda frame: published(frame, topic)))
 
 
 def robot_topic(topics: tuple[str, ...], asked: str) -> str:
@@ -138,22 +129,13 @@ def robot_topic(topics: tuple[str, ...], asked: str) -> str:
     raise UserError(f"--robot: which of its topics? Give one: --robot TOPIC, of {there}")
 
 
-def published(frame: Frame, topic: str) -> FrameResult | None:
+def published(frame: Frame, topic: str, config: Config) -> FrameResult | None:
     """What the robot says of the frame, as if a run had made it; None where it says nothing."""
     stated = next((boxes for boxes in frame.robot_boxes if boxes.topic == topic), None)
     if stated is None:
         return None
     cameras = tuple(_published_2d(frame, camera) for camera in frame.cameras)
-    return FrameResult(
-        frame=frame,
-        voxels=None,
-        ground=None,
-        obstacles=None,
-        clusters=None,
-        cameras=cameras,
-        objects=_objects(stated, frame),
-        bev=None,
-    )
+    return replace(FrameResult.unprocessed(frame, config, cameras), objects=_objects(stated, frame))
 
 
 def _objects(stated: LabelledBoxes3D, frame: Frame) -> Objects:
@@ -165,13 +147,4 @@ def _objects(stated: LabelledBoxes3D, frame: Frame) -> Objects:
 
 def _published_2d(frame: Frame, camera: Camera) -> CameraResult:
     mine = [found for found in frame.robot_detections if found.camera == camera.name]
-    return CameraResult(camera, _detections(mine[0]) if mine else None, None)
-
-
-def _detections(found: LabelledBoxes2D) -> Detections:
-    count = len(found.xyxy)
-    zero = np.zeros(count, np.int32)
-    kept = np.full(count, DetectionState.KEPT, np.int32)
-    return Detections(
-        found.xyxy, found.scores, zero, found.labels, kept, zero - 1, np.zeros(count, np.float32)
-    )
+    return CameraResult(camera, detections_of(mine[0]) if mine else None, None)

@@ -7,33 +7,54 @@ import json
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
 from bevviz.compare.differences import DIFFERENT, WORST_FIRST, Change, Difference, FrameDifferences
 from bevviz.compare.log import place
+from bevviz.config import ParameterChange
 from bevviz.errors import UserError
+from bevviz.run import Observer
 
 WORST = 10  # frames in the table
 COLUMNS = ("objects A", "objects B", *(change.value for change in (Change.SAME, *DIFFERENT)))
 
 
-class Summary:
+class Compared(Protocol):
+    """What is known of a frame of both sides; None: one of them says nothing of it."""
+
+    @property
+    def found(self) -> FrameDifferences | None: ...
+
+
+class ComparisonSummary(Observer[Compared]):
     """Counts frame after frame.
 
     Args:
         names: what the two sides are.
-        config: dotted key -> ``a -> b``, where their configurations differ.
+        config: dotted key -> how its value differs.
     """
 
-    def __init__(self, names: tuple[str, str], config: Mapping[str, str]) -> None:
-        self.names, self.config = names, config
+    def __init__(self, names: tuple[str, str], config: Mapping[str, ParameterChange]) -> None:
+        self.names, self.config = names, {key: str(change) for key, change in config.items()}
+        self.without = 0  # frames that a side says nothing of
         self.frames: list[dict[str, Any]] = []
         self._classes: dict[str, Counter[str]] = defaultdict(Counter)
         self._detections: dict[str, Counter[str]] = defaultdict(Counter)
         self._clusters: Counter[str] = Counter()
         self._moved: list[float] = []
+
+    @property
+    def about(self) -> str:
+        """What was compared, in Markdown."""
+        return "```\n" + "\n".join(parameters(self.config)) + "\n```"
+
+    def see(self, compared: Compared) -> None:
+        if compared.found is None:
+            self.without += 1
+        else:
+            self.add(compared.found)
 
     def add(self, found: FrameDifferences) -> None:
         for difference in found.objects:

@@ -99,12 +99,12 @@ class Encoder:
     def encode(
         self,
         result: FrameResult,
-        config: Config,
         scene: Scene,
         health: Mapping[str, float],
         notes: Sequence[tuple[str, str]],
     ) -> Packet:
         """One frame, and with it whatever is new in the configuration or the scene."""
+        config = result.config
         if (config, scene) != (self._config, self._scene):
             if scene != self._scene:
                 self._stream.recording.send_blueprint(blueprints.load(self._blueprint, scene))

@@ -1,13 +1,12 @@
-"""The live run: receives, processes and logs in three threads; the newest frame wins, drops are counted."""
+"""The live run: the newest frame wins, drops are counted, and no output holds another one up."""
 
 from __future__ import annotations
 
-import gc
 import signal
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Executor, ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -15,10 +14,9 @@ from typing import Any
 
 import numpy as np
 
-from bevviz.anomalies import AnomalyDetector
 from bevviz.config import Config
 from bevviz.errors import UserError
-from bevviz.frame import CameraResult, Frame, FrameResult, Source
+from bevviz.frame import Frame, FrameResult, Scene, Source
 from bevviz.live.control import Control
 from bevviz.live.encoder import Encoder
 from bevviz.live.files import Indexer, Saver
@@ -26,16 +24,14 @@ from bevviz.live.flight import FlightRecorder
 from bevviz.live.health import Health, set_nice
 from bevviz.live.notes import Notes
 from bevviz.live.output import Output
-from bevviz.live.queue import NewestQueue
-from bevviz.live.settings import AT_START, Settings, differences
+from bevviz.live.settings import AT_START, Settings
 from bevviz.live.triggers import Triggers
 from bevviz.live.viewers import Viewer, remote, server, window
 from bevviz.logging import entities
-from bevviz.pipeline import Pipeline
+from bevviz.run import Dropping, Observer, run
+from bevviz.session import Session
 
-TICK = 0.2  # seconds between two looks at signals
 LOOK = 1.0  # seconds between two looks at the configuration file and the clock
-PATIENCE = 10.0  # seconds that a thread may take to end
 ENDING = (signal.SIGINT, signal.SIGTERM)
 
 
@@ -92,28 +88,24 @@ class Live:
         self.on_change: Callable[[Config], None] = lambda config: None  # called in the thread of ``run``
         self.urls: list[str] = []
         self.frames = 0  # logged
-        self.thinned = 0  # left out on purpose: live.every and live.max_rate
-        self._source, self._settings = source, settings
+        self._source, self._settings = Thinned(source, lambda: self.config), settings
         self._on_result = on_result
-        self._told = settings.config  # the configuration that ``on_change`` has
+        self._shown = settings.config  # the configuration that ``on_change`` has
         self._changing = threading.Lock()
         self._over = threading.Event()
-        self._error: BaseException | None = None
         self._asked_to_save = False
-        live = self.config.live
+        self._looked = 0.0
+        live = settings.config.live
 
         self._nice(live.nice)
-        self._pipeline = None if observe else Pipeline(self.config)
-        self._anomalies = AnomalyDetector()  # of frames that go through no pipeline
+        self._session = Observing(settings.config) if observe else Session(settings.config)
         self._encoder = Encoder(self.config, source.scene, outputs.blueprint)
         self._indexer = Indexer()
         self._saves = ThreadPoolExecutor(1, "save")
         self.flight = FlightRecorder(live, self._encoder, self._indexer)
         self._triggers = Triggers(live)
         self.health = Health()
-        self._incoming: NewestQueue[Frame] = NewestQueue(1)
-        self._results: NewestQueue[tuple[FrameResult, Config]] = NewestQueue(live.log_queue)
-        self._published: NewestQueue[FrameResult] = NewestQueue(1)
+        self._dropping = Dropping()
 
         programs = [remote(url, self._encoder.recording_id) for url in outputs.connect]
         if outputs.serve is not None:
@@ -131,7 +123,12 @@ class Live:
 
     @property
     def config(self) -> Config:
-        return self._settings.config
+        return self._session.config
+
+    @property
+    def thinned(self) -> int:
+        """Frames left out on purpose: live.every and live.max_rate."""
+        return self._source.thinned
 
     @property
     def status(self) -> Status:
@@ -152,51 +149,44 @@ class Live:
     # --- the run -------------------------------------------------------------------------------
 
     def run(self, on_tick: Callable[[Status], None] = lambda status: None) -> None:
-        """From the main thread. On KeyboardInterrupt everything is closed, then it goes on.
+        """From the main thread, until the end; everything is closed then.
 
         Raises:
             UserError: of the source, or a failure of the runtime, when all outputs are closed.
         """
-        threads = [
-            self._thread("receive", self._receive),
-            self._thread("pipeline", self._process),
-            self._thread("log", self._log),
-            self._thread("publish", self._publish),
-        ]
-        gc.collect()
-        gc.freeze()  # what is there by now stays; looking through it takes tens of milliseconds each time
+
+        def tick() -> None:
+            if self._asked_to_save:
+                self._asked_to_save = False
+                self._save_soon("SIGUSR1")
+            if time.monotonic() - self._looked >= LOOK:
+                self._looked = time.monotonic()
+                self._look()
+                on_tick(self.status)
+
+        observers: list[Observer[FrameResult]] = [LiveRecorder(self)]
+        if self._on_result is not None:
+            observers.append(Publishing(self._on_result, self.notes))
         with ExitStack() as stack:
             stack.callback(_handle, {number: signal.getsignal(number) for number in ENDING})
-            stack.callback(self._close, threads)
+            stack.callback(self._close)
             stack.enter_context(Control(self.save))
             stack.enter_context(self._signal())
             # A second Ctrl-C must not leave half a file or a viewer behind. Closing takes bounded time.
             stack.callback(_handle, dict.fromkeys(ENDING, signal.SIG_IGN))
-            looked = time.monotonic()
-            while not self._over.wait(TICK):
-                if self._asked_to_save:
-                    self._asked_to_save = False
-                    self._save_soon("SIGUSR1")
-                if time.monotonic() - looked >= LOOK:
-                    looked = time.monotonic()
-                    self._look()
-                    on_tick(self.status)
-        if isinstance(self._error, UserError):
-            raise self._error
-        if self._error is not None:
-            raise UserError(f"ended by {type(self._error).__name__}: {self._error}") from self._error
-
-    def _thread(self, name: str, work: Callable[[], None]) -> threading.Thread:
-        def guarded() -> None:
             try:
-                work()
-            except BaseException as error:
-                self._error = self._error or error
-                self._over.set()
-
-        thread = threading.Thread(target=guarded, name=name, daemon=True)
-        thread.start()
-        return thread
+                run(
+                    self._source,
+                    self._session,
+                    observers,
+                    dropping=self._dropping,
+                    stop=self._over,
+                    tick=tick,
+                )
+            except UserError:
+                raise
+            except Exception as error:
+                raise UserError(f"ended by {type(error).__name__}: {error}") from error
 
     @contextmanager
     def _signal(self) -> Iterator[None]:
@@ -216,98 +206,32 @@ class Live:
             self._reload()
         if jump := self.health.clock_jump():
             self.notes.warn(f"the clock of this machine has jumped by {jump:+.1f} s")
-        if self._told is not self.config:
-            self._told = self.config
-            self.on_change(self._told)
+        if self._shown is not self.config:
+            self._shown = self.config
+            self.on_change(self._shown)
 
-    def _close(self, threads: Sequence[threading.Thread]) -> None:
-        stop = getattr(self._source, "stop", None)
-        if stop is not None:
-            stop()
-        self._incoming.close()  # whatever the source does
-        for thread in threads[1:]:
-            thread.join(PATIENCE)
+    def _close(self) -> None:
         for output in self._outputs:
             output.close()
         self._saves.shutdown()
         self._indexer.close()
         self._encoder.close()
-        if self._pipeline is not None:
-            self._pipeline.close()
 
-    # --- the threads ---------------------------------------------------------------------------
-
-    def _receive(self) -> None:
-        earliest = 0.0
-        try:
-            for number, frame in enumerate(self._source):
-                if self._over.is_set():
-                    return
-                live, now = self.config.live, time.monotonic()
-                if number % live.every or now < earliest:
-                    self.thinned += 1
-                    continue
-                if live.max_rate is not None:
-                    # Frames that come a little early keep their turn; a pause earns no burst.
-                    earliest = max(earliest + 1 / live.max_rate, now - 0.5 / live.max_rate)
-                self._incoming.put(frame)
-        finally:
-            self._incoming.close()
-
-    def _process(self) -> None:
-        try:
-            used = self._pipeline
-            for frame in self._incoming:
-                with self._changing:
-                    pipeline, config = self._pipeline, self.config
-                if used is not None and used is not pipeline:
-                    used.close()
-                used = pipeline
-                frame = thin(frame, config.live.points)
-                if pipeline is None:
-                    result = observed(frame)
-                    found = self._anomalies.update(result, config.anomalies)
-                    result = replace(result, anomalies=found)
-                else:
-                    result = pipeline.run(frame)
-                self._results.put((result, config))
-                if self._on_result is not None:
-                    self._published.put(result)
-        finally:
-            self._results.close()
-            self._published.close()
-
-    def _log(self) -> None:
-        for result, config in self._results:
-            drops = {entities.drops(where): float(count) for where, count in self._drops().items()}
-            packet = self._encoder.encode(
-                result, config, self._source.scene, self.health.scalars() | drops, self.notes.take()
-            )
-            for output in self._outputs:
-                output.put(packet)
-            self.flight.put(packet)
-            self.health.logged(result.frame.received)
-            self.frames += 1
-            if reason := self._triggers.check(result):
-                self._save_soon(reason)
-        self._over.set()
-
-    def _publish(self) -> None:
-        failed = False
-        for result in self._published:
-            try:
-                assert self._on_result is not None
-                self._on_result(result)
-            except Exception as error:
-                if not failed:
-                    self.notes.warn(f"results cannot be published: {type(error).__name__}: {error}")
-                failed = True
+    def log(self, result: FrameResult) -> None:
+        """Encode a frame once, for every output."""
+        drops = {entities.drops(where): float(count) for where, count in self._drops().items()}
+        health = self.health.scalars() | drops
+        packet = self._encoder.encode(result, self._source.scene, health, self.notes.take())
+        for output in self._outputs:
+            output.put(packet)
+        self.flight.put(packet)
+        self.health.logged(result.frame.received)
+        self.frames += 1
+        if reason := self._triggers.check(result):
+            self._save_soon(reason)
 
     def _drops(self) -> dict[str, int]:
-        drops = {"source": getattr(self._source, "dropped", 0)}
-        drops |= {"incoming": self._incoming.dropped, "logging": self._results.dropped}
-        if self._on_result is not None:
-            drops["publishing"] = self._published.dropped
+        drops = {"source": self._source.dropped, **self._dropping.dropped}
         for output in self._outputs:
             drops[output.name] = drops.get(output.name, 0) + output.dropped
         return drops
@@ -351,18 +275,13 @@ class Live:
             self.notes.warn(f"{error}; the configuration stays as it was")
 
     def _apply(self, config: Config) -> None:
-        before = self.config
-        changes = differences(before, config)
-        if self._pipeline is not None:
-            if config.detector != before.detector:
-                self._pipeline = Pipeline(config)  # the one before is closed by the thread that uses it
-            else:
-                self._pipeline.config = config
+        nice = self.config.live.nice
+        changed = self._session.configure(config)
         self._settings.keep(config)
         self.flight.config = self._triggers.config = config.live
-        if config.live.nice != before.live.nice:
+        if config.live.nice != nice:
             self._nice(config.live.nice)
-        for key, change in changes.items():
+        for key, change in changed.items():
             late = "; takes effect at the next start" if key.startswith(AT_START) else ""
             self.notes.info(f"configuration: {key} {change}{late}")
 
@@ -378,10 +297,96 @@ def _handle(handlers: Mapping[signal.Signals, Any]) -> None:
         signal.signal(number, handler)
 
 
-def observed(frame: Frame) -> FrameResult:
-    """A result without any stage: the frame as the robot published it."""
-    cameras = tuple(CameraResult(camera, None, None) for camera in frame.cameras)
-    return FrameResult(frame, None, None, None, None, cameras, None, None)
+class LiveRecorder(Observer[FrameResult]):
+    """Logs in a thread of its own: neither the stages nor the publisher wait for it."""
+
+    name = "logging"
+
+    def __init__(self, live: Live) -> None:
+        self._live = live
+        self.beside = live.config.live.log_queue
+
+    def see(self, result: FrameResult) -> None:
+        self._live.log(result)
+
+
+class Publishing(Observer[FrameResult]):
+    """Hands results on to the robot, in a thread of its own."""
+
+    name = "publishing"
+    beside = 1
+
+    def __init__(self, publish: Callable[[FrameResult], None], notes: Notes) -> None:
+        self._publish, self._notes = publish, notes
+        self._failed = False
+
+    def see(self, result: FrameResult) -> None:
+        try:
+            self._publish(result)
+        except Exception as error:
+            if not self._failed:
+                self._notes.warn(f"results cannot be published: {type(error).__name__}: {error}")
+            self._failed = True
+
+
+class Observing(Session):
+    """No stage is run: only what the robot published is shown."""
+
+    def __init__(self, config: Config) -> None:
+        super().__init__(config, detect=lambda camera: None)
+
+    def perceive(self, frame: Frame, network: Executor | None = None) -> FrameResult:
+        return FrameResult.unprocessed(frame, self.config)
+
+    def finish(self, result: FrameResult) -> FrameResult:
+        return self.watch(result)
+
+
+class Thinned:
+    """A source without what the configuration leaves out on purpose: scans, and points of scans.
+
+    Args:
+        source: where the frames come from; with a method ``stop`` it is told when to end.
+        config: the one that is in force.
+    """
+
+    def __init__(self, source: Source, config: Callable[[], Config]) -> None:
+        self.thinned = 0
+        self._source, self._config = source, config
+
+    @property
+    def scene(self) -> Scene:
+        return self._source.scene
+
+    @property
+    def total(self) -> int | None:
+        return self._source.total
+
+    @property
+    def warnings(self) -> Sequence[str]:
+        return self._source.warnings
+
+    @property
+    def dropped(self) -> int:
+        """That the source itself has left out."""
+        return int(getattr(self._source, "dropped", 0))
+
+    def stop(self) -> None:
+        stop = getattr(self._source, "stop", None)
+        if stop is not None:
+            stop()
+
+    def __iter__(self) -> Iterator[Frame]:
+        earliest = 0.0
+        for number, frame in enumerate(self._source):
+            live, now = self._config().live, time.monotonic()
+            if number % live.every or now < earliest:
+                self.thinned += 1
+                continue
+            if live.max_rate is not None:
+                # Frames that come a little early keep their turn; a pause earns no burst.
+                earliest = max(earliest + 1 / live.max_rate, now - 0.5 / live.max_rate)
+            yield thin(frame, live.points)
 
 
 def thin(frame: Frame, points: int | None) -> Frame:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from bevviz.config import Config, Preset, keys, load
+from bevviz.config import Config, Preset, load
 
 AT_START = (
     "source.",
@@ -60,14 +60,3 @@ class Settings:
         except OSError:
             return None
         return (found.st_mtime_ns, found.st_size, found.st_ino) if found else None
-
-
-def differences(old: Config, new: Config) -> dict[str, str]:
-    """Each dotted key that differs, with ``old -> new``."""
-    found = {}
-    for key in keys():
-        section, _, name = key.rpartition(".")
-        before, after = (getattr(getattr(c, section) if section else c, name) for c in (old, new))
-        if before != after:
-            found[key] = f"{before} -> {after}"
-    return found

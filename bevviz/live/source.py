@@ -16,8 +16,8 @@ from bevviz.frame import Frame, Intrinsics, Scene
 from bevviz.ros.encode import typestore
 from bevviz.ros.graph import PublishedTopic, matched_qos, mismatches, published_topics
 from bevviz.ros.messages import MessageError, read_header
+from bevviz.ros.node import Node
 from bevviz.ros.roles import Roles, Topic, find_roles
-from bevviz.ros.session import Session
 from bevviz.ros.typesupport import message_type
 from bevviz.sync.feed import Handler, make_handlers
 from bevviz.sync.synchronizer import Synchronizer
@@ -118,10 +118,10 @@ class LiveSource:
         self._frames = 0
         self._ended = False
 
-        self._session = Session(arguments, on_end=self.stop, name=name)
+        self._node = Node(arguments, on_end=self.stop, name=name)
         self._add_timer(LOOK, self._look)
         self._add_timer(TICK, self._tick)
-        self._session.start()
+        self._node.start()
 
     def __enter__(self) -> LiveSource:
         return self
@@ -134,7 +134,7 @@ class LiveSource:
     def close(self) -> None:
         """Leave the graph."""
         self.stop()
-        self._session.close()
+        self._node.close()
 
     def stop(self) -> None:
         """End the iteration, from any thread."""
@@ -146,15 +146,15 @@ class LiveSource:
     @property
     def node(self) -> Any:
         """The rclpy node, for what publishes back and takes orders; it has a thread of its own."""
-        return self._session.node
+        return self._node.node
 
     @property
     def domain(self) -> int:
-        return self._session.domain
+        return self._node.domain
 
     @property
     def middleware(self) -> str:
-        return self._session.middleware
+        return self._node.middleware
 
     @property
     def tree(self) -> Mapping[str, str]:
@@ -178,10 +178,10 @@ class LiveSource:
         present = self.topics
         if not present:
             return (
-                f"nothing is published on ROS domain {self._session.domain}: is the robot running, with this "
+                f"nothing is published on ROS domain {self._node.domain}: is the robot running, with this "
                 f"ROS_DOMAIN_ID, and not limited to its own machine (ROS_AUTOMATIC_DISCOVERY_RANGE)?"
             )
-        stated = {self._session.resolve(topic) for topic in self.config.source.lidar_topics}
+        stated = {self._node.resolve(topic) for topic in self.config.source.lidar_topics}
         if absent := stated - present.keys():
             return f"nobody publishes {', '.join(sorted(absent))}, which source.lidar_topics states"
         if not self.roles.lidars:
@@ -234,8 +234,8 @@ class LiveSource:
 
     def _check(self) -> None:
         """Raise here what ended the receiving thread."""
-        if self._session.error is not None:
-            raise self._session.error
+        if self._node.error is not None:
+            raise self._node.error
 
     # --- the receiving thread ------------------------------------------------------------------
 
@@ -248,7 +248,7 @@ class LiveSource:
                 callback()
 
         # Not the node's clock, which stands still where a simulation is paused.
-        self._session.input.create_timer(period, run, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        self._node.input.create_timer(period, run, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
     def _receive(self, topic: str, kind: str, data: bytes, info: dict[str, Any]) -> None:
         message = LiveMessage(topic, kind, info["received_timestamp"] or time.time_ns(), data)
@@ -291,7 +291,7 @@ class LiveSource:
     # --- the graph -----------------------------------------------------------------------------
 
     def _look(self) -> None:
-        self.topics = published_topics(self._session)
+        self.topics = published_topics(self._node)
         known = {name: topic for name, topic in self._known.items() if self.received[name]}
         self._known = known | {name: t for name, t in self.topics.items() if t.type in KINDS}
         self._assign()
@@ -327,7 +327,7 @@ class LiveSource:
     def _assign(self) -> None:
         """Give the topics their roles, and listen to those that play one."""
         topics = [Topic(t.name, t.type, None, self.frame_ids.get(t.name, "")) for t in self._known.values()]
-        stated = _resolved(self.config.source, self._session.resolve)
+        stated = _resolved(self.config.source, self._node.resolve)
         try:
             roles = find_roles(*_without_absent(topics, stated))
         except UserError as error:
@@ -341,7 +341,7 @@ class LiveSource:
             self._handlers = make_handlers(self._sync, roles, LiveMessage.decode)
         self.roles = roles
         for name in self._subscriptions.keys() - self._handlers.keys():
-            self._session.input.destroy_subscription(self._subscriptions.pop(name).handle)
+            self._node.input.destroy_subscription(self._subscriptions.pop(name).handle)
         for name in self._handlers:
             self._listen(self._known[name])
 
@@ -359,7 +359,7 @@ class LiveSource:
         if former is not None:
             if (former.type, former.qos) == (topic.type, qos):
                 return
-            self._session.input.destroy_subscription(former.handle)
+            self._node.input.destroy_subscription(former.handle)
 
         def receive(data: bytes, info: dict[str, Any]) -> None:
             with self._knowledge:
@@ -374,7 +374,7 @@ class LiveSource:
             incompatible_qos=lambda event: None,  # told by name in ``_look``
             use_default_callbacks=False,
         )
-        handle = self._session.input.create_subscription(
+        handle = self._node.input.create_subscription(
             kind, topic.name, receive, qos, event_callbacks=events, raw=True
         )
         self._subscriptions[topic.name] = _Subscription(handle, topic.type, qos)

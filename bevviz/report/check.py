@@ -6,22 +6,24 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from threading import Event
 from typing import Any
 
 import numpy as np
 from rerun.chunk import RrdReader
-from tqdm import tqdm
 
 from bevviz.config import Config, load
 from bevviz.errors import UserError
+from bevviz.frame import FrameResult
 from bevviz.logging import entities
 from bevviz.logging.logger import versions
-from bevviz.pipeline import Pipeline
-from bevviz.prefetch import prefetch
+from bevviz.progress import Progress
 from bevviz.report.digest import ROUNDING, Difference, Stage, compare, detections_of, digest, unpack
 from bevviz.report.make import replay
 from bevviz.report.origin import About, changes, file_hash, hardware, model_of
 from bevviz.report.window import open_window
+from bevviz.run import Observer, run
+from bevviz.session import Session
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,22 +95,32 @@ def check(rrd: Path, *, model: Path | None = None, settings: Sequence[str] = ())
         detections = {
             key: value for stages in kept.frames.values() for key, value in detections_of(stages).items()
         }
-        with (
-            open_window([bag], config, about.low, about.high) as source,
-            Pipeline(config, replay(detections) if about.redacted else None) as pipeline,
-        ):
-            verdict.changed = _changed(kept, bag, stored, pipeline)
-            left = dict(kept.frames)
-            for frame in tqdm(
-                prefetch(source, 2), total=source.total, unit="frame", desc="check", disable=None
-            ):
-                if about.interrupted and not left:
-                    break
-                then = left.pop(frame.index, ())
-                _count(verdict, frame.index, compare(then, digest(pipeline.run(frame))))
+        session = Session(config, replay(detections) if about.redacted else None)
+        verdict.changed = _changed(kept, bag, stored, session)
+        comparer = _Comparer(kept, verdict)
+        with open_window([bag], config, about.low, about.high) as source:
+            if run(source, session, [comparer, Progress("check")], stop=comparer.complete).interrupted:
+                raise KeyboardInterrupt
+    left = comparer.left
     for number in sorted(left):
         _count(verdict, number, Difference("cloud", "this run makes no such frame", float("inf")))
     return verdict
+
+
+class _Comparer(Observer[FrameResult]):
+    """Compares each frame with that of the report."""
+
+    def __init__(self, kept: Kept, verdict: Verdict) -> None:
+        self.left = dict(kept.frames)
+        self.complete = Event()  # of a report that was interrupted: there is no more to compare
+        self._interrupted, self._verdict = kept.about.interrupted, verdict
+
+    def see(self, result: FrameResult) -> None:
+        number = result.frame.index
+        then = self.left.pop(number, ())
+        _count(self._verdict, number, compare(then, digest(result)))
+        if self._interrupted and not self.left:
+            self.complete.set()
 
 
 def read(rrd: Path) -> Kept:
@@ -165,8 +177,8 @@ def _config(
     return stored, load(file, [*here, *settings])
 
 
-def _changed(kept: Kept, bag: Path, stored: Config, pipeline: Pipeline) -> list[str]:
-    about, config = kept.about, pipeline.config
+def _changed(kept: Kept, bag: Path, stored: Config, session: Session) -> list[str]:
+    about, config = kept.about, session.config
     found = []
     if file_hash(bag) != about.bag_sha256:
         found.append(f"{bag.name} is not the file that the report was made with (SHA-256)")
@@ -183,7 +195,7 @@ def _changed(kept: Kept, bag: Path, stored: Config, pipeline: Pipeline) -> list[
         name, number = line.rsplit(" ", 1)
         if here.get(name) != number:
             found.append(f"{name} was {number}, is {here.get(name, 'absent')}")
-    machine = dict(line.split(": ", 1) for line in hardware(pipeline).lines())
+    machine = dict(line.split(": ", 1) for line in hardware(session.stages.provider).lines())
     for line in about.hardware:
         name, value = line.split(": ", 1)
         if machine.get(name) != value:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Executor
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -16,12 +17,12 @@ from bevviz.bags.recording import RawMessage
 from bevviz.bags.source import MARGIN, BagSource
 from bevviz.config import Config
 from bevviz.errors import UserError
-from bevviz.frame import Camera, Detections
+from bevviz.frame import Camera, Detections, Frame, FrameResult
 from bevviz.logging import entities
-from bevviz.logging.logger import Logger, versions
+from bevviz.logging.logger import versions
+from bevviz.logging.recorder import Recorder
 from bevviz.logging.sinks import open_recording
-from bevviz.pipeline import Pipeline
-from bevviz.prefetch import prefetch
+from bevviz.progress import Progress
 from bevviz.report.digest import digest, pack
 from bevviz.report.facts import Facts, commands, file_lines, window_text
 from bevviz.report.origin import (
@@ -38,6 +39,8 @@ from bevviz.report.page import page
 from bevviz.report.redact import Redactor
 from bevviz.report.story import Story
 from bevviz.report.window import Cut, Window, choose_topics, cut, find_window, open_window
+from bevviz.run import Observer, run
+from bevviz.session import Session
 from bevviz.stages.detector import Detector
 
 Found = Mapping[tuple[str, int], Detections]  # by camera and stamp of the image
@@ -97,7 +100,7 @@ def make(order: Order) -> Made:
             redactor = Redactor(order.config.detector, whole.recording, whole.roles.lidars)
             found = _detect(order, window)
         detect = None if found is None else replay(found)
-        pipeline = stack.enter_context(Pipeline(order.config, detect))
+        session = Session(order.config, detect)
         part = _cut(whole, window, topics, bag, redactor)
         made.files.append(bag)
         made.warnings += [*whole.recording.warnings, *part.left_out, *(redactor.notes if redactor else ())]
@@ -109,23 +112,13 @@ def make(order: Order) -> Made:
         sinks = open_recording(whole.scene, public, save=rrd, blueprint="bug_report")
         recording = stack.enter_context(sinks).recording
         made.files.insert(0, rrd)
-        logger = Logger(recording, public, whole.scene)
-        logger.log_static()
         story = Story(window.at, again.total, len(whole.scene.cameras))
-        try:
-            for frame in tqdm(prefetch(again, 2), total=again.total, unit="frame", desc="run", disable=None):
-                result = pipeline.run(frame)
-                noted = order.note and frame.received == window.at
-                logger.log(result, notes=[("INFO", f"note: {order.note}")] if noted else ())
-                lines, block = pack(digest(result))
-                recording.log(entities.DIGEST, rr.AnyValues(stages=lines, arrays=block))
-                story.add(result)
-        except KeyboardInterrupt:
-            made.interrupted = True
+        recorder = _ReportRecorder(recording, public, story, window.at, order.note)
+        made.interrupted = run(again, session, [recorder, Progress("run")]).interrupted
         made.frames = len(story.moments)
         made.warnings += [w for w in again.warnings if w not in made.warnings]
         made.warnings = [_without_folders(w, [*order.paths, bag]) for w in made.warnings]
-        machine = hardware(pipeline)
+        machine = hardware(session.stages.provider)
         facts = _facts(order, public, window, part, made, machine, whole.scene.name)
         recording.send_property(
             "report", rr.AnyValues(about=_about(order, window, made, machine, bag).dump())
@@ -138,6 +131,23 @@ def make(order: Order) -> Made:
         raise UserError(f"{html}: cannot write the page: {error.strerror}") from None
     made.files.insert(1, html)
     return made
+
+
+class _ReportRecorder(Recorder):
+    """Logs each frame with its fingerprints and the note, and tells the story of the page."""
+
+    def __init__(
+        self, recording: rr.RecordingStream, config: Config, story: Story, at: int, note: str
+    ) -> None:
+        super().__init__(recording, config)
+        self._story, self._at, self._note = story, at, note
+
+    def see(self, result: FrameResult) -> None:
+        noted = self._note and result.frame.received == self._at
+        self.logger.log(result, notes=[("INFO", f"note: {self._note}")] if noted else ())
+        lines, block = pack(digest(result))
+        self.recording.log(entities.DIGEST, rr.AnyValues(stages=lines, arrays=block))
+        self._story.add(result)
 
 
 def replay(found: Found) -> Callable[[Camera], Detections | None]:
@@ -166,16 +176,33 @@ def _check_targets(order: Order, targets: Sequence[Path], model: Path | None) ->
             raise UserError(f"{target} exists already; --force overwrites it")
 
 
-def _detect(order: Order, window: Window) -> Found:
+class _Detections(Observer[Found]):
     """What the network finds in the images as they are, which nobody else is going to see."""
-    detector = Detector(order.config.detector)
-    found: dict[tuple[str, int], Detections] = {}
+
+    def __init__(self, config: Config) -> None:
+        self.found: dict[tuple[str, int], Detections] = {}
+        self._detector = Detector(config.detector)
+
+    def perceive(self, frame: Frame, network: Executor | None = None) -> Found:
+        return {
+            (camera.name, camera.image.stamp): self._detector(camera.image.bgr)
+            for camera in frame.cameras
+            if camera.image is not None and (camera.name, camera.image.stamp) not in self.found
+        }
+
+    def finish(self, found: Found) -> Found:
+        return found
+
+    def see(self, found: Found) -> None:
+        self.found |= found
+
+
+def _detect(order: Order, window: Window) -> Found:
+    detections = _Detections(order.config)
     with open_window(order.paths, order.config, window.low, window.high) as source:
-        for frame in tqdm(prefetch(source, 2), total=source.total, unit="frame", desc="detect", disable=None):
-            for camera in frame.cameras:
-                if camera.image is not None and (camera.name, camera.image.stamp) not in found:
-                    found[camera.name, camera.image.stamp] = detector(camera.image.bgr)
-    return found
+        if run(source, detections, [detections, Progress("detect")]).interrupted:
+            raise KeyboardInterrupt
+    return detections.found
 
 
 def _cut(

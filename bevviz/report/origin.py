@@ -12,7 +12,6 @@ from hashlib import sha256
 from pathlib import Path
 
 from bevviz.config import Config, load
-from bevviz.pipeline import Pipeline
 from bevviz.stages.detector import DEMO_MODEL
 
 
@@ -63,9 +62,8 @@ class About:
         return About(model=None if model is None else Model(**model), **values)
 
 
-def hardware(pipeline: Pipeline) -> Hardware:
-    """This machine, as the pipeline uses it."""
-    network = "" if pipeline.detector is None else pipeline.detector.provider
+def hardware(network: str) -> Hardware:
+    """This machine, and what the network runs on."""
     return Hardware(_processor(), os.cpu_count() or 0, _memory(), _system(), network)
 
 

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from bevviz.ros.session import Session
+from bevviz.ros.node import Node
 
 UNKNOWN = "_NODE_NAME_UNKNOWN_"  # rmw's name of a node whose publishers were met before itself
 LATCHED_DEPTH = 100  # one message of each node that states static transforms
@@ -21,7 +21,7 @@ class PublishedTopic:
     publishers: tuple[Any, ...]  # rclpy's TopicEndpointInfo of other nodes
 
 
-def published_topics(session: Session) -> dict[str, PublishedTopic]:
+def published_topics(session: Node) -> dict[str, PublishedTopic]:
     """Every topic that somebody else publishes; in a namespace, its own topics and those it lacks."""
     found = {}
     for name, _ in session.input.get_topic_names_and_types():

@@ -26,7 +26,17 @@ def cluster(points: F32, config: ClusteringConfig) -> Clusters:
         their state. The oriented boxes have size x >= size y and yaw in (-pi/2, pi/2]. No side of a box is
         shorter than ``MIN_SIZE``.
     """
-    labels = dbscan(points, config.eps, config.min_points)
+    return describe(points, dbscan(points, config.eps, config.min_points), config)
+
+
+def describe(points: F32, labels: I32, config: ClusteringConfig) -> Clusters:
+    """Counts, size verdicts and boxes of clusters, whoever found them.
+
+    Args:
+        points: (P, 3) float32 finite points.
+        labels: (P,) int32, -1 noise, each number from 0 to the largest on some point.
+        config: the size limits.
+    """
     count, centroid, low, high, oriented = _boxes(points, labels)
     state = np.full(len(count), ClusterState.KEPT, np.int32)
     state[count < config.min_cluster_points] = ClusterState.TOO_SMALL

@@ -23,7 +23,7 @@ MEMORY = 5.0  # metres over which the slope of the ground is remembered
 def segment_ground(points: F32, config: GroundConfig) -> Ground:
     """Tell the ground from the obstacles.
 
-    ``ransac`` takes the plane with the most points within ``distance_threshold``, whichever it is, even a
+    ``plane`` takes the one with the most points within ``distance_threshold``, whichever it is, even a
     wall, as Open3D's ``segment_plane`` does; the heights are above that plane.
 
     ``polar`` follows the ground outward from the sensor over sectors and rings, as Himmelsbach et al. 2010,
@@ -41,13 +41,13 @@ def segment_ground(points: F32, config: GroundConfig) -> Ground:
         Ground. Without a plane to start from (fewer than three points, all on a line, none where
         ``sensor_height`` would have them) nothing is ground and all heights are NaN.
     """
-    return _ransac(points, config) if config.method == "ransac" else _polar(points, config)
+    return _plane(points, config) if config.method == "plane" else _polar(points, config)
 
 
 # --- one plane ---------------------------------------------------------------------------------
 
 
-def _ransac(points: F32, config: GroundConfig) -> Ground:
+def _plane(points: F32, config: GroundConfig) -> Ground:
     inliers = _largest_plane(points, config.distance_threshold, config)
     if not inliers.any():
         return _unknown(len(points))

@@ -10,6 +10,7 @@ import numpy as np
 
 from bevviz.config import Config
 from bevviz.frame import U8, ClusterState, Decision, DetectionState, FrameResult
+from bevviz.perceive import StageLoader
 from bevviz.why.evidence import Candidate, Evidence, Traces, fusion_of, gather
 from bevviz.why.subject import Selection, Subject, competing, projected, select
 from bevviz.why.verdict import Reason, Verdict, judge, label, name_of
@@ -69,32 +70,32 @@ class Answer:
 
 def why(
     result: FrameResult,
-    config: Config,
     selection: Selection,
     classes: Sequence[str] = (),
     hints: int = 5,
     progress: Callable[[Sequence[Answer]], Iterable[Answer]] = iter,
+    loader: StageLoader | None = None,
 ) -> list[Answer]:
     """Explain what is selected, worst first: what was not reported before the rest, near before far.
 
     Args:
-        result: a frame that the pipeline ran on.
-        config: what it was run with.
+        result: what was made of a frame, described.
         selection: what is asked about; nothing: all that did not become an object of its own.
         classes: names that the detector knows.
         hints: for how many of them other configurations are tried, which runs the stages again.
         progress: wraps those answers while they are being tried.
+        loader: that has the networks already.
 
     Raises:
         UserError: see ``select``.
     """
-    traces = Traces(result, config)
+    traces = Traces(result)
     everything = competing(result, select(result, Selection(camera=selection.camera), classes))
     answers = [_answer(s, traces, everything) for s in select(result, selection, classes)]
     if not (selection.label or selection.box or selection.point):
         answers = [a for a in answers if _notable(a)]
     answers.sort(key=_rank)
-    what_if = WhatIf(result, config)
+    what_if = WhatIf(result, loader)
     tried = [_with_hints(a, traces, everything, what_if) for a in progress(answers[:hints])]
     return [*tried, *answers[hints:]]
 
@@ -117,8 +118,8 @@ def _rank(answer: Answer) -> tuple[bool, bool, bool, float]:
 
 def _answer(subject: Subject, traces: Traces, others: Sequence[Subject]) -> Answer:
     evidence = gather(subject, traces, others)
-    verdict = judge(subject, evidence, traces.result, traces.config)
-    steps = tuple(_steps(subject, evidence, traces.result, traces.config))
+    verdict = judge(subject, evidence, traces.result, traces.result.config)
+    steps = tuple(_steps(subject, evidence, traces.result, traces.result.config))
     return Answer(subject, verdict, steps, (), evidence.fate, evidence.distance)
 
 

@@ -116,7 +116,6 @@ class Traces:
 
     Args:
         result: the frame's results.
-        config: what they were made with.
 
     Attributes:
         obstacle: (M,) row of each voxel among the obstacles, -1: ground.
@@ -124,8 +123,8 @@ class Traces:
         fate: (N,) of each raw point, whosever it is.
     """
 
-    def __init__(self, result: FrameResult, config: Config) -> None:
-        self.result, self.config = result, config
+    def __init__(self, result: FrameResult) -> None:
+        self.result = result
         points = result.frame.points
         x, y, z = points.T
         self.azimuth, self.away = np.arctan2(y, x), np.hypot(x, y)
@@ -159,7 +158,7 @@ def gather(subject: Subject, traces: Traces, others: Sequence[Subject]) -> Evide
         traces: the frame's results.
         others: all subjects of the frame, of which some may share its cluster.
     """
-    result, config = traces.result, traces.config
+    result, config = traces.result, traces.result.config
     frame, voxels, clusters = result.frame, result.voxels, result.clusters
     there = subject.place(frame, frame.points)
     in_front, aimed = _before(subject, traces)

@@ -12,8 +12,7 @@ import numpy as np
 from bevviz.config import Config
 from bevviz.errors import UserError
 from bevviz.frame import Camera, Detections, DetectionState, FrameResult
-from bevviz.pipeline import Pipeline, StageLog
-from bevviz.stages.detector import Detector
+from bevviz.perceive import Detect, Memo, StageLoader, perceive
 from bevviz.why.evidence import Candidate, Evidence, Traces, gather
 from bevviz.why.subject import Subject
 from bevviz.why.verdict import Reason, Verdict, judge, name_of
@@ -32,49 +31,24 @@ class Hint:
     text: str
 
 
-class Again(Pipeline):
-    """The pipeline once more on a frame whose detections are known: the network is not run for thresholds.
+class WhatIf:
+    """Runs a frame with other configurations, each once.
 
     Args:
-        config: another configuration.
-        result: what was made of the frame with ``before``.
-        before: its configuration.
+        result: what was made of the frame.
+        loader: that has the networks already.
     """
 
-    def __init__(self, config: Config, result: FrameResult, before: Config) -> None:
-        blind = config.model_copy(update={"detector": config.detector.model_copy(update={"model": ""})})
-        super().__init__(blind)
-        self._threshold = config.detector.conf_threshold
-        self._found = {c.camera.name: c.detections for c in result.cameras}
-        # What NMS leaves cannot be told from the candidates that were kept to be explained.
-        suppression = config.detector.iou_threshold != before.detector.iou_threshold
-        self.detector = Detector(config.detector) if suppression and config.detector.model else None
-
-    def _detect(self, camera: Camera, log: StageLog) -> Detections | None:
-        if self.detector is not None:
-            return super()._detect(camera, log)
-        found = self._found[camera.name]
-        if found is None:
-            return None
-        state = np.where(
-            found.score >= self._threshold, DetectionState.KEPT, DetectionState.BELOW_THRESHOLD
-        ).astype(np.int32)
-        state[found.state == DetectionState.SUPPRESSED] = DetectionState.SUPPRESSED
-        return replace(found, state=state)
-
-
-class WhatIf:
-    """Runs a frame with other configurations, each once."""
-
-    def __init__(self, result: FrameResult, config: Config) -> None:
-        self._result, self._config = result, config
+    def __init__(self, result: FrameResult, loader: StageLoader | None = None) -> None:
+        self._result = result
+        self._loader, self._memo = loader or StageLoader(), Memo()
         self._runs: dict[tuple[tuple[str, Any], ...], Traces | None] = {}
 
     def hints(
         self, subject: Subject, evidence: Evidence, verdict: Verdict, others: Sequence[Subject]
     ) -> tuple[Hint, ...]:
         """The first change that helps of those that the reason suggests, mildest first."""
-        for count, change in enumerate(_changes(evidence, verdict.reason, self._config)):
+        for count, change in enumerate(_changes(evidence, verdict.reason, self._result.config)):
             if count == TRIES:
                 break
             run = self._run(change)
@@ -88,13 +62,34 @@ class WhatIf:
     def _run(self, change: Change) -> Traces | None:
         key = tuple(change.items())
         if key not in self._runs:
-            config = changed(self._config, change)
+            config = changed(self._result.config, change)
             try:
-                with Again(config, self._result, self._config) as pipeline:
-                    self._runs[key] = Traces(pipeline.run(self._result.frame), config)
+                stages = self._loader.load(config, self._known_detections(config))
             except UserError:  # the model file has gone meanwhile: nothing can be proved
                 self._runs[key] = None
+            else:
+                self._runs[key] = Traces(perceive(self._result.frame, config, stages, self._memo))
         return self._runs[key]
+
+    def _known_detections(self, config: Config) -> Detect | None:
+        """Detections for other thresholds: the network need not be run. None: it has to be.
+
+        What NMS leaves cannot be told from the candidates that were kept to be explained.
+        """
+        if config.detector.iou_threshold != self._result.config.detector.iou_threshold:
+            return None
+        known = {c.camera.name: c.detections for c in self._result.cameras}
+
+        def detect(camera: Camera) -> Detections | None:
+            found = known[camera.name]
+            if found is None:
+                return None
+            kept = found.score >= config.detector.conf_threshold
+            state = np.where(kept, DetectionState.KEPT, DetectionState.BELOW_THRESHOLD).astype(np.int32)
+            state[found.state == DetectionState.SUPPRESSED] = DetectionState.SUPPRESSED
+            return replace(found, state=state)
+
+        return detect
 
 
 def changed(config: Config, change: Change) -> Config:
@@ -109,7 +104,7 @@ def changed(config: Config, change: Change) -> Config:
 def _outcome(subject: Subject, verdict: Verdict, traces: Traces, others: Sequence[Subject]) -> str:
     """What has become of the subject, empty where it is no better off."""
     evidence, result = gather(subject, traces, others), traces.result
-    after = judge(subject, evidence, result, traces.config)
+    after = judge(subject, evidence, result, result.config)
     if verdict.reason is Reason.BORROWED:
         named = evidence.parts and name_of(result, evidence.parts[0].cluster)
         return "" if named else "it is not named any more"
@@ -181,7 +176,7 @@ def _lower_ground(config: Config) -> Iterator[Change]:
     for threshold in (0.3, 0.2, 0.1):
         if threshold < g.distance_threshold:
             yield {"ground.distance_threshold": threshold}
-    if g.method == "ransac":
+    if g.method == "plane":
         yield {"ground.method": "polar", "ground.distance_threshold": 0.2}
         yield {
             "ground.method": "polar",

@@ -7,7 +7,7 @@ import pytest
 
 from bevviz.config import load
 from bevviz.frame import Frame
-from bevviz.pipeline import Pipeline
+from bevviz.session import Session
 from bevviz.synthetic import SyntheticSource
 
 
@@ -18,8 +18,8 @@ def frame() -> Frame:
 
 @pytest.mark.parametrize("preset", ["default", "reference"])
 def test_every_stage_runs_on_a_whole_frame(frame: Frame, preset: str) -> None:
-    with Pipeline(load(settings=["detector.model=demo"], preset=preset)) as pipeline:  # type: ignore[arg-type]
-        result = pipeline.run(frame)
+    session = Session(load(settings=["detector.model=demo"], preset=preset))  # type: ignore[arg-type]
+    result = session.run(frame)
     assert result.failures == ()
     assert result.voxels is not None
     assert result.ground is not None
@@ -42,8 +42,8 @@ def test_every_stage_runs_on_a_whole_frame(frame: Frame, preset: str) -> None:
 def test_the_pipeline_is_deterministic(frame: Frame) -> None:
     results = []
     for _ in range(2):
-        with Pipeline(load(settings=["detector.model=demo"])) as pipeline:
-            results.append(pipeline.run(frame))
+        session = Session(load(settings=["detector.model=demo"]))
+        results.append(session.run(frame))
     a, b = results
     assert a.explanations == b.explanations
     assert a.clusters is not None
@@ -53,8 +53,8 @@ def test_the_pipeline_is_deterministic(frame: Frame) -> None:
 
 def test_without_points_the_image_is_still_searched(frame: Frame) -> None:
     empty = replace(frame, points=np.zeros((0, 3), np.float32), fields={})
-    with Pipeline(load(settings=["detector.model=demo"])) as pipeline:
-        result = pipeline.run(empty)
+    session = Session(load(settings=["detector.model=demo"]))
+    result = session.run(empty)
     assert [f.stage for f in result.failures] == ["cloud"]
     assert result.cameras[0].detections is not None
     assert len(result.cameras[0].detections) > 0
@@ -63,8 +63,8 @@ def test_without_points_the_image_is_still_searched(frame: Frame) -> None:
 
 def test_without_a_place_for_the_camera_the_rest_is_made(frame: Frame) -> None:
     lost = replace(frame.cameras[0], camera_from_points=None, problems=("no transform",))
-    with Pipeline(load(settings=["detector.model=demo"])) as pipeline:
-        result = pipeline.run(replace(frame, cameras=(lost,)))
+    session = Session(load(settings=["detector.model=demo"]))
+    result = session.run(replace(frame, cameras=(lost,)))
     assert result.clusters is not None
     assert result.cameras[0].detections is not None
     assert result.cameras[0].fusion is None
@@ -76,9 +76,9 @@ def test_a_failing_stage_is_a_reason_and_not_the_end(frame: Frame, monkeypatch: 
     def broken(*args: object) -> None:
         raise ZeroDivisionError("planted")
 
-    monkeypatch.setattr("bevviz.pipeline.cluster", broken)
-    with Pipeline(load(settings=["detector.model=demo"])) as pipeline:
-        result = pipeline.run(frame)
+    monkeypatch.setattr("bevviz.perceive.cluster", broken)
+    session = Session(load(settings=["detector.model=demo"]))
+    result = session.run(frame)
     assert [(f.stage, f.reason) for f in result.failures] == [("clustering", "ZeroDivisionError: planted")]
     assert result.ground is not None
     assert result.bev is not None

@@ -11,7 +11,7 @@ from bevviz.errors import UserError
 from bevviz.ros.environment import load_rclpy
 
 
-class Session:
+class Node:
     """One context with two nodes, each spun by a thread of its own from ``start`` to ``close``.
 
     ``node`` is the one that users meet: it has the name, the parameters and the services, and publishes.
@@ -117,7 +117,7 @@ class Session:
         self.node.destroy_node()
         self._context.try_shutdown()
 
-    def __enter__(self) -> Session:
+    def __enter__(self) -> Node:
         return self
 
     def __exit__(

@@ -1,0 +1,100 @@
+"""Where a command's results go: what its options ask for, and what that means where they ask for nothing."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from bevviz.cli.interrupts import wait_for_interrupt
+
+if TYPE_CHECKING:
+    from rerun import RecordingStream
+    from rerun.blueprint import Blueprint
+
+    from bevviz.config import Config
+    from bevviz.frame import Scene
+    from bevviz.logging.sinks import Sinks
+
+
+@dataclass(frozen=True, slots=True)
+class Outputs:
+    """What the options of ``add_output`` ask for; several at once."""
+
+    save: Path | None = None
+    serve: int | None = None  # port
+    connect: str | None = None  # URL
+    viewer: bool = False
+    blueprint: str | Blueprint = "debug"
+
+    @staticmethod
+    def of(options: argparse.Namespace) -> Outputs:
+        blueprint = getattr(options, "blueprint", "debug")
+        return Outputs(options.save, options.serve, options.connect, options.viewer, blueprint)
+
+    def __bool__(self) -> bool:
+        """Whether anything is asked for."""
+        return bool(
+            self.save is not None or self.serve is not None or self.connect is not None or self.viewer
+        )
+
+    def or_viewer(self) -> Outputs:
+        """Where nothing is asked for, the viewer on this machine, if it can be shown."""
+        return self if self or not has_display() else replace(self, viewer=True)
+
+    def or_file(self, default: Path) -> Outputs:
+        """Where nothing is asked for and nothing can be shown, a file."""
+        chosen = self.or_viewer()
+        if chosen:
+            return chosen
+        say(f"no display: saving {default} (--serve shows it in a browser)")
+        return replace(chosen, save=default)
+
+    @contextmanager
+    def opened(self, scene: Scene, config: Config) -> Iterator[Sinks]:
+        """A recording that goes there; addresses are said."""
+        from bevviz.logging.sinks import open_recording
+
+        with open_recording(
+            scene,
+            config,
+            save=self.save,
+            serve=self.serve,
+            connect=self.connect,
+            spawn=self.viewer,
+            blueprint=self.blueprint,
+        ) as sinks:
+            for url in sinks.urls:
+                say(f"viewer at {url}")
+            yield sinks
+
+    def keep_serving(self, recording: RecordingStream, what: str = "") -> None:
+        """Until the user ends it, where a server was asked for."""
+        if self.serve is not None:
+            say(f"{what}serving until Ctrl-C")
+            recording.flush()
+            wait_for_interrupt()
+
+
+def say(line: str) -> None:
+    print(f"bevviz: {line}", file=sys.stderr)
+
+
+def warn(warnings: Iterable[str]) -> None:
+    for warning in warnings:
+        say(f"warning: {warning}")
+
+
+def hint(scene: Scene, config: Config) -> None:
+    """Say what would give the user more."""
+    if scene.cameras and not config.detector.model:
+        say("no detector: give --model FILE.onnx to find objects in the images")
+
+
+def has_display() -> bool:
+    return sys.platform != "linux" or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
