@@ -22,6 +22,7 @@ from pydantic_core import PydanticCustomError
 from bevviz import plugins
 from bevviz.errors import UserError
 from bevviz.frame import AnomalyKind
+from bevviz.plugins import TOPIC
 
 Preset = Literal["default", "reference"]
 
@@ -425,6 +426,12 @@ def _plugin(section: str, method: str) -> plugins.Plugin | None:
         return plugins.find(name)
     except UserError as error:
         raise UserError(f"{section}.{STAGES[section]} {method}: {error}") from error.__cause__
+
+
+def stage_topics(config: Config) -> dict[str, str]:
+    """The robot's topics that stages are taken from, by the dotted key that names each."""
+    named = {f"{s}.{key}": str(getattr(getattr(config, s), key)) for s, key in STAGES.items()}
+    return {key: name.removeprefix(TOPIC) for key, name in named.items() if name.startswith(TOPIC)}
 
 
 def _params_of(config: Config, section: str) -> Mapping[str, FieldInfo]:

@@ -13,7 +13,7 @@ import numpy as np
 from bevviz.bags.mcap import megabytes
 from bevviz.bags.recording import Recording
 from bevviz.bags.source import SECOND, BagSource, iso
-from bevviz.config import Config
+from bevviz.config import Config, stage_topics
 from bevviz.errors import UserError
 from bevviz.frame import Camera, Frame
 from bevviz.ros.roles import Roles, Topic, find_roles
@@ -75,7 +75,7 @@ def describe(paths: Sequence[Path], config: Config) -> BagInfo:
         source = BagSource(paths, config)
     except UserError as error:
         with Recording(paths) as recording:
-            roles = find_roles(recording.topics, config.source)
+            roles = find_roles(recording.topics, config.source, stage_topics(config))
             return _describe(recording, roles, config, missing=[str(error)])
     with source:
         roles = source.roles

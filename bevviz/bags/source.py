@@ -13,7 +13,7 @@ from types import TracebackType
 import numpy as np
 
 from bevviz.bags.recording import RawMessage, Recording
-from bevviz.config import Config
+from bevviz.config import Config, stage_topics
 from bevviz.errors import UserError
 from bevviz.frame import F64, Frame, Scene
 from bevviz.ros.messages import MessageError, decode_transforms
@@ -56,7 +56,7 @@ class BagSource:
         self.config = config
         self.recording = Recording(paths)
         try:
-            self.roles = find_roles(self.recording.topics, config.source)
+            self.roles = find_roles(self.recording.topics, config.source, stage_topics(config))
             self._driver = self._find_driver()
             self._low = self._time(start, self.recording.start)
             self._high = self._time(end, self.recording.end + 1)

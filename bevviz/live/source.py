@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from types import TracebackType
 from typing import Any
 
-from bevviz.config import Config, SourceConfig
+from bevviz.config import Config, SourceConfig, stage_topics
 from bevviz.errors import UserError
 from bevviz.frame import Frame, Intrinsics, Scene
 from bevviz.ros.encode import typestore
@@ -328,8 +328,12 @@ class LiveSource:
         """Give the topics their roles, and listen to those that play one."""
         topics = [Topic(t.name, t.type, None, self.frame_ids.get(t.name, "")) for t in self._known.values()]
         stated = _resolved(self.config.source, self._node.resolve)
+        there = {topic.name for topic in topics}
+        # As with sensors: one that is not there yet is waited for.
+        stages = {key: self._node.resolve(name) for key, name in stage_topics(self.config).items()}
+        stages = {key: name for key, name in stages.items() if name in there}
         try:
-            roles = find_roles(*_without_absent(topics, stated))
+            roles = find_roles(*_without_absent(topics, stated), stages)
         except UserError as error:
             self._note("roles", str(error), "")
             return

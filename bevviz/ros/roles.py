@@ -7,6 +7,7 @@ import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from posixpath import commonprefix
+from types import MappingProxyType
 
 from bevviz.config import SourceConfig
 from bevviz.errors import UserError
@@ -49,23 +50,42 @@ class Roles:
     odometry: str = ""
     robot_detections_2d: tuple[str, ...] = ()
     robot_detections_3d: tuple[str, ...] = ()
+    robot_clouds: tuple[str, ...] = ()  # of obstacles, where the ground stage is the robot's
+    stages: tuple[str, ...] = ()  # the robot's results that our stages are taken from
     truth: str = ""
     notes: Mapping[str, str] = field(default_factory=dict)
 
 
-def find_roles(topics: Sequence[Topic], config: SourceConfig) -> Roles:
+STAGE_KINDS = {  # what the robot publishes as the result of a stage
+    "ground.method": "PointCloud2",
+    "clustering.method": "Detection3DArray",
+    "detector.model": "Detection2DArray",
+    "objects.method": "Detection3DArray",
+}
+
+
+def find_roles(
+    topics: Sequence[Topic], config: SourceConfig, stages: Mapping[str, str] = MappingProxyType({})
+) -> Roles:
     """Give each topic its role.
 
     Topics that are stated in the configuration are taken as they are. Otherwise one frame is one sensor:
     of several clouds, or several images, with the same frame_id the one nearest to the sensor is taken
     (images: the rectified one, as the others of a pipeline are made from it).
 
+    Args:
+        topics: all that there are.
+        config: which topics are stated.
+        stages: the robot's topics that stages are taken from, by the dotted key that names each.
+
     Raises:
         UserError: a stated topic does not exist, or is of another type.
     """
     topics = sorted(topics, key=lambda t: t.name)  # the order of a bag's or a graph's topics is chance
     notes = {topic.name: f"not used: nothing here reads {topic.type}" for topic in topics}
-    lidars = _find_lidars(topics, config, notes)
+    staged = {key: _stated(name, topics, key, STAGE_KINDS[key]) for key, name in stages.items()}
+    obstacles = [topic for key, topic in staged.items() if key == "ground.method"]
+    lidars = _find_lidars([t for t in topics if t not in obstacles], config, notes)
     images = _find_images(topics, config, notes)
     names = _unique_names(
         [(entity_name(t.name, t.frame_id), t) for t in lidars] + [(entity_name(t.name), t) for t in images]
@@ -91,6 +111,8 @@ def find_roles(topics: Sequence[Topic], config: SourceConfig) -> Roles:
     detections = _of(topics, "Detection2DArray")
     _note(notes, truth, "ground truth, by its name")
     _note(notes, [*boxes, *detections], "the robot's own result")
+    for key, topic in staged.items():
+        notes[topic.name] = f"the robot's own result, taken for the stage {key.partition('.')[0]}"
     return Roles(
         lidars=_names(lidars),
         lidar_names=tuple(names[: len(lidars)]),
@@ -100,6 +122,8 @@ def find_roles(topics: Sequence[Topic], config: SourceConfig) -> Roles:
         odometry=odometry,
         robot_detections_2d=_names(detections),
         robot_detections_3d=_names(boxes),
+        robot_clouds=_names(obstacles),
+        stages=_names(staged.values()),
         truth=truth[0].name if truth else "",
         notes=notes,
     )

@@ -85,6 +85,8 @@ def make_handlers(sync: Synchronizer, roles: Roles, decode: Callable[[M], Any]) 
         handlers[topic] = partial(add_transforms, static=True)
     if roles.odometry:
         handlers[roles.odometry] = add_odometry
+    for topic in roles.robot_clouds:
+        handlers[topic] = lambda m: sync.add_robot_cloud(decode_cloud(decode(m), m.topic, m.received))
     for topic in roles.robot_detections_2d:
         handlers[topic] = lambda m: sync.add_detections(decode_detections_2d(decode(m), m.topic, m.received))
     for topic in roles.robot_detections_3d:

@@ -191,6 +191,7 @@ class Synchronizer:
         self._odometry_frames: set[str] = set()
         self._boxes: dict[str, _Track[LabelledBoxes3D]] = self._make_tracks(*roles.robot_detections_3d)
         self._detections: dict[str, _Track[LabelledBoxes2D]] = self._make_tracks(*roles.robot_detections_2d)
+        self._robot_clouds: dict[str, _Track[Cloud]] = self._make_tracks(*roles.robot_clouds)
         self._truth: dict[str, _Track[LabelledBoxes3D]] = self._make_tracks(*filter(None, [roles.truth]))
         for names, pose in config.source.extrinsics.items():
             self.tf.add(_extrinsic(names, pose), static=True, origin=Origin.CONFIG)
@@ -259,6 +260,11 @@ class Synchronizer:
         """The robot's own image boxes."""
         self._add_result(self._detections, detections)
 
+    def add_robot_cloud(self, cloud: Cloud) -> None:
+        """The robot's own points without the ground."""
+        stamp = self._arrived(cloud.topic, cloud.stamp, cloud.received)
+        self._robot_clouds[cloud.topic].add(stamp, replace(cloud, stamp=stamp))
+
     def add_truth(self, truth: LabelledBoxes3D) -> None:
         """Ground truth boxes."""
         self._add_result(self._truth, truth)
@@ -300,7 +306,15 @@ class Synchronizer:
 
     def _tracks(self) -> Iterator[tuple[str, _Track[Any]]]:
         """Topic and messages."""
-        for group in (self._partners, self._images, self._boxes, self._detections, self._truth):
+        groups: tuple[Mapping[str, _Track[Any]], ...] = (
+            self._partners,
+            self._images,
+            self._boxes,
+            self._detections,
+            self._robot_clouds,
+            self._truth,
+        )
+        for group in groups:
             yield from group.items()
 
     # --- what goes out -------------------------------------------------------------------------
@@ -344,6 +358,7 @@ class Synchronizer:
         results: list[_Track[Any]] = [
             *self._boxes.values(),
             *self._detections.values(),
+            *self._robot_clouds.values(),
             *self._truth.values(),
         ]
         if len(self._clouds) == 1 and any(self._may_be_of_next(track, stamp) for track in results):
@@ -408,6 +423,7 @@ class Synchronizer:
             cameras=cameras,
             robot_boxes=tuple(placed),
             robot_detections=self._robot_detections(cameras, cloud.stamp, first, last),
+            robot_clouds=self._taken_clouds(place, first, last, problems),
             truth=truth[0] if truth else None,
             tf_age=place.tf_age,
             problems=tuple(problems),
@@ -641,6 +657,21 @@ class Synchronizer:
         return tuple(
             d if d.camera else replace(d, camera=names.get(d.frame_id, "")) for d in found if d is not None
         )
+
+    def _taken_clouds(self, place: _Place, first: int, last: int, problems: list[str]) -> tuple[Cloud, ...]:
+        """The robot's clouds of this time, in the frame of the points."""
+        found = []
+        for track in self._robot_clouds.values():
+            cloud = track.take(place.stamp, first, last)
+            if cloud is None:
+                continue
+            try:
+                pose, _ = self._moved(place, cloud.stamp, cloud.frame_id)
+            except TransformError as error:
+                self._complain(problems, f"{error}: the points of {cloud.topic} are left out")
+                continue
+            found.append(replace(cloud, xyz=geometry.apply(pose.matrix, cloud.xyz)))
+        return tuple(found)
 
     def _complain(self, problems: list[str], text: str) -> None:
         """Tell this frame, and count in the report, where sentences that differ in a number are one."""
