@@ -348,7 +348,7 @@ def test_the_traceback_goes_to_logging(here: Path, frame: Frame, caplog: pytest.
 
 
 def test_a_change_from_another_thread_meets_the_next_frame(here: Path, frame: Frame) -> None:
-    """While a frame is in a stage, another configuration comes: the frame keeps the one that it began with."""
+    """While a frame is in a stage another configuration comes: the frame keeps that which it began with."""
     (here / "mine" / "slow.py").write_text(
         "import numpy as np, threading\n"
         "inside, go = threading.Event(), threading.Event()\n"
