@@ -1,3 +1,40 @@
-"""bevviz: see what a LiDAR-camera perception pipeline saw, made and decided, frame by frame, in Rerun."""
+"""See what a LiDAR-camera perception pipeline saw, made and decided, frame by frame, in Rerun.
+
+>>> import bevviz
+>>> drive = bevviz.open("drive.mcap", model="yolo11n.onnx")
+>>> drive.at(12.5).objects.to_pandas()
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from bevviz.config import Config
+    from bevviz.drive import Drive, simulate
+    from bevviz.drive import open_drive as open  # bevviz.open
+    from bevviz.errors import UserError
+    from bevviz.frame import Frame, FrameResult
 
 __version__ = "0.1.0"
+__all__ = ["Config", "Drive", "Frame", "FrameResult", "UserError", "open", "simulate"]
+
+_HOMES = {
+    "Config": ("bevviz.config", "Config"),
+    "Drive": ("bevviz.drive", "Drive"),
+    "Frame": ("bevviz.frame", "Frame"),
+    "FrameResult": ("bevviz.frame", "FrameResult"),
+    "UserError": ("bevviz.errors", "UserError"),
+    "open": ("bevviz.drive", "open_drive"),
+    "simulate": ("bevviz.drive", "simulate"),
+}
+
+
+def __getattr__(name: str) -> Any:
+    """Imported when it is asked for, so that ``bevviz --help`` is instant."""
+    if name not in _HOMES:
+        raise AttributeError(f"module 'bevviz' has no attribute '{name}'")
+    from importlib import import_module
+
+    module, attribute = _HOMES[name]
+    return getattr(import_module(module), attribute)

@@ -443,13 +443,22 @@ def load(
     file: str | Path | Sequence[Path] | None = None,
     settings: Iterable[str] = (),
     preset: Preset | None = None,
+    base: Config | None = None,
 ) -> Config:
     """The effective configuration: preset, then the files, then each ``key=value``, later ones winning.
+
+    Args:
+        file: YAML files.
+        settings: ``key=value`` each.
+        preset: which one; None: as the files say, else ``default``.
+        base: a whole configuration that all of this is to change.
 
     Raises:
         UserError: unreadable file, unknown key, wrong unit or value out of range, in one line.
     """
     given: list[tuple[str, Any, str]] = []  # key, value, and where it was stated
+    if base is not None:
+        given += [(key, value, "configuration") for key, value in values(base).items()]
     files = [Path(file)] if isinstance(file, str | Path) else file or ()
     for path in files:
         given += [(key, value, str(path)) for key, value in _flatten(_read_yaml(path)).items()]
@@ -461,7 +470,7 @@ def load(
         given.append((key.strip(), parsed, f"--set {text}"))
     given = [(TUTORIAL_NAMES.get(key, key), value, where) for key, value, where in given]
     chosen = preset or next((value for key, value, _ in reversed(given) if key == "preset"), "default")
-    base = _flatten(REFERENCE) if chosen == "reference" else {}
+    of_preset = _flatten(REFERENCE) if chosen == "reference" else {}
     stated: dict[str, Any] = {}
     origin: dict[str, str] = {}
     for key, value, where in given:
@@ -469,10 +478,10 @@ def load(
         if name == STAGES.get(section) and stated.get(key, value) != value:  # not the parameters of this one
             stated = {k: v for k, v in stated.items() if not k.startswith(f"{section}.params.")}
         stated[key], origin[key] = value, where
-    params = _params({**base, **stated}, origin)
+    params = _params({**of_preset, **stated}, origin)
     known = [*keys(), *params]
     tree: dict[str, Any] = {"preset": chosen}
-    for key, value in {**base, **stated}.items():
+    for key, value in {**of_preset, **stated}.items():
         full = key
         if key not in known:
             section, _, name = key.partition(".")
@@ -550,6 +559,15 @@ def dump(config: Config) -> str:
 def _note(key: str, about: Mapping[str, str]) -> str:
     text = (f"in {_unit(key)}; " if _unit(key) else "") + about.get(key, "")
     return f"  # {text}" if text else ""
+
+
+def revised(config: Config, settings: Iterable[str]) -> Config:
+    """The configuration with other values, ``key=value`` each.
+
+    Raises:
+        UserError: as ``load``.
+    """
+    return load(settings=settings, base=config)
 
 
 def flat_yaml(text: str, where: str) -> dict[str, Any]:

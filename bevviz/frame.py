@@ -19,7 +19,11 @@ from typing import TYPE_CHECKING, Any, Literal, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from bevviz.errors import UserError
+
 if TYPE_CHECKING:
+    from pandas import DataFrame
+
     from bevviz.config import Config
 
 Bool = NDArray[np.bool_]
@@ -28,6 +32,20 @@ F64 = NDArray[np.float64]
 I32 = NDArray[np.int32]
 I64 = NDArray[np.int64]
 U8 = NDArray[np.uint8]
+
+
+def data_frame(columns: Mapping[str, Any] | Sequence[Mapping[str, Any]]) -> DataFrame:
+    """A table, where pandas is installed.
+
+    Raises:
+        UserError: it is not.
+    """
+    try:
+        from pandas import DataFrame
+    except ImportError:
+        raise UserError("a table needs pandas: pip install 'bevviz[notebook]'") from None
+    return DataFrame(columns)
+
 
 # --- input -------------------------------------------------------------------------------------
 
@@ -101,6 +119,13 @@ class Boxes3D:
     @staticmethod
     def empty() -> Boxes3D:
         return Boxes3D(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.float32), np.zeros(0, np.float32))
+
+    @property
+    def columns(self) -> dict[str, F32]:
+        """For a table: centre, size and heading."""
+        x, y, z = self.center.T
+        length, width, height = self.size.T
+        return {"x": x, "y": y, "z": z, "length": length, "width": width, "height": height, "yaw": self.yaw}
 
 
 @dataclass(frozen=True, slots=True)
@@ -236,6 +261,11 @@ class Clusters:
     def __len__(self) -> int:
         return len(self.count)
 
+    def to_pandas(self) -> DataFrame:
+        """A row for each cluster, with its oriented box."""
+        states = [ClusterState(state).name.lower() for state in self.state]
+        return data_frame({"state": states, "points": self.count, **self.obb.columns})
+
 
 class DetectionState(IntEnum):
     KEPT = 0
@@ -260,6 +290,13 @@ class Detections:
 
     def __len__(self) -> int:
         return len(self.score)
+
+    def to_pandas(self) -> DataFrame:
+        """A row for each detection, however weak."""
+        x0, y0, x1, y1 = self.xyxy.T
+        states = [DetectionState(state).name.lower() for state in self.state]
+        box = {"x0": x0, "y0": y0, "x1": x1, "y1": y1}
+        return data_frame({"name": self.names, "score": self.score, "state": states, **box})
 
     @staticmethod
     def empty() -> Detections:
@@ -330,6 +367,11 @@ class Objects:
     def __len__(self) -> int:
         return len(self.names)
 
+    def to_pandas(self) -> DataFrame:
+        """A row for each object."""
+        origin = {"camera": self.camera, "detection": self.detection, "cluster": self.cluster}
+        return data_frame({"name": self.names, "score": self.score, **self.boxes.columns, **origin})
+
 
 @dataclass(frozen=True, slots=True)
 class Tracks:
@@ -361,6 +403,13 @@ class Tracks:
     def speed(self) -> F32:
         """(T,) m/s on the ground."""
         return np.hypot(self.velocity[:, 0], self.velocity[:, 1])
+
+    def to_pandas(self) -> DataFrame:
+        """A row for each track that lives."""
+        state = {"confirmed": self.confirmed, "age": self.age, "coasting": self.coasting}
+        rows = {"cluster": self.cluster, "object": self.object}
+        head = {"id": self.id, "name": self.names, "speed": self.speed}
+        return data_frame({**head, **self.boxes.columns, **state, **rows})
 
 
 @dataclass(frozen=True, slots=True)

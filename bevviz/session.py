@@ -37,9 +37,9 @@ class Session:
         loader: StageLoader | None = None,
         memo: Memo | None = None,
     ) -> None:
-        self._loader = loader or StageLoader()
+        self.loader = loader or StageLoader()
         self._detect, self._memo = detect, memo
-        self._in_force = config, self._loader.load(config, detect)  # read and replaced as one
+        self._in_force = config, self.loader.load(config, detect)  # read and replaced as one
         self._tracker = Tracker()
         self._anomalies = AnomalyDetector()
 
@@ -57,7 +57,7 @@ class Session:
         Raises:
             UserError: the detector's model or somebody's function cannot be used; nothing is changed.
         """
-        stages = self._loader.load(config, self._detect)
+        stages = self.loader.load(config, self._detect)
         before = self.config
         self._in_force = config, stages
         return changes(before, config)
@@ -65,6 +65,11 @@ class Session:
     def run(self, frame: Frame) -> FrameResult:
         """Everything that can be made of the next frame. Never raises for what the frame holds."""
         return self.finish(self.perceive(frame))
+
+    def alone(self, frame: Frame) -> FrameResult:
+        """What can be made of any one frame, without what needs those before it: tracks and anomalies."""
+        config, stages = self._in_force
+        return describe(perceive(frame, config, stages, self._memo))
 
     def perceive(self, frame: Frame, network: Executor | None = None) -> FrameResult:
         """What the stages make of the next frame, with its tracks."""

@@ -7,6 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from datetime import UTC, datetime
+from functools import cached_property
 from pathlib import Path
 from types import TracebackType
 
@@ -15,7 +16,7 @@ import numpy as np
 from bevviz.bags.recording import RawMessage, Recording
 from bevviz.config import Config, stage_topics
 from bevviz.errors import UserError
-from bevviz.frame import F64, Frame, Scene
+from bevviz.frame import F64, I64, Frame, Scene
 from bevviz.ros.messages import MessageError, decode_transforms
 from bevviz.ros.roles import find_roles
 from bevviz.sync.feed import Handler, make_handlers
@@ -123,30 +124,58 @@ class BagSource:
         """
         return self._sync.pose(frame.points_frame, stamp) if self._sync else None
 
+    @cached_property
+    def scans(self) -> I64:
+        """Log time of every scan of the recording in nanoseconds, in order; its place is its number."""
+        return self.recording.times(self._driver)
+
+    def number_at(self, time: str | float) -> int:
+        """Number of the scan that is nearest to a time, see ``parse_time``.
+
+        Raises:
+            UserError: no time, or one outside the recording.
+        """
+        return int(np.abs(self.scans - self._time(str(time), 0)).argmin())
+
+    def frame(self, number: int) -> Frame | None:
+        """The frame of one scan of the recording, whichever were chosen; None where it cannot be read.
+
+        Raises:
+            UserError: there is no scan of that number.
+        """
+        if not 0 <= number < len(self.scans):
+            raise UserError(
+                f"frame {number}: {self.recording.name} has {len(self.scans)} scans, counted from 0"
+            )
+        low = int(self.scans[number])
+        return next(self._frames(low, low + 1, number, range(1)), None)
+
     def __iter__(self) -> Iterator[Frame]:
+        return self._frames(self._low, self._high, self._first, self._chosen)
+
+    def _frames(self, low: int, high: int, first: int, chosen: range) -> Iterator[Frame]:
+        """The chosen ones of the scans with low <= log time < high, the first of which has number ``first``."""
         sync = self._sync = Synchronizer(self.roles, self.config)
         self._damaged.clear()
         handlers = make_handlers(sync, self.roles, self.recording.decode)
-        self._hold_throughout(sync, handlers)
+        self._hold_throughout(sync, handlers, low)
         numbers: dict[int, int] = {}  # stamp -> number of the scan, for those not yet delivered
         number = -1
-        stop = self._high + MARGIN
-        for message in self.recording.messages(handlers.keys(), self._low - MARGIN, stop):
+        stop = high + MARGIN
+        for message in self.recording.messages(handlers.keys(), low - MARGIN, stop):
             if message.received > stop:
                 break
             if message.topic == self._driver:
-                if not self._low <= message.received < self._high:
+                if not low <= message.received < high:
                     continue
                 number += 1
-                if number not in self._chosen:
+                if number not in chosen:
                     continue
-                if number == self._chosen[-1]:
+                if number == chosen[-1]:
                     stop = message.received + MARGIN
                 with suppress(MessageError):  # told when the scan is decoded
-                    numbers[message.header()[0] or message.received] = self._first + number
-            elif message.topic in self.roles.lidars and not (
-                number in self._chosen or number + 1 in self._chosen
-            ):
+                    numbers[message.header()[0] or message.received] = first + number
+            elif message.topic in self.roles.lidars and not (number in chosen or number + 1 in chosen):
                 continue
             self._handle(handlers[message.topic], message)
             yield from self._numbered(sync.ready(message.received), numbers)
@@ -166,7 +195,9 @@ class BagSource:
             self._damaged[message.topic] += 1
             self._first_damage.setdefault(message.topic, str(error))
 
-    def _hold_throughout(self, sync: Synchronizer, handlers: Mapping[str, Handler[RawMessage]]) -> None:
+    def _hold_throughout(
+        self, sync: Synchronizer, handlers: Mapping[str, Handler[RawMessage]], low: int
+    ) -> None:
         """Give what is published once to all frames, wherever in the bag it is.
 
         Of each static transform the last one before the start, else the first one after it.
@@ -175,7 +206,7 @@ class BagSource:
         for message in self.recording.messages(self.roles.tf_static):
             try:
                 for transform in decode_transforms(self.recording.decode(message), message.topic):
-                    if message.received <= self._low or transform.child not in static:
+                    if message.received <= low or transform.child not in static:
                         static[transform.child] = transform
             except MessageError:
                 continue  # counted when its turn comes
@@ -215,14 +246,12 @@ class BagSource:
 
     def _narrow(self, time: int) -> None:
         """Read the scan nearest to ``time`` alone."""
-        times = self.recording.times(self._driver)
-        self._first = int(np.abs(times - time).argmin())
-        self._low = int(times[self._first])
+        self._first = int(np.abs(self.scans - time).argmin())
+        self._low = int(self.scans[self._first])
         self._high = self._low + 1
 
     def _choose(self, every: int, frames: tuple[int | None, int | None]) -> range:
-        times = self.recording.times(self._driver)
-        first, last = np.searchsorted(times, [self._low, self._high])
+        first, last = np.searchsorted(self.scans, [self._low, self._high])
         there = range(int(last - first))
         chosen = there[slice(*frames)][:: max(every, 1)]
         if not chosen:

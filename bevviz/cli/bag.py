@@ -23,6 +23,8 @@ def add(commands: Commands) -> None:
 
 
 def _bag(options: argparse.Namespace) -> int:
+    from bevviz.drive import Drive
+
     config = load_config(options)
     with open_bag(options, config) as source:
-        return process(source, config, Outputs.of(options), Path(options.paths[0].stem + ".rrd"))
+        return process(Drive(source, config), Outputs.of(options), Path(options.paths[0].stem + ".rrd"))

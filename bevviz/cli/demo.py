@@ -58,6 +58,7 @@ def add(commands: Commands) -> None:
 
 def _demo(options: argparse.Namespace) -> int:
     from bevviz.config import load
+    from bevviz.drive import Drive
     from bevviz.synthetic import SyntheticSource, write_bag
 
     source = SyntheticSource(options.frames, options.seed, plant=options.plant, weave=options.weave)
@@ -73,4 +74,4 @@ def _demo(options: argparse.Namespace) -> int:
     if not config.detector.model:
         # The configuration is frozen: the demo's own network is one more setting under the user's.
         config = load(options.config, ["detector.model=demo", *options.set], options.preset)
-    return process(source, config, Outputs.of(options), Path("demo.rrd"))
+    return process(Drive(source, config), Outputs.of(options), Path("demo.rrd"))

@@ -15,7 +15,8 @@ if TYPE_CHECKING:
     from rerun import RecordingStream
 
     from bevviz.config import Config
-    from bevviz.frame import FrameResult, Source
+    from bevviz.drive import Drive
+    from bevviz.frame import FrameResult
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -27,23 +28,21 @@ def through(items: Items[T], processor: Processor[T, R], observers: Sequence[Obs
         return run(items, processor, [*observers, Progress()], stop=ended)
 
 
-def process(source: Source, config: Config, outputs: Outputs, default: Path) -> int:
+def process(drive: Drive, outputs: Outputs, default: Path) -> int:
     """Every stage on every frame, logged to every output that is asked for."""
     from bevviz.anomalies import AnomalySummary
     from bevviz.logging.recorder import Recorder
-    from bevviz.session import Session
 
     anomalies = AnomalySummary()
-    session = Session(config)
 
     def observers(recording: RecordingStream) -> list[Observer[FrameResult]]:
-        hint(source.scene, config)
-        return [Recorder(recording, config), anomalies]
+        hint(drive.scene, drive.config)
+        return [Recorder(recording, drive.config), anomalies]
 
     return logged(
-        source,
-        session,
-        config,
+        drive.frames,
+        drive.new_session(),
+        drive.config,
         outputs.or_file(default),
         observers,
         lambda: say(f"anomalies: {anomalies}"),

@@ -15,6 +15,7 @@ from bevviz.errors import UserError
 from bevviz.frame import (
     F64,
     I32,
+    I64,
     Bool,
     Boxes3D,
     Camera,
@@ -139,6 +140,40 @@ class SyntheticSource:
     def __iter__(self) -> Iterator[Frame]:
         for index in range(self.total):
             yield self.snapshot(index).frame
+
+    @property
+    def scans(self) -> I64:
+        """(N,) when each scan is received, in nanoseconds."""
+        return START + LATENCY + PERIOD * np.arange(self.total, dtype=np.int64)
+
+    def number_at(self, time: str | float) -> int:
+        """Number of the scan that is nearest to a time in seconds from the start.
+
+        Raises:
+            UserError: no number, or outside the drive.
+        """
+        try:
+            number = round(float(time) * 1e9 / PERIOD)
+        except ValueError:
+            raise UserError(f"'{time}' is no time in seconds from the start") from None
+        if not 0 <= number < self.total:
+            raise UserError(
+                f"{time} is outside the drive, which has {(self.total - 1) * PERIOD * 1e-9:.1f} s"
+            )
+        return number
+
+    def frame(self, number: int) -> Frame:
+        """One frame, whatever was asked for before.
+
+        Raises:
+            UserError: there is none of that number.
+        """
+        if not 0 <= number < self.total:
+            raise UserError(f"frame {number}: the drive has {self.total} scans, counted from 0")
+        return self.snapshot(number).frame
+
+    def close(self) -> None:
+        """Nothing is open."""
 
     def snapshot(self, index: int) -> Snapshot:
         """Frame ``index``, made anew."""

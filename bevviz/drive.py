@@ -1,0 +1,367 @@
+"""A recording and what becomes of it, from Python: the same session that the commands use."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack
+from os import PathLike
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Protocol, Self, overload
+
+import numpy as np
+
+from bevviz.config import Config, ParameterChange, Preset, load
+from bevviz.errors import UserError
+from bevviz.frame import F64, I64, Frame, FrameResult, Scene
+from bevviz.run import Observer, RunEnd, results, run
+from bevviz.session import Session
+
+if TYPE_CHECKING:
+    from pandas import DataFrame
+    from rerun.blueprint import Blueprint
+
+    from bevviz.why import Answer
+
+Settings = Mapping[str, Any] | Sequence[str]
+KEPT = 8  # results of single frames that are kept for those who ask again
+
+
+class Frames(Protocol):
+    """A source whose frames can also be had one by one."""
+
+    @property
+    def scene(self) -> Scene: ...
+
+    @property
+    def total(self) -> int: ...
+
+    @property
+    def warnings(self) -> Sequence[str]: ...
+
+    @property
+    def scans(self) -> I64:
+        """Log time of every scan in nanoseconds, in order; its place is its number."""
+        ...
+
+    def __iter__(self) -> Iterator[Frame]: ...
+
+    def number_at(self, time: str | float) -> int: ...
+
+    def frame(self, number: int) -> Frame | None: ...
+
+    def close(self) -> None: ...
+
+
+class Drive:
+    """A drive that is open: its frames, in order or one by one, and what the stages make of them.
+
+    Use it as a context manager, or call ``close``.
+
+    Args:
+        frames: where they come from.
+        config: how they are run.
+
+    Attributes:
+        frames: the source.
+        session: that single frames are run in; a run over the whole drive has one of its own.
+
+    Raises:
+        UserError: the detector's model or somebody's function cannot be used.
+    """
+
+    def __init__(self, frames: Frames, config: Config) -> None:
+        self.frames, self.session = frames, Session(config)
+        self._results: OrderedDict[tuple[int, int], FrameResult] = OrderedDict()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        self.frames.close()
+
+    def __repr__(self) -> str:
+        seconds = f"{self.times[-1]:.1f} s" if len(self) else "empty"
+        return f"<Drive {self.scene.name}: {len(self)} scans, {seconds}, preset {self.config.preset}>"
+
+    # --- what is there -------------------------------------------------------------------------
+
+    @property
+    def config(self) -> Config:
+        """The configuration that is in force."""
+        return self.session.config
+
+    @property
+    def scene(self) -> Scene:
+        """Names of the drive, its LiDARs and cameras."""
+        return self.frames.scene
+
+    @property
+    def warnings(self) -> list[str]:
+        """What was lost or looked wrong so far, one sentence each."""
+        return list(self.frames.warnings)
+
+    @property
+    def times(self) -> F64:
+        """(N,) seconds from the first scan to each, by log time."""
+        scans = self.frames.scans
+        return np.asarray((scans - scans[0]) * 1e-9, np.float64) if len(scans) else np.zeros(0)
+
+    def __len__(self) -> int:
+        """Scans of the recording."""
+        return len(self.frames.scans)
+
+    # --- one frame -----------------------------------------------------------------------------
+
+    @overload
+    def at(self, time: str | float) -> FrameResult: ...
+
+    @overload
+    def at(self, *, frame: int) -> FrameResult: ...
+
+    def at(self, time: str | float | None = None, *, frame: int | None = None) -> FrameResult:
+        """What the stages make of one scan, without what needs the frames before it (tracks, anomalies).
+
+        Args:
+            time: the scan nearest to it: seconds from the start (12.5), since 1970, or ISO 8601.
+            frame: or the scan of this number, counted from 0; -1 is the last.
+
+        Raises:
+            UserError: a time outside the recording, no such scan, or one that cannot be read.
+        """
+        number = self._number(time, frame)
+        key = number, id(self.config)
+        if key not in self._results:
+            self._results[key] = self.session.alone(self.raw(number))
+            while len(self._results) > KEPT:
+                self._results.popitem(last=False)
+        self._results.move_to_end(key)
+        return self._results[key]
+
+    def raw(self, frame: int) -> Frame:
+        """A scan with all that belongs to its time, before any stage.
+
+        Raises:
+            UserError: no such scan, or one that cannot be read.
+        """
+        found = self.frames.frame(frame)
+        if found is None:
+            raise UserError(f"frame {frame}: the scan there cannot be read: {'; '.join(self.warnings)}")
+        return found
+
+    def why(
+        self,
+        time: str | float | None = None,
+        *,
+        frame: int | None = None,
+        cls: str = "",
+        box: Sequence[float] = (),
+        point: Sequence[float] = (),
+        radius: float = 0.5,
+        camera: str = "",
+        hints: int = 5,
+    ) -> list[Answer]:
+        """Why objects of a frame were reported, or were not: what ``bevviz why`` answers.
+
+        Args:
+            time, frame: which scan, as for ``at``.
+            cls: all of that class; with neither class, box nor point: whatever went wrong.
+            box: what is at the pixel u, v, or in the image box u0, v0, u1, v1.
+            point: what is at x, y, z, in metres of the points' frame.
+            radius: metres around that point.
+            camera: of the pixel, where there are several.
+            hints: for how many answers it is tried what would change them.
+
+        Returns:
+            Worst first.
+
+        Raises:
+            UserError: as ``at``; no such class, camera or pixel.
+        """
+        from bevviz.why import Selection, why
+
+        selection = Selection(cls, tuple(box), tuple(point), radius, camera)
+        result = self.at(frame=self._number(time, frame))
+        return why(result, selection, self.session.stages.class_names, hints, loader=self.session.loader)
+
+    def configure(self, *settings: str, **more: Any) -> dict[str, ParameterChange]:
+        """Change parameters for what is asked from now on.
+
+        Args:
+            settings: ``"clustering.eps=0.6"``, as after ``--set``.
+            more: the same as ``clustering={"eps": 0.6}``.
+
+        Returns:
+            What has changed.
+
+        Raises:
+            UserError: an unknown key or a wrong value; nothing is changed then.
+        """
+        from bevviz.config import revised
+
+        return self.session.configure(revised(self.config, [*settings, *_settings(more)]))
+
+    def _number(self, time: str | float | None, frame: int | None) -> int:
+        if (time is None) == (frame is None):
+            raise UserError("which scan? Give a time, or frame=NUMBER")
+        if time is not None:
+            return self.frames.number_at(time)
+        assert frame is not None
+        return frame + len(self) if frame < 0 else frame
+
+    # --- the whole drive -----------------------------------------------------------------------
+
+    def __iter__(self) -> Iterator[FrameResult]:
+        """Every frame in order, with tracks and anomalies; the next ones are made meanwhile."""
+        return results(self.frames, self.new_session())
+
+    def new_session(self) -> Session:
+        """For a run over the whole drive, which remembers what came before; networks are shared."""
+        return Session(self.config, loader=self.session.loader)
+
+    def run(self, observers: Sequence[Observer[FrameResult]]) -> RunEnd:
+        """Show every frame in order to the observers, see ``bevviz.run.run``."""
+        return run(self.frames, self.new_session(), observers)
+
+    def save(self, path: str | PathLike[str], blueprint: str | Blueprint = "debug") -> Path:
+        """Run the whole drive into a Rerun recording.
+
+        Raises:
+            UserError: the file cannot be written, or there is no such blueprint.
+        """
+        from bevviz.logging.recorder import Recorder
+        from bevviz.logging.sinks import open_recording
+        from bevviz.progress import Progress
+
+        target = Path(path)
+        with open_recording(self.scene, self.config, save=target, blueprint=blueprint) as sinks:
+            if self.run([Recorder(sinks.recording, self.config), Progress()]).interrupted:
+                raise KeyboardInterrupt
+        return target
+
+    def show(self, blueprint: str | Blueprint = "debug") -> Any:
+        """Run the whole drive into a viewer: in a notebook into the cell, else into a window.
+
+        Returns:
+            The notebook's viewer; None where a window was opened.
+
+        Raises:
+            UserError: no viewer can be shown.
+        """
+        from bevviz.logging.recorder import Recorder
+        from bevviz.logging.sinks import open_recording
+        from bevviz.notebook import in_notebook, notebook_viewer
+
+        with ExitStack() as stack:
+            viewer = None
+            if in_notebook():
+                viewer, recording = notebook_viewer(self.scene, blueprint)
+            else:
+                sinks = open_recording(self.scene, self.config, spawn=True, blueprint=blueprint)
+                recording = stack.enter_context(sinks).recording
+            self.run([Recorder(recording, self.config)])
+        return viewer
+
+    def to_pandas(self) -> DataFrame:
+        """Run the whole drive into a table: a row a frame, with counts, times and what went wrong."""
+        from bevviz.batch.table import row
+        from bevviz.frame import data_frame
+
+        return data_frame([row(result, result.config) for result in self])
+
+
+def open_drive(
+    path: str | PathLike[str] | Sequence[str | PathLike[str]],
+    *,
+    model: str | PathLike[str] = "",
+    set: Settings = (),  # as the command's option
+    config: str | PathLike[str] | None = None,
+    preset: Preset | None = None,
+    start: str | float | None = None,
+    end: str | float | None = None,
+    every: int = 1,
+    frames: tuple[int | None, int | None] | None = None,
+) -> Drive:
+    """Open a recorded drive.
+
+    Args:
+        path: bag file or folder (MCAP, sqlite3, ROS 1); several are one drive.
+        model: detector, as ``detector.model``.
+        set: parameters: ``{"clustering.eps": 0.6}``, or ``["clustering.eps=60 cm"]`` as after ``--set``.
+        config: YAML file, as ``bevviz config`` prints it.
+        preset: ``default``, or ``reference``: as the ROS 2 tutorial pipeline.
+        start, end, every, frames: which scans a run over the whole drive takes, as the options of
+            ``bevviz bag``; any scan can be asked for one by one.
+
+    Raises:
+        UserError: no bag, nothing in it, an unknown parameter, or a model that cannot be used.
+
+    Example:
+        >>> import bevviz
+        >>> drive = bevviz.open("drive.mcap", model="yolo11n.onnx", set={"clustering.eps": 0.6})
+        >>> result = drive.at(12.5)
+        >>> result.objects.to_pandas()
+        >>> for answer in drive.why(12.5, cls="person"):
+        ...     print(answer.verdict.text)
+    """
+    from bevviz.bags.source import BagSource
+
+    paths = [path] if isinstance(path, str | PathLike) else path
+    loaded = _load(model, set, config, preset)
+    times = {"start": None if start is None else str(start), "end": None if end is None else str(end)}
+    source = BagSource([Path(p) for p in paths], loaded, every=every, frames=frames, **times)
+    try:
+        return Drive(source, loaded)
+    except BaseException:
+        source.close()
+        raise
+
+
+def simulate(
+    frames: int = 100,
+    seed: int = 0,
+    *,
+    plant: Sequence[str] = (),
+    model: str | PathLike[str] = "demo",
+    set: Settings = (),
+    config: str | PathLike[str] | None = None,
+    preset: Preset | None = None,
+) -> Drive:
+    """The synthetic drive, with ground truth and its own detector: what ``bevviz demo`` shows.
+
+    Args:
+        frames: scans, at 10 Hz.
+        seed: another seed is another street.
+        plant: faults to plant, see ``bevviz demo --help``.
+        model, set, config, preset: as for ``bevviz.open``.
+
+    Raises:
+        UserError: no such fault, an unknown parameter, or a model that cannot be used.
+    """
+    from bevviz.synthetic import SyntheticSource
+
+    return Drive(SyntheticSource(frames, seed, plant=plant), _load(model, set, config, preset))
+
+
+def _load(
+    model: str | PathLike[str], stated: Settings, config: str | PathLike[str] | None, preset: Preset | None
+) -> Config:
+    settings = list(stated) if not isinstance(stated, Mapping) else _settings(stated)
+    named = [f"detector.model={model}"] if model else []
+    return load(None if config is None else Path(config), [*named, *settings], preset)
+
+
+def _settings(tree: Mapping[str, Any]) -> list[str]:
+    """``key=value`` of dotted keys, or of sections, as ``--set`` takes them."""
+    import json
+
+    flat: list[str] = []
+    for key, value in tree.items():
+        if isinstance(value, Mapping) and "." not in key:
+            flat += _settings({f"{key}.{name}": inner for name, inner in value.items()})
+        else:
+            flat.append(f"{key}={value if isinstance(value, str) else json.dumps(value)}")
+    return flat

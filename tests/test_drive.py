@@ -1,0 +1,173 @@
+"""The Python interface: the same results and answers as the commands give."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import bevviz
+from bevviz.cli import main
+from bevviz.frame import FrameResult
+from bevviz.synthetic import BagWriter, SyntheticSource
+from tests.recordings import Recording, verify
+
+
+@pytest.fixture(scope="module")
+def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("drive") / "drive.mcap"
+    source = SyntheticSource(12, 3)
+    with BagWriter(source, path) as writer:
+        for frame in source:
+            writer.write(frame)
+    return path
+
+
+@pytest.fixture
+def drive(bag: Path) -> Iterator[bevviz.Drive]:
+    with bevviz.open(bag, model="demo") as drive:
+        yield drive
+
+
+def test_what_is_there(drive: bevviz.Drive) -> None:
+    assert len(drive) == 12
+    assert drive.scene.cameras == ("zed",)
+    np.testing.assert_allclose(drive.times, 0.1 * np.arange(12), atol=1e-6)
+    assert repr(drive) == "<Drive drive.mcap: 12 scans, 1.1 s, preset default>"
+
+
+def test_a_frame_by_time_or_number_is_that_of_the_run(drive: bevviz.Drive) -> None:
+    run = {result.frame.index: result for result in drive}
+    assert sorted(run) == list(range(12))
+    assert all(result.tracks is not None for result in run.values())
+    for result, number in ((drive.at(0.52), 5), (drive.at(frame=7), 7), (drive.at(frame=-1), 11)):
+        assert result.frame.index == number
+        assert result.tracks is None
+        same(result, run[number])
+    assert drive.at(frame=7) is drive.at(0.7), "what was made is kept"
+
+
+def same(a: FrameResult, b: FrameResult) -> None:
+    assert (
+        a.clusters is not None and b.clusters is not None and a.objects is not None and b.objects is not None
+    )
+    np.testing.assert_array_equal(a.frame.points, b.frame.points)
+    np.testing.assert_array_equal(a.clusters.labels, b.clusters.labels)
+    assert a.objects.names == b.objects.names
+    assert a.explanations == b.explanations
+    assert a.bev is not None and b.bev is not None
+    np.testing.assert_array_equal(a.bev.image, b.bev.image)
+
+
+def test_the_answer_is_that_of_the_command(
+    drive: bevviz.Drive, bag: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    answers = drive.why(0.5, cls="car", hints=1)
+    assert (
+        main(["why", str(bag), "--model", "demo", "--at", "0.5", "--class", "car", "--limit", "1", "--json"])
+        == 0
+    )
+    told = json.loads(capsys.readouterr().out)["answers"]
+    assert len(answers) > 2
+    assert [answer.verdict.text for answer in answers] == [answer["verdict"] for answer in told]
+
+
+def test_a_change_is_for_what_is_asked_from_then_on(drive: bevviz.Drive) -> None:
+    before = drive.at(0.5)
+    changed = drive.configure("clustering.eps=20 cm", fusion={"min_points": 5})
+    assert {key: str(change) for key, change in changed.items()} == {
+        "clustering.eps": "0.5 -> 0.2",
+        "fusion.min_points": "3 -> 5",
+    }
+    after = drive.at(0.5)
+    assert before.clusters is not None and after.clusters is not None
+    assert len(after.clusters) != len(before.clusters)
+    assert after.config is drive.config
+    with pytest.raises(bevviz.UserError, match=r"unknown key 'clustering.epsilon'"):
+        drive.configure("clustering.epsilon=1")
+    with pytest.raises(bevviz.UserError, match="detector.model none.onnx: no such file"):
+        drive.configure("detector.model=none.onnx")
+    assert drive.at(0.5) is after
+
+
+def test_parameters_as_a_mapping_or_as_settings(bag: Path, tmp_path: Path) -> None:
+    file = tmp_path / "c.yaml"
+    file.write_text("clustering: {eps: 0.9, min_points: 7}\n")
+    stated = {"clustering.eps": 0.6, "detector.classes": ["person", "car"]}
+    with bevviz.open(bag, model="demo", set=stated, config=file, frames=(2, 5)) as drive:
+        config = drive.config
+        assert (config.clustering.eps, config.clustering.min_points) == (0.6, 7)
+        assert config.detector.classes == ("person", "car")
+        assert [result.frame.index for result in drive] == [2, 3, 4]
+    with bevviz.open([str(bag)], set=["clustering.eps=60 cm"], preset="reference", start=0.5) as drive:
+        assert drive.config.voxel.size == 0.05
+        assert len(list(drive)) == 7
+
+
+def test_a_saved_drive_is_that_of_the_command(drive: bevviz.Drive, bag: Path, tmp_path: Path) -> None:
+    path = drive.save(tmp_path / "api.rrd")
+    verify(path)
+    assert main(["bag", str(bag), "--model", "demo", "--save", str(tmp_path / "cli.rrd")]) == 0
+    ours, theirs = Recording(path), Recording(tmp_path / "cli.rrd")
+    assert ours.at.keys() == theirs.at.keys()
+    for entity in ("/explain", "/world/fused", "/tracks/speed_m_s"):
+        assert repr(ours.rows[entity]) == repr(theirs.rows[entity])
+
+
+def test_tables(drive: bevviz.Drive) -> None:
+    pytest.importorskip("pandas")
+    result = drive.at(0.5)
+    assert result.objects is not None and result.clusters is not None
+    table = result.objects.to_pandas()
+    assert list(table["name"]) == list(result.objects.names)
+    np.testing.assert_array_equal(table[["x", "y", "z"]], result.objects.boxes.center)
+    assert (result.clusters.to_pandas()["points"] == result.clusters.count).all()
+    detections = result.cameras[0].detections
+    assert detections is not None
+    assert set(detections.to_pandas()["state"]) <= {"kept", "below_threshold", "suppressed"}
+    frames = drive.to_pandas()
+    assert list(frames["frame"]) == list(range(12))
+    assert (frames["points"] > 50_000).all()
+    last = list(drive)[-1]
+    assert last.tracks is not None
+    assert len(last.tracks.to_pandas()) == len(last.tracks)
+
+
+def test_the_synthetic_drive() -> None:
+    with bevviz.simulate(frames=5, seed=2, set={"voxel.size": 0.2}) as drive:
+        assert len(drive) == 5
+        assert drive.at(0.3).frame.index == 3
+        assert drive.at(0.3).frame.truth is not None
+        assert len(list(drive)) == 5
+        with pytest.raises(bevviz.UserError, match=r"9 is outside the drive, which has 0.4 s"):
+            drive.at(9)
+
+
+@pytest.mark.parametrize(
+    ("asked", "message"),
+    [
+        ({}, "which scan"),
+        ({"time": 1, "frame": 1}, "which scan"),
+        ({"time": 100}, "100 is outside the recording"),
+        ({"time": "soon"}, "'soon' is no time"),
+        ({"frame": 12}, "frame 12: drive.mcap has 12 scans, counted from 0"),
+        ({"frame": -13}, "frame -1: drive.mcap has 12 scans"),
+    ],
+)
+def test_what_cannot_be_asked(drive: bevviz.Drive, asked: dict[str, object], message: str) -> None:
+    with pytest.raises(bevviz.UserError, match=message):
+        drive.at(**asked)  # type: ignore[call-overload]
+
+
+def test_importing_costs_next_to_nothing() -> None:
+    """What is heavy comes with the first drive."""
+    code = "import bevviz, sys; print(sorted({'numpy', 'rerun', 'numba', 'cv2'} & sys.modules.keys()))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+    with pytest.raises(AttributeError, match="module 'bevviz' has no attribute 'opne'"):
+        bevviz.opne  # noqa: B018
