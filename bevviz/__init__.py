@@ -7,6 +7,7 @@
 
 from __future__ import annotations
 
+import logging
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -18,6 +19,8 @@ if TYPE_CHECKING:
 
 __version__ = "0.1.0"
 __all__ = ["Config", "Drive", "Frame", "FrameResult", "UserError", "open", "simulate"]
+
+logging.getLogger("bevviz").addHandler(logging.NullHandler())  # silent where nobody listens
 
 _HOMES = {
     "Config": ("bevviz.config", "Config"),

@@ -229,6 +229,29 @@ class AnomalySummary(Observer[FrameResult]):
         return ", ".join(kinds) or "none"
 
 
+class FailureSummary(Observer[FrameResult]):
+    """Which stages failed, how often, and the reason that each gave first."""
+
+    def __init__(self) -> None:
+        self._frames = 0
+        self._count: Counter[str] = Counter()
+        self._first: dict[str, str] = {}
+
+    def see(self, result: FrameResult) -> None:
+        self._frames += 1
+        for failure in result.failures:
+            self._count[failure.stage] += 1
+            self._first.setdefault(failure.stage, failure.reason)
+
+    @property
+    def warnings(self) -> list[str]:
+        """One sentence for each stage."""
+        return [
+            f"{stage} failed in {count} of {self._frames} frames, first: {self._first[stage]}"
+            for stage, count in self._count.items()
+        ]
+
+
 def label(tracks: Tracks, row: int) -> str:
     """``person #12``."""
     return f"{tracks.names[row] or 'object'} #{tracks.id[row]}"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import signal
 import subprocess
@@ -312,3 +313,43 @@ def environment() -> dict[str, str]:
     """Of a process that finds this checkout and no display."""
     kept = {k: v for k, v in os.environ.items() if k not in ("DISPLAY", "WAYLAND_DISPLAY")}
     return {**kept, "PYTHONPATH": str(Path(__file__).resolve().parents[1])}
+
+
+# --- what nobody foresaw -----------------------------------------------------------------------
+
+
+def test_a_stage_that_fails_is_one_line_and_its_traceback_is_for_who_asks(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    Path("broken.py").write_text("def cluster(points):\n    return 1 // 0\n")
+    bags.write(tmp_path / "drive", bags.small_items(scans=3))
+    run = ["bag", str(tmp_path / "drive"), "--set", "clustering.method=broken:cluster", "--save", "x.rrd"]
+    assert main(run) == 0
+    said = capsys.readouterr().err
+    failed = [line for line in said.splitlines() if "clustering failed in 3 of 3 frames" in line]
+    assert len(failed) == 1 and failed[0].endswith(
+        "first: ZeroDivisionError: integer division or modulo by zero"
+    )
+    assert "Traceback" not in said
+    try:
+        assert main([*run, "--verbose"]) == 0
+    finally:
+        logging.getLogger("bevviz").handlers[:] = logging.getLogger("bevviz").handlers[:1]
+    said = capsys.readouterr().err
+    assert "Traceback" in said
+    assert 'broken.py", line 2, in cluster' in said
+
+
+def test_an_error_of_bevviz_itself_is_one_line_too(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def broken(self: Logger, result: object) -> None:
+        raise RuntimeError("planted")
+
+    bags.write(tmp_path / "drive", bags.small_items(scans=2))
+    monkeypatch.setattr(Logger, "log", broken)
+    assert main(["bag", str(tmp_path / "drive"), "--save", "x.rrd"]) == 3
+    said = capsys.readouterr().err.splitlines()
+    assert said[-1] == (
+        "bevviz: error of bevviz itself: RuntimeError: planted; --verbose shows where, please report it"
+    )

@@ -90,7 +90,7 @@ def test_a_change_is_for_what_is_asked_from_then_on(drive: bevviz.Drive) -> None
     assert after.config is drive.config
     with pytest.raises(bevviz.UserError, match=r"unknown key 'clustering.epsilon'"):
         drive.configure("clustering.epsilon=1")
-    with pytest.raises(bevviz.UserError, match="detector.model none.onnx: no such file"):
+    with pytest.raises(bevviz.UserError, match=r"detector.model none.onnx: no such file"):
         drive.configure("detector.model=none.onnx")
     assert drive.at(0.5) is after
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import gc
+import logging
 import os
 import sys
 from collections.abc import Callable, Sequence
@@ -24,7 +25,9 @@ from bevviz.cli import (
     tune,
     why,
 )
-from bevviz.errors import UserError
+from bevviz.errors import UserError, first_line, interrupt_in
+
+_log = logging.getLogger(__name__)
 
 EPILOG = """examples:
   bevviz demo                                 the synthetic drive, in the viewer
@@ -45,7 +48,11 @@ EPILOG = """examples:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run bevviz. Returns the exit status: 0 done, 1 nothing made, 2 wrong input, 130 interrupted."""
+    """Run bevviz.
+
+    Returns:
+        The exit status: 0 done, 1 nothing made, 2 wrong input, 3 an error of bevviz itself, 130 interrupted.
+    """
     # Imports and frames make many objects and few cycles: at Python's default of 700 between two looks for
     # cycles these take a tenth of all the time.
     gc.set_threshold(50_000, 10, 10)
@@ -53,9 +60,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
         interrupts.install()
     try:
         options = _parser().parse_args(arguments)
+        if options.verbose:
+            _log_to_stderr()
         run: Callable[[argparse.Namespace], int] = options.run
         return run(options)
     except UserError as error:
+        _log.debug("what led to the error", exc_info=error)
         print(f"bevviz: error: {error}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
@@ -64,6 +74,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except BrokenPipeError:  # the reader of our output has gone, as in `bevviz info bag | head`
         sys.stdout = open(os.devnull, "w")  # noqa: SIM115, PTH123
         return 0
+    except Exception as error:
+        if interrupt_in(error):
+            print("bevviz: interrupted", file=sys.stderr)
+            return 130
+        _log.error("an error that nobody foresaw", exc_info=error)
+        what = f"{type(error).__name__}: {first_line(error)}"
+        print(
+            f"bevviz: error of bevviz itself: {what}; --verbose shows where, please report it",
+            file=sys.stderr,
+        )
+        return 3
     finally:
         if arguments is None:
             interrupts.ignore()
@@ -80,4 +101,16 @@ def _parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
     for command in (bag, batch, info, why, compare, sweep, tune, calib, report, demo, live, config):
         command.add(commands)
+    for command_parser in commands.choices.values():
+        command_parser.add_argument(
+            "--verbose", action="store_true", help="also say on stderr where in the code something failed"
+        )
     return parser
+
+
+def _log_to_stderr() -> None:
+    handler = logging.StreamHandler()
+    handler.setFormatter(logging.Formatter("%(name)s: %(levelname)s: %(message)s"))
+    logger = logging.getLogger("bevviz")
+    logger.addHandler(handler)
+    logger.setLevel(logging.DEBUG)

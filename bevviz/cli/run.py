@@ -8,8 +8,6 @@ from typing import TYPE_CHECKING, TypeVar
 
 from bevviz.cli.interrupts import terminable
 from bevviz.cli.outputs import Outputs, hint, say, warn
-from bevviz.progress import Progress
-from bevviz.run import Items, Observer, Processor, RunEnd, run
 
 if TYPE_CHECKING:
     from rerun import RecordingStream
@@ -17,6 +15,7 @@ if TYPE_CHECKING:
     from bevviz.config import Config
     from bevviz.drive import Drive
     from bevviz.frame import FrameResult
+    from bevviz.run import Items, Observer, Processor, RunEnd
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -24,20 +23,27 @@ R = TypeVar("R")
 
 def through(items: Items[T], processor: Processor[T, R], observers: Sequence[Observer[R]]) -> RunEnd:
     """The run, with a progress bar; a signal ends it after the frame at hand."""
+    from bevviz.progress import Progress
+    from bevviz.run import run
+
     with terminable() as ended:
         return run(items, processor, [*observers, Progress()], stop=ended)
 
 
 def process(drive: Drive, outputs: Outputs, default: Path) -> int:
     """Every stage on every frame, logged to every output that is asked for."""
-    from bevviz.anomalies import AnomalySummary
+    from bevviz.anomalies import AnomalySummary, FailureSummary
     from bevviz.logging.recorder import Recorder
 
-    anomalies = AnomalySummary()
+    anomalies, failures = AnomalySummary(), FailureSummary()
 
     def observers(recording: RecordingStream) -> list[Observer[FrameResult]]:
         hint(drive.scene, drive.config)
-        return [Recorder(recording, drive.config), anomalies]
+        return [Recorder(recording, drive.config), anomalies, failures]
+
+    def finish() -> None:
+        warn(failures.warnings)
+        say(f"anomalies: {anomalies}")
 
     return logged(
         drive.frames,
@@ -45,7 +51,7 @@ def process(drive: Drive, outputs: Outputs, default: Path) -> int:
         drive.config,
         outputs.or_file(default),
         observers,
-        lambda: say(f"anomalies: {anomalies}"),
+        finish,
     )
 
 
