@@ -16,8 +16,9 @@ settings.load_profile("ci" if os.environ.get("CI") else "developer")
 
 @pytest.fixture(scope="session")
 def shared() -> Path:
-    """The folder of real test data beside the checkout."""
-    folder = Path(__file__).resolve().parents[2] / "shared" / "data"
+    """The folder of real test data, see README.md."""
+    stated = os.environ.get("BEVVIZ_DATA")
+    folder = Path(stated) if stated else Path(__file__).resolve().parents[2] / "shared" / "data"
     if not folder.is_dir():
-        pytest.skip("needs the real data of ../shared/data, which is not beside this checkout")
+        pytest.skip(f"needs real data: {folder} is not there (BEVVIZ_DATA, see tests/README.md)")
     return folder

@@ -154,7 +154,7 @@ class BagSource:
         return self._frames(self._low, self._high, self._first, self._chosen)
 
     def _frames(self, low: int, high: int, first: int, chosen: range) -> Iterator[Frame]:
-        """The chosen ones of the scans with low <= log time < high, the first of which is number ``first``."""
+        """The chosen ones of the scans with low <= log time < high, the first of which is ``first``."""
         sync = self._sync = Synchronizer(self.roles, self.config)
         self._damaged.clear()
         handlers = make_handlers(sync, self.roles, self.recording.decode)
