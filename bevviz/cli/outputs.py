@@ -92,6 +92,13 @@ def warn(warnings: Iterable[str]) -> None:
 
 def hint(scene: Scene, config: Config) -> None:
     """Say what would give the user more."""
+    from bevviz.stages.kernel import CACHED
+
+    if not CACHED:
+        say(
+            "no place to keep compiled stages in: every run compiles them anew, which takes some 15 seconds; "
+            "set NUMBA_CACHE_DIR to a folder that can be written"
+        )
     if scene.cameras and not config.detector.model:
         say("no detector: give --model FILE.onnx to find objects in the images")
 

@@ -5,34 +5,51 @@ from __future__ import annotations
 import json
 import os
 import socket
+import stat
+import struct
 import tempfile
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import BinaryIO, Self
 
 from bevviz.errors import UserError
 
+ANSWER = 5.0  # seconds until a process that is well has said that it heard
 PATIENCE = 120.0  # seconds that saving may take
+LONGEST = 1 << 16  # bytes of a request or an answer
+_CREDENTIALS = struct.Struct("3i")  # of a socket's peer: process, user, group
 
 
 class Control:
     """Answers requests to save until it is closed.
 
+    A request is a line of JSON, ``{"path": "FILE.rrd"}``. The first line of the answer comes at once, the
+    second, ``{"saved": ...}`` or ``{"error": ...}``, when it is done.
+
     Args:
         save: writes the recording to a path, or to one of its own choice, and returns it.
+        warn: called with one sentence where no socket can be had, so that ``snap`` will not find the process.
     """
 
-    def __init__(self, save: Callable[[Path | None], Path]) -> None:
+    def __init__(self, save: Callable[[Path | None], Path], warn: Callable[[str], None]) -> None:
         self._save = save
-        self._path = _folder(create=True) / f"{os.getpid()}.sock"
-        self._path.unlink(missing_ok=True)
-        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
-        self._socket.bind(str(self._path))
-        self._socket.listen()
+        self._path: Path | None = None
         self._thread = threading.Thread(target=self._serve, name="control", daemon=True)
+        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+        reasons: list[str] = []
+        for folder in folders():
+            try:
+                self._listen(folder)
+            except (OSError, UserError) as error:
+                reasons.append(str(error))
+            else:
+                break
+        if self._path is None:
+            warn(f"'bevviz snap' cannot reach this run, SIGUSR1 can: {'; '.join(reasons)}")
+            return
         self._thread.start()
 
     def __enter__(self) -> Self:
@@ -41,11 +58,23 @@ class Control:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
+        if self._path is None:
+            self._socket.close()
+            return
         self._path.unlink(missing_ok=True)
         with suppress(OSError):
             self._socket.shutdown(socket.SHUT_RDWR)  # wakes the thread
         self._socket.close()
         self._thread.join(PATIENCE)  # it may be saving
+
+    def _listen(self, folder: Path) -> None:
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        check_owned(folder)
+        path = folder / f"{os.getpid()}.sock"
+        path.unlink(missing_ok=True)
+        self._socket.bind(str(path))
+        self._socket.listen()
+        self._path = path
 
     def _serve(self) -> None:
         while True:
@@ -53,17 +82,30 @@ class Control:
                 connection, _ = self._socket.accept()
             except OSError:
                 return
-            with connection, suppress(OSError, ValueError):
-                connection.settimeout(5.0)
-                if request := _receive(connection):  # else somebody only looked who is there
-                    connection.sendall(json.dumps(self._answer(request)).encode())
+            with connection, suppress(OSError), connection.makefile("rb") as lines:
+                connection.settimeout(ANSWER)
+                request = _line(lines)
+                if request is None:  # somebody only looked who is there
+                    continue
+                connection.sendall(b'{"heard": true}\n')
+                connection.settimeout(PATIENCE)
+                connection.sendall(json.dumps(self._answer(request)).encode() + b"\n")
 
-    def _answer(self, request: dict[str, Any]) -> dict[str, str]:
+    def _answer(self, request: bytes) -> dict[str, str]:
         try:
-            saved = self._save(Path(request["path"]) if request.get("path") else None)
+            content = json.loads(request)
+            path = content.get("path") if isinstance(content, dict) else 0
+        except ValueError:
+            path = 0
+        if not isinstance(path, str | None):
+            return {"error": "the request was not understood"}
+        try:
+            saved = self._save(Path(path) if path else None)
             return {"saved": str(saved.absolute())}
         except UserError as error:
             return {"error": str(error)}
+        except Exception as error:  # it must not end the thread that answers the next one
+            return {"error": f"{type(error).__name__}: {error}"}
 
 
 def snap(path: Path | None = None, pid: int | None = None) -> Path:
@@ -74,7 +116,7 @@ def snap(path: Path | None = None, pid: int | None = None) -> Path:
         pid: which process, where several run.
 
     Raises:
-        UserError: none runs, or several do, or it cannot save.
+        UserError: none runs, or several do, or it does not answer, or cannot save.
     """
     running = _running()
     if pid is not None and pid not in running:
@@ -83,44 +125,81 @@ def snap(path: Path | None = None, pid: int | None = None) -> Path:
         raise UserError("no 'bevviz live' of yours runs on this machine")
     if pid is None and len(running) > 1:
         raise UserError(f"several run; choose one with --pid: {', '.join(map(str, sorted(running)))}")
-    connection = running[pid] if pid is not None else next(iter(running.values()))
-    connection.settimeout(PATIENCE)
-    connection.sendall(json.dumps({"path": str(path.absolute()) if path else ""}).encode())
-    connection.shutdown(socket.SHUT_WR)
-    answer = _receive(connection)
-    if "saved" not in answer:
-        raise UserError(answer.get("error", "it ended before it had saved"))
-    return Path(answer["saved"])
+    process, connection = next((p, c) for p, c in running.items() if pid in (None, p))
+    with connection, connection.makefile("rb") as lines:
+        try:
+            connection.settimeout(ANSWER)
+            request = {"path": str(path.absolute())} if path is not None else {}
+            connection.sendall(json.dumps(request).encode() + b"\n")
+            heard = _line(lines)
+        except OSError:
+            heard = None
+        if heard is None:
+            raise UserError(f"process {process} does not answer: it is stopped, or hangs")
+        try:
+            connection.settimeout(PATIENCE)
+            answer = json.loads(_line(lines) or b"{}")
+        except (OSError, ValueError):
+            answer = {}
+    if not isinstance(answer, dict) or "saved" not in answer:
+        error = answer.get("error") if isinstance(answer, dict) else None
+        raise UserError(str(error or f"process {process} ended before it had saved"))
+    return Path(str(answer["saved"]))
+
+
+def folders() -> Iterator[Path]:
+    """Where sockets may be, the best place first."""
+    given = os.environ.get("XDG_RUNTIME_DIR")
+    if given:
+        yield Path(given, "bevviz")
+    yield (
+        Path(f"/run/user/{os.getuid()}/bevviz") if Path(f"/run/user/{os.getuid()}").is_dir() else _temporary()
+    )
+    yield _temporary()
+
+
+def _temporary() -> Path:
+    return Path(tempfile.gettempdir(), f"bevviz-{os.getuid()}")
+
+
+def check_owned(folder: Path) -> None:
+    """Raises UserError where others could put something there: a folder of temporary files is everybody's."""
+    found = folder.lstat()
+    if not stat.S_ISDIR(found.st_mode):
+        raise UserError(f"{folder} is not a folder")
+    if found.st_uid != os.getuid():
+        raise UserError(f"{folder} belongs to another user: set XDG_RUNTIME_DIR to a folder of yours")
+    if found.st_mode & 0o022:
+        raise UserError(f"{folder} can be written by others: chmod 700 it")
 
 
 def _running() -> dict[int, socket.socket]:
-    """A connection to each process that answers; what ended ones left behind is removed."""
-    found = {}
-    for path in _folder().glob("*.sock"):
-        connection = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+    """A connection to each process of this user that listens; what ended ones left behind is removed."""
+    found: dict[int, socket.socket] = {}
+    for folder in dict.fromkeys(folders()):
         try:
-            connection.connect(str(path))
-            found[int(path.stem)] = connection
-        except ConnectionRefusedError:
-            path.unlink(missing_ok=True)
-        except FileNotFoundError:
-            pass
+            check_owned(folder)
+            paths = sorted(folder.glob("*.sock"))
+        except (OSError, UserError):
+            continue  # nobody's who could be trusted
+        for path in paths:
+            connection = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+            connection.settimeout(ANSWER)
+            try:
+                connection.connect(str(path))
+                peer = connection.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _CREDENTIALS.size)
+                process, user, _ = _CREDENTIALS.unpack(peer)
+            except ConnectionRefusedError:
+                path.unlink(missing_ok=True)
+                continue
+            except OSError:
+                continue
+            if user == os.getuid():
+                found[process] = connection
     return found
 
 
-def _receive(connection: socket.socket) -> dict[str, Any]:
-    data = b""
-    while part := connection.recv(4096):
-        data += part
-    return json.loads(data) if data else {}
-
-
-def _folder(*, create: bool = False) -> Path:
-    """Only the user can enter it."""
-    given = os.environ.get("XDG_RUNTIME_DIR")
-    folder = Path(given, "bevviz") if given else Path(tempfile.gettempdir(), f"bevviz-{os.getuid()}")
-    if create:
-        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-        if folder.stat().st_uid != os.getuid():
-            raise UserError(f"{folder} belongs to another user: set XDG_RUNTIME_DIR to a folder of yours")
-    return folder
+def _line(lines: BinaryIO) -> bytes | None:
+    """The next one; None where the other side has closed, or says more than is sane."""
+    line = lines.readline(LONGEST)
+    return line if line.endswith(b"\n") else None

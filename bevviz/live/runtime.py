@@ -170,7 +170,7 @@ class Live:
         with ExitStack() as stack:
             stack.callback(_handle, {number: signal.getsignal(number) for number in ENDING})
             stack.callback(self._close)
-            stack.enter_context(Control(self.save))
+            stack.enter_context(Control(self.save, self.notes.warn))
             stack.enter_context(self._signal())
             # A second Ctrl-C must not leave half a file or a viewer behind. Closing takes bounded time.
             stack.callback(_handle, dict.fromkeys(ENDING, signal.SIG_IGN))
