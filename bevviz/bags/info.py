@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from bevviz.bags.mcap import megabytes
+from bevviz.bags.reader import megabytes
 from bevviz.bags.recording import Recording
 from bevviz.bags.source import SECOND, BagSource, iso
 from bevviz.config import Config
