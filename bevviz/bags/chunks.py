@@ -17,8 +17,16 @@ import rosbags.rosbag2
 from rosbags.interfaces import Connection
 from tqdm import tqdm
 
-from bevviz.bags.reader import DAMAGE, LAST, Bytes, DamageError, Message, Reader, megabytes
-from bevviz.errors import first_line
+from bevviz.bags.reader import (
+    LAST,
+    Bytes,
+    DamageError,
+    Message,
+    Reader,
+    as_damage,
+    megabytes,
+    public_messages,
+)
 from bevviz.frame import I64
 
 logger = logging.getLogger(__name__)
@@ -169,9 +177,10 @@ class SoundChunks:
         self._public = form.public(public, self._index)
         if self._public is not None:
             try:
-                self._public.open()
-            except DAMAGE as error:
-                logger.info("%s: read by its index, for rosbags says: %s", path, first_line(error))
+                with as_damage():
+                    self._public.open()
+            except DamageError as error:
+                logger.info("%s: read by its index, for rosbags says: %s", path, error)
                 self._public = None
         self._bytes = Bytes(path)
 
@@ -190,7 +199,8 @@ class SoundChunks:
     def messages(self, ids: Collection[int], start: int, stop: int) -> Iterator[Message]:
         if self._public is None:
             return self._own.messages(ids, start, stop)
-        return self._public.messages([c for c in self.connections if c.id in ids], start, stop)
+        wanted = [c for c in self._public.connections if c.id in ids]
+        return public_messages(self._public.messages(wanted, start, stop))
 
     def times(self, ids: Collection[int]) -> I64:
         return self._own.times(ids) if self._public is None else self._times(ids, 0, LAST)
@@ -304,6 +314,7 @@ class IndexedChunks:
         why = "whose content is not all there"
         try:
             found = self._form.look_into(self._bytes, chunk)
+            found = [item for item in found if chunk.start <= item[0] <= chunk.end]
         except DamageError as damage:
             found, why = [], str(damage)
         if len(found) < sum(chunk.counts.values()):

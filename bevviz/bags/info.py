@@ -117,10 +117,11 @@ def _topic(recording: Recording, topic: Topic, roles: Roles) -> TopicInfo:
     if (topic.count or 0) > 1 and recording.message_count < MANY:
         times = recording.times(topic.name)
         steps = np.diff(times)
-        longest = int(np.argmax(steps))
-        pause = float(steps[longest]) / SECOND
-        pause_at = float(times[longest] - recording.start) / SECOND
-        if times[-1] > times[0]:
+        if len(steps):  # of a damaged bag there may be fewer than were counted
+            longest = int(np.argmax(steps))
+            pause = float(steps[longest]) / SECOND
+            pause_at = float(times[longest] - recording.start) / SECOND
+        if len(steps) and times[-1] > times[0]:
             rate = float(len(steps) / ((times[-1] - times[0]) / SECOND))
     return TopicInfo(
         name=topic.name,

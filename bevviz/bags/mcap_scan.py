@@ -79,27 +79,41 @@ class Walker:
                 if record is None:
                     return
                 offset = record.start
-            assert record is not None
-            following = self._at(record.end) if record.end < size else None
-            if following is None and record.end != size and record.opcode != FOOTER:
-                # Its length is wrong and what follows lies within, or the next record is broken.
-                nearer = None
-                if self._skip(record.end) is None:
-                    nearer = self._search(record.body, min(record.end, size), record.opcode == CHUNK)
-                if nearer is not None and record.opcode == CHUNK:
-                    record, following = record._replace(end=nearer.start), nearer
-                elif nearer is not None or (record.end > size and record.opcode != CHUNK):
-                    self._pass((nearer.start if nearer else size) - offset)
-                    if nearer is None:
-                        return
-                    record, offset = nearer, nearer.start
-                    continue
-            self._learn(record)
-            yield record
-            if record.opcode == FOOTER:
-                return
-            offset = record.end
+            sound, following = self._settle(record)
+            if sound is not None:
+                self._learn(sound)
+                yield sound
+                if sound.opcode == FOOTER:
+                    return
+                offset = sound.end
+            elif following is not None:
+                self._pass(following.start - offset)
+                offset = following.start
             record = following
+
+    def _settle(self, record: Record) -> tuple[Record | None, Record | None]:
+        """The record, its end put right, None: it is broken; and the one behind it, None: not known."""
+        size, is_chunk = self._source.size, record.opcode == CHUNK
+        if record.end == size or record.opcode == FOOTER:
+            return record, None
+        following = self._at(record.end) if record.end < size else None
+        if following is not None or self._skip(record.end) is not None:
+            return record, following
+        # Its length is wrong, and what follows lies within or a little behind; or the next record is broken.
+        nearer = self._search(record.body, min(record.end, size), is_chunk)
+        if is_chunk:
+            return (record._replace(end=nearer.start) if nearer else record), nearer
+        if nearer is None and record.end < size:
+            doubtful = record.opcode == MESSAGE and not self._begins_message(record.end)
+            return (None if doubtful else record), None
+        return None, nearer
+
+    def _begins_message(self, offset: int) -> bool:
+        """Whether there is a message but for its length, or the end."""
+        head = self._source.read(offset, RECORD.size + MESSAGE_HEAD.size)
+        if len(head) < RECORD.size + MESSAGE_HEAD.size:
+            return True
+        return head[0] == MESSAGE and self._fits(offset + RECORD.size)
 
     def _pass(self, size: int) -> None:
         self.broken += 1
@@ -298,15 +312,15 @@ def look_into(file: Bytes, chunk: Chunk) -> list[tuple[int, int, memoryview]]:
     """
     content, crc = _unpacked(file, chunk)
     data = memoryview(content)
-    found = _plain(data, chunk.counts)
-    if crc or len(found) == sum(chunk.counts.values()):
+    found, whole = _messages(data, chunk.counts)
+    if crc or (whole and len(found) == sum(chunk.counts.values())):
         return found
     walk = Walker(Content(content), chunk.counts, _span(chunk))(0)
-    return [item for r in walk if r.opcode == MESSAGE for item in _plain(data[r.start : r.end], chunk.counts)]
+    return [i for r in walk if r.opcode == MESSAGE for i in _messages(data[r.start : r.end], chunk.counts)[0]]
 
 
-def _plain(data: memoryview, channels: Container[int]) -> list[tuple[int, int, memoryview]]:
-    """The messages of a content, as far as one record leads to the next."""
+def _messages(data: memoryview, channels: Container[int]) -> tuple[list[tuple[int, int, memoryview]], bool]:
+    """The messages of a content by the lengths of its records, and whether these lead to its end."""
     found, offset, size = [], 0, len(data)
     while offset + RECORD.size <= size:
         opcode, length = RECORD.unpack_from(data, offset)
@@ -316,7 +330,7 @@ def _plain(data: memoryview, channels: Container[int]) -> list[tuple[int, int, m
             channel, _, time, _ = MESSAGE_HEAD.unpack_from(data, body)
             if channel in channels and time < LAST:
                 found.append((time, channel, data[body + MESSAGE_HEAD.size : offset]))
-    return found
+    return found, offset == size
 
 
 def _unpacked(file: Bytes, chunk: Chunk) -> tuple[bytes, bool]:

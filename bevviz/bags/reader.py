@@ -9,6 +9,7 @@ import struct
 from binascii import crc32
 from bz2 import BZ2Decompressor
 from collections.abc import Callable, Collection, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -39,14 +40,28 @@ class DamageError(Exception):
 
 
 # What rosbags and the libraries below it raise when bytes are not what they should be.
-DAMAGE: tuple[type[Exception], ...] = (
-    DamageError,
+_DAMAGE: tuple[type[Exception], ...] = (
     *(rosbags.rosbag1.ReaderError, rosbags.rosbag2.ReaderError, apsw.Error),
     *(zstd.ZstdError, EOFError, RuntimeError),  # the last one is lz4's
     *(OSError, ValueError),  # bz2's, those of text that is no UTF-8, and a disk's
     *(struct.error, LookupError, TypeError, AssertionError),  # what is missing or leads nowhere
     *(OverflowError, MemoryError),  # lengths and times beyond all measure
 )
+
+
+@contextmanager
+def as_damage() -> Iterator[None]:
+    """Around what rosbags does, and nothing else: what it raises on damage becomes a DamageError."""
+    try:
+        yield
+    except _DAMAGE as error:
+        raise DamageError(f"damaged ({first_line(error)})") from error
+
+
+def public_messages(messages: Iterator[Message]) -> Iterator[Message]:
+    """The messages that rosbags reads; what it raises on damage becomes a DamageError."""
+    with as_damage():
+        yield from messages
 
 
 class Reader(Protocol):
@@ -80,7 +95,7 @@ class Reader(Protocol):
 
 
 class SoundReader(Reader, Protocol):
-    """Any of its methods may raise what is in ``DAMAGE``."""
+    """Any of its methods may raise DamageError."""
 
     def sums(self, ids: Collection[int], start: int, stop: int) -> tuple[int, int]:
         """How many messages there are as the index has it, and the sum of their log times."""
@@ -97,7 +112,7 @@ class BagFile:
     Args:
         path: of the file.
         form: name of its format.
-        sound: opens the reader of a sound file; raises what is in ``DAMAGE``.
+        sound: opens the reader of a sound file; raises DamageError.
         rescue: opens the reader of a damaged one; raises UserError where nothing is left of it.
     """
 
@@ -110,7 +125,7 @@ class BagFile:
         self._reader: Reader
         try:
             self._reader = self._sound = sound()
-        except DAMAGE as error:
+        except DamageError as error:
             self._tell(error)
             self._reader = rescue()
 
@@ -153,7 +168,7 @@ class BagFile:
                 again = latest = LAST  # all of it may have been given
                 self._check(known, low, high, (given, total))
                 return
-            except DAMAGE as error:
+            except DamageError as error:
                 self._change(error)
                 again = low if latest == LAST else latest
         before = given if latest == LAST else given - len(at_latest)
@@ -174,7 +189,7 @@ class BagFile:
         if self._sound is not None:
             try:
                 return self._sound.times(ids)
-            except DAMAGE as error:
+            except DamageError as error:
                 self._change(error)
         return self._reader.times(ids)
 
@@ -194,7 +209,7 @@ class BagFile:
         if listed != given:
             raise DamageError("its index has other times than its messages")
 
-    def _change(self, error: Exception) -> None:
+    def _change(self, error: DamageError) -> None:
         """From here on the rescuer reads."""
         self._tell(error)
         sound, self._sound = self._sound, None
@@ -202,10 +217,9 @@ class BagFile:
         self._reader = sound.rescuer()
         sound.close()
 
-    def _tell(self, error: Exception) -> None:
-        reason = str(error) if isinstance(error, DamageError) else f"damaged ({first_line(error)})"
-        logger.info("%s: %s: rescuing what is there", self.path, reason, exc_info=error)
-        self._notes.append(f"{reason}: what is there was rescued")
+    def _tell(self, error: DamageError) -> None:
+        logger.info("%s: %s: rescuing what is there", self.path, error, exc_info=error)
+        self._notes.append(f"{error}: what is there was rescued")
 
 
 class Bytes:

@@ -216,6 +216,8 @@ class BagSource:
     def _narrow(self, time: int) -> None:
         """Read the scan nearest to ``time`` alone."""
         times = self.recording.times(self._driver)
+        if not len(times):
+            return
         self._first = int(np.abs(times - time).argmin())
         self._low = int(times[self._first])
         self._high = self._low + 1

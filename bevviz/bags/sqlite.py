@@ -6,6 +6,7 @@ is not. A write-ahead log beside the file, which a recorder leaves that was kill
 
 from __future__ import annotations
 
+import os
 import struct
 from array import array
 from collections import Counter
@@ -23,7 +24,16 @@ from rosbags.rosbag2 import Reader as PublicReader
 from tqdm import tqdm
 
 from bevviz.bags.mcap import FORMATS, NOTHING
-from bevviz.bags.reader import LAST, Bytes, DamageError, Message, Reader, megabytes
+from bevviz.bags.reader import (
+    LAST,
+    Bytes,
+    DamageError,
+    Message,
+    Reader,
+    as_damage,
+    megabytes,
+    public_messages,
+)
 from bevviz.errors import UserError
 from bevviz.frame import I64
 
@@ -52,9 +62,9 @@ class SoundSqlite:
 
     def __init__(self, path: Path, public: Path) -> None:
         self._path = path
-        with path.open("rb") as file:
-            head = file.read(100)
-            size = file.seek(0, 2)
+        self._file = path.open("rb")
+        head, size = self._file.read(100), self._file.seek(0, 2)
+        self._size = size
         page = _page_size(head)
         if page is None or size < page:
             raise DamageError("the head of the file is damaged")
@@ -64,11 +74,12 @@ class SoundSqlite:
         if log.exists() and log.stat().st_size > LOG_HEAD.size:
             raise DamageError(f"the recorder did not close it: messages in {log.name} are read with it")
         self._public = PublicReader(public)
-        self._public.open()
+        with as_damage():
+            self._public.open()
+            self._queries = apsw.Connection(
+                f"file:{public}?immutable=1", flags=apsw.SQLITE_OPEN_READONLY | apsw.SQLITE_OPEN_URI
+            )
         self.connections: Sequence[Connection] = list(self._public.connections)
-        self._queries = apsw.Connection(
-            f"file:{public}?immutable=1", flags=apsw.SQLITE_OPEN_READONLY | apsw.SQLITE_OPEN_URI
-        )
         self._check()
 
     @property
@@ -76,11 +87,16 @@ class SoundSqlite:
         return self._public.start_time, self._public.end_time
 
     def messages(self, ids: Collection[int], start: int, stop: int) -> Iterator[Message]:
-        return self._public.messages([c for c in self.connections if c.id in ids], start, stop)
+        wanted = [c for c in self.connections if c.id in ids]
+        for message in public_messages(self._public.messages(wanted, start, stop)):
+            # Where pages are missing sqlite3 reads zeros.
+            if os.fstat(self._file.fileno()).st_size < self._size:
+                raise DamageError("the file was cut while it was read")
+            yield message
 
     def times(self, ids: Collection[int]) -> I64:
         query = f"SELECT timestamp FROM messages WHERE topic_id IN ({_marks(ids)}) ORDER BY timestamp"
-        return np.array([t for (t,) in self._queries.execute(query, tuple(ids))], np.int64)
+        return np.array([time for (time,) in self._numbers(query, *ids)], np.int64)
 
     def sums(self, ids: Collection[int], start: int, stop: int) -> tuple[int, int]:
         query = (
@@ -113,9 +129,11 @@ class SoundSqlite:
                 raise DamageError("its index of times disagrees with its messages")
 
     def _numbers(self, query: str, *values: int) -> list[tuple[Any, ...]]:
-        return list(self._queries.execute(query, values))
+        with as_damage():
+            return list(self._queries.execute(query, values))
 
     def close(self) -> None:
+        self._file.close()
         self._public.close()
         self._queries.close()
 
