@@ -7,12 +7,11 @@ import struct
 from array import array
 from collections import defaultdict
 from collections.abc import Callable, Container, Iterator
-from pathlib import Path
 from typing import NamedTuple
 
 from rosbags.rosbag2 import Reader
 
-from bevviz.bags.chunks import Chunk, Form, Index, Scan
+from bevviz.bags.chunks import Chunk, Form, Scan
 from bevviz.bags.mcap import (
     CHANNEL,
     CHUNK,
@@ -335,7 +334,9 @@ def _messages(data: memoryview, channels: Container[int]) -> tuple[list[tuple[in
 
 def _unpacked(file: Bytes, chunk: Chunk) -> tuple[bytes, bool]:
     """The content of a chunk, and whether it is known to be as it was written."""
-    crc = read_crc(file, chunk) if chunk.crc is None else chunk.crc
+    crc = chunk.crc
+    if crc is None:  # it stands before the content
+        crc = int.from_bytes(file.read(chunk.data - 16 - len(chunk.compression), 4), "little")
     packed = file.read(chunk.data, chunk.packed)
     cut = chunk.cut or len(packed) < chunk.packed
     return unpack(chunk.compression, packed, chunk.size, crc, cut=cut), bool(crc) and not cut
@@ -345,20 +346,5 @@ def _span(chunk: Chunk) -> tuple[int, int] | None:
     return (chunk.start, chunk.end) if 0 < chunk.start <= chunk.end < LAST else None
 
 
-def read_crc(file: Bytes, chunk: Chunk) -> int:
-    """The checksum before the content of a chunk."""
-    return int.from_bytes(file.read(chunk.data - 16 - len(chunk.compression), 4), "little")
-
-
-def _public(path: Path, index: Index) -> Reader | None:
-    """rosbags' reader, but not where chunks have no checksum: it passes over what is broken in them."""
-    file = Bytes(path)
-    try:
-        if not all(read_crc(file, chunk) for chunk in index.chunks[:1] + index.chunks[-1:]):
-            return None
-    finally:
-        file.close()
-    return Reader(path)
-
-
-FORM = Form(_public, read_index, read_times, look_into, scan, "'mcap recover' writes a sound copy")
+REPAIR = "'mcap recover' writes a sound copy"
+FORM = Form(Reader, True, read_index, read_times, look_into, scan, REPAIR)

@@ -10,6 +10,7 @@ from binascii import crc32
 from bz2 import BZ2Decompressor
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
+from functools import cache
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -339,3 +340,12 @@ def _unpacked_blocks(packed: bytes, most: int) -> tuple[bytes, bool]:
 def megabytes(size: int) -> str:
     """A file size for people: ``3.1 MB``."""
     return f"{size / 1e6:.1f} MB" if size >= 100_000 else f"{size / 1e3:.1f} kB"
+
+
+@cache
+def normalized(msgtype: str) -> str:
+    """The name of a type as ROS 2 spells it: sensor_msgs/msg/Image."""
+    package, _, name = msgtype.rpartition("/")
+    if package.rpartition("/")[2] in ("msg", "action"):
+        return msgtype
+    return f"{package}/msg/{name}".lstrip("/")

@@ -7,7 +7,7 @@ import re
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache, cached_property
+from functools import cached_property
 from operator import itemgetter
 from pathlib import Path, PurePath
 from tempfile import TemporaryDirectory, mkdtemp
@@ -23,13 +23,21 @@ from rosbags.interfaces import (
     MessageDefinitionFormat,
 )
 from rosbags.typesys import Stores, TypesysError, get_types_from_idl, get_types_from_msg, get_typestore
-from rosbags.typesys.msg import normalize_msgtype
 from rosbags.typesys.store import Typestore
 from tqdm import tqdm
 
 from bevviz.bags import mcap, mcap_scan, ros1, sqlite
 from bevviz.bags.chunks import Form, SoundChunks, rescue
-from bevviz.bags.reader import LONGEST, PIECE, BagFile, Bytes, Reader, SoundReader, megabytes
+from bevviz.bags.reader import (
+    LONGEST,
+    PIECE,
+    BagFile,
+    Bytes,
+    Reader,
+    SoundReader,
+    megabytes,
+    normalized,
+)
 from bevviz.bags.sqlite import SoundSqlite, SqliteRescuer
 from bevviz.errors import UserError
 from bevviz.frame import I64
@@ -78,8 +86,6 @@ OTHERS = {
     b"#ROSBAG V1": "a bag of ROS before 1.2: 'rosbag fix' converts it",
 }
 METADATA = "metadata.yaml"
-
-_normalized = cache(normalize_msgtype)  # which takes as long as decoding a small message
 
 
 @dataclass(frozen=True, slots=True)
@@ -204,7 +210,7 @@ class Recording:
         return tuple(
             Topic(
                 name,
-                _normalized(first[name].msgtype),
+                normalized(first[name].msgtype),
                 counts[name],
                 self._frame_id(name) if counts[name] and self._has_header(first[name]) else "",
                 (counts[name] - 1) / duration if counts[name] > 1 and duration else None,
@@ -236,7 +242,7 @@ class Recording:
             MessageError: the data does not fit the definition, or there is none.
         """
         connection = message.connection
-        msgtype = _normalized(connection.msgtype)
+        msgtype = normalized(connection.msgtype)
         try:
             data = message.content()
             store = self._store(connection)
@@ -253,7 +259,7 @@ class Recording:
 
     def encode(self, message: RawMessage, content: Any) -> memoryview:
         """``content``, as ``decode`` gave it and changed since, serialised as the message was."""
-        store, msgtype = self._store(message.connection), _normalized(message.connection.msgtype)
+        store, msgtype = self._store(message.connection), normalized(message.connection.msgtype)
         if is_ros1(message.connection):
             return store.serialize_ros1(content, msgtype)
         return store.serialize_cdr(content, msgtype)
@@ -264,7 +270,7 @@ class Recording:
             return connection.msgdef
         version: Literal[1, 2] = 1 if is_ros1(connection) else 2
         try:
-            msgtype = _normalized(connection.msgtype)
+            msgtype = normalized(connection.msgtype)
             text, _ = self._store(connection).generate_msgdef(msgtype, ros_version=version)
         except (KeyError, TypesysError):
             return connection.msgdef
@@ -292,7 +298,7 @@ class Recording:
 
     def _has_header(self, connection: Connection) -> bool:
         try:
-            _, fields = self._store(connection).fielddefs[_normalized(connection.msgtype)]
+            _, fields = self._store(connection).fielddefs[normalized(connection.msgtype)]
         except KeyError:
             return False
         return bool(fields) and fields[0][1][1] == "std_msgs/msg/Header"
@@ -480,7 +486,7 @@ def _lazily(
 
 def _defined(connection: Connection) -> Typestore:
     """A store of the types that a connection's own definition lists."""
-    text, msgtype = connection.msgdef.data, _normalized(connection.msgtype)
+    text, msgtype = connection.msgdef.data, normalized(connection.msgtype)
     if connection.msgdef.format == MessageDefinitionFormat.MSG:
         types = get_types_from_msg(text, msgtype)
     else:

@@ -13,10 +13,9 @@ from pathlib import Path
 import numpy as np
 from rosbags.interfaces import Connection, ConnectionExtRosbag1, MessageDefinition, MessageDefinitionFormat
 from rosbags.rosbag1 import Reader
-from rosbags.typesys.msg import normalize_msgtype
 
 from bevviz.bags.chunks import Chunk, Form, Index, Scan
-from bevviz.bags.reader import LAST, Bytes, Content, DamageError, unpack
+from bevviz.bags.reader import LAST, Bytes, Content, DamageError, normalized, unpack
 from bevviz.frame import I64
 
 MAGIC = b"#ROSBAG V2.0\n"
@@ -123,7 +122,7 @@ class Connections:
         self._known[record.number("conn")] = Connection(
             record.number("conn"),
             "/" * absolute + "/".join(parts),
-            normalize_msgtype(kind),
+            normalized(kind),
             MessageDefinition(MessageDefinitionFormat.MSG, text),
             digest,
             0,
@@ -132,7 +131,7 @@ class Connections:
         )
 
     def counted(self, counts: Mapping[int, int]) -> list[Connection]:
-        return [c._replace(msgcount=counts.get(number, 0)) for number, c in sorted(self._known.items())]
+        return [c._replace(msgcount=counts.get(number, 0)) for number, c in self._known.items()]
 
 
 # --- the index of a sound bag ------------------------------------------------------------------
@@ -365,4 +364,4 @@ def _unpacked(file: Bytes, chunk: Chunk) -> Content:
 
 
 REPAIR = "'rosbag reindex' repairs the file"
-FORM = Form(lambda path, index: Reader(path), read_index, read_times, look_into, scan, REPAIR)
+FORM = Form(Reader, False, read_index, read_times, look_into, scan, REPAIR)
