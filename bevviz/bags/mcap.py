@@ -98,7 +98,13 @@ def read_index(path: Path) -> Index:
         summary = file.read(start, file.size - start)
         if crc and crc32(summary[: -len(MAGIC) - 4]) != crc:
             raise DamageError("its index does not fit its checksum")
-        return _parse_summary(summary[: end - start], start)
+        index = _parse_summary(summary[: end - start], start)
+        for chunk in index.chunks[-1:]:  # where bytes are missing or too many, at least the last one is moved
+            at = chunk.data - RECORD.size - CHUNK_HEAD.size - len(chunk.compression) - 8
+            length = CHUNK_HEAD.size + len(chunk.compression) + 8 + chunk.packed
+            if file.read(at, RECORD.size) != RECORD.pack(CHUNK, length):
+                raise DamageError("its index leads to no chunk")
+        return index
     except (struct.error, IndexError, ValueError) as error:
         raise DamageError(f"its index is damaged ({error})") from None
     finally:

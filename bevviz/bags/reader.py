@@ -155,34 +155,33 @@ class BagFile:
         high = LAST if stop is None else min(stop, LAST)
         given, total, latest = 0, 0, low
         at_latest: list[tuple[int, bytes | memoryview]] = []  # what was given of the latest log time
-        again = latest  # where the rescuer begins
-        if self._sound is not None:
-            try:
-                for connection, time, data in self._sound.messages(known, low, high):
-                    if time != latest:
-                        latest = time
-                        at_latest.clear()
-                    at_latest.append((connection.id, data))
+        if self._sound is None:
+            for connection, time, data in self._reader.messages(known, low, high):
+                yield known[connection.id], time, data
+            return
+        again = low  # where the rescuer begins
+        try:
+            for connection, time, data in self._sound.messages(known, low, high):
+                if time != latest:
+                    latest = again = time
+                    at_latest.clear()
+                at_latest.append((connection.id, data))
+                given += 1
+                total += time
+                yield known[connection.id], time, data
+            latest, again = LAST, low  # all of it was given, as far as it is known
+            self._check(known, low, high, (given, total))
+        except DamageError as error:
+            self._change(error)
+            for connection, time, data in self._reader.messages(known, again, high):
+                if time == latest and (connection.id, data) in at_latest:
+                    at_latest.remove((connection.id, data))
+                elif time >= latest:
                     given += 1
-                    total += time
                     yield known[connection.id], time, data
-                again = latest = LAST  # all of it may have been given
-                self._check(known, low, high, (given, total))
-                return
-            except DamageError as error:
-                self._change(error)
-                again = low if latest == LAST else latest
-        before = given if latest == LAST else given - len(at_latest)
-        for connection, time, data in self._reader.messages(known, again, high):
-            if time < latest:
-                before -= 1
-                continue
-            if time == latest and (connection.id, data) in at_latest:
-                at_latest.remove((connection.id, data))
-                continue
-            yield known[connection.id], time, data
-        if latest == LAST and before < 0:
-            self._notes.append(f"{-before} message(s) were found too late to be given in order of time")
+            times = self._reader.times(known)
+            if (late := int(((times >= low) & (times < high)).sum()) - given) > 0:
+                self._notes.append(f"{late} message(s) were found too late to be given in order of time")
 
     def times(self, connections: Collection[Connection]) -> I64:
         """Log times of all messages of ``connections``, sorted, without reading them."""

@@ -393,8 +393,8 @@ class SqliteRescuer:
                 raise DamageError("a column is of a type that there is not")
             columns.append((kind, start - offset))
             start += INTEGER_SIZES[kind] if kind < 12 else (kind - 12) // 2
-        if start - offset != size or column != end:
-            raise DamageError("the columns of a row are not as long as the row")
+        if start - offset > size or column != end:
+            raise DamageError("the columns of a row are longer than the row")
         return Cell(page, rowid, offset, local, size, overflow, tuple(columns))
 
     def _take(
@@ -411,8 +411,8 @@ class SqliteRescuer:
         if len(kinds) == 3 and max(kinds[:2]) < 10 and kinds[2] >= 12 and kinds[2] % 2 == 0:
             # messages: id, topic_id, timestamp, data
             topic, time = _integer(cell, 1), _integer(cell, 2)
-            if not 0 <= time < LAST:
-                raise DamageError("a message of an impossible time")
+            if not 0 <= time < LAST or cell.columns[3][1] + (kinds[2] - 12) // 2 != cell.size:
+                raise DamageError("a message of an impossible time or size")
             if cell.rowid in seen:
                 return
             seen.add(cell.rowid)
