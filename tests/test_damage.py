@@ -394,3 +394,39 @@ def test_behind_a_damaged_frame_the_next_one_is_unpacked(tmp_path: Path) -> None
     assert len(found) > 60 and missing(found, "mcap") < 100
     assert {time for _, time, _ in found} >= {time for _, time, _ in whole("mcap")[-20:]}
     assert any("1 damaged place(s)" in text for text in said)
+
+
+# --- what else stands in the way ---------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["mcap", "ros1"])
+def test_first_bytes_that_are_damaged(tmp_path: Path, name: str) -> None:
+    path = FORMATS[name](tmp_path)
+    change(path, 0, b"\0\0\0\0")
+    found, said = read(path)
+    assert not missing(found, name)
+    assert any("rescued" in text for text in said)
+
+
+def test_a_database_of_which_all_is_still_in_its_log(tmp_path: Path) -> None:
+    path = tmp_path / "bag.db3"
+    with sqlite3.connect(FORMATS["sqlite3"](tmp_path)) as source, sqlite3.connect(path) as target:
+        target.execute("PRAGMA journal_mode=WAL")
+        target.execute("PRAGMA wal_autocheckpoint=0")
+        target.execute("CREATE TABLE first (id)")
+        script = "\n".join(source.iterdump())
+        target.executescript(script)
+        log = path.with_name("bag.db3-wal").read_bytes()
+    source.close()
+    target.close()
+    path.write_bytes(b"")
+    path.with_name("bag.db3-wal").write_bytes(log)
+    assert not missing(read(path)[0], "sqlite3")
+
+
+@pytest.mark.parametrize("name", ["drive #1?.db3", "100%.db3", "drive", "drive.mcap"])
+def test_names_that_mean_something_else(tmp_path: Path, name: str) -> None:
+    path = FORMATS["sqlite3"](tmp_path)
+    found, said = read(path.rename(tmp_path / name))
+    assert not missing(found, "sqlite3")
+    assert not said

@@ -56,7 +56,7 @@ def as_damage() -> Iterator[None]:
     try:
         yield
     except _DAMAGE as error:
-        raise DamageError(f"damaged ({first_line(error)})") from error
+        raise DamageError(f"damaged ({first_line(error)})" if str(error) else "damaged") from error
 
 
 def public_messages(messages: Iterator[Message]) -> Iterator[Message]:

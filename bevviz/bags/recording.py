@@ -384,21 +384,21 @@ class Recording:
             path = self._unpack(path)
             with path.open("rb") as file:
                 head = file.read(16)
-        kind = next((kind for kind in KINDS if head.startswith(kind.magic)), None)
-        if kind is None:
-            what = next((text for magic, text in OTHERS.items() if head.startswith(magic)), None)
-            kind = next((kind for kind in KINDS if path.suffix == kind.suffix), None)
-            if not head and not (kind is SQLITE and sqlite.log_of(path).exists()):
-                raise UserError(f"{path}: the file is empty")
-            file_ = None if what or kind is None else self._open_as(kind, path)
-            if file_ is None or not any(c.msgcount for c in file_.connections):
-                if file_ is not None:
-                    file_.close()
-                raise UserError(
-                    f"{path}: {what or 'not a bag: neither MCAP, nor sqlite3, nor ROS 1 by its first bytes'}"
-                )
-            return file_
-        return self._open_as(kind, path)
+        if kind := next((kind for kind in KINDS if head.startswith(kind.magic)), None):
+            return self._open_as(kind, path)
+        what = next((text for magic, text in OTHERS.items() if head.startswith(magic)), None)
+        # The first bytes may be damaged; and of a database all may still lie in its log.
+        kind = next((kind for kind in KINDS if path.suffix == kind.suffix), None)
+        if not head and not (kind is SQLITE and sqlite.log_of(path).exists()):
+            raise UserError(f"{path}: the file is empty")
+        if kind and not what:
+            opened = self._open_as(kind, path)
+            if any(c.msgcount for c in opened.connections):
+                return opened
+            opened.close()
+        raise UserError(
+            f"{path}: {what or 'not a bag: neither MCAP, nor sqlite3, nor ROS 1 by its first bytes'}"
+        )
 
     def _open_as(self, kind: Kind, path: Path) -> BagFile:
         public = path

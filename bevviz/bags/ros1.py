@@ -145,6 +145,8 @@ def read_index(path: Path) -> Index:
     """
     file = Bytes(path)
     try:
+        if file.read(0, len(MAGIC)) != MAGIC:
+            raise DamageError("it does not begin as a ROS 1 bag does")
         head = read_record(file, len(MAGIC))
         if head is None or head.kind != "bag":
             raise DamageError("the bag's head is damaged")
