@@ -716,6 +716,15 @@ def test_an_image_that_would_take_gigabytes_is_refused_by_its_header(monkeypatch
     assert large.bgr.shape == (3000, 4000, 3)
 
 
+def test_a_png_whose_parts_are_longer_than_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
+    png = encoded(".png", random_pixels(24, 32, 3))
+    at = png.index(b"IDAT") - 4
+    monkeypatch.setattr(cv2, "imdecode", None)  # which would take four gigabytes
+    with pytest.raises(MessageError, match=r"/i: the image/png data \(\d+ bytes\) is damaged or cut"):
+        bomb = png[:at] + struct.pack(">I", 2**31 - 1) + png[at + 4 :]
+        messages.decode_compressed_image(compressed(bomb, ""), "/i", 0)
+
+
 @given(
     width=st.integers(1, 80),
     height=st.integers(1, 80),

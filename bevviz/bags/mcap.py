@@ -104,6 +104,8 @@ def read_index(path: Path) -> Index:
             length = CHUNK_HEAD.size + len(chunk.compression) + 8 + chunk.packed
             if file.read(at, RECORD.size) != RECORD.pack(CHUNK, length):
                 raise DamageError("its index leads to no chunk")
+            for channel in chunk.index:
+                read_times(file, chunk, channel)
         return index
     except (struct.error, IndexError, ValueError) as error:
         raise DamageError(f"its index is damaged ({error})") from None

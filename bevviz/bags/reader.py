@@ -228,22 +228,24 @@ class Bytes:
     def __init__(self, path: Path) -> None:
         self._file = path.open("rb", buffering=0)
         self.size = os.fstat(self._file.fileno()).st_size
-        self._start, self._block = 0, b""
+        self._latest = 0, b""  # block that was read last, in one piece for whoever reads in another thread
 
     def close(self) -> None:
         self._file.close()
 
     def read(self, offset: int, size: int) -> bytes:
         """``size`` bytes, fewer at the end of the file."""
-        at = offset - self._start
-        if at < 0 or at + size > len(self._block):
+        start, block = self._latest
+        at = offset - start
+        if at < 0 or at + size > len(block):
             size = min(size, self.size - offset)
             if size <= 0 or offset < 0:
                 return b""
             if size > BLOCK // 4:
                 return self._pread(offset, size)
-            self._start, self._block, at = offset, self._pread(offset, BLOCK), 0
-        return self._block[at : at + size]
+            block, at = self._pread(offset, BLOCK), 0
+            self._latest = offset, block
+        return block[at : at + size]
 
     def search(self, pattern: re.Pattern[bytes], start: int, reach: int = 64) -> Iterator[int]:
         """Offsets that ``pattern`` is found at, from ``start`` on; it needs ``reach`` bytes at most."""

@@ -422,11 +422,11 @@ class SqliteRescuer:
                 self._incomplete += 1
                 return
             rows.extend((time, topic, *place, cell.rowid))
-        elif len(kinds) >= 3 and all(kind >= 13 and kind % 2 for kind in kinds):
+        elif len(kinds) >= 3 and kinds[0] >= 13 and kinds[0] % 2:
             text = self._texts(cell)
             if text[1] in FORMATS:  # message_definitions: id, type, encoding, definition, hash
                 definitions[text[0]] = MessageDefinition(FORMATS[text[1]], text[2])
-            elif text[0] and "/" in text[1]:  # topics: id, name, type, serialization_format, ...
+            elif text[0][:1] == "/" or "/" in text[1]:  # topics: id, name, type, serialization_format, ...
                 topics[cell.rowid] = text[0], text[1], text[2]
 
     def _overflow(self, cell: Cell) -> list[int]:
@@ -463,9 +463,12 @@ class SqliteRescuer:
         return content[: cell.size]
 
     def _texts(self, cell: Cell) -> list[str]:
+        """The columns behind the first one; of those that are no text nothing."""
         content = self._content(cell)
         return [
             content[start : start + (kind - 13) // 2].decode(errors="replace")
+            if kind >= 13 and kind % 2
+            else ""
             for kind, start in cell.columns[1:]
         ]
 

@@ -362,8 +362,13 @@ def decode_compressed_image(msg: Any, topic: str, received: int) -> Image:
 
 
 def _size_of(encoded: bytes) -> tuple[int, int]:
-    """Width and height that the header of a PNG or a JPEG states; 0 where there is none."""
+    """Width and height that the header of a PNG or a JPEG states; 0 where there is none, or a PNG is cut."""
     if encoded.startswith(b"\x89PNG"):
+        at = 8
+        while encoded[at + 4 : at + 8] != b"IEND":  # a decoder makes room for a part before it reads it
+            at += 12 + int.from_bytes(encoded[at : at + 4], "big")
+            if at + 8 > len(encoded):
+                return 0, 0
         return int.from_bytes(encoded[16:20], "big"), int.from_bytes(encoded[20:24], "big")
     at = 2
     while at + 9 <= len(encoded):
