@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 from bevviz import geometry
@@ -315,10 +315,13 @@ def test_a_cut_bag_gives_all_before_the_cut(
 
 
 @settings(max_examples=20, deadline=None)
-@given(data=st.data())
+@given(share=st.floats(0, 1, exclude_max=True))
+@example(share=0.9546)  # in the index behind the only chunk of the MCAP: all its messages were lost
+@example(share=0.957)
+@example(share=0.9594)
 @pytest.mark.parametrize("form", ["mcap", "sqlite3", "ros1"])
 def test_a_cut_at_any_byte_never_gives_wrong_messages(
-    tmp_path_factory: pytest.TempPathFactory, form: str, data: st.DataObject
+    tmp_path_factory: pytest.TempPathFactory, form: str, share: float
 ) -> None:
     folder = tmp_path_factory.getbasetemp()
     bag = folder / (f"any_{form}.bag" if form == "ros1" else f"any_{form}")
@@ -328,7 +331,7 @@ def test_a_cut_at_any_byte_never_gives_wrong_messages(
     whole = content(path)
     size = path.stat().st_size
     cut = folder / f"any_cut_{form}"
-    cut.write_bytes(path.read_bytes()[: data.draw(st.integers(0, size - 1))])
+    cut.write_bytes(path.read_bytes()[: int(share * size)])
     try:
         found = content(cut)
     except UserError:
@@ -394,7 +397,7 @@ def test_a_damaged_page_costs_its_own_messages(tmp_path: Path) -> None:
     data[leaves[len(leaves) // 2]] = 0xFF
     path.write_bytes(data)
     with BagSource([path], Config()) as source:
-        assert any("the file is damaged" in w for w in source.warnings)
+        assert any("is malformed" in w and "rescued" in w for w in source.warnings)
         assert 50 < len(list(source)) <= 60
     found = content(path)
     assert is_part(found, whole)

@@ -5,6 +5,8 @@ from __future__ import annotations
 import array
 import math
 import struct
+import zlib
+from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace as Message
 from typing import Any
@@ -668,3 +670,98 @@ def test_detections_that_are_not_finite_are_left_out() -> None:
 def test_an_unknown_layout_of_a_detection_is_named() -> None:
     with pytest.raises(MessageError, match="/boxes: unknown version of vision_msgs"):
         messages.decode_detections_3d(array_of(Message(results=[], box=None)), "/boxes", 0)
+
+
+# --- what a message may hold ---------------------------------------------------------------------
+
+
+def test_a_cloud_beyond_the_limits_is_refused_in_one_line() -> None:
+    msg = cloud_message(random_points(10))
+    msg.height = msg.width = 2**32 - 1
+    with pytest.raises(MessageError, match="/p: a cloud of 4294967295 x 4294967295 points is not taken"):
+        messages.decode_cloud(msg, "/p", 0)
+    for step in (2**31, 2**32 - 1, 0):
+        msg = cloud_message(random_points(10))
+        msg.point_step = step
+        with pytest.raises(MessageError, match=rf"/p: a point of {step} bytes cannot be"):
+            messages.decode_cloud(msg, "/p", 0)
+    msg = cloud_message(random_points(10))
+    msg.fields[3].count, msg.fields[3].datatype, msg.point_step = 10**6, 2, 2_000_000
+    with pytest.raises(MessageError, match="/p: its points have more than 1024 fields, each element counted"):
+        messages.decode_cloud(msg, "/p", 0)
+
+
+def png_of(width: int, height: int) -> bytes:
+    """A PNG of one bit a pixel, all black; small however large it is."""
+
+    def part(kind: bytes, content: bytes) -> bytes:
+        crc = zlib.crc32(kind + content)
+        return struct.pack(">I", len(content)) + kind + content + struct.pack(">I", crc)
+
+    head = struct.pack(">IIBBBBB", width, height, 1, 0, 0, 0, 0)
+    rows = zlib.compress((b"\0" + bytes(-(-width // 8))) * height)
+    return b"\x89PNG\r\n\x1a\n" + part(b"IHDR", head) + part(b"IDAT", rows) + part(b"IEND", b"")
+
+
+def test_an_image_that_would_take_gigabytes_is_refused_by_its_header(monkeypatch: pytest.MonkeyPatch) -> None:
+    bomb = png_of(32_000, 32_000)
+    jpeg = encoded(".jpg", random_pixels(16, 16, 3))
+    at = jpeg.index(b"\xff\xc0") + 5
+    monkeypatch.setattr(cv2, "imdecode", None)  # nothing is decoded
+    for data in (bomb, jpeg[:at] + struct.pack(">HH", 32_000, 32_000) + jpeg[at + 4 :]):
+        with pytest.raises(MessageError, match=r"/i: an image of 32000 x 32000 pixels is not taken: 1000000"):
+            messages.decode_compressed_image(compressed(data, ""), "/i", 0)
+    monkeypatch.undo()
+    large = messages.decode_compressed_image(compressed(png_of(4000, 3000), ""), "/i", 0)
+    assert large.bgr.shape == (3000, 4000, 3)
+
+
+def test_a_png_whose_parts_are_longer_than_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
+    png = encoded(".png", random_pixels(24, 32, 3))
+    at = png.index(b"IDAT") - 4
+    monkeypatch.setattr(cv2, "imdecode", None)  # which would take four gigabytes
+    with pytest.raises(MessageError, match=r"/i: the image/png data \(\d+ bytes\) is damaged or cut"):
+        bomb = png[:at] + struct.pack(">I", 2**31 - 1) + png[at + 4 :]
+        messages.decode_compressed_image(compressed(bomb, ""), "/i", 0)
+
+
+@given(
+    width=st.integers(1, 80),
+    height=st.integers(1, 80),
+    grey=st.booleans(),
+    form=st.sampled_from([".jpg", ".png"]),
+)
+def test_the_size_in_a_header_is_that_of_the_image(width: int, height: int, grey: bool, form: str) -> None:
+    pixels = random_pixels(height, width) if grey else random_pixels(height, width, 3)
+    options = [cv2.IMWRITE_JPEG_PROGRESSIVE, int(width % 2)] if form == ".jpg" else []
+    data = bytes(cv2.imencode(form, pixels, options)[1].tobytes())
+    assert messages._size_of(data) == (width, height)
+
+
+DECODERS: dict[str, Callable[[Any], object]] = {
+    "cloud": lambda m: messages.decode_cloud(m, "/t", 0),
+    "image": lambda m: messages.decode_image(m, "/t", 0),
+    "compressed": lambda m: messages.decode_compressed_image(m, "/t", 0),
+    "info": lambda m: messages.decode_camera_info(m, True, "/t"),
+    "transforms": lambda m: messages.decode_transforms(m, "/t"),
+    "odometry": lambda m: messages.decode_odometry(m, "/t"),
+    "boxes": lambda m: messages.decode_detections_2d(m, "/t", 0),
+    "boxes 3d": lambda m: messages.decode_detections_3d(m, "/t", 0),
+}
+
+
+@pytest.mark.parametrize("kind", DECODERS)
+@pytest.mark.parametrize(
+    "msg",
+    [
+        Message(),
+        Message(header=None, data="text", fields=5, height="9", width=None, transforms=[None], format=7),
+        Message(
+            header=header(), detections=[Message(results=[Message()])], encoding="bgr8", K=(), D=(), P=()
+        ),
+    ],
+)
+def test_a_definition_with_other_fields_is_the_failure_of_its_messages(kind: str, msg: Message) -> None:
+    with pytest.raises(MessageError, match=r"^(/t|message \w+)\b.*\S$") as caught:
+        DECODERS[kind](msg)
+    assert "\n" not in str(caught.value)

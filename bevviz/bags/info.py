@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from bevviz.bags.mcap import megabytes
+from bevviz.bags.reader import megabytes
 from bevviz.bags.recording import Recording
 from bevviz.bags.source import SECOND, BagSource, iso
 from bevviz.config import Config, stage_topics
@@ -117,10 +117,11 @@ def _topic(recording: Recording, topic: Topic, roles: Roles) -> TopicInfo:
     if (topic.count or 0) > 1 and recording.message_count < MANY:
         times = recording.times(topic.name)
         steps = np.diff(times)
-        longest = int(np.argmax(steps))
-        pause = float(steps[longest]) / SECOND
-        pause_at = float(times[longest] - recording.start) / SECOND
-        if times[-1] > times[0]:
+        if len(steps):  # of a damaged bag there may be fewer than were counted
+            longest = int(np.argmax(steps))
+            pause = float(steps[longest]) / SECOND
+            pause_at = float(times[longest] - recording.start) / SECOND
+        if len(steps) and times[-1] > times[0]:
             rate = float(len(steps) / ((times[-1] - times[0]) / SECOND))
     return TopicInfo(
         name=topic.name,

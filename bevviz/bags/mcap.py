@@ -1,29 +1,27 @@
-"""MCAP files: rosbags' reader, able to rebuild the index of a file whose end is missing."""
+"""What an MCAP file is made of (https://mcap.dev/spec), and the index of a sound one."""
 
 from __future__ import annotations
 
-import heapq
+import logging
 import struct
 from binascii import crc32
-from collections import defaultdict
-from collections.abc import Collection, Generator, Iterator
-from contextlib import suppress
-from operator import itemgetter
+from collections import Counter
+from collections.abc import Mapping
 from pathlib import Path
-from typing import IO
+from typing import Any
 
 import numpy as np
-from backports import zstd
-from lz4.frame import LZ4FrameDecompressor  # type: ignore[import-untyped]
 from rosbags.interfaces import Connection, ConnectionExtRosbag2, MessageDefinition, MessageDefinitionFormat
-from rosbags.rosbag2.metadata import ReaderMetadata
-from rosbags.rosbag2.storage_mcap import ChunkInfo, McapReader
 
-from bevviz.errors import UserError
+from bevviz.bags.chunks import Chunk, Index
+from bevviz.bags.reader import LAST, Bytes, DamageError
 from bevviz.frame import I64
 
+logger = logging.getLogger(__name__)
+
 MAGIC = b"\x89MCAP0\r\n"
-SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX, DATA_END, FOOTER = 3, 4, 5, 6, 7, 0x0F, 2
+HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX, CHUNK_INDEX = range(1, 9)
+STATISTICS, DATA_END = 0x0B, 0x0F
 FORMATS = {
     "ros2msg": MessageDefinitionFormat.MSG,
     "ros1msg": MessageDefinitionFormat.MSG,
@@ -33,280 +31,181 @@ FORMATS = {
 RECORD = struct.Struct("<BQ")
 CHUNK_HEAD = struct.Struct("<QQQII")  # first and last log time, size, CRC, length of the compression's name
 MESSAGE_HEAD = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
+_FOOTER = struct.Struct("<BQQQI8s")  # opcode, length, start of the summary and of its offsets, CRC, magic
+_STATISTICS = struct.Struct("<QHIIIIQQ")  # messages, schemas, channels, ..., chunks, first and last log time
+_COUNT = struct.Struct("<HQ")
 
-Message = tuple[Connection, int, bytes | memoryview]
+NOTHING = MessageDefinition(MessageDefinitionFormat.NONE, "")
 
 
-class McapFile(McapReader):
-    """Messages in order of log time. A file without its index is scanned once, record by record.
+class Channels:
+    """The connections that schema and channel records make."""
 
-    Differs from rosbags' reader where a file is not as it should be: the end may be missing, even in the
-    middle of a compressed chunk; a damaged chunk costs its own messages only; messages outside chunks
-    may be out of order; channels that are not ROS do not matter.
-    """
+    def __init__(self) -> None:
+        self.schemas: dict[int, tuple[str, MessageDefinition]] = {}
+        self._channels: dict[int, tuple[int, str, str]] = {}
 
-    path: Path
-    format = "MCAP"
+    def __contains__(self, channel: object) -> bool:
+        return channel in self._channels
 
-    def __init__(self, path: Path) -> None:
-        super().__init__(path)
-        self.unread = 0  # bytes of the incomplete record at the end
-        self._size = 0
-        self._rescued = 0  # messages found in them
-        self.damaged_chunks = 0
-        self.damaged_messages = 0
-        self._flat: I64 = np.zeros((0, 4), np.int64)  # messages outside chunks: time, channel, offset, size
-        self._definitions: dict[int, tuple[str, MessageDefinition]] = {}
+    def __bool__(self) -> bool:
+        return bool(self._channels)
 
-    def open(self) -> None:
-        """Read the index, or make one.
+    def note(self, opcode: int, record: bytes) -> None:
+        """Take what a schema or a channel says; of two with one number, the first."""
+        if opcode == SCHEMA:
+            (number,) = struct.unpack_from("<H", record)
+            msgtype, encoding, text = strings(record, 2, 3)
+            kind = FORMATS.get(encoding.decode(errors="replace"), MessageDefinitionFormat.NONE)
+            definition = MessageDefinition(kind, text.decode(errors="replace")) if kind.value else NOTHING
+            self.schemas.setdefault(number, (msgtype.decode(errors="replace"), definition))
+        elif opcode == CHANNEL:
+            number, schema = struct.unpack_from("<HH", record)
+            topic, form = (text.decode(errors="replace") for text in strings(record, 4, 2))
+            self._channels.setdefault(number, (schema, topic, form))
 
-        Raises:
-            UserError: there is no MCAP record in the file.
-        """
-        self._size = self.path.stat().st_size
-        with suppress(Exception):  # whatever rosbags stumbles over, the scan answers for
-            super().open()
-            if self.chunks and (
-                self.metadata.message_count == 0 or any(c.channel_count for c in self.chunks)
-            ):
-                return
-            super().close()
-        self.bio = self.path.open("rb")
-        if self.bio.read(len(MAGIC)) != MAGIC:
-            raise UserError(f"{self.path}: not an MCAP file")
-        self._scan(self.bio)
-
-    @property
-    def compression(self) -> str:
-        return ", ".join(sorted({c.compression for c in self.chunks} - {""}))
-
-    @property
-    def warnings(self) -> list[str]:
+    def connections(self, counts: Mapping[int, int]) -> list[Connection]:
         found = []
-        if self.unread:
+        for number, (schema, topic, encoding) in self._channels.items():
+            msgtype, definition = self.schemas.get(schema, ("", NOTHING))
+            extra = ConnectionExtRosbag2(encoding, [])
             found.append(
-                f"{self.path.name}: the file ends in the middle of a record (no footer): read "
-                f"{self.metadata.message_count} messages, {self._rescued} of them from the incomplete last "
-                f"{megabytes(self.unread)}; 'mcap recover' writes a sound copy"
-            )
-        if self.damaged_chunks:
-            found.append(
-                f"{self.path.name}: {self.damaged_chunks} damaged chunk(s) in the file: "
-                f"{self.damaged_messages} messages lost"
+                Connection(number, topic, msgtype, definition, "", counts.get(number, 0), extra, None)
             )
         return found
 
-    def messages(  # type: ignore[override]  # views of the chunk instead of copies
-        self, connections: Collection[Connection], start: int | None = None, stop: int | None = None
-    ) -> Generator[Message, None, None]:
-        """Messages of ``connections`` with start <= log time < stop, in order of log time."""
-        wanted = {c.id: c for c in connections}
-        low = 0 if start is None else start
-        high = 2**63 - 1 if stop is None else stop
-        sources: list[Iterator[tuple[int, Connection | None, bytes | memoryview]]] = [
-            self._chunk_messages(c, wanted, low, high)
-            for c in self.chunks
-            if c.message_start_time < high
-            and c.message_end_time >= low
-            and c.channel_count.keys() & wanted.keys()
-        ]
-        if len(self._flat):
-            sources.append(self._flat_messages(wanted, low, high))
-        for time, connection, data in heapq.merge(*sources, key=itemgetter(0)):
-            if connection is not None:
-                yield connection, time, data
 
-    def times(self, connections: Collection[Connection]) -> I64:
-        """Log times of all messages of ``connections``, sorted, from the index alone."""
-        wanted = {c.id for c in connections}
-        parts = [self._flat[np.isin(self._flat[:, 1], list(wanted)), 0]]
-        for chunk in self.chunks:
-            for channel in wanted & chunk.channel_count.keys():
-                offset = chunk.message_index_offsets.get(channel)
-                if offset is None:
-                    parts.append(np.array([t for c, t, _ in self._records(chunk) if c == channel], np.int64))
-                else:
-                    entries = np.frombuffer(self._read(offset + 15, 16 * chunk.channel_count[channel]), "<i8")
-                    parts.append(entries[::2])
-        return np.sort(np.concatenate(parts))
+def read_index(path: Path) -> Index:
+    """The index at the end of a file, which is believed where it agrees with the statistics.
 
-    def _read(self, offset: int, size: int) -> bytes:
-        assert self.bio is not None
-        self.bio.seek(offset)
-        return self.bio.read(size)
+    Raises:
+        DamageError: there is none, it ends early, or it disagrees with them.
+    """
+    file = Bytes(path)
+    try:
+        end = file.size - _FOOTER.size
+        if file.read(0, len(MAGIC)) != MAGIC:
+            raise DamageError("it does not begin as an MCAP file does")
+        if end < len(MAGIC):
+            raise DamageError("the file ends early (no footer)")
+        opcode, length, start, _, crc, magic = _FOOTER.unpack(file.read(end, _FOOTER.size))
+        if (opcode, length, magic) != (FOOTER, 20, MAGIC):
+            raise DamageError("the file ends early (no footer)")
+        if not start:
+            raise DamageError("it has no index")
+        if not len(MAGIC) <= start <= end:
+            raise DamageError("its footer is damaged")
+        summary = file.read(start, file.size - start)
+        if crc and crc32(summary[: -len(MAGIC) - 4]) != crc:
+            raise DamageError("its index does not fit its checksum")
+        index = _parse_summary(summary[: end - start], start)
+        for chunk in index.chunks[-1:]:  # where bytes are missing or too many, at least the last one is moved
+            at = chunk.data - RECORD.size - CHUNK_HEAD.size - len(chunk.compression) - 8
+            length = CHUNK_HEAD.size + len(chunk.compression) + 8 + chunk.packed
+            if file.read(at, RECORD.size) != RECORD.pack(CHUNK, length):
+                raise DamageError("its index leads to no chunk")
+            for channel in chunk.index:
+                read_times(file, chunk, channel)
+        return index
+    except (struct.error, IndexError, ValueError) as error:
+        raise DamageError(f"its index is damaged ({error})") from None
+    finally:
+        file.close()
 
-    def _chunk_messages(
-        self, chunk: ChunkInfo, wanted: dict[int, Connection], low: int, high: int
-    ) -> Iterator[tuple[int, Connection | None, bytes | memoryview]]:
-        # The merge draws the first item of every source at once: this one costs no reading.
-        yield chunk.message_start_time, None, b""
-        found = [(t, wanted[c], d) for c, t, d in self._records(chunk) if c in wanted and low <= t < high]
-        found.sort(key=itemgetter(0))
-        yield from found
 
-    def _flat_messages(
-        self, wanted: dict[int, Connection], low: int, high: int
-    ) -> Iterator[tuple[int, Connection | None, bytes | memoryview]]:
-        time, channel = self._flat[:, 0], self._flat[:, 1]
-        chosen = self._flat[np.isin(channel, list(wanted)) & (time >= low) & (time < high)]
-        for t, c, offset, size in chosen[np.argsort(chosen[:, 0], kind="stable")].tolist():
-            yield t, wanted[c], self._read(offset, size)
-
-    def _records(self, chunk: ChunkInfo) -> Iterator[tuple[int, int, memoryview]]:
-        """Channel, log time and payload of each message of a chunk; schemas and channels are noted."""
-        try:
-            data = self._chunk_data(chunk)
-        except (ValueError, RuntimeError, zstd.ZstdError):
-            self.damaged_chunks += 1
-            self.damaged_messages += sum(chunk.channel_count.values())
-            return
-        offset = 0
-        while offset + RECORD.size <= len(data):
-            opcode, size = RECORD.unpack_from(data, offset)
-            offset += RECORD.size
-            if offset + size > len(data):
-                return
-            record = data[offset : offset + size]
-            offset += size
-            if opcode == MESSAGE:
-                channel, _, time, _ = MESSAGE_HEAD.unpack_from(record)
-                yield channel, time, record[MESSAGE_HEAD.size :]
-            else:
-                self._note(opcode, record)
-
-    def _chunk_data(self, chunk: ChunkInfo) -> memoryview:
-        head = self._read(chunk.chunk_start_offset + RECORD.size, CHUNK_HEAD.size)
-        _, _, size, crc, name = CHUNK_HEAD.unpack(head)
-        packed = self._read(
-            chunk.chunk_start_offset + RECORD.size + CHUNK_HEAD.size + name + 8, chunk.compressed_size
+def _parse_summary(summary: bytes, end: int) -> Index:
+    channels, chunks = Channels(), []
+    statistics: tuple[Any, ...] | None = None
+    counted: Mapping[int, int] = {}
+    offset = 0
+    while offset < len(summary):
+        opcode, length = RECORD.unpack_from(summary, offset)
+        offset += RECORD.size
+        if offset + length > len(summary):
+            raise DamageError("its index ends early")
+        record = summary[offset : offset + length]
+        offset += length
+        if opcode in (SCHEMA, CHANNEL):
+            channels.note(opcode, record)
+        elif opcode == CHUNK_INDEX:
+            chunks.append(_parse_chunk_index(record, end))
+        elif opcode == STATISTICS:
+            statistics = _STATISTICS.unpack_from(record)
+            (size,) = struct.unpack_from("<I", record, _STATISTICS.size)
+            counted = dict(_COUNT.iter_unpack(record[_STATISTICS.size + 4 :][:size]))
+    if statistics is None:
+        raise DamageError("it has no statistics that its index could be held against")
+    counts: Counter[int] = Counter()
+    for chunk in chunks:
+        counts.update(chunk.counts)
+    total, chunk_count, first, last = statistics[0], statistics[5], statistics[6], statistics[7]
+    index = Index(chunks, channels.connections(counts))
+    if counts.total() != total or (chunk_count, counts) != (len(chunks), Counter(counted)):
+        raise DamageError(
+            f"its index, of {len(chunks)} chunks with {counts.total()} messages, disagrees with its "
+            f"statistics, of {chunk_count} with {total}"
+            if chunks
+            else "it has no index of chunks"
         )
-        if chunk.compression == "zstd":
-            data = zstd.ZstdDecompressor().decompress(packed)
-        elif chunk.compression == "lz4":
-            data = LZ4FrameDecompressor().decompress(packed)
-        elif chunk.compression == "":
-            data = packed
-        else:
-            raise UserError(f"{self.path}: chunk compression '{chunk.compression}' is not known")
-        cut = chunk.chunk_start_offset + chunk.chunk_length > self._size
-        if not cut and (len(data) != size or (crc and crc32(data) != crc)):
-            raise ValueError("the chunk's content does not fit its checksum")
-        return memoryview(data)
-
-    def _note(self, opcode: int, record: memoryview) -> None:
-        if opcode == SCHEMA:
-            (number,) = struct.unpack_from("<H", record)
-            msgtype, encoding, text = _strings(record, 2, 3)
-            kind = FORMATS.get(encoding.decode(), MessageDefinitionFormat.NONE)
-            definition = MessageDefinition(kind, text.decode() if kind.value else "")
-            self._definitions[number] = msgtype.decode(), definition
-        elif opcode == CHANNEL:
-            number, schema = struct.unpack_from("<HH", record)
-            topic, encoding = _strings(record, 4, 2)
-            name, definition = self._definitions.get(
-                schema, ("", MessageDefinition(MessageDefinitionFormat.NONE, ""))
-            )
-            if all(c.id != number for c in self.connections):
-                ext = ConnectionExtRosbag2(encoding.decode(), [])
-                self.connections.append(
-                    Connection(number, topic.decode(), name, definition, "", 0, ext, self)
-                )
-
-    def _scan(self, bio: IO[bytes]) -> None:
-        """Rebuild the index: chunks are jumped over unless they hold a channel not yet known."""
-        size = self._size
-        offset = len(MAGIC)
-        flat: list[tuple[int, int, int, int]] = []
-        indexed = True  # the newest chunk has been asked for its channels
-        while True:
-            bio.seek(offset)
-            head = bio.read(RECORD.size)
-            opcode, length = RECORD.unpack(head) if len(head) == RECORD.size else (0, 0)
-            if opcode != MESSAGE_INDEX and not indexed:
-                self._complete_chunk()
-                indexed = True
-            body = offset + RECORD.size
-            if opcode in (DATA_END, FOOTER):
-                break
-            if opcode == 0 or body + length > size:
-                self.unread = size - offset
-                if opcode == CHUNK and self._note_chunk(offset, length, size):
-                    self._complete_chunk()
-                    self._rescued = sum(self.chunks[-1].channel_count.values())
-                break
-            if opcode in (SCHEMA, CHANNEL):
-                self._note(opcode, memoryview(bio.read(length)))
-            elif opcode == MESSAGE:
-                channel, _, time, _ = MESSAGE_HEAD.unpack(bio.read(MESSAGE_HEAD.size))
-                flat.append((time, channel, body + MESSAGE_HEAD.size, length - MESSAGE_HEAD.size))
-            elif opcode == CHUNK:
-                indexed = not self._note_chunk(offset, length, size)
-            elif opcode == MESSAGE_INDEX and self.chunks:
-                channel, entries = struct.unpack("<HI", bio.read(6))
-                if entries:
-                    self.chunks[-1].message_index_offsets[channel] = offset
-                    self.chunks[-1].channel_count[channel] = entries // 16
-            offset = body + length
-        self._flat = np.array(flat, np.int64).reshape(-1, 4)
-        self._summarise()
-
-    def _note_chunk(self, offset: int, length: int, file_size: int) -> bool:
-        head = self._read(offset + RECORD.size, CHUNK_HEAD.size + 64)
-        if len(head) < CHUNK_HEAD.size:
-            return False
-        first, last, size, _, name = CHUNK_HEAD.unpack_from(head)
-        data = offset + RECORD.size + CHUNK_HEAD.size + name + 8
-        compression = head[CHUNK_HEAD.size : CHUNK_HEAD.size + name].decode(errors="replace")
-        packed = min(offset + RECORD.size + length, file_size) - data
-        if packed <= 0:
-            return False
-        self.chunks.append(
-            ChunkInfo(first, last, offset, RECORD.size + length, {}, 0, compression, packed, size, {})
-        )
-        return True
-
-    def _complete_chunk(self) -> None:
-        """Look into the newest chunk where its message index is missing or names an unknown channel."""
-        counts = self.chunks[-1].channel_count
-        if counts and counts.keys() <= {c.id for c in self.connections}:
-            return
-        found: dict[int, int] = defaultdict(int)
-        for channel, _, _ in self._records(self.chunks[-1]):
-            found[channel] += 1
-        if not counts:
-            counts.update(found)
-
-    def _summarise(self) -> None:
-        counts: dict[int, int] = defaultdict(int)
-        for chunk in self.chunks:
-            for channel, count in chunk.channel_count.items():
-                counts[channel] += count
-        for channel, count in zip(*np.unique(self._flat[:, 1], return_counts=True), strict=True):
-            counts[int(channel)] += int(count)
-        self.connections = [c._replace(msgcount=counts[c.id]) for c in self.connections]
-        filled = [c for c in self.chunks if c.channel_count]
-        first = [c.message_start_time for c in filled] + self._flat[:1, 0].tolist()
-        last = [c.message_end_time for c in filled]
-        if len(self._flat):
-            first.append(int(self._flat[:, 0].min()))
-            last.append(int(self._flat[:, 0].max()))
-        start, end = min(first, default=2**63 - 1), max(last, default=-1) + 1
-        self.metadata = ReaderMetadata(
-            max(0, end - start), start, end, sum(counts.values()), None, None, None, None
-        )
+    if total and index.span != (first, last + 1):
+        raise DamageError("its index disagrees with its statistics on the time")
+    if not counts.keys() <= {c.id for c in index.connections}:
+        raise DamageError("its index has messages on channels that it does not describe")
+    return index
 
 
-def _strings(record: memoryview, offset: int, count: int) -> list[bytes]:
-    """``count`` strings, each behind its length."""
+def _parse_chunk_index(record: bytes, end: int) -> Chunk:
+    start, last, offset, length, size = struct.unpack_from("<QQQQI", record)
+    at = 36 + size
+    index_length, name_size = struct.unpack_from("<QI", record, at)
+    name = record[at + 12 : at + 12 + name_size]
+    packed, unpacked = struct.unpack_from("<QQ", record, at + 12 + name_size)
+    listed = dict(_COUNT.iter_unpack(record[36:at]))
+    stop = offset + length + index_length  # of the message indexes, one behind the other
+    if not (offset < offset + length <= stop <= end) or max(start, last) >= LAST or packed > length:
+        raise DamageError("its index leads out of the file, or out of time")
+    if listed and (min(listed.values()) < offset + length or max(listed.values()) >= stop):
+        raise DamageError("its index leads out of the file")
+    order = sorted((at, channel) for channel, at in listed.items())
+    counts = {}
+    for (at, channel), (after, _) in zip(order, [*order[1:], (stop, 0)], strict=True):
+        if (count := (after - at - 15) // 16) > 0:
+            counts[channel] = count
+    data = offset + RECORD.size + CHUNK_HEAD.size + len(name) + 8
+    return Chunk(
+        start, last, data, packed, unpacked, name.decode(), counts, index={c: listed[c] for c in counts}
+    )
+
+
+def read_times(file: Bytes, chunk: Chunk, channel: int) -> I64:
+    """Log times of the messages of a channel, as a message index has them.
+
+    Raises:
+        DamageError: it is none, or it disagrees with the index of the chunk.
+    """
+    entries = 16 * chunk.counts[channel]
+    record = file.read(chunk.index[channel], 15 + entries)
+    expected = struct.pack("<BQHI", MESSAGE_INDEX, 6 + entries, channel, entries)
+    if record[:15] != expected or len(record) != 15 + entries:
+        raise DamageError("the message index of a chunk is damaged")
+    times: I64 = np.frombuffer(record, "<i8", offset=15)[::2]
+    if len(times) and not chunk.start <= times.min() <= times.max() <= chunk.end:
+        raise DamageError("the message index of a chunk disagrees with that of the chunks")
+    return times
+
+
+def strings(record: bytes, offset: int, count: int) -> list[bytes]:
+    """``count`` strings, each behind its length.
+
+    Raises:
+        struct.error: the record ends before them.
+    """
     found = []
     for _ in range(count):
         (size,) = struct.unpack_from("<I", record, offset)
-        found.append(bytes(record[offset + 4 : offset + 4 + size]))
-        offset += 4 + size
+        offset += 4
+        if offset + size > len(record):
+            raise struct.error("a string ends behind its record")
+        found.append(bytes(record[offset : offset + size]))
+        offset += size
     return found
-
-
-def megabytes(size: int) -> str:
-    """A file size for people: ``3.1 MB``."""
-    return f"{size / 1e6:.1f} MB" if size >= 100_000 else f"{size / 1e3:.1f} kB"

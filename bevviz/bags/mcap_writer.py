@@ -12,8 +12,14 @@ from types import TracebackType
 from typing import IO, Self
 
 from backports import zstd
-from rosbags.interfaces import Connection, ConnectionExtRosbag2, MessageDefinition, MessageDefinitionFormat
-from rosbags.rosbag2.metadata import dump_qos_v9
+from rosbags.interfaces import (
+    Connection,
+    ConnectionExtRosbag2,
+    MessageDefinition,
+    MessageDefinitionFormat,
+    Qos,
+    QosTime,
+)
 from ruamel.yaml import YAML
 
 from bevviz import __version__
@@ -123,7 +129,7 @@ class McapWriter:
         if isinstance(extra, ConnectionExtRosbag2) and extra.offered_qos_profiles:
             # So that a player offers what is published once to whoever comes late, as the robot did.
             profiles = BytesIO()
-            YAML(typ="safe", pure=True).dump(dump_qos_v9(extra.offered_qos_profiles), profiles)
+            YAML(typ="safe", pure=True).dump([_profile(qos) for qos in extra.offered_qos_profiles], profiles)
             metadata = _text("offered_qos_profiles") + _text(profiles.getvalue().decode())
         self._declare(
             CHANNEL,
@@ -190,6 +196,25 @@ class McapWriter:
         self._file.write(self._declared.getvalue() + _record(STATISTICS, about + _bytes(counts)))
         self._file.write(self._chunks.getvalue())
         self._file.write(_record(FOOTER, struct.pack("<QQI", summary, 0, 0)) + MAGIC)
+
+
+def _profile(qos: Qos) -> dict[str, object]:
+    """A quality of service as metadata.yaml of version 9 has it."""
+
+    def duration(time: QosTime) -> dict[str, int]:
+        return {"sec": time.sec, "nsec": time.nsec}
+
+    return {
+        "history": qos.history.name.lower(),
+        "depth": qos.depth,
+        "reliability": qos.reliability.name.lower(),
+        "durability": qos.durability.name.lower(),
+        "deadline": duration(qos.deadline),
+        "lifespan": duration(qos.lifespan),
+        "liveliness": qos.liveliness.name.lower(),
+        "liveliness_lease_duration": duration(qos.liveliness_lease_duration),
+        "avoid_ros_namespace_conventions": qos.avoid_ros_namespace_conventions,
+    }
 
 
 def _record(opcode: int, content: bytes) -> bytes:

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import heapq
+import re
 from collections import Counter
-from collections.abc import Collection, Iterator, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache, cached_property
+from functools import cached_property
 from operator import itemgetter
 from pathlib import Path, PurePath
-from tempfile import TemporaryDirectory
+from tempfile import TemporaryDirectory, mkdtemp
 from types import TracebackType
 from typing import Any, Literal
 
@@ -23,27 +23,59 @@ from rosbags.interfaces import (
     MessageDefinitionFormat,
 )
 from rosbags.typesys import Stores, TypesysError, get_types_from_idl, get_types_from_msg, get_typestore
-from rosbags.typesys.msg import normalize_msgtype
 from rosbags.typesys.store import Typestore
+from tqdm import tqdm
 
-from bevviz.bags import mcap, ros1, sqlite
-from bevviz.bags.mcap import McapFile, megabytes
-from bevviz.bags.ros1 import Ros1File
-from bevviz.bags.sqlite import SqliteFile
+from bevviz.bags import mcap, mcap_scan, ros1, sqlite
+from bevviz.bags.chunks import Form, SoundChunks, rescue
+from bevviz.bags.reader import (
+    LONGEST,
+    PIECE,
+    BagFile,
+    Bytes,
+    Reader,
+    SoundReader,
+    megabytes,
+    normalized,
+)
+from bevviz.bags.sqlite import SoundSqlite, SqliteRescuer
 from bevviz.errors import UserError
 from bevviz.frame import I64
 from bevviz.ros import vision_msgs
 from bevviz.ros.messages import MessageError, read_header
 from bevviz.ros.roles import Topic
 
-BagFile = McapFile | SqliteFile | Ros1File
-
-KINDS: Mapping[bytes, type[BagFile]] = {
-    mcap.MAGIC: McapFile,
-    sqlite.MAGIC: SqliteFile,
-    ros1.MAGIC: Ros1File,
-}
 ZSTD = b"\x28\xb5\x2f\xfd"
+FRAME = re.compile(re.escape(ZSTD))
+
+
+@dataclass(frozen=True, slots=True)
+class Kind:
+    """A format of files."""
+
+    name: str
+    magic: bytes
+    suffix: str  # that rosbags knows it by
+    sound: Callable[[Path, Path], SoundReader]  # of the file, and of the same by a name with that suffix
+    rescue: Callable[[Path], Reader]
+
+
+def _of_chunks(name: str, magic: bytes, suffix: str, form: Form) -> Kind:
+    return Kind(
+        name,
+        magic,
+        suffix,
+        lambda path, public: SoundChunks(path, form, public),
+        lambda path: rescue(path, form),
+    )
+
+
+SQLITE = Kind("sqlite3", sqlite.MAGIC, ".db3", SoundSqlite, SqliteRescuer)
+KINDS = (
+    _of_chunks("MCAP", mcap.MAGIC, ".mcap", mcap_scan.FORM),
+    _of_chunks("ROS 1 bag", ros1.MAGIC, ".bag", ros1.FORM),
+    SQLITE,
+)
 OTHERS = {
     b"RRF": "a Rerun recording: open it with 'rerun'",
     b"PK\x03\x04": "a zip archive: unpack it first",
@@ -55,8 +87,6 @@ OTHERS = {
 }
 METADATA = "metadata.yaml"
 
-_normalized = cache(normalize_msgtype)  # which takes as long as decoding a small message
-
 
 @dataclass(frozen=True, slots=True)
 class RawMessage:
@@ -66,8 +96,18 @@ class RawMessage:
     connection: Connection
 
     def content(self) -> bytes | memoryview:
-        """The serialised message; a compressed one is unpacked."""
-        return zstd.decompress(self.data) if self.data[:4] == ZSTD else self.data
+        """The serialised message; a compressed one is unpacked.
+
+        Raises:
+            zstd.ZstdError: it cannot be, or has more than ``LONGEST`` bytes.
+        """
+        if self.data[:4] != ZSTD:
+            return self.data
+        stream = zstd.ZstdDecompressor()
+        data = stream.decompress(self.data, LONGEST)
+        if not stream.eof:
+            raise zstd.ZstdError("the end of the compressed message is missing, or it is too long")
+        return data
 
     def header(self) -> tuple[int, str]:
         """Stamp in nanoseconds and frame_id of a message that begins with a Header; the rest is not decoded.
@@ -137,12 +177,12 @@ class Recording:
     @cached_property
     def start(self) -> int:
         """Log time of the first message, in nanoseconds."""
-        return min(_span(f)[0] for f in self.files if _span(f)[1])
+        return min(f.span[0] for f in self.files if f.span[1])
 
     @cached_property
     def end(self) -> int:
         """Log time of the last message, in nanoseconds."""
-        return max(_span(f)[1] for f in self.files) - 1
+        return max(f.span[1] for f in self.files) - 1
 
     @property
     def message_count(self) -> int:
@@ -170,7 +210,7 @@ class Recording:
         return tuple(
             Topic(
                 name,
-                _normalized(first[name].msgtype),
+                normalized(first[name].msgtype),
                 counts[name],
                 self._frame_id(name) if counts[name] and self._has_header(first[name]) else "",
                 (counts[name] - 1) / duration if counts[name] > 1 and duration else None,
@@ -202,7 +242,7 @@ class Recording:
             MessageError: the data does not fit the definition, or there is none.
         """
         connection = message.connection
-        msgtype = _normalized(connection.msgtype)
+        msgtype = normalized(connection.msgtype)
         try:
             data = message.content()
             store = self._store(connection)
@@ -219,7 +259,7 @@ class Recording:
 
     def encode(self, message: RawMessage, content: Any) -> memoryview:
         """``content``, as ``decode`` gave it and changed since, serialised as the message was."""
-        store, msgtype = self._store(message.connection), _normalized(message.connection.msgtype)
+        store, msgtype = self._store(message.connection), normalized(message.connection.msgtype)
         if is_ros1(message.connection):
             return store.serialize_ros1(content, msgtype)
         return store.serialize_cdr(content, msgtype)
@@ -230,7 +270,7 @@ class Recording:
             return connection.msgdef
         version: Literal[1, 2] = 1 if is_ros1(connection) else 2
         try:
-            msgtype = _normalized(connection.msgtype)
+            msgtype = normalized(connection.msgtype)
             text, _ = self._store(connection).generate_msgdef(msgtype, ros_version=version)
         except (KeyError, TypesysError):
             return connection.msgdef
@@ -258,7 +298,7 @@ class Recording:
 
     def _has_header(self, connection: Connection) -> bool:
         try:
-            _, fields = self._store(connection).fielddefs[_normalized(connection.msgtype)]
+            _, fields = self._store(connection).fielddefs[normalized(connection.msgtype)]
         except KeyError:
             return False
         return bool(fields) and fields[0][1][1] == "std_msgs/msg/Header"
@@ -344,43 +384,72 @@ class Recording:
             path = self._unpack(path)
             with path.open("rb") as file:
                 head = file.read(16)
-        if not head:
+        if kind := next((kind for kind in KINDS if head.startswith(kind.magic)), None):
+            return self._open_as(kind, path)
+        what = next((text for magic, text in OTHERS.items() if head.startswith(magic)), None)
+        # The first bytes may be damaged; and of a database all may still lie in its log.
+        kind = next((kind for kind in KINDS if path.suffix == kind.suffix), None)
+        if not head and not (kind is SQLITE and sqlite.log_of(path).exists()):
             raise UserError(f"{path}: the file is empty")
-        kind = next((kind for magic, kind in KINDS.items() if head.startswith(magic)), None)
-        if kind is None:
-            what = next((text for magic, text in OTHERS.items() if head.startswith(magic)), None)
-            raise UserError(
-                f"{path}: {what or 'not a bag: neither MCAP, nor sqlite3, nor ROS 1 by its first bytes'}"
-            )
-        opened = kind(path)
-        try:
-            opened.open()
-        except BaseException:
-            with suppress(Exception):  # it may not have come as far as opening the file
-                opened.close()
-            raise
-        return opened
+        if kind and not what:
+            opened = self._open_as(kind, path)
+            if any(c.msgcount for c in opened.connections):
+                return opened
+            opened.close()
+        raise UserError(
+            f"{path}: {what or 'not a bag: neither MCAP, nor sqlite3, nor ROS 1 by its first bytes'}"
+        )
+
+    def _open_as(self, kind: Kind, path: Path) -> BagFile:
+        public = path
+        if path.suffix != kind.suffix or set("?#%") & set(str(path)):  # the latter mean something in a URI
+            public = Path(mkdtemp(dir=self._folder.name)) / f"bag{kind.suffix}"
+            public.symlink_to(path.resolve())
+        return BagFile(path, kind.name, lambda: kind.sound(path, public), lambda: kind.rescue(path))
 
     def _unpack(self, path: Path) -> Path:
-        target = Path(self._folder.name) / f"{len(self.files)}" / path.stem
-        target.parent.mkdir(exist_ok=True)
-        stream, damaged = zstd.ZstdDecompressor(), False
-        with path.open("rb") as source, target.open("wb") as out:
-            while block := source.read(1 << 20):
-                try:
-                    out.write(stream.decompress(block))
-                    while stream.eof and stream.unused_data:  # one frame behind another
-                        block, stream = stream.unused_data, zstd.ZstdDecompressor()
-                        out.write(stream.decompress(block))
-                except (zstd.ZstdError, EOFError):
-                    damaged = True
-                    break
-        if damaged or not stream.eof:
+        target = Path(mkdtemp(dir=self._folder.name)) / path.stem
+        damaged, whole = unpack_file(path, target)
+        if damaged or not whole:
+            what = f"{damaged} damaged place(s) in it" if damaged else "its end is missing"
             self._notes.append(
-                f"{path.name}: the compressed file is damaged or its end is missing: "
+                f"{path.name}: the compressed file is damaged ({what}): "
                 f"{megabytes(target.stat().st_size)} could be unpacked"
             )
         return target
+
+
+def unpack_file(path: Path, target: Path) -> tuple[int, bool]:
+    """Unpack a zstd file; behind a damaged place its next frame is searched for.
+
+    Returns:
+        How many places are damaged, and whether the last frame is whole.
+    """
+    source, damaged, stream = Bytes(path), 0, zstd.ZstdDecompressor()
+    bar = tqdm(
+        total=source.size, unit="B", unit_scale=True, desc=f"unpack {path.name}", delay=1, disable=None
+    )
+    try:
+        with target.open("wb") as out, bar:
+            offset = 0
+            while offset < source.size:
+                # In small pieces: what the decompressor makes of the one that it stumbles over is lost.
+                piece = source.read(offset, PIECE)
+                try:
+                    out.write(stream.decompress(piece))
+                    offset += len(piece) - len(stream.unused_data)
+                    found = offset if stream.eof else None
+                except zstd.ZstdError:
+                    damaged += 1
+                    found = next(source.search(FRAME, offset + 1), source.size)
+                bar.update(offset - bar.n)
+                if found is not None and found < source.size:
+                    offset, stream = found, zstd.ZstdDecompressor()
+                elif found is not None:
+                    break
+    finally:
+        source.close()
+    return damaged, stream.eof
 
 
 def bag_files(folder: Path) -> list[Path]:
@@ -400,12 +469,6 @@ def is_ros1(connection: Connection) -> bool:
     return isinstance(extra, ConnectionExtRosbag1) or extra.serialization_format == "ros1"
 
 
-def _span(file: BagFile) -> tuple[int, int]:
-    """Log time of the first message, and just after that of the last one; 0 where there is none."""
-    about = file if isinstance(file, Ros1File) else file.metadata
-    return about.start_time, about.end_time
-
-
 def _lazily(
     file: BagFile, topics: Collection[str], start: int | None, stop: int | None
 ) -> Iterator[tuple[int, RawMessage | None]]:
@@ -416,14 +479,14 @@ def _lazily(
     ]
     if not connections:
         return
-    yield _span(file)[0], None
+    yield file.span[0], None
     for connection, time, data in file.messages(connections, start, stop):
         yield time, RawMessage(connection.topic, time, data, connection)
 
 
 def _defined(connection: Connection) -> Typestore:
     """A store of the types that a connection's own definition lists."""
-    text, msgtype = connection.msgdef.data, _normalized(connection.msgtype)
+    text, msgtype = connection.msgdef.data, normalized(connection.msgtype)
     if connection.msgdef.format == MessageDefinitionFormat.MSG:
         types = get_types_from_msg(text, msgtype)
     else:

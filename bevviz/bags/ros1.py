@@ -1,249 +1,369 @@
-"""ROS 1 bags: rosbags' reader, able to rebuild the index of a bag that was never closed or is cut."""
+"""ROS 1 bags (http://wiki.ros.org/Bags/Format/2.0): the index of a sound one, a scan of a damaged one."""
 
 from __future__ import annotations
 
-import heapq
-from bz2 import BZ2Decompressor
-from collections import defaultdict
-from collections.abc import Callable, Collection, Generator
-from contextlib import suppress
-from io import BytesIO
+import re
+import struct
+from array import array
+from collections import Counter, defaultdict
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO, cast
 
 import numpy as np
-from lz4.frame import LZ4FrameDecompressor  # type: ignore[import-untyped]
-from rosbags.interfaces import (
-    Connection,
-    ConnectionExtRosbag1,
-    MessageDefinition,
-    MessageDefinitionFormat,
-)
+from rosbags.interfaces import Connection, ConnectionExtRosbag1, MessageDefinition, MessageDefinitionFormat
 from rosbags.rosbag1 import Reader
-from rosbags.rosbag1.reader import (
-    Chunk,
-    ChunkInfo,
-    Header,
-    IndexData,
-    ReaderError,
-    RecordType,
-    normalize,
-    read_bytes,
-    read_uint32,
-)
-from rosbags.typesys.msg import normalize_msgtype
 
-from bevviz.bags.mcap import megabytes
-from bevviz.errors import UserError
+from bevviz.bags.chunks import Chunk, Form, Index, Scan
+from bevviz.bags.reader import LAST, Bytes, Content, DamageError, normalized, unpack
 from bevviz.frame import I64
 
 MAGIC = b"#ROSBAG V2.0\n"
-# Unlike the one-shot functions these give what there is of a stream whose end is missing.
-DECOMPRESSORS: dict[str, Callable[[bytes], bytes]] = {
-    "none": bytes,
-    "bz2": lambda data: BZ2Decompressor().decompress(data),
-    "lz4": lambda data: cast(bytes, LZ4FrameDecompressor().decompress(data)),
+OPCODE = re.compile(rb"(?=\x04\0\0\0op=)")  # every header has one
+LONGEST_HEADER = 1 << 16  # bytes; but for what a connection's data says, which is of the same form
+SEARCHED = 160  # bytes of a header that may stand before its opcode
+
+# What a record is, is told by its fields: an opcode can be damaged without a trace, the others hardly.
+KINDS: Mapping[str, Mapping[str, int | None]] = {  # fields and their sizes
+    "chunk": {"compression": None, "size": 4},
+    "message": {"conn": 4, "time": 8},
+    "connection": {"conn": 4, "topic": None},
+    "index": {"ver": 4, "conn": 4, "count": 4},
+    "chunk info": {"ver": 4, "chunk_pos": 8, "start_time": 8, "end_time": 8, "count": 4},
+    "bag": {"index_pos": 8, "conn_count": 4, "chunk_count": 4},
 }
-LONGEST_HEADER = 1 << 24
+Fields = dict[str, bytes]
 
 
-class Ros1File(Reader):
-    """Messages in order of log time. A bag without its index is scanned once, chunk by chunk."""
+@dataclass(slots=True)
+class Record:
+    kind: str  # one of KINDS, "": another one
+    fields: Fields
+    start: int  # offset
+    body: int  # offset of the data
+    end: int  # offset; beyond that of the file where the record is cut
 
-    path: Path
-    format = "ROS 1 bag"
+    def number(self, name: str) -> int:
+        return int.from_bytes(self.fields[name], "little")
 
-    def __init__(self, path: Path) -> None:
-        super().__init__(path)
-        self.unread = 0  # bytes of the incomplete record at the end
-        self.lost_messages = 0
-        self._rebuilt = False
-        self._rescued = 0  # messages found in the incomplete record
-        self._damaged: set[int] = set()  # chunks
-        self._unpacked: dict[int, bytes] = {}
+    def time(self, name: str) -> int:
+        """Nanoseconds."""
+        sec, nsec = struct.unpack("<II", self.fields[name])
+        return int(sec) * 10**9 + int(nsec)
 
-    def open(self) -> None:
-        """Read the index, or make one.
 
-        Raises:
-            UserError: not a ROS 1 bag.
-        """
-        with suppress(Exception):  # whatever rosbags stumbles over, the scan answers for
-            super().open()
-            if self.chunk_infos:
-                return
-            super().close()
-        self.bio = self.path.open("rb")
-        if self.bio.read(len(MAGIC)) != MAGIC:
-            raise UserError(f"{self.path}: not a ROS 1 bag of version 2.0")
-        self.connections, self.chunk_infos, self.chunks = [], [], {}
-        self._scan(self.bio)
+def read_record(source: Bytes, offset: int) -> Record | None:
+    """The record at an offset, None where there is none. Its data may be cut."""
+    size = int.from_bytes(source.read(offset, 4), "little")
+    if not 4 <= size <= LONGEST_HEADER:
+        return None
+    fields = read_fields(source.read(offset + 4, size), size)
+    length = source.read(offset + 4 + size, 4)
+    if fields is None or len(length) < 4 or len(fields.get("op", b"")) != 1:
+        return None
+    kind = next((name for name, layout in KINDS.items() if _fits(fields, layout)), "")
+    body = offset + size + 8
+    return Record(kind, fields, offset, body, body + int.from_bytes(length, "little"))
 
-    @property
-    def compression(self) -> str:
-        """Of the first chunk: a recorder does not change it."""
-        assert self.bio is not None
-        for position in self.chunks:
-            self.bio.seek(position)
-            name = Header.read(self.bio).get_string("compression")
-            return "" if name == "none" else name
-        return ""
 
-    @property
-    def warnings(self) -> list[str]:
-        found = []
-        if self._rebuilt:
-            rest = (
-                f", {self._rescued} of them from the incomplete last {megabytes(self.unread)}"
-                if self.unread
-                else ""
-            )
-            found.append(
-                f"{self.path.name}: the bag's index is missing (not closed, or cut): read "
-                f"{self.message_count} messages{rest}; 'rosbag reindex' repairs the file"
-            )
-        if self._damaged:
-            found.append(
-                f"{self.path.name}: {len(self._damaged)} damaged chunk(s): {self.lost_messages} messages lost"
-            )
-        return found
+def read_fields(header: bytes, size: int) -> Fields | None:
+    """The fields of a header of ``size`` bytes, None where it is none."""
+    if len(header) < size:
+        return None
+    fields: Fields = {}
+    at = 0
+    while at < size:
+        length = int.from_bytes(header[at : at + 4], "little")
+        name, equals, value = header[at + 4 : at + 4 + length].partition(b"=")
+        at += 4 + length
+        if not equals or at > size or not name.isascii():
+            return None
+        fields[name.decode()] = value
+    return fields
 
-    @property
-    def message_count(self) -> int:
-        return sum(c.msgcount for c in self.connections)
 
-    def messages(
-        self, connections: Collection[Connection] = (), start: int | None = None, stop: int | None = None
-    ) -> Generator[tuple[Connection, int, bytes], None, None]:
-        """Messages of ``connections`` with start <= log time < stop, in order of log time."""
-        wanted = {c.id: c for c in connections}
-        for entry in heapq.merge(*(self.indexes[number] for number in wanted)):
-            if start is not None and entry.time < start:
-                continue
-            if stop is not None and entry.time >= stop:
-                return
-            try:
-                number, data = self._message(entry)
-            except (ReaderError, OSError, RuntimeError, ValueError):
-                self._damaged.add(entry.chunk_pos)
-                self.lost_messages += 1
-                continue
-            yield wanted[number], entry.time, data
+def _fits(fields: Fields, layout: Mapping[str, int | None]) -> bool:
+    return all(name in fields and size in (None, len(fields[name])) for name, size in layout.items())
 
-    def times(self, connections: Collection[Connection]) -> I64:
-        """Log times of all messages of ``connections``, sorted, from the index alone."""
-        return np.sort(np.array([e.time for c in connections for e in self.indexes[c.id]], np.int64))
 
-    def _message(self, entry: IndexData) -> tuple[int, bytes]:
-        records = BytesIO(self._chunk_data(entry.chunk_pos))
-        records.seek(entry.offset)
-        while (header := Header.read(records)).get_uint8("op") == RecordType.CONNECTION:
-            records.seek(read_uint32(records), 1)
-        if header.get_time("time") != entry.time:
-            raise ReaderError("the index leads to another message")
-        return header.get_uint32("conn"), read_bytes(records, read_uint32(records))
+def _is_sane(record: Record, size: int) -> bool:
+    """Whether its data have the size that its fields say, and end within ``size`` bytes or are a chunk."""
+    length = record.end - record.body
+    if record.kind == "index":
+        return length == 12 * record.number("count") and record.end <= size
+    if record.kind == "chunk info":
+        return length == 8 * record.number("count") and record.end <= size
+    if record.kind == "message":
+        return record.end <= size and record.time("time") < LAST
+    if record.kind == "chunk" and record.fields["compression"] == b"none":
+        return length == record.number("size")
+    return bool(record.kind) and (record.end <= size or record.kind == "chunk")
 
-    def _chunk_data(self, position: int) -> bytes:
-        """Content of a chunk. Two are kept, for time order goes to and fro between neighbours."""
-        if position not in self._unpacked:
-            assert self.bio is not None
-            if position in self._damaged:
-                raise ReaderError("damaged chunk")
-            chunk = self.chunks[position]
-            self.bio.seek(chunk.datapos)
-            if len(self._unpacked) > 1:
-                del self._unpacked[next(iter(self._unpacked))]
-            self._unpacked[position] = chunk.decompressor(self.bio.read(chunk.datasize))
-        return self._unpacked[position]
 
-    def _scan(self, bio: BinaryIO) -> None:
-        """Rebuild the index: chunks are unpacked only where their own index records do not suffice."""
-        self._rebuilt = True
-        size = self.path.stat().st_size
-        indexes: dict[int, list[IndexData]] = defaultdict(list)
-        chunk: dict[int, list[IndexData]] = {}  # entries of the newest chunk by connection
-        position = -1  # of that chunk, -1 once it is complete
+class Connections:
+    """The connections of a bag, as its connection records describe them."""
 
-        def complete() -> None:
-            entries = chunk
-            if not chunk or not chunk.keys() <= {c.id for c in self.connections}:
-                entries = self._look_into(position)
-            times = [e.time for found in entries.values() for e in found]
-            counts = {number: len(found) for number, found in entries.items()}
-            if times:
-                self.chunk_infos.append(ChunkInfo(position, min(times), max(times) + 1, counts))
-            for number, found in entries.items():
-                indexes[number] += found
+    def __init__(self) -> None:
+        self._known: dict[int, Connection] = {}
 
-        offset = len(MAGIC)
+    def __contains__(self, number: object) -> bool:
+        return number in self._known
+
+    def note(self, record: Record, data: bytes) -> None:
+        """Take a connection; of two with one number, the first."""
+        about = read_fields(data, len(data))
+        topic = record.fields["topic"].decode(errors="replace")
+        if about is None or not topic or record.number("conn") in self:
+            return
+        kind, digest, text = (
+            about.get(name, b"").decode(errors="replace") for name in ("type", "md5sum", "message_definition")
+        )
+        absolute, parts = topic[0] == "/", [part for part in topic.split("/") if part]
+        self._known[record.number("conn")] = Connection(
+            record.number("conn"),
+            "/" * absolute + "/".join(parts),
+            normalized(kind),
+            MessageDefinition(MessageDefinitionFormat.MSG, text),
+            digest,
+            0,
+            ConnectionExtRosbag1(None, None),
+            None,
+        )
+
+    def counted(self, counts: Mapping[int, int]) -> list[Connection]:
+        return [c._replace(msgcount=counts.get(number, 0)) for number, c in self._known.items()]
+
+
+# --- the index of a sound bag ------------------------------------------------------------------
+
+
+def read_index(path: Path) -> Index:
+    """The index of a bag, which is believed where its parts agree with each other.
+
+    Raises:
+        DamageError: there is none, it ends early, or it disagrees with itself.
+    """
+    file = Bytes(path)
+    try:
+        if file.read(0, len(MAGIC)) != MAGIC:
+            raise DamageError("it does not begin as a ROS 1 bag does")
+        head = read_record(file, len(MAGIC))
+        if head is None or head.kind != "bag":
+            raise DamageError("the bag's head is damaged")
+        if head.fields.get("encryptor"):
+            raise DamageError("the bag is encrypted")
+        start = head.number("index_pos")
+        if not start:
+            raise DamageError("the bag's index is missing (not closed)")
+        if not head.end <= start <= file.size:
+            raise DamageError("the bag's index is missing (cut)")
+        return _read_index(file, start, head.number("conn_count"), head.number("chunk_count"))
+    except (struct.error, KeyError, ValueError, MemoryError) as error:
+        raise DamageError(f"the bag's index is damaged ({error})") from None
+    finally:
+        file.close()
+
+
+def _read_index(file: Bytes, offset: int, connection_count: int, chunk_count: int) -> Index:
+    connections, chunks, end = Connections(), [], offset
+    described = 0
+    while offset < file.size:
+        record = read_record(file, offset)
+        if record is None or not _is_sane(record, file.size):
+            raise DamageError("the bag's index ends early or is damaged")
+        if record.kind == "connection" and record.fields["op"] == b"\x07":
+            connections.note(record, file.read(record.body, record.end - record.body))
+            described += 1
+        elif record.kind == "chunk info" and record.fields["op"] == b"\x06":
+            chunks.append(_read_chunk(file, record, end))
+        else:
+            raise DamageError("the bag's index is damaged")
+        offset = record.end
+    if (described, len(chunks)) != (connection_count, chunk_count):
+        raise DamageError(
+            f"the bag's index has {described} connections and {len(chunks)} chunks, "
+            f"its head says {connection_count} and {chunk_count}"
+        )
+    counts: Counter[int] = Counter()
+    for chunk in chunks:
+        counts.update(chunk.counts)
+    if not all(number in connections for number in counts):
+        raise DamageError("the bag's index has messages of connections that it does not describe")
+    return Index(chunks, connections.counted(counts))
+
+
+def _read_chunk(file: Bytes, info: Record, end: int) -> Chunk:
+    """A chunk and the index records behind it, held against what the index of the bag says of it."""
+    pairs = np.frombuffer(file.read(info.body, info.end - info.body), "<u4").reshape(-1, 2)
+    counts = {number: count for number, count in pairs.tolist() if count}
+    record = read_record(file, info.number("chunk_pos"))
+    if record is None or record.kind != "chunk" or record.end > end or record.fields["op"] != b"\x05":
+        raise DamageError("the bag's index leads to no chunk")
+    compression = record.fields["compression"].decode()
+    index, at = {}, record.end
+    for _ in range(len(pairs)):
+        entries = read_record(file, at)
+        if entries is None or entries.kind != "index" or not _is_sane(entries, end):
+            raise DamageError("the index of a chunk ends early or is damaged")
+        number = entries.number("conn")
+        if entries.number("count") != counts.get(number, 0) or entries.fields["op"] != b"\x04":
+            raise DamageError("the index of a chunk disagrees with that of the bag")
+        index[number] = entries.body
+        at = entries.end
+    if not counts.keys() <= index.keys():
+        raise DamageError("the index of a chunk disagrees with that of the bag")
+    start, last = (info.time("start_time"), info.time("end_time")) if counts else (LAST, -1)
+    length = record.end - record.body
+    return Chunk(start, last, record.body, length, record.number("size"), compression, counts, index=index)
+
+
+def read_times(file: Bytes, chunk: Chunk, number: int) -> I64:
+    """Log times of the messages of a connection, as the index of a chunk has them.
+
+    Raises:
+        DamageError: it ends early, or disagrees with that of the bag.
+    """
+    size = 12 * chunk.counts[number]
+    data = file.read(chunk.index[number], size)
+    if len(data) < size:
+        raise DamageError("the index of a chunk ends early")
+    entries = np.frombuffer(data, "<u4").reshape(-1, 3).astype(np.int64)
+    times: I64 = entries[:, 0] * 10**9 + entries[:, 1]
+    if len(times) and not chunk.start <= times.min() <= times.max() <= chunk.end:
+        raise DamageError("the index of a chunk disagrees with that of the bag")
+    return times
+
+
+# --- a damaged bag -----------------------------------------------------------------------------
+
+
+class Walker:
+    """The records of a bag or of a chunk; behind one that makes no sense the next one that does.
+
+    Only a chunk may be cut: it ends behind the bytes.
+    """
+
+    def __init__(self, source: Bytes) -> None:
+        self._source = source
+        self.broken = self.passed = 0
+
+    def __call__(self, offset: int) -> Iterator[Record]:
+        size = self._source.size
+        record = self._at(offset)
         while offset < size:
-            bio.seek(offset)
+            if record is None:
+                record = self._search(offset + 1, size)
+                self.broken += 1
+                self.passed += (record.start if record else size) - offset
+                if record is None:
+                    return
+                offset = record.start
+            assert record is not None
+            following = self._at(record.end)
+            if following is None and record.end != size:
+                # Its length is wrong and what follows lies within, or the next record is broken.
+                is_chunk = record.kind == "chunk"
+                nearer = self._search(record.body, min(record.end, size), is_chunk)
+                if nearer is not None and is_chunk:
+                    record.end, following = nearer.start, nearer
+                elif nearer is not None:
+                    self.broken += 1
+                    self.passed += nearer.start - offset
+                    record, offset = nearer, nearer.start
+                    continue
+            yield record
+            offset = record.end
+            record = following
+
+    def _at(self, offset: int) -> Record | None:
+        record = read_record(self._source, offset)
+        return record if record is not None and _is_sane(record, self._source.size) else None
+
+    def _search(self, start: int, stop: int, chunk: bool = False) -> Record | None:
+        """The next record that makes sense, or the next chunk; followed by another, or by the end."""
+        for at in self._source.search(OPCODE, start):
+            if at >= stop:
+                return None
+            before = self._source.read(max(start, at - SEARCHED), SEARCHED)[: at - max(start, at - SEARCHED)]
+            for back in range(4, len(before) + 1):
+                size = int.from_bytes(before[len(before) - back :][:4], "little")
+                if not back + 3 < size <= LONGEST_HEADER:
+                    continue
+                record = self._at(at - back)
+                if record is None or (chunk and record.kind != "chunk"):
+                    continue
+                if record.end >= self._source.size or self._at(record.end) is not None:
+                    return record
+        return None
+
+
+def scan(file: Bytes, found: Scan, tell: Callable[[int], object]) -> None:
+    """Look through a bag from front to back, and into every chunk."""
+    connections, walker = Connections(), Walker(file)
+    outside = array("q")  # messages of an uncompressed chunk whose head is damaged
+    for record in walker(len(MAGIC)):
+        tell(record.end)
+        if record.kind == "connection":
+            connections.note(record, file.read(record.body, record.end - record.body))
+        elif record.kind == "chunk":
+            compression = record.fields["compression"].decode(errors="replace")
+            packed = min(record.end, file.size) - record.body
+            chunk = Chunk(LAST, -1, record.body, packed, record.number("size"), compression, {}, 0, {})
+            chunk.cut = record.end > file.size
+            found.begin(chunk)
             try:
-                if read_uint32(bio) > LONGEST_HEADER:
-                    raise ReaderError("not a record")
-                bio.seek(offset)
-                header = Header.read(bio)
-                opcode, length = header.get_uint8("op"), read_uint32(bio)
-                body = bio.tell()
-            except (ReaderError, UnicodeDecodeError):
-                self.unread = size - offset
-                break
-            if opcode != RecordType.IDXDATA and position >= 0:
-                complete()
-                position = -1
-            if opcode == RecordType.CHUNK:
-                decompressor = DECOMPRESSORS.get(header.get_string("compression"), bytes)
-                self.chunks[offset] = Chunk(min(length, size - body), body, decompressor)
-                chunk, position = {}, offset
-            if body + length > size:
-                self.unread = size - offset
-                break
-            bio.seek(body)
-            if opcode == RecordType.IDXDATA:
-                found = np.frombuffer(bio.read(length), "<u4").reshape(-1, 3).tolist()
-                chunk[header.get_uint32("conn")] = [
-                    IndexData(sec * 10**9 + nsec, position, at) for sec, nsec, at in found
-                ]
-            elif opcode == RecordType.CONNECTION:
-                self._note(header, Header.read(BytesIO(length.to_bytes(4, "little") + bio.read(length))))
-            offset = body + length
-        if position >= 0:
-            before = sum(map(len, indexes.values()))
-            complete()
-            if self.unread:
-                self._rescued = sum(map(len, indexes.values())) - before
-        self.connections = [c._replace(msgcount=len(indexes[c.id])) for c in self.connections]
-        self.indexes = {c.id: sorted(indexes[c.id]) for c in self.connections}
+                _describe(file, chunk, connections, found)
+            except DamageError as damage:
+                found.damaged[str(damage)] += 1
+            if chunk.cut:
+                found.cut, found.rescued = file.size - record.body, sum(chunk.counts.values())
+        elif record.kind == "index":
+            found.listed[record.number("conn")] += record.number("count")
+        elif record.kind == "message":
+            size = record.end - record.body
+            outside.extend((record.time("time"), record.number("conn"), record.body, size))
+    found.end()
+    found.broken += walker.broken
+    found.passed += walker.passed
+    found.index.connections = connections.counted(found.finish(connections, outside))
 
-    def _look_into(self, position: int) -> dict[int, list[IndexData]]:
-        """The index of a chunk from its content; connections are noted."""
-        found: dict[int, list[IndexData]] = defaultdict(list)
-        with suppress(ReaderError, OSError, RuntimeError, ValueError):  # ends where the data does
-            records = BytesIO(self._chunk_data(position))
-            while True:
-                offset = records.tell()
-                header = Header.read(records)
-                data = read_bytes(records, read_uint32(records))
-                if header.get_uint8("op") == RecordType.CONNECTION:
-                    self._note(header, Header.read(BytesIO(len(data).to_bytes(4, "little") + data)))
-                else:
-                    found[header.get_uint32("conn")].append(
-                        IndexData(header.get_time("time"), position, offset)
-                    )
-        return found
 
-    def _note(self, header: Header, about: Header) -> None:
-        number = header.get_uint32("conn")
-        if all(c.id != number for c in self.connections):
-            self.connections.append(
-                Connection(
-                    number,
-                    normalize(header.get_string("topic")),
-                    normalize_msgtype(about.get_string("type")),
-                    MessageDefinition(MessageDefinitionFormat.MSG, about.get_string("message_definition")),
-                    about.get_string("md5sum"),
-                    0,
-                    ConnectionExtRosbag1(None, None),
-                    self,
-                )
-            )
+def _describe(file: Bytes, chunk: Chunk, connections: Connections, found: Scan) -> None:
+    """Fill in what is in a chunk."""
+    times: dict[int, array[int]] = defaultdict(lambda: array("q"))
+    content = _unpacked(file, chunk)
+    walker = Walker(content)
+    for record in walker(0):
+        if record.kind == "message":
+            times[record.number("conn")].append(record.time("time"))
+        elif record.kind == "connection":
+            connections.note(record, content.read(record.body, record.end - record.body))
+    if not chunk.cut:
+        found.broken += walker.broken
+        found.passed += walker.passed
+    chunk.fill(times)
+
+
+def look_into(file: Bytes, chunk: Chunk) -> list[tuple[int, int, memoryview]]:
+    """Log time, connection and data of the messages of a chunk, those of its index.
+
+    Raises:
+        DamageError: it cannot be unpacked.
+    """
+    content = _unpacked(file, chunk)
+    data = memoryview(content.read(0, content.size))
+    return [
+        (r.time("time"), r.number("conn"), data[r.body : r.end])
+        for r in Walker(content)(0)
+        if r.kind == "message" and r.number("conn") in chunk.counts
+    ]
+
+
+def _unpacked(file: Bytes, chunk: Chunk) -> Content:
+    packed = file.read(chunk.data, chunk.packed)
+    cut = chunk.cut or len(packed) < chunk.packed
+    return Content(unpack(chunk.compression, packed, chunk.size, cut=cut))
+
+
+REPAIR = "'rosbag reindex' repairs the file"
+FORM = Form(Reader, False, read_index, read_times, look_into, scan, REPAIR)

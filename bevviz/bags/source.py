@@ -135,6 +135,8 @@ class BagSource:
         Raises:
             UserError: no time, or one outside the recording.
         """
+        if not len(self.scans):
+            raise UserError(f"{self.recording.name}: {self._driver} has no scan that can be read")
         return int(np.abs(self.scans - self._time(str(time), 0)).argmin())
 
     def frame(self, number: int) -> Frame | None:
@@ -246,6 +248,8 @@ class BagSource:
 
     def _narrow(self, time: int) -> None:
         """Read the scan nearest to ``time`` alone."""
+        if not len(self.scans):
+            return
         self._first = int(np.abs(self.scans - time).argmin())
         self._low = int(self.scans[self._first])
         self._high = self._low + 1

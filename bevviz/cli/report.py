@@ -61,7 +61,7 @@ def _report(options: argparse.Namespace) -> int:
 
 
 def _make(options: argparse.Namespace) -> int:
-    from bevviz.bags.mcap import megabytes
+    from bevviz.bags.reader import megabytes
     from bevviz.report.make import Order, make
 
     if options.at is None:

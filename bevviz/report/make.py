@@ -12,7 +12,7 @@ from pathlib import Path
 import rerun as rr
 from tqdm import tqdm
 
-from bevviz.bags.mcap import megabytes
+from bevviz.bags.reader import megabytes
 from bevviz.bags.recording import RawMessage
 from bevviz.bags.source import MARGIN, BagSource
 from bevviz.config import Config

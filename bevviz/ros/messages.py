@@ -1,28 +1,58 @@
 """ROS messages into arrays.
 
 Only attributes are read, never types, so that what rosbags deserialises and what rclpy delivers are
-both welcome, whichever the ROS version. Every function raises MessageError and nothing else.
+both welcome, whichever the ROS version. Every function raises MessageError and nothing else, whatever is
+in the message, and none takes more memory than a message of reasonable size asks for: see the limits below.
 """
 
 from __future__ import annotations
 
+import logging
 import math
 import struct
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from functools import wraps
+from typing import Any, NamedTuple, ParamSpec, TypeVar
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from bevviz import geometry
-from bevviz.errors import UserError
+from bevviz.errors import UserError, first_line
 from bevviz.frame import F32, F64, U8, Boxes3D, Cloud, Image, Intrinsics, LabelledBoxes2D, LabelledBoxes3D
+
+logger = logging.getLogger(__name__)
+
+MOST_POINTS = 100_000_000  # of a cloud
+MOST_FIELDS = 1024  # of a point; each element of a field counts
+MOST_PIXELS = 100_000_000  # of an image
+
+P = ParamSpec("P")
+R = TypeVar("R")
 
 
 class MessageError(UserError):
     """A message that cannot be used: its topic, what is wrong with it, and what would be accepted."""
+
+
+def _guarded(decode: Callable[P, R]) -> Callable[P, R]:
+    """Whatever else ``decode`` raises, as a MessageError: a message may hold anything, even other fields."""
+
+    @wraps(decode)
+    def guarded(*args: P.args, **kwargs: P.kwargs) -> R:
+        try:
+            return decode(*args, **kwargs)
+        except MessageError:
+            raise
+        except Exception as error:
+            topic = next((value for value in (*args, *kwargs.values()) if isinstance(value, str)), "message")
+            logger.debug("%s cannot be used", topic, exc_info=True)
+            what = f"{type(error).__name__}: {first_line(error)}"
+            raise MessageError(f"{topic}: cannot be used ({what})") from None
+
+    return guarded
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,6 +99,7 @@ _AXES = ("x", "y", "z")
 _POINT_FIELD = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 
 
+@_guarded
 def decode_cloud(msg: Any, topic: str, received: int) -> Cloud:
     """Points and extra fields of a sensor_msgs/PointCloud2.
 
@@ -78,8 +109,14 @@ def decode_cloud(msg: Any, topic: str, received: int) -> Cloud:
     becomes one field for each: ``name_0``, ``name_1`` ...
 
     Raises:
-        MessageError: x, y or z is missing, or a field does not fit into its point.
+        MessageError: x, y or z is missing, a field does not fit into its point, or the header announces more
+            than ``MOST_POINTS`` points or ``MOST_FIELDS`` fields.
     """
+    if (announced := int(msg.height) * int(msg.width)) > MOST_POINTS:
+        raise MessageError(
+            f"{topic}: a cloud of {msg.width} x {msg.height} points is not taken: "
+            f"{MOST_POINTS} at most, and there are {len(msg.data)} bytes of data"
+        )
     layout = _point_layout(msg, topic)
     grid = _point_grid(msg, layout)
     with np.errstate(over="ignore", invalid="ignore"):  # a float64 beyond float32 is infinite, and dropped
@@ -102,7 +139,7 @@ def decode_cloud(msg: Any, topic: str, received: int) -> Cloud:
         fields=fields,
         topic=topic,
         received=received,
-        dropped=int(msg.height) * int(msg.width) - len(xyz),
+        dropped=announced - len(xyz),
     )
 
 
@@ -125,6 +162,10 @@ def _positions(grid: NDArray[np.void]) -> F32:
 
 def _point_layout(msg: Any, topic: str) -> np.dtype[np.void]:
     """The structured dtype of one point; ``itemsize`` is point_step."""
+    if not 0 < msg.point_step < 1 << 31:
+        raise MessageError(f"{topic}: a point of {msg.point_step} bytes cannot be")
+    if sum(max(int(field.count), 1) for field in msg.fields) > MOST_FIELDS:
+        raise MessageError(f"{topic}: its points have more than {MOST_FIELDS} fields, each element counted")
     order = ">" if msg.is_bigendian else "<"
     formats: dict[str, str] = {}
     offsets: dict[str, int] = {}
@@ -208,6 +249,7 @@ _ENCODINGS: Mapping[str, _Encoding] = {
 }
 
 
+@_guarded
 def decode_image(msg: Any, topic: str, received: int) -> Image:
     """A sensor_msgs/Image as BGR; bgr8 without row padding is a view of the message's data.
 
@@ -270,6 +312,7 @@ def to_8_bits(pixels: NDArray[np.uint16]) -> U8:
 _MEDIA_TYPES = {b"\xff\xd8\xff": "image/jpeg", b"\x89PNG\r\n\x1a\n": "image/png"}
 
 
+@_guarded
 def decode_compressed_image(msg: Any, topic: str, received: int) -> Image:
     """A JPEG or PNG in a sensor_msgs/CompressedImage, decoded, with the encoded bytes untouched beside.
 
@@ -277,7 +320,8 @@ def decode_compressed_image(msg: Any, topic: str, received: int) -> Image:
     as ``to_8_bits`` says, and the encoded one, which would look different, is not kept.
 
     Raises:
-        MessageError: depth images, other kinds, and data that is damaged or cut.
+        MessageError: depth images, other kinds, data that is damaged or cut, and more than ``MOST_PIXELS``
+            pixels, which is known before they are decoded.
     """
     if "compressedDepth" in msg.format:
         raise MessageError(f"{topic}: '{msg.format}' is a depth image; choose a topic with colour images")
@@ -289,7 +333,14 @@ def decode_compressed_image(msg: Any, topic: str, received: int) -> Image:
             f"{topic}: compressed image of format '{msg.format}' holds neither JPEG nor PNG data "
             f"({len(encoded)} bytes)"
         )
-    cut = media_type == "image/jpeg" and encoded.rfind(b"\xff\xd9") < 0  # decoders fill the rest with grey
+    width, height = _size_of(encoded)
+    if width * height > MOST_PIXELS:
+        raise MessageError(
+            f"{topic}: an image of {width} x {height} pixels is not taken: {MOST_PIXELS} at most"
+        )
+    cut = not width or not height
+    if media_type == "image/jpeg" and encoded.rfind(b"\xff\xd9") < 0:
+        cut = True  # decoders would fill the rest with grey
     # Orientation: the calibration belongs to the pixels as they are stored, not as EXIF would turn them.
     flags = cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
     try:
@@ -310,6 +361,30 @@ def decode_compressed_image(msg: Any, topic: str, received: int) -> Image:
     )
 
 
+def _size_of(encoded: bytes) -> tuple[int, int]:
+    """Width and height that the header of a PNG or a JPEG states; 0 where there is none, or a PNG is cut."""
+    if encoded.startswith(b"\x89PNG"):
+        at = 8
+        while encoded[at + 4 : at + 8] != b"IEND":  # a decoder makes room for a part before it reads it
+            at += 12 + int.from_bytes(encoded[at : at + 4], "big")
+            if at + 8 > len(encoded):
+                return 0, 0
+        return int.from_bytes(encoded[16:20], "big"), int.from_bytes(encoded[20:24], "big")
+    at = 2
+    while at + 9 <= len(encoded):
+        marker, size = encoded[at + 1], int.from_bytes(encoded[at + 2 : at + 4], "big")
+        if encoded[at] != 0xFF or marker == 0xFF:  # between segments there may be anything
+            at += 1
+        elif 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):  # start of a frame
+            height, width = struct.unpack_from(">HH", encoded, at + 5)
+            return width, height
+        elif marker == 0xDA:  # start of the pixels
+            break
+        else:
+            at += 2 if marker in (0x01, *range(0xD0, 0xD9)) else 2 + max(size, 2)
+    return 0, 0
+
+
 # --- camera models -----------------------------------------------------------------------------
 
 _DISTORTION = {
@@ -321,6 +396,7 @@ _DISTORTION = {
 }
 
 
+@_guarded
 def decode_camera_info(msg: Any, rectified: bool, topic: str = "camera_info") -> Intrinsics:
     """The camera model of a sensor_msgs/CameraInfo, for images as they are published.
 
@@ -376,6 +452,7 @@ def _either(msg: Any, *names: str) -> Any:
 # --- transforms --------------------------------------------------------------------------------
 
 
+@_guarded
 def decode_transforms(msg: Any, topic: str = "/tf") -> list[StampedTransform]:
     """The transforms of a tf2_msgs/TFMessage; one that is no rigid transform is left out.
 
@@ -396,6 +473,7 @@ def decode_transforms(msg: Any, topic: str = "/tf") -> list[StampedTransform]:
     return transforms
 
 
+@_guarded
 def decode_odometry(msg: Any, topic: str = "odometry") -> StampedTransform:
     """The pose of a nav_msgs/Odometry: header.frame_id from child_frame_id.
 
@@ -423,6 +501,7 @@ def _stamped(header: Any, child: str, translation: Any, rotation: Any, topic: st
 # --- detections --------------------------------------------------------------------------------
 
 
+@_guarded
 def decode_detections_2d(msg: Any, topic: str, received: int) -> LabelledBoxes2D:
     """The image boxes of a vision_msgs/Detection2DArray, of ROS 1 or any version of ROS 2.
 
@@ -452,6 +531,7 @@ def decode_detections_2d(msg: Any, topic: str, received: int) -> LabelledBoxes2D
     )
 
 
+@_guarded
 def decode_detections_3d(msg: Any, topic: str, received: int) -> LabelledBoxes3D:
     """The boxes of a vision_msgs/Detection3DArray, of ROS 1 or any version of ROS 2.
 

@@ -1,0 +1,73 @@
+"""Torture: damaged bags and fuzzed messages, beside what other readers make of them.
+
+Prints a table for each part and what went wrong in it, and ends with status 1 where anything did: a
+traceback, a hang, a loss without a word, or fewer messages than 99.5 % of what the best other reader gives.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Callable, Mapping
+
+from benchmarks.torture import damage, fuzz
+from benchmarks.torture.samples import FORMATS
+
+EXAMPLES = 40  # of what went wrong that are printed
+SHARE = 0.995  # of the messages that the best other reader gives
+
+Part = Callable[[argparse.Namespace], bool]
+"""A part of the torture: prints its figures, returns whether all was well."""
+
+
+def damaged_bags(options: argparse.Namespace) -> bool:
+    names = [name for name in FORMATS if options.format is None or options.format in name]
+    if not names:
+        raise SystemExit(f"--format {options.format}: none of {'; '.join(FORMATS)}")
+    total = damage.Tally()
+    print(f"\nDamaged bags, seed {options.seed}\n\n{damage.HEAD}")
+    for name, tally in damage.run(options.seed, options.bags, names):
+        print(damage.row(name, tally), flush=True)
+        total += tally
+    print(damage.row("all", total))
+    _print_examples(total.examples)
+    return total.share >= SHARE and not (total.tracebacks or total.hangs or total.silent)
+
+
+def fuzzed_messages(options: argparse.Namespace) -> bool:
+    (total,) = fuzz.run(options.seed, options.messages)
+    print(f"\nFuzzed messages, seed {options.seed}\n\n{fuzz.HEAD}\n{fuzz.row(total)}")
+    _print_examples(total.examples)
+    return not (total.tracebacks or total.broken or total.hangs)
+
+
+def _print_examples(examples: list[str]) -> None:
+    for example in examples[:EXAMPLES]:
+        print(f"- {example}")
+    if len(examples) > EXAMPLES:
+        print(f"- and {len(examples) - EXAMPLES} more")
+
+
+PARTS: Mapping[str, Part] = {"damage": damaged_bags, "fuzz": fuzzed_messages}
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.torture",
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("parts", nargs="*", metavar="PART", help=f"{', '.join(PARTS)} (default: all of them)")
+    parser.add_argument("--seed", type=int, default=0, help="of all that is random (default: 0)")
+    parser.add_argument("--bags", type=int, default=900, help="damaged bags (default: 900)")
+    parser.add_argument("--format", metavar="NAME", help="only the formats whose name has this in it")
+    parser.add_argument("--messages", type=int, default=2000, help="fuzzed messages (default: 2000)")
+    options = parser.parse_args()
+    if unknown := set(options.parts) - set(PARTS):
+        parser.error(f"{', '.join(sorted(unknown))}: no such part; there are {', '.join(PARTS)}")
+    failed = [name for name in options.parts or PARTS if not PARTS[name](options)]
+    return int(bool(failed))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

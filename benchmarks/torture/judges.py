@@ -1,0 +1,319 @@
+"""Readers that are not bevviz's: what they get out of a damaged bag is what is to be reached."""
+
+from __future__ import annotations
+
+import io
+import re
+import shutil
+import sqlite3
+import struct
+import subprocess
+from bz2 import BZ2Decompressor
+from collections.abc import Callable, Iterator
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import lz4.frame  # type: ignore[import-untyped]
+import rosbag  # type: ignore[import-untyped]
+import rosbags.rosbag1
+import rosbags.rosbag2
+import zstandard
+from mcap.data_stream import ReadDataStream
+from mcap.reader import make_reader
+from mcap.records import Channel, Chunk, Message
+from mcap.stream_reader import CRCValidationError, StreamReader, breakup_chunk
+
+Found = tuple[str, int, bytes]
+"""Topic, log time and serialised message."""
+
+Judge = Callable[[Path], Iterator[Found]]
+
+
+def taken(judge: Judge, path: Path) -> list[Found]:
+    """What a reader gives before it gives up. Whatever it raises is its own affair."""
+    found: list[Found] = []
+    try:
+        for item in judge(path):
+            found.append(item)  # noqa: PERF402  # what came before an exception counts
+    except Exception:
+        pass
+    return found
+
+
+# --- MCAP --------------------------------------------------------------------------------------
+
+
+def mcap_stream(path: Path) -> Iterator[Found]:
+    """The mcap package, from front to back; a chunk that it cannot read costs that chunk alone."""
+    channels: dict[int, Channel] = {}
+    with path.open("rb") as file:
+        for record in StreamReader(file, emit_chunks=True, record_size_limit=1 << 28).records:
+            yield from _records(record, channels)
+
+
+def _records(record: Any, channels: dict[int, Channel]) -> Iterator[Found]:
+    inner = [record]
+    if isinstance(record, Chunk):
+        try:
+            inner = breakup_chunk(record, validate_crc=True)
+        except Exception:
+            return
+    for item in inner:
+        if isinstance(item, Channel):
+            channels.setdefault(item.id, item)
+        elif isinstance(item, Message) and item.channel_id in channels:
+            yield channels[item.channel_id].topic, item.log_time, item.data
+
+
+def mcap_index(path: Path) -> Iterator[Found]:
+    """The mcap package, by the index."""
+    with path.open("rb") as file:
+        for _, channel, message in make_reader(file, validate_crcs=True).iter_messages(log_time_order=False):
+            yield channel.topic, message.log_time, message.data
+
+
+def mcap_resync(path: Path) -> Iterator[Found]:
+    """A scan that tries every place which looks like the head of a record, with the mcap package's parser.
+
+    What is in a chunk that does not fit its checksum counts for nothing, here as there.
+    """
+    data = path.read_bytes()
+    channels: dict[int, Channel] = {}
+    late: list[Message] = []
+    at, head = 8, re.compile(rb"[\x01-\x0f].{4}\0{4}", re.DOTALL)
+    while at + 9 < len(data):
+        opcode, length = struct.unpack_from("<BQ", data, at)
+        end = at + 9 + length
+        if 0 < opcode < 16 and end <= len(data):
+            stream = ReadDataStream(io.BytesIO(data[at + 9 : end]))
+            try:
+                if opcode == 4:
+                    channel = Channel.read(stream)
+                    channels.setdefault(channel.id, channel)
+                elif opcode == 5:
+                    message = Message.read(stream, length)
+                    if message.channel_id in channels:
+                        yield channels[message.channel_id].topic, message.log_time, message.data
+                    else:
+                        late.append(message)
+                elif opcode == 6:
+                    for item in breakup_chunk(Chunk.read(stream), validate_crc=True):
+                        if isinstance(item, Channel):
+                            channels.setdefault(item.id, item)
+                        elif isinstance(item, Message) and item.channel_id in channels:
+                            yield channels[item.channel_id].topic, item.log_time, item.data
+                at = end
+                continue
+            except CRCValidationError:
+                at = end
+                continue
+            except Exception:
+                pass
+        following = head.search(data, at + 1)
+        if following is None:
+            break
+        at = following.start()
+    for message in late:
+        if message.channel_id in channels:
+            yield channels[message.channel_id].topic, message.log_time, message.data
+
+
+def rosbags2(path: Path) -> Iterator[Found]:
+    with rosbags.rosbag2.Reader(path) as reader:
+        for connection, time, data in reader.messages():
+            yield connection.topic, time, data
+
+
+# --- sqlite3 -----------------------------------------------------------------------------------
+
+QUERY = "SELECT name, timestamp, data FROM messages {} JOIN topics ON topic_id = topics.id ORDER BY {}"
+
+
+def sqlite(path: Path) -> Iterator[Found]:
+    """sqlite3 itself, log and all, from both ends of the table."""
+    copy = path.with_name("copy")
+    copy.mkdir()
+    try:
+        for suffix in ("", "-wal"):
+            if Path(f"{path}{suffix}").exists():
+                shutil.copy(f"{path}{suffix}", copy / f"bag.db3{suffix}")
+        seen: set[Found] = set()
+        for order in ("messages.id", "messages.id DESC", "timestamp"):
+            rows = _queried(copy / "bag.db3", QUERY.format("NOT INDEXED" * (order != "timestamp"), order))
+            for row in taken(lambda _, rows=rows: rows, path):  # type: ignore[misc]
+                if row not in seen:
+                    seen.add(row)
+                    yield row
+    finally:
+        shutil.rmtree(copy)
+
+
+def _queried(path: Path, query: str) -> Iterator[Found]:
+    with closing(sqlite3.connect(path)) as connection:
+        for name, time, data in connection.execute(query):
+            yield str(name), int(time), bytes(data)
+
+
+def sqlite_recover(path: Path) -> Iterator[Found]:
+    """The command line's ``.recover``, where there is one that has it (Debian's has not)."""
+    program = shutil.which("sqlite3")
+    if program is None:
+        return
+    copy = path.with_name("recovered")
+    copy.mkdir()
+    try:
+        for suffix in ("", "-wal"):
+            if Path(f"{path}{suffix}").exists():
+                shutil.copy(f"{path}{suffix}", copy / f"bag.db3{suffix}")
+        found = copy / "found.db3"
+        script = subprocess.run([program, copy / "bag.db3", ".recover"], capture_output=True, check=False)
+        subprocess.run([program, found], input=script.stdout, capture_output=True, check=False)
+        yield from _queried(found, QUERY.format("", "messages.id"))
+    finally:
+        shutil.rmtree(copy)
+
+
+# --- ROS 1 -------------------------------------------------------------------------------------
+
+
+def rosbags1(path: Path) -> Iterator[Found]:
+    with rosbags.rosbag1.Reader(path) as reader:
+        for connection, time, data in reader.messages():
+            yield connection.topic, time, data
+
+
+def rosbag_original(path: Path) -> Iterator[Found]:
+    """ROS 1's own library, which indexes anew what has no index."""
+    copy = path.with_name("reindexed.bag")
+    shutil.copy(path, copy)
+    try:
+        try:
+            bag = rosbag.Bag(str(copy))
+        except rosbag.ROSBagUnindexedException:
+            bag = rosbag.Bag(str(copy), "a", allow_unindexed=True)
+            for _ in bag.reindex():
+                pass
+            bag.close()
+            bag = rosbag.Bag(str(copy))
+        with closing(bag):
+            for topic, raw, time in bag.read_messages(raw=True):
+                yield topic, time.to_nsec(), raw[1]
+    finally:
+        copy.unlink()
+
+
+def ros1_resync(path: Path) -> Iterator[Found]:
+    """A scan that tries every place which looks like the head of a record."""
+    yield from _ros1_records(path.read_bytes(), 13, {})
+
+
+def _ros1_records(data: bytes, at: int, topics: dict[int, str]) -> Iterator[Found]:
+    while at + 8 < len(data):
+        record = _ros1_record(data, at)
+        if record is None:
+            mark = data.find(b"op=", at + 5)
+            starts = range(max(at + 1, mark - 120), mark - 7)
+            at = next((s for s in reversed(starts) if _ros1_record(data, s)), mark if mark > 0 else len(data))
+            continue
+        fields, body, end = record
+        opcode = fields[b"op"][0]
+        if opcode == 7 and b"topic" in fields:
+            topics.setdefault(int.from_bytes(fields[b"conn"], "little"), fields[b"topic"].decode())
+        elif opcode == 2:
+            number = int.from_bytes(fields[b"conn"], "little")
+            if number in topics:
+                sec, nsec = struct.unpack("<II", fields[b"time"])
+                yield topics[number], sec * 10**9 + nsec, data[body:end]
+        elif opcode == 5:
+            try:
+                content = _ros1_content(fields[b"compression"], data[body:end])
+            except Exception:
+                content = b""
+            yield from _ros1_records(content, 0, topics)
+        at = end
+
+
+def _ros1_record(data: bytes, at: int) -> tuple[dict[bytes, bytes], int, int] | None:
+    size = int.from_bytes(data[at : at + 4], "little")
+    if not 8 <= size < 4096:
+        return None
+    fields, place, stop = {}, at + 4, at + 4 + size
+    while place < stop:
+        length = int.from_bytes(data[place : place + 4], "little")
+        name, equals, value = data[place + 4 : place + 4 + length].partition(b"=")
+        place += 4 + length
+        if not equals:
+            return None
+        fields[name] = value
+    length = int.from_bytes(data[stop : stop + 4], "little")
+    end = stop + 4 + length
+    if place != stop or len(fields.get(b"op", b"")) != 1 or (end > len(data) and fields[b"op"] != b"\x05"):
+        return None
+    if fields[b"op"] == b"\x02" and (len(fields.get(b"conn", b"")), len(fields.get(b"time", b""))) != (4, 8):
+        return None
+    return fields, stop + 4, min(end, len(data))
+
+
+def _ros1_content(compression: bytes, packed: bytes) -> bytes:
+    if compression == b"bz2":
+        return BZ2Decompressor().decompress(packed)
+    if compression == b"lz4":
+        return bytes(lz4.frame.LZ4FrameDecompressor().decompress(packed))
+    return packed
+
+
+# --- packed files and messages -----------------------------------------------------------------
+
+
+def unpacked(judge: Judge) -> Judge:
+    """The judge on as much of a zstd file as the zstandard package unpacks."""
+
+    def read(path: Path) -> Iterator[Found]:
+        target = path.with_name("unpacked") / path.stem
+        target.parent.mkdir()
+        try:
+            with target.open("wb") as out, path.open("rb") as file:
+                stream = zstandard.ZstdDecompressor().decompressobj(read_across_frames=True)
+                try:
+                    while block := file.read(1 << 10):
+                        out.write(stream.decompress(block))
+                except zstandard.ZstdError:
+                    pass
+            yield from judge(target)
+        finally:
+            shutil.rmtree(target.parent)
+
+    return read
+
+
+def messages_unpacked(judge: Judge) -> Judge:
+    """The judge, and each message unpacked with the zstandard package; those that cannot be are left out."""
+
+    def read(path: Path) -> Iterator[Found]:
+        for topic, time, data in taken(judge, path):
+            try:
+                yield topic, time, zstandard.ZstdDecompressor().decompress(data)
+            except zstandard.ZstdError:
+                continue
+
+    return read
+
+
+def judges(name: str) -> dict[str, Judge]:
+    """Those that can read a format."""
+    found: dict[str, Judge]
+    if "mcap" in name:
+        found = {
+            "mcap": mcap_stream,
+            "mcap, by the index": mcap_index,
+            "mcap, resyncing": mcap_resync,
+            "rosbags": rosbags2,
+        }
+    elif name.startswith("ros1"):
+        found = {"rosbags": rosbags1, "rosbag": rosbag_original, "ROS 1, resyncing": ros1_resync}
+    else:
+        found = {"sqlite3": sqlite, "sqlite3 .recover": sqlite_recover, "rosbags": rosbags2}
+    if "messages packed" in name:
+        return {key: messages_unpacked(judge) for key, judge in found.items()}
+    return {key: unpacked(judge) for key, judge in found.items()} if ".zstd" in name else found

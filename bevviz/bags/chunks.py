@@ -1,0 +1,368 @@
+"""Files of chunks, MCAP and ROS 1: rosbags reads a sound one, its index or a scan leads through others."""
+
+from __future__ import annotations
+
+import heapq
+import logging
+from array import array
+from collections import Counter
+from collections.abc import Callable, Collection, Container, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from operator import itemgetter
+from pathlib import Path
+
+import numpy as np
+import rosbags.rosbag1
+import rosbags.rosbag2
+from rosbags.interfaces import Connection
+from tqdm import tqdm
+
+from bevviz.bags.reader import (
+    LAST,
+    Bytes,
+    DamageError,
+    Message,
+    Reader,
+    as_damage,
+    megabytes,
+    public_messages,
+)
+from bevviz.frame import I64
+
+logger = logging.getLogger(__name__)
+
+PublicReader = rosbags.rosbag1.Reader | rosbags.rosbag2.Reader
+
+
+@dataclass(slots=True)
+class Chunk:
+    """Where a chunk lies and what is in it, as the file's index says or as was found by looking into it."""
+
+    start: int  # log time of the first message
+    end: int  # of the last one
+    data: int  # offset of its packed content
+    packed: int  # bytes of it
+    size: int  # bytes unpacked
+    compression: str
+    counts: Mapping[int, int]  # messages by connection
+    crc: int | None = None  # checksum of the content, 0: it has none, None: not read yet
+    times: Mapping[int, I64] | None = None  # log times by connection; None: to be read by ``index``
+    index: Mapping[int, int] = field(default_factory=dict)  # offset of the times by connection
+    cut: bool = False  # the end is missing
+
+    def fill(self, times: Mapping[int, array[int]]) -> None:
+        """Take the log times that were found by looking into it."""
+        self.times = {number: np.frombuffer(found, np.int64) for number, found in times.items()}
+        self.counts = {number: len(found) for number, found in times.items()}
+        if times:
+            self.start = min(map(min, times.values()))
+            self.end = max(map(max, times.values()))
+
+
+@dataclass(slots=True)
+class Index:
+    """What is in a file and where."""
+
+    chunks: list[Chunk]
+    connections: list[Connection]
+    outside: I64 = field(default_factory=lambda: np.zeros((0, 4), np.int64))
+    """(N, 4) messages outside chunks: log time, connection, offset and size of the data."""
+
+    @property
+    def span(self) -> tuple[int, int]:
+        """Log time of the first message, and just after that of the last one."""
+        times = self.outside[:, 0].tolist()
+        filled = [c for c in self.chunks if c.counts]
+        first = min([c.start for c in filled] + times, default=LAST)
+        return first, max([c.end for c in filled] + times, default=-1) + 1
+
+
+@dataclass
+class Scan:
+    """What was found by looking through a file, and what was not."""
+
+    index: Index = field(default_factory=lambda: Index([], []))
+    damaged: Counter[str] = field(default_factory=Counter)  # chunks, by what is wrong with them
+    missing: int = 0  # messages that the file says were in its chunks
+    undescribed: int = 0  # messages of connections that nothing describes
+    stated: int | None = None  # messages by the file's statistics
+    cut: int = 0  # bytes of the chunk whose end is missing
+    rescued: int = 0  # messages found in it
+    broken: int = 0  # places without a sound record
+    passed: int = 0  # bytes there
+    listed: Counter[int] = field(default_factory=Counter)  # messages of the newest chunk by its own index
+
+    @property
+    def count(self) -> int:
+        return sum(c.msgcount for c in self.index.connections)
+
+    def begin(self, chunk: Chunk) -> None:
+        """A further chunk; ``listed`` is what its own index then lists."""
+        self.end()
+        self.index.chunks.append(chunk)
+
+    def end(self) -> None:
+        """Count what the index of the newest chunk lists and it does not have."""
+        if self.index.chunks:
+            there = self.index.chunks[-1].counts
+            self.missing += sum(max(0, n - there.get(number, 0)) for number, n in self.listed.items())
+        self.listed.clear()
+
+    def finish(self, known: Container[int], outside: array[int]) -> Counter[int]:
+        """Leave out what is of no known connection, and count the rest by connection."""
+        counts: Counter[int] = Counter()
+        for chunk in self.index.chunks:
+            unknown = {number for number in chunk.counts if number not in known}
+            self.undescribed += sum(chunk.counts[number] for number in unknown)
+            chunk.counts = {number: n for number, n in chunk.counts.items() if number not in unknown}
+            counts.update(chunk.counts)
+        rows: I64 = np.frombuffer(outside, np.int64).reshape(-1, 4)
+        described = np.array([number in known for number in rows[:, 1].tolist()], bool)
+        self.undescribed += int((~described).sum())
+        self.index.outside = rows[described]
+        counts.update(self.index.outside[:, 1].tolist())
+        return counts
+
+    def notes(self, repair: str) -> list[str]:
+        """What was found and what was not; ``repair`` says which command writes a sound copy."""
+        part = f", {self.rescued} of them from the incomplete last {megabytes(self.cut)}" if self.cut else ""
+        notes = [f"read {self.count} messages{part}; {repair}"]
+        if self.damaged:
+            ((why, _),) = self.damaged.most_common(1)
+            notes.append(f"{self.damaged.total()} damaged chunk(s), {why}: {self.missing} messages lost")
+        elif self.missing:
+            notes.append(f"{self.missing} messages that the index of a chunk lists are not there: lost")
+        if self.undescribed:
+            notes.append(f"{self.undescribed} messages are of channels that nothing describes: lost")
+        if self.broken:
+            notes.append(f"{self.broken} broken place(s), {megabytes(self.passed)}, passed over")
+        if self.stated is not None and (lost := self.stated - self.count) > 0:
+            notes.append(f"its statistics count {self.stated} messages: {lost} are lost")
+        return notes
+
+
+@dataclass(frozen=True, slots=True)
+class Form:
+    """What differs between the formats."""
+
+    public: Callable[[Path], PublicReader]  # rosbags' reader
+    views: bool  # messages are read by our index, see SoundChunks
+    read_index: Callable[[Path], Index]  # DamageError: it is not to be believed
+    read_times: Callable[[Bytes, Chunk, int], I64]  # of one connection in a chunk, by its own index; the same
+    look_into: Callable[[Bytes, Chunk], list[tuple[int, int, memoryview]]]  # log time, connection and data
+    scan: Callable[[Bytes, Scan, Callable[[int], object]], None]  # the last one is told how far it has come
+    repair: str  # what writes a sound copy
+
+
+class SoundChunks:
+    """A file whose index is to be believed: rosbags opens it, and reads what it reads as fast as we do.
+
+    That is ROS 1. The messages of an MCAP file are read by the index, as views of its chunks: rosbags copies
+    each one twice, which takes 1.2 s a GB instead of 0.5 s where chunks have 4 MB, and it passes over what
+    is broken in a chunk without a checksum. What rosbags refuses, messages that are not ROS 2's beside those
+    that are or ROS 1's in MCAP, is read the same way.
+
+    Args:
+        path: of the file.
+        form: of its format.
+        public: the same file under a name that rosbags knows the format by.
+
+    Raises:
+        DamageError: there is no index, or it cannot be right.
+    """
+
+    def __init__(self, path: Path, form: Form, public: Path) -> None:
+        self._path, self._form = path, form
+        index = form.read_index(path)
+        self._public: PublicReader | None = None
+        reader = form.public(public)
+        try:
+            with as_damage():
+                reader.open()
+        except DamageError as error:
+            logger.info("%s: read by its index, for rosbags says: %s", path, error)
+        else:
+            known = {c.id: c for c in reader.connections}  # with their quality of service
+            index.connections = [
+                known.get(c.id, c)._replace(msgcount=c.msgcount, owner=None) for c in index.connections
+            ]
+            if form.views:
+                reader.close()
+            else:
+                self._public = reader
+        self._index: Index | None = index
+        self._chunks = index.chunks
+        self._own = IndexedChunks(path, form, index)
+        self._bytes = Bytes(path)
+
+    @property
+    def connections(self) -> Sequence[Connection]:
+        return self._own.connections
+
+    @property
+    def compression(self) -> str:
+        return self._own.compression
+
+    @property
+    def span(self) -> tuple[int, int]:
+        return self._own.span
+
+    @property
+    def warnings(self) -> Sequence[str]:
+        return self._own.warnings
+
+    def messages(self, ids: Collection[int], start: int, stop: int) -> Iterator[Message]:
+        if self._public is None:
+            return self._own.messages(ids, start, stop)
+        wanted = [c for c in self._public.connections if c.id in ids]
+        return public_messages(self._public.messages(wanted, start, stop))
+
+    def times(self, ids: Collection[int]) -> I64:
+        return self._times(ids, 0, LAST)
+
+    def sums(self, ids: Collection[int], start: int, stop: int) -> tuple[int, int]:
+        times = self._times(ids, start, stop)
+        times = times[(times >= start) & (times < stop)]
+        high, low = times >> 32, times & 0xFFFFFFFF  # whose sums fit an int64
+        return len(times), (int(high.sum()) << 32) + int(low.sum())
+
+    def rescuer(self) -> Reader:
+        if self._index is None:
+            return rescue(self._path, self._form)
+        return IndexedChunks(self._path, self._form, self._index)
+
+    def close(self) -> None:
+        self._bytes.close()
+        self._own.close()
+        if self._public is not None:
+            self._public.close()
+
+    def _times(self, ids: Collection[int], start: int, stop: int) -> I64:
+        """Log times in the chunks that reach into a span, sorted."""
+        if self._public is None:
+            return self._own.times(ids, start, stop)
+        parts = [np.zeros(0, np.int64)]
+        try:
+            for chunk in self._chunks:
+                if chunk.start < stop and chunk.end >= start:
+                    there = [number for number in ids if number in chunk.index]
+                    parts += [self._form.read_times(self._bytes, chunk, number) for number in there]
+        except DamageError:
+            self._index = None
+            raise
+        return np.sort(np.concatenate(parts))
+
+
+class IndexedChunks:
+    """Messages by an index, in order of log time. A damaged chunk costs its own, which are counted."""
+
+    def __init__(self, path: Path, form: Form, index: Index, notes: Sequence[str] = ()) -> None:
+        self._form, self._index, self._notes = form, index, notes
+        self._bytes = Bytes(path)
+        # Of damaged chunks: messages lost by connection, log times of the others, and what is wrong.
+        self._damaged: dict[int, tuple[Counter[int], Mapping[int, I64], str]] = {}
+        self.compression = ", ".join(sorted({c.compression for c in index.chunks} - {"", "none"}))
+
+    @property
+    def connections(self) -> Sequence[Connection]:
+        lost = sum((lost for lost, _, _ in self._damaged.values()), Counter[int]())
+        return [c._replace(msgcount=c.msgcount - lost[c.id]) for c in self._index.connections]
+
+    @property
+    def span(self) -> tuple[int, int]:
+        return self._index.span
+
+    @property
+    def warnings(self) -> Sequence[str]:
+        notes = list(self._notes)
+        if self._damaged:
+            lost = sum(lost.total() for lost, _, _ in self._damaged.values())
+            why = next(iter(self._damaged.values()))[2]
+            notes.append(f"{len(self._damaged)} damaged chunk(s), {why}: {lost} messages lost")
+        return notes
+
+    def messages(self, ids: Collection[int], start: int, stop: int) -> Iterator[Message]:
+        wanted = {c.id: c for c in self.connections if c.id in ids}
+        sources: list[Iterator[tuple[int, Connection | None, bytes | memoryview]]] = [
+            self._of_chunk(number, wanted, start, stop)
+            for number, chunk in enumerate(self._index.chunks)
+            if chunk.start < stop and chunk.end >= start and chunk.counts.keys() & wanted.keys()
+        ]
+        if len(self._index.outside):
+            sources.append(self._outside(wanted, start, stop))
+        for time, connection, data in heapq.merge(*sources, key=itemgetter(0)):
+            if connection is not None:
+                yield connection, time, data
+
+    def times(self, ids: Collection[int], start: int = 0, stop: int = LAST) -> I64:
+        """As of any reader, but at least those with start <= log time < stop."""
+        outside = self._index.outside
+        parts = [outside[np.isin(outside[:, 1], list(ids)), 0]]
+        reaching = [(n, c) for n, c in enumerate(self._index.chunks) if c.start < stop and c.end >= start]
+        for number, chunk in reaching:
+            for connection in chunk.counts.keys() & set(ids):
+                if number in self._damaged:
+                    parts.append(self._damaged[number][1].get(connection, np.zeros(0, np.int64)))
+                elif chunk.times is not None:
+                    parts.append(chunk.times[connection])
+                else:
+                    parts.append(self._times_of(number, connection))
+        return np.sort(np.concatenate(parts))
+
+    def close(self) -> None:
+        self._bytes.close()
+
+    def _times_of(self, number: int, connection: int) -> I64:
+        try:
+            return self._form.read_times(self._bytes, self._index.chunks[number], connection)
+        except DamageError:
+            return np.array([t for t, c, _ in self._content(number) if c == connection], np.int64)
+
+    def _of_chunk(
+        self, number: int, wanted: Mapping[int, Connection], start: int, stop: int
+    ) -> Iterator[tuple[int, Connection | None, bytes | memoryview]]:
+        # The merge draws the first item of every source at once: this one costs no reading.
+        yield self._index.chunks[number].start, None, b""
+        found = [(t, wanted[c], d) for t, c, d in self._content(number) if c in wanted and start <= t < stop]
+        found.sort(key=itemgetter(0))
+        yield from found
+
+    def _content(self, number: int) -> list[tuple[int, int, memoryview]]:
+        """Log time, connection and data of the messages of a chunk."""
+        chunk = self._index.chunks[number]
+        why = "whose content is not all there"
+        try:
+            found = self._form.look_into(self._bytes, chunk)
+            found = [item for item in found if chunk.start <= item[0] <= chunk.end]
+        except DamageError as damage:
+            found, why = [], str(damage)
+        if len(found) < sum(chunk.counts.values()):
+            times = {id_: np.array([t for t, c, _ in found if c == id_], np.int64) for id_ in chunk.counts}
+            lost = Counter({id_: count - len(times[id_]) for id_, count in chunk.counts.items()})
+            self._damaged[number] = lost, times, why
+        return found
+
+    def _outside(
+        self, wanted: Mapping[int, Connection], start: int, stop: int
+    ) -> Iterator[tuple[int, Connection | None, bytes | memoryview]]:
+        rows = self._index.outside
+        time = rows[:, 0]
+        chosen = rows[np.isin(rows[:, 1], list(wanted)) & (time >= start) & (time < stop)]
+        for t, number, offset, size in chosen[np.argsort(chosen[:, 0], kind="stable")].tolist():
+            data = self._bytes.read(offset, size)
+            if len(data) == size:
+                yield t, wanted[number], data
+
+
+def rescue(path: Path, form: Form) -> IndexedChunks:
+    """A reader of what is found by looking through a file from front to back."""
+    found, file = Scan(), Bytes(path)
+    try:
+        bar = tqdm(
+            total=file.size, unit="B", unit_scale=True, desc=f"rescue {path.name}", delay=1, disable=None
+        )
+        with bar:
+            form.scan(file, found, lambda offset: bar.update(offset - bar.n))
+    finally:
+        file.close()
+    return IndexedChunks(path, form, found.index, found.notes(form.repair))

@@ -1,0 +1,350 @@
+"""An MCAP file looked through record by record; behind a broken one the next sound one is searched for."""
+
+from __future__ import annotations
+
+import re
+import struct
+from array import array
+from collections import defaultdict
+from collections.abc import Callable, Container, Iterator
+from typing import NamedTuple
+
+from rosbags.rosbag2 import Reader
+
+from bevviz.bags.chunks import Chunk, Form, Scan
+from bevviz.bags.mcap import (
+    CHANNEL,
+    CHUNK,
+    CHUNK_HEAD,
+    CHUNK_INDEX,
+    DATA_END,
+    FOOTER,
+    HEADER,
+    MAGIC,
+    MESSAGE,
+    MESSAGE_HEAD,
+    MESSAGE_INDEX,
+    RECORD,
+    SCHEMA,
+    STATISTICS,
+    Channels,
+    read_index,
+    read_times,
+    strings,
+)
+from bevviz.bags.reader import LAST, Bytes, Content, DamageError, unpack
+
+HEAD = re.compile(  # an opcode with a length below 2^40, or the first bytes of a compressed chunk's content
+    rb"(?=[\x01-\x0f].{5}\0\0\0|\x04\0\0\0zstd.{8}\x28\xb5\x2f\xfd|\x03\0\0\0lz4.{8}\x04\x22\x4d\x18)",
+    re.DOTALL,
+)
+COMPRESSIONS = (b"", b"lz4", b"zstd")
+HOUR, DAY = 3600 * 10**9, 24 * 3600 * 10**9
+PRIVATE = 0x80  # opcodes from here on are anybody's own
+_SUMMARY = {CHUNK_INDEX, STATISTICS, 0x0A, 0x0C, 0x0D, 0x0E}
+
+
+class Record(NamedTuple):
+    opcode: int
+    body: int  # offset
+    end: int  # offset; beyond that of the file where the record is cut
+
+    @property
+    def start(self) -> int:
+        return self.body - RECORD.size
+
+
+class Walker:
+    """The records of a file or of a chunk's content.
+
+    Args:
+        source: the bytes.
+        channels: those that are known; filled meanwhile.
+        span: first and last log time that a message found by searching may have; None: not known yet.
+    """
+
+    def __init__(self, source: Bytes, channels: Container[int], span: tuple[int, int] | None = None) -> None:
+        self._source, self._channels, self._span = source, channels, span
+        self.broken = self.passed = 0  # places without a sound record, and bytes there
+
+    def __call__(self, offset: int) -> Iterator[Record]:
+        """Records from ``offset`` on. Only a chunk may be cut: it ends behind the bytes."""
+        size = self._source.size
+        record = self._at(offset)
+        while offset < size:
+            if record is None:
+                record = self._skip(offset) or self._search(offset + 1, size)
+                self._pass((record.start if record else size) - offset)
+                if record is None:
+                    return
+                offset = record.start
+            sound, following = self._settle(record)
+            if sound is not None:
+                self._learn(sound)
+                yield sound
+                if sound.opcode == FOOTER:
+                    return
+                offset = sound.end
+            elif following is not None:
+                self._pass(following.start - offset)
+                offset = following.start
+            record = following
+
+    def _settle(self, record: Record) -> tuple[Record | None, Record | None]:
+        """The record, its end put right, None: it is broken; and the one behind it, None: not known."""
+        size, is_chunk = self._source.size, record.opcode == CHUNK
+        if record.end == size or record.opcode == FOOTER:
+            return record, None
+        following = self._at(record.end) if record.end < size else None
+        if following is not None or self._skip(record.end) is not None:
+            return record, following
+        # Its length is wrong, and what follows lies within or a little behind; or the next record is broken.
+        nearer = self._search(record.body, min(record.end, size), is_chunk)
+        if is_chunk:
+            return (record._replace(end=nearer.start) if nearer else record), nearer
+        if nearer is None and record.end < size:
+            doubtful = record.opcode == MESSAGE and not self._begins_message(record.end)
+            return (None if doubtful else record), None
+        return None, nearer
+
+    def _begins_message(self, offset: int) -> bool:
+        """Whether there is a message but for its length, or the end."""
+        head = self._source.read(offset, RECORD.size + MESSAGE_HEAD.size)
+        if len(head) < RECORD.size + MESSAGE_HEAD.size:
+            return True
+        return head[0] == MESSAGE and self._fits(offset + RECORD.size)
+
+    def _pass(self, size: int) -> None:
+        self.broken += 1
+        self.passed += size
+
+    def _learn(self, record: Record) -> None:
+        if record.opcode == MESSAGE:
+            _, _, time, _ = MESSAGE_HEAD.unpack(self._source.read(record.body, MESSAGE_HEAD.size))
+            first, last = self._span or (time, time)
+            self._span = min(first, time), max(last, time)
+
+    def _skip(self, offset: int) -> Record | None:
+        """The record behind one that makes no sense, where its length still leads to it."""
+        head = self._source.read(offset, RECORD.size)
+        if len(head) < RECORD.size:
+            return None
+        end = offset + RECORD.size + RECORD.unpack(head)[1]
+        return self._at(end, searched=True) if end < self._source.size else None
+
+    def _search(self, start: int, stop: int, chunk: bool = False) -> Record | None:
+        """The next record that makes sense, or only the next chunk."""
+        for offset in self._source.search(HEAD, start):
+            if offset >= stop:
+                return None
+            head = self._source.read(offset, RECORD.size)
+            if head[:4] in (b"\x04\0\0\0", b"\x03\0\0\0"):
+                offset -= RECORD.size + CHUNK_HEAD.size - 4
+                record = self._chunk(offset) if offset >= start else None
+            else:
+                record = self._at(offset, searched=True)
+            if record is not None and (record.opcode == CHUNK or not chunk):
+                return record
+        return None
+
+    def _at(self, offset: int, searched: bool = False) -> Record | None:
+        """The record at an offset, None where it makes no sense.
+
+        Args:
+            offset: of the record.
+            searched: nothing leads here, so that more must fit.
+        """
+        head = self._source.read(offset, RECORD.size)
+        if len(head) < RECORD.size:
+            return None
+        opcode, length = RECORD.unpack(head)
+        body, size = offset + RECORD.size, self._source.size
+        record = Record(opcode, body, body + length)
+        if opcode == CHUNK or (length > CHUNK_HEAD.size + 8 and self._is_chunk(offset)):
+            return self._chunk(offset)
+        if record.end > size:
+            cut = not searched and 0 < opcode <= DATA_END and length < 1 << 40 and self._is_sane(record)
+            return record if cut else None
+        if not self._is_sane(record) and not (opcode >= PRIVATE and not searched):
+            return None
+        if searched and record.end + RECORD.size <= size and opcode != FOOTER:
+            after, following = RECORD.unpack(self._source.read(record.end, RECORD.size))
+            if not (0 < after <= DATA_END or after >= PRIVATE) or following >= 1 << 40:
+                return None
+            if opcode == MESSAGE and not self._fits(body):
+                return None
+        return record
+
+    def _fits(self, body: int) -> bool:
+        """Whether a message is of a known channel and of the time of the others."""
+        head = self._source.read(body, MESSAGE_HEAD.size)
+        channel, _, time, published = MESSAGE_HEAD.unpack(head)
+        if self._channels and channel not in self._channels:
+            return False
+        if self._span is None:
+            return not published or abs(time - published) < DAY
+        first, last = self._span
+        return bool(first - HOUR <= time <= last + HOUR)
+
+    def _is_sane(self, record: Record) -> bool:
+        """Whether the lengths within a record fit its own, as far as its bytes are there."""
+        opcode, body, end = record
+        length = end - body
+        if opcode == MESSAGE:
+            head = self._source.read(body, MESSAGE_HEAD.size)
+            return (
+                length >= MESSAGE_HEAD.size
+                and len(head) == MESSAGE_HEAD.size
+                and MESSAGE_HEAD.unpack(head)[2] < LAST
+            )
+        if opcode in (SCHEMA, CHANNEL, HEADER, MESSAGE_INDEX):
+            if length > 1 << 26:
+                return False
+            data = self._source.read(body, length)
+            offset, count = {SCHEMA: (2, 3), CHANNEL: (4, 3), HEADER: (0, 2), MESSAGE_INDEX: (2, 1)}[opcode]
+            try:
+                return offset + sum(4 + len(text) for text in strings(data, offset, count)) == len(data)
+            except struct.error:
+                return False
+        if opcode in (FOOTER, DATA_END):
+            return length == (20 if opcode == FOOTER else 4)
+        return opcode in _SUMMARY or opcode == 9  # an attachment
+
+    def _is_chunk(self, offset: int) -> bool:
+        """Whether a record with another opcode is one, by the two lengths that agree in a chunk."""
+        head = self._source.read(offset, RECORD.size + CHUNK_HEAD.size + 12)
+        name_size = int.from_bytes(head[RECORD.size + 28 : RECORD.size + 32], "little")
+        if name_size > 4 or len(head) < RECORD.size + CHUNK_HEAD.size + 12:
+            return False
+        at = RECORD.size + CHUNK_HEAD.size
+        length = int.from_bytes(head[1:9], "little")
+        packed = int.from_bytes(head[at + name_size : at + name_size + 8], "little")
+        return (
+            head[at : at + name_size] in COMPRESSIONS and length == CHUNK_HEAD.size + name_size + 8 + packed
+        )
+
+    def _chunk(self, offset: int) -> Record | None:
+        """A chunk, whose length stands there twice."""
+        body = offset + RECORD.size
+        head = self._source.read(offset, RECORD.size + CHUNK_HEAD.size + 12)
+        if len(head) < RECORD.size + CHUNK_HEAD.size:
+            return None
+        name_size = int.from_bytes(head[RECORD.size + 28 : RECORD.size + 32], "little")
+        at = RECORD.size + CHUNK_HEAD.size
+        if name_size > 4 or head[at : at + name_size] not in COMPRESSIONS or len(head) < at + name_size + 8:
+            return None
+        size = self._source.size
+        ends = [
+            body + int.from_bytes(head[1:9], "little"),
+            offset + at + name_size + 8 + int.from_bytes(head[at + name_size : at + name_size + 8], "little"),
+        ]
+        if ends[0] == ends[1]:
+            return Record(CHUNK, body, ends[0])
+        for end in ends:
+            if body + at < end < size and self._at(end, searched=True) is not None:
+                return Record(CHUNK, body, end)
+        return None
+
+
+def scan(file: Bytes, found: Scan, tell: Callable[[int], object]) -> None:
+    """Look through a file from front to back, and into every chunk."""
+    channels = Channels()
+    walker = Walker(file, channels)
+    outside = array("q")
+    for opcode, body, end in walker(len(MAGIC) if file.read(0, len(MAGIC)) == MAGIC else 0):
+        tell(end)
+        if opcode in (SCHEMA, CHANNEL):
+            channels.note(opcode, file.read(body, end - body))
+        elif opcode == MESSAGE:
+            channel, _, time, _ = MESSAGE_HEAD.unpack(file.read(body, MESSAGE_HEAD.size))
+            outside.extend((time, channel, body + MESSAGE_HEAD.size, end - body - MESSAGE_HEAD.size))
+        elif opcode == CHUNK:
+            chunk = _read_head(file, body, end)
+            found.begin(chunk)
+            try:
+                _describe(file, chunk, channels, found)
+            except DamageError as damage:
+                found.damaged[str(damage)] += 1
+            if chunk.cut:
+                found.cut, found.rescued = file.size - body, sum(chunk.counts.values())
+        elif opcode == MESSAGE_INDEX:
+            channel, size = struct.unpack("<HI", file.read(body, 6))
+            found.listed[channel] += size // 16
+        elif opcode == STATISTICS and end - body >= 8:
+            found.stated = int.from_bytes(file.read(body, 8), "little")
+    found.end()
+    found.broken += walker.broken
+    found.passed += walker.passed
+    found.index.connections = channels.connections(found.finish(channels, outside))
+
+
+def _read_head(file: Bytes, body: int, end: int) -> Chunk:
+    first, last, size, crc, name_size = CHUNK_HEAD.unpack(file.read(body, CHUNK_HEAD.size))
+    name = file.read(body + CHUNK_HEAD.size, name_size).decode()
+    data = body + CHUNK_HEAD.size + name_size + 8
+    cut = end > file.size
+    return Chunk(first, last, data, min(end, file.size) - data, size, name, {}, crc, times={}, cut=cut)
+
+
+def _describe(file: Bytes, chunk: Chunk, channels: Channels, found: Scan) -> None:
+    """Fill in what is in a chunk."""
+    times: dict[int, array[int]] = defaultdict(lambda: array("q"))
+    content = Content(_unpacked(file, chunk)[0])
+    walker = Walker(content, channels, _span(chunk))
+    for opcode, body, end in walker(0):
+        if opcode == MESSAGE:
+            channel, _, time, _ = MESSAGE_HEAD.unpack(content.read(body, MESSAGE_HEAD.size))
+            times[channel].append(time)
+        elif opcode in (SCHEMA, CHANNEL):
+            channels.note(opcode, content.read(body, end - body))
+    if not chunk.cut:
+        found.broken += walker.broken
+        found.passed += walker.passed
+    chunk.fill(times)
+
+
+def look_into(file: Bytes, chunk: Chunk) -> list[tuple[int, int, memoryview]]:
+    """Log time, channel and data of the messages of a chunk, those of its index.
+
+    Raises:
+        DamageError: it cannot be unpacked.
+    """
+    content, crc = _unpacked(file, chunk)
+    data = memoryview(content)
+    found, whole = _messages(data, chunk.counts)
+    if crc or (whole and len(found) == sum(chunk.counts.values())):
+        return found
+    walk = Walker(Content(content), chunk.counts, _span(chunk))(0)
+    return [i for r in walk if r.opcode == MESSAGE for i in _messages(data[r.start : r.end], chunk.counts)[0]]
+
+
+def _messages(data: memoryview, channels: Container[int]) -> tuple[list[tuple[int, int, memoryview]], bool]:
+    """The messages of a content by the lengths of its records, and whether these lead to its end."""
+    found, offset, size = [], 0, len(data)
+    while offset + RECORD.size <= size:
+        opcode, length = RECORD.unpack_from(data, offset)
+        body = offset + RECORD.size
+        offset = body + length
+        if opcode == MESSAGE and offset <= size and length >= MESSAGE_HEAD.size:
+            channel, _, time, _ = MESSAGE_HEAD.unpack_from(data, body)
+            if channel in channels and time < LAST:
+                found.append((time, channel, data[body + MESSAGE_HEAD.size : offset]))
+    return found, offset == size
+
+
+def _unpacked(file: Bytes, chunk: Chunk) -> tuple[bytes, bool]:
+    """The content of a chunk, and whether it is known to be as it was written."""
+    crc = chunk.crc
+    if crc is None:  # it stands before the content
+        crc = int.from_bytes(file.read(chunk.data - 16 - len(chunk.compression), 4), "little")
+    packed = file.read(chunk.data, chunk.packed)
+    cut = chunk.cut or len(packed) < chunk.packed
+    return unpack(chunk.compression, packed, chunk.size, crc, cut=cut), bool(crc) and not cut
+
+
+def _span(chunk: Chunk) -> tuple[int, int] | None:
+    return (chunk.start, chunk.end) if 0 < chunk.start <= chunk.end < LAST else None
+
+
+REPAIR = "'mcap recover' writes a sound copy"
+FORM = Form(Reader, True, read_index, read_times, look_into, scan, REPAIR)

@@ -1,0 +1,432 @@
+"""Damaged bags: what is there is read, nothing false is given, and every loss is said with a number."""
+
+from __future__ import annotations
+
+import os
+import re
+import sqlite3
+import struct
+from collections import Counter
+from pathlib import Path
+
+import pytest
+
+from benchmarks.torture.samples import FORMATS, items
+from bevviz.bags import chunks, mcap
+from bevviz.bags.info import describe, render
+from bevviz.bags.reader import DamageError
+from bevviz.bags.recording import Recording
+from bevviz.bags.source import BagSource
+from bevviz.bags.sqlite import checksum_of
+from bevviz.config import Config
+from bevviz.errors import UserError
+
+Found = list[tuple[str, int, bytes]]
+
+
+def whole(name: str) -> Found:
+    """What was written."""
+    return [(topic, time, data) for topic, _, time, data in items(name.startswith("ros1"))]
+
+
+def read(path: Path) -> tuple[Found, list[str]]:
+    """Every message, and what is said; counts, times and span are those of the messages."""
+    with Recording([path]) as recording:
+        names = [topic.name for topic in recording.topics]
+        found = [(m.topic, m.received, bytes(m.content())) for m in recording.messages(names)]
+        times = [time for _, time, _ in found]
+        assert times == sorted(times)
+        assert recording.message_count == len(found)
+        for name in names:
+            assert recording.times(name).tolist() == [time for topic, time, _ in found if topic == name]
+        return found, recording.warnings
+
+
+def missing(found: Found, name: str) -> int:
+    """How many messages are missing; there are none that were not written."""
+    assert not Counter(found) - Counter(whole(name))
+    return len(whole(name)) - len(found)
+
+
+def records(data: bytes, opcode: int) -> list[int]:
+    """Offsets of the records of a kind in an MCAP file, those in uncompressed chunks, too."""
+    found, at = [], 8
+    while at + 9 < len(data):
+        (size,) = struct.unpack_from("<Q", data, at + 1)
+        inner = at + 9 + 40 if data[at] == mcap.CHUNK else at + 9 + size
+        if data[at] == opcode:
+            found.append(at)
+        while inner < at + 9 + size and not data[at + 9 + 28]:
+            if data[inner] == opcode:
+                found.append(inner)
+            inner += 9 + struct.unpack_from("<Q", data, inner + 1)[0]
+        at += 9 + size
+    return found
+
+
+def change(path: Path, at: int, new: bytes) -> None:
+    data = bytearray(path.read_bytes())
+    data[at : at + len(new)] = new
+    path.write_bytes(data)
+
+
+# --- sound -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_a_sound_bag_is_read_without_a_rescue(tmp_path: Path, name: str) -> None:
+    found, said = read(FORMATS[name](tmp_path))
+    assert not missing(found, name)
+    rescued = [text for text in said if "rescued" in text]
+    if name in ("mcap, flat", "sqlite3, with a log"):  # they have no index, or no end
+        assert len(rescued) == 1
+    else:
+        assert not said
+
+
+def test_a_bug_is_not_taken_for_damage(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = FORMATS["mcap"](tmp_path)
+
+    def broken(*_: object) -> None:
+        raise TypeError("a slip of ours")
+
+    monkeypatch.setattr(mcap.Channels, "connections", broken)
+    with pytest.raises(TypeError, match="a slip of ours"):
+        read(path)
+    monkeypatch.undo()
+    monkeypatch.setattr(chunks.SoundChunks, "sums", broken)
+    with pytest.raises(TypeError, match="a slip of ours"):
+        read(path)
+
+
+# --- an index that is not to be believed -------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["mcap", "mcap, no checksums", "mcap, one chunk"])
+def test_an_mcap_cut_behind_its_last_chunk_has_all_messages(tmp_path: Path, name: str) -> None:
+    path = FORMATS[name](tmp_path)
+    data = path.read_bytes()
+    last = records(data, mcap.CHUNK)[-1]
+    end = last + 9 + struct.unpack_from("<Q", data, last + 1)[0]
+    for cut in range(end, len(data), max(1, (len(data) - end) // 12)):
+        path.write_bytes(data[:cut])
+        found, said = read(path)
+        assert not missing(found, name)
+        assert any("read 161 messages" in text for text in said)
+
+
+def test_a_ros1_bag_cut_anywhere_has_all_messages_before_the_cut(tmp_path: Path) -> None:
+    path = FORMATS["ros1"](tmp_path)
+    data, written = path.read_bytes(), whole("ros1")
+    ends, at = [], 0
+    for _, _, content in written:
+        at = data.index(content, at) + len(content)
+        ends.append(at)
+    for cut in range(30_000, len(data), len(data) // 25):
+        path.write_bytes(data[:cut])
+        found, said = read(path)
+        assert found == written[: sum(end <= cut for end in ends)]
+        assert any(f"read {len(found)} messages" in text for text in said)
+
+
+@pytest.mark.parametrize("name", ["mcap", "mcap, zstd", "mcap, one chunk"])
+@pytest.mark.parametrize("kind", [mcap.CHUNK_INDEX, mcap.STATISTICS, mcap.MESSAGE_INDEX, mcap.CHANNEL])
+def test_a_changed_opcode_in_the_index_loses_nothing(tmp_path: Path, name: str, kind: int) -> None:
+    path = FORMATS[name](tmp_path)
+    change(path, records(path.read_bytes(), kind)[-1], b"\x4d")
+    found, said = read(path)
+    assert not missing(found, name)
+    # A damaged message index does not keep a chunk from being read, nor is it asked for before.
+    assert kind == mcap.MESSAGE_INDEX or any("rescued" in text for text in said)
+
+
+def test_an_index_that_disagrees_with_the_statistics_is_not_believed(tmp_path: Path) -> None:
+    path = FORMATS["mcap, one chunk"](tmp_path)
+    at = records(path.read_bytes(), mcap.STATISTICS)[0]
+    change(path, at + 9, struct.pack("<Q", 200))
+    with pytest.raises(DamageError, match=r"of 1 chunks with 161 messages, disagrees .* of 1 with 200"):
+        mcap.read_index(path)
+    found, said = read(path)
+    assert not missing(found, "mcap")
+    assert any("count 200 messages: 39 are lost" in text for text in said)
+
+
+# --- broken records ----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("length", [0, 5, 300, 1 << 33, 2**63 - 1, 2**64 - 1])
+@pytest.mark.parametrize("name", ["mcap, flat", "mcap, no checksums", "mcap, one chunk"])
+def test_behind_a_broken_message_the_next_one_is_found(tmp_path: Path, name: str, length: int) -> None:
+    path = FORMATS[name](tmp_path)
+    at = records(path.read_bytes(), mcap.MESSAGE)[70]
+    change(path, at + 1, struct.pack("<Q", length))
+    found, said = read(path)
+    assert missing(found, name) == 1
+    assert any(re.search(r"1 (are|messages) lost|: 1 are lost", text) for text in said)
+
+
+@pytest.mark.parametrize("name", ["mcap", "mcap, lz4", "mcap, zstd"])
+@pytest.mark.parametrize("wrong", [b"\x00", b"\x05", b"\xff"])
+def test_a_chunk_is_known_by_its_content(tmp_path: Path, name: str, wrong: bytes) -> None:
+    path = FORMATS[name](tmp_path)
+    data = path.read_bytes()
+    change(path, records(data, mcap.CHUNK)[3], wrong)
+    path.write_bytes(path.read_bytes()[:-40])  # without its index, that is
+    assert not missing(read(path)[0], name)
+
+
+@pytest.mark.parametrize("name", ["mcap", "mcap, lz4", "mcap, zstd"])
+def test_a_damaged_chunk_costs_its_own_messages_and_no_wrong_one_is_given(tmp_path: Path, name: str) -> None:
+    path = FORMATS[name](tmp_path)
+    data = path.read_bytes()
+    at = records(data, mcap.CHUNK)[3] + 2000
+    for content in (data, data[:-40]):
+        path.write_bytes(content)
+        change(path, at, b"\x55\xaa\x55")
+        found, said = read(path)
+        lost = missing(found, name)
+        assert 5 < lost < 20
+        assert any(
+            f"1 damaged chunk(s), the content of a chunk does not fit its checksum: {lost} " in s
+            for s in said
+        ) or any(f"{lost} messages lost" in s or f"{lost} are lost" in s for s in said)
+
+
+@pytest.mark.parametrize("name", ["mcap", "mcap, zstd", "ros1", "ros1, bz2", "sqlite3"])
+def test_bytes_that_are_missing_in_the_middle(tmp_path: Path, name: str) -> None:
+    path = FORMATS[name](tmp_path)
+    data = path.read_bytes()
+    path.write_bytes(data[:200_000] + (bytes(300) if name == "sqlite3" else b"") + data[200_300:])
+    found, said = read(path)
+    assert missing(found, name) < 30 if name != "sqlite3" else len(found) > 155
+    assert name == "sqlite3" or any(re.search(r"\d+ (are|messages) lost|\d broken place", s) for s in said)
+
+
+def test_damage_met_while_reading_gives_nothing_twice(tmp_path: Path) -> None:
+    path = FORMATS["mcap"](tmp_path)
+    change(path, records(path.read_bytes(), mcap.CHUNK)[4] + 5000, b"\0\0\0\0\0\0\0\1")
+    with Recording([path]) as recording:
+        names = [topic.name for topic in recording.topics]
+        messages = recording.messages(names)
+        first = [next(messages) for _ in range(20)]
+        assert not recording.warnings
+        rest = list(messages)
+        found = [(m.topic, m.received, bytes(m.data)) for m in [*first, *rest]]
+        assert any("does not fit its checksum" in text for text in recording.warnings)
+        again = [(m.topic, m.received, bytes(m.data)) for m in recording.messages(names)]
+    assert 5 < missing(found, "mcap") < 20
+    assert again == found
+
+
+@pytest.mark.parametrize("name", ["mcap", "mcap, zstd", "mcap, flat", "sqlite3", "ros1", "ros1, lz4"])
+def test_a_file_that_is_cut_while_it_is_read(tmp_path: Path, name: str) -> None:
+    path = FORMATS[name](tmp_path)
+    size = path.stat().st_size
+    with Recording([path]) as recording:
+        names = [topic.name for topic in recording.topics]
+        messages = recording.messages(names)
+        found = [next(messages) for _ in range(10)]
+        os.truncate(path, size // 2)
+        found += messages
+        said = recording.warnings
+    given = [(m.topic, m.received, bytes(m.data)) for m in found]
+    assert 30 < missing(given, name) < 110
+    assert any(re.search(r"\d+ messages lost|read \d+ messages", text) for text in said)
+
+
+# --- numbers beyond all measure ----------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["mcap", "mcap, flat", "mcap, no checksums", "ros1", "sqlite3"])
+@pytest.mark.parametrize("number", [2**64 - 1, 2**62])
+def test_no_number_in_a_file_leads_to_a_traceback(tmp_path: Path, name: str, number: int) -> None:
+    path = FORMATS[name](tmp_path)
+    data = path.read_bytes()
+    places = range(4096, len(data), 30_011) if "mcap" not in name else []
+    for kind in (mcap.MESSAGE, mcap.CHUNK, mcap.CHUNK_INDEX, mcap.STATISTICS, mcap.FOOTER, mcap.SCHEMA):
+        if "mcap" in name:
+            places = [*places, *(at + 9 + step for at in records(data, kind)[:1] for step in range(0, 32, 8))]
+    for at in places:
+        path.write_bytes(data)
+        change(path, at, struct.pack("<Q", number))
+        try:
+            read(path)
+            render(describe([path], Config()))
+        except UserError as error:
+            assert "\n" not in str(error)
+
+
+def test_a_time_that_no_date_has_is_a_broken_message(tmp_path: Path) -> None:
+    path = FORMATS["mcap, flat"](tmp_path)
+    at = records(path.read_bytes(), mcap.MESSAGE)[5]
+    change(path, at + 9 + 6, struct.pack("<Q", 2**63 + 7))
+    found, said = read(path)
+    assert missing(found, "mcap, flat") == 1
+    assert any("count 161 messages: 1 are lost" in text for text in said)
+
+
+@pytest.mark.parametrize("name", ["mcap, flat", "ros1"])
+def test_a_definition_that_is_no_utf8(tmp_path: Path, name: str) -> None:
+    path = FORMATS[name](tmp_path)
+    data = path.read_bytes()
+    path.write_bytes(data.replace(b"uint32 height", b"uint32 \xff\xfe\xfdght"))
+    with BagSource([path], Config()) as source:
+        list(source)
+        said = source.warnings
+    assert len(read(path)[0]) == 161
+    assert any("definition" in text or "could not be used" in text for text in said)
+
+
+# --- ROS 1 -------------------------------------------------------------------------------------
+
+
+def test_messages_of_an_unknown_connection_are_counted(tmp_path: Path) -> None:
+    path = FORMATS["ros1"](tmp_path)
+    data = path.read_bytes()
+    for match in re.finditer(rb"conn=(....)", data, re.DOTALL):
+        if match[1] == b"\x03\0\0\0":
+            change(path, match.start(1), b"\x77\0\0\0")
+    found, said = read(path)
+    assert missing(found, "ros1") <= 41
+    assert any("that nothing describes: lost" in text for text in said) or not missing(found, "ros1")
+
+
+@pytest.mark.parametrize("name", ["ros1", "ros1, bz2", "ros1, lz4"])
+def test_changed_opcodes_of_ros1_records(tmp_path: Path, name: str) -> None:
+    path = FORMATS[name](tmp_path)
+    data = path.read_bytes()
+    places = [match.end() for match in re.finditer(b"op=", data)]
+    for at in places[1 :: len(places) // 10]:
+        path.write_bytes(data)
+        change(path, at, b"\x09")
+        assert not missing(read(path)[0], name)
+
+
+# --- sqlite3 -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", [10, 11])
+def test_columns_of_a_type_that_there_is_not(tmp_path: Path, kind: int) -> None:
+    path = FORMATS["sqlite3"](tmp_path)
+    data = path.read_bytes()
+    matches = list(re.finditer(rb"\x00[\x01\x08\x09]\x06", data))  # id, topic, time, and then the data
+    assert len(matches) > 20
+    change(path, matches[10].start() + 1, bytes([kind]))
+    found, said = read(path)
+    assert missing(found, "sqlite3") <= 1
+    assert any("rescued" in text for text in said)
+
+
+def test_the_log_beside_a_database_is_read(tmp_path: Path) -> None:
+    path = FORMATS["sqlite3, with a log"](tmp_path)
+    log = path.with_name("bag.db3-wal")
+    assert log.stat().st_size > 100_000
+    before = path.read_bytes(), log.read_bytes(), sorted(tmp_path.rglob("*"))
+    found, said = read(path)
+    assert not missing(found, "sqlite3")
+    assert any("bag.db3-wal are read with it" in text for text in said)
+    assert (path.read_bytes(), log.read_bytes(), sorted(tmp_path.rglob("*"))) == before
+    log.write_bytes(log.read_bytes()[: log.stat().st_size // 2])
+    rows = sqlite3.connect(path).execute("SELECT count(*) FROM messages").fetchall()
+    found, _ = read_copy(path, before[0], log)
+    assert len(found) == rows[0][0] > 120
+
+
+def read_copy(path: Path, data: bytes, log: Path) -> tuple[Found, list[str]]:
+    """Read again as it was before sqlite3 had looked at it."""
+    folder = path.parent / "copy"
+    folder.mkdir()
+    (folder / "bag.db3").write_bytes(data)
+    (folder / "bag.db3-wal").write_bytes(log.read_bytes())
+    return read(folder / "bag.db3")
+
+
+def test_the_checksum_of_a_log_is_that_of_its_definition() -> None:
+    data, before = os.urandom(8 + 512), (123_456_789, 4_000_000_000)
+    for order in "<>":
+        s0, s1 = before
+        for x0, x1 in struct.iter_unpack(f"{order}II", data):
+            s0 = (s0 + x0 + s1) % 2**32
+            s1 = (s1 + x1 + s0) % 2**32
+        assert checksum_of(data, order, before) == (s0, s1)
+
+
+def test_a_database_whose_index_disagrees_with_its_messages(tmp_path: Path) -> None:
+    path = FORMATS["sqlite3"](tmp_path)
+    with sqlite3.connect(path) as connection:
+        (root,) = connection.execute(
+            "SELECT rootpage FROM sqlite_master WHERE name = 'timestamp_idx'"
+        ).fetchone()
+        (size,) = connection.execute("PRAGMA page_size").fetchone()
+    connection.close()
+    data = path.read_bytes()
+    at = data.index(struct.pack(">q", whole("sqlite3")[9][1]), (root - 1) * size, root * size)
+    change(path, at + 4, b"\0\0\0")
+    found, said = read(path)
+    assert not missing(found, "sqlite3")
+    assert any("its index of times disagrees" in text for text in said)
+
+
+# --- packed files ------------------------------------------------------------------------------
+
+
+def test_of_a_cut_zstd_file_no_whole_block_is_lost(tmp_path: Path) -> None:
+    import zstandard
+
+    path = FORMATS["mcap.zstd"](tmp_path)
+    data = path.read_bytes()
+    for share in (0.3, 0.61, 0.97):
+        path.write_bytes(data[: int(share * len(data))])
+        reference = zstandard.ZstdDecompressor().decompressobj().decompress(path.read_bytes())
+        found, said = read(path)
+        written = whole("mcap")
+        there = sum(reference.find(content) >= 0 for _, _, content in written)
+        assert found == written[:there]
+        assert any("its end is missing" in text and "could be unpacked" in text for text in said)
+
+
+def test_behind_a_damaged_frame_the_next_one_is_unpacked(tmp_path: Path) -> None:
+    path = FORMATS["mcap.zstd, several frames"](tmp_path)
+    data = path.read_bytes()
+    second = data.index(b"\x28\xb5\x2f\xfd", 4)
+    change(path, second + 4, b"\xff" * 12)
+    found, said = read(path)
+    assert len(found) > 60 and missing(found, "mcap") < 100
+    assert {time for _, time, _ in found} >= {time for _, time, _ in whole("mcap")[-20:]}
+    assert any("1 damaged place(s)" in text for text in said)
+
+
+# --- what else stands in the way ---------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["mcap", "ros1"])
+def test_first_bytes_that_are_damaged(tmp_path: Path, name: str) -> None:
+    path = FORMATS[name](tmp_path)
+    change(path, 0, b"\0\0\0\0")
+    found, said = read(path)
+    assert not missing(found, name)
+    assert any("rescued" in text for text in said)
+
+
+def test_a_database_of_which_all_is_still_in_its_log(tmp_path: Path) -> None:
+    path = tmp_path / "bag.db3"
+    with sqlite3.connect(FORMATS["sqlite3"](tmp_path)) as source, sqlite3.connect(path) as target:
+        target.execute("PRAGMA journal_mode=WAL")
+        target.execute("PRAGMA wal_autocheckpoint=0")
+        target.execute("CREATE TABLE first (id)")
+        script = "\n".join(source.iterdump())
+        target.executescript(script)
+        log = path.with_name("bag.db3-wal").read_bytes()
+    source.close()
+    target.close()
+    path.write_bytes(b"")
+    path.with_name("bag.db3-wal").write_bytes(log)
+    assert not missing(read(path)[0], "sqlite3")
+
+
+@pytest.mark.parametrize("name", ["drive #1?.db3", "100%.db3", "drive", "drive.mcap"])
+def test_names_that_mean_something_else(tmp_path: Path, name: str) -> None:
+    path = FORMATS["sqlite3"](tmp_path)
+    found, said = read(path.rename(tmp_path / name))
+    assert not missing(found, "sqlite3")
+    assert not said

@@ -1,0 +1,78 @@
+"""A short part of the torture, with a fixed seed; ``python -m benchmarks.torture`` is the whole of it."""
+
+from __future__ import annotations
+
+import argparse
+from collections import Counter
+from pathlib import Path
+
+import pytest
+
+from benchmarks.torture import damage, fuzz
+from benchmarks.torture.__main__ import SHARE
+from benchmarks.torture.damage import DAMAGES, Tally, judged
+from benchmarks.torture.judges import judges, taken
+from benchmarks.torture.samples import FORMATS, items
+from benchmarks.torture.worker import Outcome, Worker
+
+SHORT = ("mcap, no checksums", "mcap, zstd", "mcap, flat", "mcap.zstd", "sqlite3, with a log", "ros1, lz4")
+
+
+def test_damaged_bags() -> None:
+    total = Tally()
+    for _, tally in damage.run(seed=1, bags=len(SHORT) * len(DAMAGES), names=SHORT):
+        total += tally
+    assert total.bags == 60
+    assert total.best > 6000
+    assert total.share >= SHARE, total.examples
+    assert not (total.tracebacks or total.hangs or total.silent), total.examples
+    assert total.wrong <= total.their_wrong * 1.2
+
+
+def test_fuzzed_messages() -> None:
+    (total,) = fuzz.run(seed=1, messages=120)
+    assert total.messages >= 120 and total.refused > 40
+    assert not (total.tracebacks or total.broken or total.hangs), total.examples
+    assert total.slowest < 5
+    assert total.memory < 400
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_the_other_readers_read_a_sound_bag(tmp_path: Path, name: str) -> None:
+    """Else what they get out of a damaged one would be worth nothing."""
+    path = FORMATS[name](tmp_path)
+    written = Counter((topic, time, data) for topic, _, time, data in items(name.startswith("ros1")))
+    best = {judge: (Counter(taken(read, path)) & written).total() for judge, read in judges(name).items()}
+    assert max(best.values()) == 161
+    assert sum(count == 161 for count in best.values()) >= 2 or "with a log" in name, best
+
+
+def test_what_counts_as_a_failure(tmp_path: Path) -> None:
+    path = FORMATS["ros1"](tmp_path)
+    written = [(topic, time, data) for topic, _, time, data in items(ros1=True)]
+    whole = Counter(written)
+    tally = judged(path, "ros1", whole, Outcome(found=[*written[5:], ("/other", 5, b"")]))
+    assert (tally.ours, tally.best, tally.wrong, tally.silent) == (156, 161, 1, 1)
+    assert judged(path, "ros1", whole, Outcome(found=written[5:], said=["5 lost"])).silent == 0
+    assert judged(path, "ros1", whole, Outcome(traceback="Traceback ...")).tracebacks == 1
+
+
+def test_a_worker_that_hangs_is_replaced(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = FORMATS["ros1"](tmp_path)
+    monkeypatch.setattr("benchmarks.torture.worker.LIMIT", 0.01)
+    with Worker() as worker:
+        assert worker.read(path).hung
+        monkeypatch.setattr("benchmarks.torture.worker.LIMIT", 60.0)
+        assert len(worker.read(path).found) == 161
+        assert worker.read(tmp_path / "nothing.bag").said
+
+
+def test_the_command_says_which_parts_there_are(capsys: pytest.CaptureFixture[str]) -> None:
+    from benchmarks.torture.__main__ import PARTS, damaged_bags
+
+    options = argparse.Namespace(seed=2, bags=10, format="ros1, bz2", messages=1)
+    assert set(PARTS) >= {"damage", "fuzz"}
+    assert damaged_bags(options)
+    lines = capsys.readouterr().out.splitlines()
+    assert "Damaged bags, seed 2" in lines
+    assert any(line.startswith("| all | 10 | 1610 |") for line in lines)
