@@ -17,11 +17,11 @@ import rerun.blueprint as rrb
 
 from bevviz.compare.summary import columns
 from bevviz.config import Config
+from bevviz.counts import counts_of
 from bevviz.errors import UserError
 from bevviz.evaluate import Score, Truth
 from bevviz.frame import F64, Frame, FrameResult
 from bevviz.logging import entities
-from bevviz.logging.logger import counts_of
 from bevviz.variants import Variants, check_same_frames
 
 MOST = 500  # combinations of values

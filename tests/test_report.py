@@ -220,7 +220,7 @@ def test_other_versions_and_machines_are_named(
 ) -> None:
     from bevviz.report import check, origin
 
-    monkeypatch.setattr(check, "versions", lambda: ["numpy 9.9"])
+    monkeypatch.setattr(check, "versions", lambda: {"numpy": "9.9"})
     monkeypatch.setattr(check, "hardware", lambda _: origin.Hardware("abacus", 1, "0 GiB", "none"))
     assert main(["report", "--check", str(small)]) == 0
     said = capsys.readouterr().out

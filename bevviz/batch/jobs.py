@@ -15,7 +15,7 @@ from bevviz.bags.recording import METADATA, bag_files
 from bevviz.batch.table import About, read_about
 from bevviz.config import Config
 from bevviz.errors import UserError
-from bevviz.logging.logger import versions
+from bevviz.provenance import versions
 
 PARTIAL = ".partial"  # folder of what is not complete
 
@@ -65,7 +65,7 @@ class Job:
             "selection": asdict(self.selection),
             "config": config,
             "blueprint": _content(self.blueprint),
-            "versions": versions(),
+            "versions": [f"{name} {number}" for name, number in versions().items()],
         }
         return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()
 

@@ -14,9 +14,9 @@ import pyarrow.parquet as pq
 from pydantic import TypeAdapter
 
 from bevviz.config import Config
+from bevviz.counts import counts_of
 from bevviz.frame import ClusterState, Decision, DetectionState, FrameResult, Scene
-from bevviz.logging.logger import counts_of
-from bevviz.logging.text import remarks
+from bevviz.logging.decisions import remarks
 
 DECISIONS = tuple(d.name.lower() for d in Decision if d.value in (0, 1, 2, 3, 4, 8))  # what a kept one can be
 STAGES = (

@@ -126,7 +126,7 @@ def _log(
     options: argparse.Namespace,
 ) -> None:
     """Into every output that was asked for; without one, only the text was."""
-    from bevviz.logging.calib import log_calibration
+    from bevviz.calib.log import log_calibration
 
     if not (options.save or options.serve or options.connect or options.viewer or has_display()):
         say("no display: --save FILE.rrd keeps the pictures and curves, --serve shows them in a browser")

@@ -138,7 +138,7 @@ def _show(
     result: FrameResult, config: Config, answers: Sequence[Answer], scene: Scene, options: argparse.Namespace
 ) -> None:
     from bevviz.logging.logger import Logger
-    from bevviz.logging.why import log_answers
+    from bevviz.why.log import log_answers
 
     with outputs(scene, config, options) as sinks:
         logger = Logger(sinks.recording, config, scene)

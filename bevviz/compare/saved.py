@@ -20,7 +20,9 @@ from bevviz.config import flat_yaml
 from bevviz.errors import UserError
 from bevviz.frame import F64, Boxes3D, Scene
 from bevviz.logging import entities
+from bevviz.logging.camera import log_shared_image
 from bevviz.logging.pieces import CORNER
+from bevviz.logging.writer import Writer
 
 Row = Mapping[str, Any]
 
@@ -161,10 +163,9 @@ class SavedPair:
         """Send both runs on, the new one under ``/b``. Returns what is to be called with the differences."""
         recording.send_chunks(self.a.stream())
         recording.send_chunks(_beside(self.b))
-        for camera in self.b.cameras:  # over the one image
-            for path in (entities.projected(camera), entities.detections(camera), entities.weak(camera)):
-                over = rr.CoordinateFrame(f"tf#{entities.image(camera)}")
-                recording.log(entities.B + path, over, static=True)
+        beside = Writer(recording, entities.B)
+        for camera in self.b.cameras:
+            log_shared_image(beside, camera)
         about = "```\n" + "\n".join(parameters(self.summary.config)) + "\n```"
         log = DifferenceLogger(recording, self.summary.names, about)
 

@@ -109,6 +109,11 @@ def state(*lane: str) -> str:
     return "/".join((STATES, *lane))
 
 
+def class_state(camera: str, class_name: str) -> str:
+    """What became of the best detection of the class."""
+    return state(camera, class_name.replace(" ", "_"))
+
+
 def why(what: str) -> str:
     """The chain of what ``bevviz why`` explains: points by their fate, boxes, frustums."""
     return f"{WHY}/{what}"

@@ -15,9 +15,9 @@ from tqdm import tqdm
 from bevviz.config import Config, load
 from bevviz.errors import UserError
 from bevviz.logging import entities
-from bevviz.logging.logger import versions
 from bevviz.pipeline import Pipeline
 from bevviz.prefetch import prefetch
+from bevviz.provenance import versions
 from bevviz.report.digest import ROUNDING, Difference, Stage, compare, detections_of, digest, unpack
 from bevviz.report.make import replay
 from bevviz.report.origin import About, changes, file_hash, hardware, model_of
@@ -178,7 +178,7 @@ def _changed(kept: Kept, bag: Path, stored: Config, pipeline: Pipeline) -> list[
         model = model_of(config)
         if model is not None and about.model is not None and model.sha256 != about.model.sha256:
             found.append(f"model was {about.model.name} (SHA-256 {about.model.sha256}), is {model.sha256}")
-    here = dict(line.rsplit(" ", 1) for line in versions())
+    here = dict(line.rsplit(" ", 1) for line in [f"{name} {number}" for name, number in versions().items()])
     for line in kept.versions:
         name, number = line.rsplit(" ", 1)
         if here.get(name) != number:

@@ -18,10 +18,11 @@ from bevviz.config import Config
 from bevviz.errors import UserError
 from bevviz.frame import Camera, Detections
 from bevviz.logging import entities
-from bevviz.logging.logger import Logger, versions
+from bevviz.logging.logger import Logger
 from bevviz.logging.sinks import open_recording
 from bevviz.pipeline import Pipeline
 from bevviz.prefetch import prefetch
+from bevviz.provenance import versions
 from bevviz.report.digest import digest, pack
 from bevviz.report.facts import Facts, commands, file_lines, window_text
 from bevviz.report.origin import (
@@ -235,7 +236,7 @@ def _facts(
         start=window.start,
         config=f"Preset {public.preset}, {differs}.",
         changes=changed,
-        versions=versions(),
+        versions=[f"{name} {number}" for name, number in versions().items()],
         hardware=machine.lines(),
         warnings=made.warnings,
         files=file_lines(sizes, part.counts, model_of(order.config)),

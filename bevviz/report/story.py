@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from bevviz.frame import Frame, FrameResult
-from bevviz.logging.logger import health
+from bevviz.logging.health import health
 from bevviz.report.pictures import camera_picture, jpeg, shrink
 
 STRIP_PICTURES = 48  # of all cameras and the bird's-eye view together

@@ -1,13 +1,22 @@
-"""The decisions of one frame as a page of Markdown."""
+"""The decisions of one frame: a page of Markdown, and lines of the log of all frames."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 
 from bevviz.frame import Explanation, FrameResult
+from bevviz.logging import entities
+from bevviz.logging.pieces import document
+from bevviz.logging.writer import Writer
 
 _WEAK = {"not_kept", "below_threshold", "suppressed"}
 _MANY = {"out_of_view", "too_small", "too_large"}  # clusters that are only counted and numbered
+
+
+def log_decisions(to: Writer, result: FrameResult, notes: Sequence[tuple[str, str]] = ()) -> None:
+    """``notes``: level and text of further lines of the log."""
+    to.put(entities.EXPLAIN, document(markdown(result)))
+    to.lines(entities.EXPLAIN_LOG, [*notes, *remarks(result)])
 
 
 def markdown(result: FrameResult) -> str:
