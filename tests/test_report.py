@@ -22,10 +22,14 @@ from bevviz.bags.mcap_writer import McapWriter
 from bevviz.bags.recording import RawMessage
 from bevviz.bags.recording import Recording as Bag
 from bevviz.cli import main
+from bevviz.config import DetectorConfig
 from bevviz.frame import Detections, Frame, FrameResult
-from bevviz.report.digest import Stage, compare, detections_of, pack, unpack
+from bevviz.provenance import Part, Provenance
+from bevviz.report.check import CheckResult
+from bevviz.report.digest import StageDigest, compare, detections_of, pack, unpack
 from bevviz.report.page import spans
 from bevviz.report.plots import plot, ticks
+from bevviz.stages.detector import Detector
 from tests import bags
 from tests.recordings import Recording, verify
 from tests.test_cli import Capture, error_of
@@ -146,8 +150,8 @@ def test_the_model_without_its_folder(tmp_path: Path, small: Path, capsys: Captu
     assert main(call) == 0
     found = Recording(Path("bug.rrd"))
     about = json.loads(found.static["/__properties/report"]["about"][0])
-    assert about["model"]["name"] == "net.onnx"
-    assert "network: CPU" in about["hardware"]
+    assert about["provenance"]["parts"]["detector.model"]["file"] == "net.onnx"
+    assert about["provenance"]["machine"]["network"] == "CPU"
     assert "secret" not in Path("bug.html").read_text() + str(found.static)
     capsys.readouterr()
     assert "--model FILE" in error_of(capsys, "report", "--check", "bug.rrd")
@@ -162,7 +166,10 @@ def test_the_model_without_its_folder(tmp_path: Path, small: Path, capsys: Captu
     other.doc_string = "another file"
     onnx.save(other, "net.onnx")
     assert main(["report", "--check", "bug.rrd"]) == 0
-    assert re.search(r"not as it was: model was net\.onnx \(SHA-256 \w+\), is \w+", capsys.readouterr().out)
+    said = capsys.readouterr().out
+    assert re.search(
+        r"not as it was: detector\.model was net\.onnx \(SHA-256 \w+\), is net\.onnx \(SHA", said
+    )
 
 
 # --- the check ---------------------------------------------------------------------------------
@@ -218,14 +225,62 @@ def test_a_missing_scan_is_found(small: Path, tmp_path: Path, capsys: Capture) -
 def test_other_versions_and_machines_are_named(
     small: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from bevviz.report import check, origin
+    from bevviz.report import check
 
-    monkeypatch.setattr(check, "versions", lambda: {"numpy": "9.9"})
-    monkeypatch.setattr(check, "hardware", lambda _: origin.Hardware("abacus", 1, "0 GiB", "none"))
+    here = Provenance({"numpy": Part("9.9"), "abacist": Part("2")}, {"processor": "abacus"})
+    monkeypatch.setattr(check, "provenance", lambda *_: here)
     assert main(["report", "--check", str(small)]) == 0
     said = capsys.readouterr().out
     assert re.search(r"not as it was: numpy was \d.*, is 9\.9", said)
+    assert re.search(r"not as it was: numba was \d.*, is absent", said)
+    assert "not as it was: abacist was absent, is 2" in said
     assert re.search(r"not as it was: processor was .*, is abacus", said)
+    assert re.search(r"not as it was: memory was .*, is absent", said)
+
+
+def test_whatever_may_be_the_reason_is_named(tmp_path: Path, capsys: Capture) -> None:
+    """What only one of the two runs has, too: a detector, its file of class names, what it runs on."""
+    bag = bags.write(tmp_path / "drive", bags.small_items(scans=12))
+    names = tmp_path / "names.txt"
+    names.write_bytes(b"a\r\nb\n\nc")
+    call = ["report", str(bag), "--at", "0.5", "--before", "0", "--after", "0"]
+    assert main(call) == 0
+    capsys.readouterr()
+    assert main(["report", "--check", "bug.rrd", "--model", "demo"]) == 1
+    said = capsys.readouterr().out
+    assert re.search(r"was: detector\.model was absent, is demo_detector\.onnx \(SHA-256 \w{64}\)", said)
+    assert "not as it was: network was absent, is CPU" in said
+
+    count = len(Detector(DetectorConfig(model="demo")).names)
+    names.write_bytes(b"\r\n".join(b"class %d" % i for i in range(count)))
+    assert main([*call, "--force", "--model", "demo", "--set", f"detector.names={names}"]) == 0
+    names.unlink()
+    capsys.readouterr()
+    assert main(["report", "--check", "bug.rrd"]) == 0
+    assert capsys.readouterr().out == "1 frames: the same in every bit\n"
+    names.write_text("\n".join(f"other {i}" for i in range(count)))
+    main(["report", "--check", "bug.rrd", "--set", f"detector.names={names}"])
+    assert "not as it was: detector.names was names.txt (SHA-256" in capsys.readouterr().out
+
+
+def test_where_nothing_is_another_the_check_says_so(
+    small: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = pipeline.Pipeline.run
+
+    def shifted(self: pipeline.Pipeline, frame: Frame) -> FrameResult:
+        return run(self, replace(frame, points=frame.points + np.float32(0.5)))
+
+    monkeypatch.setattr(pipeline.Pipeline, "run", shifted)
+    assert main(["report", "--check", str(small)]) == 1
+    *_, last = capsys.readouterr().out.splitlines()
+    assert last == "bag, model, configuration, versions and machine are as they were"
+
+
+def test_no_frame_is_no_proof() -> None:
+    nothing = CheckResult()
+    assert not nothing.same
+    assert list(nothing.lines()) == ["no frame, then or now: there is nothing to compare"]
 
 
 def test_what_is_no_report(small: Path, tmp_path: Path, capsys: Capture) -> None:
@@ -286,7 +341,7 @@ def test_an_interrupted_run_is_a_shorter_report(
 # --- fingerprints ------------------------------------------------------------------------------
 
 
-def stages(**arrays: Any) -> tuple[Stage, ...]:
+def stages(**arrays: Any) -> tuple[StageDigest, ...]:
     from bevviz.report.digest import _stage
 
     return (_stage("part", {name: np.asarray(value) for name, value in arrays.items()}),)

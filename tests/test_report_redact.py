@@ -19,7 +19,7 @@ from bevviz.cli import main
 from bevviz.frame import F32, U8
 from bevviz.report.pictures import shrink
 from bevviz.report.redact import CELLS, Redactor, grown, hide
-from bevviz.report.story import STRIP_WIDTH
+from bevviz.report.summary import STRIP_WIDTH
 from bevviz.ros.messages import decode_compressed_image, decode_image
 from tests import bags
 from tests.recordings import Recording, verify

@@ -17,7 +17,7 @@ from bevviz.bags.source import MARGIN, SECOND, BagSource
 from bevviz.config import Config, load
 from bevviz.errors import UserError
 from bevviz.pipeline import Pipeline
-from bevviz.report.digest import Stage, compare, digest
+from bevviz.report.digest import StageDigest, compare, digest
 from bevviz.report.window import Cut, Edit, Window, choose_topics, cut, find_window, open_window
 from bevviz.synthetic.bag import _qos
 from tests import bags
@@ -47,7 +47,7 @@ def contents(path: Path, low: int = 0, high: int = 2**62) -> dict[str, list[tupl
     return dict(found)
 
 
-def digests(path: Path, config: Config, window: Window) -> list[tuple[Stage, ...]]:
+def digests(path: Path, config: Config, window: Window) -> list[tuple[StageDigest, ...]]:
     with open_window([path], config, window.low, window.high) as source, Pipeline(config) as pipeline:
         return [digest(pipeline.run(frame)) for frame in source]
 

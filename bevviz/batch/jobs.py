@@ -8,14 +8,14 @@ import re
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
-from functools import cached_property, lru_cache
+from functools import cached_property
 from pathlib import Path
 
 from bevviz.bags.recording import METADATA, bag_files
 from bevviz.batch.table import About, read_about
 from bevviz.config import Config
 from bevviz.errors import UserError
-from bevviz.provenance import versions
+from bevviz.provenance import file_hash, parts_of
 
 PARTIAL = ".partial"  # folder of what is not complete
 
@@ -58,16 +58,15 @@ class Job:
     @cached_property
     def key(self) -> str:
         """Another one for another bag, selection, configuration, model, layout or version."""
-        config = self.config.model_dump(mode="json", exclude={"live"})
-        config["detector"] |= {name: _content(config["detector"][name]) for name in ("model", "names")}
-        parts = {
+        files = {"detector": {"model", "names"}}  # told apart by their content, as parts
+        content = {
             "bag": [[file.name, file.stat().st_size, file.stat().st_mtime_ns] for file in _files(self.bag)],
             "selection": asdict(self.selection),
-            "config": config,
-            "blueprint": _content(self.blueprint),
-            "versions": [f"{name} {number}" for name, number in versions().items()],
+            "config": self.config.model_dump(mode="json", exclude={"live": True, **files}),
+            "blueprint": file_hash(Path(self.blueprint)) if _is_file(self.blueprint) else self.blueprint,
+            "parts": {name: [part.version, part.sha256] for name, part in parts_of(self.config).items()},
         }
-        return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()
+        return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
     @property
     def recording_id(self) -> str:
@@ -199,21 +198,6 @@ def _absolute(text: str) -> str:
     return str(Path(text).resolve()) if _is_file(text) else text
 
 
-def _content(text: str) -> str:
-    """Of a file its hash; a name that something is known by stays as it is."""
-    if not _is_file(text):
-        return text
-    path = Path(text)
-    stat = path.stat()
-    return _hash(path, stat.st_size, stat.st_mtime_ns)
-
-
 def _is_file(text: str) -> bool:
     """Whether it is a path; "debug" and "demo" are names, whatever lies in the working directory."""
     return bool(Path(text).suffix) and Path(text).is_file()
-
-
-@lru_cache
-def _hash(path: Path, size: int, mtime: int) -> str:
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()

@@ -11,7 +11,8 @@ from pathlib import Path
 from bevviz import __version__
 from bevviz.bags.source import SECOND, iso
 from bevviz.config import Config
-from bevviz.report.origin import Model, changes
+from bevviz.provenance import Part
+from bevviz.report.origin import changes
 from bevviz.report.window import Window
 
 
@@ -71,12 +72,12 @@ def commands(rrd: Path, window: Window, config: Config, redacted: bool) -> list[
     ]
 
 
-def file_lines(sizes: Mapping[str, str], counts: Mapping[str, int], model: Model | None) -> list[str]:
+def file_lines(sizes: Mapping[str, str], counts: Mapping[str, int], model: Part | None) -> list[str]:
     """The files of a report, and the model that it needs."""
     lines = [f"{name}: {size}" for name, size in sizes.items()]
     if counts:
-        told = ", ".join(f"{topic} ({n})" for topic, n in sorted(counts.items()))
-        lines.append(f"messages in the bag, by topic: {told}")
+        topics = ", ".join(f"{topic} ({n})" for topic, n in sorted(counts.items()))
+        lines.append(f"messages in the bag, by topic: {topics}")
     if model is not None:
-        lines.append(f"model: {model.name}, SHA-256 {model.sha256}")
+        lines.append(f"model: {model.file}, SHA-256 {model.sha256}")
     return lines

@@ -14,7 +14,7 @@ from bevviz.logging import entities
 from bevviz.report.facts import Facts
 from bevviz.report.pictures import camera_picture, jpeg, shrink
 from bevviz.report.plots import Series, plot
-from bevviz.report.story import Story
+from bevviz.report.summary import WindowSummary
 
 PICTURE_WIDTH = 960
 
@@ -29,14 +29,14 @@ _LOOKS = {
 _QUIET = {"below_threshold", "suppressed", "not_kept", "out_of_view", "too_small", "too_large"}
 
 
-def page(facts: Facts, story: Story) -> str:
+def page(facts: Facts, summary: WindowSummary) -> str:
     """The whole file."""
-    result = story.result
+    result = summary.result
     parts = [
         f"<h1>{escape(facts.title)}</h1>",
         f'<p class="faint">{escape(facts.where)}</p>',
         f'<div class="note">{escape(facts.note)}</div>' if facts.note else "",
-        _section("What happened", _verdict(story)),
+        _section("What happened", _verdict(summary)),
     ]
     if result is not None:
         parts += [
@@ -44,9 +44,9 @@ def page(facts: Facts, story: Story) -> str:
             _section(f"What was decided, {_when(result, facts)}", _decisions(result)),
         ]
     parts += [
-        _section("The window", _strip(story, facts)),
-        _section("Decisions over the window", _summary(story)),
-        _section("Health", _plots(story, facts)),
+        _section("The window", _strip(summary, facts)),
+        _section("Decisions over the window", _summary(summary)),
+        _section("Health", _plots(summary, facts)),
         _section("How to run it again", _commands(facts)),
         _section("How it was made", _origin(facts)),
     ]
@@ -94,12 +94,12 @@ def _when(result: FrameResult, facts: Facts) -> str:
 # --- at the time -------------------------------------------------------------------------------
 
 
-def _verdict(story: Story) -> Iterator[str]:
+def _verdict(summary: WindowSummary) -> Iterator[str]:
     """The few lines to read first."""
-    if story.result is None:
+    if summary.result is None:
         yield "<p>No frame was made.</p>"
         return
-    result, lines = story.result, []
+    result, lines = summary.result, []
     kept = [e for e in result.explanations if e.subject == "detection" and e.state not in _QUIET]
     if kept:
         counts = Counter(e.state.replace("_", " ") for e in kept)
@@ -115,7 +115,7 @@ def _verdict(story: Story) -> Iterator[str]:
         names = Counter(result.objects.names)
         lines.append("objects: " + (", ".join(f"{n} {name}" for name, n in names.items()) or "none"))
     yield _list(lines, "verdict")
-    frames, troubled = len(story.moments), [m for m in story.moments if m.problems]
+    frames, troubled = len(summary.frames), [m for m in summary.frames if m.problems]
     if troubled:
         common = Counter(problem for m in troubled for problem in m.problems).most_common(5)
         yield f"<p>{len(troubled)} of the window's {frames} frames have problems:</p>"
@@ -170,12 +170,12 @@ def _explained(explanations: Sequence[Explanation]) -> str:
 # --- over the window ---------------------------------------------------------------------------
 
 
-def _strip(story: Story, facts: Facts) -> Iterator[str]:
-    if not story.strip:
+def _strip(summary: WindowSummary, facts: Facts) -> Iterator[str]:
+    if not summary.strip:
         return
-    nearest = min(story.strip, key=lambda shown: abs(shown[0].received - story.at))
+    nearest = min(summary.strip, key=lambda shown: abs(shown[0].received - summary.at))
     yield '<div class="strip">'
-    for shown in story.strip:
+    for shown in summary.strip:
         moment, pictures = shown
         label = f"{(moment.received - facts.start) / SECOND:.2f} s, frame {moment.index}"
         images = "".join(_image(data, f"{name}, {label}") for name, data in pictures.items())
@@ -184,11 +184,11 @@ def _strip(story: Story, facts: Facts) -> Iterator[str]:
     yield "</div>"
 
 
-def _summary(story: Story) -> Iterator[str]:
+def _summary(summary: WindowSummary) -> Iterator[str]:
     """How many of each decision, and in which frames what is neither matched nor quiet."""
     frames: dict[tuple[str, str, str], list[int]] = defaultdict(list)
     total: Counter[tuple[str, str, str]] = Counter()
-    for moment in story.moments:
+    for moment in summary.frames:
         total += moment.states
         for key in moment.states:
             frames[key].append(moment.index)
@@ -221,17 +221,17 @@ def spans(numbers: Sequence[int]) -> str:
     return ", ".join(f"{a}-{b}" if a < b else f"{a}" for a, b in found)
 
 
-def _plots(story: Story, facts: Facts) -> Iterator[str]:
-    at = (story.at - facts.start) / SECOND
+def _plots(summary: WindowSummary, facts: Facts) -> Iterator[str]:
+    at = (summary.at - facts.start) / SECOND
     counted = ("clusters", "detections", "matches", "problems", "failures")
     groups = {
-        "Stage times, ms": _series(story, facts, entities.stage_time("")),
-        "Image stamp - cloud stamp, ms": _series(story, facts, entities.sync_error("")),
-        "Age of the transforms, ms": _series(story, facts, entities.tf_age("")),
-        "Counts": _series(story, facts, entities.count(""), counted),
-        "Points": _series(story, facts, entities.count(""), ("points", "voxels", "obstacle_points")),
+        "Stage times, ms": _series(summary, facts, entities.stage_time("")),
+        "Image stamp - cloud stamp, ms": _series(summary, facts, entities.sync_error("")),
+        "Age of the transforms, ms": _series(summary, facts, entities.tf_age("")),
+        "Counts": _series(summary, facts, entities.count(""), counted),
+        "Points": _series(summary, facts, entities.count(""), ("points", "voxels", "obstacle_points")),
         "Scans left out, invalid points": _series(
-            story, facts, entities.count(""), ("skipped_frames", "invalid_points")
+            summary, facts, entities.count(""), ("skipped_frames", "invalid_points")
         ),
     }
     yield '<div class="plots">'
@@ -240,9 +240,11 @@ def _plots(story: Story, facts: Facts) -> Iterator[str]:
     yield "</div>"
 
 
-def _series(story: Story, facts: Facts, prefix: str, names: Sequence[str] | None = None) -> dict[str, Series]:
+def _series(
+    summary: WindowSummary, facts: Facts, prefix: str, names: Sequence[str] | None = None
+) -> dict[str, Series]:
     found: dict[str, list[tuple[float, float]]] = defaultdict(list)
-    for moment in story.moments:
+    for moment in summary.frames:
         for path, value in moment.health.items():
             name = path.removeprefix(prefix)
             if path.startswith(prefix) and value == value and (names is None or name in names):
