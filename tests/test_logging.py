@@ -389,6 +389,26 @@ def test_truth_and_the_robots_own(record: Callable[..., Recording]) -> None:
     (outline,) = found.at["/bev/overlay/ground_truth"]["LineStrips2D:strips"][0]
     center = np.mean(outline[:4], axis=0)
     np.testing.assert_allclose(center, [(40 - 1) / 0.1, (40 - 2) / 0.1], atol=0.01)
+    assert found.at["/bev/overlay/robot/detection/fused_3d"]["LineStrips2D:labels"][0] == ["car"]
+
+
+def test_names_of_others_take_nobodys_place(record: Callable[..., Recording]) -> None:
+    """A topic called like an entity of ours, and one and a class that are no good parts of a path."""
+    result = make()
+    boxes = Boxes3D(f32([2, 1, 0]), f32([4, 2, 1.5]), f32(0.5))
+    tracks = LabelledBoxes3D("/tracks", START, "lidar", boxes, ("car",), f32(0.7), WORLD_FROM_LIDAR)
+    odd = dataclasses.replace(tracks, topic="/my boxes\\x/\x1b[2J")
+    (camera,) = result.cameras
+    assert camera.detections is not None
+    named = dataclasses.replace(camera.detections, names=("a / b\n", "car", "car"))
+    frame = dataclasses.replace(result.frame, robot_boxes=(tracks, odd))
+    cameras = (dataclasses.replace(camera, detections=named),)
+    result = dataclasses.replace(tracked([result])[0], frame=frame, cameras=cameras)
+    found = record([result])
+    assert found.at["/bev/overlay/robot/tracks"]["LineStrips2D:labels"][0] == ["car"]
+    assert "/bev/overlay/tracks" not in found.rows  # no track is confirmed in the first frame
+    assert any(path.startswith("/robot/my_boxes_x/") for path in found.at)
+    assert found.column("/explain/states/zed/a___b_", "StateChange:state") == [["matched"]]
 
 
 def test_several_lidars_keep_their_own_frames(record: Callable[..., Recording]) -> None:

@@ -35,7 +35,7 @@ def log_truth_looks(to: Writer) -> None:
 def log_truth(to: Writer, frame: Frame, config: BevConfig) -> None:
     if frame.truth is not None and len(frame.truth.boxes):
         _log_boxes(to, entities.TRUTH, frame.truth, None)
-        _log_outlines(to, "ground_truth", frame, frame.truth, config, _TRUTH_COLOR)
+        _log_outlines(to, entities.overlay("ground_truth"), frame, frame.truth, config, _TRUTH_COLOR)
 
 
 def log_robot(to: Writer, frame: Frame, config: BevConfig) -> None:
@@ -43,7 +43,7 @@ def log_robot(to: Writer, frame: Frame, config: BevConfig) -> None:
     for stated in frame.robot_boxes:
         if len(stated.boxes):
             _log_boxes(to, entities.robot(stated.topic), stated, _ROBOT_COLOR)
-            _log_outlines(to, stated.topic.strip("/"), frame, stated, config, _ROBOT_COLOR)
+            _log_outlines(to, entities.robot_overlay(stated.topic), frame, stated, config, _ROBOT_COLOR)
     for found in frame.robot_detections:
         if len(found.xyxy):
             _log_image_boxes(to, found)
@@ -72,7 +72,7 @@ def _log_image_boxes(to: Writer, found: LabelledBoxes2D) -> None:
 
 
 def _log_outlines(
-    to: Writer, what: str, frame: Frame, stated: LabelledBoxes3D, config: BevConfig, color: Color
+    to: Writer, path: str, frame: Frame, stated: LabelledBoxes3D, config: BevConfig, color: Color
 ) -> None:
     """Boxes seen from above, over the bird's-eye image; only those whose centre is in it."""
     points_from_boxes = geometry.inverse(frame.pose) @ _pose(stated)
@@ -82,7 +82,7 @@ def _log_outlines(
         return
     outlines = footprints(geometry.corners(stated.boxes)[inside])
     to.put(
-        entities.overlay(what),
+        path,
         rr.LineStrips2D(
             seen_from_above(config, points_from_boxes, outlines),
             colors=[color],
