@@ -15,13 +15,15 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from bevviz.compare.summary import columns
+from bevviz import table
 from bevviz.config import Config
 from bevviz.counts import counts_of
 from bevviz.errors import UserError
 from bevviz.evaluate import Score, Truth
 from bevviz.frame import F64, Frame, FrameResult
 from bevviz.logging import entities
+from bevviz.logging.pieces import document
+from bevviz.text import markdown, printable
 from bevviz.variants import Variants, check_same_frames
 
 MOST = 500  # combinations of values
@@ -185,10 +187,10 @@ class Sweep:
         """For the terminal."""
         frames = max(outcome.frames for outcome in self.outcomes.values())
         lines = [f"{frames} frames; means of a frame, median milliseconds", ""]
-        lines += columns([*self._rows("time ms")])
+        lines += table.lines([*self._rows("time ms")])
         if self.best is not None:
             where = ", ".join(f"{p.key} = {v}" for p, v in zip(self.parameters, self.best, strict=True))
-            lines += ["", f"best F1: {self.outcomes[self.best].score.f1:.3f} at {where}"]
+            lines += ["", f"best F1: {self.outcomes[self.best].score.f1:.3f} at {printable(where)}"]
         failures = sum(outcome.failures for outcome in self.outcomes.values())
         return "\n".join([*lines, *([f"{failures} stages failed"] if failures else [])])
 
@@ -231,10 +233,9 @@ class Sweep:
     def log(self, recording: rr.RecordingStream, name: str) -> None:
         """The table, and every number over the parameter: bars, or over two parameters a heat map."""
         recording.send_recording_name(name)
-        header, *rows = self._rows("time ms")
-        lines = [header, ["---"] * len(header), *rows]
-        page = f"# {self.title}\n\n{name}\n\n" + "\n".join(f"| {' | '.join(line)} |" for line in lines)
-        recording.log(entities.SWEEP, rr.TextDocument(page, media_type=rr.MediaType.MARKDOWN), static=True)
+        columns = table.markdown([*self._rows("time ms")])
+        page = f"# {self.title}\n\n{markdown(name)}\n\n{columns}"
+        recording.log(entities.SWEEP, document(page), static=True)
         for series in self._plots().values():
             for place, metric in enumerate(series):
                 values = [o.metrics.get(metric, math.nan) for o in self.outcomes.values()]

@@ -18,6 +18,8 @@ from bevviz.live.settings import Settings
 from bevviz.live.settings import differences as config_differences
 from bevviz.logging import entities
 from bevviz.logging.logger import Logger
+from bevviz.logging.pieces import document
+from bevviz.text import markdown, printable
 from bevviz.variants import Variants, check_same_frames
 
 ABOUT = "A is the version before, B the one that is shown."
@@ -43,7 +45,7 @@ class Version:
         changes = "; ".join(f"{key} {change}" for key, change in self.changes.items())
         failed = [f"{failure.stage} failed: {failure.reason}" for failure in self.result.failures]
         objects = f"{len(self.found.b.names)} objects" + (f" ({', '.join(said)})" if said else "")
-        return "; ".join([f"version {self.number}: {changes or 'as it is'}: {objects}", *failed])
+        return printable("; ".join([f"version {self.number}: {changes or 'as it is'}: {objects}", *failed]))
 
 
 class Tuner:
@@ -110,9 +112,9 @@ class Tuner:
             writer.sequences = {entities.VERSION: number}
         self._logger.log(result)
         self._differences.log(found, self._frame.received, self._frame.pose)
-        lines = [f"- {key}: {change}" for key, change in changes.items()] or ["- the first one"]
+        lines = [f"- {key}: {markdown(change)}" for key, change in changes.items()] or ["- the first one"]
         page = "\n".join([f"# Version {number}", "", *lines])
-        self._recording.log(entities.TUNE, rr.TextDocument(page, media_type=rr.MediaType.MARKDOWN))
+        self._recording.log(entities.TUNE, document(page))
         self._recording.flush()
         return Version(number, config, changes, result, found, time.time() - since)
 

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 import rerun as rr
 
-from bevviz import geometry
+from bevviz import geometry, table
 from bevviz.calib.axes import TIME, error_pose
 from bevviz.calib.result import Calibration, Verdict
 from bevviz.calib.shots import Shot
@@ -17,6 +17,7 @@ from bevviz.frame import F32, F64, Bool, Intrinsics
 from bevviz.logging import entities
 from bevviz.logging.annotations import depth_annotations
 from bevviz.logging.pieces import CORNER, document, encode_image
+from bevviz.text import fenced, markdown
 
 _STATED, _CORRECTED = (255, 80, 80), (90, 230, 120)
 _COLORS = {Verdict.FINE: (70, 160, 90), Verdict.OFF: (210, 70, 70), Verdict.UNKNOWN: (130, 130, 145)}
@@ -96,15 +97,14 @@ def _inside(uv: F32, intrinsics: Intrinsics) -> Bool:
 
 
 def _page(result: Calibration) -> str:
-    rows = [f"| {axis.axis.name} | {axis.measured} | {axis.told} |" for axis in result.axes]
+    rows = [(axis.axis.name, axis.measured, axis.told) for axis in result.axes]
     return "\n".join(
         [
-            f"## {result.answer}\n",
-            "| axis | offset of what is stated | verdict |\n|---|---|---|",
-            *rows,
+            f"## {markdown(result.answer)}\n",
+            table.markdown([("axis", "offset of what is stated", "verdict"), *rows], "lll"),
             f"\n{result.frames} frames, {result.edges} edges. Score {result.score_stated:.3f} as stated, "
             f"{result.score_corrected:.3f} as corrected.\n",
-            *result.notes,
-            f"\n```yaml\n{result.config}```",
+            *map(markdown, result.notes),
+            f"\n{fenced(result.config, 'yaml')}",
         ]
     )

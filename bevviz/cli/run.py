@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
 from bevviz.cli.interrupts import terminable, wait_for_interrupt
+from bevviz.text import printable
 
 if TYPE_CHECKING:
     from rerun import RecordingStream
@@ -164,7 +165,7 @@ def through(items: Items[T], work: Callable[[T], R], handle: Callable[[R], None]
     try:
         with (
             terminable() as ended,
-            tqdm(total=items.total, unit="frame", desc=items.scene.name, disable=None) as bar,
+            tqdm(total=items.total, unit="frame", desc=printable(items.scene.name), disable=None) as bar,
             closing(overlap(items, work, 2)) as results,
         ):
             for result in results:
@@ -185,7 +186,7 @@ def hint(scene: Scene, config: Config) -> None:
 
 
 def say(line: str) -> None:
-    print(f"bevviz: {line}", file=sys.stderr)
+    print(f"bevviz: {printable(line)}", file=sys.stderr)
 
 
 def has_display() -> bool:

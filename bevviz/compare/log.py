@@ -7,6 +7,7 @@ from collections.abc import Iterator, Mapping
 import numpy as np
 import rerun as rr
 
+from bevviz import table
 from bevviz.compare.differences import DIFFERENT, WORST_FIRST, Change, Difference, FrameDifferences
 from bevviz.frame import F64
 from bevviz.logging import entities
@@ -14,6 +15,7 @@ from bevviz.logging.camera import over_image
 from bevviz.logging.pieces import boxes2d, boxes3d, document, transform
 from bevviz.logging.states import StateLanes
 from bevviz.logging.writer import Writer
+from bevviz.text import markdown
 
 COLORS = {
     Change.SAME: (70, 160, 90),
@@ -30,14 +32,15 @@ class DifferenceLogger(Writer):
     Args:
         recording: where to.
         names: what the two sides are.
-        summary: Markdown that says what was compared.
+        summary: Markdown that says how they were made.
     """
 
     def __init__(self, recording: rr.RecordingStream, names: tuple[str, str], summary: str) -> None:
         super().__init__(recording)
         self._lanes = StateLanes(COLORS)  # one for each class: the worst that has become of it
         self.recording.send_property("compare", rr.AnyValues(a=names[0], b=names[1]))
-        text = f"# What was compared\n\n- **A**: {names[0]}\n- **B**: {names[1]}\n\n{summary}"
+        a, b = map(markdown, names)
+        text = f"# What was compared\n\n- **A**: {a}\n- **B**: {b}\n\n{summary}"
         self.static(entities.COMPARE_ABOUT, document(text))
         for change in DIFFERENT:
             self.static(
@@ -68,7 +71,7 @@ class DifferenceLogger(Writer):
             self._log_image(camera, pairs, found)
         for name, value in _counts(found).items():
             self.scalar(entities.difference_count(name), float(value))
-        self.put(entities.COMPARE, document(markdown(found)))
+        self.put(entities.COMPARE, document(page(found)))
         changed = [d for d in found.objects if d.change is not Change.SAME]
         self.lines(entities.COMPARE_LOG, [("INFO", f"{d.text} {place(d, found)}") for d in changed])
         worst = worst_of_each_class(found.objects)
@@ -132,7 +135,7 @@ def place(difference: Difference, found: FrameDifferences) -> str:
     return f"at {np.hypot(x, y):.1f} m, {abs(angle):.0f}° {side}"
 
 
-def markdown(found: FrameDifferences) -> str:
+def page(found: FrameDifferences) -> str:
     """The differences of one frame as a page."""
     return "\n".join(_lines(found))
 
@@ -140,29 +143,35 @@ def markdown(found: FrameDifferences) -> str:
 def _lines(found: FrameDifferences) -> Iterator[str]:
     yield f"### Frame {found.index}"
     yield ""
-    yield "| | A | B |"
-    yield "| --- | ---: | ---: |"
-    yield f"| objects | {len(found.a.names)} | {len(found.b.names)} |"
-    if found.a.clusters is not None or found.b.clusters is not None:
-        clusters = ["-" if side.clusters is None else str(side.clusters) for side in (found.a, found.b)]
-        yield f"| clusters | {clusters[0]} | {clusters[1]} |"
-    for camera in found.images:
-        a, b = found.a.images[camera], found.b.images[camera]
-        yield f"| detections, {camera} | {len(a.names)} | {len(b.names)} |"
+    yield table.markdown([("", "A", "B"), *_totals(found)])
     for change in (*DIFFERENT, Change.SAME):
         mine = [d for d in found.objects if d.change is change]
         if mine:
             yield ""
             yield f"#### {change[0].upper() + change[1:]}: {len(mine)}"
             yield ""
-            yield from (f"- {_item(d)} {place(d, found)}" for d in mine)
+            yield from (f"- {markdown(_item(d))} {place(d, found)}" for d in mine)
     for camera, pairs in found.images.items():
         rows = [d for d in pairs if d.change is not Change.SAME]
         if rows:
             yield ""
-            yield f"#### Detections, {camera}"
+            yield f"#### Detections, {markdown(camera)}"
             yield ""
-            yield from (f"- {d.text}" for d in rows)
+            yield from (f"- {markdown(d.text)}" for d in rows)
+
+
+def _totals(found: FrameDifferences) -> Iterator[tuple[str, str, str]]:
+    """Rows of a table: what, and how many of it in A and B."""
+    a, b = found.a, found.b
+    yield "objects", str(len(a.names)), str(len(b.names))
+    if a.clusters is not None or b.clusters is not None:
+        yield (
+            "clusters",
+            "-" if a.clusters is None else str(a.clusters),
+            "-" if b.clusters is None else str(b.clusters),
+        )
+    for camera in found.images:
+        yield f"detections, {camera}", str(len(a.images[camera].names)), str(len(b.images[camera].names))
 
 
 def _item(difference: Difference) -> str:

@@ -23,6 +23,7 @@ from bevviz.logging import entities
 from bevviz.logging.camera import log_shared_image
 from bevviz.logging.pieces import CORNER
 from bevviz.logging.writer import Writer
+from bevviz.text import fenced
 
 Row = Mapping[str, Any]
 
@@ -166,7 +167,7 @@ class SavedPair:
         beside = Writer(recording, entities.B)
         for camera in self.b.cameras:
             log_shared_image(beside, camera)
-        about = "```\n" + "\n".join(parameters(self.summary.config)) + "\n```"
+        about = fenced("\n".join(parameters(self.summary.config)))
         log = DifferenceLogger(recording, self.summary.names, about)
 
         def handle(found: FrameDifferences) -> None:

@@ -29,6 +29,7 @@ from bevviz.frame import (
 from bevviz.live.settings import differences as config_differences
 from bevviz.logging import entities
 from bevviz.logging.logger import Logger
+from bevviz.text import fenced
 from bevviz.variants import Variants, check_same_frames, common_frames
 
 Results = tuple[Frame, FrameResult | None, FrameResult | None]
@@ -67,7 +68,7 @@ class Comparison:
         ]
         for logger in loggers:
             logger.log_static()
-        about = "```\n" + "\n".join(parameters(self.summary.config)) + "\n```"
+        about = fenced("\n".join(parameters(self.summary.config)))
         log = DifferenceLogger(recording, self.summary.names, about)
 
         def handle(results: Results) -> None:

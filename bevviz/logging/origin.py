@@ -10,6 +10,7 @@ from bevviz.logging import entities
 from bevviz.logging.pieces import document
 from bevviz.logging.writer import Writer
 from bevviz.provenance import versions
+from bevviz.text import fenced, markdown
 
 
 def log_origin(to: Writer, config: Config, scene: Scene) -> None:
@@ -20,8 +21,8 @@ def log_origin(to: Writer, config: Config, scene: Scene) -> None:
         entities.CONFIG,
         document(
             "# How this recording was made\n\n"
-            f"Source: **{scene.name}**, preset: **{config.preset}**\n\n"
-            f"```yaml\n{settings}```\n\n" + "\n".join(f"- {line}" for line in packages)
+            f"Source: **{markdown(scene.name)}**, preset: **{config.preset}**\n\n"
+            f"{fenced(settings, 'yaml')}\n\n" + "\n".join(f"- {line}" for line in packages)
         ),
     )
     if not to.root:

@@ -14,6 +14,7 @@ from bevviz.config import Config
 from bevviz.provenance import Part
 from bevviz.report.origin import changes
 from bevviz.report.window import Window
+from bevviz.text import fenced, markdown
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -34,11 +35,12 @@ class Facts:
 
     def markdown(self) -> str:
         """The same for the recording, without what it holds already."""
-        lines = [f"# {self.title}", "", self.where, ""]
-        lines += [f"> {line}" for line in self.note.splitlines()]
+        lines = [f"# {markdown(self.title)}", "", markdown(self.where), ""]
+        lines += [f"> {markdown(line)}" for line in self.note.splitlines()]
         for title, items in (("Files", self.files), ("Warnings", self.warnings), ("Hardware", self.hardware)):
-            lines += ["", f"## {title}", "", *(f"- {item}" for item in items)] if items else []
-        return "\n".join([*lines, "", "## How to run it again", "", "```", *self.commands, "```"])
+            lines += ["", f"## {title}", "", *(f"- {markdown(item)}" for item in items)] if items else []
+        commands = fenced("\n".join(self.commands))
+        return "\n".join([*lines, "", "## How to run it again", "", commands])
 
 
 def window_text(name: str, window: Window) -> str:

@@ -15,7 +15,7 @@ from bevviz.logging.pieces import boxes2d, document, edges, transform
 from bevviz.why.answer import Answer
 from bevviz.why.evidence import Fate
 from bevviz.why.subject import projected
-from bevviz.why.text import markdown
+from bevviz.why.text import page
 
 COLORS = {
     Fate.GROUND: (170, 110, 60),
@@ -38,7 +38,7 @@ def log_answers(recording: rr.RecordingStream, frame: Frame, answers: Sequence[A
         answers: worst first.
         shown: how many of them are drawn.
     """
-    recording.log(entities.WHY, document(markdown(answers, shown)))
+    recording.log(entities.WHY, document(page(answers, shown)))
     pose = transform(frame.pose)
     drawn = answers[:shown]
     fate = np.zeros(len(frame.points), np.uint8)
