@@ -17,6 +17,8 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from bevviz import geometry
 from bevviz.anomalies import KINDS
@@ -48,6 +50,7 @@ from bevviz.frame import (
     Tracks,
     Voxels,
 )
+from bevviz.logging.cloud import quantised
 from bevviz.logging.entities import DEPTH_BINS, DEPTH_RANGE, TRACK_COLORS, ClassId
 from bevviz.logging.logger import Logger
 from bevviz.logging.sinks import open_recording
@@ -205,6 +208,16 @@ def test_cloud(record: Callable[..., Recording]) -> None:
         ("/world/lidar/points/obstacles", result.obstacles),
     ):
         np.testing.assert_allclose(found.at[entity]["Points3D:positions"][0], points, atol=0.1 / 8)
+
+
+@given(st.floats(0.01, 2), st.integers(0, 2**32 - 1))
+def test_voxelised_points_move_by_an_eighth_of_a_voxel_at_most(size: float, seed: int) -> None:
+    points = np.random.default_rng(seed).uniform(-100, 100, (50, 3)).astype(np.float32)
+    moved = quantised(points, size)
+    np.testing.assert_allclose(moved, points, rtol=0, atol=size / 8)
+    step = next(2.0**n for n in range(-12, 3) if 2.0**n >= size / 8)
+    assert step < size / 4
+    np.testing.assert_array_equal(np.round(moved / step), moved / step)
 
 
 def test_poses_and_calibration(record: Callable[..., Recording]) -> None:

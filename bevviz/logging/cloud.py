@@ -63,7 +63,11 @@ def _log_class(to: Writer, path: str, points: F32, class_id: ClassId) -> None:
 
 
 def quantised(points: F32, voxel_size: float) -> F32:
-    """Voxelised points to a fraction of a voxel, which compresses to half; with size 0 as they are."""
+    """Voxelised points, rounded, which compresses to half; with size 0 as they are.
+
+    The step is a power of two of a metre, from an eighth to a quarter of a voxel: no coordinate moves by more
+    than an eighth of one.
+    """
     if voxel_size == 0:
         return points
     return rounded(points, 2.0 ** np.floor(np.log2(8 / voxel_size)))
