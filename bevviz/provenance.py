@@ -29,7 +29,7 @@ PACKAGES = (  # those that are not installed do not count: some libraries come a
 
 
 @dataclass(frozen=True, slots=True)
-class Part:
+class Dependency:
     """A thing that results depend on: a package, or a file. The same content is the same under any name."""
 
     version: str = ""
@@ -46,18 +46,18 @@ class Part:
 class Provenance:
     """What results were made with, and on.
 
-    ``parts`` decide what comes out: packages by their name, files by the key that names them in the
+    ``dependencies`` decide what comes out: packages by their name, files by the key that names them in the
     configuration (``detector.model``). The ``machine`` may round differently.
     """
 
-    parts: Mapping[str, Part]
+    dependencies: Mapping[str, Dependency]
     machine: Mapping[str, str] = field(default_factory=dict)
 
     @staticmethod
     def load(values: Mapping[str, Any]) -> Provenance:
         """From what ``dataclasses.asdict`` made of one. Raises KeyError or TypeError for anything else."""
-        parts = {name: Part(**part) for name, part in dict(values["parts"]).items()}
-        return Provenance(parts, dict(values["machine"]))
+        dependencies = {name: Dependency(**part) for name, part in dict(values["dependencies"]).items()}
+        return Provenance(dependencies, dict(values["machine"]))
 
 
 def provenance(config: Config, network: str = "") -> Provenance:
@@ -67,21 +67,21 @@ def provenance(config: Config, network: str = "") -> Provenance:
         config: of the run; the files that it names are read.
         network: what the detector's network runs on; empty: there is none.
     """
-    return Provenance(parts_of(config), machine(network))
+    return Provenance(dependencies_of(config), machine(network))
 
 
-def parts_of(config: Config) -> dict[str, Part]:
+def dependencies_of(config: Config) -> dict[str, Dependency]:
     """Every package, and every file that the configuration names and whose content decides results."""
-    found = {name: Part(version=number) for name, number in versions().items()}
+    found = {name: Dependency(version=number) for name, number in versions().items()}
     for key, path in (("detector.model", model_path(config)), ("detector.names", names_path(config))):
         if path is not None:
-            found[key] = Part(sha256=file_hash(path), file=path.name)
+            found[key] = Dependency(sha256=file_hash(path), file=path.name)
     return found
 
 
 def differences(then: Provenance, now: Provenance) -> Iterator[str]:
     """One sentence for whatever is not as it was."""
-    for before, after in ((then.parts, now.parts), (then.machine, now.machine)):
+    for before, after in ((then.dependencies, now.dependencies), (then.machine, now.machine)):
         for name in dict.fromkeys([*before, *after]):
             if before.get(name) != after.get(name):
                 yield f"{name} was {before.get(name, 'absent')}, is {after.get(name, 'absent')}"

@@ -23,7 +23,7 @@ from hypothesis import strategies as st
 
 from bevviz.bags.source import BagSource
 from bevviz.batch.batch import claimed, left_to_do
-from bevviz.batch.jobs import PARTIAL, Job, Selection, find_bags, make_jobs, name_bags, tables
+from bevviz.batch.jobs import PARTIAL, FrameSelection, Job, find_bags, make_jobs, name_bags, tables
 from bevviz.batch.table import row
 from bevviz.cli import main
 from bevviz.config import Config, load
@@ -106,7 +106,7 @@ def batch(shared: Path, model: str, tmp_path_factory: pytest.TempPathFactory) ->
 
 def jobs_of(batch: Batch, model: str, **settings: Any) -> list[Job]:
     config = load(None, [f"detector.model={model}", WEAK, *(f"{k}={v}" for k, v in settings.items())])
-    return make_jobs([batch.root / "bags"], batch.folder, config, Selection(), "debug")
+    return make_jobs([batch.root / "bags"], batch.folder, config, FrameSelection(), "debug")
 
 
 # --- what is done ------------------------------------------------------------------------------

@@ -17,12 +17,12 @@ from hypothesis import strategies as st
 import bevviz
 from bevviz.config import load
 from bevviz.provenance import (
-    Part,
+    Dependency,
     Provenance,
+    dependencies_of,
     differences,
     file_hash,
     machine,
-    parts_of,
     provenance,
     versions,
 )
@@ -75,7 +75,7 @@ def test_files_are_told_apart_by_content(tmp_path: Path) -> None:
     names.write_text("car")
     settings = [f"detector.model={model}", f"detector.names={names}"]
     before = provenance(load(settings=settings), "CPU")
-    assert str(before.parts["detector.model"]) == f"a.onnx (SHA-256 {file_hash(model)})"
+    assert str(before.dependencies["detector.model"]) == f"a.onnx (SHA-256 {file_hash(model)})"
     assert not list(differences(before, provenance(load(settings=settings), "CPU")))
 
     moved = model.replace(tmp_path / "b.onnx")
@@ -88,13 +88,13 @@ def test_files_are_told_apart_by_content(tmp_path: Path) -> None:
     moved.write_bytes(b"Network")
     (only,) = differences(after, provenance(load(settings=settings)))
     assert only.startswith("detector.model was b.onnx (SHA-256 ")
-    assert "detector.model" not in parts_of(load())
+    assert "detector.model" not in dependencies_of(load())
 
 
 def test_a_stage_of_the_users_own_fits_in() -> None:
     """A module has a version, a file and its hash: stored, read back and compared like the others."""
-    then = Provenance({"my_pkg.ground:segment": Part("1.2", "ab" * 32, "ground.py")})
-    now = Provenance({"my_pkg.ground:segment": Part("1.3", "cd" * 32, "ground.py")})
+    then = Provenance({"my_pkg.ground:segment": Dependency("1.2", "ab" * 32, "ground.py")})
+    now = Provenance({"my_pkg.ground:segment": Dependency("1.3", "cd" * 32, "ground.py")})
     assert Provenance.load(json.loads(json.dumps(asdict(then)))) == then
     assert list(differences(then, now)) == [
         f"my_pkg.ground:segment was 1.2, ground.py (SHA-256 {'ab' * 32}), "
@@ -103,11 +103,11 @@ def test_a_stage_of_the_users_own_fits_in() -> None:
 
 
 text = st.text(min_size=1, max_size=8)
-parts = st.dictionaries(text, st.builds(Part, text, text, text), max_size=4)
+dependencies = st.dictionaries(text, st.builds(Dependency, text, text, text), max_size=4)
 
 
-@given(parts, st.dictionaries(text, text, max_size=4))
-def test_what_is_stored_comes_back(some: dict[str, Part], here: dict[str, str]) -> None:
+@given(dependencies, st.dictionaries(text, text, max_size=4))
+def test_what_is_stored_comes_back(some: dict[str, Dependency], here: dict[str, str]) -> None:
     made_with = Provenance(some, here)
     assert Provenance.load(json.loads(json.dumps(asdict(made_with)))) == made_with
     assert not list(differences(made_with, made_with))
@@ -115,7 +115,7 @@ def test_what_is_stored_comes_back(some: dict[str, Part], here: dict[str, str]) 
 
 
 @pytest.mark.parametrize(
-    "values", [{}, {"parts": 1, "machine": {}}, {"parts": {"a": {"x": 1}}, "machine": {}}]
+    "values", [{}, {"dependencies": 1, "machine": {}}, {"dependencies": {"a": {"x": 1}}, "machine": {}}]
 )
 def test_what_is_no_provenance(values: dict[str, object]) -> None:
     with pytest.raises((KeyError, TypeError)):

@@ -24,7 +24,7 @@ from bevviz.bags.recording import Recording as Bag
 from bevviz.cli import main
 from bevviz.config import DetectorConfig
 from bevviz.frame import Detections, Frame, FrameResult
-from bevviz.provenance import Part, Provenance
+from bevviz.provenance import Dependency, Provenance
 from bevviz.report.check import CheckResult
 from bevviz.report.digest import StageDigest, compare, detections_of, pack, unpack
 from bevviz.report.page import spans
@@ -150,7 +150,7 @@ def test_the_model_without_its_folder(tmp_path: Path, small: Path, capsys: Captu
     assert main(call) == 0
     found = Recording(Path("bug.rrd"))
     about = json.loads(found.static["/__properties/report"]["about"][0])
-    assert about["provenance"]["parts"]["detector.model"]["file"] == "net.onnx"
+    assert about["provenance"]["dependencies"]["detector.model"]["file"] == "net.onnx"
     assert about["provenance"]["machine"]["network"] == "CPU"
     assert "secret" not in Path("bug.html").read_text() + str(found.static)
     capsys.readouterr()
@@ -227,7 +227,7 @@ def test_other_versions_and_machines_are_named(
 ) -> None:
     from bevviz.report import check
 
-    here = Provenance({"numpy": Part("9.9"), "abacist": Part("2")}, {"processor": "abacus"})
+    here = Provenance({"numpy": Dependency("9.9"), "abacist": Dependency("2")}, {"processor": "abacus"})
     monkeypatch.setattr(check, "provenance", lambda *_: here)
     assert main(["report", "--check", str(small)]) == 0
     said = capsys.readouterr().out

@@ -12,16 +12,16 @@ from functools import cached_property
 from pathlib import Path
 
 from bevviz.bags.recording import METADATA, bag_files
-from bevviz.batch.table import About, read_about
+from bevviz.batch.table import RunInfo, read_info
 from bevviz.config import Config
 from bevviz.errors import UserError
-from bevviz.provenance import file_hash, parts_of
+from bevviz.provenance import dependencies_of, file_hash
 
 PARTIAL = ".partial"  # folder of what is not complete
 
 
 @dataclass(frozen=True)
-class Selection:
+class FrameSelection:
     """Which frames of each bag, as in ``BagSource``."""
 
     start: str | None = None
@@ -38,7 +38,7 @@ class Job:
     bag: Path  # absolute
     folder: Path  # absolute, for the results
     config: Config
-    selection: Selection
+    selection: FrameSelection
     blueprint: str
 
     @property
@@ -58,13 +58,13 @@ class Job:
     @cached_property
     def key(self) -> str:
         """Another one for another bag, selection, configuration, model, layout or version."""
-        files = {"detector": {"model", "names"}}  # told apart by their content, as parts
+        files = {"detector": {"model", "names"}}  # they count by their content, below
         content = {
             "bag": [[file.name, file.stat().st_size, file.stat().st_mtime_ns] for file in _files(self.bag)],
             "selection": asdict(self.selection),
             "config": self.config.model_dump(mode="json", exclude={"live": True, **files}),
             "blueprint": file_hash(Path(self.blueprint)) if _is_file(self.blueprint) else self.blueprint,
-            "parts": {name: [part.version, part.sha256] for name, part in parts_of(self.config).items()},
+            "dependencies": {name: [d.version, d.sha256] for name, d in dependencies_of(self.config).items()},
         }
         return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
@@ -73,16 +73,16 @@ class Job:
         """Another one for another result: a viewer takes recordings with the same one for the same."""
         return f"{self.name}-{self.key[:8]}"
 
-    def complete(self) -> About | None:
+    def complete(self) -> RunInfo | None:
         """What is known of the result, None where it is missing or out of date."""
-        about = read_about(self.table)
-        if about is None or about.key != self.key or not self.recording.is_file():
+        info = read_info(self.table)
+        if info is None or info.key != self.key or not self.recording.is_file():
             return None
-        return about
+        return info
 
 
 def make_jobs(
-    paths: Sequence[Path], folder: Path, config: Config, selection: Selection, blueprint: str
+    paths: Sequence[Path], folder: Path, config: Config, selection: FrameSelection, blueprint: str
 ) -> list[Job]:
     """A job for each bag that the paths name.
 
@@ -100,16 +100,16 @@ def make_jobs(
     )
     folder = folder.resolve()
     blueprint = _absolute(blueprint)
-    owners = {about.bag: table.stem for table, about in tables(folder)}
+    owners = {info.bag: table.stem for table, info in tables(folder)}
     names = name_bags(bags, owners)
     return [Job(names[bag], bag, folder, config, selection, blueprint) for bag in bags]
 
 
-def tables(folder: Path) -> Iterator[tuple[Path, About]]:
+def tables(folder: Path) -> Iterator[tuple[Path, RunInfo]]:
     """The results of all bags in a folder, by name."""
     for path in sorted(folder.glob("*.parquet")):
-        if (about := read_about(path)) is not None:
-            yield path, about
+        if (info := read_info(path)) is not None:
+            yield path, info
 
 
 # --- bags --------------------------------------------------------------------------------------

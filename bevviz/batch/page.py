@@ -10,15 +10,15 @@ from typing import Any
 from urllib.parse import quote, urlsplit
 
 from bevviz.bags.source import iso
-from bevviz.batch.table import About
+from bevviz.batch.table import RunInfo
 
 
 @dataclass(frozen=True, slots=True)
-class Drive:
+class BagTotals:
     """The totals of one bag."""
 
     name: str
-    about: About
+    info: RunInfo
     first: int  # stamp of the first frame
     duration: float  # seconds between the first and the last stamp
     totals: Mapping[str, int]  # of each count
@@ -62,7 +62,7 @@ EXPLAINED = (
 
 def render(
     title: str,
-    drives: Sequence[Drive],
+    drives: Sequence[BagTotals],
     worst: Sequence[Mapping[str, Any]],
     failed: Sequence[tuple[str, str]],
     viewer: str,
@@ -76,7 +76,7 @@ def render(
         failed: name of each bag that failed, and why.
         viewer: address of a web viewer for the links of the frames; empty: none is served.
     """
-    frames = sum(drive.about.frames for drive in drives)
+    frames = sum(drive.info.frames for drive in drives)
     minutes = sum(drive.duration for drive in drives) / 60
     bad = sum(drive.bad for drive in drives)
     body = [
@@ -88,7 +88,7 @@ def render(
         items = "".join(f"<li><b>{escape(name)}</b>: {escape(why)}</li>" for name, why in failed)
         body.append(f"<h2 class=bad>{len(failed)} failed</h2><ul>{items}</ul>")
     body += ["<h2>Bags</h2>", _table(_DRIVE_HEADS, map(_drive, drives))]
-    if warnings := [(d.name, text) for d in drives for text in d.about.warnings]:
+    if warnings := [(d.name, text) for d in drives for text in d.info.warnings]:
         items = "".join(f"<li><b>{escape(name)}</b>: {escape(text)}</li>" for name, text in warnings)
         body.append(f"<h2>Warnings</h2><ul>{items}</ul>")
     if worst:
@@ -108,11 +108,11 @@ _DRIVE_HEADS = (
 _FRAME_HEADS = ("-badness", "bag", "-frame", "stamp", "what is wrong", "open")
 
 
-def _drive(drive: Drive) -> list[str]:
-    totals, frames = drive.totals, drive.about.frames
+def _drive(drive: BagTotals) -> list[str]:
+    totals, frames = drive.totals, drive.info.frames
     matched = "" if math.isnan(drive.matched) else f"{drive.matched:.0%}"
     return [
-        f"<span title='{escape(drive.about.bag)}'>{escape(drive.name)}</span>",
+        f"<span title='{escape(drive.info.bag)}'>{escape(drive.name)}</span>",
         iso(drive.first)[:19].replace("T", " "),
         f"{frames}",
         f"{drive.duration:.1f}",

@@ -183,14 +183,14 @@ def _configs(
     elif then.detector.model not in ("", "demo") and not info.redacted:
         beside = rrd.with_name(then.detector.model)
         if not beside.exists():
-            part = info.provenance.parts.get("detector.model", then.detector.model)
-            raise UserError(f"{rrd}: it was made with {part}, which is not beside it: give --model FILE")
+            used = info.provenance.dependencies.get("detector.model", then.detector.model)
+            raise UserError(f"{rrd}: it was made with {used}, which is not beside it: give --model FILE")
         here.append(f"detector.model={beside}")
     return then, load(file, [*here, *settings])
 
 
 def _changed_input(info: ReportInfo, bag: Path, then: Config, now: Config) -> Iterator[str]:
-    """The bag and the configuration, but for the files that this names: they are parts."""
+    """The bag and the configuration, but for the files that this names, which are dependencies."""
     if file_hash(bag) != info.bag_sha256:
         yield f"{bag.name} is not the file that the report was made with (SHA-256)"
     for key, (before, after) in changes(now, then).items():
@@ -201,7 +201,7 @@ def _changed_input(info: ReportInfo, bag: Path, then: Config, now: Config) -> It
 def _changed_provenance(info: ReportInfo, now: Config, network: str) -> Iterator[str]:
     then = info.provenance
     if info.redacted:  # the network is not run: what it found is in the report
-        parts = {name: part for name, part in then.parts.items() if not name.startswith("detector.")}
-        then = replace(then, parts=parts)
+        left = {name: d for name, d in then.dependencies.items() if not name.startswith("detector.")}
+        then = replace(then, dependencies=left)
         now = now.model_copy(update={"detector": now.detector.model_copy(update={"model": ""})})
     return differences(then, provenance(now, network))

@@ -11,7 +11,7 @@ from pathlib import Path
 from bevviz import __version__
 from bevviz.bags.source import SECOND, iso
 from bevviz.config import Config
-from bevviz.provenance import Part
+from bevviz.provenance import Dependency
 from bevviz.report.origin import changes
 from bevviz.report.window import Window
 from bevviz.text import fenced, markdown
@@ -74,7 +74,7 @@ def commands(rrd: Path, window: Window, config: Config, redacted: bool) -> list[
     ]
 
 
-def file_lines(sizes: Mapping[str, str], counts: Mapping[str, int], model: Part | None) -> list[str]:
+def file_lines(sizes: Mapping[str, str], counts: Mapping[str, int], model: Dependency | None) -> list[str]:
     """The files of a report, and the model that it needs."""
     lines = [f"{name}: {size}" for name, size in sizes.items()]
     if counts:

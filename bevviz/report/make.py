@@ -240,7 +240,7 @@ def _facts(
         versions=[f"{name} {version}" for name, version in versions().items()],
         hardware=[f"{name}: {value}" for name, value in made_with.machine.items()],
         warnings=written.warnings,
-        files=file_lines(sizes, part.counts, made_with.parts.get("detector.model")),
+        files=file_lines(sizes, part.counts, made_with.dependencies.get("detector.model")),
         commands=commands(request.output, window, public, request.redact),
     )
 
