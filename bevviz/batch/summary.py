@@ -11,7 +11,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from bevviz.batch.page import BagTotals, render
+from bevviz.batch.page import BagTotals, page
 from bevviz.batch.table import SCHEMA, RunInfo
 
 NAME = "summary"
@@ -26,16 +26,16 @@ def collect(results: Sequence[tuple[Path, RunInfo]], link: Link | None) -> tuple
         results: table and its description for each bag.
         link: fills the column ``link``; None leaves it empty.
     """
-    parts, drives = [], []
+    parts, bags = [], []
     for path, info in results:
         part = pq.read_table(path, schema=SCHEMA)
-        drives.append(_drive(path.stem, info, part))
+        bags.append(_totals(path.stem, info, part))
         links = [link(info.recording_id, f) if link else None for f in part["frame"].to_pylist()]
         parts.append(part.append_column("link", pa.array(links, pa.string())))
     empty = SCHEMA.append(pa.field("link", pa.string())).empty_table()
     frames = pa.concat_tables([empty, *(p.replace_schema_metadata(None) for p in parts)])
     order = [("badness", "descending"), ("recording", "ascending"), ("frame", "ascending")]
-    return frames.sort_by(order), drives
+    return frames.sort_by(order), bags
 
 
 def head(frames: pa.Table, count: int) -> list[dict[str, Any]]:
@@ -46,7 +46,7 @@ def head(frames: pa.Table, count: int) -> list[dict[str, Any]]:
     return rows
 
 
-def _drive(name: str, info: RunInfo, part: pa.Table) -> BagTotals:
+def _totals(name: str, info: RunInfo, part: pa.Table) -> BagTotals:
     stamps = np.sort(part["stamp"].to_numpy().astype(np.int64))
     times = part["time_ms_total"].to_numpy()
     counts = [field.name for field in SCHEMA if field.type == pa.int32()]
@@ -81,12 +81,12 @@ def write_summary(
         link: what opens a frame; None: recordings are in no catalog.
         viewer: address of a web viewer; empty: none is served.
     """
-    frames, drives = collect(results, link)
-    page = folder / f"{NAME}.html"
-    text = render(folder.resolve().name, drives, head(frames, top), failed, viewer)
-    _write_whole(folder / f"{NAME}.parquet", lambda path: pq.write_table(frames, path))
-    _write_whole(page, lambda path: path.write_text(text))
-    return page
+    frames, bags = collect(results, link)
+    path = folder / f"{NAME}.html"
+    text = page(folder.resolve().name, bags, head(frames, top), failed, viewer)
+    _write_whole(folder / f"{NAME}.parquet", lambda unfinished: pq.write_table(frames, unfinished))
+    _write_whole(path, lambda unfinished: unfinished.write_text(text, encoding="utf-8"))
+    return path
 
 
 def _write_whole(path: Path, write: Callable[[Path], object]) -> None:
