@@ -41,6 +41,7 @@ def _sweep(options: argparse.Namespace) -> int:
     from bevviz.config import load
     from bevviz.evaluate import truth_source
     from bevviz.sweep import Sweep, combine, parse
+    from bevviz.sweep.log import layout, log_sweep
     from bevviz.variants import common_frames
 
     parameters, constant = parse(options.set)
@@ -58,7 +59,7 @@ def _sweep(options: argparse.Namespace) -> int:
         with ExitStack() as stack:
             sinks = None
             if wanted:
-                opened = outputs(source.scene, source.config, options, blueprint=sweep.layout())
+                opened = outputs(source.scene, source.config, options, blueprint=layout(sweep))
                 sinks = stack.enter_context(opened)
             hint(source.scene, config)
             frames, interrupted = through(source, lambda frame: frame, sweep.add)
@@ -68,7 +69,7 @@ def _sweep(options: argparse.Namespace) -> int:
             if options.csv is not None:
                 sweep.write_csv(options.csv)
             if sinks is not None:
-                sweep.log(sinks.recording, source.scene.name)
+                log_sweep(sinks.recording, sweep, source.scene.name)
                 if options.serve is not None and not interrupted:
                     serve(sinks.recording)
     if interrupted:
