@@ -9,7 +9,6 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager, redirect_stderr
 from dataclasses import dataclass, replace
-from html.parser import HTMLParser
 from io import StringIO
 from pathlib import Path
 from threading import Event, Thread
@@ -31,6 +30,7 @@ from bevviz.errors import UserError
 from bevviz.frame import DetectionState
 from bevviz.pipeline import Pipeline
 from tests import bags
+from tests.pages import Page
 from tests.recordings import Recording, verify
 
 GOOD = ("kitti", "one-drive", "two_b_-drive")
@@ -274,22 +274,6 @@ def test_badness_weighs_what_went_wrong(batch: Batch) -> None:
     )
     assert empty["remarks"][0] == "cloud: the cloud holds no finite point"
     assert "late" in empty["remarks"]
-
-
-class Page(HTMLParser):
-    """The elements and the text of a page."""
-
-    def __init__(self, text: str) -> None:
-        super().__init__()
-        self.tags: list[tuple[str, dict[str, str | None]]] = []
-        self.text = ""
-        self.feed(text)
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        self.tags.append((tag, dict(attrs)))
-
-    def handle_data(self, data: str) -> None:
-        self.text += data
 
 
 def test_the_page_stands_on_its_own(batch: Batch) -> None:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from html.parser import HTMLParser
-
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -14,25 +12,9 @@ from bevviz.batch.table import RunInfo
 from bevviz.frame import Scene
 from bevviz.html import environment, render
 from bevviz.report.plots import plot
+from tests.pages import Page
 
 EVIL = "</style></script><script>alert('x')</script>\"'><img src=x onerror=alert(1)> &amp; {{ 7 * 7 }}"
-
-
-class Tags(HTMLParser):
-    """Every tag with its attributes, and all text outside of them."""
-
-    def __init__(self, text: str) -> None:
-        super().__init__()
-        self.tags: list[tuple[str, dict[str, str | None]]] = []
-        self.text = ""
-        self.feed(text)
-        self.close()
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        self.tags.append((tag, dict(attrs)))
-
-    def handle_data(self, data: str) -> None:
-        self.text += data
 
 
 def totals(name: str) -> BagTotals:
@@ -57,7 +39,7 @@ def batch(text: str) -> str:
 
 @given(st.one_of(st.text(max_size=40), st.just(EVIL)))
 def test_no_name_becomes_markup(name: str) -> None:
-    shown, plain = Tags(batch(name)), Tags(batch("plain"))
+    shown, plain = Page(batch(name)), Page(batch("plain"))
     assert [tag for tag, _ in shown.tags] == [tag for tag, _ in plain.tags]
     assert [list(attrs) for _, attrs in shown.tags] == [list(attrs) for _, attrs in plain.tags]
     if name == EVIL:
@@ -78,7 +60,7 @@ def test_what_a_template_names_must_be_there() -> None:
 
 
 def test_a_page_loads_nothing() -> None:
-    (policy,) = (a["content"] for tag, a in Tags(batch("x")).tags if "http-equiv" in a)
+    (policy,) = (a["content"] for tag, a in Page(batch("x")).tags if "http-equiv" in a)
     assert policy == "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
 
 
@@ -88,7 +70,7 @@ def test_a_plot() -> None:
     inside = [(x, y) for line in drawn.lines for x, y in line.points]
     assert all(drawn.left <= x <= drawn.right and drawn.top <= y <= drawn.bottom for x, y in inside)
     template = environment().from_string('{% from "macros.html" import plot %}{{ plot(drawn) }}')
-    found = Tags(template.render(drawn=drawn))
+    found = Page(template.render(drawn=drawn))
     tags = [tag for tag, _ in found.tags]
     assert tags.count("polyline") == 2 and tags.count("circle") == 1
     assert all(text in found.text for text in ("a < b", "<x>", "one"))

@@ -136,15 +136,15 @@ def why(what: str) -> str:
 
 def difference(change: str) -> str:
     """Objects that differ in this way between two runs."""
-    return f"{COMPARE}/objects/{change.replace(' ', '_').lower()}"
+    return f"{COMPARE}/objects/{_change(change)}"
 
 
 def image_difference(camera: str, change: str) -> str:
-    return f"{COMPARE}/{camera}/{change.replace(' ', '_').lower()}"
+    return f"{COMPARE}/{camera}/{_change(change)}"
 
 
 def difference_count(change: str) -> str:
-    return f"{COMPARE}/count/{change.replace(' ', '_').lower()}"
+    return f"{COMPARE}/count/{_change(change)}"
 
 
 def difference_state(class_name: str) -> str:
@@ -153,7 +153,7 @@ def difference_state(class_name: str) -> str:
 
 def sweep(metric: str) -> str:
     """A number over the parameter that was swept."""
-    return f"{SWEEP}/{metric.replace(' ', '_')}"
+    return f"{SWEEP}/{_part(metric)}"
 
 
 def track_state(lane: int) -> str:
@@ -222,6 +222,10 @@ def calib_corrected(camera: str) -> str:
 def _part(name: str) -> str:
     """One part of a path, of a name that others chose: nothing in it ends the part or needs an escape."""
     return re.sub(r"[\s/\\]", "_", name) or "_"
+
+
+def _change(change: str) -> str:
+    return _part(change).lower()
 
 
 def _topic(topic: str) -> str:
