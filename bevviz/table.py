@@ -31,7 +31,9 @@ def markdown(rows: Rows, align: str = "") -> str:
     """A table in Markdown; arguments as of ``lines``."""
     rules = ["---" if side == "l" else "---:" for side in align or _default(rows)]
     head, *body = [[text.markdown(cell) for cell in row] for row in rows]
-    return "\n".join(f"| {' | '.join(row)} |" for row in [head, rules, *body])
+    return "\n".join(
+        "|" + "".join(f" {cell} |" if cell else " |" for cell in row) for row in [head, rules, *body]
+    )
 
 
 def _default(rows: Rows) -> str:
