@@ -193,7 +193,7 @@ def _stages(result: FrameResult, config: AnomaliesConfig) -> Iterator[Anomaly]:
             yield Anomaly("stage", stage, f"{stage} took {1e3 * seconds:.0f} ms")
 
 
-class News:
+class Onsets:
     """Tells what is new in the anomalies of each frame, even where frames are left out."""
 
     def __init__(self) -> None:
@@ -208,14 +208,14 @@ class Summary:
     """How many anomalies of each kind a drive had, and when the first began."""
 
     def __init__(self) -> None:
-        self._news = News()
+        self._onsets = Onsets()
         self._start: int | None = None
         self._count: Counter[str] = Counter()
         self._first: dict[str, int] = {}
 
     def add(self, result: FrameResult) -> None:
         self._start = result.frame.stamp if self._start is None else self._start
-        for anomaly in self._news.of(result.anomalies):
+        for anomaly in self._onsets.of(result.anomalies):
             self._count[anomaly.kind] += 1
             self._first.setdefault(anomaly.kind, anomaly.since - self._start)
 

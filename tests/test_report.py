@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import onnx
 import pytest
+import rerun as rr
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -293,6 +294,12 @@ def test_what_is_no_report(small: Path, tmp_path: Path, capsys: Capture) -> None
     assert "not one of 'bevviz report'" in error_of(capsys, "report", "--check", "run.rrd")
     Path("alone.rrd").write_bytes(small.read_bytes())
     assert "alone.mcap" in error_of(capsys, "report", "--check", "alone.rrd")
+    with rr.RecordingStream("bevviz") as recording:
+        recording.save("older.rrd")
+        recording.send_property("bevviz", rr.AnyValues(config="preset: default"))
+        recording.send_property("report", rr.AnyValues(about='{"low": 1}'))
+    Path("older.mcap").touch()
+    assert "a report of another version" in error_of(capsys, "report", "--check", "older.rrd")
     assert "takes one report" in error_of(capsys, "report", "--check", "a.rrd", "b.rrd")
 
 

@@ -9,7 +9,7 @@ from types import MappingProxyType
 import numpy as np
 import rerun as rr
 
-from bevviz.anomalies import News
+from bevviz.anomalies import Onsets
 from bevviz.config import Config
 from bevviz.frame import CameraResult, Frame, FrameResult, Intrinsics, Scene
 from bevviz.logging import entities
@@ -76,7 +76,7 @@ class Logger(Writer):
         self._intrinsics: dict[str, Intrinsics] = {}
         self._track_lanes = Lanes()
         self._state_lanes = StateLanes(COLORS)
-        self._news = News()
+        self._onsets = Onsets()
         self._last: Frame | None = None
 
     @property
@@ -149,7 +149,7 @@ class Logger(Writer):
             log_bev(self, result.bev, self._config)
             log_grid(self, result, result.bev)
         log_decisions(self, result, notes)
-        log_anomalies(self, result, self._news.of(result.anomalies))
+        log_anomalies(self, result, self._onsets.of(result.anomalies))
         self._log_states(result)
         log_health(self, result, self._last, health)
         self.end()
