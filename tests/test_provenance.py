@@ -33,6 +33,7 @@ NEUTRAL = {
     "pydantic": "the configuration's types",
     "pydantic_core": "the configuration's types",
     "tqdm": "progress bars",
+    "jinja2": "pages about results",
     "ruamel.yaml": "files of configurations",
     "pyarrow": "containers of what is computed",
     "apsw": "bytes out of SQLite files",
@@ -56,7 +57,7 @@ def imported(file: Path) -> Iterator[str]:
 def test_every_package_that_results_depend_on_is_listed() -> None:
     modules = {name for file in PACKAGE.rglob("*.py") for name in imported(file)}
     top = {name.split(".")[0] for name in modules} - sys.stdlib_module_names - {"bevviz"}
-    owners = packages_distributions()
+    owners = {module: [o.lower() for o in found] for module, found in packages_distributions().items()}
     listed = {*versions(), *NEUTRAL}
     ours = {name for name in top if not any(o.startswith("ros-") for o in owners.get(name, ["ros-"]))}
     assert "numba" in ours

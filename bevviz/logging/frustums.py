@@ -42,7 +42,7 @@ def log_frustums(to: Writer, frame: Frame, cameras: Sequence[CameraResult]) -> N
         corners = geometry.frustum(found.xyxy[rows], intrinsics, near, far[rows])
         corners = geometry.apply(pose, corners.reshape(-1, 3)).reshape(-1, 8, 3)
         names = [found.names[d] for d in rows]
-        strips += map(edges, corners)
+        strips.append(edges(corners))
         colors += [
             class_color(n) if m else _UNMATCHED_COLOR for n, m in zip(names, matched[rows], strict=True)
         ]
@@ -51,6 +51,10 @@ def log_frustums(to: Writer, frame: Frame, cameras: Sequence[CameraResult]) -> N
         to.put(
             entities.FRUSTUMS,
             rr.LineStrips3D(
-                strips, colors=colors, labels=labels, radii=rr.Radius.ui_points(1.0), show_labels=False
+                np.concatenate(strips),
+                colors=colors,
+                labels=labels,
+                radii=rr.Radius.ui_points(1.0),
+                show_labels=False,
             ),
         )

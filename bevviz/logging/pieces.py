@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 import pyarrow as pa
 import rerun as rr
+from numpy.typing import NDArray
 
 from bevviz import geometry
 from bevviz.frame import F32, F64, U8, Boxes3D, Image
@@ -42,8 +43,22 @@ def boxes2d(xyxy: F32, labels: list[str], **looks: Any) -> rr.Boxes2D:
 
 
 def edges(corners: F32) -> F32:
-    """(16, 3) every edge of a box or frustum, given its (8, 3) corners, in one stroke."""
-    return corners[_EDGES]
+    """(..., 16, 3) every edge of a box or frustum, given its (..., 8, 3) corners, in one stroke."""
+    return corners[..., _EDGES, :]
+
+
+def strips(points: F32, lengths: NDArray[np.integer]) -> pa.Array:
+    """Lines as Rerun keeps them, in one piece rather than line by line.
+
+    Args:
+        points: (N, 2) or (N, 3), of one line after the other.
+        lengths: how many of them each line has.
+    """
+    point = pa.list_(pa.field("item", pa.float32(), nullable=False), points.shape[1])
+    line = pa.list_(pa.field("item", point, nullable=False))
+    offsets = pa.array(np.append(0, np.cumsum(lengths)).astype(np.int32))
+    values = pa.FixedSizeListArray.from_arrays(pa.array(points.ravel()), type=point)
+    return pa.ListArray.from_arrays(offsets, values, type=line)
 
 
 def scored(names: Iterable[str], scores: Iterable[Any]) -> list[str]:

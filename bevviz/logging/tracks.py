@@ -14,7 +14,7 @@ from bevviz.logging import entities
 from bevviz.logging.annotations import class_annotations
 from bevviz.logging.bev import footprints, seen_from_above
 from bevviz.logging.entities import TRACK_COLORS, ClassId
-from bevviz.logging.pieces import OUTLINE, boxes3d
+from bevviz.logging.pieces import OUTLINE, boxes3d, strips
 from bevviz.logging.writer import Writer
 
 LANES = 12  # tracks with a state lane and a speed of their own: entities that come and go are never freed
@@ -49,13 +49,11 @@ def log_tracks(to: Writer, frame: Frame, tracks: Tracks, config: BevConfig) -> N
             to.put(path, boxes3d(tracks.boxes, chosen, labels, class_ids=class_ids(tracks.id[chosen])))
     if len(rows) == 0:
         return
-    paths, colors = trails(tracks, rows), class_ids(tracks.id[rows])
-    to.put(entities.TRAILS, rr.LineStrips3D(paths, class_ids=colors))
-    points_from_world = geometry.inverse(frame.pose)
-    to.put(
-        entities.overlay("trails"),
-        rr.LineStrips2D([seen_from_above(config, points_from_world, p) for p in paths], class_ids=colors),
-    )
+    colors, points_from_world = class_ids(tracks.id[rows]), geometry.inverse(frame.pose)
+    trail, lengths = trails(tracks, rows)
+    to.put(entities.TRAILS, rr.LineStrips3D(strips(trail, lengths), class_ids=colors))
+    seen = seen_from_above(config, points_from_world, trail)
+    to.put(entities.overlay("trails"), rr.LineStrips2D(strips(seen, lengths), class_ids=colors))
     outlines = footprints(geometry.corners(tracks.boxes)[rows])
     to.put(
         entities.overlay("tracks"),
@@ -140,6 +138,8 @@ def of_objects(tracks: Tracks | None, count: int) -> list[int | None]:
     return rows
 
 
-def trails(tracks: Tracks, rows: I64) -> list[F32]:
-    """Where each was, oldest first."""
-    return [trail[np.isfinite(trail[:, 0])] for trail in tracks.trail[rows]]
+def trails(tracks: Tracks, rows: I64) -> tuple[F32, I64]:
+    """Where each was, oldest first: (N, 3) points of one after the other, and how many each has."""
+    found = tracks.trail[rows]
+    known = np.isfinite(found[:, :, 0])
+    return found[known], known.sum(axis=1)
