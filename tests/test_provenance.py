@@ -42,6 +42,8 @@ NEUTRAL = {
     "open3d": "the simulator, whose scans are input like any other",
     "libusb-package": "a library that open3d loads",
     "distributed": "brings jobs to other machines",
+    "pandas": "results as tables",
+    "ipython": "the viewer in a notebook",
 }
 
 
