@@ -29,13 +29,13 @@ def markdown(text: str) -> str:
     >>> markdown("*x* of min_points")
     '\\*x\\* of min_points'
     """
-    if _PLAIN.fullmatch(text) and ("_" not in text or not _MARKS.search(text)):
+    if _PLAIN.fullmatch(text) and "  " not in text and ("_" not in text or not _MARKS.search(text)):
         return text
     line = _MARKS.sub(r"\\\g<0>", printable(" ".join(text.split())))
     if start := _START.match(line):
         at = start.end() if start.group().isdigit() else 0
         line = f"{line[:at]}\\{line[at:]}"
-    return line
+    return f"{line[:-1]}\\#" if line.endswith((" #", "##")) else line  # the end of a heading
 
 
 def fenced(text: str, language: str = "") -> str:

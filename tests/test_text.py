@@ -46,6 +46,8 @@ def shown(text: str) -> str:
 @example("tracks_of_ _x_ __init__ a_b")
 @example("1. one")
 @example("# no heading")
+@example("no end of one #")
+@example("~~struck~~")
 @example("[link](javascript:x) ![i](j) <script>alert(1)</script> &lt; `code` a  \nb")
 def test_markdown_shows_any_text_as_it_is(text: str) -> None:
     line = markdown(text)
