@@ -62,12 +62,12 @@ def _report(options: argparse.Namespace) -> int:
 
 def _make(options: argparse.Namespace) -> int:
     from bevviz.bags.reader import megabytes
-    from bevviz.report.make import Order, make
+    from bevviz.report.make import ReportRequest, make
 
     if options.at is None:
         raise UserError("--at TIME is missing: the time that the report is about")
     made = make(
-        Order(
+        ReportRequest(
             paths=options.paths,
             config=load_config(options),
             at=options.at,

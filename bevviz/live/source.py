@@ -7,9 +7,9 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from types import TracebackType
 from typing import Any
 
+from bevviz.closing import Closing
 from bevviz.config import Config, SourceConfig, stage_topics
 from bevviz.errors import UserError
 from bevviz.frame import Frame, Intrinsics, Scene
@@ -70,7 +70,7 @@ class _Subscription:
     qos: Any
 
 
-class LiveSource:
+class LiveSource(Closing):
     """The frames of a robot, as they become complete, until ``stop``.
 
     Messages are received, decoded and synchronised in a thread of their own. It hands over through a slot
@@ -122,14 +122,6 @@ class LiveSource:
         self._add_timer(LOOK, self._look)
         self._add_timer(TICK, self._tick)
         self._node.start()
-
-    def __enter__(self) -> LiveSource:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
     def close(self) -> None:
         """Leave the graph."""
