@@ -132,6 +132,10 @@ class SyncConfig(Section):
     """How images and transforms are found for a cloud."""
 
     tolerance: Seconds = Field(0.1, gt=0, le=10, description="largest |image stamp - cloud stamp|")
+    offsets: Mapping[str, Seconds] = Field({}, description="topic -> time added to its stamps")
+    by: Literal["stamp", "received"] = Field(
+        "stamp", description="what tells the time of a message: its own stamp, or when it was received"
+    )
     tf_tolerance: Seconds = Field(0.2, ge=0, le=60, description="how far past its samples TF is held")
     motion_compensation: bool = Field(
         True, description="move the cloud to the image's time before projection"

@@ -73,6 +73,7 @@ class Intrinsics:
     K: F64  # (3, 3)
     distortion_model: str = ""  # "", plumb_bob, rational_polynomial or equidistant
     D: F64 = field(default_factory=lambda: np.zeros(0))  # coefficients in ROS order
+    baseline: tuple[float, float] = (0.0, 0.0)  # metres right of and below the first camera of a stereo pair
     assumed: bool = False  # True: no CameraInfo was seen, these are the configured defaults
 
 

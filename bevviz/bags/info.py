@@ -110,7 +110,7 @@ def _describe(
         points_frame=frame.points_frame if frame else "",
         world_frame=frame.world_frame if frame and frame.world_from_points is not None else "",
         missing=tuple(missing),
-        warnings=tuple(recording.warnings),
+        warnings=(*recording.warnings, *(source.doubts if source else ())),
     )
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import replace
 from datetime import UTC, datetime
 from functools import cached_property
@@ -100,6 +99,15 @@ class BagSource(Closing):
         return [*self.recording.warnings, *damaged, *(self._sync.report.warnings() if self._sync else ())]
 
     @property
+    def doubts(self) -> Sequence[str]:
+        """What of the frames read so far may make all of them wrong, one sentence each."""
+        damaged = [
+            f"{topic}: {count} message(s) could not be used, the first: {self._first_damage[topic]}"
+            for topic, count in self._damaged.items()
+        ]
+        return [*damaged, *(self._sync.report.doubts() if self._sync else ())]
+
+    @property
     def span(self) -> tuple[int, int]:
         """Log times of the scans that are read: from the first, to before the second."""
         return self._low, self._high
@@ -153,7 +161,9 @@ class BagSource(Closing):
         self._damaged.clear()
         handlers = make_handlers(sync, self.roles, self.recording.decode)
         self._hold_throughout(sync, handlers, low)
-        numbers: dict[int, int] = {}  # stamp -> number of the scan, for those not yet delivered
+        numbers: dict[
+            int, list[int]
+        ] = {}  # time of receipt -> numbers of the scans that are not yet delivered
         number = -1
         stop = high + MARGIN
         for message in self.recording.messages(handlers.keys(), low - MARGIN, stop):
@@ -167,20 +177,20 @@ class BagSource(Closing):
                     continue
                 if number == chosen[-1]:
                     stop = message.received + MARGIN
-                with suppress(MessageError):  # told when the scan is decoded
-                    numbers[message.header()[0] or message.received] = first + number
+                numbers.setdefault(message.received, []).append(first + number)
             elif message.topic in self.roles.lidars and not (number in chosen or number + 1 in chosen):
                 continue
             self._handle(handlers[message.topic], message)
             yield from self._numbered(sync.ready(message.received), numbers)
         yield from self._numbered(sync.flush(), numbers)
 
-    def _numbered(self, frames: Iterator[Frame], numbers: dict[int, int]) -> Iterator[Frame]:
+    def _numbered(self, frames: Iterator[Frame], numbers: dict[int, list[int]]) -> Iterator[Frame]:
         """The frames, each with the number of its scan in the part of the recording that is read."""
         for frame in frames:
-            yield replace(frame, index=numbers.pop(frame.stamp, frame.index))
-            for stamp in [s for s in numbers if s < frame.stamp - 10 * MARGIN]:
-                del numbers[stamp]  # of scans that were dropped
+            same = numbers.get(frame.received, ())
+            yield replace(frame, index=same.pop(0) if same else frame.index)
+            for received in [t for t in numbers if t < frame.received - 10 * MARGIN]:
+                del numbers[received]  # of scans that were dropped
 
     def _handle(self, handler: Handler[RawMessage], message: RawMessage) -> None:
         try:

@@ -416,9 +416,10 @@ def decode_camera_info(msg: Any, rectified: bool, topic: str = "camera_info") ->
         MessageError: an uncalibrated camera, or a distortion model that is not known.
     """
     K, D, P = (np.asarray(_either(msg, n, n.lower()), np.float64) for n in "KDP")
-    matrix = K.reshape(3, 3)
+    matrix, baseline = K.reshape(3, 3), (0.0, 0.0)
     if rectified and P[0]:
         matrix = P.reshape(3, 4)[:, :3]
+        baseline = -float(P[3] / P[0]), -float(P[7] / P[5] if P[5] else 0.0)
     if not np.isfinite(matrix).all() or matrix[0, 0] <= 0 or matrix[1, 1] <= 0:
         raise MessageError(f"{topic}: the camera is uncalibrated (K is zero or not finite); calibrate it")
     model = ""
@@ -430,7 +431,7 @@ def decode_camera_info(msg: Any, rectified: bool, topic: str = "camera_info") ->
     binning = np.array([max(int(msg.binning_x), 1), max(int(msg.binning_y), 1)])
     matrix[:2] /= binning[:, None]
     width, height = np.array([msg.roi.width or msg.width, msg.roi.height or msg.height], int) // binning
-    return Intrinsics(int(width), int(height), matrix, model, D if model else np.zeros(0))
+    return Intrinsics(int(width), int(height), matrix, model, D if model else np.zeros(0), baseline)
 
 
 def _distortion(name: str, D: F64, topic: str) -> str:

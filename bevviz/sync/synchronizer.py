@@ -19,6 +19,7 @@ from bevviz.errors import UserError
 from bevviz.frame import F32, F64, Camera, Cloud, Frame, Image, Intrinsics, LabelledBoxes2D, LabelledBoxes3D
 from bevviz.ros.messages import StampedTransform
 from bevviz.ros.roles import CameraRole, Roles, entity_name
+from bevviz.sync.clocks import Clocks
 from bevviz.sync.tf import Lookup, Origin, TransformBuffer, TransformError
 from bevviz.sync.upright import Upright
 
@@ -28,6 +29,7 @@ SECOND = 1_000_000_000
 JUMP = SECOND  # a stamp that is this much older than its topic's newest means that the clock was reset
 LATENCY = 2 * SECOND  # the longest a cloud is expected to arrive after an image of the same stamp
 FIXED_FRAMES = {"map", "odom", "world", "earth", "global", "utm", "enu", "ned", "mocap", "vicon", "init"}
+FAR = 500.0  # metres that no LiDAR has half of its points beyond
 GLOBE_FRAMES = {"earth", "ecef", "utm"}  # coordinates too large for the float32 of a viewer
 TUTORIAL_K = np.array([[267.0, 0.0, 320.0], [0.0, 267.0, 180.0], [0.0, 0.0, 1.0]])
 
@@ -52,6 +54,13 @@ class SyncReport:
     problems: Counter[str] = field(default_factory=Counter)  # missing transforms and CameraInfo -> frames
     tf: TransformBuffer = field(default_factory=TransformBuffer)  # for what looked wrong in the transforms
     upright: Mapping[str, str] = field(default_factory=dict)  # for what is doubtful about the vertical
+    clocks: Clocks = field(default_factory=lambda: Clocks({}, "stamp"))
+    clocked: tuple[str, ...] = ()  # topics whose clocks must be one
+    oddities: dict[str, str] = field(default_factory=dict)  # topic -> what its messages should not say
+
+    def doubts(self) -> tuple[str, ...]:
+        """One sentence for whatever may make every frame wrong: clocks, units, which way is up."""
+        return (*self.clocks.doubts(self.clocked), *self.oddities.values(), *self.upright.values())
 
     def warnings(self) -> tuple[str, ...]:
         """One sentence each."""
@@ -82,7 +91,7 @@ class SyncReport:
         for camera, n in self.undecodable.items():
             found.append(f"camera '{camera}': an image could not be decoded {_times(n)}")
         found += [f"{text} ({n} of {self.frames} frames)" for text, n in self.problems.items()]
-        return (*found, *self.upright.values(), *self.tf.problems)
+        return (*self.doubts(), *found, *self.tf.problems)
 
 
 def _times(n: int) -> str:
@@ -186,6 +195,8 @@ class Synchronizer:
         self.tf = self.report.tf
         self.upright = Upright(self.tf, config.source.base_frame, config.sync.tf_tolerance)
         self.report.upright = self.upright.warnings
+        self.clocks = self.report.clocks = Clocks(config.sync.offsets, config.sync.by)
+        self.report.clocked = (*roles.lidars, *(c.topic for c in roles.cameras), *roles.tf)
         self._roles = roles
         self._config = config
         self._tolerance = round(config.sync.tolerance * 1e9)
@@ -201,6 +212,9 @@ class Synchronizer:
         self._images: dict[str, _Track[_Undecoded]] = self._make_tracks(*(c.topic for c in roles.cameras))
         self._camera_frames: dict[str, str] = {}  # image topic -> optical frame
         self.intrinsics: dict[str, Intrinsics] = {}  # CameraInfo topic -> the newest
+        self._infos: dict[str, _Track[Intrinsics]] = {}  # by topic
+        self._info_counts: Counter[str] = Counter()
+        self._image_counts: Counter[str] = Counter()
         self._odometry_frames: set[str] = set()
         self._boxes: dict[str, _Track[LabelledBoxes3D]] = self._make_tracks(*roles.robot_detections_3d)
         self._detections: dict[str, _Track[LabelledBoxes2D]] = self._make_tracks(*roles.robot_detections_2d)
@@ -214,8 +228,11 @@ class Synchronizer:
 
     def take_over(self, former: Synchronizer) -> None:
         """Go on with the transforms, calibrations and counts of ``former``, when the roles change."""
+        clocked = self.report.clocked
         self.report, self.absent = former.report, former.absent
-        self.tf, self.intrinsics, self.upright = former.tf, former.intrinsics, former.upright
+        self.report.clocked = clocked
+        self.tf, self.upright, self.clocks = former.tf, former.upright, former.clocks
+        self.intrinsics, self._infos = former.intrinsics, former._infos
         self._odometry_frames = former._odometry_frames
 
     # --- what comes in -------------------------------------------------------------------------
@@ -226,6 +243,7 @@ class Synchronizer:
             return
         stamp = self._arrived(cloud.topic, cloud.stamp, cloud.received)
         cloud = replace(cloud, stamp=stamp, name=self._lidar_name(cloud))
+        self._check_units(cloud)
         self.report.clouds += 1
         if cloud.topic in self._partners:
             self._partners[cloud.topic].add(cloud.stamp, cloud)
@@ -251,11 +269,15 @@ class Synchronizer:
         if topic in self._images:
             stamp = self._arrived(topic, stamp, received)
             self._camera_frames[topic] = frame_id
+            self._image_counts[topic] += 1
             self._images[topic].add(stamp, _Undecoded(stamp, frame_id, load))
 
-    def add_camera_info(self, topic: str, intrinsics: Intrinsics) -> None:
-        """``topic`` is that of the CameraInfo; the newest one holds."""
+    def add_camera_info(self, topic: str, intrinsics: Intrinsics, stamp: int, received: int) -> None:
+        """``topic`` is that of the CameraInfo; for an image the one that is nearest in stamp holds."""
         self.intrinsics[topic] = intrinsics
+        self._info_counts[topic] += 1
+        track = self._infos.setdefault(topic, _Track(self._horizon))
+        track.add(self._arrived(topic, stamp, received), intrinsics)
 
     def add_transform(
         self, transform: StampedTransform, static: bool = False, fallback: bool = False
@@ -293,7 +315,17 @@ class Synchronizer:
         if stamp == 0:
             self.report.unstamped[topic] += 1
             return received
-        return stamp
+        return self.clocks.stamp(topic, stamp, received)
+
+    def _check_units(self, cloud: Cloud) -> None:
+        """In millimetres nothing is within the reach of any stage, and nothing would be said."""
+        if cloud.topic not in self.report.oddities and len(cloud.xyz):
+            middle = float(np.median(np.abs(cloud.xyz[::16]).max(axis=1)))
+            if middle > FAR:
+                self.report.oddities[cloud.topic] = (
+                    f"{cloud.topic}: half of its points are farther than {middle:,.0f} m, as coordinates in "
+                    f"millimetres are; a PointCloud2 is in metres (REP 103): correct its driver"
+                )
 
     def _watch_clock(self, stamp: int) -> None:
         newest = self._clouds[-1].stamp if self._clouds else self._last
@@ -379,8 +411,18 @@ class Synchronizer:
         infos = {camera.info_topic for camera in self._roles.cameras} - {""}
         if infos - self.absent - self.intrinsics.keys():
             return False
+        if not all(self._info_reaches(camera, stamp) for camera in self._roles.cameras):
+            return False
         lacking = not self.absent.isdisjoint((*self._roles.tf, self._roles.odometry))
         return lacking or self._transforms_reach(self._clouds[0])
+
+    def _info_reaches(self, role: CameraRole, stamp: int) -> bool:
+        """Whether the calibration of the image of this time has come, where each image has one of its own."""
+        track, image = self._infos.get(role.info_topic), self._images[role.topic].nearest(stamp)
+        if track is None or track.newest is None or image is None or role.info_topic in self.absent:
+            return True
+        one_each = self._info_counts[role.info_topic] * 2 > self._image_counts[role.topic] > 1
+        return not one_each or track.newest >= image[0]
 
     def _may_be_of_next(self, track: _Track[Any], stamp: int) -> bool:
         nearest = track.nearest(stamp)
@@ -549,31 +591,61 @@ class Synchronizer:
     def _camera(self, role: CameraRole, place: _Place) -> Camera:
         problems: list[str] = []
         image, stamp = self._image(role, place.stamp, problems)
-        intrinsics = self._camera_intrinsics(role, image, problems)
+        intrinsics = self._camera_intrinsics(role, image, stamp, problems)
         camera = Camera(role.name, image, intrinsics, None, None, problems=tuple(problems))
         if image is not None:
             camera = replace(camera, sync_error=(stamp - place.stamp) * 1e-9)
+            off = self.clocks.apart(role.topic, self._roles.lidars[0])
+            if off:
+                self._complain(
+                    problems,
+                    f"the clocks of camera '{role.name}' and the LiDAR are {abs(off):.2f} s apart: "
+                    f"its image is of another time",
+                )
+                camera = replace(camera, problems=tuple(problems))
         frame = self._camera_frames.get(role.topic)
         if frame is None:
             return camera
         try:
             found, compensated = self._moved(place, stamp, frame)
         except TransformError as error:
-            lacking = not self.tf.knows(place.points_frame, frame)
+            lacking = frame and place.points_frame and not self.tf.knows(place.points_frame, frame)
             self._complain(problems, f"{error}; source.extrinsics can state it" if lacking else str(error))
             return replace(camera, problems=tuple(problems))
         if image is not None and not compensated and self._compensates(place):
             self._complain(problems, f"no motion compensation: '{place.inertial_frame}' is out of reach")
         world = np.eye(4) if place.world_from_points is None else place.world_from_points
+        first_from_camera = self._second_of_stereo(role, intrinsics, frame)
+        points_from_camera = found.matrix @ first_from_camera
+        mounting = self._mounting(place, frame) if compensated else None
         return replace(
             camera,
-            camera_from_points=geometry.inverse(found.matrix),
-            world_from_camera=world @ found.matrix,
+            camera_from_points=geometry.inverse(points_from_camera),
+            world_from_camera=world @ points_from_camera,
             tf_age=found.age,
             motion_compensated=compensated,
-            mounting=self._mounting(place, frame) if compensated else None,
+            mounting=None if mounting is None else geometry.inverse(first_from_camera) @ mounting,
             problems=tuple(problems),
         )
+
+    def _second_of_stereo(self, role: CameraRole, intrinsics: Intrinsics | None, frame: str) -> F64:
+        """(4, 4) frame of the image from its camera: the second of a stereo pair is in the first one's.
+
+        See P in sensor_msgs/CameraInfo. Many drivers give the second camera a frame of its own, and P all the
+        same; then it is where TF says.
+        """
+        pose = np.eye(4)
+        if intrinsics is None or intrinsics.baseline == (0.0, 0.0):
+            return pose
+        if any(there == frame for topic, there in self._camera_frames.items() if topic != role.topic):
+            pose[:2, 3] = intrinsics.baseline
+        else:
+            self.report.oddities.setdefault(
+                role.info_topic,
+                f"{role.info_topic}: its P tells of a camera {math.hypot(*intrinsics.baseline):.3f} m beside "
+                f"another one's frame; '{frame}' is taken as its own, as no other camera is in it",
+            )
+        return pose
 
     def _mounting(self, place: _Place, frame: str) -> F64 | None:
         """frame from points at the cloud's stamp, None where TF does not say."""
@@ -605,9 +677,11 @@ class Synchronizer:
         return f"{within}: nearest is {abs(away):.2f} s {'later' if away > 0 else 'earlier'}"
 
     def _camera_intrinsics(
-        self, role: CameraRole, image: Image | None, problems: list[str]
+        self, role: CameraRole, image: Image | None, stamp: int, problems: list[str]
     ) -> Intrinsics | None:
-        intrinsics = self.intrinsics.get(role.info_topic or "")
+        infos = self._infos.get(role.info_topic)
+        nearest = None if infos is None else infos.nearest(stamp)
+        intrinsics = None if nearest is None else nearest[1]
         if intrinsics is not None and image is not None:
             return self._fitted(role, intrinsics, image, problems)
         if intrinsics is not None:
