@@ -17,6 +17,7 @@ from bevviz.errors import UserError
 from bevviz.frame import Detections, DetectionState
 from bevviz.geometry import iou
 from bevviz.stages.detector import COCO, Detector, Layout, find_layout, nms
+from bevviz.stages.detector.names import COCO_CATEGORIES
 
 onnx = pytest.importorskip("onnx", reason="the test networks are built with onnx")
 from onnx import TensorProto, helper, numpy_helper  # noqa: E402
@@ -369,6 +370,8 @@ def test_names(tmp_path: Path) -> None:
     assert detector(three, names=str(names)).names == ("car", "person", "cyclist")
     with pytest.raises(UserError, match=r"no detector for 3 class names; .*\[1, 84, 126\]"):
         detector(coco, names=str(names))
+    assert detector(coco, names="coco").names == COCO
+    assert (len(COCO_CATEGORIES), COCO_CATEGORIES[1], COCO_CATEGORIES[90]) == (91, "person", "toothbrush")
     names.write_text("\n")
     with pytest.raises(UserError, match="holds no class name"):
         detector(three, names=str(names))

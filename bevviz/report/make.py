@@ -41,7 +41,7 @@ from bevviz.report.story import Story
 from bevviz.report.window import Cut, Window, choose_topics, cut, find_window, open_window
 from bevviz.run import Observer, run
 from bevviz.session import Session
-from bevviz.stages.detector import Detector
+from bevviz.stages.detector import Detector, read_names
 
 Found = Mapping[tuple[str, int], Detections]  # by camera and stamp of the image
 
@@ -273,7 +273,7 @@ def _facts(
 def _class_names(config: Config) -> list[str]:
     """Of the file that the configuration names, which does not come along."""
     names = config.detector.names
-    return Path(names).read_text().splitlines() if names and config.detector.model else []
+    return list(read_names(names)) if names and config.detector.model else []
 
 
 def _without_folders(text: str, paths: Sequence[Path]) -> str:

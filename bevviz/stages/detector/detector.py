@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import ast
 import difflib
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass
 from enum import StrEnum
@@ -16,26 +15,15 @@ import numpy as np
 import onnxruntime as ort
 
 from bevviz.config import DetectorConfig
-from bevviz.errors import UserError
+from bevviz.errors import UserError, first_line
 from bevviz.frame import F32, I32, U8, Detections, DetectionState
 from bevviz.geometry import iou
+from bevviz.stages.detector.names import default_names, literal, metadata_names, read_names
 
-DEMO_MODEL = Path(__file__).parents[1] / "data" / "demo_detector.onnx"
+DEMO_MODEL = Path(__file__).parents[2] / "data" / "demo_detector.onnx"
 DEFAULT_SIZE = 640  # of models that leave their input size open, as Ultralytics and Megvii train them
 MAX_CANDIDATES = 3000  # that enter the NMS, best first: bounds the time a nonsense model can take
 GREY = 114  # of the letterbox's border, the same in all these families
-
-COCO = (
-    "person", "bicycle", "car", "motorcycle", "airplane", "bus", "train", "truck", "boat", "traffic light",
-    "fire hydrant", "stop sign", "parking meter", "bench", "bird", "cat", "dog", "horse", "sheep", "cow",
-    "elephant", "bear", "zebra", "giraffe", "backpack", "umbrella", "handbag", "tie", "suitcase", "frisbee",
-    "skis", "snowboard", "sports ball", "kite", "baseball bat", "baseball glove", "skateboard", "surfboard",
-    "tennis racket", "bottle", "wine glass", "cup", "fork", "knife", "spoon", "bowl", "banana", "apple",
-    "sandwich", "orange", "broccoli", "carrot", "hot dog", "pizza", "donut", "cake", "chair", "couch",
-    "potted plant", "bed", "dining table", "toilet", "tv", "laptop", "mouse", "remote", "keyboard",
-    "cell phone", "microwave", "oven", "toaster", "sink", "refrigerator", "book", "clock", "vase", "scissors",
-    "teddy bear", "hair drier", "toothbrush",
-)  # fmt: skip
 
 # From the fastest down. DirectML and others that are not named here are used when asked for.
 PREFERRED_PROVIDERS = ("Tensorrt", "CUDA", "MIGraphX", "ROCM", "OpenVINO", "CoreML", "CPU")
@@ -107,17 +95,17 @@ class Detector:
         self._input, self._dtype = inputs[0].name, types[inputs[0].type]
 
         metadata = self._session.get_modelmeta().custom_metadata_map
-        self._stride = int(_literal(metadata.get("stride"), int) or 32)
-        size = _literal(metadata.get("imgsz"), list) or []
+        self._stride = int(literal(metadata.get("stride"), int) or 32)
+        size = literal(metadata.get("imgsz"), list) or []
         size = size if len(size) == 2 else [DEFAULT_SIZE, DEFAULT_SIZE]
         self._open_axes = tuple(not isinstance(n, int) for n in shape[2:])
         self.input_size = tuple(
             n if isinstance(n, int) else int(s) for n, s in zip(shape[2:], size, strict=True)
         )
-        names = _read_names(Path(config.names)) if config.names else _metadata_names(metadata)
+        names = read_names(config.names) if config.names else metadata_names(metadata)
         more = metadata.get("task") in ("segment", "pose")  # these append columns to the class scores
         self._output, self.layout, count = self._probe(where, len(names) if names else None, more)
-        self.names = names or _default_names(count)
+        self.names = names or default_names(count)
         self._wanted = self._wanted_classes()
         self.description = (
             f"{path.name}: {self.layout}, {self.input_size[1]} x {self.input_size[0]}, "
@@ -243,7 +231,7 @@ class Detector:
             outputs = self._session.run(None, {self._input: grey})
         except Exception as error:  # onnxruntime's errors have no common base class
             raise UserError(
-                f"{where}: fails on an input of {list(grey.shape)}: {_first_line(error)}"
+                f"{where}: fails on an input of {list(grey.shape)}: {first_line(error)}"
             ) from None
         names = [o.name for o in self._session.get_outputs()]
         shapes = [list(np.shape(o)) for o in outputs]
@@ -372,49 +360,10 @@ def _open(path: Path, config: DetectorConfig) -> tuple[Any, str]:
     try:
         session = ort.InferenceSession(path, options, [available[name] for name in chosen])
     except Exception as error:  # onnxruntime's errors have no common base class
-        raise UserError(f"detector.model {path}: onnxruntime cannot load it: {_first_line(error)}") from None
+        raise UserError(f"detector.model {path}: onnxruntime cannot load it: {first_line(error)}") from None
     used = session.get_providers()[0].removesuffix("ExecutionProvider")
     if config.provider.lower() != "auto" and used != chosen[0]:
         raise UserError(
             f"detector.provider {config.provider}: could not be started, onnxruntime fell back to {used}"
         )
     return session, used
-
-
-def _first_line(error: Exception) -> str:
-    return next(iter(str(error).splitlines()), type(error).__name__)
-
-
-def _symbol(dimension: Any) -> tuple[str, ...]:
-    return (dimension,) if isinstance(dimension, str) else ()
-
-
-def _literal(text: str | None, kind: type) -> Any:
-    """The Python literal in a metadata value, None where there is none of that kind."""
-    try:
-        value = ast.literal_eval(text or "")
-    except (ValueError, SyntaxError):
-        return None
-    return value if isinstance(value, kind) else None
-
-
-def _metadata_names(metadata: Mapping[str, str]) -> tuple[str, ...] | None:
-    """Ultralytics writes ``names`` as a dict of class id -> name, others as a list."""
-    by_id = _literal(metadata.get("names"), dict)
-    if by_id:
-        return tuple(str(by_id.get(i, f"class_{i}")) for i in range(max(by_id) + 1))
-    return tuple(map(str, _literal(metadata.get("names"), list) or ())) or None
-
-
-def _read_names(path: Path) -> tuple[str, ...]:
-    try:
-        names = tuple(line.strip() for line in path.read_text().splitlines() if line.strip())
-    except (OSError, UnicodeDecodeError) as error:
-        raise UserError(f"detector.names {path}: cannot be read: {_first_line(error)}") from None
-    if not names:
-        raise UserError(f"detector.names {path}: holds no class name; expected one a line")
-    return names
-
-
-def _default_names(count: int | None) -> tuple[str, ...]:
-    return COCO if count == len(COCO) else tuple(f"class_{i}" for i in range(count or 0))
