@@ -17,12 +17,13 @@ import onnxruntime as ort
 from bevviz.config import DetectorConfig
 from bevviz.errors import UserError, first_line
 from bevviz.frame import F32, I32, U8, Detections, DetectionState
-from bevviz.geometry import iou
 from bevviz.stages.detector.names import default_names, literal, metadata_names, read_names
+from bevviz.stages.detector.suppression import nms
 
 DEMO_MODEL = Path(__file__).parents[2] / "data" / "demo_detector.onnx"
 DEFAULT_SIZE = 640  # of models that leave their input size open, as Ultralytics and Megvii train them
-MAX_CANDIDATES = 3000  # that enter the NMS, best first: bounds the time a nonsense model can take
+MAX_CANDIDATES = 30_000  # that enter the NMS, best first, as Ultralytics bounds what a nonsense model costs
+CLASS_OFFSET = 7680.0  # pixels by which Ultralytics moves the boxes of each class in its NMS
 GREY = 114  # of the letterbox's border, the same in all these families
 
 # From the fastest down. DirectML and others that are not named here are used when asked for.
@@ -144,13 +145,7 @@ class Detector:
         """What the thresholds make of the network's output; ``__call__`` says what."""
         config = self._config
         xyxy, score, class_id = self._decode(found.output, found.input_size)
-        # Networks count from the corner of the first pixel, bevviz from its centre.
-        xyxy -= np.tile(found.offset, 2)
-        xyxy /= np.tile(found.scale, 2)
-        xyxy -= 0.5
-        finite = np.isfinite(xyxy).all(axis=1)
-        np.clip(xyxy, -0.5, np.array(found.image_size * 2, np.float32) - 0.5, out=xyxy)
-        sound = finite & (xyxy[:, 2] > xyxy[:, 0]) & (xyxy[:, 3] > xyxy[:, 1])
+        sound = np.isfinite(xyxy).all(axis=1)
         if self._wanted is not None:
             sound &= np.isin(class_id, self._wanted)
         order = np.flatnonzero(sound)
@@ -160,17 +155,20 @@ class Detector:
         if self.layout is Layout.END_TO_END:
             suppressor, overlap = np.full(len(order), -1, np.int32), np.zeros(len(order), np.float32)
         else:
-            suppressor, overlap = nms(xyxy, class_id, config.iou_threshold)
+            offset = 0.0 if self.layout is Layout.YOLOX else CLASS_OFFSET
+            suppressor, overlap = nms(xyxy, class_id, config.iou_threshold, offset)
+        # Clipped after the NMS, as in the families' own post-processing: what lies outside suppresses, too.
+        xyxy -= np.tile(found.offset, 2)
+        xyxy /= np.tile(found.scale, 2)
+        np.clip(xyxy, 0, np.array(found.image_size * 2, np.float32), out=xyxy)
+        seen = (xyxy[:, 2] > xyxy[:, 0]) & (xyxy[:, 3] > xyxy[:, 1])
+        seen &= (suppressor < 0) | seen[suppressor]
         state = np.where(score >= config.conf_threshold, DetectionState.KEPT, DetectionState.BELOW_THRESHOLD)
         state[suppressor >= 0] = DetectionState.SUPPRESSED
-        room = max(config.max_candidates - np.count_nonzero(state == DetectionState.KEPT), 0)
-        # Survivors of NMS first: a duplicate is the least worth a word, and never outlives its suppressor.
-        others = np.flatnonzero(state != DetectionState.KEPT)
-        others = others[np.argsort(state[others], kind="stable")]
-        row = np.delete(np.arange(len(order)), others[room:])
+        row = _best(np.flatnonzero(seen), state, config.max_candidates)
         suppressor = np.where(suppressor[row] >= 0, np.searchsorted(row, suppressor[row]), -1)
         return Detections(
-            xyxy=xyxy[row],
+            xyxy=xyxy[row] - np.float32(0.5),  # networks count from the corner of the first pixel
             score=score[row],
             class_id=class_id[row],
             names=tuple(self._name(c) for c in class_id[row].tolist()),
@@ -261,29 +259,14 @@ class Detector:
         return self.names[class_id] if 0 <= class_id < len(self.names) else f"class_{class_id}"
 
 
-def nms(xyxy: F32, class_id: I32, threshold: float) -> tuple[I32, F32]:
-    """Greedy class-wise non-maximum suppression (Neubeck and Van Gool 2006).
-
-    Args:
-        xyxy: (N, 4) boxes, best score first.
-        class_id: (N,) classes; only boxes of the same one suppress each other.
-        threshold: IoU above which the weaker box goes.
-
-    Returns:
-        suppressor: (N,) row of the surviving box that suppressed this one, -1 for survivors.
-        overlap: (N,) IoU with it, 0 for survivors.
-    """
-    suppressor = np.full(len(xyxy), -1, np.int32)
-    overlap = np.zeros(len(xyxy), np.float32)
-    for i in range(len(xyxy)):
-        if suppressor[i] >= 0:
-            continue
-        rival = i + 1 + np.flatnonzero((suppressor[i + 1 :] < 0) & (class_id[i + 1 :] == class_id[i]))
-        value = iou(xyxy[i : i + 1], xyxy[rival])[0]
-        hit = value > threshold
-        suppressor[rival[hit]] = i
-        overlap[rival[hit]] = value[hit]
-    return suppressor, overlap
+def _best(row: Any, state: Any, limit: int) -> Any:
+    """Every row that is KEPT, and the best of the others up to that many in all; rows have the best first."""
+    kept = state[row] == DetectionState.KEPT
+    room = max(limit - np.count_nonzero(kept), 0)
+    others = np.flatnonzero(~kept)
+    # Survivors of NMS first: a duplicate is the least worth a word, and never outlives its suppressor.
+    others = others[np.argsort(state[row[others]], kind="stable")]
+    return np.delete(row, others[room:])
 
 
 def find_layout(
