@@ -135,7 +135,8 @@ class Head:
             found = Listed(*(column[real] for column in found))
             wrong = read.wrong_list(found.score, found.class_id, self.names)
         else:
-            wrong = read.wrong_scores(found, facts.ultralytics or facts.names is not None)
+            counted = facts.ultralytics or facts.names is not None or self.classes == len(COCO)
+            wrong = read.wrong_scores(found, counted)
         return wrong or read.wrong_boxes(found.boxes, self.layout.boxes, facts.ultralytics)
 
 

@@ -164,16 +164,16 @@ def wrong_list(score: Any, class_id: Any, names: tuple[str, ...]) -> str:
     return ""
 
 
-def wrong_scores(found: Scored, trusted: bool) -> str:
+def wrong_scores(found: Scored, counted: bool) -> str:
     """Why these cannot be scores for an image that shows nothing, empty where they can.
 
-    ``trusted``: something tells how many classes there are.
+    ``counted``: something tells that there are so many classes.
     """
     tables = [found.scores] if found.objectness is None else [found.scores, found.objectness]
     low, high = min(t.min() for t in tables), max(t.max() for t in tables)
     if low < NEGATIVE or high > 1 + SLACK:
         return f"it has scores from {low:.3g} to {high:.3g}"
-    if found.objectness is None and not trusted and np.median(found.scores[:, -1]) > EVERYWHERE:
+    if found.objectness is None and not counted and np.median(found.scores[:, -1]) > EVERYWHERE:
         return (
             "its last class is everywhere, like angles of oriented boxes; where it is one, set detector.names"
         )
