@@ -13,7 +13,7 @@ from typing import get_args
 import numpy as np
 
 from bevviz.config import AnomaliesConfig
-from bevviz.frame import F32, Anomaly, AnomalyKind, Decision, DetectionState, FrameResult, Tracks
+from bevviz.frame import F32, Anomaly, AnomalyKind, Decision, FrameResult, Tracks
 from bevviz.geometry import iou
 from bevviz.run import Observer
 from bevviz.stages.fusion import in_view
@@ -146,7 +146,7 @@ class AnomalyDetector:
             before, self._alone[name] = self._alone.get(name, []), []
             if found is None or fusion is None:
                 continue
-            unmatched = np.isin(fusion.detection_decision, UNMATCHED) & (found.state == DetectionState.KEPT)
+            unmatched = np.isin(fusion.detection_decision, UNMATCHED) & found.kept
             for d in np.flatnonzero(unmatched).tolist():
                 box, what = found.xyxy[d], found.names[d]
                 earlier = [
@@ -194,7 +194,7 @@ def _stages(result: FrameResult, config: AnomaliesConfig) -> Iterator[Anomaly]:
             yield Anomaly("stage", stage, f"{stage} took {1e3 * seconds:.0f} ms")
 
 
-class News:
+class Onsets:
     """Tells what is new in the anomalies of each frame, even where frames are left out."""
 
     def __init__(self) -> None:
@@ -209,14 +209,14 @@ class AnomalySummary(Observer[FrameResult]):
     """How many anomalies of each kind a drive had, and when the first began."""
 
     def __init__(self) -> None:
-        self._news = News()
+        self._onsets = Onsets()
         self._start: int | None = None
         self._count: Counter[str] = Counter()
         self._first: dict[str, int] = {}
 
     def see(self, result: FrameResult) -> None:
         self._start = result.frame.stamp if self._start is None else self._start
-        for anomaly in self._news.of(result.anomalies):
+        for anomaly in self._onsets.of(result.anomalies):
             self._count[anomaly.kind] += 1
             self._first.setdefault(anomaly.kind, anomaly.since - self._start)
 

@@ -7,10 +7,11 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol, Self, overload
+from typing import TYPE_CHECKING, Any, Protocol, overload
 
 import numpy as np
 
+from bevviz.closing import Closing
 from bevviz.config import Config, ParameterChange, Preset, load
 from bevviz.errors import UserError
 from bevviz.frame import F64, I64, Frame, FrameResult, Scene
@@ -53,7 +54,7 @@ class Frames(Protocol):
     def close(self) -> None: ...
 
 
-class Drive:
+class Drive(Closing):
     """A drive that is open: its frames, in order or one by one, and what the stages make of them.
 
     Use it as a context manager, or call ``close``.
@@ -73,12 +74,6 @@ class Drive:
     def __init__(self, frames: Frames, config: Config) -> None:
         self.frames, self.session = frames, Session(config)
         self._results: OrderedDict[tuple[int, int], FrameResult] = OrderedDict()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self.close()
 
     def close(self) -> None:
         self.frames.close()
@@ -347,11 +342,11 @@ def simulate(
 
 
 def _load(
-    model: str | PathLike[str], stated: Settings, config: str | PathLike[str] | None, preset: Preset | None
+    model: str | PathLike[str], settings: Settings, config: str | PathLike[str] | None, preset: Preset | None
 ) -> Config:
-    settings = list(stated) if not isinstance(stated, Mapping) else _settings(stated)
+    given = _settings(settings) if isinstance(settings, Mapping) else list(settings)
     named = [f"detector.model={model}"] if model else []
-    return load(None if config is None else Path(config), [*named, *settings], preset)
+    return load(None if config is None else Path(config), [*named, *given], preset)
 
 
 def _settings(tree: Mapping[str, Any]) -> list[str]:

@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+from bevviz.text import printable
+
 
 class UserError(Exception):
     """What is wrong, in which file, topic or field, and what to do. The command exits with status 2."""
+
+    def __str__(self) -> str:
+        return printable(super().__str__())  # it is shown on a terminal
 
 
 class StageError(Exception):

@@ -16,9 +16,8 @@ from bevviz.frame import (
     DetectionState,
     Explanation,
     Fusion,
+    Pair,
 )
-
-Looked = dict[tuple[int, int], int]  # (detection, cluster) -> row of Fusion.pairs
 
 
 def explain(
@@ -35,22 +34,14 @@ def explain(
         clusters: the frame's clusters, None where their stage failed.
         config: what the frame was run with.
     """
-    looked = [_looked(camera.fusion) for camera in cameras]
     found: list[Explanation] = []
-    for result, rows in zip(cameras, looked, strict=True):
+    for result in cameras:
         found.extend(_problems(result, config))
         if result.detections is not None:
-            found.extend(_detections(result, result.detections, rows, clusters, config))
+            found.extend(_detections(result, result.detections, clusters, config))
     if clusters is not None:
-        found.extend(_clusters(cameras, looked, clusters, config))
+        found.extend(_clusters(cameras, clusters, config))
     return tuple(found)
-
-
-def _looked(fusion: Fusion | None) -> Looked:
-    if fusion is None:
-        return {}
-    pairs = zip(fusion.pairs.detection.tolist(), fusion.pairs.cluster.tolist(), strict=True)
-    return {pair: row for row, pair in enumerate(pairs)}
 
 
 def _problems(result: CameraResult, config: Config) -> Iterator[Explanation]:
@@ -66,7 +57,7 @@ def _problems(result: CameraResult, config: Config) -> Iterator[Explanation]:
 
 
 def _detections(
-    result: CameraResult, detections: Detections, looked: Looked, clusters: Clusters | None, config: Config
+    result: CameraResult, detections: Detections, clusters: Clusters | None, config: Config
 ) -> Iterator[Explanation]:
     for d, value in enumerate(detections.state.tolist()):
         state = DetectionState(value)
@@ -83,7 +74,7 @@ def _detections(
         else:
             decision = Decision(int(result.fusion.detection_decision[d]))
             key = decision.name.lower()
-            text = _detection(decision, d, result, result.fusion, detections, looked, clusters, config)
+            text = _detection(decision, d, result, result.fusion, detections, clusters, config)
         yield Explanation("detection", result.camera.name, d, key, f"{_label(detections, d)}: {text}")
 
 
@@ -93,22 +84,18 @@ def _detection(
     result: CameraResult,
     fusion: Fusion,
     detections: Detections,
-    looked: Looked,
     clusters: Clusters,
     config: Config,
 ) -> str:
     if decision is Decision.NO_CLUSTER:
         return f"no cluster, {_unclustered(d, result, detections, clusters, config)}"
     k = int(fusion.detection_cluster[d])
-    pairs, row = fusion.pairs, looked[d, k]
+    pair = _pair(fusion, d, k)
     if config.fusion.method == "centroid":
-        evidence = (
-            f"centre of cluster {k} at {pairs.depth[row]:.1f} m is {pairs.distance[row]:.0f} px from its own"
-        )
+        evidence = f"centre of cluster {k} at {pair.depth:.1f} m is {pair.distance:.0f} px from its own"
     else:
         evidence = (
-            f"{_points(pairs.points[row])} of cluster {k} in its frustum "
-            f"at {pairs.depth[row]:.1f} m, IoU {pairs.iou[row]:.2f}"
+            f"{_points(pair.points)} of cluster {k} in its frustum at {pair.depth:.1f} m, IoU {pair.iou:.2f}"
         )
     if decision is Decision.MATCHED:
         named = (fusion.cluster_decision == Decision.MATCHED) & (fusion.cluster_detection == d)
@@ -147,9 +134,7 @@ def _unclustered(
 # --- clusters ----------------------------------------------------------------------------------
 
 
-def _clusters(
-    cameras: Sequence[CameraResult], looked: Sequence[Looked], clusters: Clusters, config: Config
-) -> Iterator[Explanation]:
+def _clusters(cameras: Sequence[CameraResult], clusters: Clusters, config: Config) -> Iterator[Explanation]:
     compared = [result.camera.name for result in cameras if result.fusion is not None]
     ranges = np.hypot(clusters.centroid[:, 0], clusters.centroid[:, 1])
     for k, (state, count, distance) in enumerate(
@@ -166,13 +151,13 @@ def _clusters(
             )
             continue
         unseen = True
-        for result, rows in zip(cameras, looked, strict=True):
+        for result in cameras:
             fusion, detections = result.fusion, result.detections
             if fusion is None or detections is None or fusion.cluster_decision[k] == Decision.OUT_OF_VIEW:
                 continue
             unseen = False
             decision = Decision(int(fusion.cluster_decision[k]))
-            text = _cluster(decision, k, fusion, detections, rows, config)
+            text = _cluster(decision, k, fusion, detections, config)
             if decision is not Decision.MATCHED:
                 text = f"in view of {result.camera.name}, {text}"
             yield Explanation("cluster", result.camera.name, k, decision.name.lower(), f"{head}: {text}")
@@ -182,23 +167,28 @@ def _clusters(
             )
 
 
-def _cluster(
-    decision: Decision, k: int, fusion: Fusion, detections: Detections, looked: Looked, config: Config
-) -> str:
+def _cluster(decision: Decision, k: int, fusion: Fusion, detections: Detections, config: Config) -> str:
     if decision is Decision.NO_DETECTION:
         return "under no detection"
     d = int(fusion.cluster_detection[k])
     label = _label(detections, d)
     if decision is Decision.MATCHED:
         return f"matched with {label}"
-    pairs, row = fusion.pairs, looked[d, k]
+    pair = _pair(fusion, d, k)
     if config.fusion.method == "centroid":
-        evidence = f"its centre {pairs.distance[row]:.0f} px from that of {label}"
+        evidence = f"its centre {pair.distance:.0f} px from that of {label}"
     else:
-        evidence = f"{_points(pairs.points[row])} in the frustum of {label}, IoU {pairs.iou[row]:.2f}"
+        evidence = f"{_points(pair.points)} in the frustum of {label}, IoU {pair.iou:.2f}"
     if decision is Decision.TAKEN:
         return f"{evidence}, taken by cluster {fusion.detection_cluster[d]}"
     return f"{evidence}, {_rule(decision, config)}"
+
+
+def _pair(fusion: Fusion, d: int, k: int) -> Pair:
+    """Of a detection and a cluster of which the fusion says that they met."""
+    pair = fusion.pair(d, k)
+    assert pair is not None
+    return pair
 
 
 # --- words -------------------------------------------------------------------------------------

@@ -24,7 +24,7 @@ from bevviz.errors import UserError
 if TYPE_CHECKING:
     from pandas import DataFrame
 
-    from bevviz.config import Config
+    from bevviz.config import ClusteringConfig, Config
 
 Bool = NDArray[np.bool_]
 F32 = NDArray[np.float32]
@@ -261,6 +261,15 @@ class Clusters:
     def __len__(self) -> int:
         return len(self.count)
 
+    @property
+    def kept(self) -> Bool:
+        """(K,) those that go on to the fusion."""
+        return np.equal(self.state, ClusterState.KEPT)
+
+    def boxes(self, config: ClusteringConfig) -> Boxes3D:
+        """Those that ``clustering.boxes`` asks for."""
+        return self.obb if config.boxes == "oriented" else self.aabb
+
     def to_pandas(self) -> DataFrame:
         """A row for each cluster, with its oriented box."""
         states = [ClusterState(state).name.lower() for state in self.state]
@@ -277,7 +286,7 @@ class DetectionState(IntEnum):
 class Detections:
     """2D detections in pixels of the camera's image, best score first, however weak.
 
-    Only those with state KEPT go on to the fusion; the others are there to be explained.
+    Only the ``kept`` ones go on to the fusion; the others are there to be explained.
     """
 
     xyxy: F32  # (D, 4)
@@ -290,6 +299,11 @@ class Detections:
 
     def __len__(self) -> int:
         return len(self.score)
+
+    @property
+    def kept(self) -> Bool:
+        """(D,) those that go on to the fusion."""
+        return np.equal(self.state, DetectionState.KEPT)
 
     def to_pandas(self) -> DataFrame:
         """A row for each detection, however weak."""
@@ -332,6 +346,17 @@ class Pairs:
 
 
 @dataclass(frozen=True, slots=True)
+class Pair:
+    """One row of ``Pairs``."""
+
+    points: int
+    depth: float
+    iou: float
+    distance: float
+    cost: float
+
+
+@dataclass(frozen=True, slots=True)
 class Fusion:
     """Result for one camera. Row d belongs to detection d, row k to cluster k."""
 
@@ -342,6 +367,16 @@ class Fusion:
     cluster_detection: I32  # (K,) matched detection, or the best candidate that was refused, else -1
     pairs: Pairs
     cluster_uv: F32  # (K, 4) x0, y0, x1, y1 around the projected cluster, NaN where not in view
+
+    def pair(self, detection: int, cluster: int) -> Pair | None:
+        """The evidence of a detection and a cluster; None: the fusion did not look at them together."""
+        pairs = self.pairs
+        rows = np.flatnonzero((pairs.detection == detection) & (pairs.cluster == cluster))
+        if len(rows) == 0:
+            return None
+        row = int(rows[0])
+        points, depth = int(pairs.points[row]), float(pairs.depth[row])
+        return Pair(points, depth, float(pairs.iou[row]), float(pairs.distance[row]), float(pairs.cost[row]))
 
 
 @dataclass(frozen=True, slots=True)

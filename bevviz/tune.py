@@ -19,8 +19,10 @@ from bevviz.frame import Frame, FrameResult, Scene
 from bevviz.live.settings import Settings
 from bevviz.logging import entities
 from bevviz.logging.logger import Logger
+from bevviz.logging.pieces import document
 from bevviz.perceive import describe
 from bevviz.run import Items, Observer
+from bevviz.text import markdown, printable
 from bevviz.variants import Variants, check_same_frames
 
 ABOUT = "A is the version before, B the one that is shown."
@@ -56,7 +58,7 @@ class Version:
         changed = "; ".join(f"{key} {change}" for key, change in self.save.changes.items())
         failed = [f"{failure.stage} failed: {failure.reason}" for failure in self.result.failures]
         objects = f"{len(self.found.b.names)} objects" + (f" ({', '.join(different)})" if different else "")
-        return "; ".join([f"version {self.number}: {changed or 'as it is'}: {objects}", *failed])
+        return printable("; ".join([f"version {self.number}: {changed or 'as it is'}: {objects}", *failed]))
 
 
 class Saves:
@@ -177,9 +179,11 @@ class VersionRecorder(Observer[Version]):
             writer.sequences = {entities.VERSION: version.number}
         self._logger.log(result)
         self._differences.log(version.found, frame.received, frame.pose)
-        lines = [f"- {key}: {change}" for key, change in save.changes.items()] or ["- the first one"]
+        lines = [f"- {key}: {markdown(str(change))}" for key, change in save.changes.items()] or [
+            "- the first one"
+        ]
         page = "\n".join([f"# Version {version.number}", "", *lines])
-        self._recording.log(entities.TUNE, rr.TextDocument(page, media_type=rr.MediaType.MARKDOWN))
+        self._recording.log(entities.TUNE, document(page))
         self._recording.flush()
         self._tell(version, time.time() - save.time)
 

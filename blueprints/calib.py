@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import rerun.blueprint as rrb
 
+from bevviz.calib.views import alignment, calibration, score_curves
 from bevviz.frame import Scene
 from bevviz.logging import views
 
@@ -11,8 +12,8 @@ from bevviz.logging import views
 def blueprint(scene: Scene) -> rrb.Blueprint:
     pages: list[rrb.Container | rrb.View] = [
         rrb.Horizontal(
-            rrb.Vertical(*views.alignment(name)),
-            rrb.Vertical(views.calibration(name), views.score_curves(name), row_shares=[2, 3]),
+            rrb.Vertical(*alignment(name)),
+            rrb.Vertical(calibration(name), score_curves(name), row_shares=[2, 3]),
             column_shares=[5, 4],
             name=name,
         )

@@ -4,18 +4,19 @@ from __future__ import annotations
 
 import rerun.blueprint as rrb
 
+from bevviz.compare import views as compare
 from bevviz.frame import Scene
 from bevviz.logging import entities, views
 
 
 def blueprint(scene: Scene) -> rrb.Blueprint:
     sides = [
-        rrb.Vertical(views.side_space(scene, root), views.side_pictures(scene, root), row_shares=[3, 2])
+        rrb.Vertical(compare.side_space(scene, root), compare.side_pictures(scene, root), row_shares=[3, 2])
         for root in ("", entities.B)
     ]
     words = rrb.Tabs(
-        views.differences(),
-        views.compared(),
+        compare.differences(),
+        compare.compared(),
         views.explain(name="Explain A"),
         views.explain(entities.B, "Explain B"),
     )
@@ -23,10 +24,10 @@ def blueprint(scene: Scene) -> rrb.Blueprint:
         rrb.Vertical(
             rrb.Horizontal(*sides, words, column_shares=[4, 4, 3]),
             rrb.Horizontal(
-                views.difference_counts(),
-                views.side_counts(),
-                views.difference_states(),
-                views.difference_log(),
+                compare.difference_counts(),
+                compare.side_counts(),
+                compare.difference_states(),
+                compare.difference_log(),
             ),
             row_shares=[4, 1],
         ),

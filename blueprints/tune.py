@@ -4,23 +4,24 @@ from __future__ import annotations
 
 import rerun.blueprint as rrb
 
+from bevviz.compare import views as compare
 from bevviz.frame import Scene
 from bevviz.logging import entities, views
 
 
 def blueprint(scene: Scene) -> rrb.Blueprint:
     side: list[rrb.Container | rrb.View] = [views.cameras(scene)] if scene.cameras else []
-    words = rrb.Tabs(views.explain(), views.difference_log(), views.log(), views.config())
+    words = rrb.Tabs(views.explain(), compare.difference_log(), views.log(), views.config())
     return rrb.Blueprint(
         rrb.Vertical(
             rrb.Horizontal(
-                views.space(scene, beside=[f"{entities.ROBOT}/**", *views.changes()]),
+                views.space(scene, beside=[f"{entities.ROBOT}/**", *compare.changes()]),
                 rrb.Vertical(*side, views.birds_eye(), row_shares=[*[2] * len(side), 3]),
-                rrb.Vertical(views.version(), views.differences(), words, row_shares=[1, 3, 2]),
+                rrb.Vertical(compare.version(), compare.differences(), words, row_shares=[1, 3, 2]),
                 column_shares=[5, 4, 3],
             ),
             rrb.Horizontal(
-                views.difference_counts(), views.side_counts(), views.counts(), views.stage_times()
+                compare.difference_counts(), compare.side_counts(), views.counts(), views.stage_times()
             ),
             row_shares=[4, 1],
         ),

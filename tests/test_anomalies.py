@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from bevviz.anomalies import AnomalyDetector, AnomalySummary, News
+from bevviz.anomalies import AnomalyDetector, AnomalySummary, Onsets
 from bevviz.config import AnomaliesConfig, load
 from bevviz.frame import (
     Anomaly,
@@ -40,7 +40,7 @@ class Drive:
         self.config = AnomaliesConfig(**limits)
         self.said: list[tuple[int, str, str]] = []
         self.summary = AnomalySummary()
-        self._tracker, self._detector, self._news = Tracker(), AnomalyDetector(), News()
+        self._tracker, self._detector, self._onsets = Tracker(), AnomalyDetector(), Onsets()
         self._index = -1
 
     def frame(
@@ -75,7 +75,7 @@ class Drive:
         tracks = self._tracker.update(frame, clusters, looked_at, objects, TRACKING)
         result = replace(result, tracks=tracks, **changes)
         result = replace(result, anomalies=self._detector.update(result, self.config))
-        self.said += [(self._index, a.kind, a.text) for a in self._news.of(result.anomalies)]
+        self.said += [(self._index, a.kind, a.text) for a in self._onsets.of(result.anomalies)]
         self.summary.see(result)
         return result.anomalies
 
@@ -219,13 +219,13 @@ def test_what_lasts_is_one_and_is_held_for_a_while() -> None:
 
 
 def test_news_is_told_once_also_where_its_first_frame_was_left_out() -> None:
-    news = News()
+    onsets = Onsets()
     one, two = Anomaly("tf", "zed", "lost", since=5), Anomaly("sync", "zed", "late", since=6)
-    assert news.of([]) == []
-    assert news.of([one]) == [one]
-    assert news.of([one, two]) == [two]
-    assert news.of([two]) == []
-    assert news.of([replace(two, since=9)]) == [replace(two, since=9)]
+    assert onsets.of([]) == []
+    assert onsets.of([one]) == [one]
+    assert onsets.of([one, two]) == [two]
+    assert onsets.of([two]) == []
+    assert onsets.of([replace(two, since=9)]) == [replace(two, since=9)]
 
 
 def test_a_drive_that_starts_anew() -> None:

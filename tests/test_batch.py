@@ -9,7 +9,6 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager, redirect_stderr
 from dataclasses import dataclass, replace
-from html.parser import HTMLParser
 from io import StringIO
 from pathlib import Path
 from threading import Event, Thread
@@ -23,7 +22,7 @@ from hypothesis import strategies as st
 
 from bevviz.bags.source import BagSource
 from bevviz.batch.batch import claimed, left_to_do
-from bevviz.batch.jobs import PARTIAL, Job, Selection, find_bags, make_jobs, name_bags, tables
+from bevviz.batch.jobs import PARTIAL, FrameSelection, Job, find_bags, make_jobs, name_bags, tables
 from bevviz.batch.table import row
 from bevviz.cli import main
 from bevviz.config import Config, load
@@ -31,6 +30,7 @@ from bevviz.errors import UserError
 from bevviz.frame import DetectionState
 from bevviz.session import Session
 from tests import bags
+from tests.pages import Page
 from tests.recordings import Recording, verify
 
 GOOD = ("kitti", "one-drive", "two_b_-drive")
@@ -106,7 +106,7 @@ def batch(shared: Path, model: str, tmp_path_factory: pytest.TempPathFactory) ->
 
 def jobs_of(batch: Batch, model: str, **settings: Any) -> list[Job]:
     config = load(None, [f"detector.model={model}", WEAK, *(f"{k}={v}" for k, v in settings.items())])
-    return make_jobs([batch.root / "bags"], batch.folder, config, Selection(), "debug")
+    return make_jobs([batch.root / "bags"], batch.folder, config, FrameSelection(), "debug")
 
 
 # --- what is done ------------------------------------------------------------------------------
@@ -276,22 +276,6 @@ def test_badness_weighs_what_went_wrong(batch: Batch) -> None:
     )
     assert empty["remarks"][0] == "cloud: the cloud holds no finite point"
     assert "late" in empty["remarks"]
-
-
-class Page(HTMLParser):
-    """The elements and the text of a page."""
-
-    def __init__(self, text: str) -> None:
-        super().__init__()
-        self.tags: list[tuple[str, dict[str, str | None]]] = []
-        self.text = ""
-        self.feed(text)
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        self.tags.append((tag, dict(attrs)))
-
-    def handle_data(self, data: str) -> None:
-        self.text += data
 
 
 def test_the_page_stands_on_its_own(batch: Batch) -> None:

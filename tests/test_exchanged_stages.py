@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import re
 import textwrap
 import threading
 from collections.abc import Iterator
@@ -501,5 +502,22 @@ def test_a_whole_run_with_somebodys_stages(
     assert "clustering.params.cell  1.0 -> 3.0" in capsys.readouterr().out
     assert main(["why", drive, *own, "--at", "0.1", "--point=1,1,0"]) == 0
     assert main(["bag", drive, "--set", "clustering.method=mine.stages:raising", "--save", "y.rrd"]) == 0
+    assert main(["report", drive, *own, "--at", "0.1", "-o", "bug.rrd"]) == 0
+    assert main(["report", "--check", "bug.rrd"]) == 0
+    module = here / "mine" / "stages.py"
+    source = module.read_text()
+    module.write_text(source + "# another\n")
+    capsys.readouterr()
+    assert main(["report", "--check", "bug.rrd"]) == 0
+    assert re.search(
+        r"not as it was: clustering\.method was mine\.stages:cells \(SHA-256 \w{64}\), is",
+        capsys.readouterr().out,
+    )
+    module.write_text(source)
+    raising = ["--set", "clustering.method=mine.stages:raising"]
+    assert main(["report", drive, *raising, "--at", "0.1", "-o", "failed.rrd"]) == 0
+    text = (here / "failed.html").read_text()
+    assert "Traceback of stage &#39;clustering&#39;" in text and "in raising" in text
+    assert str(here) not in text, "no folder of the machine"
     assert main(["config", *own]) == 0
     assert "cell: 1.0  # metres: edge of a cell" in capsys.readouterr().out

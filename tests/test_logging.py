@@ -17,6 +17,8 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from bevviz import geometry
 from bevviz.anomalies import KINDS
@@ -48,6 +50,7 @@ from bevviz.frame import (
     Tracks,
     Voxels,
 )
+from bevviz.logging.cloud import quantised
 from bevviz.logging.entities import DEPTH_BINS, DEPTH_RANGE, TRACK_COLORS, ClassId
 from bevviz.logging.logger import Logger
 from bevviz.logging.sinks import open_recording
@@ -206,6 +209,16 @@ def test_cloud(record: Callable[..., Recording]) -> None:
         ("/world/lidar/points/obstacles", result.obstacles),
     ):
         np.testing.assert_allclose(found.at[entity]["Points3D:positions"][0], points, atol=0.1 / 8)
+
+
+@given(st.floats(0.01, 2), st.integers(0, 2**32 - 1))
+def test_voxelised_points_move_by_an_eighth_of_a_voxel_at_most(size: float, seed: int) -> None:
+    points = np.random.default_rng(seed).uniform(-100, 100, (50, 3)).astype(np.float32)
+    moved = quantised(points, size)
+    np.testing.assert_allclose(moved, points, rtol=0, atol=size / 8)
+    step = next(2.0**n for n in range(-12, 3) if 2.0**n >= size / 8)
+    assert step < size / 4
+    np.testing.assert_array_equal(np.round(moved / step), moved / step)
 
 
 def test_poses_and_calibration(record: Callable[..., Recording]) -> None:
@@ -390,6 +403,26 @@ def test_truth_and_the_robots_own(record: Callable[..., Recording]) -> None:
     (outline,) = found.at["/bev/overlay/ground_truth"]["LineStrips2D:strips"][0]
     center = np.mean(outline[:4], axis=0)
     np.testing.assert_allclose(center, [(40 - 1) / 0.1, (40 - 2) / 0.1], atol=0.01)
+    assert found.at["/bev/overlay/robot/detection/fused_3d"]["LineStrips2D:labels"][0] == ["car"]
+
+
+def test_names_of_others_take_nobodys_place(record: Callable[..., Recording]) -> None:
+    """A topic called like an entity of ours, and one and a class that are no good parts of a path."""
+    result = make()
+    boxes = Boxes3D(f32([2, 1, 0]), f32([4, 2, 1.5]), f32(0.5))
+    tracks = LabelledBoxes3D("/tracks", START, "lidar", boxes, ("car",), f32(0.7), WORLD_FROM_LIDAR)
+    odd = dataclasses.replace(tracks, topic="/my boxes\\x/\x1b[2J")
+    (camera,) = result.cameras
+    assert camera.detections is not None
+    named = dataclasses.replace(camera.detections, names=("a / b\n", "car", "car"))
+    frame = dataclasses.replace(result.frame, robot_boxes=(tracks, odd))
+    cameras = (dataclasses.replace(camera, detections=named),)
+    result = dataclasses.replace(tracked([result])[0], frame=frame, cameras=cameras)
+    found = record([result])
+    assert found.at["/bev/overlay/robot/tracks"]["LineStrips2D:labels"][0] == ["car"]
+    assert "/bev/overlay/tracks" not in found.rows  # no track is confirmed in the first frame
+    assert any(path.startswith("/robot/my_boxes_x/") for path in found.at)
+    assert found.column("/explain/states/zed/a___b_", "StateChange:state") == [["matched"]]
 
 
 def test_several_lidars_keep_their_own_frames(record: Callable[..., Recording]) -> None:

@@ -8,6 +8,7 @@ import re
 import signal
 import time
 from collections.abc import Callable
+from concurrent.futures import Executor
 from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
@@ -16,6 +17,7 @@ from typing import Any
 import numpy as np
 import onnx
 import pytest
+import rerun as rr
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -24,11 +26,15 @@ from bevviz.bags.mcap_writer import McapWriter
 from bevviz.bags.recording import RawMessage
 from bevviz.bags.recording import Recording as Bag
 from bevviz.cli import main
-from bevviz.frame import Detections, FrameResult
-from bevviz.report.digest import Stage, compare, detections_of, pack, unpack
+from bevviz.config import DetectorConfig
+from bevviz.frame import Detections, Frame, FrameResult
+from bevviz.provenance import Dependency, Provenance
+from bevviz.report.check import CheckResult
+from bevviz.report.digest import StageDigest, compare, detections_of, pack, unpack
 from bevviz.report.page import spans
-from bevviz.report.plots import plot, ticks
+from bevviz.report.plots import ticks
 from bevviz.session import Session
+from bevviz.stages.detector import Detector
 from tests import bags
 from tests.recordings import Recording, verify
 from tests.test_cli import Capture, error_of
@@ -149,8 +155,8 @@ def test_the_model_without_its_folder(tmp_path: Path, small: Path, capsys: Captu
     assert main(call) == 0
     found = Recording(Path("bug.rrd"))
     about = json.loads(found.static["/__properties/report"]["about"][0])
-    assert about["model"]["name"] == "net.onnx"
-    assert "network: CPU" in about["hardware"]
+    assert about["provenance"]["dependencies"]["detector.model"]["file"] == "net.onnx"
+    assert about["provenance"]["machine"]["network"] == "CPU"
     assert "secret" not in Path("bug.html").read_text() + str(found.static)
     capsys.readouterr()
     assert "--model FILE" in error_of(capsys, "report", "--check", "bug.rrd")
@@ -165,7 +171,10 @@ def test_the_model_without_its_folder(tmp_path: Path, small: Path, capsys: Captu
     other.doc_string = "another file"
     onnx.save(other, "net.onnx")
     assert main(["report", "--check", "bug.rrd"]) == 0
-    assert re.search(r"not as it was: model was net\.onnx \(SHA-256 \w+\), is \w+", capsys.readouterr().out)
+    said = capsys.readouterr().out
+    assert re.search(
+        r"not as it was: detector\.model was net\.onnx \(SHA-256 \w+\), is net\.onnx \(SHA", said
+    )
 
 
 # --- the check ---------------------------------------------------------------------------------
@@ -221,14 +230,62 @@ def test_a_missing_scan_is_found(small: Path, tmp_path: Path, capsys: Capture) -
 def test_other_versions_and_machines_are_named(
     small: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from bevviz.report import check, origin
+    from bevviz.report import check
 
-    monkeypatch.setattr(check, "versions", lambda: ["numpy 9.9"])
-    monkeypatch.setattr(check, "hardware", lambda _: origin.Hardware("abacus", 1, "0 GiB", "none"))
+    here = Provenance({"numpy": Dependency("9.9"), "abacist": Dependency("2")}, {"processor": "abacus"})
+    monkeypatch.setattr(check, "provenance", lambda *_: here)
     assert main(["report", "--check", str(small)]) == 0
     said = capsys.readouterr().out
     assert re.search(r"not as it was: numpy was \d.*, is 9\.9", said)
+    assert re.search(r"not as it was: numba was \d.*, is absent", said)
+    assert "not as it was: abacist was absent, is 2" in said
     assert re.search(r"not as it was: processor was .*, is abacus", said)
+    assert re.search(r"not as it was: memory was .*, is absent", said)
+
+
+def test_whatever_may_be_the_reason_is_named(tmp_path: Path, capsys: Capture) -> None:
+    """What only one of the two runs has, too: a detector, its file of class names, what it runs on."""
+    bag = bags.write(tmp_path / "drive", bags.small_items(scans=12))
+    names = tmp_path / "names.txt"
+    names.write_bytes(b"a\r\nb\n\nc")
+    call = ["report", str(bag), "--at", "0.5", "--before", "0", "--after", "0"]
+    assert main(call) == 0
+    capsys.readouterr()
+    assert main(["report", "--check", "bug.rrd", "--model", "demo"]) == 1
+    said = capsys.readouterr().out
+    assert re.search(r"was: detector\.model was absent, is demo_detector\.onnx \(SHA-256 \w{64}\)", said)
+    assert "not as it was: network was absent, is CPU" in said
+
+    count = len(Detector(DetectorConfig(model="demo")).names)
+    names.write_bytes(b"\r\n".join(b"class %d" % i for i in range(count)))
+    assert main([*call, "--force", "--model", "demo", "--set", f"detector.names={names}"]) == 0
+    names.unlink()
+    capsys.readouterr()
+    assert main(["report", "--check", "bug.rrd"]) == 0
+    assert capsys.readouterr().out == "1 frames: the same in every bit\n"
+    names.write_text("\n".join(f"other {i}" for i in range(count)))
+    main(["report", "--check", "bug.rrd", "--set", f"detector.names={names}"])
+    assert "not as it was: detector.names was names.txt (SHA-256" in capsys.readouterr().out
+
+
+def test_where_nothing_is_another_the_check_says_so(
+    small: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    perceive = Session.perceive
+
+    def shifted(self: Session, frame: Frame, network: Executor | None = None) -> FrameResult:
+        return perceive(self, replace(frame, points=frame.points + np.float32(0.5)), network)
+
+    monkeypatch.setattr(Session, "perceive", shifted)
+    assert main(["report", "--check", str(small)]) == 1
+    *_, last = capsys.readouterr().out.splitlines()
+    assert last == "bag, model, configuration, versions and machine are as they were"
+
+
+def test_no_frame_is_no_proof() -> None:
+    nothing = CheckResult()
+    assert not nothing.same
+    assert list(nothing.lines()) == ["no frame, then or now: there is nothing to compare"]
 
 
 def test_what_is_no_report(small: Path, tmp_path: Path, capsys: Capture) -> None:
@@ -241,6 +298,12 @@ def test_what_is_no_report(small: Path, tmp_path: Path, capsys: Capture) -> None
     assert "not one of 'bevviz report'" in error_of(capsys, "report", "--check", "run.rrd")
     Path("alone.rrd").write_bytes(small.read_bytes())
     assert "alone.mcap" in error_of(capsys, "report", "--check", "alone.rrd")
+    with rr.RecordingStream("bevviz") as recording:
+        recording.save("older.rrd")
+        recording.send_property("bevviz", rr.AnyValues(config="preset: default"))
+        recording.send_property("report", rr.AnyValues(about='{"low": 1}'))
+    Path("older.mcap").touch()
+    assert "a report of another version" in error_of(capsys, "report", "--check", "older.rrd")
     assert "takes one report" in error_of(capsys, "report", "--check", "a.rrd", "b.rrd")
 
 
@@ -291,7 +354,7 @@ def test_an_interrupted_run_is_a_shorter_report(
 # --- fingerprints ------------------------------------------------------------------------------
 
 
-def stages(**arrays: Any) -> tuple[Stage, ...]:
+def stages(**arrays: Any) -> tuple[StageDigest, ...]:
     from bevviz.report.digest import _stage
 
     return (_stage("part", {name: np.asarray(value) for name, value in arrays.items()}),)
@@ -369,7 +432,5 @@ def test_ticks_enclose_what_they_measure(low: float, span: float, count: int) ->
     assert found[-1] >= low + span - 1e-6 * step - 1e-9
 
 
-def test_a_plot_is_well_formed_and_escapes() -> None:
-    Page(plot("a < b", {"<x>": [(0.0, 1.0), (1.0, 3.0)], "one": [(0.5, -2.0)]}, 0.5))
-    assert plot("none", {"empty": []}, 0) == ""
+def test_spans() -> None:
     assert spans([1, 2, 3, 7, 9, 10]) == "1-3, 7, 9-10"

@@ -16,10 +16,11 @@ from hypothesis import strategies as st
 
 from bevviz.bags.recording import Recording as Bag
 from bevviz.cli import main
+from bevviz.config import DetectorConfig
 from bevviz.frame import F32, U8
 from bevviz.report.pictures import shrink
 from bevviz.report.redact import CELLS, Redactor, grown, hide
-from bevviz.report.story import STRIP_WIDTH
+from bevviz.report.summary import STRIP_WIDTH
 from bevviz.ros.messages import decode_compressed_image, decode_image
 from tests import bags
 from tests.recordings import Recording, verify
@@ -168,8 +169,6 @@ def test_it_needs_a_detector_of_people_and_vehicles(drive: Path, tmp_path: Path,
 
 def test_a_narrow_configuration_does_not_count(drive: Path, shared: Path) -> None:
     """Neither a high threshold nor a choice of classes keeps anybody visible."""
-    from bevviz.config import DetectorConfig
-
     config = DetectorConfig(
         model=str(shared / "models" / "yolox_nano.onnx"),
         classes=("dog",),
@@ -182,6 +181,34 @@ def test_a_narrow_configuration_does_not_count(drive: Path, shared: Path) -> Non
     boxes = redactor.find(unfold(drive)[PNG][0])
     assert np.abs(boxes - PERSON).max(axis=1).min() < 15
     assert len(boxes) > 5
+
+
+@pytest.mark.parametrize("limit", [1, 100])
+@pytest.mark.parametrize("overlap", [0.01, 0.99])
+def test_every_candidate_is_hidden_however_many_the_configuration_keeps(
+    limit: int, overlap: float, tmp_path: Path
+) -> None:
+    """126 people on top of each other, each a little weaker: all but a few are suppressed."""
+    pytest.importorskip("onnx", reason="the test networks are built with onnx")
+    from tests.test_detector import CELLS as PEOPLE
+    from tests.test_detector import H, W, constant, head
+
+    rng = np.random.default_rng(0)
+    corner = rng.uniform(0, 8, (PEOPLE, 2))
+    boxes = np.hstack([corner, corner + np.array([30, 40])])
+    scores = np.linspace(0.9, 0.02, PEOPLE)
+    names = {"names": "['person', 'car', 'dog']"}
+    output = head("YOLOv8", boxes, scores, np.zeros(PEOPLE, int))
+    config = DetectorConfig(
+        model=constant(tmp_path / "crowd.onnx", output, metadata=names),
+        threads=1,
+        max_candidates=limit,
+        iou_threshold=overlap,
+    )
+    bag = bags.write(tmp_path / "drive", bags.small_items(scans=1))
+    with Bag([bag]) as recording:
+        found = Redactor(config, recording).find(np.zeros((H, W, 3), np.uint8))
+    assert len(found) == PEOPLE
 
 
 # --- hiding ------------------------------------------------------------------------------------

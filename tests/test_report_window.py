@@ -16,7 +16,7 @@ from bevviz.bags.recording import Recording
 from bevviz.bags.source import MARGIN, SECOND, BagSource
 from bevviz.config import Config, load
 from bevviz.errors import UserError
-from bevviz.report.digest import Stage, compare, digest
+from bevviz.report.digest import StageDigest, compare, digest
 from bevviz.report.window import Cut, Edit, Window, choose_topics, cut, find_window, open_window
 from bevviz.session import Session
 from bevviz.synthetic.bag import _qos
@@ -47,7 +47,7 @@ def contents(path: Path, low: int = 0, high: int = 2**62) -> dict[str, list[tupl
     return dict(found)
 
 
-def digests(path: Path, config: Config, window: Window) -> list[tuple[Stage, ...]]:
+def digests(path: Path, config: Config, window: Window) -> list[tuple[StageDigest, ...]]:
     with open_window([path], config, window.low, window.high) as source:
         session = Session(config)
         return [digest(session.run(frame)) for frame in source]

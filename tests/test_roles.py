@@ -8,6 +8,8 @@ from hypothesis import strategies as st
 
 from bevviz.config import SourceConfig
 from bevviz.errors import UserError
+from bevviz.logging import entities
+from bevviz.logging.entities import RESERVED
 from bevviz.ros.roles import Roles, Topic, entity_name, find_roles
 
 CLOUD = "sensor_msgs/msg/PointCloud2"
@@ -269,6 +271,21 @@ def test_names_that_would_clash_are_told_apart() -> None:
     assert roles.lidar_names == ("bev_points",)
 
 
+@pytest.mark.parametrize("name", sorted(RESERVED))
+def test_a_sensor_called_like_something_else_in_a_recording(name: str) -> None:
+    (found,) = find_roles([Topic(f"/{name}", CLOUD, 5, name)], DEFAULT).lidar_names
+    assert found not in RESERVED
+    assert name in found
+
+
+def test_the_name_of_every_entity_beside_the_sensors_is_reserved() -> None:
+    """They are constants, those of sensors functions."""
+    roots = (entities.WORLD, entities.COMPARE, entities.BEV)
+    paths = [value for value in vars(entities).values() if isinstance(value, str)]
+    taken = {path.split("/")[2] for path in paths if path.startswith(tuple(f"{root}/" for root in roots))}
+    assert {"tracks", "fused", "about"} <= taken <= RESERVED
+
+
 PART = st.sampled_from(["zed", "zed2", "left", "rgb", "image_raw", "points", "lidar", "fused", "bev", "c d"])
 NAME = st.lists(PART, min_size=1, max_size=3).map(lambda parts: "/" + "/".join(parts))
 TOPICS = st.lists(
@@ -292,7 +309,7 @@ def test_names_are_unique_and_the_order_of_topics_is_no_matter(
     roles = find_roles(topics, DEFAULT)
     names = [*roles.lidar_names, *cameras(roles)]
     assert len(set(names)) == len(roles.lidars) + len(roles.cameras)
-    assert not set(names) & {"bev", "fused", "frustums", "lidars"}
+    assert not set(names) & RESERVED
     assert all(name.replace("_", "").isalnum() for name in names)
     assert set(roles.notes) == {topic.name for topic in topics}
     assert find_roles(shuffled, DEFAULT) == roles

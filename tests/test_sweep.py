@@ -276,7 +276,7 @@ def test_another_topic_as_truth() -> None:
     other = run_with(
         lambda f: truth_of(f, LabelledBoxes3D("/x", 0, "map", own.boxes, own.labels, own.scores))
     )
-    assert sweep.tallies["0.5",].score.classes == other.tallies["0.5",].score.classes
+    assert sweep.outcomes["0.5",].score.classes == other.outcomes["0.5",].score.classes
 
 
 def run_with(judge: Any) -> Sweep:
@@ -293,7 +293,7 @@ def test_an_interrupted_sweep_tells_what_it_has(
     perceive = Sweep.perceive
 
     def interrupted(self: Sweep, frame: Frame, network: Any = None) -> int:
-        if self.tallies["0.5",].frames:
+        if self.outcomes["0.5",].frames:
             raise KeyboardInterrupt
         return perceive(self, frame, network)
 

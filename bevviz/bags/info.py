@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from bevviz import table
 from bevviz.bags.reader import megabytes
 from bevviz.bags.recording import Recording
 from bevviz.bags.source import SECOND, BagSource, iso
@@ -17,6 +18,7 @@ from bevviz.config import Config, stage_topics
 from bevviz.errors import UserError
 from bevviz.frame import Camera, Frame
 from bevviz.ros.roles import Roles, Topic, find_roles
+from bevviz.text import printable
 
 WIDTH = 100
 TRIAL = 5  # the scan that is tried out: at the first ones a camera or a transform may not have begun
@@ -192,7 +194,7 @@ def render_contents(about: Mapping[str, str], info: Contents) -> str:
 
 
 def _row(name: str, text: str) -> str:
-    return textwrap.fill(text, WIDTH, initial_indent=f"{name:<8}", subsequent_indent=" " * 8)
+    return textwrap.fill(printable(text), WIDTH, initial_indent=f"{name:<8}", subsequent_indent=" " * 8)
 
 
 def _section(title: str, items: Sequence[str]) -> list[str]:
@@ -201,10 +203,10 @@ def _section(title: str, items: Sequence[str]) -> list[str]:
 
 def _item(text: str) -> Iterator[str]:
     """Wrapped text; an option at its end stays in one piece, to be copied."""
-    said, separator, option = text.partition(": --")
-    depth = len(said) - len(said.lstrip())
+    sentence, separator, option = printable(text).partition(": --")
+    depth = len(sentence) - len(sentence.lstrip())
     yield from textwrap.wrap(
-        said.lstrip() + separator[:1],
+        sentence.lstrip() + separator[:1],
         WIDTH,
         initial_indent=" " * (2 + depth),
         subsequent_indent=" " * (4 + depth),
@@ -227,13 +229,7 @@ def _topic_table(topics: Sequence[TopicInfo]) -> Iterator[str]:
         )
         for t in topics
     ]
-    widths = [max(len(row[i]) for row in [head, *rows]) for i in range(len(head))]
-    for row in [head, *rows]:
-        cells = [
-            c.rjust(w) if i in (2, 3) else c.ljust(w)
-            for i, (c, w) in enumerate(zip(row, widths, strict=True))
-        ]
-        yield "  ".join(cells).rstrip()
+    return table.lines([head, *rows], "llrrll")
 
 
 def _camera(camera: Camera) -> str:

@@ -51,18 +51,25 @@ class McapWriter:
         path: the ``.mcap`` file; replaced where it exists.
         define: tells what the type of a connection is made of.
         ros1: the profile that the file states.
+        compress: chunks with zstd.
 
     Raises:
         UserError: the file cannot be written.
     """
 
     def __init__(
-        self, path: Path, define: Callable[[Connection], MessageDefinition], *, ros1: bool = False
+        self,
+        path: Path,
+        define: Callable[[Connection], MessageDefinition],
+        *,
+        ros1: bool = False,
+        compress: bool = True,
     ) -> None:
         self._path = path
         self._part = path.with_name(f".{path.name}.part")
         self._define = define
         self._profile = "ros1" if ros1 else "ros2"
+        self._compression = "zstd" if compress else ""
         self._schemas: dict[tuple[str, MessageDefinition], int] = {}
         self._channels: dict[tuple[str, str, MessageDefinition], int] = {}
         self._declared = BytesIO()  # schemas and channels, for the summary
@@ -158,10 +165,11 @@ class McapWriter:
 
     def _close_chunk(self) -> None:
         data, start = self._chunk.getvalue(), self._file.tell()
-        packed = zstd.compress(data)
+        packed = zstd.compress(data) if self._compression else data
         times = [time for entries in self._index.values() for time, _ in entries]
         first, last = min(times, default=0), max(times, default=0)
-        head = CHUNK_HEAD.pack(first, last, len(data), crc32(data), len(b"zstd")) + b"zstd"
+        head = CHUNK_HEAD.pack(first, last, len(data), crc32(data), len(self._compression))
+        head += self._compression.encode()
         self._file.write(_record(CHUNK, head + struct.pack("<Q", len(packed)) + packed))
         index_start = self._file.tell()
         offsets = b""
@@ -170,7 +178,7 @@ class McapWriter:
             listed = b"".join(struct.pack("<QQ", *entry) for entry in entries)
             self._file.write(_record(MESSAGE_INDEX, struct.pack("<H", channel) + _bytes(listed)))
         about = struct.pack("<QQQQ", first, last, start, index_start - start) + _bytes(offsets)
-        about += struct.pack("<Q", self._file.tell() - index_start) + _text("zstd")
+        about += struct.pack("<Q", self._file.tell() - index_start) + _text(self._compression)
         self._chunks.write(_record(CHUNK_INDEX, about + struct.pack("<QQ", len(packed), len(data))))
         self._chunk_count += 1
         if times:

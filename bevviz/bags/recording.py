@@ -11,7 +11,6 @@ from functools import cached_property
 from operator import itemgetter
 from pathlib import Path, PurePath
 from tempfile import TemporaryDirectory, mkdtemp
-from types import TracebackType
 from typing import Any, Literal
 
 import numpy as np
@@ -39,6 +38,7 @@ from bevviz.bags.reader import (
     normalized,
 )
 from bevviz.bags.sqlite import SoundSqlite, SqliteRescuer
+from bevviz.closing import Closing
 from bevviz.errors import UserError
 from bevviz.frame import I64
 from bevviz.ros import vision_msgs
@@ -123,7 +123,7 @@ class RawMessage:
         return read_header(data, "<" if little else ">", self.topic)
 
 
-class Recording:
+class Recording(Closing):
     """The messages of one or several bags as a single stream in order of log time.
 
     Args:
@@ -150,14 +150,6 @@ class Recording:
         except BaseException:
             self.close()
             raise
-
-    def __enter__(self) -> Recording:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
     def close(self) -> None:
         while self.files:

@@ -9,11 +9,11 @@ from dataclasses import replace
 from datetime import UTC, datetime
 from functools import cached_property
 from pathlib import Path
-from types import TracebackType
 
 import numpy as np
 
 from bevviz.bags.recording import RawMessage, Recording
+from bevviz.closing import Closing
 from bevviz.config import Config, stage_topics
 from bevviz.errors import UserError
 from bevviz.frame import F64, I64, Frame, Scene
@@ -27,7 +27,7 @@ MARGIN = 2 * SECOND  # what else belongs to the first and the last cloud is look
 EPOCH = 1e8  # a larger number of seconds is a date
 
 
-class BagSource:
+class BagSource(Closing):
     """The frames of one recording, kept in one or several bags.
 
     Args:
@@ -71,14 +71,6 @@ class BagSource:
         self._damaged: Counter[str] = Counter()
         self._first_damage: dict[str, str] = {}
         self._sync: Synchronizer | None = None
-
-    def __enter__(self) -> BagSource:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
     def close(self) -> None:
         self.recording.close()

@@ -10,7 +10,7 @@ from tempfile import TemporaryDirectory
 import rerun as rr
 
 from bevviz.batch.summary import Link
-from bevviz.batch.table import About
+from bevviz.batch.table import RunInfo
 from bevviz.errors import UserError, first_line
 from bevviz.logging import blueprints, entities
 from bevviz.logging.sinks import APPLICATION, check_port, free_port
@@ -18,7 +18,7 @@ from bevviz.logging.sinks import APPLICATION, check_port, free_port
 TIMEOUT = 600  # seconds
 
 
-def register(url: str, name: str, results: Sequence[tuple[Path, About]], blueprint: str) -> Link:
+def register(url: str, name: str, results: Sequence[tuple[Path, RunInfo]], blueprint: str) -> Link:
     """Make the dataset hold these recordings; what it holds already stays, what has changed is replaced.
 
     Args:
@@ -38,7 +38,7 @@ def register(url: str, name: str, results: Sequence[tuple[Path, About]], bluepri
 
     try:
         dataset = CatalogClient(url).create_dataset(name, exist_ok=True)
-        wanted = {about.recording_id: path for path, about in results}
+        wanted = {info.recording_id: path for path, info in results}
         there = set(dataset.segment_ids())
         stems = {path.stem for path in wanted.values()}
         if old := [s for s in there - set(wanted) if s.rpartition("-")[0] in stems]:

@@ -7,12 +7,12 @@ from typing import Any
 from urllib.parse import urlsplit
 
 from bevviz.batch.jobs import Job
-from bevviz.batch.work import Outcome, Outcomes
+from bevviz.batch.work import JobResult, JobResults
 from bevviz.errors import UserError, first_line
 from bevviz.logging.sinks import answers
 
 
-def run_dask(jobs: Sequence[Job], address: str, retries: int, on_frame: Callable[[], None]) -> Outcomes:
+def run_dask(jobs: Sequence[Job], address: str, retries: int, on_frame: Callable[[], None]) -> JobResults:
     """Run the jobs on a cluster, each once, and yield how they ended, as they end.
 
     A job whose worker dies is run again on another one, as often as the cluster's setting
@@ -48,26 +48,26 @@ def run_dask(jobs: Sequence[Job], address: str, retries: int, on_frame: Callable
         }
         try:
             for future in as_completed(list(futures)):
-                outcome = _outcome(futures[future], future)
-                for _ in range(outcome.frames):
+                result = _result(futures[future], future)
+                for _ in range(result.frames):
                     on_frame()
                 future.release()
-                yield outcome
+                yield result
         finally:
             client.cancel([future for future in futures if not future.done()])
 
 
-def _outcome(job: Job, future: Any) -> Outcome:
+def _result(job: Job, future: Any) -> JobResult:
     if future.status == "finished":
-        outcome: Outcome = future.result()
-        return outcome
+        result: JobResult = future.result()
+        return result
     error = future.exception() if future.status == "error" else None
     if type(error).__name__ == "KilledWorker":
-        return Outcome(job.name, error="the workers that ran it died; out of memory?")
-    return Outcome(job.name, error=f"{type(error).__name__}: {error}" if error else "cancelled")
+        return JobResult(job.name, error="the workers that ran it died; out of memory?")
+    return JobResult(job.name, error=f"{type(error).__name__}: {error}" if error else "cancelled")
 
 
-def _work(job: Job) -> Outcome:
+def _work(job: Job) -> JobResult:
     """On the worker."""
     from distributed import get_worker
 

@@ -8,20 +8,20 @@ import re
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
-from functools import cached_property, lru_cache
+from functools import cached_property
 from pathlib import Path
 
 from bevviz.bags.recording import METADATA, bag_files
-from bevviz.batch.table import About, read_about
+from bevviz.batch.table import RunInfo, read_info
 from bevviz.config import Config
 from bevviz.errors import UserError
-from bevviz.logging.logger import versions
+from bevviz.provenance import dependencies_of, file_hash, model_path
 
 PARTIAL = ".partial"  # folder of what is not complete
 
 
 @dataclass(frozen=True)
-class Selection:
+class FrameSelection:
     """Which frames of each bag, as in ``BagSource``."""
 
     start: str | None = None
@@ -38,7 +38,7 @@ class Job:
     bag: Path  # absolute
     folder: Path  # absolute, for the results
     config: Config
-    selection: Selection
+    selection: FrameSelection
     blueprint: str
 
     @property
@@ -58,32 +58,31 @@ class Job:
     @cached_property
     def key(self) -> str:
         """Another one for another bag, selection, configuration, model, layout or version."""
-        config = self.config.model_dump(mode="json", exclude={"live"})
-        config["detector"] |= {name: _content(config["detector"][name]) for name in ("model", "names")}
-        parts = {
+        files = {"detector": {"model", "names"}}  # they count by their content, below
+        content = {
             "bag": [[file.name, file.stat().st_size, file.stat().st_mtime_ns] for file in _files(self.bag)],
             "selection": asdict(self.selection),
-            "config": config,
-            "blueprint": _content(self.blueprint),
-            "versions": versions(),
+            "config": self.config.model_dump(mode="json", exclude={"live": True, **files}),
+            "blueprint": file_hash(Path(self.blueprint)) if _is_file(self.blueprint) else self.blueprint,
+            "dependencies": {name: [d.version, d.sha256] for name, d in dependencies_of(self.config).items()},
         }
-        return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()
+        return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
     @property
     def recording_id(self) -> str:
         """Another one for another result: a viewer takes recordings with the same one for the same."""
         return f"{self.name}-{self.key[:8]}"
 
-    def complete(self) -> About | None:
+    def complete(self) -> RunInfo | None:
         """What is known of the result, None where it is missing or out of date."""
-        about = read_about(self.table)
-        if about is None or about.key != self.key or not self.recording.is_file():
+        info = read_info(self.table)
+        if info is None or info.key != self.key or not self.recording.is_file():
             return None
-        return about
+        return info
 
 
 def make_jobs(
-    paths: Sequence[Path], folder: Path, config: Config, selection: Selection, blueprint: str
+    paths: Sequence[Path], folder: Path, config: Config, selection: FrameSelection, blueprint: str
 ) -> list[Job]:
     """A job for each bag that the paths name.
 
@@ -91,26 +90,23 @@ def make_jobs(
         UserError: a path that does not exist, or no bag at all.
     """
     bags = find_bags(paths)
-    detector = config.detector
-    config = config.model_copy(
-        update={
-            "detector": detector.model_copy(
-                update={"model": _absolute(detector.model), "names": _absolute(detector.names)}
-            )
-        }
-    )
+    detector, model = config.detector, model_path(config)
+    files = {"names": _absolute(detector.names)}
+    if model is not None and detector.model != "demo":
+        files["model"] = str(model.resolve())
+    config = config.model_copy(update={"detector": detector.model_copy(update=files)})
     folder = folder.resolve()
     blueprint = _absolute(blueprint)
-    owners = {about.bag: table.stem for table, about in tables(folder)}
+    owners = {info.bag: table.stem for table, info in tables(folder)}
     names = name_bags(bags, owners)
     return [Job(names[bag], bag, folder, config, selection, blueprint) for bag in bags]
 
 
-def tables(folder: Path) -> Iterator[tuple[Path, About]]:
+def tables(folder: Path) -> Iterator[tuple[Path, RunInfo]]:
     """The results of all bags in a folder, by name."""
     for path in sorted(folder.glob("*.parquet")):
-        if (about := read_about(path)) is not None:
-            yield path, about
+        if (info := read_info(path)) is not None:
+            yield path, info
 
 
 # --- bags --------------------------------------------------------------------------------------
@@ -199,21 +195,6 @@ def _absolute(text: str) -> str:
     return str(Path(text).resolve()) if _is_file(text) else text
 
 
-def _content(text: str) -> str:
-    """Of a file its hash; a name that something is known by stays as it is."""
-    if not _is_file(text):
-        return text
-    path = Path(text)
-    stat = path.stat()
-    return _hash(path, stat.st_size, stat.st_mtime_ns)
-
-
 def _is_file(text: str) -> bool:
     """Whether it is a path; "debug" and "demo" are names, whatever lies in the working directory."""
     return bool(Path(text).suffix) and Path(text).is_file()
-
-
-@lru_cache
-def _hash(path: Path, size: int, mtime: int) -> str:
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()

@@ -12,7 +12,7 @@ from multiprocessing.connection import Connection, wait
 from multiprocessing.context import SpawnProcess
 
 from bevviz.batch.jobs import Job
-from bevviz.batch.work import Outcome, Outcomes
+from bevviz.batch.work import JobResult, JobResults
 
 # concurrent.futures is of no use here: a worker that dies breaks the pool and every job that was on its way.
 
@@ -24,7 +24,7 @@ class _Worker:
     job: Job
 
 
-def run_local(jobs: Sequence[Job], workers: int, retries: int, on_frame: Callable[[], None]) -> Outcomes:
+def run_local(jobs: Sequence[Job], workers: int, retries: int, on_frame: Callable[[], None]) -> JobResults:
     """Run the jobs, each once, and yield how they ended, as they end.
 
     Args:
@@ -47,19 +47,19 @@ def run_local(jobs: Sequence[Job], workers: int, retries: int, on_frame: Callabl
             ready = wait([worker.pipe for worker in busy])
             for worker in [w for w in busy if w.pipe in ready]:
                 try:
-                    said = worker.pipe.recv()
+                    message = worker.pipe.recv()
                 except (EOFError, OSError):
-                    said = None
-                if said == _FRAME:
+                    message = None
+                if message == _FRAME:
                     on_frame()
                     continue
                 busy.remove(worker)
-                again, outcome = _judge(worker, said)
-                if again and attempts[worker.job.name] < retries:
+                retry, result = _judge(worker, message)
+                if retry and attempts[worker.job.name] < retries:
                     attempts[worker.job.name] += 1
                     waiting.append(worker.job)
                 else:
-                    yield outcome
+                    yield result
                 if waiting:
                     busy.append(_next(worker, waiting.popleft(), threads))
                 else:
@@ -74,17 +74,17 @@ def run_local(jobs: Sequence[Job], workers: int, retries: int, on_frame: Callabl
 _FRAME = "frame"
 
 
-def _judge(worker: _Worker, said: Outcome | str | None) -> tuple[bool, Outcome]:
+def _judge(worker: _Worker, message: JobResult | str | None) -> tuple[bool, JobResult]:
     """Whether the job may go better another time, and how it ended."""
-    if isinstance(said, Outcome):
-        return False, said
-    if said is not None:
-        return True, Outcome(worker.job.name, error=said)
+    if isinstance(message, JobResult):
+        return False, message
+    if message is not None:
+        return True, JobResult(worker.job.name, error=message)
     worker.process.join()
     code = worker.process.exitcode or 0
     why = f"by {signal.Signals(-code).name}" if code < 0 else f"with status {code}"
     hint = "; out of memory?" if code == -signal.SIGKILL else ""
-    return True, Outcome(worker.job.name, error=f"its process ended {why}{hint}")
+    return True, JobResult(worker.job.name, error=f"its process ended {why}{hint}")
 
 
 def _start(job: Job, threads: int) -> _Worker:
@@ -136,9 +136,9 @@ def _work(pipe: Connection, threads: int) -> None:
         except EOFError:
             return
         try:
-            outcome: Outcome | str = run(job, threads, lambda: pipe.send(_FRAME))
+            result: JobResult | str = run(job, threads, lambda: pipe.send(_FRAME))
         except BrokenPipeError:
             return  # the batch has gone
         except Exception as error:
-            outcome = f"{type(error).__name__}: {error}"
-        pipe.send(outcome)
+            result = f"{type(error).__name__}: {error}"
+        pipe.send(result)

@@ -11,31 +11,31 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from bevviz.batch.page import Drive, render
-from bevviz.batch.table import SCHEMA, About
+from bevviz.batch.page import BagTotals, page
+from bevviz.batch.table import SCHEMA, RunInfo
 
 NAME = "summary"
 
 Link = Callable[[str, int], str]  # recording id, frame -> what opens it
 
 
-def collect(results: Sequence[tuple[Path, About]], link: Link | None) -> tuple[pa.Table, list[Drive]]:
+def collect(results: Sequence[tuple[Path, RunInfo]], link: Link | None) -> tuple[pa.Table, list[BagTotals]]:
     """The frames of all bags, worst first, and the totals of each bag in the order given.
 
     Args:
         results: table and its description for each bag.
         link: fills the column ``link``; None leaves it empty.
     """
-    parts, drives = [], []
-    for path, about in results:
+    parts, bags = [], []
+    for path, info in results:
         part = pq.read_table(path, schema=SCHEMA)
-        drives.append(_drive(path.stem, about, part))
-        links = [link(about.recording_id, f) if link else None for f in part["frame"].to_pylist()]
+        bags.append(_totals(path.stem, info, part))
+        links = [link(info.recording_id, f) if link else None for f in part["frame"].to_pylist()]
         parts.append(part.append_column("link", pa.array(links, pa.string())))
     empty = SCHEMA.append(pa.field("link", pa.string())).empty_table()
     frames = pa.concat_tables([empty, *(p.replace_schema_metadata(None) for p in parts)])
     order = [("badness", "descending"), ("recording", "ascending"), ("frame", "ascending")]
-    return frames.sort_by(order), drives
+    return frames.sort_by(order), bags
 
 
 def head(frames: pa.Table, count: int) -> list[dict[str, Any]]:
@@ -46,13 +46,13 @@ def head(frames: pa.Table, count: int) -> list[dict[str, Any]]:
     return rows
 
 
-def _drive(name: str, about: About, part: pa.Table) -> Drive:
+def _totals(name: str, info: RunInfo, part: pa.Table) -> BagTotals:
     stamps = np.sort(part["stamp"].to_numpy().astype(np.int64))
     times = part["time_ms_total"].to_numpy()
     counts = [field.name for field in SCHEMA if field.type == pa.int32()]
-    return Drive(
+    return BagTotals(
         name=name,
-        about=about,
+        info=info,
         first=int(stamps[0]),
         duration=float(stamps[-1] - stamps[0]) / 1e9,
         totals={count: int(part[count].to_numpy().sum(dtype=np.int64)) for count in counts},
@@ -65,7 +65,7 @@ def _drive(name: str, about: About, part: pa.Table) -> Drive:
 
 def write_summary(
     folder: Path,
-    results: Sequence[tuple[Path, About]],
+    results: Sequence[tuple[Path, RunInfo]],
     failed: Sequence[tuple[str, str]],
     top: int,
     link: Link | None,
@@ -81,12 +81,12 @@ def write_summary(
         link: what opens a frame; None: recordings are in no catalog.
         viewer: address of a web viewer; empty: none is served.
     """
-    frames, drives = collect(results, link)
-    page = folder / f"{NAME}.html"
-    text = render(folder.resolve().name, drives, head(frames, top), failed, viewer)
-    _write_whole(folder / f"{NAME}.parquet", lambda path: pq.write_table(frames, path))
-    _write_whole(page, lambda path: path.write_text(text))
-    return page
+    frames, bags = collect(results, link)
+    path = folder / f"{NAME}.html"
+    text = page(folder.resolve().name, bags, head(frames, top), failed, viewer)
+    _write_whole(folder / f"{NAME}.parquet", lambda unfinished: pq.write_table(frames, unfinished))
+    _write_whole(path, lambda unfinished: unfinished.write_text(text, encoding="utf-8"))
+    return path
 
 
 def _write_whole(path: Path, write: Callable[[Path], object]) -> None:

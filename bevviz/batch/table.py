@@ -14,9 +14,9 @@ import pyarrow.parquet as pq
 from pydantic import TypeAdapter
 
 from bevviz.config import Config
-from bevviz.frame import ClusterState, Decision, DetectionState, FrameResult, Scene
-from bevviz.logging.logger import counts_of
-from bevviz.logging.text import remarks
+from bevviz.counts import counts_of
+from bevviz.frame import Decision, DetectionState, FrameResult, Scene
+from bevviz.logging.decisions import remarks
 
 DECISIONS = tuple(d.name.lower() for d in Decision if d.value in (0, 1, 2, 3, 4, 8))  # what a kept one can be
 STAGES = (
@@ -50,7 +50,7 @@ SCHEMA = pa.schema(
 
 
 @dataclass(frozen=True, slots=True)
-class About:
+class RunInfo:
     """What a table was made from and how; kept in it."""
 
     key: str
@@ -62,7 +62,7 @@ class About:
     warnings: tuple[str, ...] = ()
 
 
-_ABOUT = TypeAdapter(About)
+_INFO = TypeAdapter(RunInfo)
 
 
 def row(result: FrameResult, config: Config) -> dict[str, Any]:
@@ -76,7 +76,7 @@ def row(result: FrameResult, config: Config) -> dict[str, Any]:
     if result.ground is not None:
         found["ground_points"] = int(result.ground.mask.sum())
     if result.clusters is not None:
-        found["set_aside"] = int((result.clusters.state != ClusterState.KEPT).sum())
+        found["set_aside"] = int((~result.clusters.kept).sum())
     if result.objects is not None:
         found["objects"] = len(result.objects)
     found["anomalies"] = len(result.anomalies)
@@ -119,16 +119,16 @@ def row(result: FrameResult, config: Config) -> dict[str, Any]:
     }
 
 
-def write(path: Path, rows: Sequence[Mapping[str, Any]], about: About) -> None:
+def write(path: Path, rows: Sequence[Mapping[str, Any]], info: RunInfo) -> None:
     table = pa.Table.from_pylist([dict(r) for r in rows], schema=SCHEMA)
-    pq.write_table(table.replace_schema_metadata({"bevviz": _ABOUT.dump_json(about)}), path)
+    pq.write_table(table.replace_schema_metadata({"bevviz": _INFO.dump_json(info)}), path)
 
 
-def read_about(path: Path) -> About | None:
+def read_info(path: Path) -> RunInfo | None:
     """What is known of a table; None where there is none, or a broken or foreign one."""
     try:
         metadata = pq.read_schema(path).metadata or {}
-        return _ABOUT.validate_json(metadata[b"bevviz"])
+        return _INFO.validate_json(metadata[b"bevviz"])
     except (OSError, KeyError, ValueError):  # ArrowInvalid and ValidationError are values too
         return None
 

@@ -12,7 +12,7 @@ from uuid import uuid4
 
 from bevviz.bags.source import BagSource
 from bevviz.batch.jobs import PARTIAL, Job
-from bevviz.batch.table import About, row, write
+from bevviz.batch.table import RunInfo, row, write
 from bevviz.errors import UserError
 from bevviz.frame import FrameResult
 from bevviz.logging.recorder import Recorder
@@ -30,7 +30,7 @@ class WithdrawnError(Exception):
 
 
 @dataclass(frozen=True, slots=True)
-class Outcome:
+class JobResult:
     """How a job ended. ``error`` is empty where its results are complete."""
 
     name: str
@@ -39,10 +39,10 @@ class Outcome:
     error: str = ""
 
 
-Outcomes: TypeAlias = Generator[Outcome, None, None]
+JobResults: TypeAlias = Generator[JobResult, None, None]
 
 
-def run(job: Job, threads: int, on_frame: Callable[[], None] = lambda: None) -> Outcome:
+def run(job: Job, threads: int, on_frame: Callable[[], None] = lambda: None) -> JobResult:
     """Run the pipeline over a bag. Recording and table get their names when both are complete.
 
     The unfinished recording is the worker's licence to go on: whoever removes it ends the job.
@@ -55,8 +55,8 @@ def run(job: Job, threads: int, on_frame: Callable[[], None] = lambda: None) -> 
     Raises:
         WithdrawnError: the unfinished recording was removed.
     """
-    if about := job.complete():  # by a worker that died before it could say so
-        return Outcome(job.name, about.frames, about.seconds)
+    if info := job.complete():  # by a worker that died before it could say so
+        return JobResult(job.name, info.frames, info.seconds)
     start = time.perf_counter()
     recording = job.folder / PARTIAL / f"{job.name}-{os.getpid()}-{uuid4().hex[:8]}.rrd"
     table = recording.with_suffix(".parquet")
@@ -90,17 +90,17 @@ def run(job: Job, threads: int, on_frame: Callable[[], None] = lambda: None) -> 
         if not rows:
             raise UserError("; ".join([f"{job.bag.name}: no frame in it", *warnings]))
         seconds = time.perf_counter() - start
-        about = About(job.key, str(job.bag), job.recording_id, len(rows), seconds, scene, warnings)
-        write(table, rows, about)
+        info = RunInfo(job.key, str(job.bag), job.recording_id, len(rows), seconds, scene, warnings)
+        write(table, rows, info)
         job.table.unlink(missing_ok=True)  # of an older result: it must not vouch for the new recording
         recording.replace(job.recording)
         table.replace(job.table)
     except UserError as error:
-        return Outcome(job.name, len(rows), time.perf_counter() - start, str(error))
+        return JobResult(job.name, len(rows), time.perf_counter() - start, str(error))
     finally:
         for path in (recording, table):
             path.unlink(missing_ok=True)
-    return Outcome(job.name, len(rows), seconds)
+    return JobResult(job.name, len(rows), seconds)
 
 
 class _Rows(Observer[FrameResult]):

@@ -25,8 +25,8 @@ from bevviz.errors import UserError
 
 if TYPE_CHECKING:
     from bevviz.batch.jobs import Job
-    from bevviz.batch.table import About
-    from bevviz.batch.work import Outcomes
+    from bevviz.batch.table import RunInfo
+    from bevviz.batch.work import JobResults
 
 
 def add(commands: Commands) -> None:
@@ -85,22 +85,22 @@ def _batch(options: argparse.Namespace) -> int:
         if options.paths:
             jobs = _jobs(options)
             interrupted = _run(jobs, options, failed)
-            complete = [(job.table, about) for job in jobs if (about := job.complete())]
+            complete = [(job.table, info) for job in jobs if (info := job.complete())]
         else:
             interrupted = False
             found = tables(options.output.resolve())
-            complete = [(table, about) for table, about in found if table.with_suffix(".rrd").is_file()]
+            complete = [(table, info) for table, info in found if table.with_suffix(".rrd").is_file()]
         return _sum_up(complete, failed, options, interrupted)
 
 
 def _jobs(options: argparse.Namespace) -> list[Job]:
-    from bevviz.batch.jobs import Selection, make_jobs
+    from bevviz.batch.jobs import FrameSelection, make_jobs
     from bevviz.frame import Scene
     from bevviz.logging import blueprints
     from bevviz.stages.detector import Detector
 
     config = load_config(options)
-    selection = Selection(options.start, options.end, options.every, options.frames)
+    selection = FrameSelection(options.start, options.end, options.every, options.frames)
     jobs = make_jobs(options.paths, options.output, config, selection, options.blueprint)
     # What is wrong for every bag is told once.
     blueprints.load(options.blueprint, Scene("", "lidar"))
@@ -145,7 +145,7 @@ def _run(jobs: list[Job], options: argparse.Namespace, failed: list[tuple[str, s
     return False
 
 
-def _execute(todo: list[Job], options: argparse.Namespace, on_frame: Callable[[], None]) -> Outcomes:
+def _execute(todo: list[Job], options: argparse.Namespace, on_frame: Callable[[], None]) -> JobResults:
     if options.dask:
         from bevviz.batch.dask import run_dask
 
@@ -157,7 +157,7 @@ def _execute(todo: list[Job], options: argparse.Namespace, on_frame: Callable[[]
 
 
 def _sum_up(
-    complete: list[tuple[Path, About]],
+    complete: list[tuple[Path, RunInfo]],
     failed: list[tuple[str, str]],
     options: argparse.Namespace,
     interrupted: bool,
@@ -166,7 +166,7 @@ def _sum_up(
     from bevviz.batch.summary import write_summary
 
     folder: Path = options.output
-    recordings = [(table.with_suffix(".rrd"), about) for table, about in complete]
+    recordings = [(table.with_suffix(".rrd"), info) for table, info in complete]
     with ExitStack() as stack:
         link, url, viewer = None, options.catalog, ""
         if interrupted:
@@ -185,7 +185,7 @@ def _sum_up(
         if interrupted:
             say(f"interrupted; {len(complete)} bags are complete, the same command goes on. Summary: {page}")
             return 130
-        frames = sum(about.frames for _, about in complete)
+        frames = sum(info.frames for _, info in complete)
         say(f"{len(complete)} bags complete, {len(failed)} failed, {frames} frames. Summary: {page}")
         if viewer:
             say(f"catalog at {url}, viewer at {viewer}; serving until Ctrl-C")

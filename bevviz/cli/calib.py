@@ -125,7 +125,7 @@ def _log(
     options: argparse.Namespace,
 ) -> None:
     """Into every output that was asked for; without one, only the text was."""
-    from bevviz.logging.calib import log_calibration
+    from bevviz.calib.log import log_calibration
 
     outputs = Outputs.of(options).or_viewer()
     if not outputs:

@@ -43,6 +43,7 @@ def _sweep(options: argparse.Namespace) -> int:
     from bevviz.config import load
     from bevviz.evaluate import truth_source
     from bevviz.sweep import Sweep, combine, parse
+    from bevviz.sweep.log import layout, log_sweep
     from bevviz.variants import common_frames
 
     parameters, constant = parse(options.set)
@@ -56,7 +57,7 @@ def _sweep(options: argparse.Namespace) -> int:
     with open_bag(options, config) as source:
         truth = truth_source(source.roles, options.truth, options.kitti_labels)
         sweep = Sweep(parameters, configs, truth)
-        outputs = replace(Outputs.of(options), blueprint=sweep.layout())
+        outputs = replace(Outputs.of(options), blueprint=layout(sweep))
         with ExitStack() as stack:
             # Before the run, that may take long: what cannot be opened is told now.
             sinks = stack.enter_context(outputs.opened(source.scene, source.config)) if outputs else None
@@ -67,7 +68,7 @@ def _sweep(options: argparse.Namespace) -> int:
             if options.csv is not None:
                 sweep.write_csv(options.csv)
             if sinks is not None:
-                sweep.log(sinks.recording, source.scene.name)
+                log_sweep(sinks.recording, sweep, source.scene.name)
                 if not end.interrupted:
                     outputs.keep_serving(sinks.recording)
     if end.interrupted:

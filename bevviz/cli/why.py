@@ -132,7 +132,7 @@ def _print_json(result: FrameResult, answers: Sequence[Answer]) -> None:
 
 def _show(result: FrameResult, answers: Sequence[Answer], scene: Scene, outputs: Outputs, limit: int) -> None:
     from bevviz.logging.logger import Logger
-    from bevviz.logging.why import log_answers
+    from bevviz.why.log import log_answers
 
     with outputs.opened(scene, result.config) as sinks:
         logger = Logger(sinks.recording, result.config, scene)

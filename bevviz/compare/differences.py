@@ -10,7 +10,7 @@ from enum import StrEnum
 import numpy as np
 
 from bevviz import geometry
-from bevviz.frame import F32, F64, Boxes3D, ClusterState, DetectionState, FrameResult
+from bevviz.frame import F32, F64, Boxes3D, FrameResult
 from bevviz.stages.fusion import assign
 
 REACH = 2.0  # metres between the centres of one object, seen from above
@@ -104,11 +104,11 @@ def seen(result: FrameResult) -> Seen:
     images = {}
     for camera in result.cameras:
         if (found := camera.detections) is not None:
-            kept = np.flatnonzero(found.state == DetectionState.KEPT)
+            kept = np.flatnonzero(found.kept)
             images[camera.camera.name] = ImageBoxes(found.xyxy[kept], tuple(found.names[d] for d in kept))
     clusters = None
     if result.clusters is not None:
-        clusters = int((result.clusters.state == ClusterState.KEPT).sum())
+        clusters = int(result.clusters.kept.sum())
     if result.objects is None:
         return Seen(Boxes3D.empty(), (), np.zeros(0, np.float32), images, clusters)
     return Seen(result.objects.boxes, result.objects.names, result.objects.score, images, clusters)

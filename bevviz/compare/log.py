@@ -7,11 +7,15 @@ from collections.abc import Iterator, Mapping
 import numpy as np
 import rerun as rr
 
+from bevviz import table
 from bevviz.compare.differences import DIFFERENT, WORST_FIRST, Change, Difference, FrameDifferences
 from bevviz.frame import F64
 from bevviz.logging import entities
-from bevviz.logging.pieces import CORNER, boxes3d, transform
+from bevviz.logging.camera import over_image
+from bevviz.logging.pieces import boxes2d, boxes3d, document, transform
+from bevviz.logging.states import StateLanes
 from bevviz.logging.writer import Writer
+from bevviz.text import markdown
 
 COLORS = {
     Change.SAME: (70, 160, 90),
@@ -28,37 +32,37 @@ class DifferenceLogger(Writer):
     Args:
         recording: where to.
         names: what the two sides are.
-        summary: Markdown that says what was compared.
+        summary: Markdown that says how they were made.
     """
 
     def __init__(self, recording: rr.RecordingStream, names: tuple[str, str], summary: str) -> None:
         super().__init__(recording)
-        self._names = names
-        self._lanes: dict[str, str] = {}
-        self._recording.send_property("compare", rr.AnyValues(a=names[0], b=names[1]))
-        text = f"# What was compared\n\n- **A**: {names[0]}\n- **B**: {names[1]}\n\n{summary}"
-        self._static(entities.COMPARE_ABOUT, rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN))
+        self._lanes = StateLanes(COLORS)  # one for each class: the worst that has become of it
+        self.recording.send_property("compare", rr.AnyValues(a=names[0], b=names[1]))
+        a, b = map(markdown, names)
+        text = f"# What was compared\n\n- **A**: {a}\n- **B**: {b}\n\n{summary}"
+        self.static(entities.COMPARE_ABOUT, document(text))
         for change in DIFFERENT:
-            self._static(
+            self.static(
                 entities.difference(change),
                 rr.Boxes3D.from_fields(
                     colors=[COLORS[change]], radii=rr.Radius.ui_points(2.5), show_labels=True
                 ),
             )
-            self._static(
+            self.static(
                 entities.difference_count(change),
                 rr.SeriesLines(colors=[COLORS[change]], names=[change], widths=[2]),
             )
         for what, color in (("a", COLORS[Change.ONLY_A]), ("b", COLORS[Change.ONLY_B])):
             for series in ("objects", "clusters"):
-                self._static(
+                self.static(
                     entities.difference_count(f"{series}_{what}"),
                     rr.SeriesLines(colors=[color], names=[f"{series} {what.upper()}"]),
                 )
 
     def log(self, found: FrameDifferences, received: int, world_from_points: F64) -> None:
         """One frame. Times in nanoseconds; ``received`` is 0 where it is not known."""
-        self._begin(found.index, found.stamp, received)
+        self.begin(found.index, found.stamp, received)
         for change in DIFFERENT:
             mine = [d for d in found.objects if d.change is change]
             if mine:
@@ -66,15 +70,13 @@ class DifferenceLogger(Writer):
         for camera, pairs in found.images.items():
             self._log_image(camera, pairs, found)
         for name, value in _counts(found).items():
-            self._scalar(entities.difference_count(name), float(value))
-        page = rr.TextDocument(markdown(found), media_type=rr.MediaType.MARKDOWN)
-        self._put(entities.COMPARE, page)
-        for difference in found.objects:
-            if difference.change is not Change.SAME:
-                text = f"{difference.text} {place(difference, found)}"
-                self._log(entities.COMPARE_LOG, rr.TextLog(text, level="INFO"))
-        self._log_states(found)
-        self._end()
+            self.scalar(entities.difference_count(name), float(value))
+        self.put(entities.COMPARE, document(page(found)))
+        changed = [d for d in found.objects if d.change is not Change.SAME]
+        self.lines(entities.COMPARE_LOG, [("INFO", f"{d.text} {place(d, found)}") for d in changed])
+        worst = worst_of_each_class(found.objects)
+        self._lanes.log(self, {entities.difference_state(name): change for name, change in worst.items()})
+        self.end()
 
     def _log_boxes(
         self, change: Change, mine: list[Difference], found: FrameDifferences, world_from_points: F64
@@ -84,12 +86,12 @@ class DifferenceLogger(Writer):
             side, rows = (found.b, [d.row_b for d in mine])
         path = entities.difference(change)
         what = boxes3d(side.boxes, np.array(rows), [_label(d) for d in mine])
-        self._put(path, transform(world_from_points), what)
+        self.put(path, transform(world_from_points), what)
         if change is Change.MOVED:
             start = found.a.boxes.center[[d.row_a for d in mine]]
             end = found.b.boxes.center[rows]
             arrows = rr.Arrows3D(origins=start, vectors=end - start, colors=[COLORS[change]])
-            self._put(f"{path}/from_a", arrows)
+            self.put(f"{path}/from_a", arrows)
 
     def _log_image(self, camera: str, pairs: tuple[Difference, ...], found: FrameDifferences) -> None:
         for change in (Change.CLASS, Change.ONLY_A, Change.ONLY_B):
@@ -100,31 +102,17 @@ class DifferenceLogger(Writer):
                 boxes = found.a.images[camera].xyxy[[d.row_a for d in mine]]
             else:
                 boxes = found.b.images[camera].xyxy[[d.row_b for d in mine]]
-            self._put(
+            self.put(
                 entities.image_difference(camera, change),
-                rr.CoordinateFrame(f"tf#{entities.image(camera)}"),
-                rr.Boxes2D(
-                    array=boxes + CORNER,
-                    array_format=rr.Box2DFormat.XYXY,
-                    labels=[_label(d) for d in mine],
+                over_image(camera),
+                boxes2d(
+                    boxes,
+                    [_label(d) for d in mine],
                     colors=[COLORS[change]],
                     radii=rr.Radius.ui_points(2.5),
                     draw_order=40.0,
                 ),
             )
-
-    def _log_states(self, found: FrameDifferences) -> None:
-        """One lane for each class: the worst that has become of it in the frame."""
-        lanes = dict.fromkeys(self._lanes, "")
-        for name, change in worst_of_each_class(found.objects).items():
-            lanes[entities.difference_state(name)] = change
-        for lane, value in lanes.items():
-            if lane not in self._lanes:
-                values, colors = list(COLORS), list(COLORS.values())
-                self._static(lane, rr.StateConfiguration(values=values, colors=colors))
-            if self._lanes.get(lane) != value:
-                self._log(lane, rr.StateChange(state=value))
-        self._lanes = lanes
 
 
 def worst_of_each_class(objects: tuple[Difference, ...]) -> Mapping[str, Change]:
@@ -147,7 +135,7 @@ def place(difference: Difference, found: FrameDifferences) -> str:
     return f"at {np.hypot(x, y):.1f} m, {abs(angle):.0f}° {side}"
 
 
-def markdown(found: FrameDifferences) -> str:
+def page(found: FrameDifferences) -> str:
     """The differences of one frame as a page."""
     return "\n".join(_lines(found))
 
@@ -155,29 +143,35 @@ def markdown(found: FrameDifferences) -> str:
 def _lines(found: FrameDifferences) -> Iterator[str]:
     yield f"### Frame {found.index}"
     yield ""
-    yield "| | A | B |"
-    yield "| --- | ---: | ---: |"
-    yield f"| objects | {len(found.a.names)} | {len(found.b.names)} |"
-    if found.a.clusters is not None or found.b.clusters is not None:
-        clusters = ["-" if side.clusters is None else str(side.clusters) for side in (found.a, found.b)]
-        yield f"| clusters | {clusters[0]} | {clusters[1]} |"
-    for camera in found.images:
-        a, b = found.a.images[camera], found.b.images[camera]
-        yield f"| detections, {camera} | {len(a.names)} | {len(b.names)} |"
+    yield table.markdown([("", "A", "B"), *_totals(found)])
     for change in (*DIFFERENT, Change.SAME):
         mine = [d for d in found.objects if d.change is change]
         if mine:
             yield ""
             yield f"#### {change[0].upper() + change[1:]}: {len(mine)}"
             yield ""
-            yield from (f"- {_item(d)} {place(d, found)}" for d in mine)
+            yield from (f"- {markdown(_item(d))} {place(d, found)}" for d in mine)
     for camera, pairs in found.images.items():
         rows = [d for d in pairs if d.change is not Change.SAME]
         if rows:
             yield ""
-            yield f"#### Detections, {camera}"
+            yield f"#### Detections, {markdown(camera)}"
             yield ""
-            yield from (f"- {d.text}" for d in rows)
+            yield from (f"- {markdown(d.text)}" for d in rows)
+
+
+def _totals(found: FrameDifferences) -> Iterator[tuple[str, str, str]]:
+    """Rows of a table: what, and how many of it in A and B."""
+    a, b = found.a, found.b
+    yield "objects", str(len(a.names)), str(len(b.names))
+    if a.clusters is not None or b.clusters is not None:
+        yield (
+            "clusters",
+            "-" if a.clusters is None else str(a.clusters),
+            "-" if b.clusters is None else str(b.clusters),
+        )
+    for camera in found.images:
+        yield f"detections, {camera}", str(len(a.images[camera].names)), str(len(b.images[camera].names))
 
 
 def _item(difference: Difference) -> str:

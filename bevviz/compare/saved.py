@@ -21,7 +21,9 @@ from bevviz.config import changes, flat_yaml
 from bevviz.errors import UserError
 from bevviz.frame import F64, Boxes3D, Scene
 from bevviz.logging import entities
+from bevviz.logging.camera import log_shared_image
 from bevviz.logging.pieces import CORNER
+from bevviz.logging.writer import Writer
 from bevviz.run import Items, Observer
 
 Row = Mapping[str, Any]
@@ -183,10 +185,9 @@ class SavedPairRecorder(Observer[SavedFrames]):
         recording, pair = self._recording, self._pair
         recording.send_chunks(pair.a.stream())
         recording.send_chunks(_beside(pair.b))
-        for camera in pair.b.cameras:  # over the one image
-            for path in (entities.projected(camera), entities.detections(camera), entities.weak(camera)):
-                over = rr.CoordinateFrame(f"tf#{entities.image(camera)}")
-                recording.log(entities.B + path, over, static=True)
+        beside = Writer(recording, entities.B)
+        for camera in pair.b.cameras:
+            log_shared_image(beside, camera)
         self._differences = DifferenceLogger(recording, pair.summary.names, pair.summary.about)
 
     def see(self, frames: SavedFrames) -> None:

@@ -11,11 +11,13 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from bevviz import table
 from bevviz.compare.differences import DIFFERENT, WORST_FIRST, Change, Difference, FrameDifferences
 from bevviz.compare.log import place
 from bevviz.config import ParameterChange
 from bevviz.errors import UserError
 from bevviz.run import Observer
+from bevviz.text import fenced, printable
 
 WORST = 10  # frames in the table
 COLUMNS = ("objects A", "objects B", *(change.value for change in (Change.SAME, *DIFFERENT)))
@@ -48,7 +50,7 @@ class ComparisonSummary(Observer[Compared]):
     @property
     def about(self) -> str:
         """What was compared, in Markdown."""
-        return "```\n" + "\n".join(parameters(self.config)) + "\n```"
+        return fenced("\n".join(parameters(self.config)))
 
     def see(self, compared: Compared) -> None:
         if compared.found is None:
@@ -97,20 +99,20 @@ class ComparisonSummary(Observer[Compared]):
 
     def table(self) -> str:
         """For the terminal."""
-        return "\n".join(self._lines())
+        return "\n".join(map(printable, self._lines()))
 
     def _lines(self) -> Iterator[str]:
         yield f"A: {self.names[0]}"
         yield f"B: {self.names[1]}"
         yield from parameters(self.config)
         yield ""
-        yield from columns([("objects", *COLUMNS), *_rows(self._classes)])
+        yield from table.lines([("objects", *COLUMNS), *_rows(self._classes)])
         if self._moved:
             yield f"moved: {np.median(self._moved):.2f} m (median), {max(self._moved):.2f} m at most"
         if self._detections:
             yield ""
             without = tuple(c for c in COLUMNS if c != Change.MOVED)
-            yield from columns([("detections", *without), *_rows(self._detections, without)])
+            yield from table.lines([("detections", *without), *_rows(self._detections, without)])
         if self._clusters:
             yield ""
             yield f"clusters: {self._clusters['objects A']} in A, {self._clusters['objects B']} in B"
@@ -170,17 +172,8 @@ def parameters(config: Mapping[str, str]) -> Iterator[str]:
     if not config:
         yield "parameters: no difference"
         return
-    width = max(map(len, config))
     yield "parameters that differ, A -> B:"
-    yield from (f"  {key:{width}}  {change}" for key, change in config.items())
-
-
-def columns(rows: Sequence[Sequence[str]]) -> Iterator[str]:
-    """A table: the first column to the left, the others to the right."""
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    for row in rows:
-        cells = [row[0].ljust(widths[0]), *(c.rjust(w) for c, w in zip(row[1:], widths[1:], strict=True))]
-        yield "  ".join(cells).rstrip()
+    yield from (f"  {line}" for line in table.lines(list(config.items()), "ll"))
 
 
 def _count(counts: Mapping[str, Counter[str]], difference: Difference) -> None:

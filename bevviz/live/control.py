@@ -12,9 +12,9 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from pathlib import Path
-from types import TracebackType
-from typing import BinaryIO, Self
+from typing import BinaryIO
 
+from bevviz.closing import Closing
 from bevviz.errors import UserError
 
 ANSWER = 5.0  # seconds until a process that is well has said that it heard
@@ -23,7 +23,7 @@ LONGEST = 1 << 16  # bytes of a request or an answer
 _CREDENTIALS = struct.Struct("3i")  # of a socket's peer: process, user, group
 
 
-class Control:
+class Control(Closing):
     """Answers requests to save until it is closed.
 
     A request is a line of JSON, ``{"path": "FILE.rrd"}``. The first line of the answer comes at once, the
@@ -52,12 +52,7 @@ class Control:
             return
         self._thread.start()
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def close(self) -> None:
         if self._path is None:
             self._socket.close()
             return

@@ -9,12 +9,11 @@ import os
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from types import TracebackType
-from typing import Self
 
 import rerun as rr
 import rerun.blueprint as rrb
 
+from bevviz.closing import Closing
 from bevviz.config import Config
 from bevviz.frame import FrameResult, Scene
 from bevviz.logging import blueprints
@@ -34,7 +33,7 @@ class Packet:
     time: float  # seconds, monotonic
 
 
-class _Stream:
+class _Stream(Closing):
     """A recording whose bytes are read back as they are written, through a file in memory."""
 
     def __init__(self, recording_id: str | None = None, blueprint: rrb.Blueprint | None = None) -> None:
@@ -45,14 +44,6 @@ class _Stream:
         # A footer would list every chunk that was ever logged, in memory.
         sink = rr.FileSink(f"/proc/self/fd/{self._file}", write_footer=False)
         self.recording.set_sinks(sink, default_blueprint=blueprint)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
     def close(self) -> None:
         self.recording.disconnect()

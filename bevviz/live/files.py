@@ -8,22 +8,15 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from pathlib import Path
 
-import rerun as rr
-
 from bevviz.config import LiveConfig
 from bevviz.errors import UserError
 from bevviz.live.encoder import Encoder, Packet
 from bevviz.live.notes import Notes
 from bevviz.live.output import Output
+from bevviz.logging.sinks import rerun_program
 
 MEGABYTE = 1_000_000
 INDEXED = 1000 * MEGABYTE  # the index is made in memory; a larger file stays without
-
-
-def rerun_binary() -> str:
-    """The command line program of the very version that came with the SDK."""
-    binary = Path(rr.__file__).parents[1] / "rerun_cli" / "rerun"
-    return str(binary) if binary.exists() else "rerun"
 
 
 class Indexer:
@@ -46,7 +39,7 @@ class Indexer:
 
     def _index(self, path: Path) -> None:
         indexed = path.with_suffix(".rrd.part")
-        command = ["nice", "-n", "19", rerun_binary(), "rrd", "optimize", str(path), "-o", str(indexed)]
+        command = ["nice", "-n", "19", rerun_program(), "rrd", "optimize", str(path), "-o", str(indexed)]
         done = subprocess.run(command, capture_output=True, check=False, start_new_session=True)
         if done.returncode == 0 and indexed.exists():
             indexed.replace(path)

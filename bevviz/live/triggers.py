@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 
-from bevviz.anomalies import News
+from bevviz.anomalies import Onsets
 from bevviz.config import LiveConfig
 from bevviz.frame import FrameResult
 
@@ -18,12 +18,12 @@ class Triggers:
 
     def __init__(self, config: LiveConfig) -> None:
         self.config = config
-        self._news = News()
+        self._onsets = Onsets()
         self._fired = -math.inf
 
     def check(self, result: FrameResult) -> str | None:
-        news = self._news.of(result.anomalies)  # whether or not one is reported
-        reasons = [anomaly.text for anomaly in news if anomaly.kind in self.config.triggers]
+        onsets = self._onsets.of(result.anomalies)  # whether or not one is reported
+        reasons = [anomaly.text for anomaly in onsets if anomaly.kind in self.config.triggers]
         now = time.monotonic()
         if not reasons or now - self._fired < self.config.trigger_pause:
             return None

@@ -10,11 +10,10 @@ from contextlib import suppress
 from dataclasses import dataclass
 
 from bevviz.live.encoder import Encoder, Packet
-from bevviz.live.files import rerun_binary
 from bevviz.live.notes import Notes
 from bevviz.live.output import Output
 from bevviz.logging.logger import Context
-from bevviz.logging.sinks import answers, check_port, check_viewer, free_port, viewer_address
+from bevviz.logging.sinks import answers, check_port, check_viewer, free_port, rerun_program, viewer_address
 
 RETRY = 3.0  # seconds until a viewer that is gone is tried again
 
@@ -36,7 +35,7 @@ class Program:
 
 def window() -> Program:
     """The viewer on this machine."""
-    command = [rerun_binary(), "-", "--port", "auto", "--memory-limit", "50%", "--hide-welcome-screen"]
+    command = [rerun_program(), "-", "--port", "auto", "--memory-limit", "50%", "--hide-welcome-screen"]
     return Program("window", command, lasting=False)
 
 
@@ -48,7 +47,7 @@ def server(port: int, bind: str, memory: float) -> tuple[Program, str]:
     """
     check_port(port)
     data_port = free_port(9876, but=port)
-    command = [rerun_binary(), "-", "--serve-web", "--bind", bind, "--port", str(data_port)]
+    command = [rerun_program(), "-", "--serve-web", "--bind", bind, "--port", str(data_port)]
     command += ["--web-viewer-port", str(port), "--server-memory-limit", f"{memory:.0f}MB"]
     command += ["--cors-allow-origin", f"http://*:{port}"]
     host = (

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from enum import IntEnum
 
 from bevviz.frame import AnomalyKind, ClusterState, DetectionState
@@ -47,6 +48,15 @@ COMPARE_ABOUT = "/compare/about"
 COMPARE_LOG = "/compare/log"
 COMPARE_STATES = "/compare/states"
 CALIB = "/calib"
+
+# Names that no sensor can have, as they are something else where it has its entities.
+RESERVED = frozenset(
+    {path.split("/")[2] for path in (FUSED, FRUSTUMS, GRID, TRUTH, TRACKS)}
+    | {path.split("/")[2] for path in (COMPARE_ABOUT, COMPARE_LOG, COMPARE_STATES)}
+    | {"objects", "count"}  # of /compare
+    | {"pipeline"}  # of /explain/states
+    | {"lidars"}  # several LiDARs that are merged
+)
 
 
 def sensor(name: str) -> str:
@@ -97,16 +107,26 @@ def channel(name: str) -> str:
 
 
 def overlay(what: str) -> str:
-    """Over the bird's-eye image: tracks, their trails, the ground truth, what the robot published."""
+    """Over the bird's-eye image: tracks, their trails, the ground truth."""
     return f"{BEV}/overlay/{what}"
 
 
 def robot(topic: str) -> str:
-    return f"{ROBOT}/{topic.strip('/')}"
+    return f"{ROBOT}{_topic(topic)}"
+
+
+def robot_overlay(topic: str) -> str:
+    """What the robot published, over the bird's-eye image."""
+    return overlay(f"robot{_topic(topic)}")
 
 
 def state(*lane: str) -> str:
     return "/".join((STATES, *lane))
+
+
+def class_state(camera: str, class_name: str) -> str:
+    """What became of the best detection of the class."""
+    return state(camera, _part(class_name))
 
 
 def why(what: str) -> str:
@@ -116,24 +136,24 @@ def why(what: str) -> str:
 
 def difference(change: str) -> str:
     """Objects that differ in this way between two runs."""
-    return f"{COMPARE}/objects/{change.replace(' ', '_').lower()}"
+    return f"{COMPARE}/objects/{_change(change)}"
 
 
 def image_difference(camera: str, change: str) -> str:
-    return f"{COMPARE}/{camera}/{change.replace(' ', '_').lower()}"
+    return f"{COMPARE}/{camera}/{_change(change)}"
 
 
 def difference_count(change: str) -> str:
-    return f"{COMPARE}/count/{change.replace(' ', '_').lower()}"
+    return f"{COMPARE}/count/{_change(change)}"
 
 
 def difference_state(class_name: str) -> str:
-    return f"{COMPARE_STATES}/{class_name.replace(' ', '_')}"
+    return f"{COMPARE_STATES}/{_part(class_name)}"
 
 
 def sweep(metric: str) -> str:
     """A number over the parameter that was swept."""
-    return f"{SWEEP}/{metric.replace(' ', '_')}"
+    return f"{SWEEP}/{_part(metric)}"
 
 
 def track_state(lane: int) -> str:
@@ -197,6 +217,19 @@ def calib_stated(camera: str) -> str:
 def calib_corrected(camera: str) -> str:
     """The same with what is off put right."""
     return f"{CALIB}/{camera}/corrected"
+
+
+def _part(name: str) -> str:
+    """One part of a path, of a name that others chose: nothing in it ends the part or needs an escape."""
+    return re.sub(r"[\s/\\]", "_", name) or "_"
+
+
+def _change(change: str) -> str:
+    return _part(change).lower()
+
+
+def _topic(topic: str) -> str:
+    return "".join(f"/{_part(part)}" for part in topic.split("/") if part)
 
 
 # --- class ids ---------------------------------------------------------------------------------

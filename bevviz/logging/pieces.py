@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any
 
+import cv2
 import numpy as np
 import pyarrow as pa
 import rerun as rr
+from numpy.typing import NDArray
 
 from bevviz import geometry
-from bevviz.frame import F32, F64, U8, Boxes3D
+from bevviz.frame import F32, F64, U8, Boxes3D, Image
 from bevviz.stages.kernel import kernel
 
 CORNER = 0.5  # pixels: Rerun counts from the corner of the first pixel, bevviz from its centre
+OUTLINE = rr.components.FillMode.MajorWireframe
+
+_EDGES = [0, 1, 2, 3, 0, 4, 5, 1, 5, 6, 2, 6, 7, 3, 7, 4]
 
 
 def transform(world_from_entity: F64) -> rr.Transform3D:
@@ -29,6 +35,57 @@ def boxes3d(boxes: Boxes3D, rows: np.ndarray[Any, Any], labels: list[str], **loo
     return rr.Boxes3D(
         centers=boxes.center[rows], sizes=boxes.size[rows], quaternions=turns, labels=labels, **looks
     )
+
+
+def boxes2d(xyxy: F32, labels: list[str], **looks: Any) -> rr.Boxes2D:
+    """(N, 4) boxes in pixels as bevviz counts them."""
+    return rr.Boxes2D(array=xyxy + CORNER, array_format=rr.Box2DFormat.XYXY, labels=labels, **looks)
+
+
+def edges(corners: F32) -> F32:
+    """(..., 16, 3) every edge of a box or frustum, given its (..., 8, 3) corners, in one stroke."""
+    return corners[..., _EDGES, :]
+
+
+def strips(points: F32, lengths: NDArray[np.integer]) -> pa.Array:
+    """Lines as Rerun keeps them, in one piece rather than line by line.
+
+    Args:
+        points: (N, 2) or (N, 3), of one line after the other.
+        lengths: how many of them each line has.
+    """
+    point = pa.list_(pa.field("item", pa.float32(), nullable=False), points.shape[1])
+    line = pa.list_(pa.field("item", point, nullable=False))
+    offsets = pa.array(np.append(0, np.cumsum(lengths)).astype(np.int32))
+    values = pa.FixedSizeListArray.from_arrays(pa.array(points.ravel()), type=point)
+    return pa.ListArray.from_arrays(offsets, values, type=line)
+
+
+def scored(names: Iterable[str], scores: Iterable[Any]) -> list[str]:
+    """``person 0.90`` for each."""
+    return [f"{name} {score:.2f}" for name, score in zip(names, scores, strict=True)]
+
+
+def document(text: str) -> rr.TextDocument:
+    """A page of Markdown."""
+    return rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN)
+
+
+def encode_image(image: Image, quality: int) -> rr.EncodedImage:
+    """As it came where it came encoded, else as JPEG of that quality."""
+    if image.encoded is not None:
+        return rr.EncodedImage(contents=image.encoded, media_type=image.media_type or None)
+    return jpeg(image.bgr, quality)
+
+
+def jpeg(bgr: U8, quality: int) -> rr.EncodedImage:
+    _, data = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, quality])
+    return rr.EncodedImage(contents=blob(data), media_type="image/jpeg")
+
+
+def png(bgr: U8) -> rr.EncodedImage:
+    _, data = cv2.imencode(".png", bgr, [cv2.IMWRITE_PNG_COMPRESSION, 1])
+    return rr.EncodedImage(contents=blob(data), media_type="image/png")
 
 
 def blob(data: U8) -> pa.Array:

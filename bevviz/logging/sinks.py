@@ -148,8 +148,7 @@ def answers(host: str, port: int) -> bool:
 
 
 def _viewer() -> rr.GrpcSink:
-    """The viewer on this machine, of the very version that came with the SDK."""
-    binary = Path(rr.__file__).parents[1] / "rerun_cli" / "rerun"
+    """The viewer on this machine."""
     port = free_port(9876)
     try:
         rr.spawn(
@@ -158,13 +157,19 @@ def _viewer() -> rr.GrpcSink:
             memory_limit="50%",
             server_memory_limit=MEMORY,
             hide_welcome_screen=True,
-            executable_path=str(binary) if binary.exists() else None,
+            executable_path=rerun_program(),
         )
     except RuntimeError as error:
         raise UserError(
             f"cannot start the viewer: {first_line(error)}; --save or --serve need none"
         ) from None
     return rr.GrpcSink(f"rerun+http://127.0.0.1:{port}/proxy")
+
+
+def rerun_program() -> str:
+    """Rerun's viewer and tools, of the very version that came with the SDK."""
+    binary = Path(rr.__file__).parents[1] / "rerun_cli" / "rerun"
+    return str(binary) if binary.exists() else "rerun"
 
 
 def _server(port: int) -> tuple[rr.GrpcServerSink, str]:

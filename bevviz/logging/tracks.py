@@ -5,12 +5,96 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 
 import numpy as np
+import rerun as rr
 
-from bevviz import anomalies
-from bevviz.frame import F32, I64, Tracks
+from bevviz import anomalies, geometry
+from bevviz.config import BevConfig
+from bevviz.frame import F32, I64, Frame, Tracks
+from bevviz.logging import entities
+from bevviz.logging.annotations import class_annotations
+from bevviz.logging.bev import footprints, seen_from_above
 from bevviz.logging.entities import TRACK_COLORS, ClassId
+from bevviz.logging.pieces import OUTLINE, boxes3d, strips
+from bevviz.logging.writer import Writer
 
 LANES = 12  # tracks with a state lane and a speed of their own: entities that come and go are never freed
+
+
+def log_tracks_looks(to: Writer) -> None:
+    for path, labelled in ((entities.TRACKS, False), (entities.UNSEEN, True)):
+        to.static(
+            path,
+            rr.Boxes3D.from_fields(radii=rr.Radius.ui_points(0.75), show_labels=labelled, fill_mode=OUTLINE),
+        )
+    to.static(entities.TRAILS, rr.LineStrips3D.from_fields(radii=rr.Radius.ui_points(1.5)))
+    to.static(entities.TRACK_SPEEDS, rr.SeriesLines(names=[f"{n:02}" for n in range(LANES)]))
+    for name, radius in (("tracks", 1.0), ("trails", 1.5)):
+        to.static(
+            entities.overlay(name),
+            class_annotations(),
+            rr.LineStrips2D.from_fields(radii=rr.Radius.ui_points(radius), draw_order=20.0),
+        )
+
+
+def log_tracks(to: Writer, frame: Frame, tracks: Tracks, config: BevConfig) -> None:
+    """In the fixed frame, and seen from above over the bird's-eye image."""
+    rows = shown(tracks)
+    named = tracks.object[rows] >= 0
+    for path, chosen, text in (
+        (entities.TRACKS, rows[named], label),
+        (entities.UNSEEN, rows[~named], unseen),
+    ):
+        if len(chosen):
+            labels = [text(tracks, row) for row in chosen.tolist()]
+            to.put(path, boxes3d(tracks.boxes, chosen, labels, class_ids=class_ids(tracks.id[chosen])))
+    if len(rows) == 0:
+        return
+    colors, points_from_world = class_ids(tracks.id[rows]), geometry.inverse(frame.pose)
+    trail, lengths = trails(tracks, rows)
+    to.put(entities.TRAILS, rr.LineStrips3D(strips(trail, lengths), class_ids=colors))
+    seen = seen_from_above(config, points_from_world, trail)
+    to.put(entities.overlay("trails"), rr.LineStrips2D(strips(seen, lengths), class_ids=colors))
+    outlines = footprints(geometry.corners(tracks.boxes)[rows])
+    to.put(
+        entities.overlay("tracks"),
+        rr.LineStrips2D(
+            seen_from_above(config, points_from_world, outlines),
+            class_ids=colors,
+            labels=[f"#{tracks.id[row]} {tracks.speed[row]:.1f} m/s" for row in rows],
+            show_labels=True,
+        ),
+    )
+
+
+def log_speeds(to: Writer, tracks: Tracks, rows: Mapping[int, int]) -> None:
+    """``rows``: lane -> row of its track."""
+    speeds = np.full(LANES, np.nan)
+    speeds[list(rows)] = tracks.speed[list(rows.values())]
+    to.write(entities.TRACK_SPEEDS, rr.Scalars(speeds))
+
+
+class Lanes:
+    """Gives each track that is shown one of ``LANES`` numbers, which it keeps until it ends."""
+
+    def __init__(self) -> None:
+        self._lane_of: dict[int, int] = {}  # id -> lane
+
+    def update(self, tracks: Tracks | None) -> Mapping[int, int]:
+        """Lane -> row of its track. Where there are more tracks than lanes, the latest have none."""
+        row_of = {} if tracks is None else {int(tracks.id[row]): row for row in shown(tracks).tolist()}
+        self._lane_of = {number: lane for number, lane in self._lane_of.items() if number in row_of}
+        free = self._free()
+        for number in row_of:
+            if number not in self._lane_of and (lane := next(free, None)) is not None:
+                self._lane_of[number] = lane
+        return {lane: row_of[number] for number, lane in self._lane_of.items()}
+
+    def _free(self) -> Iterator[int]:
+        taken = set(self._lane_of.values())
+        return (lane for lane in range(LANES) if lane not in taken)
+
+
+# --- words and colours -------------------------------------------------------------------------
 
 
 def shown(tracks: Tracks | None) -> I64:
@@ -54,27 +138,8 @@ def of_objects(tracks: Tracks | None, count: int) -> list[int | None]:
     return rows
 
 
-def trails(tracks: Tracks, rows: I64) -> list[F32]:
-    """Where each was, oldest first."""
-    return [trail[np.isfinite(trail[:, 0])] for trail in tracks.trail[rows]]
-
-
-class Lanes:
-    """Gives each track that is shown one of ``LANES`` numbers, which it keeps until it ends."""
-
-    def __init__(self) -> None:
-        self._lane_of: dict[int, int] = {}  # id -> lane
-
-    def update(self, tracks: Tracks | None) -> Mapping[int, int]:
-        """Lane -> row of its track. Where there are more tracks than lanes, the latest have none."""
-        row_of = {} if tracks is None else {int(tracks.id[row]): row for row in shown(tracks).tolist()}
-        self._lane_of = {number: lane for number, lane in self._lane_of.items() if number in row_of}
-        free = self._free()
-        for number in row_of:
-            if number not in self._lane_of and (lane := next(free, None)) is not None:
-                self._lane_of[number] = lane
-        return {lane: row_of[number] for number, lane in self._lane_of.items()}
-
-    def _free(self) -> Iterator[int]:
-        taken = set(self._lane_of.values())
-        return (lane for lane in range(LANES) if lane not in taken)
+def trails(tracks: Tracks, rows: I64) -> tuple[F32, I64]:
+    """Where each was, oldest first: (N, 3) points of one after the other, and how many each has."""
+    found = tracks.trail[rows]
+    known = np.isfinite(found[:, :, 0])
+    return found[known], known.sum(axis=1)

@@ -6,12 +6,12 @@ from collections.abc import Sequence
 
 import rerun.blueprint as rrb
 
-from bevviz.calib.axes import AXES
 from bevviz.frame import Scene
 from bevviz.logging import entities
 
 _DARK = (13, 14, 18)
-_HIDDEN = rrb.EntityBehavior(visible=False)
+HIDDEN = rrb.EntityBehavior(visible=False)
+LINKED = rrb.archetypes.TimeAxis(link=rrb.components.LinkAxis.LinkToGlobal)
 
 
 def space(
@@ -56,7 +56,7 @@ def space(
             look_target=(10.0, -0.5, -1.0) if why else (10.0, 0.0, -1.0),
             eye_up=(0.0, 0.0, 1.0),
         ),
-        overrides=dict.fromkeys((root + path for path in hidden), _HIDDEN),
+        overrides=dict.fromkeys((root + path for path in hidden), HIDDEN),
     )
 
 
@@ -70,7 +70,7 @@ def camera(scene: Scene, name: str, *, why: bool = False) -> rrb.Spatial2DView:
         name=name,
         origin=entities.sensor(name),
         contents=[*contents, *([f"{entities.why(name)}/**"] if why else [])],
-        overrides={entities.projected(name) if why else entities.weak(name): _HIDDEN},
+        overrides={entities.projected(name) if why else entities.weak(name): HIDDEN},
     )
 
 
@@ -138,159 +138,46 @@ def over_time() -> rrb.Tabs:
     return rrb.Tabs(anomalies(), states(), tracks(), speeds(), name="Over time")
 
 
-def stage_times() -> rrb.TimeSeriesView:
+def plot(
+    name: str, origin: str, contents: Sequence[str] = ("$origin/**",), *, linked: bool = False
+) -> rrb.TimeSeriesView:
+    """Numbers over time, the legend inside. ``linked``: it shows the same time as the others that are."""
     return rrb.TimeSeriesView(
-        name="Stage times, ms", origin=entities.stage_time(""), plot_legend=rrb.Corner2D.LeftTop
+        name=name,
+        origin=origin,
+        contents=contents,
+        plot_legend=rrb.Corner2D.LeftTop,
+        axis_x=LINKED if linked else None,
     )
+
+
+def stage_times() -> rrb.TimeSeriesView:
+    return plot("Stage times, ms", entities.stage_time(""))
 
 
 def clocks() -> rrb.TimeSeriesView:
     """Image against cloud, and how old the transforms are."""
-    return rrb.TimeSeriesView(
-        name="Sync error and TF age, ms",
-        origin=entities.HEALTH,
-        contents=[f"{entities.sync_error('**')}", f"{entities.tf_age('**')}"],
-        plot_legend=rrb.Corner2D.LeftTop,
-    )
+    contents = [entities.sync_error("**"), entities.tf_age("**")]
+    return plot("Sync error and TF age, ms", entities.HEALTH, contents)
 
 
 def counts() -> rrb.TimeSeriesView:
     """Clusters, detections and matches: the numbers of the same size."""
-    return rrb.TimeSeriesView(
-        name="Counts",
-        origin=entities.HEALTH,
-        contents=[
-            entities.count(what) for what in ("clusters", "detections", "matches", "problems", "failures")
-        ],
-        plot_legend=rrb.Corner2D.LeftTop,
-    )
+    shown = ("clusters", "detections", "matches", "problems", "failures")
+    return plot("Counts", entities.HEALTH, [entities.count(what) for what in shown])
 
 
 def rates() -> rrb.TimeSeriesView:
-    return rrb.TimeSeriesView(name="Rates, Hz", origin=entities.rate(""), plot_legend=rrb.Corner2D.LeftTop)
+    return plot("Rates, Hz", entities.rate(""))
 
 
 def health() -> rrb.Tabs:
     return rrb.Tabs(stage_times(), clocks(), counts(), rates(), name="Health")
 
 
-# --- two runs that are compared ------------------------------------------------------------------
-
-_LINKED = rrb.archetypes.TimeAxis(link=rrb.components.LinkAxis.LinkToGlobal)
-_SIDES = {"": ("A", "only A"), entities.B: ("B", "only B")}
-
-
-def side_space(scene: Scene, root: str) -> rrb.Spatial3DView:
-    """What one run has found, with the differences that concern it: obstacles, clusters, objects."""
-    name, only = _SIDES[root]
-    changes = [f"{entities.difference(change)}/**" for change in (only, "moved", "other class")]
-    return space(
-        scene, raw=False, grid=False, name=f"3D {name}", root=root, beside=[entities.TRUTH, *changes]
-    )
-
-
-def side_camera(camera_name: str, root: str) -> rrb.Spatial2DView:
-    """The one image, with the detections of one run and those that the other one has not."""
-    name, only = _SIDES[root]
-    image = entities.image(camera_name)
-    changes = [entities.image_difference(camera_name, change) for change in (only, "other class")]
-    return rrb.Spatial2DView(
-        name=f"{camera_name} {name}",
-        origin=entities.sensor(camera_name),
-        contents=[image, f"{root}{image}/**", *changes],
-        overrides={root + entities.weak(camera_name): _HIDDEN},
-    )
-
-
-def side_pictures(scene: Scene, root: str) -> rrb.Tabs:
-    """The cameras and the bird's-eye view of one run."""
-    name = _SIDES[root][0]
-    cameras = [side_camera(camera_name, root) for camera_name in scene.cameras]
-    return rrb.Tabs(*cameras, birds_eye(root, f"Bird's-eye view {name}"))
-
-
-def differences() -> rrb.TextDocumentView:
-    """How the runs differ in the frame, in words."""
-    return rrb.TextDocumentView(name="Differences", origin=entities.COMPARE, contents=["$origin"])
-
-
-def changes() -> list[str]:
-    """Contents: objects that differ, to be shown beside a run."""
-    return [f"{entities.difference(change)}/**" for change in ("only A", "only B", "moved", "other class")]
-
-
-def version() -> rrb.TextDocumentView:
-    """What was changed in the configuration."""
-    return rrb.TextDocumentView(name="Version", origin=entities.TUNE)
-
-
-def compared() -> rrb.TextDocumentView:
-    """What the two runs are."""
-    return rrb.TextDocumentView(name="A and B", origin=entities.COMPARE_ABOUT)
-
-
-def difference_log() -> rrb.TextLogView:
-    return rrb.TextLogView(name="Log of differences", origin=entities.COMPARE_LOG)
-
-
-def difference_counts() -> rrb.TimeSeriesView:
-    """Objects that differ, by how."""
-    return rrb.TimeSeriesView(
-        name="Objects that differ",
-        origin=entities.COMPARE,
-        contents=[entities.difference_count(what) for what in ("only A", "only B", "moved", "other class")],
-        plot_legend=rrb.Corner2D.LeftTop,
-        axis_x=_LINKED,
-    )
-
-
-def side_counts() -> rrb.TimeSeriesView:
-    """Objects and clusters of both."""
-    return rrb.TimeSeriesView(
-        name="Objects and clusters",
-        origin=entities.COMPARE,
-        contents=[
-            entities.difference_count(f"{what}_{side}") for what in ("objects", "clusters") for side in "ab"
-        ],
-        plot_legend=rrb.Corner2D.LeftTop,
-        axis_x=_LINKED,
-    )
-
-
-def difference_states() -> rrb.StateTimelineView:
-    """For each class the worst that has become of it, over time."""
-    return rrb.StateTimelineView(
-        name="Worst of each class", origin=entities.COMPARE_STATES, time_view=_LINKED
-    )
-
-
 def config() -> rrb.TextDocumentView:
     """How the recording was made."""
     return rrb.TextDocumentView(name="Configuration", origin=entities.CONFIG)
-
-
-def alignment(camera: str) -> tuple[rrb.Spatial2DView, rrb.Spatial2DView]:
-    """Points by depth and the edges of the cloud over the image: as stated, and as corrected."""
-    return (
-        rrb.Spatial2DView(name=f"{camera}, as stated", origin=entities.calib_stated(camera)),
-        rrb.Spatial2DView(name=f"{camera}, corrected", origin=entities.calib_corrected(camera)),
-    )
-
-
-def calibration(camera: str) -> rrb.TextDocumentView:
-    """What 'bevviz calib' found."""
-    return rrb.TextDocumentView(name="Calibration", origin=entities.calib_result(camera))
-
-
-def score_curves(camera: str) -> rrb.Grid:
-    """How well the edges meet over the offset along each axis."""
-    return rrb.Grid(
-        *(
-            rrb.BarChartView(name=f"{axis.what}, {axis.unit}", origin=entities.calib_curve(camera, axis.name))
-            for axis in AXES
-        ),
-        grid_columns=2,
-    )
 
 
 def time_panel(

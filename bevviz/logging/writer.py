@@ -5,31 +5,33 @@ from __future__ import annotations
 import time
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
-from types import TracebackType
-from typing import Self
 
 import numpy as np
 import rerun as rr
 
+from bevviz.closing import Closing
 from bevviz.logging import entities
 
 STAMPS = (entities.STAMP, entities.RECEIVED)  # timelines in nanoseconds; the others count
 WAIT = 1.0  # seconds, for a recording rather than for a robot's operator
 
 
-class Writer:
+class Writer(Closing):
     """Writes frames to a recording, on the timelines ``stamp``, ``frame`` and ``received``.
+
+    The ``log_*`` functions of this folder, one for each kind of thing, write through one.
 
     Args:
         recording: where to; it may have any number of sinks.
         root: entity that everything goes under; empty: paths are as they are.
         wait: seconds that numbers to plot may wait for those of the next frames: sent together, as columns,
-            they take a fraction of the time. Then use it as a context manager, which sends the last of them.
+            they take a fraction of the time. Then close it, which sends the last of them.
     """
 
     def __init__(self, recording: rr.RecordingStream, root: str = "", wait: float = 0.0) -> None:
-        self._recording = recording
-        self._root = root
+        self.recording = recording
+        self.root = root
+        self.sequences: Mapping[str, int] = {}  # further timelines, and where on them what comes next is
         self._wait = wait
         self._clock: dict[str, int] = {}  # timeline -> where on it this frame is
         self._scalars: dict[str, list[tuple[dict[str, int], float]]] = defaultdict(list)
@@ -37,60 +39,95 @@ class Writer:
         self._known: set[str] = set()  # entities that any frame had
         self._shown: set[str] = set()  # entities with something of the frame before
         self._now: set[str] = set()
-        self.sequences: Mapping[str, int] = {}  # further timelines, and where on them what comes next is
+        self._versions: dict[str, int] = {}  # entity -> what ``keep`` was last called with
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.flush()
-
-    def _begin(self, index: int, stamp: int, received: int) -> None:
+    def begin(self, index: int, stamp: int, received: int) -> None:
         """Start a frame. Stamps in nanoseconds, ``received`` 0 where it is not known."""
         self._now = set()
         before = self._clock
-        self._set_time(index, stamp, received)
+        self.set_time(index, stamp, received)
         if before.keys() != self._clock.keys():
             self.flush()  # a column has the same timelines from end to end
 
-    def _end(self) -> None:
+    def end(self) -> None:
         """Clear what the frame before had and this one has not."""
         self._known |= self._now
         for path in self._shown - self._now:
-            self._log(path, rr.Clear(recursive=False))
+            self.write(path, rr.Clear(recursive=False))
         self._shown = self._now
         if time.monotonic() - self._sent >= self._wait:
             self.flush()
+
+    def refresh(self) -> None:
+        """Make the next frame whole without those before: what it lacks is cleared, nothing is kept."""
+        self._shown = set(self._known)
+        self._versions.clear()
 
     def flush(self) -> None:
         """Send what waits for more of its kind."""
         for path, rows in self._scalars.items():
             clocks, values = zip(*rows, strict=True)
-            self._columns(path, clocks, rr.Scalars.columns(scalars=values))
+            self._write_columns(path, clocks, rr.Scalars.columns(scalars=values))
         self._scalars.clear()
         self._sent = time.monotonic()
 
-    def _static(self, path: str, *archetypes: rr.AsComponents) -> None:
-        for archetype in archetypes:
-            self._recording.log(self._root + path, archetype, static=True)
+    def close(self) -> None:
+        self.flush()
 
-    def _put(self, path: str, *archetypes: rr.AsComponents) -> None:
-        """Something of this frame alone."""
-        self._log(path, *archetypes)
+    # --- what is written -----------------------------------------------------------------------
+
+    def static(self, path: str, *archetypes: rr.AsComponents) -> None:
+        """Something that holds at all times."""
+        for archetype in archetypes:
+            self.recording.log(self.root + path, archetype, static=True)
+
+    def put(self, path: str, *archetypes: rr.AsComponents) -> None:
+        """Something of this frame alone: the next one that has nothing there clears it."""
+        self.write(path, *archetypes)
         self._now.add(path)
 
-    def _log(self, path: str, *archetypes: rr.AsComponents) -> None:
-        self._recording.log(self._root + path, *archetypes)
+    def keep(self, path: str, version: int) -> bool:
+        """Keep what the frame before put there, if that was of this version; else False: put it anew."""
+        kept = self._versions.get(path) == version and path in self._shown
+        self._versions[path] = version
+        self._now.add(path)
+        return kept
 
-    def _scalar(self, path: str, value: float) -> None:
+    def write(self, path: str, *archetypes: rr.AsComponents) -> None:
+        """Something that holds from this frame on, until there is more."""
+        self.recording.log(self.root + path, *archetypes)
+
+    def scalar(self, path: str, value: float) -> None:
+        """A number to plot."""
         if self._wait > 0:
             self._scalars[path].append((self._clock, value))
         else:
-            self._log(path, rr.Scalars(value))
+            self.write(path, rr.Scalars(value))
 
-    def _columns(self, path: str, clocks: Sequence[dict[str, int]], columns: rr.ComponentColumnList) -> None:
+    def lines(self, path: str, lines: Sequence[tuple[str, str]]) -> None:
+        """Lines of a log: level and text of each."""
+        if lines:
+            levels, texts = zip(*lines, strict=True)
+            self._write_columns(
+                path, [self._clock] * len(lines), rr.TextLog.columns(text=texts, level=levels)
+            )
+
+    def set_time(self, index: int, stamp: int, received: int) -> None:
+        """Where on the timelines what comes next is, without a frame; see ``begin``."""
+        self._clock = {entities.FRAME: index, entities.STAMP: stamp}
+        if received:
+            self._clock[entities.RECEIVED] = received
+        self._clock |= self.sequences
+        self.recording.reset_time()
+        for name, number in self._clock.items():
+            if name in STAMPS:
+                self.recording.set_time(name, timestamp=np.datetime64(number, "ns"))
+            else:
+                self.recording.set_time(name, sequence=number)
+
+    def _write_columns(
+        self, path: str, clocks: Sequence[dict[str, int]], columns: rr.ComponentColumnList
+    ) -> None:
         """Several rows of one entity, each with its place on the timelines."""
         times = []
         for name in clocks[0]:
@@ -99,16 +136,4 @@ class Writer:
                 times.append(rr.TimeColumn(name, timestamp=np.array(numbers, "datetime64[ns]")))
             else:
                 times.append(rr.TimeColumn(name, sequence=numbers))
-        rr.send_columns(self._root + path, times, columns, recording=self._recording)
-
-    def _set_time(self, index: int, stamp: int, received: int) -> None:
-        self._clock = {entities.FRAME: index, entities.STAMP: stamp}
-        if received:
-            self._clock[entities.RECEIVED] = received
-        self._clock |= self.sequences
-        self._recording.reset_time()
-        for name, number in self._clock.items():
-            if name in STAMPS:
-                self._recording.set_time(name, timestamp=np.datetime64(number, "ns"))
-            else:
-                self._recording.set_time(name, sequence=number)
+        rr.send_columns(self.root + path, times, columns, recording=self.recording)

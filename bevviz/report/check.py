@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from math import inf
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from threading import Event
@@ -12,39 +13,47 @@ from typing import Any
 import numpy as np
 from rerun.chunk import RrdReader
 
-from bevviz.config import Config, load
-from bevviz.errors import UserError
+from bevviz.config import Config, changes, load
+from bevviz.errors import UserError, first_line
 from bevviz.frame import FrameResult
 from bevviz.logging import entities
-from bevviz.logging.logger import versions
 from bevviz.progress import Progress
-from bevviz.report.digest import ROUNDING, Difference, Stage, compare, detections_of, digest, unpack
+from bevviz.provenance import differences, file_hash, model_path, provenance
+from bevviz.report.digest import (
+    ROUNDING,
+    DigestDifference,
+    StageDigest,
+    compare,
+    detections_of,
+    digest,
+    unpack,
+)
 from bevviz.report.make import replay
-from bevviz.report.origin import About, changes, file_hash, hardware, model_of
+from bevviz.report.origin import ReportInfo
 from bevviz.report.window import open_window
 from bevviz.run import Observer, run
 from bevviz.session import Session
+from bevviz.stages.detector import DEMO_MODEL
 
 
 @dataclass(frozen=True, slots=True)
-class Kept:
+class StoredReport:
     """A report as its recording holds it."""
 
-    about: About
+    info: ReportInfo
     config: str  # YAML
-    versions: Sequence[str]
-    frames: dict[int, tuple[Stage, ...]]  # by number
+    frames: dict[int, tuple[StageDigest, ...]]  # by number
 
 
 @dataclass(slots=True)
-class Verdict:
+class CheckResult:
     """How a second run compares. ``changed``: what it was made with that is not as it was then."""
 
     frames: int = 0
     exact: int = 0  # frames that are the same in every bit
     rounding: float = 0.0  # largest relative difference of a number in those that are the same but for it
     differing: int = 0
-    first: tuple[int, Difference] | None = None  # frame and what differs
+    first: tuple[int, DigestDifference] | None = None  # frame and what differs
     changed: list[str] = field(default_factory=list)
     redacted: bool = False
 
@@ -52,29 +61,42 @@ class Verdict:
     def same(self) -> bool:
         return self.frames > 0 and not self.differing
 
-    def lines(self) -> list[str]:
+    def add(self, number: int, difference: DigestDifference | None) -> None:
+        """Count one frame."""
+        self.frames += 1
+        if difference is None:
+            self.exact += 1
+        elif difference.amount <= ROUNDING:
+            self.rounding = max(self.rounding, difference.amount)
+        else:
+            self.differing += 1
+            self.first = self.first or (number, difference)
+
+    def lines(self) -> Iterator[str]:
         """For people."""
         if self.first is not None:
             number, difference = self.first
-            said = [
+            yield (
                 f"{self.differing} of {self.frames} frames differ, first frame {number} "
                 f"in '{difference.stage}': {difference.text}"
-            ]
+            )
+        elif not self.frames:
+            yield "no frame, then or now: there is nothing to compare"
         elif self.exact == self.frames:
-            said = [f"{self.frames} frames: the same in every bit"]
+            yield f"{self.frames} frames: the same in every bit"
         else:
-            said = [
+            yield (
                 f"{self.frames} frames: the same; {self.exact} in every bit, the others to "
                 f"{self.rounding:.1g} of their numbers (rounding, up to {ROUNDING:g})"
-            ]
-        if self.redacted:
-            said.append(
-                "the images are redacted: detections are taken from the report, all else was computed again"
             )
-        return said + [f"not as it was: {text}" for text in self.changed]
+        if self.redacted:
+            yield "the images are redacted: detections are taken from the report, all else was computed again"
+        yield from (f"not as it was: {text}" for text in self.changed)
+        if self.differing and not self.changed:
+            yield "bag, model, configuration, versions and machine are as they were"
 
 
-def check(rrd: Path, *, model: Path | None = None, settings: Sequence[str] = ()) -> Verdict:
+def check(rrd: Path, *, model: Path | None = None, settings: Sequence[str] = ()) -> CheckResult:
     """Run the bag beside a report's recording as the recording says, and compare each frame.
 
     Args:
@@ -85,69 +107,73 @@ def check(rrd: Path, *, model: Path | None = None, settings: Sequence[str] = ())
     Raises:
         UserError: no report, no bag, or no model.
     """
-    kept = read(rrd)
-    about, bag = kept.about, rrd.with_suffix(".mcap")
+    stored = read(rrd)
+    info, bag = stored.info, rrd.with_suffix(".mcap")
     if not bag.exists():
         raise UserError(f"{bag}: the bag of the report is not there; it has the name of the recording")
     with TemporaryDirectory(prefix="bevviz-") as folder:
-        stored, config = _config(rrd, kept, model, settings, Path(folder))
-        verdict = Verdict(redacted=about.redacted)
+        then, now = _configs(rrd, stored, model, settings, Path(folder))
+        result = CheckResult(redacted=info.redacted)
         detections = {
-            key: value for stages in kept.frames.values() for key, value in detections_of(stages).items()
+            key: value for stages in stored.frames.values() for key, value in detections_of(stages).items()
         }
-        session = Session(config, replay(detections) if about.redacted else None)
-        verdict.changed = _changed(kept, bag, stored, session)
-        comparer = _Comparer(kept, verdict)
-        with open_window([bag], config, about.low, about.high) as source:
+        session = Session(now, replay(detections) if info.redacted else None)
+        network = session.stages.provider
+        result.changed = [*_changed_input(info, bag, then, now), *_changed_provenance(info, now, network)]
+        comparer = _Comparer(stored, result)
+        with open_window([bag], now, info.low, info.high) as source:
             if run(source, session, [comparer, Progress("check")], stop=comparer.complete).interrupted:
                 raise KeyboardInterrupt
-    left = comparer.left
-    for number in sorted(left):
-        _count(verdict, number, Difference("cloud", "this run makes no such frame", float("inf")))
-    return verdict
+    for number in sorted(comparer.left):
+        result.add(number, DigestDifference("cloud", "this run makes no such frame", inf))
+    return result
 
 
 class _Comparer(Observer[FrameResult]):
     """Compares each frame with that of the report."""
 
-    def __init__(self, kept: Kept, verdict: Verdict) -> None:
-        self.left = dict(kept.frames)
+    def __init__(self, stored: StoredReport, result: CheckResult) -> None:
+        self.left = dict(stored.frames)
         self.complete = Event()  # of a report that was interrupted: there is no more to compare
-        self._interrupted, self._verdict = kept.about.interrupted, verdict
+        self._interrupted, self._result = stored.info.interrupted, result
 
     def see(self, result: FrameResult) -> None:
         number = result.frame.index
-        then = self.left.pop(number, ())
-        _count(self._verdict, number, compare(then, digest(result)))
+        self._result.add(number, compare(self.left.pop(number, ()), digest(result)))
         if self._interrupted and not self.left:
             self.complete.set()
 
 
-def read(rrd: Path) -> Kept:
+def read(rrd: Path) -> StoredReport:
     """The report in a recording.
 
     Raises:
         UserError: no recording, or none of a report.
     """
-    about = config = made_with = None
-    frames: dict[int, tuple[Stage, ...]] = {}
+    info = config = None
+    frames: dict[int, tuple[StageDigest, ...]] = {}
     if not rrd.is_file():
         raise UserError(f"{rrd}: no such file")
     try:
         for chunk in RrdReader(rrd).stream():
             if chunk.entity_path == "/__properties/report":
-                about = About.load(_column(chunk, "about")[-1][0])
-            elif chunk.entity_path == "/__properties/bevviz":
-                config, made_with = _column(chunk, "config")[-1][0], _column(chunk, "versions")[-1]
+                info = _column(chunk, "about")[-1][0]
+            elif chunk.entity_path == f"/__properties/{entities.PROPERTY}":
+                config = _column(chunk, "config")[-1][0]
             elif chunk.entity_path == entities.DIGEST:
                 numbers = _column(chunk, entities.FRAME)
                 rows = zip(numbers, _column(chunk, "stages"), _column(chunk, "arrays"), strict=True)
                 frames |= {n: unpack(lines, np.array(block, np.uint8)) for n, lines, block in rows}
     except (ValueError, KeyError, TypeError, RuntimeError) as error:
-        raise UserError(f"{rrd}: cannot be read as a report: {str(error).splitlines()[0]}") from None
-    if about is None or config is None or made_with is None:
+        raise UserError(f"{rrd}: cannot be read as a report: {first_line(error)}") from None
+    if info is None or config is None:
         raise UserError(f"{rrd}: a recording, but not one of 'bevviz report' (or one that was not finished)")
-    return Kept(about, config, made_with, frames)
+    try:
+        return StoredReport(ReportInfo.load(info), config, frames)
+    except (ValueError, KeyError, TypeError):
+        raise UserError(
+            f"{rrd}: a report of another version of bevviz: check it with that version; /config names it"
+        ) from None
 
 
 def _column(chunk: Any, name: str) -> list[Any]:
@@ -155,60 +181,40 @@ def _column(chunk: Any, name: str) -> list[Any]:
     return found
 
 
-def _config(
-    rrd: Path, kept: Kept, model: Path | None, settings: Sequence[str], folder: Path
+def _configs(
+    rrd: Path, stored: StoredReport, model: Path | None, settings: Sequence[str], folder: Path
 ) -> tuple[Config, Config]:
-    """The configuration as it is kept, and as it is to be run on this machine."""
-    file, names = folder / "config.yaml", folder / "names.txt"
-    file.write_text(kept.config)
-    names.write_text("\n".join(kept.about.classes))
-    stored = load(file)
-    here = [f"detector.names={names}"] if kept.about.classes else []
+    """The configuration as it is stored, and as it is to be run on this machine."""
+    info, file, names = stored.info, folder / "config.yaml", folder / "names.txt"
+    file.write_text(stored.config)
+    names.write_bytes(info.names.encode())
+    then = load(file)
+    needed = model_path(then)
+    here = [f"detector.names={names}"] if info.names else []
     if model is not None:
         here.append(f"detector.model={model}")
-    elif stored.detector.model not in ("", "demo") and not kept.about.redacted:
-        beside = rrd.with_name(stored.detector.model)
+    elif needed is not None and needed != DEMO_MODEL and not info.redacted:
+        beside = rrd.with_name(needed.name)
         if not beside.exists():
-            was = f"{stored.detector.model}" + (
-                f" (SHA-256 {kept.about.model.sha256})" if kept.about.model else ""
-            )
-            raise UserError(f"{rrd}: it was made with {was}, which is not beside it: give --model FILE")
+            used = info.provenance.dependencies.get("detector.model", then.detector.model)
+            raise UserError(f"{rrd}: it was made with {used}, which is not beside it: give --model FILE")
         here.append(f"detector.model={beside}")
-    return stored, load(file, [*here, *settings])
+    return then, load(file, [*here, *settings])
 
 
-def _changed(kept: Kept, bag: Path, stored: Config, session: Session) -> list[str]:
-    about, config = kept.about, session.config
-    found = []
-    if file_hash(bag) != about.bag_sha256:
-        found.append(f"{bag.name} is not the file that the report was made with (SHA-256)")
-    local = ("detector.model", "detector.names")
-    for key, (then, now) in changes(config, stored).items():
-        if key not in local:
-            found.append(f"{key} was {then}, is {now}")
-    if not about.redacted:
-        model = model_of(config)
-        if model is not None and about.model is not None and model.sha256 != about.model.sha256:
-            found.append(f"model was {about.model.name} (SHA-256 {about.model.sha256}), is {model.sha256}")
-    here = dict(line.rsplit(" ", 1) for line in versions())
-    for line in kept.versions:
-        name, number = line.rsplit(" ", 1)
-        if here.get(name) != number:
-            found.append(f"{name} was {number}, is {here.get(name, 'absent')}")
-    machine = dict(line.split(": ", 1) for line in hardware(session.stages.provider).lines())
-    for line in about.hardware:
-        name, value = line.split(": ", 1)
-        if machine.get(name) != value:
-            found.append(f"{name} was {value}, is {machine.get(name)}")
-    return found
+def _changed_input(info: ReportInfo, bag: Path, then: Config, now: Config) -> Iterator[str]:
+    """The bag and the configuration, but for the files that this names, which are dependencies."""
+    if file_hash(bag) != info.bag_sha256:
+        yield f"{bag.name} is not the file that the report was made with (SHA-256)"
+    for key, change in changes(then, now).items():
+        if key not in ("detector.model", "detector.names"):
+            yield f"{key} was {change.before}, is {change.after}"
 
 
-def _count(verdict: Verdict, number: int, difference: Difference | None) -> None:
-    verdict.frames += 1
-    if difference is None:
-        verdict.exact += 1
-    elif difference.amount <= ROUNDING:
-        verdict.rounding = max(verdict.rounding, difference.amount)
-    else:
-        verdict.differing += 1
-        verdict.first = verdict.first or (number, difference)
+def _changed_provenance(info: ReportInfo, now: Config, network: str) -> Iterator[str]:
+    then = info.provenance
+    if info.redacted:  # the network is not run: what it found is in the report
+        left = {name: d for name, d in then.dependencies.items() if not name.startswith("detector.")}
+        then = replace(then, dependencies=left)
+        now = now.model_copy(update={"detector": now.detector.model_copy(update={"model": ""})})
+    return differences(then, provenance(now, network))

@@ -20,7 +20,7 @@ WHOLE = 1 << 14  # elements up to which an array is kept beside its fingerprint,
 ROUNDING = 1e-5  # of a number, or of 1: networks and geometry round differently on another processor
 
 
-class Large(NamedTuple):
+class LargeArray(NamedTuple):
     """An array that is too large to be kept."""
 
     fingerprint: str
@@ -29,17 +29,17 @@ class Large(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True)
-class Stage:
+class StageDigest:
     """What one stage made of a frame."""
 
     name: str  # with the camera behind it where there is one: "detector zed"
     fingerprint: str  # SHA-256 over names, types, shapes and bytes of its arrays
     whole: Arrays  # those of at most ``WHOLE`` elements
-    large: Mapping[str, Large]  # what is kept of the others
+    large: Mapping[str, LargeArray]  # what is kept of the others
 
 
 @dataclass(frozen=True, slots=True)
-class Difference:
+class DigestDifference:
     """Where two runs part. ``amount``: see ``ROUNDING``; infinite where it is no question of numbers."""
 
     stage: str
@@ -47,7 +47,7 @@ class Difference:
     amount: float
 
 
-def digest(result: FrameResult) -> tuple[Stage, ...]:
+def digest(result: FrameResult) -> tuple[StageDigest, ...]:
     """Each stage's results, in the order in which they depend on each other.
 
     Times, words and the picture's encoding are no part of it: the first differ from run to run, the others
@@ -56,17 +56,17 @@ def digest(result: FrameResult) -> tuple[Stage, ...]:
     return tuple(_stage(name, arrays) for name, arrays in _stages(result))
 
 
-def compare(then: tuple[Stage, ...], now: tuple[Stage, ...]) -> Difference | None:
+def compare(then: tuple[StageDigest, ...], now: tuple[StageDigest, ...]) -> DigestDifference | None:
     """The first stage that differs by more than rounding, else the one that rounds worst, else None.
 
     Numbers within ``ROUNDING`` of each other, with everything else being equal, are rounding.
     """
-    worst: Difference | None = None
+    worst: DigestDifference | None = None
     before, after = {s.name: s for s in then}, {s.name: s for s in now}
     for name in dict.fromkeys([*before, *after]):
         if name not in after or name not in before:
             there = "the report has" if name in before else "this run has"
-            return Difference(name, f"only {there} results of it", float("inf"))
+            return DigestDifference(name, f"only {there} results of it", float("inf"))
         if before[name].fingerprint == after[name].fingerprint:
             continue
         found = _difference(before[name], after[name])
@@ -77,7 +77,7 @@ def compare(then: tuple[Stage, ...], now: tuple[Stage, ...]) -> Difference | Non
     return worst
 
 
-def pack(stages: tuple[Stage, ...]) -> tuple[list[str], U8]:
+def pack(stages: tuple[StageDigest, ...]) -> tuple[list[str], U8]:
     """Lines of text and a compressed block of arrays, as a recording can hold them."""
     block: dict[str, NDArray[Any]] = {}
     for stage in stages:
@@ -90,22 +90,22 @@ def pack(stages: tuple[Stage, ...]) -> tuple[list[str], U8]:
     )
 
 
-def unpack(lines: list[str], block: U8) -> tuple[Stage, ...]:
+def unpack(lines: list[str], block: U8) -> tuple[StageDigest, ...]:
     """What ``pack`` packed."""
     whole: dict[str, dict[str, NDArray[Any]]] = defaultdict(dict)
-    large: dict[str, dict[str, Large]] = defaultdict(dict)
+    large: dict[str, dict[str, LargeArray]] = defaultdict(dict)
     with np.load(io.BytesIO(block.tobytes()), allow_pickle=False) as archive:
         for key in archive.files:
             kind, stage, name = key.split("/", 2)
             if kind == "large":
-                large[stage][name] = Large(*archive[key].tolist())
+                large[stage][name] = LargeArray(*archive[key].tolist())
             else:
                 whole[stage][name] = archive[key]
     split = [line.partition(" ")[::2] for line in lines]
-    return tuple(Stage(name, fingerprint, whole[name], large[name]) for fingerprint, name in split)
+    return tuple(StageDigest(name, fingerprint, whole[name], large[name]) for fingerprint, name in split)
 
 
-def detections_of(stages: tuple[Stage, ...]) -> dict[tuple[str, int], Detections]:
+def detections_of(stages: tuple[StageDigest, ...]) -> dict[tuple[str, int], Detections]:
     """What the network found, exactly, by camera and stamp of the image."""
     arrays = {stage.name: stage.whole for stage in stages}
     found = {}
@@ -165,7 +165,7 @@ def _arrays(part: Any, prefix: str = "") -> Iterator[tuple[str, NDArray[Any]]]:
             yield from _arrays(value, f"{prefix}{entry.name}.")
 
 
-def _stage(name: str, arrays: Arrays) -> Stage:
+def _stage(name: str, arrays: Arrays) -> StageDigest:
     content = sha256()
     whole, large = {}, {}
     for key, given in arrays.items():
@@ -177,24 +177,24 @@ def _stage(name: str, arrays: Arrays) -> Stage:
         if array.size <= WHOLE:
             whole[key] = array
         else:
-            large[key] = Large(own, str(len(array)), f"{np.sum(array, dtype=np.float64):.17g}")
-    return Stage(name, content.hexdigest(), whole, large)
+            large[key] = LargeArray(own, str(len(array)), f"{np.sum(array, dtype=np.float64):.17g}")
+    return StageDigest(name, content.hexdigest(), whole, large)
 
 
 # --- differences -------------------------------------------------------------------------------
 
 
-def _difference(then: Stage, now: Stage) -> Difference:
+def _difference(then: StageDigest, now: StageDigest) -> DigestDifference:
     """How two stages with different fingerprints differ: the array that does so by most."""
-    worst = Difference(now.name, "equal in value, but not in every bit", 0.0)  # 0.0 and -0.0
+    worst = DigestDifference(now.name, "equal in value, but not in every bit", 0.0)  # 0.0 and -0.0
     for name in dict.fromkeys([*then.whole, *then.large, *now.whole, *now.large]):
         amount, text = _array_difference(then, now, name)
         if amount > worst.amount:
-            worst = Difference(now.name, f"{name}: {text}", amount)
+            worst = DigestDifference(now.name, f"{name}: {text}", amount)
     return worst
 
 
-def _array_difference(then: Stage, now: Stage, name: str) -> tuple[float, str]:
+def _array_difference(then: StageDigest, now: StageDigest, name: str) -> tuple[float, str]:
     """By how much, infinite where that is no question of numbers, and in words."""
     rows, new_rows = _rows(then, name), _rows(now, name)
     if rows != new_rows:
@@ -225,7 +225,7 @@ def _step(old: NDArray[Any], new: NDArray[Any]) -> tuple[float, str]:
     return float(relative.max(initial=0.0)), text
 
 
-def _rows(stage: Stage, name: str) -> int:
+def _rows(stage: StageDigest, name: str) -> int:
     if name in stage.large:
         return int(stage.large[name].rows)
     return len(stage.whole[name]) if name in stage.whole else 0

@@ -3,16 +3,22 @@
 from __future__ import annotations
 
 import json
+import re
 import shlex
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from bevviz import __version__
 from bevviz.bags.source import SECOND, iso
-from bevviz.config import Config
-from bevviz.report.origin import Model, changes
+from bevviz.config import Config, ParameterChange, changes, load
+from bevviz.provenance import Dependency
 from bevviz.report.window import Window
+from bevviz.text import fenced, markdown
+
+TRACEBACKS = 5  # that are told
+_FOLDERS = re.compile(r'(?<=File ").*?([^/\\"]+[/\\][^/\\"]+)(?=")')
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -24,20 +30,24 @@ class Facts:
     where: str  # the bag, its window, and the place in it
     start: int  # log time of the recording's start: seconds count from here
     config: str  # preset in a sentence
-    changes: Mapping[str, tuple[object, object]]  # key -> value of the preset, value here
+    changes: Mapping[str, ParameterChange]  # by key; before: as the preset has it
     versions: Sequence[str]
     hardware: Sequence[str]
     warnings: Sequence[str]
+    tracebacks: Mapping[str, str]  # of errors in stages that nobody foresaw, by a heading
     files: Sequence[str]  # what lies beside the page
     commands: Sequence[str]
 
     def markdown(self) -> str:
         """The same for the recording, without what it holds already."""
-        lines = [f"# {self.title}", "", self.where, ""]
-        lines += [f"> {line}" for line in self.note.splitlines()]
+        lines = [f"# {markdown(self.title)}", "", markdown(self.where), ""]
+        lines += [f"> {markdown(line)}" for line in self.note.splitlines()]
         for title, items in (("Files", self.files), ("Warnings", self.warnings), ("Hardware", self.hardware)):
-            lines += ["", f"## {title}", "", *(f"- {item}" for item in items)] if items else []
-        return "\n".join([*lines, "", "## How to run it again", "", "```", *self.commands, "```"])
+            lines += ["", f"## {title}", "", *(f"- {markdown(item)}" for item in items)] if items else []
+        for title, traceback in self.tracebacks.items():
+            lines += ["", f"## {markdown(title)}", "", fenced(traceback)]
+        commands = fenced("\n".join(self.commands))
+        return "\n".join([*lines, "", "## How to run it again", "", commands])
 
 
 def window_text(name: str, window: Window) -> str:
@@ -58,9 +68,9 @@ def commands(rrd: Path, window: Window, config: Config, redacted: bool) -> list[
     run = ["bevviz", "bag", rrd.with_suffix(".mcap").name]
     run += ["--start", iso(window.low), "--end", iso(window.high)]
     run += ["--preset", config.preset] if config.preset != "default" else []
-    for key, (_, value) in changes(config).items():
+    for key, change in changes(load(preset=config.preset), config).items():
         run += ["--model", config.detector.model] if key == "detector.model" else []
-        run += ["--set", f"{key}={json.dumps(value)}"] if key != "detector.model" else []
+        run += ["--set", f"{key}={json.dumps(change.after)}"] if key != "detector.model" else []
     note = ["# its images are redacted: here the network sees less than it did"] if redacted else []
     return [
         f"pip install bevviz=={__version__}",
@@ -71,12 +81,20 @@ def commands(rrd: Path, window: Window, config: Config, redacted: bool) -> list[
     ]
 
 
-def file_lines(sizes: Mapping[str, str], counts: Mapping[str, int], model: Model | None) -> list[str]:
+def traceback_texts(tracebacks: Counter[tuple[str, str]]) -> dict[str, str]:
+    """The most common ones by a heading, without the folders of this machine."""
+    return {
+        f"Traceback of stage '{stage}' ({times} frame{'s' * (times > 1)})": _FOLDERS.sub(r"\1", text)
+        for (stage, text), times in reversed(tracebacks.most_common(TRACEBACKS))
+    }
+
+
+def file_lines(sizes: Mapping[str, str], counts: Mapping[str, int], model: Dependency | None) -> list[str]:
     """The files of a report, and the model that it needs."""
     lines = [f"{name}: {size}" for name, size in sizes.items()]
     if counts:
-        told = ", ".join(f"{topic} ({n})" for topic, n in sorted(counts.items()))
-        lines.append(f"messages in the bag, by topic: {told}")
+        topics = ", ".join(f"{topic} ({n})" for topic, n in sorted(counts.items()))
+        lines.append(f"messages in the bag, by topic: {topics}")
     if model is not None:
-        lines.append(f"model: {model.name}, SHA-256 {model.sha256}")
+        lines.append(f"model: {model.file}, SHA-256 {model.sha256}")
     return lines

@@ -15,39 +15,31 @@ from tqdm import tqdm
 from bevviz.bags.reader import megabytes
 from bevviz.bags.recording import RawMessage
 from bevviz.bags.source import MARGIN, BagSource
-from bevviz.config import Config
+from bevviz.config import Config, changes, load
 from bevviz.errors import UserError
 from bevviz.frame import Camera, Detections, Frame, FrameResult
 from bevviz.logging import entities
-from bevviz.logging.logger import versions
+from bevviz.logging.pieces import document
 from bevviz.logging.recorder import Recorder
 from bevviz.logging.sinks import open_recording
 from bevviz.progress import Progress
+from bevviz.provenance import Provenance, file_hash, model_path, names_path, provenance, versions
 from bevviz.report.digest import digest, pack
-from bevviz.report.facts import Facts, commands, file_lines, window_text
-from bevviz.report.origin import (
-    About,
-    Hardware,
-    changes,
-    file_hash,
-    hardware,
-    model_of,
-    model_path,
-    shareable,
-)
+from bevviz.report.facts import Facts, commands, file_lines, traceback_texts, window_text
+from bevviz.report.origin import ReportInfo, shareable
 from bevviz.report.page import page
 from bevviz.report.redact import Redactor
-from bevviz.report.story import Story
+from bevviz.report.summary import WindowSummary
 from bevviz.report.window import Cut, Window, choose_topics, cut, find_window, open_window
 from bevviz.run import Observer, run
 from bevviz.session import Session
-from bevviz.stages.detector import Detector, read_names
+from bevviz.stages.detector import Detector
 
 Found = Mapping[tuple[str, int], Detections]  # by camera and stamp of the image
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Order:
+class ReportRequest:
     """What is asked for.
 
     ``before`` and ``after`` are in seconds; ``topics``: patterns of those that go into the bag beside the
@@ -68,7 +60,7 @@ class Order:
 
 
 @dataclass(slots=True)
-class Made:
+class WrittenReport:
     """What came of it."""
 
     files: list[Path] = field(default_factory=list)
@@ -77,7 +69,7 @@ class Made:
     warnings: list[str] = field(default_factory=list)
 
 
-def make(order: Order) -> Made:
+def make(request: ReportRequest) -> WrittenReport:
     """Write the report. Interrupted while it runs, it is a report of the frames until then.
 
     The pipeline runs on the bag that was cut out, not on the whole one: so does whoever runs it again. With
@@ -87,67 +79,65 @@ def make(order: Order) -> Made:
     Raises:
         UserError: wrong input, a time outside the bag, files that exist, or that cannot be written.
     """
-    made = Made()
-    rrd, html, bag = (order.output.with_suffix(suffix) for suffix in (".rrd", ".html", ".mcap"))
-    model = model_path(order.config) if order.include_model else None
-    _check_targets(order, [rrd, html, bag], model)
+    written = WrittenReport()
+    rrd, html, bag = (request.output.with_suffix(suffix) for suffix in (".rrd", ".html", ".mcap"))
+    model = model_path(request.config) if request.include_model else None
+    _check_targets(request, [rrd, html, bag], model)
     with ExitStack() as stack:
-        whole = stack.enter_context(BagSource(order.paths, order.config, at=order.at))
-        window = find_window(whole, whole.span[0], order.before, order.after)
-        topics = choose_topics(whole.recording, whole.roles, order.topics)
+        whole = stack.enter_context(BagSource(request.paths, request.config, at=request.at))
+        window = find_window(whole, whole.span[0], request.before, request.after)
+        topics = choose_topics(whole.recording, whole.roles, request.topics)
         redactor = found = None
-        if order.redact:
-            redactor = Redactor(order.config.detector, whole.recording, whole.roles.lidars)
-            found = _detect(order, window)
+        if request.redact:
+            redactor = Redactor(request.config.detector, whole.recording, whole.roles.lidars)
+            found = _detect(request, window)
         detect = None if found is None else replay(found)
-        session = Session(order.config, detect)
+        session = Session(request.config, detect)
         part = _cut(whole, window, topics, bag, redactor)
-        made.files.append(bag)
-        made.warnings += [*whole.recording.warnings, *part.left_out, *(redactor.notes if redactor else ())]
+        written.files.append(bag)
+        written.warnings += [*whole.recording.warnings, *part.left_out, *(redactor.notes if redactor else ())]
         if model is not None:
-            made.files.append(Path(shutil.copyfile(model, rrd.with_name(model.name))))
+            written.files.append(Path(shutil.copyfile(model, rrd.with_name(model.name))))
 
-        public = shareable(order.config)
-        again = stack.enter_context(open_window([bag], order.config, window.low, window.high))
+        public = shareable(request.config)
+        source = stack.enter_context(open_window([bag], request.config, window.low, window.high))
         sinks = open_recording(whole.scene, public, save=rrd, blueprint="bug_report")
         recording = stack.enter_context(sinks).recording
-        made.files.insert(0, rrd)
-        story = Story(window.at, again.total, len(whole.scene.cameras))
-        recorder = _ReportRecorder(recording, public, story, window.at, order.note)
-        made.interrupted = run(again, session, [recorder, Progress("run")]).interrupted
-        made.frames = len(story.moments)
-        made.warnings += [w for w in again.warnings if w not in made.warnings]
-        made.warnings = [_without_folders(w, [*order.paths, bag]) for w in made.warnings]
-        machine = hardware(session.stages.provider)
-        facts = _facts(order, public, window, part, made, machine, whole.scene.name)
-        recording.send_property(
-            "report", rr.AnyValues(about=_about(order, window, made, machine, bag).dump())
-        )
-        document = rr.TextDocument(facts.markdown(), media_type=rr.MediaType.MARKDOWN)
-        recording.log(entities.REPORT, document, static=True)
+        written.files.insert(0, rrd)
+        summary = WindowSummary(window.at, source.total, len(whole.scene.cameras))
+        recorder = _ReportRecorder(recording, public, summary, window.at, request.note)
+        written.interrupted = run(source, session, [recorder, Progress("run")]).interrupted
+        written.frames = len(summary.frames)
+        written.warnings += [w for w in source.warnings if w not in written.warnings]
+        written.warnings = [_without_folders(w, [*request.paths, bag]) for w in written.warnings]
+        made_with = provenance(request.config, session.stages.provider)
+        facts = _facts(request, public, window, part, written, made_with, summary, whole.scene.name)
+        info = _info(request, window, written, made_with, bag)
+        recording.send_property("report", rr.AnyValues(about=info.dump()))
+        recording.log(entities.REPORT, document(facts.markdown()), static=True)
     try:
-        html.write_text(page(facts, story), encoding="utf-8")
+        html.write_text(page(facts, summary), encoding="utf-8")
     except OSError as error:
         raise UserError(f"{html}: cannot write the page: {error.strerror}") from None
-    made.files.insert(1, html)
-    return made
+    written.files.insert(1, html)
+    return written
 
 
 class _ReportRecorder(Recorder):
-    """Logs each frame with its fingerprints and the note, and tells the story of the page."""
+    """Logs each frame with its fingerprints and the note, and gathers what the page tells."""
 
     def __init__(
-        self, recording: rr.RecordingStream, config: Config, story: Story, at: int, note: str
+        self, recording: rr.RecordingStream, config: Config, summary: WindowSummary, at: int, note: str
     ) -> None:
         super().__init__(recording, config)
-        self._story, self._at, self._note = story, at, note
+        self._summary, self._at, self._note = summary, at, note
 
     def see(self, result: FrameResult) -> None:
         noted = self._note and result.frame.received == self._at
         self.logger.log(result, notes=[("INFO", f"note: {self._note}")] if noted else ())
         lines, block = pack(digest(result))
         self.recording.log(entities.DIGEST, rr.AnyValues(stages=lines, arrays=block))
-        self._story.add(result)
+        self._summary.add(result)
 
 
 def replay(found: Found) -> Callable[[Camera], Detections | None]:
@@ -159,20 +149,20 @@ def replay(found: Found) -> Callable[[Camera], Detections | None]:
     return detect
 
 
-def _check_targets(order: Order, targets: Sequence[Path], model: Path | None) -> None:
-    output = order.output
+def _check_targets(request: ReportRequest, targets: Sequence[Path], model: Path | None) -> None:
+    output = request.output
     if output.suffix != ".rrd":
         raise UserError(f"-o {output}: expected a file name that ends in .rrd")
     if not output.parent.is_dir():
         raise UserError(f"-o {output}: there is no folder {output.parent}")
-    if order.include_model and model is None:
+    if request.include_model and model is None:
         raise UserError("--include-model: there is no model: give --model FILE.onnx")
     copy = [] if model is None else [output.with_name(model.name)]
-    given = {path.resolve() for path in order.paths} | ({model.resolve()} if model is not None else set())
+    given = {path.resolve() for path in request.paths} | ({model.resolve()} if model is not None else set())
     for target in [*targets, *copy]:
         if target.resolve() in given:
             raise UserError(f"-o {output}: {target} is what is read; give another name")
-        if target.exists() and not order.force:
+        if target.exists() and not request.force:
             raise UserError(f"{target} exists already; --force overwrites it")
 
 
@@ -197,9 +187,9 @@ class _Detections(Observer[Found]):
         self.found |= found
 
 
-def _detect(order: Order, window: Window) -> Found:
-    detections = _Detections(order.config)
-    with open_window(order.paths, order.config, window.low, window.high) as source:
+def _detect(request: ReportRequest, window: Window) -> Found:
+    detections = _Detections(request.config)
+    with open_window(request.paths, request.config, window.low, window.high) as source:
         if run(source, detections, [detections, Progress("detect")]).interrupted:
             raise KeyboardInterrupt
     return detections.found
@@ -220,60 +210,69 @@ def _cut(
         return cut(source.recording, window, topics, source.roles.tf_static, bag, edit)
 
 
-def _about(order: Order, window: Window, made: Made, machine: Hardware, bag: Path) -> About:
-    return About(
+def _info(
+    request: ReportRequest, window: Window, written: WrittenReport, made_with: Provenance, bag: Path
+) -> ReportInfo:
+    return ReportInfo(
         low=window.low,
         high=window.high,
         at=window.at,
         bag_sha256=file_hash(bag),
-        model=model_of(order.config),
-        classes=_class_names(order.config),
-        hardware=machine.lines(),
-        redacted=order.redact,
-        interrupted=made.interrupted,
-        note=order.note,
-        warnings=made.warnings,
+        provenance=made_with,
+        names=_class_names(request.config),
+        redacted=request.redact,
+        interrupted=written.interrupted,
+        note=request.note,
+        warnings=written.warnings,
     )
 
 
 def _facts(
-    order: Order, public: Config, window: Window, part: Cut, made: Made, machine: Hardware, name: str
+    request: ReportRequest,
+    public: Config,
+    window: Window,
+    part: Cut,
+    written: WrittenReport,
+    made_with: Provenance,
+    summary: WindowSummary,
+    name: str,
 ) -> Facts:
     sizes = {
         path.name: f"{what}, {megabytes(path.stat().st_size)}"
         for path, what in (
-            (order.output.with_suffix(".mcap"), "the raw messages of the window"),
-            *((path, "the model") for path in made.files[2:]),
+            (request.output.with_suffix(".mcap"), "the raw messages of the window"),
+            *((path, "the model") for path in written.files[2:]),
         )
     }
-    sizes = {order.output.name: "everything that was seen, made and decided, for the Rerun viewer", **sizes}
+    sizes = {request.output.name: "everything that was seen, made and decided, for the Rerun viewer", **sizes}
     where = window_text(name, window)
-    if made.interrupted:
-        where += f"; interrupted after {made.frames} frames"
-    if order.redact:
+    if written.interrupted:
+        where += f"; interrupted after {written.frames} frames"
+    if request.redact:
         where += "; people and vehicles that the detector finds are hidden in the images"
-    title = f"{order.output.stem}: {order.note.splitlines()[0]}" if order.note else order.output.stem
-    changed = changes(public)
+    stem = request.output.stem
+    changed = changes(load(preset=public.preset), public)
     differs = f"with {len(changed)} parameter{'s' * (len(changed) > 1)} changed" if changed else "unchanged"
     return Facts(
-        title=title,
-        note=order.note,
+        title=f"{stem}: {request.note.splitlines()[0]}" if request.note else stem,
+        note=request.note,
         where=where,
         start=window.start,
         config=f"Preset {public.preset}, {differs}.",
         changes=changed,
-        versions=versions(),
-        hardware=machine.lines(),
-        warnings=made.warnings,
-        files=file_lines(sizes, part.counts, model_of(order.config)),
-        commands=commands(order.output, window, public, order.redact),
+        versions=[f"{name} {version}" for name, version in versions().items()],
+        hardware=[f"{name}: {value}" for name, value in made_with.machine.items()],
+        warnings=written.warnings,
+        tracebacks=traceback_texts(summary.tracebacks),
+        files=file_lines(sizes, part.counts, made_with.dependencies.get("detector.model")),
+        commands=commands(request.output, window, public, request.redact),
     )
 
 
-def _class_names(config: Config) -> list[str]:
-    """Of the file that the configuration names, which does not come along."""
-    names = config.detector.names
-    return list(read_names(names)) if names and config.detector.model else []
+def _class_names(config: Config) -> str:
+    """The file that the configuration names, which does not come along."""
+    path = names_path(config)
+    return "" if path is None else path.read_bytes().decode()
 
 
 def _without_folders(text: str, paths: Sequence[Path]) -> str:

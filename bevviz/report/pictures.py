@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 
 from bevviz.colors import bins, class_color, turbo
-from bevviz.frame import U8, Bool, CameraResult, Decision, DetectionState
+from bevviz.frame import U8, Bool, CameraResult, Decision
 from bevviz.logging.entities import DEPTH_BINS, DEPTH_RANGE
 
 
@@ -31,7 +31,7 @@ def camera_picture(
     found = result.detections
     if found is None:
         return picture
-    kept = np.flatnonzero(found.state == DetectionState.KEPT)
+    kept = np.flatnonzero(found.kept)
     matched = np.zeros(len(found), bool)
     if result.fusion is not None:
         matched = result.fusion.detection_decision == Decision.MATCHED

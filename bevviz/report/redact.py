@@ -16,7 +16,7 @@ from bevviz.config import DetectorConfig
 from bevviz.errors import UserError
 from bevviz.frame import F32, U8
 from bevviz.ros.messages import MessageError, decode_compressed_image, decode_image
-from bevviz.stages.detector import Detector
+from bevviz.stages.detector import MAX_CANDIDATES, Detector
 
 SCORE = 0.01  # candidates from here on are hidden: rather too much than too little
 CELLS = 8  # along the longer side of a box: one or two for a face or a plate
@@ -42,7 +42,7 @@ class Redactor:
     find stays as it is.
 
     Args:
-        config: the detector. Its thresholds and its choice of classes do not count here.
+        config: the detector. Its thresholds, limits and choice of classes do not count here.
         recording: which the messages are of.
         lidars: topics whose clouds are kept even where their points have colours.
 
@@ -55,7 +55,13 @@ class Redactor:
             raise UserError(
                 "--redact needs a detector that finds people and vehicles: give --model FILE.onnx"
             )
-        settings = {"classes": (), "conf_threshold": SCORE, "explain_threshold": SCORE}
+        settings = {
+            "classes": (),
+            "conf_threshold": SCORE,
+            "explain_threshold": SCORE,
+            "iou_threshold": 1.0,  # nothing is suppressed: what lies outside the image would do that, too
+            "max_candidates": MAX_CANDIDATES,
+        }
         self._detector = Detector(config.model_copy(update=settings))
         names = [name.lower() for name in self._detector.names]
         for what, pattern in (("people", PEOPLE), ("vehicles, which plates are on", VEHICLES)):

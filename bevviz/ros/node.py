@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Sequence
-from types import TracebackType
 from typing import Any
 
+from bevviz.closing import Closing
 from bevviz.errors import UserError
 from bevviz.ros.environment import load_rclpy
 
 
-class Node:
+class Node(Closing):
     """One context with two nodes, each spun by a thread of its own from ``start`` to ``close``.
 
     ``node`` is the one that users meet: it has the name, the parameters and the services, and publishes.
@@ -116,11 +116,3 @@ class Node:
         self.input.destroy_node()
         self.node.destroy_node()
         self._context.try_shutdown()
-
-    def __enter__(self) -> Node:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()

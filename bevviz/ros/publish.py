@@ -9,7 +9,7 @@ import numpy as np
 
 from bevviz.config import Config
 from bevviz.errors import UserError
-from bevviz.frame import I64, Boxes3D, Cloud, Clusters, ClusterState, DetectionState, FrameResult, Image
+from bevviz.frame import I64, Boxes3D, Cloud, FrameResult, Image
 from bevviz.ros.encode import encode_boxes_2d, encode_boxes_3d, encode_cloud, encode_image, typestore
 from bevviz.ros.typesupport import message_type
 
@@ -60,8 +60,8 @@ class Publisher:
         if result.obstacles is not None and self._wanted(OBSTACLES):
             self._send(OBSTACLES, encode_cloud(Cloud(stamp, frame_id, result.obstacles)))
         if result.clusters is not None and self._wanted(CLUSTERS):
-            rows = np.flatnonzero(result.clusters.state == ClusterState.KEPT)
-            boxes = _rows(self._boxes(result.clusters), rows)
+            rows = np.flatnonzero(result.clusters.kept)
+            boxes = _rows(result.clusters.boxes(self._config.clustering), rows)
             names = [[(f"cluster_{row}", 1.0)] for row in rows]
             self._send(CLUSTERS, encode_boxes_3d(stamp, frame_id, boxes, names))
         if self._wanted(DETECTIONS):
@@ -77,12 +77,9 @@ class Publisher:
             image, found = camera.camera.image, camera.detections
             if image is None or found is None:
                 continue
-            rows = np.flatnonzero(found.state == DetectionState.KEPT)
+            rows = np.flatnonzero(found.kept)
             results = [[(found.names[row], float(found.score[row]))] for row in rows]
             self._send(DETECTIONS, encode_boxes_2d(image.stamp, image.frame_id, found.xyxy[rows], results))
-
-    def _boxes(self, clusters: Clusters) -> Boxes3D:
-        return clusters.obb if self._config.clustering.boxes == "oriented" else clusters.aabb
 
     def _wanted(self, topic: str) -> bool:
         publisher = self._publishers.get(topic)

@@ -11,6 +11,7 @@ from types import MappingProxyType
 
 from bevviz.config import SourceConfig
 from bevviz.errors import UserError
+from bevviz.logging.entities import RESERVED
 
 
 @dataclass(frozen=True, slots=True)
@@ -313,7 +314,6 @@ _IMAGE_WORDS = re.compile(
     r"(?:image|rgb|colou?r|raw|rect|gray|mono|rectified)(?:_(?:image|rgb|colou?r|raw|rect|gray|mono))*"
 )
 _WEAK = {"left", "right", "front", "rear", "back", "center", "camera", "cam", "sensor", "driver", "points"}
-_TAKEN = ("bev", "frustums", "fused", "ground_truth", "lidars")  # entities of /world beside the sensors
 
 
 def entity_name(topic: str, frame_id: str = "") -> str:
@@ -353,10 +353,10 @@ def _unique_names(named: Sequence[tuple[str, Topic]]) -> list[str]:
     short = [name for name, _ in named]
     unique: list[str] = []
     for name, topic in named:
-        if short.count(name) > 1 or name in _TAKEN:
+        if short.count(name) > 1 or name in RESERVED:
             name = _clean("_".join(_device(topic.name)))
         number, free = 2, name
-        while free in unique or free in _TAKEN:
+        while free in unique or free in RESERVED:
             free, number = f"{name}_{number}", number + 1
         unique.append(free)
     return unique

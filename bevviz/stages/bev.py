@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from bevviz.colors import class_color, turbo
 from bevviz.config import BevConfig
-from bevviz.frame import F32, I32, U8, Bev, Bool, Boxes3D, Clusters, ClusterState, Objects
+from bevviz.frame import F32, I32, U8, Bev, Bool, Boxes3D, Clusters, Objects
 from bevviz.geometry import corners
 from bevviz.stages.kernel import kernel
 
@@ -232,7 +232,7 @@ def _draw_reference(image: U8, objects: Objects, scale: F32) -> None:
 def _draw_rich(image: U8, objects: Objects | None, clusters: Clusters | None, config: BevConfig) -> None:
     named = set() if objects is None else set(objects.cluster.tolist())
     if clusters is not None:
-        rows = [k for k in np.flatnonzero(clusters.state == ClusterState.KEPT).tolist() if k not in named]
+        rows = [k for k in np.flatnonzero(clusters.kept).tolist() if k not in named]
         outlines = _pixels(corners(clusters.obb)[rows, :4, :2], config)
         cv2.polylines(image, list(outlines), True, _UNNAMED, 1, cv2.LINE_AA, _SHIFT)
     if objects is None:

@@ -20,7 +20,6 @@ from bevviz.frame import (
     Bool,
     Boxes3D,
     Clusters,
-    ClusterState,
     Detections,
     DetectionState,
     Ground,
@@ -153,7 +152,7 @@ def placed(
     """Boxes that no detection named, each with the kept cluster that has most points in it, -1: none."""
     own = np.full(len(boxes), -1, np.int32)
     if obstacles is not None and clusters is not None:
-        kept = np.append(clusters.state == ClusterState.KEPT, False)
+        kept = np.append(clusters.kept, False)
         candidates = np.flatnonzero(kept[clusters.labels])  # noise, -1, is the last
         points, labels = obstacles[candidates], clusters.labels[candidates]
         for k in range(len(boxes)):

@@ -16,10 +16,8 @@ from bevviz.frame import (
     Boxes3D,
     CameraResult,
     Clusters,
-    ClusterState,
     Decision,
     Detections,
-    DetectionState,
     Fusion,
     Intrinsics,
     Objects,
@@ -97,7 +95,7 @@ def fuse(
     best_cluster = _first_of_each(pairs.detection, order)
     best_detection = _first_of_each(pairs.cluster, order)
     detection_decision, detection_cluster = _decide(
-        np.where(detections.state == DetectionState.KEPT, Decision.NO_CLUSTER, Decision.NOT_KEPT),
+        np.where(detections.kept, Decision.NO_CLUSTER, Decision.NOT_KEPT),
         pairs.detection[best_cluster],
         pairs.cluster[best_cluster],
         reason[best_cluster],
@@ -105,7 +103,7 @@ def fuse(
     in_view = np.isfinite(cluster_uv[:, 0])
     cluster_decision, cluster_detection = _decide(
         np.where(
-            clusters.state != ClusterState.KEPT,
+            ~clusters.kept,
             Decision.NOT_KEPT,
             np.where(in_view, Decision.NO_DETECTION, Decision.OUT_OF_VIEW),
         ),
@@ -144,7 +142,7 @@ def merge(clusters: Clusters, cameras: Sequence[CameraResult], config: Clusterin
             if k not in best or score > best[k][0]:
                 best[k] = score, result.detections.names[d], result.camera.name, d
     rows = sorted(best)
-    boxes = clusters.obb if config.boxes == "oriented" else clusters.aabb
+    boxes = clusters.boxes(config)
     return Objects(
         boxes=Boxes3D(boxes.center[rows], boxes.size[rows], boxes.yaw[rows]),
         names=tuple(best[k][1] for k in rows),
@@ -252,10 +250,10 @@ def _frustum_pairs(
     config: FusionConfig,
 ) -> tuple[Pairs, I32]:
     """Every kept detection with every kept cluster in its frustum; TAKEN, or the rule that forbids it."""
-    kept = np.flatnonzero(detections.state == DetectionState.KEPT)
+    kept = np.flatnonzero(detections.kept)
     point = np.concatenate([np.zeros(0, np.int64), *(inside[d] for d in kept)])
     detection = np.repeat(kept, [len(inside[d]) for d in kept])
-    usable = np.append(clusters.state == ClusterState.KEPT, False)[labels[point]]  # noise, -1, is the last
+    usable = np.append(clusters.kept, False)[labels[point]]  # noise, -1, is the last
     point, detection = point[usable], detection[usable]
 
     key = detection * max(len(clusters), 1) + labels[point]
@@ -310,8 +308,8 @@ def _centroid_pairs(
 ) -> tuple[Pairs, I64]:
     """Every kept detection with every kept cluster before the camera, and their order by distance."""
     center = apply(camera_from_points, clusters.centroid)
-    kept = np.flatnonzero(detections.state == DetectionState.KEPT)
-    ahead = np.flatnonzero((clusters.state == ClusterState.KEPT) & (center[:, 2] > 0))
+    kept = np.flatnonzero(detections.kept)
+    ahead = np.flatnonzero(clusters.kept & (center[:, 2] > 0))
     detection, cluster = (a.ravel() for a in np.meshgrid(kept, ahead, indexing="ij"))
     on_image = center[cluster] @ intrinsics.K.T.astype(np.float32)
     point = on_image[:, :2] / on_image[:, 2:]

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from bevviz import geometry
 from bevviz.config import TrackingConfig
-from bevviz.frame import F32, F64, I32, I64, Bool, Boxes3D, Clusters, ClusterState, Frame, Objects, Tracks
+from bevviz.frame import F32, F64, I32, I64, Bool, Boxes3D, Clusters, Frame, Objects, Tracks
 from bevviz.stages.fusion import assign
 from bevviz.stages.kernel import kernel
 
@@ -118,7 +118,7 @@ class Tracker:
         if not 0 <= dt <= config.reset_after or place != self._frame:
             self._state, self._stamps, self._frame, dt = _State.empty(), [], place, 0.0
             self._state.votes = np.zeros((0, len(self._classes)))
-        kept = np.flatnonzero(clusters.state == ClusterState.KEPT)
+        kept = np.flatnonzero(clusters.kept)
         pose = frame.pose
         boxes = _placed(clusters.obb, kept, pose)
 

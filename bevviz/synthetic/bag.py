@@ -2,16 +2,26 @@
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Iterable
 from pathlib import Path
 from types import TracebackType
 from typing import Any
 
-from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
-from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.interfaces import (
+    Connection,
+    ConnectionExtRosbag2,
+    MessageDefinition,
+    MessageDefinitionFormat,
+    Qos,
+    QosDurability,
+    QosHistory,
+    QosLiveliness,
+    QosReliability,
+    QosTime,
+)
 
 from bevviz import geometry
+from bevviz.bags.mcap_writer import McapWriter
 from bevviz.errors import UserError
 from bevviz.frame import Frame
 from bevviz.ros.encode import (
@@ -55,38 +65,19 @@ class BagWriter:
             raise UserError(f"{path}: a bag is written as MCAP, so its name must end in .mcap")
         if path.exists():
             raise UserError(f"{path} exists already; remove it or give another name")
-        self._source, self._path = source, path
+        self._source = source
+        self._writer = McapWriter(path, lambda connection: connection.msgdef, compress=False)
+        self._connections = {topic: _connection(topic, kind) for topic, kind in TOPICS.items()}
 
     def __enter__(self) -> BagWriter:
-        try:
-            # rosbags makes a folder with metadata.yaml; one .mcap is complete without, and is moved out.
-            self._folder = tempfile.TemporaryDirectory(prefix=".bevviz-", dir=self._path.parent)
-        except OSError as error:
-            raise UserError(f"{self._path}: cannot write the bag: {error.strerror}") from None
-        self._writer = Writer(Path(self._folder.name) / "bag", version=9, storage_plugin=StoragePlugin.MCAP)
-        self._writer.open()
-        self._topics = {
-            topic: self._writer.add_connection(
-                topic, kind, typestore=typestore(), offered_qos_profiles=[_qos(latched=topic == "/tf_static")]
-            )
-            for topic, kind in TOPICS.items()
-        }
+        self._writer.__enter__()
         self._put("/tf_static", drive.START, mounting(self._source))
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        try:
-            if kind is None:
-                self._writer.close()
-                next(Path(self._folder.name).glob("bag/*.mcap")).replace(self._path)
-            else:
-                self._writer.abort()
-        except OSError as failure:
-            raise UserError(f"{self._path}: cannot write the bag: {failure.strerror}") from None
-        finally:
-            self._folder.cleanup()
+        self._writer.__exit__(kind, error, trace)
 
     def write(self, frame: Frame) -> None:
         """Append one frame, with odometry and transforms up to the next one."""
@@ -95,10 +86,7 @@ class BagWriter:
 
     def _put(self, topic: str, received: int, message: Any) -> None:
         data = typestore().serialize_cdr(message, TOPICS[topic])
-        try:
-            self._writer.write(self._topics[topic], received, data)
-        except OSError as error:
-            raise UserError(f"{self._path}: cannot write the bag: {error.strerror}") from None
+        self._writer.write(self._connections[topic], received, data)
 
 
 def mounting(source: SyntheticSource) -> Any:
@@ -152,6 +140,13 @@ def write_bag(source: SyntheticSource, path: Path, frames: Iterable[Frame] | Non
     with BagWriter(source, path) as bag:
         for frame in source if frames is None else frames:
             bag.write(frame)
+
+
+def _connection(topic: str, kind: str) -> Connection:
+    definition, digest = typestore().generate_msgdef(kind, ros_version=2)
+    message = MessageDefinition(MessageDefinitionFormat.MSG, definition)
+    extra = ConnectionExtRosbag2("cdr", [_qos(latched=topic == "/tf_static")])
+    return Connection(0, topic, kind, message, digest, 0, extra, None)
 
 
 def _qos(latched: bool) -> Qos:

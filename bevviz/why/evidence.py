@@ -143,7 +143,7 @@ class Traces:
             named = np.zeros(len(clusters) + 1, np.bool_)  # noise, -1, is the last
             if result.objects is not None:
                 named[result.objects.cluster] = True
-            aside = np.append(clusters.state != ClusterState.KEPT, False)
+            aside = np.append(~clusters.kept, False)
             self.fate[aside[self.cluster]] = Fate.SET_ASIDE
             self.fate[named[self.cluster]] = Fate.REPORTED
             self.fate[self.cluster < 0] = Fate.NOISE

@@ -281,9 +281,8 @@ def _detection(found: CameraResult, row: int) -> Subject:
     name = f"{detections.names[row]} {detections.score[row]:.2f} in {found.camera.name}"
     fusion = found.fusion
     if fusion is not None and fusion.detection_decision[row] == Decision.MATCHED:
-        k = int(fusion.detection_cluster[row])
-        pair = (fusion.pairs.detection == row) & (fusion.pairs.cluster == k)
-        name += f" at {float(fusion.pairs.depth[pair][0]):.1f} m"
+        pair = fusion.pair(row, int(fusion.detection_cluster[row]))
+        name += f" at {pair.depth:.1f} m" if pair is not None else ""
     return Subject(
         "detection", f"the {name}", detections.names[row], row, found.camera.name, detections.xyxy[row]
     )

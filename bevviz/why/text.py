@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 
+from bevviz.text import markdown, printable
 from bevviz.why.answer import Answer
 
 
 def plain(answers: Sequence[Answer], chains: int) -> str:
     """The verdicts, worst first; under the first ``chains`` of them the stages."""
-    return "\n".join(_plain(answers, chains))
+    return "\n".join(map(printable, _plain(answers, chains)))
 
 
 def _plain(answers: Sequence[Answer], chains: int) -> Iterator[str]:
@@ -24,22 +25,22 @@ def _plain(answers: Sequence[Answer], chains: int) -> Iterator[str]:
         yield from (f"- {answer.verdict.text}" for answer in answers[chains:])
 
 
-def markdown(answers: Sequence[Answer], chains: int) -> str:
-    return "\n".join(_markdown(answers, chains))
+def page(answers: Sequence[Answer], chains: int) -> str:
+    return "\n".join(_page(answers, chains))
 
 
-def _markdown(answers: Sequence[Answer], chains: int) -> Iterator[str]:
+def _page(answers: Sequence[Answer], chains: int) -> Iterator[str]:
     for answer in answers[:chains]:
         yield f"### {answer.verdict.reason.value}"
         yield ""
-        yield f"**{answer.verdict.text}**"
+        yield f"**{markdown(answer.verdict.text)}**"
         yield ""
-        yield from (f"- *{step.stage}*: {step.text}" for step in answer.steps)
+        yield from (f"- *{step.stage}*: {markdown(step.text)}" for step in answer.steps)
         yield ""
     if len(answers) > chains:
         yield "### more"
         yield ""
-        yield from (f"- {answer.verdict.text}" for answer in answers[chains:])
+        yield from (f"- {markdown(answer.verdict.text)}" for answer in answers[chains:])
         yield ""
     yield (
         "Points: brown ground, red noise, orange set aside, yellow in a cluster without a name, "

@@ -289,17 +289,14 @@ def _because_detected(
 def _pair(result: FrameResult, best: Candidate) -> str:
     """The number that the fusion's rule looked at."""
     fusion = next(c for c in result.cameras if c.camera.name == best.camera).fusion
-    if fusion is None or best.cluster < 0:
-        return ""
-    pairs = fusion.pairs
-    row = np.flatnonzero((pairs.detection == best.row) & (pairs.cluster == best.cluster))
-    if len(row) == 0:
+    pair = None if fusion is None else fusion.pair(best.row, best.cluster)
+    if pair is None:
         return ""
     if best.decision is Decision.LOW_OVERLAP:
-        return f"IoU {pairs.iou[row[0]]:.2f}"
+        return f"IoU {pair.iou:.2f}"
     if best.decision is Decision.TOO_FEW_POINTS:
-        return _count(int(pairs.points[row[0]]), "point")
-    return f"{pairs.distance[row[0]]:.0f} px, {pairs.depth[row[0]]:.1f} m"
+        return _count(pair.points, "point")
+    return f"{pair.distance:.0f} px, {pair.depth:.1f} m"
 
 
 def _taker(result: FrameResult, best: Candidate) -> str:

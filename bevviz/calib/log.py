@@ -1,4 +1,4 @@
-"""What ``bevviz calib`` found: points over the image as stated and as corrected, and the score curves."""
+"""Logs what ``bevviz calib`` found: points over the image, stated and corrected, and the score curves."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 import rerun as rr
 
-from bevviz import geometry
+from bevviz import geometry, table
 from bevviz.calib.axes import TIME, error_pose
 from bevviz.calib.result import Calibration, Verdict
 from bevviz.calib.shots import Shot
@@ -15,8 +15,9 @@ from bevviz.colors import bins
 from bevviz.config import LoggingConfig
 from bevviz.frame import F32, F64, Bool, Intrinsics
 from bevviz.logging import entities
-from bevviz.logging.logger import depth_annotations, encode_image
-from bevviz.logging.pieces import CORNER
+from bevviz.logging.annotations import depth_annotations
+from bevviz.logging.pieces import CORNER, document, encode_image
+from bevviz.text import fenced, markdown
 
 _STATED, _CORRECTED = (255, 80, 80), (90, 230, 120)
 _COLORS = {Verdict.FINE: (70, 160, 90), Verdict.OFF: (210, 70, 70), Verdict.UNKNOWN: (130, 130, 145)}
@@ -34,9 +35,7 @@ def log_calibration(
         config: quality of the images.
     """
     camera = result.camera
-    recording.log(
-        entities.calib_result(camera), rr.TextDocument(_text(result), media_type="text/markdown"), static=True
-    )
+    recording.log(entities.calib_result(camera), document(_page(result)), static=True)
     for axis in result.axes:
         path = entities.calib_curve(camera, axis.axis.name)
         width = np.full(len(axis.score), axis.abscissa[1] - axis.abscissa[0], np.float32)
@@ -97,16 +96,15 @@ def _inside(uv: F32, intrinsics: Intrinsics) -> Bool:
         return np.asarray(((uv > -CORNER) & (uv < [intrinsics.width, intrinsics.height])).all(axis=1))
 
 
-def _text(result: Calibration) -> str:
-    rows = [f"| {axis.axis.name} | {axis.measured} | {axis.told} |" for axis in result.axes]
+def _page(result: Calibration) -> str:
+    rows = [(axis.axis.name, axis.measured, axis.told) for axis in result.axes]
     return "\n".join(
         [
-            f"## {result.answer}\n",
-            "| axis | offset of what is stated | verdict |\n|---|---|---|",
-            *rows,
+            f"## {markdown(result.answer)}\n",
+            table.markdown([("axis", "offset of what is stated", "verdict"), *rows], "lll"),
             f"\n{result.frames} frames, {result.edges} edges. Score {result.score_stated:.3f} as stated, "
             f"{result.score_corrected:.3f} as corrected.\n",
-            *result.notes,
-            f"\n```yaml\n{result.config}```",
+            *map(markdown, result.notes),
+            f"\n{fenced(result.config, 'yaml')}",
         ]
     )

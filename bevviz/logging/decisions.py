@@ -1,16 +1,26 @@
-"""The decisions of one frame as a page of Markdown."""
+"""The decisions of one frame: a page of Markdown, and lines of the log of all frames."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 
 from bevviz.frame import Explanation, FrameResult
+from bevviz.logging import entities
+from bevviz.logging.pieces import document
+from bevviz.logging.writer import Writer
+from bevviz.text import markdown
 
 _WEAK = {"not_kept", "below_threshold", "suppressed"}
 _MANY = {"out_of_view", "too_small", "too_large"}  # clusters that are only counted and numbered
 
 
-def markdown(result: FrameResult) -> str:
+def log_decisions(to: Writer, result: FrameResult, notes: Sequence[tuple[str, str]] = ()) -> None:
+    """``notes``: level and text of further lines of the log."""
+    to.put(entities.EXPLAIN, document(page(result)))
+    to.lines(entities.EXPLAIN_LOG, [*notes, *remarks(result)])
+
+
+def page(result: FrameResult) -> str:
     """What went wrong first, then each camera's detections, best decision first, then the clusters."""
     return "\n".join(_lines(result))
 
@@ -33,17 +43,17 @@ def _lines(result: FrameResult) -> Iterator[str]:
     frame = result.frame
     yield f"### Frame {frame.index}"
     yield ""
-    yield from _section("Failures", (f"**{f.stage}**: {f.reason}" for f in result.failures))
+    yield from _section("Failures", (f"**{f.stage}**: {markdown(f.reason)}" for f in result.failures))
     problems = list(frame.problems)
     problems += [e.text for e in result.explanations if e.subject == "camera"]
-    yield from _section("Problems", problems)
+    yield from _section("Problems", map(markdown, problems))
     for camera in result.cameras:
         name = camera.camera.name
         mine = [e for e in result.explanations if e.subject == "detection" and e.camera == name]
         kept = sorted((e for e in mine if e.state not in _WEAK), key=lambda e: e.state != "matched")
         if camera.detections is not None:
             yield from _section(f"{name}: detections", map(_item, kept) if kept else ["none"])
-        yield from _section(f"{name}: not kept", (e.text for e in mine if e.state in _WEAK))
+        yield from _section(f"{name}: not kept", (markdown(e.text) for e in mine if e.state in _WEAK))
         yield from _clusters(
             [e for e in result.explanations if e.subject == "cluster" and e.camera == name], name
         )
@@ -65,13 +75,14 @@ def _clusters(explanations: list[Explanation], camera: str) -> Iterator[str]:
 
 
 def _item(explanation: Explanation) -> str:
-    return f"**{explanation.state.replace('_', ' ')}** {explanation.text}"
+    return f"**{explanation.state.replace('_', ' ')}** {markdown(explanation.text)}"
 
 
 def _section(title: str, items: Iterable[str]) -> Iterator[str]:
+    """``items`` are Markdown already."""
     lines = [f"- {item}" for item in items]
     if lines:
-        yield f"#### {title}"
+        yield f"#### {markdown(title)}"
         yield ""
         yield from lines
         yield ""

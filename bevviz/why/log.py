@@ -8,13 +8,14 @@ import numpy as np
 import rerun as rr
 
 from bevviz import geometry
-from bevviz.frame import F32, Boxes3D, Camera, Frame
+from bevviz.frame import F32, Camera, Frame
 from bevviz.logging import entities
-from bevviz.logging.pieces import CORNER, transform
+from bevviz.logging.camera import over_image
+from bevviz.logging.pieces import boxes2d, document, edges, transform
 from bevviz.why.answer import Answer
 from bevviz.why.evidence import Fate
 from bevviz.why.subject import projected
-from bevviz.why.text import markdown
+from bevviz.why.text import page
 
 COLORS = {
     Fate.GROUND: (170, 110, 60),
@@ -25,7 +26,6 @@ COLORS = {
     Fate.IN_FRONT: (80, 140, 255),
 }
 _SUBJECT = (255, 60, 200)
-_EDGES = [0, 1, 2, 3, 0, 4, 5, 1, 5, 6, 2, 6, 7, 3, 7, 4]  # every edge of a frustum in one stroke
 _DEPTH = 20.0  # metres that a frustum is drawn to where the distance is unknown
 
 
@@ -38,7 +38,7 @@ def log_answers(recording: rr.RecordingStream, frame: Frame, answers: Sequence[A
         answers: worst first.
         shown: how many of them are drawn.
     """
-    recording.log(entities.WHY, rr.TextDocument(markdown(answers, shown), media_type=rr.MediaType.MARKDOWN))
+    recording.log(entities.WHY, document(page(answers, shown)))
     pose = transform(frame.pose)
     drawn = answers[:shown]
     fate = np.zeros(len(frame.points), np.uint8)
@@ -50,7 +50,11 @@ def log_answers(recording: rr.RecordingStream, frame: Frame, answers: Sequence[A
         colors[list(COLORS)] = list(COLORS.values())
         points = rr.Points3D(frame.points[known], colors=colors[fate[known]], radii=rr.Radius.ui_points(4.0))
         recording.log(entities.why("points"), pose, points)
-    strips = [_edges(a.subject.box, a.subject.name) for a in drawn if a.subject.box is not None]
+    strips = [
+        (edges(geometry.corners(a.subject.box)[0]), a.subject.name)
+        for a in drawn
+        if a.subject.box is not None
+    ]
     strips += [strip for camera in frame.cameras for strip in _frustums(camera, drawn)]
     if strips:
         lines, names = zip(*strips, strict=True)
@@ -60,10 +64,6 @@ def log_answers(recording: rr.RecordingStream, frame: Frame, answers: Sequence[A
         recording.log(entities.why("place"), pose, place)
     for camera in frame.cameras:
         _log_image(recording, camera, drawn)
-
-
-def _edges(box: Boxes3D, name: str) -> tuple[F32, str]:
-    return geometry.corners(box)[0][_EDGES], name
 
 
 def _frustums(camera: Camera, answers: Sequence[Answer]) -> Iterator[tuple[F32, str]]:
@@ -76,7 +76,7 @@ def _frustums(camera: Camera, answers: Sequence[Answer]) -> Iterator[tuple[F32, 
         if s.xyxy is not None and s.camera == camera.name:
             far = _DEPTH if np.isnan(answer.distance) else answer.distance
             corners = geometry.frustum(s.xyxy[None], camera.intrinsics, 0.5, far)[0]
-            yield geometry.apply(points_from_camera, corners)[_EDGES], s.name
+            yield edges(geometry.apply(points_from_camera, corners)), s.name
 
 
 def _log_image(recording: rr.RecordingStream, camera: Camera, answers: Sequence[Answer]) -> None:
@@ -85,17 +85,11 @@ def _log_image(recording: rr.RecordingStream, camera: Camera, answers: Sequence[
         own = s.xyxy if s.camera == camera.name else None
         box = projected(s.box, camera) if s.box is not None else own
         if box is not None:
-            boxes.append(box + CORNER)
+            boxes.append(box)
             names.append(s.name)
     if boxes:
         recording.log(
             entities.why(f"{camera.name}/place"),
-            rr.CoordinateFrame(f"tf#{entities.image(camera.name)}"),
-            rr.Boxes2D(
-                array=np.array(boxes),
-                array_format=rr.Box2DFormat.XYXY,
-                labels=names,
-                colors=[_SUBJECT],
-                draw_order=40.0,
-            ),
+            over_image(camera.name),
+            boxes2d(np.array(boxes), names, colors=[_SUBJECT], draw_order=40.0),
         )

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from bevviz.frame import Frame, FrameResult
-from bevviz.logging.logger import health
+from bevviz.logging.health import health
 from bevviz.report.pictures import camera_picture, jpeg, shrink
 
 STRIP_PICTURES = 48  # of all cameras and the bird's-eye view together
@@ -15,7 +15,7 @@ STRIP_WIDTH = 400
 
 
 @dataclass(frozen=True, slots=True)
-class Moment:
+class FrameSummary:
     """One frame. ``states``: subject, class and state of each decision."""
 
     index: int
@@ -27,7 +27,7 @@ class Moment:
 
 
 @dataclass(slots=True)
-class Story:
+class WindowSummary:
     """The frames of a window.
 
     Args:
@@ -39,12 +39,13 @@ class Story:
     at: int
     total: int
     cameras: int
-    moments: list[Moment] = field(default_factory=list)
-    strip: list[tuple[Moment, dict[str, bytes]]] = field(default_factory=list)  # JPEGs by sensor
+    frames: list[FrameSummary] = field(default_factory=list)
+    strip: list[tuple[FrameSummary, dict[str, bytes]]] = field(default_factory=list)  # JPEGs by sensor
     result: FrameResult | None = None  # of the scan nearest to ``at``
+    tracebacks: Counter[tuple[str, str]] = field(default_factory=Counter)  # stage and traceback
     _last: Frame | None = None
 
-    def add(self, result: FrameResult) -> Moment:
+    def add(self, result: FrameResult) -> FrameSummary:
         """Take in the next frame."""
         frame = result.frame
         names = {c.camera.name: c.detections.names for c in result.cameras if c.detections is not None}
@@ -53,16 +54,17 @@ class Story:
             for e in result.explanations
             if e.subject != "camera"
         )
+        self.tracebacks.update((f.stage, f.traceback) for f in result.failures if f.traceback)
         problems = [f"{f.stage}: {f.reason}" for f in result.failures]
         problems += frame.problems
         problems += [f"{c.camera.name}: {p}" for c in result.cameras for p in c.camera.problems]
         measured = dict(health(result, self._last))
-        moment = Moment(frame.index, frame.stamp, frame.received, measured, states, tuple(problems))
-        if self._is_for_strip(len(self.moments)):
+        moment = FrameSummary(frame.index, frame.stamp, frame.received, measured, states, tuple(problems))
+        if self._is_for_strip(len(self.frames)):
             self.strip.append((moment, strip_pictures(result)))
         if self.result is None or abs(frame.received - self.at) < abs(self.result.frame.received - self.at):
             self.result = result
-        self.moments.append(moment)
+        self.frames.append(moment)
         self._last = frame
         return moment
 

@@ -1,0 +1,32 @@
+"""The views of a calibration, for layouts; see ``bevviz.logging.views``."""
+
+from __future__ import annotations
+
+import rerun.blueprint as rrb
+
+from bevviz.calib.axes import AXES
+from bevviz.logging import entities
+
+
+def alignment(camera: str) -> tuple[rrb.Spatial2DView, rrb.Spatial2DView]:
+    """Points by depth and the edges of the cloud over the image: as stated, and as corrected."""
+    return (
+        rrb.Spatial2DView(name=f"{camera}, as stated", origin=entities.calib_stated(camera)),
+        rrb.Spatial2DView(name=f"{camera}, corrected", origin=entities.calib_corrected(camera)),
+    )
+
+
+def calibration(camera: str) -> rrb.TextDocumentView:
+    """What 'bevviz calib' found."""
+    return rrb.TextDocumentView(name="Calibration", origin=entities.calib_result(camera))
+
+
+def score_curves(camera: str) -> rrb.Grid:
+    """How well the edges meet over the offset along each axis."""
+    return rrb.Grid(
+        *(
+            rrb.BarChartView(name=f"{axis.what}, {axis.unit}", origin=entities.calib_curve(camera, axis.name))
+            for axis in AXES
+        ),
+        grid_columns=2,
+    )

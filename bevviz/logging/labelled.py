@@ -1,0 +1,98 @@
+"""Boxes that somebody else states: ground truth, and what the robot itself published."""
+
+from __future__ import annotations
+
+import numpy as np
+import rerun as rr
+
+from bevviz import geometry
+from bevviz.config import BevConfig
+from bevviz.frame import F64, Frame, LabelledBoxes2D, LabelledBoxes3D
+from bevviz.logging import entities
+from bevviz.logging.bev import footprints, seen_from_above
+from bevviz.logging.camera import over_image
+from bevviz.logging.pieces import OUTLINE, boxes2d, boxes3d, scored, transform
+from bevviz.logging.writer import Writer
+
+Color = tuple[int, int, int]
+
+_TRUTH_COLOR = (215, 215, 215)
+_ROBOT_COLOR = (255, 210, 0)
+
+
+def log_truth_looks(to: Writer) -> None:
+    to.static(
+        entities.TRUTH,
+        rr.Boxes3D.from_fields(
+            colors=[_TRUTH_COLOR],
+            radii=rr.Radius.ui_points(0.5),
+            show_labels=False,
+            fill_mode=OUTLINE,
+        ),
+    )
+
+
+def log_truth(to: Writer, frame: Frame, config: BevConfig) -> None:
+    if frame.truth is not None and len(frame.truth.boxes):
+        _log_boxes(to, entities.TRUTH, frame.truth, None)
+        _log_outlines(to, entities.overlay("ground_truth"), frame, frame.truth, config, _TRUTH_COLOR)
+
+
+def log_robot(to: Writer, frame: Frame, config: BevConfig) -> None:
+    """Under the names of its topics."""
+    for labelled in frame.robot_boxes:
+        if len(labelled.boxes):
+            _log_boxes(to, entities.robot(labelled.topic), labelled, _ROBOT_COLOR)
+            _log_outlines(to, entities.robot_overlay(labelled.topic), frame, labelled, config, _ROBOT_COLOR)
+    for found in frame.robot_detections:
+        if len(found.xyxy):
+            _log_image_boxes(to, found)
+
+
+def _log_boxes(to: Writer, path: str, labelled: LabelledBoxes3D, color: Color | None) -> None:
+    to.put(
+        path,
+        transform(_pose(labelled)),
+        boxes3d(
+            labelled.boxes,
+            np.arange(len(labelled.boxes)),
+            scored(labelled.labels, labelled.scores),
+            colors=None if color is None else [color],
+        ),
+    )
+
+
+def _log_image_boxes(to: Writer, found: LabelledBoxes2D) -> None:
+    """Under /robot, but in the space of the camera's image, so that it can be shown over it."""
+    to.put(
+        entities.robot(found.topic),
+        *([over_image(found.camera)] if found.camera else []),
+        boxes2d(found.xyxy, scored(found.labels, found.scores), colors=[_ROBOT_COLOR], draw_order=25.0),
+    )
+
+
+def _log_outlines(
+    to: Writer, path: str, frame: Frame, labelled: LabelledBoxes3D, config: BevConfig, color: Color
+) -> None:
+    """Boxes seen from above, over the bird's-eye image; only those whose centre is in it."""
+    points_from_boxes = geometry.inverse(frame.pose) @ _pose(labelled)
+    reach = np.array([config.range_x, config.range_y], np.float32)
+    inside = (np.abs(geometry.apply(points_from_boxes, labelled.boxes.center)[:, :2]) < reach).all(axis=1)
+    if not inside.any():
+        return
+    outlines = footprints(geometry.corners(labelled.boxes)[inside])
+    to.put(
+        path,
+        rr.LineStrips2D(
+            seen_from_above(config, points_from_boxes, outlines),
+            colors=[color],
+            radii=rr.Radius.ui_points(0.75),
+            labels=[labelled.labels[k] for k in np.flatnonzero(inside)],
+            show_labels=False,
+            draw_order=10.0,
+        ),
+    )
+
+
+def _pose(labelled: LabelledBoxes3D) -> F64:
+    return np.eye(4) if labelled.world_from_boxes is None else labelled.world_from_boxes

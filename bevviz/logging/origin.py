@@ -1,0 +1,40 @@
+"""How a recording was made: for people on a page, for programs as the recording's property."""
+
+from __future__ import annotations
+
+import rerun as rr
+
+from bevviz.config import Config, dump
+from bevviz.frame import Scene
+from bevviz.logging import entities
+from bevviz.logging.pieces import document
+from bevviz.logging.writer import Writer
+from bevviz.provenance import versions
+from bevviz.text import fenced, markdown
+
+
+def log_origin(to: Writer, config: Config, scene: Scene) -> None:
+    """Source, configuration and versions."""
+    settings = dump(config)
+    packages = [f"{name} {version}" for name, version in versions().items()]
+    to.static(
+        entities.CONFIG,
+        document(
+            "# How this recording was made\n\n"
+            f"Source: **{markdown(scene.name)}**, preset: **{config.preset}**\n\n"
+            f"{fenced(settings, 'yaml')}\n\n" + "\n".join(f"- {line}" for line in packages)
+        ),
+    )
+    if not to.root:
+        to.recording.send_recording_name(scene.name)
+    to.recording.send_property(
+        entities.PROPERTY + to.root.replace("/", "_"),
+        rr.AnyValues(
+            source=scene.name,
+            preset=config.preset,
+            config=settings,
+            versions=packages,
+            lidars=list(scene.lidars or (scene.lidar,)),
+            cameras=list(scene.cameras) or None,
+        ),
+    )

@@ -1,0 +1,88 @@
+"""States over time, in lanes: of the pipeline, the cameras and what they see, anomalies, tracks."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import numpy as np
+import rerun as rr
+
+from bevviz import anomalies
+from bevviz.anomalies import KINDS
+from bevviz.frame import CameraResult, Decision, FrameResult, Tracks
+from bevviz.logging import entities
+from bevviz.logging.writer import Writer
+
+Color = tuple[int, int, int]
+
+COLORS: Mapping[str, Color] = {
+    "ok": (70, 160, 90),
+    "matched": (70, 160, 90),
+    "degraded": (220, 160, 50),
+    "failed": (210, 70, 70),
+    "no cluster": (210, 70, 70),
+    "too few points": (220, 160, 50),
+    "low overlap": (220, 160, 50),
+    "taken": (150, 120, 220),
+    "too far": (110, 130, 160),
+    "not fused": (110, 110, 120),
+}
+
+
+class StateLanes:
+    """Logs a lane's state where it changes. A lane without a state in a frame goes empty.
+
+    Args:
+        colors: of the states, which are text; others get the viewer's own.
+    """
+
+    def __init__(self, colors: Mapping[Any, Color]) -> None:
+        self._values, self._colors = list(colors), list(colors.values())
+        self.states: Mapping[str, str] = {}  # lane -> its latest state
+
+    def log(self, to: Writer, states: Mapping[str, str]) -> None:
+        """The states of a frame, by the entity of their lane."""
+        states = dict.fromkeys(self.states, "") | dict(states)
+        for lane, state in states.items():
+            if lane not in self.states:
+                to.static(lane, rr.StateConfiguration(values=self._values, colors=self._colors))
+            if self.states.get(lane) != state:
+                to.write(lane, rr.StateChange(state=state))
+        self.states = states
+
+
+def states_of(result: FrameResult) -> dict[str, str]:
+    """Lane -> state of the pipeline, of each camera and its classes, and of each kind of anomaly."""
+    degraded = result.frame.problems or any(c.camera.problems for c in result.cameras)
+    states = {entities.state("pipeline"): "failed" if result.failures else "degraded" if degraded else "ok"}
+    for camera in result.cameras:
+        name = camera.camera.name
+        is_fused = camera.detections is not None and camera.fusion is not None
+        states[entities.state(name)] = (
+            "degraded" if camera.camera.problems else "ok" if is_fused else "not fused"
+        )
+        for class_name, decision in _best_decisions(camera):
+            states[entities.class_state(name, class_name)] = decision
+    for kind in KINDS:
+        subjects = [anomaly.subject for anomaly in result.anomalies if anomaly.kind == kind]
+        more = f" +{len(subjects) - 1}" if subjects[1:] else ""
+        states[entities.anomaly_state(kind)] = f"{subjects[0]}{more}" if subjects else ""
+    return states
+
+
+def track_states(tracks: Tracks, rows: Mapping[int, int]) -> dict[str, str]:
+    """``rows``: lane -> row of its track."""
+    return {entities.track_state(lane): anomalies.label(tracks, row) for lane, row in rows.items()}
+
+
+def _best_decisions(camera: CameraResult) -> Iterator[tuple[str, str]]:
+    """For each class, what became of its best kept detection."""
+    if camera.detections is None or camera.fusion is None:
+        return
+    found, seen = camera.detections, set()
+    for d in np.flatnonzero(found.kept).tolist():
+        if found.names[d] not in seen:
+            seen.add(found.names[d])
+            decision = Decision(int(camera.fusion.detection_decision[d]))
+            yield found.names[d], decision.name.lower().replace("_", " ")

@@ -1,0 +1,92 @@
+"""Which values a parameter takes, as the user writes them, and the configurations that they make."""
+
+from __future__ import annotations
+
+import itertools
+import math
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from bevviz.config import Config
+from bevviz.errors import UserError
+from bevviz.frame import F64
+from bevviz.variants import check_same_frames
+
+MOST = 500  # combinations of values
+
+_NUMBER = r"[-+]?[\d.]+(?:[eE][-+]?\d+)?"
+_RANGE = re.compile(rf"\s*({_NUMBER})\s*:\s*({_NUMBER})\s*:\s*({_NUMBER})\s*")
+
+Values = tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Parameter:
+    """A dotted key and the values that it takes in turn, as they are written."""
+
+    key: str
+    values: Values
+
+    @property
+    def numbers(self) -> F64:
+        """Where the values are on an axis: the numbers that they are, else 0, 1, 2 ..."""
+        try:
+            return np.array([float(value) for value in self.values])
+        except ValueError:
+            return np.arange(len(self.values), dtype=np.float64)
+
+
+def parse(settings: Sequence[str]) -> tuple[list[Parameter], list[str]]:
+    """Split ``key=value`` settings: with a range ``a:b:step`` or a list ``x,y,z``, and constant ones.
+
+    Raises:
+        UserError: a range that leads nowhere, none at all, more than two, or too many values.
+    """
+    swept, constant = [], []
+    for text in settings:
+        key, _, value = text.partition("=")
+        found = _RANGE.fullmatch(value)
+        if found:
+            swept.append(Parameter(key.strip(), _range(text, *map(float, found.groups()))))
+        elif "," in value and value.strip()[0] not in "[{\"'":
+            swept.append(Parameter(key.strip(), tuple(part.strip() for part in value.split(","))))
+        else:
+            constant.append(text)
+    if not swept:
+        raise UserError("sweep: over what? Give a range or a list, e.g. --set clustering.eps=0.3:0.9:0.1")
+    if len(swept) > 2:
+        raise UserError(f"sweep: two parameters at most, not {len(swept)}: {', '.join(p.key for p in swept)}")
+    number = math.prod(len(parameter.values) for parameter in swept)
+    if number > MOST:
+        raise UserError(f"sweep: {number} combinations are more than {MOST}; take larger steps")
+    return swept, constant
+
+
+def _range(text: str, first: float, last: float, step: float) -> Values:
+    if step <= 0 or last < first:
+        raise UserError(f"--set {text}: expected first:last:step with last >= first and step > 0")
+    number = int((last - first) / step + 1e-6) + 1
+    if number > MOST:
+        raise UserError(f"--set {text}: {number} values are more than {MOST}; take larger steps")
+    return tuple(f"{first + i * step:.10g}" for i in range(number))
+
+
+def combine(parameters: Sequence[Parameter], load: Callable[[list[str]], Config]) -> dict[Values, Config]:
+    """Every combination of values.
+
+    Args:
+        parameters: one or two.
+        load: makes the configuration of further settings.
+
+    Raises:
+        UserError: an unknown key, a value out of range, or a key that changes what frames are made of.
+    """
+    configs = {}
+    for values in itertools.product(*(parameter.values for parameter in parameters)):
+        stated = zip(parameters, values, strict=True)
+        configs[values] = load([f"{parameter.key}={value}" for parameter, value in stated])
+    check_same_frames({" ".join(values): config for values, config in configs.items()})
+    return configs

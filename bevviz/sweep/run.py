@@ -1,0 +1,162 @@
+"""Every combination of values on the same frames: counted, timed and held against truth."""
+
+from __future__ import annotations
+
+import csv
+import math
+from collections import Counter, defaultdict
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import Executor
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from bevviz import table
+from bevviz.config import Config
+from bevviz.counts import counts_of
+from bevviz.errors import UserError
+from bevviz.evaluate import Score, Truth
+from bevviz.frame import Frame, FrameResult
+from bevviz.sweep.parameters import Parameter, Values
+from bevviz.text import printable
+from bevviz.variants import Variants
+
+STAGES = ("voxel", "ground", "clustering", "fusion")  # each has its own time
+COUNTS = ("clusters", "detections", "matches", "objects")
+SCORES = ("precision", "recall", "F1", "error m")
+
+
+@dataclass
+class Outcome:
+    """What one combination of values has made of the frames."""
+
+    frames: int = 0
+    counts: Counter[str] = field(default_factory=Counter)
+    seconds: dict[str, list[float]] = field(default_factory=lambda: defaultdict(list))  # by stage
+    failures: int = 0
+    judged: int = 0  # frames with truth
+    score: Score = field(default_factory=Score)
+
+    def add(self, result: FrameResult, truth: Truth | None) -> None:
+        self.frames += 1
+        self.failures += len(result.failures)
+        self.counts.update(counts_of(result))
+        self.counts["objects"] += 0 if result.objects is None else len(result.objects)
+        for stage in STAGES:
+            self.seconds[stage].append(result.timings.get(stage, 0.0))
+        if truth is not None and result.objects is not None:
+            self.judged += 1
+            self.score.add(result.objects, truth)
+
+    @property
+    def metrics(self) -> dict[str, float]:
+        """Means of a frame; medians of the LiDAR stages' milliseconds, shared by values or not; scores."""
+        frames = max(self.frames, 1)
+        found = {what: self.counts[what] / frames for what in COUNTS}
+        # The first frame pays for what is loaded with it: no means.
+        times = {f"{stage} ms": float(np.median(self.seconds[stage] or [0.0])) * 1e3 for stage in STAGES}
+        found |= {"time ms": sum(times.values()), **times}
+        if self.judged:
+            errors = self.score.errors
+            error = float(np.median(errors)) if errors else math.nan
+            scores = (self.score.precision, self.score.recall, self.score.f1, error)
+            found |= dict(zip(SCORES, scores, strict=True))
+        return found
+
+
+class Sweep:
+    """Runs every combination of values on each frame.
+
+    Args:
+        parameters: one or two.
+        configs: of ``combine``.
+        truth: what is really there in a frame, where that is known.
+
+    Raises:
+        UserError: a detector that cannot be used.
+    """
+
+    def __init__(
+        self,
+        parameters: Sequence[Parameter],
+        configs: Mapping[Values, Config],
+        truth: Callable[[Frame], Truth | None] | None = None,
+    ) -> None:
+        self.parameters, self.configs = parameters, configs
+        self.outcomes = {values: Outcome() for values in configs}
+        self.truth = truth
+        self._variants = Variants()
+        for config in configs.values():
+            self._variants.check(config)
+
+    def perceive(self, frame: Frame, network: Executor | None = None) -> int:
+        """Run everything on the frame. Returns its index."""
+        truth = self.truth(frame) if self.truth else None
+        for values, config in self.configs.items():
+            self.outcomes[values].add(self._variants.perceive(frame, config, network), truth)
+        return frame.index
+
+    def finish(self, index: int) -> int:
+        return index
+
+    @property
+    def best(self) -> Values | None:
+        """The values with the greatest F1; None where nothing could be judged."""
+        rated = {v: o.score.f1 for v, o in self.outcomes.items() if o.judged and not math.isnan(o.score.f1)}
+        return max(rated, key=lambda values: rated[values]) if rated else None
+
+    @property
+    def title(self) -> str:
+        return "Sweep over " + " and ".join(parameter.key for parameter in self.parameters)
+
+    def table(self) -> str:
+        """For the terminal."""
+        frames = max(outcome.frames for outcome in self.outcomes.values())
+        lines = [f"{frames} frames; means of a frame, median milliseconds", ""]
+        lines += table.lines([*self.rows("time ms")])
+        if self.best is not None:
+            where = ", ".join(f"{p.key} = {v}" for p, v in zip(self.parameters, self.best, strict=True))
+            lines += ["", f"best F1: {self.outcomes[self.best].score.f1:.3f} at {printable(where)}"]
+        failures = sum(outcome.failures for outcome in self.outcomes.values())
+        return "\n".join([*lines, *([f"{failures} stages failed"] if failures else [])])
+
+    def rows(self, last: str) -> Iterator[tuple[str, ...]]:
+        """The header and a row for each combination; of the times only ``last``."""
+        names = [n for n in self._metrics() if not n.endswith(" ms") or n == last]
+        yield (*(parameter.key for parameter in self.parameters), *names)
+        for values, outcome in self.outcomes.items():
+            metrics = outcome.metrics
+            yield (*values, *(_number(name, metrics.get(name, math.nan)) for name in names))
+
+    def _metrics(self) -> list[str]:
+        return max((list(outcome.metrics) for outcome in self.outcomes.values()), key=len)
+
+    def write_csv(self, path: Path) -> None:
+        """A row for each combination: every number of the table, each stage's time, counts by class.
+
+        Raises:
+            UserError: the file cannot be written.
+        """
+        names = self._metrics()
+        classes = sorted({name for o in self.outcomes.values() for name in o.score.names})
+        kinds = ("tp", "fp", "fn")
+        header = [p.key for p in self.parameters] + ["frames", *names]
+        header += [f"{name} {kind}" for name in classes for kind in kinds]
+        try:
+            with path.open("w", newline="") as file:
+                writer = csv.writer(file)
+                writer.writerow(header)
+                for values, outcome in self.outcomes.items():
+                    metrics = outcome.metrics
+                    by_class = [outcome.score.classes[name][kind] for name in classes for kind in kinds]
+                    rounded = (f"{metrics.get(name, math.nan):.6g}" for name in names)
+                    writer.writerow([*values, outcome.frames, *rounded, *by_class])
+        except OSError as error:
+            raise UserError(f"--csv {path}: cannot be written: {error.strerror}") from None
+
+
+def _number(name: str, value: float) -> str:
+    if math.isnan(value):
+        return "-"
+    return f"{value:.3f}" if name in SCORES[:3] else f"{value:.2f}" if name == "error m" else f"{value:.1f}"
