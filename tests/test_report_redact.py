@@ -211,6 +211,21 @@ def test_every_candidate_is_hidden_however_many_the_configuration_keeps(
     assert len(found) == PEOPLE
 
 
+def test_what_lies_outside_the_image_hides_nobody_in_it(tmp_path: Path) -> None:
+    """A stronger box that nobody sees would suppress one that somebody does."""
+    pytest.importorskip("onnx", reason="the test networks are built with onnx")
+    from tests.test_detector import H, W, constant, head
+
+    boxes = np.array([[-50.0, 0, -1, 40], [-45, 0, 6, 40]])
+    output = head("YOLOv8", boxes, np.array([0.9, 0.8]), np.array([0, 0]))
+    names = {"names": "['person', 'car', 'dog']"}
+    config = DetectorConfig(model=constant(tmp_path / "edge.onnx", output, metadata=names), threads=1)
+    bag = bags.write(tmp_path / "drive", bags.small_items(scans=1))
+    with Bag([bag]) as recording:
+        found = Redactor(config, recording).find(np.zeros((H, W, 3), np.uint8))
+    np.testing.assert_allclose(found, [[-0.5, -0.5, 5.5, 39.5]], atol=1e-4)
+
+
 # --- hiding ------------------------------------------------------------------------------------
 
 SIDE = st.floats(-20, 140, width=32)
