@@ -19,7 +19,7 @@ from bevviz.cli import main
 from bevviz.config import DetectorConfig
 from bevviz.frame import F32, U8
 from bevviz.report.pictures import shrink
-from bevviz.report.redact import CELLS, Redactor, grown, hide
+from bevviz.report.redact import CELLS, Redactor, _encoded, grown, hide
 from bevviz.report.summary import STRIP_WIDTH
 from bevviz.ros.messages import decode_compressed_image, decode_image
 from tests import bags
@@ -224,6 +224,15 @@ def test_what_lies_outside_the_image_hides_nobody_in_it(tmp_path: Path) -> None:
     with Bag([bag]) as recording:
         found = Redactor(config, recording).find(np.zeros((H, W, 3), np.uint8))
     np.testing.assert_allclose(found, [[-0.5, -0.5, 5.5, 39.5]], atol=1e-4)
+
+
+@pytest.mark.parametrize("form", [".jpg", ".png", ".webp"])
+def test_what_was_changed_keeps_its_form(form: str) -> None:
+    magic = cv2.imencode(form, np.zeros((8, 8, 3), np.uint8))[1].tobytes()[:8]
+    grey = np.full((16, 16, 3), 77, np.uint8)
+    data = _encoded(grey, magic)
+    assert data[:4].tobytes() == magic[:4]
+    assert np.abs(cv2.imdecode(data, cv2.IMREAD_COLOR).astype(int) - 77).max() <= 1
 
 
 # --- hiding ------------------------------------------------------------------------------------
