@@ -47,7 +47,9 @@ class SyncReport:
     idle: str = ""  # topic of the LiDAR that should drive, while only others deliver
     unstamped: Counter[str] = field(default_factory=Counter)  # topic -> messages with stamp zero
     without_image: Counter[str] = field(default_factory=Counter)  # camera -> frames
+    images: int = 0  # of all cameras, decoded
     undecodable: Counter[str] = field(default_factory=Counter)  # camera -> images
+    first_undecodable: dict[str, str] = field(default_factory=dict)  # camera -> why the first was
     problems: Counter[str] = field(default_factory=Counter)  # missing transforms and CameraInfo -> frames
     tf: TransformBuffer = field(default_factory=TransformBuffer)  # for what looked wrong in the transforms
 
@@ -78,7 +80,8 @@ class SyncReport:
         for camera, n in self.without_image.items():
             found.append(f"{n} of {self.frames} frames have no image of camera '{camera}'")
         for camera, n in self.undecodable.items():
-            found.append(f"camera '{camera}': an image could not be decoded {_times(n)}")
+            first = self.first_undecodable[camera]
+            found.append(f"camera '{camera}': an image could not be decoded {_times(n)}, the first: {first}")
         found += [f"{text} ({n} of {self.frames} frames)" for text, n in self.problems.items()]
         return (*found, *self.tf.problems)
 
@@ -571,9 +574,12 @@ class Synchronizer:
             problems.append(f"no image of camera '{role.name}' {self._nearest(nearest, stamp)}")
             return None, stamp
         try:
-            return replace(nearest[1].load(), stamp=nearest[0]), nearest[0]
+            image = replace(nearest[1].load(), stamp=nearest[0])
+            self.report.images += 1
+            return image, nearest[0]
         except UserError as error:
             self.report.undecodable[role.name] += 1
+            self.report.first_undecodable.setdefault(role.name, str(error))
             problems.append(str(error))
             return None, stamp
 
@@ -597,10 +603,11 @@ class Synchronizer:
             self._complain(problems, f"{missing} yet: using fx = fy = 267, cx 320, cy 180 of the reference")
             height, width = image.bgr.shape[:2] if image is not None else (360, 640)
             return Intrinsics(width, height, TUTORIAL_K, assumed=True)
+        others = [topic for topic in self._roles.camera_infos if topic != role.info_topic]
+        setting = f"source.camera_info_topics='{{{role.topic}: {others[0]}}}'" if others else ""
+        helps = f"name the topic with --set {setting}" if setting else "record one"
         self._complain(
-            problems,
-            f"{missing} for camera '{role.name}': nothing can be projected into it; "
-            f"name the topic with source.camera_info_topics",
+            problems, f"{missing} for camera '{role.name}': nothing can be projected into it; {helps}"
         )
         return None
 
