@@ -17,11 +17,10 @@ from bevviz.closing import Closing
 from bevviz.config import Config, stage_topics
 from bevviz.errors import UserError
 from bevviz.frame import F64, I64, Frame, Scene
-from bevviz.plugins import TOPIC
 from bevviz.ros.messages import MessageError, decode_transforms
 from bevviz.ros.roles import find_roles
 from bevviz.sync.feed import Handler, make_handlers
-from bevviz.sync.synchronizer import Synchronizer
+from bevviz.sync.synchronizer import Synchronizer, blindness
 
 SECOND = 1_000_000_000
 MARGIN = 2 * SECOND  # what else belongs to the first and the last cloud is looked for this far outside
@@ -99,19 +98,8 @@ class BagSource(Closing):
             for topic, count in self._damaged.items()
         ]
         synced = self._sync.report.warnings() if self._sync else ()
-        return [*self.recording.warnings, *damaged, *self._blindness(), *synced]
-
-    def _blindness(self) -> Iterator[str]:
-        """Why the detector sees nothing at all, where there is one."""
-        model = self.config.detector.model
-        if not model or model.startswith(TOPIC):
-            return
-        report = self._sync.report if self._sync else None
-        if self.roles.no_camera:
-            yield f"detector.model {model} sees nothing: {self.roles.no_camera}"
-        elif report is not None and report.frames and not report.images:
-            reasons = [*report.first_undecodable.values(), "no image at the time of any scan"]
-            yield f"detector.model {model} has seen nothing in {report.frames} frames: {reasons[0]}"
+        blind = blindness(self.config, self.roles, self._sync.report if self._sync else None)
+        return [*self.recording.warnings, *damaged, *blind, *synced]
 
     @property
     def span(self) -> tuple[int, int]:

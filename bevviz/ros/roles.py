@@ -54,12 +54,14 @@ class Roles:
     robot_clouds: tuple[str, ...] = ()  # of obstacles, where the ground stage is the robot's
     stages: tuple[str, ...] = ()  # the robot's results that our stages are taken from
     truth: str = ""
-    camera_infos: tuple[str, ...] = ()  # all of them, whether some camera uses them or not
-    no_lidar: str = ""  # why there is none, and what would help
-    no_camera: str = ""  # the same of cameras
+    # What follows is for sentences: it changes with topics that play no role.
+    camera_infos: tuple[str, ...] = field(default=(), compare=False)  # all of them, whoever uses them
+    no_lidar: str = field(default="", compare=False)  # why there is none, and what would help
+    no_camera: str = field(default="", compare=False)  # the same of cameras
     notes: Mapping[str, str] = field(default_factory=dict)
 
 
+MANY = 12  # topics; more are not listed in a sentence
 VIDEO = "video, which is not decoded here: republish it as images (image_transport) and record these"
 _FOREIGN = (  # what holds points or pixels in a form that nothing here reads, and what would help
     ("camera", re.compile(r"video|ffmpeg|theora|h26[45]", re.IGNORECASE), VIDEO),
@@ -175,6 +177,8 @@ def _no_lidar(topics: Sequence[Topic]) -> str:
         return f"{said}; {'; '.join(held)}"
     if taken := _names(_of(topics, "PointCloud2")):
         return f"no LiDAR: {', '.join(taken)} is the result of a stage"
+    if len(topics) > MANY:
+        return f"{said}; 'bevviz info' shows them"
     return f"{said}; there are {', '.join(f'{t.name} ({t.kind})' for t in topics) or 'none'}"
 
 

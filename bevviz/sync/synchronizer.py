@@ -17,6 +17,7 @@ from bevviz import geometry
 from bevviz.config import Config
 from bevviz.errors import UserError
 from bevviz.frame import F32, F64, Camera, Cloud, Frame, Image, Intrinsics, LabelledBoxes2D, LabelledBoxes3D
+from bevviz.plugins import TOPIC
 from bevviz.ros.messages import StampedTransform
 from bevviz.ros.roles import CameraRole, Roles, entity_name
 from bevviz.sync.tf import Lookup, Origin, TransformBuffer, TransformError
@@ -84,6 +85,22 @@ class SyncReport:
             found.append(f"camera '{camera}': an image could not be decoded {_times(n)}, the first: {first}")
         found += [f"{text} ({n} of {self.frames} frames)" for text, n in self.problems.items()]
         return (*found, *self.tf.problems)
+
+
+def blindness(config: Config, roles: Roles, report: SyncReport | None) -> list[str]:
+    """Why the detector's model was shown no image at all, in one sentence; empty where it was shown one.
+
+    ``report``: of the frames so far; None: there were none yet.
+    """
+    model = config.detector.model
+    if not model or model.startswith(TOPIC):
+        return []
+    if roles.no_camera:
+        return [f"detector.model {model} sees nothing: {roles.no_camera}"]
+    if report is None or not report.frames or report.images:
+        return []
+    reasons = [*report.first_undecodable.values(), "no image at the time of any scan"]
+    return [f"detector.model {model} has seen nothing in {report.frames} frames: {reasons[0]}"]
 
 
 def _times(n: int) -> str:
