@@ -116,7 +116,7 @@ class BagSource(Closing):
 
         None: no fixed frame above the points, or the transforms read so far do not reach the stamp.
         """
-        return self._sync.pose(frame.points_frame, stamp) if self._sync else None
+        return self._sync.pose(frame, stamp) if self._sync else None
 
     @cached_property
     def scans(self) -> I64:

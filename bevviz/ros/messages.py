@@ -106,9 +106,10 @@ def decode_cloud(msg: Any, topic: str, received: int) -> Cloud:
     """Points and extra fields of a sensor_msgs/PointCloud2.
 
     Any field types, offsets, padding and byte order; organised clouds are flattened row by row. Points
-    with a coordinate that is NaN or infinite are dropped, and so are those that the header announces
-    but cut data no longer holds; both are counted in ``Cloud.dropped``. A field of several elements
-    becomes one field for each: ``name_0``, ``name_1`` ...
+    with a coordinate that is NaN or infinite are dropped, and so are those at (0, 0, 0), by which
+    drivers mean a beam without a return, and those that the header announces but cut data no longer
+    holds; all are counted in ``Cloud.dropped``. A field of several elements becomes one field for each:
+    ``name_0``, ``name_1`` ...
 
     Raises:
         MessageError: x, y or z is missing, a field does not fit into its point, or the header announces more
@@ -123,8 +124,11 @@ def decode_cloud(msg: Any, topic: str, received: int) -> Cloud:
     grid = _point_grid(msg, layout)
     with np.errstate(over="ignore", invalid="ignore"):  # a float64 beyond float32 is infinite, and dropped
         xyz = _positions(grid)
-        finite = np.isfinite(xyz[:, 0] + xyz[:, 1] + xyz[:, 2])
-    kept = None if finite.all() else np.flatnonzero(finite)
+        total = xyz[:, 0] + xyz[:, 1] + xyz[:, 2]
+    usable = np.isfinite(total)
+    if not total.all():
+        usable &= xyz.any(axis=1)
+    kept = None if usable.all() else np.flatnonzero(usable)
     fields: dict[str, NDArray[Any]] = {}
     for name in layout.fields or ():
         if name not in _AXES:
@@ -508,6 +512,29 @@ def decode_odometry(msg: Any, topic: str = "odometry") -> StampedTransform:
     """
     pose = msg.pose.pose
     return _stamped(msg.header, msg.child_frame_id, pose.position, pose.orientation, topic)
+
+
+@dataclass(frozen=True, slots=True)
+class Acceleration:
+    """What an Imu feels, in its own frame: at rest one g upwards."""
+
+    stamp: int
+    frame_id: str
+    acceleration: F64  # (3,) m/s^2, or in g: drivers differ
+
+
+def decode_acceleration(msg: Any, topic: str = "imu") -> Acceleration:
+    """Of a sensor_msgs/Imu.
+
+    Raises:
+        MessageError: the message says that it has none.
+    """
+    if msg.linear_acceleration_covariance[0] == -1:
+        raise MessageError(f"{topic}: its covariance says that no acceleration is measured")
+    felt = msg.linear_acceleration
+    return Acceleration(
+        stamp_ns(msg.header.stamp), _frame(msg.header.frame_id), np.array([felt.x, felt.y, felt.z])
+    )
 
 
 def _stamped(header: Any, child: str, translation: Any, rotation: Any, topic: str) -> StampedTransform:

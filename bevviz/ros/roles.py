@@ -49,6 +49,7 @@ class Roles:
     tf: tuple[str, ...] = ()
     tf_static: tuple[str, ...] = ()
     odometry: str = ""
+    imus: tuple[str, ...] = ()  # tell which way is up, where transforms do not
     robot_detections_2d: tuple[str, ...] = ()
     robot_detections_3d: tuple[str, ...] = ()
     robot_clouds: tuple[str, ...] = ()  # of obstacles, where the ground stage is the robot's
@@ -144,6 +145,8 @@ def find_roles(
     _note(notes, static, "static transforms")
     _note(notes, moving, "transforms")
     odometry = _find_odometry(topics, config, notes)
+    imus = [topic for topic in _of(topics, "Imu") if topic.count != 0]
+    _note(notes, imus, "gravity, where the transforms have no upright frame")
     boxes = _of(topics, "Detection3DArray")
     truth = [t for t in boxes if t.name.endswith("ground_truth")][:1]
     boxes = [t for t in boxes if t not in truth]
@@ -159,6 +162,7 @@ def find_roles(
         tf=_names(moving),
         tf_static=_names(static),
         odometry=odometry,
+        imus=_names(imus),
         robot_detections_2d=_names(detections),
         robot_detections_3d=_names(boxes),
         robot_clouds=_names(obstacles),

@@ -8,6 +8,7 @@ from typing import Any, Protocol, TypeVar
 
 from bevviz.frame import Image
 from bevviz.ros.messages import (
+    decode_acceleration,
     decode_camera_info,
     decode_cloud,
     decode_compressed_image,
@@ -72,6 +73,10 @@ def make_handlers(sync: Synchronizer, roles: Roles, decode: Callable[[M], Any]) 
         followed = transform.child
         sync.add_transform(transform, fallback=True)
 
+    def add_imu(message: M) -> None:
+        if sync.upright.needs_gravity:
+            sync.upright.add_acceleration(decode_acceleration(decode(message), message.topic))
+
     handlers: dict[str, Handler[M]] = {}
     for topic in roles.lidars:
         handlers[topic] = lambda m: sync.add_cloud(decode_cloud(decode(m), m.topic, m.received))
@@ -85,6 +90,8 @@ def make_handlers(sync: Synchronizer, roles: Roles, decode: Callable[[M], Any]) 
         handlers[topic] = partial(add_transforms, static=True)
     if roles.odometry:
         handlers[roles.odometry] = add_odometry
+    for topic in roles.imus:
+        handlers[topic] = add_imu
     for topic in roles.robot_clouds:
         handlers[topic] = lambda m: sync.add_robot_cloud(decode_cloud(decode(m), m.topic, m.received))
     for topic in roles.robot_detections_2d:

@@ -21,6 +21,7 @@ from bevviz.plugins import TOPIC
 from bevviz.ros.messages import StampedTransform
 from bevviz.ros.roles import CameraRole, Roles, entity_name
 from bevviz.sync.tf import Lookup, Origin, TransformBuffer, TransformError
+from bevviz.sync.upright import Upright
 
 T = TypeVar("T")
 
@@ -53,6 +54,7 @@ class SyncReport:
     first_undecodable: dict[str, str] = field(default_factory=dict)  # camera -> why the first was
     problems: Counter[str] = field(default_factory=Counter)  # missing transforms and CameraInfo -> frames
     tf: TransformBuffer = field(default_factory=TransformBuffer)  # for what looked wrong in the transforms
+    upright: Mapping[str, str] = field(default_factory=dict)  # for what is doubtful about the vertical
 
     def warnings(self) -> tuple[str, ...]:
         """One sentence each."""
@@ -84,7 +86,7 @@ class SyncReport:
             first = self.first_undecodable[camera]
             found.append(f"camera '{camera}': an image could not be decoded {_times(n)}, the first: {first}")
         found += [f"{text} ({n} of {self.frames} frames)" for text, n in self.problems.items()]
-        return (*found, *self.tf.problems)
+        return (*found, *self.upright.values(), *self.tf.problems)
 
 
 def blindness(config: Config, roles: Roles, report: SyncReport | None) -> list[str]:
@@ -177,8 +179,17 @@ class _Place:
     points_frame: str
     world_frame: str  # "" where there is none
     inertial_frame: str  # the smoothest fixed frame, to compensate motion with; "" where there is none
+    upright: F64 | None = None  # (4, 4) points from points_frame; None: it is upright
     world_from_points: F64 | None = None
     tf_age: float = float("nan")
+
+    def points_from(self, frame: Lookup) -> Lookup:
+        """Of what was looked up in ``points_frame``."""
+        return frame if self.upright is None else replace(frame, matrix=self.upright @ frame.matrix)
+
+    def from_points(self, matrix: F64) -> F64:
+        """The same the other way round."""
+        return matrix if self.upright is None else matrix @ geometry.inverse(self.upright)
 
 
 class Synchronizer:
@@ -193,6 +204,8 @@ class Synchronizer:
         self.report = SyncReport()
         self.absent: frozenset[str] = frozenset()  # topics that nobody publishes now: not waited for
         self.tf = self.report.tf
+        self.upright = Upright(self.tf, config.source.base_frame, config.sync.tf_tolerance)
+        self.report.upright = self.upright.warnings
         self._roles = roles
         self._config = config
         self._tolerance = round(config.sync.tolerance * 1e9)
@@ -222,7 +235,7 @@ class Synchronizer:
     def take_over(self, former: Synchronizer) -> None:
         """Go on with the transforms, calibrations and counts of ``former``, when the roles change."""
         self.report, self.absent = former.report, former.absent
-        self.tf, self.intrinsics = former.tf, former.intrinsics
+        self.tf, self.intrinsics, self.upright = former.tf, former.intrinsics, former.upright
         self._odometry_frames = former._odometry_frames
 
     # --- what comes in -------------------------------------------------------------------------
@@ -421,7 +434,8 @@ class Synchronizer:
         problems: list[str] = []
         place = self._place(cloud, problems)
         clouds, poses = self._gather(cloud, place, problems)
-        points, fields = _merge(clouds, poses, cloud.frame_id.lstrip("/") == place.points_frame)
+        in_place = place.upright is None and cloud.frame_id.lstrip("/") == place.points_frame
+        points, fields = _merge(clouds, poses, in_place)
         cameras = tuple(self._camera(role, place) for role in self._roles.cameras)
         first, last = self._window(cloud.stamp)
         boxes = [track.take(cloud.stamp, first, last) for track in self._boxes.values()]
@@ -435,6 +449,7 @@ class Synchronizer:
             lidar="lidars" if self._partners else cloud.name,
             points=points,
             points_frame=place.points_frame,
+            upright=place.upright,
             fields=fields,
             world_frame=place.world_frame or place.points_frame,
             world_from_points=place.world_from_points,
@@ -469,6 +484,9 @@ class Synchronizer:
         place = _Place(cloud.stamp, points_frame, world, inertial)
         if problems is None:
             return place
+        turn = self.upright.turn(cloud, world)
+        if points_frame == cloud.frame_id.lstrip("/"):
+            place = replace(place, upright=turn)
         if self._partners and points_frame != base:
             self._complain(
                 problems,
@@ -486,7 +504,7 @@ class Synchronizer:
         except TransformError as error:
             self._complain(problems, f"{error}: the cloud has no place in the world")
             return place
-        return replace(place, world_from_points=found.matrix, tf_age=found.age)
+        return replace(place, world_from_points=place.from_points(found.matrix), tf_age=found.age)
 
     def _fixed(self, points_frame: str) -> tuple[str, str]:
         """The world's frame and the smoothest fixed frame above ``points_frame``; "" where there is none."""
@@ -496,21 +514,22 @@ class Synchronizer:
         given = self._config.source.fixed_frame.lstrip("/")
         return given or (near[-1] if near else ""), near[0] if near else given
 
-    def pose(self, points_frame: str, stamp: int) -> F64 | None:
-        """(4, 4) where a frame is in the smoothest fixed frame, as far as the transforms reach so far."""
-        inertial = self._fixed(points_frame)[1]
+    def pose(self, frame: Frame, stamp: int) -> F64 | None:
+        """(4, 4) smoothest fixed frame from points, as far as the transforms reach so far."""
+        inertial = self._fixed(frame.points_frame)[1]
         if not inertial:
             return None
         try:
-            return self.tf.lookup(inertial, points_frame, stamp, self._config.sync.tf_tolerance).matrix
+            found = self.tf.lookup(inertial, frame.points_frame, stamp, self._config.sync.tf_tolerance)
         except TransformError:
             return None
+        return found.matrix if frame.upright is None else found.matrix @ geometry.inverse(frame.upright)
 
     def _gather(
         self, cloud: Cloud, place: _Place, problems: list[str]
     ) -> tuple[tuple[Cloud, ...], tuple[F64, ...]]:
         """The clouds of every LiDAR nearest to ``cloud``, each with points_from_cloud."""
-        clouds, poses = [cloud], [np.eye(4)]
+        clouds, poses = [cloud], [np.eye(4) if place.upright is None else place.upright]
         if place.points_frame != cloud.frame_id.lstrip("/"):
             try:
                 poses[0] = self._moved(place, cloud.stamp, cloud.frame_id)[0].matrix
@@ -536,12 +555,13 @@ class Synchronizer:
         tolerance = self._config.sync.tf_tolerance
         if self._compensates(place):
             try:
-                return self.tf.lookup_moving(
+                found = self.tf.lookup_moving(
                     place.points_frame, place.stamp, frame, stamp, place.inertial_frame, tolerance
-                ), True
+                )
+                return place.points_from(found), True
             except TransformError:
                 pass  # without motion is the next best
-        return self.tf.lookup(place.points_frame, frame, place.stamp, tolerance), False
+        return place.points_from(self.tf.lookup(place.points_frame, frame, place.stamp, tolerance)), False
 
     def _compensates(self, place: _Place) -> bool:
         return self._config.sync.motion_compensation and bool(place.inertial_frame)
@@ -581,7 +601,7 @@ class Synchronizer:
             found = self.tf.lookup(place.points_frame, frame, place.stamp, self._config.sync.tf_tolerance)
         except TransformError:
             return None
-        return geometry.inverse(found.matrix)
+        return geometry.inverse(place.points_from(found).matrix)
 
     def _image(self, role: CameraRole, stamp: int, problems: list[str]) -> tuple[Image | None, int]:
         """The decoded image nearest to ``stamp``, and its stamp; without one, ``stamp``."""
@@ -670,7 +690,7 @@ class Synchronizer:
         except TransformError as error:
             self._complain(problems, f"{error}: the boxes of {boxes.topic} have no place in the world")
             return boxes
-        return replace(boxes, world_from_boxes=found.matrix)
+        return replace(boxes, world_from_boxes=(found if known else place.points_from(found)).matrix)
 
     def _robot_detections(
         self, cameras: tuple[Camera, ...], stamp: int, first: int, last: int
