@@ -195,7 +195,7 @@ class DetectorConfig(StageSection):
         "(H, W, 3) BGR -> xyxy, score, names; or topic:/detections of the robot; empty: no detector",
     )
     names: str = Field(
-        "", description="file with one class name a line; empty: the model's metadata, else COCO"
+        "", description="file with one class name a line, coco or coco91; empty: the model's, else COCO's"
     )
     conf_threshold: float = Field(0.25, gt=0, le=1, description="lowest score of a detection")
     iou_threshold: float = Field(0.45, gt=0, le=1, description="class-wise NMS")

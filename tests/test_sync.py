@@ -256,6 +256,8 @@ def test_undecodable_image_is_a_problem_of_its_camera() -> None:
     assert frame.cameras[0].image is None
     assert frame.cameras[0].problems == ("/zed/image: encoding 'yuv9' is not known",)
     assert feed.sync.report.undecodable == {"zed": 1}
+    said = "could not be decoded once, the first: /zed/image: encoding 'yuv9' is not known"
+    assert feed.sync.report.warnings()[0] == f"camera 'zed': an image {said}"
 
 
 def test_without_transforms_the_frame_is_made_and_names_the_option() -> None:
@@ -297,7 +299,14 @@ def test_without_camera_info() -> None:
     (frame,) = feed.sync.flush()
     assert frame.cameras[0].intrinsics is None
     assert "no CameraInfo on /zed/camera_info" in frame.cameras[0].problems[0]
-    assert "source.camera_info_topics" in frame.cameras[0].problems[0]
+    assert frame.cameras[0].problems[0].endswith("; record one")
+
+    other = Feed(replace(ONE, camera_infos=("/zed/camera_info", "/zed/left/camera_info")))
+    other.sync.add_cloud(cloud(0.0))
+    other.image(0.0)
+    (frame,) = other.sync.flush()
+    offered = f"--set source.camera_info_topics='{{{LEFT.topic}: /zed/left/camera_info}}'"
+    assert any(problem.endswith(offered) for problem in frame.cameras[0].problems)
 
     tutorial = Feed(ONE, preset="reference")
     tutorial.calibration()

@@ -19,7 +19,7 @@ from bevviz.frame import F64, I64, Frame, Scene
 from bevviz.ros.messages import MessageError, decode_transforms
 from bevviz.ros.roles import find_roles
 from bevviz.sync.feed import Handler, make_handlers
-from bevviz.sync.synchronizer import Synchronizer
+from bevviz.sync.synchronizer import Synchronizer, blindness
 
 SECOND = 1_000_000_000
 MARGIN = 2 * SECOND  # what else belongs to the first and the last cloud is looked for this far outside
@@ -96,7 +96,9 @@ class BagSource(Closing):
             f"{count} message(s) of {topic} could not be used, the first: {self._first_damage[topic]}"
             for topic, count in self._damaged.items()
         ]
-        return [*self.recording.warnings, *damaged, *(self._sync.report.warnings() if self._sync else ())]
+        synced = self._sync.report.warnings() if self._sync else ()
+        blind = blindness(self.config, self.roles, self._sync.report if self._sync else None)
+        return [*self.recording.warnings, *damaged, *blind, *synced]
 
     @property
     def doubts(self) -> Sequence[str]:
@@ -222,19 +224,18 @@ class BagSource(Closing):
 
     def _find_driver(self) -> str:
         """The first LiDAR: its scans make the frames."""
-        topics = {topic.name: topic for topic in self.recording.topics}
-        if not self.roles.lidars:
-            there = ", ".join(f"{t.name} ({t.kind})" for t in topics.values())
-            raise UserError(
-                f"{self.recording.name}: no LiDAR (no sensor_msgs/PointCloud2 topic) among {there}; "
-                "set by hand with --set source.lidar_topics=[/topic]"
-            )
+        if self.roles.no_lidar:
+            raise UserError(f"{self.recording.name}: {self.roles.no_lidar}")
+        counts = {t.name: t.count for t in self.recording.topics if t.kind == "PointCloud2"}
         driver = self.roles.lidars[0]
-        if not topics[driver].count:
-            raise UserError(
-                f"{self.recording.name}: the LiDAR's topic {driver} has no messages; "
-                "choose another one with --set source.lidar_topics=[/topic]"
+        if not counts[driver]:
+            others = [name for name, count in counts.items() if count]
+            helps = (
+                f"choose another one: --set source.lidar_topics=[{others[0]}]"
+                if others
+                else "nor has any other"
             )
+            raise UserError(f"{self.recording.name}: the LiDAR's topic {driver} has no messages; {helps}")
         return driver
 
     def _time(self, text: str | None, default: int) -> int:

@@ -17,6 +17,7 @@ from bevviz import geometry
 from bevviz.config import Config
 from bevviz.errors import UserError
 from bevviz.frame import F32, F64, Camera, Cloud, Frame, Image, Intrinsics, LabelledBoxes2D, LabelledBoxes3D
+from bevviz.plugins import TOPIC
 from bevviz.ros.messages import StampedTransform
 from bevviz.ros.roles import CameraRole, Roles, entity_name
 from bevviz.sync.clocks import Clocks
@@ -50,7 +51,9 @@ class SyncReport:
     idle: str = ""  # topic of the LiDAR that should drive, while only others deliver
     unstamped: Counter[str] = field(default_factory=Counter)  # topic -> messages with stamp zero
     without_image: Counter[str] = field(default_factory=Counter)  # camera -> frames
+    images: int = 0  # of all cameras, decoded
     undecodable: Counter[str] = field(default_factory=Counter)  # camera -> images
+    first_undecodable: dict[str, str] = field(default_factory=dict)  # camera -> why the first was
     problems: Counter[str] = field(default_factory=Counter)  # missing transforms and CameraInfo -> frames
     tf: TransformBuffer = field(default_factory=TransformBuffer)  # for what looked wrong in the transforms
     upright: Mapping[str, str] = field(default_factory=dict)  # for what is doubtful about the vertical
@@ -89,9 +92,26 @@ class SyncReport:
         for camera, n in self.without_image.items():
             found.append(f"{n} of {self.frames} frames have no image of camera '{camera}'")
         for camera, n in self.undecodable.items():
-            found.append(f"camera '{camera}': an image could not be decoded {_times(n)}")
+            first = self.first_undecodable[camera]
+            found.append(f"camera '{camera}': an image could not be decoded {_times(n)}, the first: {first}")
         found += [f"{text} ({n} of {self.frames} frames)" for text, n in self.problems.items()]
         return (*self.doubts(), *found, *self.tf.problems)
+
+
+def blindness(config: Config, roles: Roles, report: SyncReport | None) -> list[str]:
+    """Why the detector's model was shown no image at all, in one sentence; empty where it was shown one.
+
+    ``report``: of the frames so far; None: there were none yet.
+    """
+    model = config.detector.model
+    if not model or model.startswith(TOPIC):
+        return []
+    if roles.no_camera:
+        return [f"detector.model {model} sees nothing: {roles.no_camera}"]
+    if report is None or not report.frames or report.images:
+        return []
+    reasons = [*report.first_undecodable.values(), "no image at the time of any scan"]
+    return [f"detector.model {model} has seen nothing in {report.frames} frames: {reasons[0]}"]
 
 
 def _times(n: int) -> str:
@@ -663,9 +683,12 @@ class Synchronizer:
             problems.append(f"no image of camera '{role.name}' {self._nearest(nearest, stamp)}")
             return None, stamp
         try:
-            return replace(nearest[1].load(), stamp=nearest[0]), nearest[0]
+            image = replace(nearest[1].load(), stamp=nearest[0])
+            self.report.images += 1
+            return image, nearest[0]
         except UserError as error:
             self.report.undecodable[role.name] += 1
+            self.report.first_undecodable.setdefault(role.name, str(error))
             problems.append(str(error))
             return None, stamp
 
@@ -691,10 +714,11 @@ class Synchronizer:
             self._complain(problems, f"{missing} yet: using fx = fy = 267, cx 320, cy 180 of the reference")
             height, width = image.bgr.shape[:2] if image is not None else (360, 640)
             return Intrinsics(width, height, TUTORIAL_K, assumed=True)
+        others = [topic for topic in self._roles.camera_infos if topic != role.info_topic]
+        setting = f"source.camera_info_topics='{{{role.topic}: {others[0]}}}'" if others else ""
+        helps = f"name the topic with --set {setting}" if setting else "record one"
         self._complain(
-            problems,
-            f"{missing} for camera '{role.name}': nothing can be projected into it; "
-            f"name the topic with source.camera_info_topics",
+            problems, f"{missing} for camera '{role.name}': nothing can be projected into it; {helps}"
         )
         return None
 
