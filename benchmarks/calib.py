@@ -14,7 +14,7 @@ import numpy as np
 from tqdm import tqdm
 
 from bevviz import geometry
-from bevviz.calib import AXES, Calibration, Verdict, calibrate, gather
+from bevviz.calib import AXES, Calibration, Finding, calibrate, gather
 from bevviz.calib.axes import SCALES, TIME, error_pose
 from bevviz.frame import F64, Frame
 from bevviz.synthetic import SyntheticSource
@@ -63,15 +63,15 @@ def errors() -> Iterator[tuple[str, F64]]:
 
 
 def row(name: str, offsets: F64, result: Calibration) -> str:
-    """What was planted, what was found on that axis, the largest error on the others, and the verdicts."""
+    """What was planted, what was found on that axis, the largest error on the others, and the findings."""
     wrong = np.array([axis.offset for axis in result.axes]) - offsets * SCALES
     planted = np.flatnonzero(offsets)
     found = result.axes[planted[0]].measured if len(planted) else ""
     others = np.delete(np.abs(wrong), planted)
     names = np.delete(np.arange(len(AXES)), planted)
     worst = [others[(names // 3) == kind].max(initial=0.0) for kind in range(3)]
-    off = ", ".join(axis.axis.name for axis in result.by(Verdict.OFF)) or "none"
-    unknown = ", ".join(axis.axis.name for axis in result.by(Verdict.UNKNOWN)) or "none"
+    off = ", ".join(axis.axis.name for axis in result.by(Finding.OFF)) or "none"
+    unknown = ", ".join(axis.axis.name for axis in result.by(Finding.UNKNOWN)) or "none"
     left = f"{worst[0]:.2f} deg, {worst[1]:.1f} cm" + (f", {worst[2]:.1f} ms" if TIME in names else "")
     return f"| {name} | {found} | {left} | {off} | {unknown} |"
 

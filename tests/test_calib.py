@@ -13,7 +13,7 @@ import pytest
 from benchmarks.calib import Drive
 from bevviz import geometry
 from bevviz.bags.source import BagSource
-from bevviz.calib import AXES, Calibration, Verdict, calibrate, gather
+from bevviz.calib import AXES, Calibration, Finding, calibrate, gather
 from bevviz.calib.axes import SCALES, TIME, error_pose
 from bevviz.calib.edges import cloud_edges
 from bevviz.calib.score import Scorer
@@ -45,8 +45,8 @@ def found(result: Calibration) -> dict[str, float]:
     return {axis.axis.name: axis.offset for axis in result.axes}
 
 
-def verdicts(result: Calibration) -> dict[str, str]:
-    return {axis.axis.name: str(axis.verdict) for axis in result.axes}
+def findings(result: Calibration) -> dict[str, str]:
+    return {axis.axis.name: str(axis.finding) for axis in result.axes}
 
 
 # --- planted errors ----------------------------------------------------------------------------
@@ -60,7 +60,7 @@ def test_what_was_planted_is_found(drive: Drive, planted: dict[str, float]) -> N
     for axis in result.axes:
         near = {"deg": 0.2, "cm": 2.0, "ms": 10.0}[axis.axis.unit]
         assert axis.offset == pytest.approx(planted.get(axis.axis.name, 0.0), abs=near)
-    assert {axis.axis.name for axis in result.by(Verdict.OFF)} == set(planted)
+    assert {axis.axis.name for axis in result.by(Finding.OFF)} == set(planted)
     assert result.score_corrected >= result.score_stated
 
 
@@ -133,12 +133,12 @@ def test_kitti_is_near_zero(shared: Path, tmp_path: Path) -> None:
     path = bags.write(tmp_path / "kitti", bags.kitti_items(shared))
     with BagSource([path], Config()) as source:
         result = calibrate(gather(source, source.scene.cameras, source.pose)["camera"])
-    assert not result.by(Verdict.OFF)
+    assert not result.by(Finding.OFF)
     assert max(abs(found(result)[name]) for name in ("rx", "ry", "rz")) < 0.2
     assert max(abs(found(result)[name]) for name in ("tx", "ty")) < 3.0
     for axis in result.axes[:3]:
         assert abs(axis.abscissa[axis.score.argmax()]) <= 0.2
-    assert verdicts(result)["dt"] == "cannot tell"
+    assert findings(result)["dt"] == "cannot tell"
     assert "motion of the robot is not known" in result.axes[TIME].reason
     assert np.allclose(result.corrected, result.stated)
 
@@ -157,7 +157,7 @@ def changed(drive: Drive, change: object) -> Iterator[Frame]:
 def test_images_without_edges_tell_nothing(drive: Drive) -> None:
     grey = changed(drive, lambda number, bgr: np.full_like(bgr, 90))
     result = calibrate(gather(grey, ["zed"], drive.pose)["zed"])
-    assert set(verdicts(result).values()) == {"cannot tell"}
+    assert set(findings(result).values()) == {"cannot tell"}
     assert "cannot tell: the score is flat" in result.answer
     assert not result.correction.any()
 
@@ -165,7 +165,7 @@ def test_images_without_edges_tell_nothing(drive: Drive) -> None:
 def test_images_of_another_street_tell_nothing(drive: Drive) -> None:
     mirrored = changed(drive, lambda number, bgr: np.ascontiguousarray(bgr[:, ::-1]))
     result = calibrate(gather(mirrored, ["zed"], drive.pose)["zed"])
-    assert not result.by(Verdict.OFF)
+    assert not result.by(Finding.OFF)
 
 
 def test_clouds_without_edges_tell_nothing(drive: Drive) -> None:
@@ -174,14 +174,14 @@ def test_clouds_without_edges_tell_nothing(drive: Drive) -> None:
         for frame in drive.frames[:3]
     ]
     result = calibrate(gather(few, ["zed"], drive.pose)["zed"])
-    assert set(verdicts(result).values()) == {"cannot tell"}
+    assert set(findings(result).values()) == {"cannot tell"}
     assert "only 0 edges" in result.answer
 
 
 def test_a_robot_at_rest_tells_no_time(drive: Drive) -> None:
     still = gather(drive.frames[:3], ["zed"], lambda frame, stamp: drive.pose(frame, frame.stamp))["zed"]
     time = calibrate(still).axes[TIME]
-    assert time.verdict is Verdict.UNKNOWN
+    assert time.finding is Finding.UNKNOWN
     assert "hardly moved" in time.reason
 
 
@@ -248,7 +248,7 @@ def test_command(turned: Path, capsys: Capture) -> None:
 
     assert main(["calib", str(turned), "--config", "fixed.yaml", "--json", "--frames", ":8"]) == 0
     (again,) = json.loads(capsys.readouterr().out)
-    assert not [name for name, axis in again["axes"].items() if axis["verdict"] == "off"]
+    assert not [name for name, axis in again["axes"].items() if axis["finding"] == "off"]
 
 
 def test_wrong_input(turned: Path, capsys: Capture) -> None:

@@ -12,7 +12,7 @@ from bevviz.calib.axes import AXES, TIME, Axis
 from bevviz.frame import F64
 
 
-class Verdict(StrEnum):
+class Finding(StrEnum):
     FINE = "fine"
     OFF = "off"
     UNKNOWN = "cannot tell"
@@ -25,8 +25,8 @@ class AxisResult:
     axis: Axis
     offset: float  # of what is stated from what fits best
     interval: float
-    verdict: Verdict
-    reason: str  # of a verdict UNKNOWN
+    finding: Finding
+    reason: str  # of a finding UNKNOWN
     abscissa: F64  # (S,) offsets along this axis, the other axes being as they fit best
     score: F64  # (S,)
 
@@ -37,10 +37,10 @@ class AxisResult:
 
     @property
     def told(self) -> str:
-        """The verdict in words."""
-        if self.verdict is Verdict.OFF:
+        """The finding in words."""
+        if self.finding is Finding.OFF:
             return f"off: {self.axis.positive if self.offset > 0 else self.axis.negative}"
-        return f"{self.verdict}: {self.reason}" if self.reason else str(self.verdict)
+        return f"{self.finding}: {self.reason}" if self.reason else str(self.finding)
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,13 +60,13 @@ class Calibration:
     score_corrected: float
     notes: tuple[str, ...] = ()
 
-    def by(self, verdict: Verdict) -> list[AxisResult]:
-        return [axis for axis in self.axes if axis.verdict is verdict]
+    def by(self, finding: Finding) -> list[AxisResult]:
+        return [axis for axis in self.axes if axis.finding is finding]
 
     @property
     def answer(self) -> str:
         """The whole result in one or two sentences."""
-        off, unknown = self.by(Verdict.OFF), self.by(Verdict.UNKNOWN)
+        off, unknown = self.by(Finding.OFF), self.by(Finding.UNKNOWN)
         if len(unknown) == len(self.axes):
             reasons = dict.fromkeys(axis.reason for axis in unknown)
             return f"Camera '{self.camera}': cannot tell: {'; '.join(reasons)}."
@@ -85,7 +85,7 @@ class Calibration:
 
     def table(self) -> str:
         """The axes in lines of fixed width."""
-        rows = [("axis", "offset of what is stated", "verdict")]
+        rows = [("axis", "offset of what is stated", "finding")]
         rows += [(f"{axis.axis.name}  {axis.axis.what}", axis.measured, axis.told) for axis in self.axes]
         widths = [max(len(row[i]) for row in rows) for i in range(2)]
         return "\n".join(f"{a:<{widths[0]}}  {b:>{widths[1]}}  {c}" for a, b, c in rows)
@@ -104,7 +104,7 @@ class Calibration:
                     "unit": axis.axis.unit,
                     "offset": axis.offset,
                     "interval": axis.interval,
-                    "verdict": str(axis.verdict),
+                    "finding": str(axis.finding),
                     "reason": axis.reason,
                 }
                 for axis in self.axes

@@ -9,7 +9,7 @@ import numpy as np
 
 from bevviz import geometry
 from bevviz.calib.axes import AXES, PRIOR, TIME, Axis, error_pose
-from bevviz.calib.result import AxisResult, Calibration, Verdict
+from bevviz.calib.result import AxisResult, Calibration, Finding
 from bevviz.calib.score import Scorer, Sums
 from bevviz.calib.shots import GROUPS, Shots
 from bevviz.errors import UserError
@@ -69,7 +69,7 @@ def calibrate(shots: Shots, progress: Callable[[str], None] = lambda _: None) ->
     deviation = np.where(free, np.hypot(deviation, _confusion(shots)), PRIOR)
     progress("curves")
     axes = _judge(shots, best.offsets, deviation)
-    off = np.array([axis.verdict is Verdict.OFF for axis in axes])
+    off = np.array([axis.finding is Finding.OFF for axis in axes])
     fixed = _climb(scorer, np.where(off, best.offsets, 0.0), off, everything) if off.any() else None
     correction = np.zeros(len(AXES)) if fixed is None else fixed.offsets
     stated = shots.shots[0].mounting
@@ -155,7 +155,7 @@ def _mean(sums: Sums) -> float:
     return float(sums.score.sum() / max(float(sums.count.sum()), 1.0))
 
 
-# --- verdicts ----------------------------------------------------------------------------------
+# --- findings ----------------------------------------------------------------------------------
 
 
 def _judge(shots: Shots, best: F64, deviation: F64) -> tuple[AxisResult, ...]:
@@ -179,12 +179,12 @@ def _judge(shots: Shots, best: F64, deviation: F64) -> tuple[AxisResult, ...]:
             reason = _why_unsure(shots, axis)
         if row < 2 and reason:
             chance = reason
-        verdict = Verdict.FINE
+        finding = Finding.FINE
         if reason:
-            verdict = Verdict.UNKNOWN
+            finding = Finding.UNKNOWN
         elif abs(offset) > max(CERTAIN * interval, axis.least):
-            verdict = Verdict.OFF
-        found.append(AxisResult(axis, offset, interval, verdict, reason, abscissa, scores))
+            finding = Finding.OFF
+        found.append(AxisResult(axis, offset, interval, finding, reason, abscissa, scores))
     return tuple(found)
 
 

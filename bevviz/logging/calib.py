@@ -9,7 +9,7 @@ import rerun as rr
 
 from bevviz import geometry
 from bevviz.calib.axes import TIME, error_pose
-from bevviz.calib.result import Calibration, Verdict
+from bevviz.calib.result import Calibration, Finding
 from bevviz.calib.shots import Shot
 from bevviz.colors import bins
 from bevviz.config import LoggingConfig
@@ -19,7 +19,7 @@ from bevviz.logging.logger import depth_annotations, encode_image
 from bevviz.logging.pieces import CORNER
 
 _STATED, _CORRECTED = (255, 80, 80), (90, 230, 120)
-_COLORS = {Verdict.FINE: (70, 160, 90), Verdict.OFF: (210, 70, 70), Verdict.UNKNOWN: (130, 130, 145)}
+_COLORS = {Finding.FINE: (70, 160, 90), Finding.OFF: (210, 70, 70), Finding.UNKNOWN: (130, 130, 145)}
 
 
 def log_calibration(
@@ -41,7 +41,7 @@ def log_calibration(
         path = entities.calib_curve(camera, axis.axis.name)
         width = np.full(len(axis.score), axis.abscissa[1] - axis.abscissa[0], np.float32)
         height = axis.score - min(curve.score.min() for curve in result.axes)
-        bars = rr.BarChart(height, abscissa=axis.abscissa, widths=width, color=_COLORS[axis.verdict])
+        bars = rr.BarChart(height, abscissa=axis.abscissa, widths=width, color=_COLORS[axis.finding])
         recording.log(path, bars, static=True)
     for path in (entities.calib_stated(camera), entities.calib_corrected(camera)):
         recording.log(f"{path}/points", depth_annotations(), static=True)
@@ -102,7 +102,7 @@ def _text(result: Calibration) -> str:
     return "\n".join(
         [
             f"## {result.answer}\n",
-            "| axis | offset of what is stated | verdict |\n|---|---|---|",
+            "| axis | offset of what is stated | finding |\n|---|---|---|",
             *rows,
             f"\n{result.frames} frames, {result.edges} edges. Score {result.score_stated:.3f} as stated, "
             f"{result.score_corrected:.3f} as corrected.\n",
