@@ -19,7 +19,12 @@ from bevviz.logging.logger import depth_annotations, encode_image
 from bevviz.logging.pieces import CORNER
 
 _STATED, _CORRECTED = (255, 80, 80), (90, 230, 120)
-_COLORS = {Finding.FINE: (70, 160, 90), Finding.OFF: (210, 70, 70), Finding.UNKNOWN: (130, 130, 145)}
+_COLORS = {
+    Finding.FINE: (70, 160, 90),
+    Finding.OFF: (210, 70, 70),
+    Finding.UNKNOWN: (130, 130, 145),
+    Finding.CONFLICT: (225, 160, 60),
+}
 
 
 def log_calibration(
@@ -107,6 +112,6 @@ def _text(result: Calibration) -> str:
             f"\n{result.frames} frames, {result.edges} edges. Score {result.score_stated:.3f} as stated, "
             f"{result.score_corrected:.3f} as corrected.\n",
             *result.notes,
-            f"\n```yaml\n{result.config}```",
+            f"\n```yaml\n{result.config}```" if result.moved else "",
         ]
     )
