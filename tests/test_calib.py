@@ -20,7 +20,7 @@ from bevviz.calib.score import Scorer
 from bevviz.cli import main
 from bevviz.config import Config, load
 from bevviz.errors import UserError
-from bevviz.frame import F64, U8, Cloud, Frame
+from bevviz.frame import F64, I64, U8, Camera, Cloud, Frame, Image, Intrinsics
 from bevviz.synthetic import SyntheticSource, write_bag
 from bevviz.synthetic.drive import PERIOD, START
 from tests import bags
@@ -70,6 +70,45 @@ def test_what_was_planted_is_found(drive: Drive, planted: dict[str, float]) -> N
         assert abs(axis.offset - planted.get(axis.axis.name, 0.0)) < axis.interval
     assert {axis.axis.name for axis in result.by(Finding.OFF)} == set(planted)
     assert result.score_corrected >= result.score_stated
+
+
+@pytest.mark.parametrize("turn", [2.0, -2.0])
+def test_a_fence_is_not_taken_for_its_neighbour(turn: float) -> None:
+    """Posts every 2 degrees: between what is stated and the truth lies a place that fits nearly as well."""
+    wrong = stated_wrongly([fence(seed) for seed in range(4)], offsets(ry=turn))
+    result = calibrate(gather(wrong, ["camera"], lambda frame, stamp: None)["camera"])
+    assert covers(result, ry=turn)
+    assert [axis.axis.name for axis in result.by(Finding.OFF)] == ["ry"]
+    assert found(result)["ry"] == pytest.approx(turn, abs=0.1)
+
+
+def fence(seed: int) -> Frame:
+    """Posts at 5 to 25 m, a little irregular, before a wall; the camera stands where the LiDAR stands."""
+    rng = np.random.default_rng(seed)
+    place = np.radians(np.arange(-40.0, 40.0, 2.0) + rng.uniform(-0.3, 0.3, 40))
+    top, reach = np.radians(rng.uniform(1, 6, 40)), np.append(rng.uniform(5, 25, 40), 60.0)
+
+    def seen(azimuth: F64, elevation: F64) -> I64:
+        on = (np.abs(azimuth[..., None] - place) < np.radians(1 / 3)) & (elevation[..., None] < top)
+        nearest = np.where(on, reach[:-1], np.inf)
+        return np.where(on.any(-1), nearest.argmin(-1), len(place))
+
+    azimuth, elevation = np.meshgrid(np.radians(np.arange(-40, 40, 0.2)), np.radians(np.arange(-10, 10, 0.4)))
+    flat = np.cos(elevation)
+    unit = np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)], -1)
+    xyz = (unit * reach[seen(azimuth, elevation)][..., None]).reshape(-1, 3).astype(np.float32)
+    ring = np.repeat(np.arange(len(azimuth)), azimuth.shape[1])
+    x, y = np.meshgrid((np.arange(640) - 319.5) / 400, (np.arange(360) - 179.5) / 400)
+    grey = np.append(rng.integers(20, 100, 40), 180)[seen(np.arctan(-x), np.arctan(-y / np.hypot(1, x)))]
+    bgr = np.repeat((grey + rng.normal(0, 2, grey.shape)).astype(np.uint8)[..., None], 3, 2)
+    mounting = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
+    intrinsics = Intrinsics(640, 360, np.array([[400, 0, 319.5], [0, 400, 179.5], [0, 0, 1.0]]))
+    return Frame(
+        seed, 0, 0, "lidar", xyz, "lidar",
+        clouds=(Cloud(0, "lidar", xyz, {"ring": ring}),),
+        points_from_clouds=(np.eye(4),),
+        cameras=(Camera("camera", Image(0, "camera", bgr), intrinsics, mounting, None),),
+    )  # fmt: skip
 
 
 def test_the_correction_undoes_the_error(drive: Drive) -> None:
@@ -235,11 +274,11 @@ def shots_of(frames: Iterable[Frame]) -> Shots:
 
 def test_one_view_twelve_times_is_one_view(drive: Drive) -> None:
     once, often = (
-        calibrate(gather(drive.frames[:1] * times, ["zed"], drive.pose)["zed"]) for times in (1, 12)
+        calibrate(gather(drive.frames[3:4] * times, ["zed"], drive.pose)["zed"]) for times in (1, 12)
     )
-    assert once.by(Finding.FINE)
+    assert all(axis.interval < 1.0 for axis in once.axes[:3])
     for axis, again in zip(once.axes, often.axes, strict=True):
-        assert again.interval > 0.7 * axis.interval
+        assert again.interval > 0.6 * axis.interval
 
 
 def changed(drive: Drive, change: object) -> Iterator[Frame]:
