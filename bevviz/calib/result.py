@@ -90,6 +90,11 @@ class Calibration:
         return f"{said} It cannot tell the {_names(unknown)}." if unknown else said
 
     @property
+    def measured_from(self) -> str:
+        """``30 frames, 43192 edges``."""
+        return f"{self.frames} frame{'s' * (self.frames != 1)}, {self.edges} edges"
+
+    @property
     def moved(self) -> bool:
         """Whether the mounting is put right, and not left as stated."""
         return bool(self.correction[:TIME].any())

@@ -100,7 +100,7 @@ def _print(results: list[Calibration], as_json: bool) -> None:
     for result in results:
         print(result.answer)
         print(f"\n{result.table()}\n")
-        print(f"{result.frames} frames, {result.edges} edges; an interval is two standard deviations wide")
+        print(f"{result.measured_from}; an interval is two standard deviations wide")
         for note in result.notes:
             print(note)
         if result.moved:

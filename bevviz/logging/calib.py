@@ -109,7 +109,7 @@ def _text(result: Calibration) -> str:
             f"## {result.answer}\n",
             "| axis | offset of what is stated | finding |\n|---|---|---|",
             *rows,
-            f"\n{result.frames} frames, {result.edges} edges. Score {result.score_stated:.3f} as stated, "
+            f"\n{result.measured_from}. Score {result.score_stated:.3f} as stated, "
             f"{result.score_corrected:.3f} as corrected.\n",
             *result.notes,
             f"\n```yaml\n{result.config}```" if result.moved else "",
