@@ -16,6 +16,7 @@ from bevviz.bags.source import BagSource
 from bevviz.calib import AXES, Calibration, Finding, Shots, calibrate, gather
 from bevviz.calib.axes import SCALES, TIME, error_pose
 from bevviz.calib.edges import cloud_edges
+from bevviz.calib.result import configuration
 from bevviz.calib.score import Scorer
 from bevviz.cli import main
 from bevviz.config import Config, load
@@ -424,7 +425,9 @@ def test_wrong_input(turned: Path, capsys: Capture) -> None:
 
 def test_a_late_clock_is_put_right_by_what_is_written() -> None:
     """Lateness that is found is taken from what is added to the stamps already."""
-    result = calibrate(shots_of(list(SyntheticSource(2, 3))), stamps={"/zed2/zed/rgb/image_rect_color": 0.1})
+    result = calibrate(
+        shots_of(list(SyntheticSource(4, 3, weave=True))), stamps={"/zed2/zed/rgb/image_rect_color": 0.1}
+    )
     late = replace(result, correction=np.array([0.0] * 6 + [0.03]))
     assert "sync:\n  offsets:\n    /zed2/zed/rgb/image_rect_color: 0.0700\n" in configuration([late])
     assert late.moved and "sync" not in configuration([replace(late, offset=0.0, correction=offsets())])
