@@ -425,9 +425,9 @@ def test_wrong_input(turned: Path, capsys: Capture) -> None:
 
 def test_a_late_clock_is_put_right_by_what_is_written() -> None:
     """Lateness that is found is taken from what is added to the stamps already."""
-    result = calibrate(
-        shots_of(list(SyntheticSource(4, 3, weave=True))), stamps={"/zed2/zed/rgb/image_rect_color": 0.1}
-    )
+    frames = SyntheticSource(4, 3, weave=True)
+    shots = gather(frames, ["zed"], lambda frame, stamp: None)["zed"]
+    result = calibrate(shots, stamps={"/zed2/zed/rgb/image_rect_color": 0.1})
     late = replace(result, correction=np.array([0.0] * 6 + [0.03]))
     assert "sync:\n  offsets:\n    /zed2/zed/rgb/image_rect_color: 0.0700\n" in configuration([late])
     assert late.moved and "sync" not in configuration([replace(late, offset=0.0, correction=offsets())])
