@@ -29,6 +29,7 @@ class Outputs:
 
     save: Path | None = None
     serve: int | None = None  # port
+    bind: str = "127.0.0.1"  # address that it is at
     connect: str | None = None  # URL
     viewer: bool = False
     blueprint: str | Blueprint = "debug"
@@ -36,7 +37,7 @@ class Outputs:
     @staticmethod
     def of(options: argparse.Namespace) -> Outputs:
         blueprint = getattr(options, "blueprint", "debug")
-        return Outputs(options.save, options.serve, options.connect, options.viewer, blueprint)
+        return Outputs(options.save, options.serve, options.bind, options.connect, options.viewer, blueprint)
 
     def __bool__(self) -> bool:
         """Whether anything is asked for."""
@@ -66,6 +67,7 @@ class Outputs:
             config,
             save=self.save,
             serve=self.serve,
+            bind=self.bind,
             connect=self.connect,
             spawn=self.viewer,
             blueprint=self.blueprint,

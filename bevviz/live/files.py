@@ -13,7 +13,7 @@ from bevviz.errors import UserError
 from bevviz.live.encoder import Encoder, Packet
 from bevviz.live.notes import Notes
 from bevviz.live.output import Output
-from bevviz.logging.sinks import rerun_program
+from bevviz.logging import rerun_cli
 
 MEGABYTE = 1_000_000
 INDEXED = 1000 * MEGABYTE  # the index is made in memory; a larger file stays without
@@ -39,8 +39,10 @@ class Indexer:
 
     def _index(self, path: Path) -> None:
         indexed = path.with_suffix(".rrd.part")
-        command = ["nice", "-n", "19", rerun_program(), "rrd", "optimize", str(path), "-o", str(indexed)]
-        done = subprocess.run(command, capture_output=True, check=False, start_new_session=True)
+        command = ["nice", "-n", "19", rerun_cli.program(), "rrd", "optimize", str(path), "-o", str(indexed)]
+        done = subprocess.run(
+            command, capture_output=True, check=False, env=rerun_cli.environment(), start_new_session=True
+        )
         if done.returncode == 0 and indexed.exists():
             indexed.replace(path)
         else:
