@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import socket
 import subprocess
 import sys
@@ -57,7 +56,7 @@ def listening(pid: int) -> dict[int, str]:
         with suppress(OSError):
             for handle in Path(f"/proc/{process}/fd").iterdir():
                 with suppress(OSError):
-                    inodes.add(os.readlink(handle).removeprefix("socket:[").rstrip("]"))
+                    inodes.add(str(handle.readlink()).removeprefix("socket:[").rstrip("]"))
     found = {}
     for table in ("tcp", "tcp6"):
         for line in Path(f"/proc/net/{table}").read_text().splitlines()[1:]:
