@@ -268,6 +268,10 @@ class Recording(Closing):
             return connection.msgdef
         return MessageDefinition(MessageDefinitionFormat.MSG, text)
 
+    def definitions(self, connection: Connection) -> Mapping[str, Any]:
+        """The fields of every type that a connection's messages may be made of, as rosbags has them."""
+        return self._store(connection).fielddefs
+
     def _store(self, connection: Connection) -> Typestore:
         """The types that the bag itself defines, else those of the ROS release."""
         ros1, definition = is_ros1(connection), connection.msgdef

@@ -30,7 +30,7 @@ from bevviz.report.origin import ReportInfo, shareable
 from bevviz.report.page import page
 from bevviz.report.redact import Redactor
 from bevviz.report.summary import WindowSummary
-from bevviz.report.window import Cut, Window, choose_topics, cut, find_window, open_window
+from bevviz.report.window import Cut, Window, choose_topics, cut, find_window, fits, open_window
 from bevviz.run import Observer, run
 from bevviz.session import Session
 from bevviz.stages.detector import Detector
@@ -43,7 +43,8 @@ class ReportRequest:
     """What is asked for.
 
     ``before`` and ``after`` are in seconds; ``topics``: patterns of those that go into the bag beside the
-    ones that the pipeline reads, None: all; ``redact``: hide people and vehicles; ``force``: overwrite.
+    ones that the pipeline reads, None: all; ``redact``: hide people and vehicles; ``unredacted``: patterns of
+    topics that are kept even so where nobody can tell what they show; ``force``: overwrite.
     """
 
     paths: Sequence[Path]
@@ -55,6 +56,7 @@ class ReportRequest:
     note: str = ""
     topics: Sequence[str] | None = None
     redact: bool = False
+    unredacted: Sequence[str] = ()
     include_model: bool = False
     force: bool = False
 
@@ -89,7 +91,14 @@ def make(request: ReportRequest) -> WrittenReport:
         topics = choose_topics(whole.recording, whole.roles, request.topics)
         redactor = found = None
         if request.redact:
-            redactor = Redactor(request.config.detector, whole.recording, whole.roles.lidars)
+            fits(whole.recording, request.unredacted, "--unredacted")
+            redactor = Redactor(
+                request.config.detector, whole.recording, whole.roles.lidars, request.unredacted
+            )
+        # Whatever ends this run, nobody must take an older report for this one, least of all unredacted.
+        for target in (rrd, html, bag):
+            target.unlink(missing_ok=True)
+        if request.redact:
             found = _detect(request, window)
         detect = None if found is None else replay(found)
         session = Session(request.config, detect)
