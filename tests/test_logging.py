@@ -713,7 +713,12 @@ def test_a_killed_process_leaves_what_it_had_logged(tmp_path: Path) -> None:
     env = {**os.environ, "PYTHONPATH": str(root)}
     done = subprocess.run([sys.executable, "-c", textwrap.dedent(script)], cwd=root, env=env, timeout=120)
     assert done.returncode == -signal.SIGKILL
-    assert sorted(Recording(path).at["/world/lidar/points"]["Points3D:positions"]) == [0, 1, 2, 3, 4]
+    left = tmp_path / "killed.partial.rrd"
+    assert not path.exists()
+    assert sorted(Recording(left).at["/world/lidar/points"]["Points3D:positions"]) == [0, 1, 2, 3, 4]
+    with open_recording(SCENE, load(), save=path) as sinks:  # the next run tells
+        assert sinks.warnings == ["killed.partial.rrd, which a run that did not end had left, is overwritten"]
+    assert path.exists() and not left.exists()
 
 
 @pytest.mark.parametrize(

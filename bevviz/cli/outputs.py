@@ -15,7 +15,6 @@ from bevviz.cli.interrupts import wait_for_interrupt
 from bevviz.text import printable
 
 if TYPE_CHECKING:
-    from rerun import RecordingStream
     from rerun.blueprint import Blueprint
 
     from bevviz.config import Config
@@ -74,13 +73,14 @@ class Outputs:
         ) as sinks:
             for url in sinks.urls:
                 say(f"viewer at {url}")
+            warn(sinks.warnings)
             yield sinks
 
-    def keep_serving(self, recording: RecordingStream, what: str = "") -> None:
+    def keep_serving(self, sinks: Sinks, what: str = "") -> None:
         """Until the user ends it, where a server was asked for."""
         if self.serve is not None:
             say(f"{what}serving until Ctrl-C")
-            recording.flush()
+            sinks.check()
             wait_for_interrupt()
 
 

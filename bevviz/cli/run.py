@@ -76,12 +76,14 @@ def logged(
     Returns:
         The exit status.
     """
+    from bevviz.logging.recorder import DiskWatch
+
     with outputs.opened(items.scene, config) as sinks:
-        end = through(items, processor, observers(sinks.recording))
+        end = through(items, processor, [*observers(sinks.recording), DiskWatch(sinks)])
         warn(items.warnings)
         finish()
         if end.frames and not end.interrupted:
-            outputs.keep_serving(sinks.recording, f"{end.frames} frames; ")
+            outputs.keep_serving(sinks, f"{end.frames} frames; ")
     target = f" in {outputs.save}" if outputs.save is not None else ""
     if end.interrupted:
         say(f"interrupted after {end.frames} frames; what was made until then is complete{target}")

@@ -10,6 +10,7 @@ from pathlib import Path
 
 from bevviz.config import LiveConfig
 from bevviz.errors import UserError
+from bevviz.files import lock, write_all
 from bevviz.live.encoder import Encoder, Packet
 from bevviz.live.notes import Notes
 from bevviz.live.output import Output
@@ -115,7 +116,14 @@ class Saver(Output):
 
     def _open(self) -> None:
         path = self._next
-        self._file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, 0o666)
+        self._file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_CLOEXEC, 0o666)
+        try:
+            lock(self._file, f"{path}: another process is writing it")
+        except UserError:
+            os.close(self._file)
+            raise
+        with suppress(OSError):  # no file but a device
+            os.ftruncate(self._file, 0)
         self.paths.append(path)
         self._written = self._whole = 0
 
@@ -133,10 +141,3 @@ class Saver(Output):
         os.close(self._file)
         if self._written:
             self._indexer.add(self.paths[-1])
-
-
-def write_all(file: int, data: bytes) -> None:
-    """``os.write`` until all is written: a disk that fills up takes a part first."""
-    rest = memoryview(data)
-    while rest:
-        rest = rest[os.write(file, rest) :]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import socket
 import sys
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from urllib.parse import urlsplit
@@ -15,8 +15,10 @@ import rerun.blueprint as rrb
 
 from bevviz.config import Config
 from bevviz.errors import UserError
+from bevviz.files import Unfinished, written
 from bevviz.frame import Scene
 from bevviz.logging import blueprints, rerun_cli
+from bevviz.logging.file_writer import FileWriter
 from bevviz.logging.ports import (
     FIRST_DATA_PORT,
     LOOPBACK,
@@ -34,10 +36,24 @@ MEMORY = "25%"  # of the machine's, for what a server keeps for those who join l
 
 @dataclass(frozen=True, slots=True)
 class Sinks:
-    """An open recording. ``urls``: what to open in a browser or viewer, one for each server."""
+    """An open recording.
+
+    Attributes:
+        urls: what to open in a browser or viewer, one for each server.
+        warnings: one sentence each.
+        file: where the recording is until it is whole; None: in no file.
+    """
 
     recording: rr.RecordingStream
     urls: list[str] = field(default_factory=list)
+    warnings: list[str] = field(default_factory=list)
+    file: Path | None = None
+    writer: FileWriter | None = None
+
+    def check(self) -> None:
+        """Raises UserError where the file cannot be written any more."""
+        if self.writer is not None:
+            self.writer.check()
 
 
 @contextmanager
@@ -55,12 +71,13 @@ def open_recording(
 ) -> Iterator[Sinks]:
     """Open a recording that goes to everything that is asked for, with the blueprint.
 
-    A file is written while the recording goes on: what was logged before an interruption is in it.
+    A file is written while the recording goes on, beside its place (see ``bevviz.files.written``): what was
+    logged before an interruption is in it.
 
     Args:
         scene: names of the sensors, for the blueprint.
         config: the configuration.
-        save: .rrd file; overwritten.
+        save: .rrd file; overwritten in the end.
         serve: port of the web viewer on this machine.
         bind: its address at which ``serve`` listens, for the page and for the data.
         connect: URL of a viewer that listens, rerun+http://host:9876/proxy.
@@ -70,15 +87,24 @@ def open_recording(
             random one, the same for all recordings of a process.
 
     Raises:
-        UserError: unknown blueprint, file that cannot be written, port in use, no viewer found or reached;
+        UserError: unknown blueprint, file that cannot be written or that another
+            process writes, port in use, no viewer found or reached;
             on leaving, when not everything could be written.
     """
     layout = blueprints.load(blueprint, scene) if isinstance(blueprint, str) else blueprint
     sinks: list[rr.FileSink | rr.GrpcSink | rr.GrpcServerSink] = []
     urls: list[str] = []
+    warnings: list[str] = []
+    file = writer = None
     with ExitStack() as stack:
         if save is not None:
-            sinks.append(_file(save))
+            given = stack.enter_context(_file(save))
+            file = given.path
+            writer = FileWriter(file)
+            stack.callback(writer.close)
+            sinks.append(writer.sink)
+            if given.leftover:
+                warnings.append(f"{file.name}, which a run that did not end had left, is overwritten")
         if connect is not None:
             sinks.append(_connection(connect))
         if spawn:
@@ -93,14 +119,20 @@ def open_recording(
             recording.set_sinks(*sinks, default_blueprint=layout)
         except (RuntimeError, ValueError) as error:
             raise UserError(f"cannot open the outputs: {error}") from None
+        if writer is not None:
+            writer.begin()
         try:
-            yield Sinks(recording, urls)
+            yield Sinks(recording, urls, warnings, file, writer)
         finally:
             _close(recording)
+            if writer is not None:
+                writer.close()
+        if writer is not None:
+            writer.check()
 
 
 def _close(recording: rr.RecordingStream) -> None:
-    """Write what is still on its way. An error that is already on its way out goes first."""
+    """Hand over what is still on its way. An error that is already on its way out goes first."""
     pending = sys.exc_info()[0] is not None
     try:
         recording.flush()
@@ -111,15 +143,12 @@ def _close(recording: rr.RecordingStream) -> None:
         recording.disconnect()
 
 
-def _file(path: Path) -> rr.FileSink:
-    if path.suffix != ".rrd":  # a slip must not overwrite the bag itself
-        raise UserError(f"--save {path}: expected a file name that ends in .rrd")
-    try:
-        with path.open("wb"):
-            pass
-    except OSError as error:
-        raise UserError(f"{path}: cannot write the recording: {error.strerror}") from None
-    return rr.FileSink(path)
+def _file(path: Path) -> AbstractContextManager[Unfinished]:
+    for name in (path, path.resolve()):  # a slip must not overwrite the bag itself, also not through a link
+        if name.suffix != ".rrd":
+            link = f" (it is a link to {name})" if name != path else ""
+            raise UserError(f"--save {path}: expected a file name that ends in .rrd{link}")
+    return written(path, "recording")
 
 
 def _connection(url: str) -> rr.GrpcSink:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
@@ -17,10 +18,12 @@ from bevviz.bags.recording import RawMessage
 from bevviz.bags.source import MARGIN, BagSource
 from bevviz.config import Config, changes, load
 from bevviz.errors import UserError
+from bevviz.files import claim, unfinished
+from bevviz.files import written as write_beside
 from bevviz.frame import Camera, Detections, Frame, FrameResult
 from bevviz.logging import entities
 from bevviz.logging.pieces import document
-from bevviz.logging.recorder import Recorder
+from bevviz.logging.recorder import DiskWatch, Recorder
 from bevviz.logging.sinks import open_recording
 from bevviz.progress import Progress
 from bevviz.provenance import Provenance, file_hash, model_path, names_path, provenance, versions
@@ -97,7 +100,10 @@ def make(request: ReportRequest) -> WrittenReport:
             )
         # Whatever ends this run, nobody must take an older report for this one, least of all unredacted.
         for target in (rrd, html, bag):
+            handle = claim(target, "report")
             target.unlink(missing_ok=True)
+            unfinished(target).unlink()
+            os.close(handle)
         if request.redact:
             found = _detect(request, window)
         detect = None if found is None else replay(found)
@@ -110,12 +116,12 @@ def make(request: ReportRequest) -> WrittenReport:
 
         public = shareable(request.config)
         source = stack.enter_context(open_window([bag], request.config, window.low, window.high))
-        sinks = open_recording(whole.scene, public, save=rrd, blueprint="bug_report")
-        recording = stack.enter_context(sinks).recording
+        sinks = stack.enter_context(open_recording(whole.scene, public, save=rrd, blueprint="bug_report"))
+        recording = sinks.recording
         written.files.insert(0, rrd)
         summary = WindowSummary(window.at, source.total, len(whole.scene.cameras))
         recorder = _ReportRecorder(recording, public, summary, window.at, request.note)
-        written.interrupted = run(source, session, [recorder, Progress("run")]).interrupted
+        written.interrupted = run(source, session, [recorder, DiskWatch(sinks), Progress("run")]).interrupted
         written.frames = len(summary.frames)
         written.warnings += [w for w in source.warnings if w not in written.warnings]
         written.warnings = [_without_folders(w, [*request.paths, bag]) for w in written.warnings]
@@ -124,10 +130,11 @@ def make(request: ReportRequest) -> WrittenReport:
         info = _info(request, window, written, made_with, bag)
         recording.send_property("report", rr.AnyValues(about=info.dump()))
         recording.log(entities.REPORT, document(facts.markdown()), static=True)
-    try:
-        html.write_text(page(facts, summary), encoding="utf-8")
-    except OSError as error:
-        raise UserError(f"{html}: cannot write the page: {error.strerror}") from None
+    with write_beside(html, "page") as given:
+        try:
+            given.path.write_text(page(facts, summary), encoding="utf-8")
+        except OSError as error:
+            raise UserError(f"{html}: cannot write the page: {error.strerror}") from None
     written.files.insert(1, html)
     return written
 
