@@ -34,7 +34,7 @@ class Killed:
     """What came of the signals that a command was sent."""
 
     signals: int = 0
-    ended: int = 0  # before the signal came
+    ended: int = 0  # before the signal came, or had not begun when it did
     tracebacks: int = 0
     false: int = 0  # a status or a result that is not true
     hangs: int = 0
@@ -48,7 +48,7 @@ class Killed:
         return not (self.tracebacks or self.false or self.hangs or self.unreadable or self.lost)
 
 
-HEAD = """| command | signals | ended before | tracebacks | false | hangs | unreadable | lost | s to the end |
+HEAD = """| command | signals | not running | tracebacks | false | hangs | unreadable | lost | s to the end |
 | --- | ---: | ---: | ---: | ---: | ---: | ---: | ---: | ---: |"""
 
 
@@ -99,7 +99,10 @@ def _one(folder: Path, command: str, number: signal.Signals, delay: float, tally
         return
     if number != signal.SIGKILL:
         tally.slowest = max(tally.slowest, time.monotonic() - sent)
-    if "Traceback" in said and "bevviz" in said:  # Python's own start has one, before any code of ours
+    if "<frozen site>" in said or "Fatal Python error" in said:  # Python itself was still starting
+        tally.ended += 1
+        return
+    if "Traceback" in said:
         tally.tracebacks += 1
         tally.examples.append(f"{what}: {said.strip().splitlines()[-1]}")
     if problem := _falsehood(folder, command, process.returncode, out):
