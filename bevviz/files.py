@@ -113,7 +113,7 @@ def _finish(path: Path, target: Path, what: str) -> None:
         raise UserError(f"{target}: cannot write the {what}: {error.strerror}") from None
 
 
-def write_all(file: int, data: bytes | bytearray) -> None:
+def write_all(file: int, data: bytes | memoryview) -> None:
     """``os.write`` until all is written: a disk that fills up takes a part first."""
     with memoryview(data) as rest:
         done = 0

@@ -77,12 +77,14 @@ class FileWriter(Closing):
                     break
                 _, length = MESSAGE.unpack_from(waiting, whole)
                 expected = whole + MESSAGE.size + length
-            self._write(waiting[:whole])
+            with memoryview(waiting) as view, view[:whole] as part:
+                self._write(part)
             del waiting[:whole]
             expected -= whole
-        self._write(waiting)  # the end of the file is no message
+        with memoryview(waiting) as view:
+            self._write(view)  # the end of the file is no message
 
-    def _write(self, data: bytearray) -> None:
+    def _write(self, data: memoryview) -> None:
         """All of it or nothing."""
         if self._failure is not None:
             return
