@@ -24,8 +24,8 @@ from bevviz import geometry
 from bevviz.anomalies import KINDS
 from bevviz.config import Config, load
 from bevviz.errors import UserError
-from bevviz.files import unfinished
 from bevviz.explain import explain
+from bevviz.files import unfinished
 from bevviz.frame import (
     Anomaly,
     Boxes3D,

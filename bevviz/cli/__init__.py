@@ -77,7 +77,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         sys.stdout = open(os.devnull, "w")  # noqa: SIM115, PTH123
         return 0
     except Exception as error:
-        if interrupt_in(error):
+        if interrupt_in(error) or interrupts.came():
             print("bevviz: interrupted", file=sys.stderr)
             return 130
         _log.error("an error that nobody foresaw", exc_info=error)
