@@ -647,9 +647,13 @@ def _flatten(tree: Mapping[str, Any]) -> dict[str, Any]:
 
 def _read_yaml(path: Path) -> Mapping[str, Any]:
     try:
-        text = path.read_text()
+        if path.is_fifo() and path.parts[1:2] not in (("dev",), ("proc",)):  # <(...) of a shell is welcome
+            raise UserError(f"{path}: cannot read the configuration: it is no file")
+        text = path.read_text(encoding="utf-8")
     except OSError as error:
         raise UserError(f"{path}: cannot read the configuration: {error.strerror}") from None
+    except UnicodeDecodeError as error:
+        raise UserError(f"{path}: is no UTF-8 text: {error.reason} at byte {error.start}") from None
     tree = _yaml_value(text, str(path))
     if tree is None:
         return {}
@@ -669,3 +673,7 @@ def _yaml_value(text: str, where: str) -> Any:
         mark = getattr(error, "problem_mark", None)
         line = f" line {mark.line + 1}" if mark else ""
         raise UserError(f"{where}:{line} is not valid YAML: {problem}") from None
+    except RecursionError:
+        raise UserError(f"{where}: is not valid YAML for a configuration: too deep") from None
+    except (ValueError, OverflowError) as error:  # a date that is none
+        raise UserError(f"{where}: is not valid YAML: {error}") from None

@@ -227,13 +227,14 @@ class Drive(Closing):
         Raises:
             UserError: the file cannot be written, or there is no such blueprint.
         """
-        from bevviz.logging.recorder import Recorder
+        from bevviz.logging.recorder import DiskWatch, Recorder
         from bevviz.logging.sinks import open_recording
         from bevviz.progress import Progress
 
         target = Path(path)
         with open_recording(self.scene, self.config, save=target, blueprint=blueprint) as sinks:
-            if self.run([Recorder(sinks.recording, self.config), Progress()]).interrupted:
+            recorder = Recorder(sinks.recording, self.config)
+            if self.run([recorder, DiskWatch(sinks), Progress()]).interrupted:
                 raise KeyboardInterrupt
         return target
 

@@ -18,6 +18,7 @@ import pytest
 from rosbags.typesys import get_types_from_msg
 
 from bevviz.cli import main
+from bevviz.files import unfinished
 from bevviz.frame import FrameResult
 from bevviz.logging.logger import Logger
 from tests import bags
@@ -248,7 +249,9 @@ def test_a_recording_never_overwrites_a_bag(capsys: Capture) -> None:
     small_bag()
     before = {path: path.read_bytes() for path in Path("drive").iterdir()}
     for path in before:
-        assert "ends in .rrd" in error_of(capsys, "bag", "drive", "--save", path)
+        assert "is what is read" in error_of(capsys, "bag", "drive", "--save", path)
+    Path("other.mcap").write_text("another bag")
+    assert "ends in .rrd" in error_of(capsys, "bag", "drive", "--save", "other.mcap")
     assert {path: path.read_bytes() for path in Path("drive").iterdir()} == before
 
 
@@ -331,7 +334,7 @@ def test_an_interrupted_run_leaves_a_readable_recording(tmp_path: Path, number: 
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env=environment()) as run:
         try:
             while run.poll() is None and time.monotonic() < deadline:
-                if saved.exists() and saved.stat().st_size > 4_000_000:
+                if unfinished(saved).exists() and unfinished(saved).stat().st_size > 4_000_000:
                     break
                 time.sleep(0.1)
             run.send_signal(number)

@@ -503,12 +503,16 @@ def test_a_whole_run_with_somebodys_stages(
     assert main(["why", drive, *own, "--at", "0.1", "--point=1,1,0"]) == 0
     assert main(["bag", drive, "--set", "clustering.method=mine.stages:raising", "--save", "y.rrd"]) == 0
     assert main(["report", drive, *own, "--at", "0.1", "-o", "bug.rrd"]) == 0
-    assert main(["report", "--check", "bug.rrd"]) == 0
+    trusted = ["--set", "clustering.method=mine.stages:cells"]
+    capsys.readouterr()
+    assert main(["report", "--check", "bug.rrd"]) == 2  # somebody else's report may name any code
+    assert f"if you trust it, add {' '.join(trusted)}" in capsys.readouterr().err
+    assert main(["report", "--check", "bug.rrd", *trusted]) == 0
     module = here / "mine" / "stages.py"
     source = module.read_text()
     module.write_text(source + "# another\n")
     capsys.readouterr()
-    assert main(["report", "--check", "bug.rrd"]) == 0
+    assert main(["report", "--check", "bug.rrd", *trusted]) == 0
     assert re.search(
         r"not as it was: clustering\.method was mine\.stages:cells \(SHA-256 \w{64}\), is",
         capsys.readouterr().out,

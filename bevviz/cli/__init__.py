@@ -25,6 +25,7 @@ from bevviz.cli import (
     tune,
     why,
 )
+from bevviz.cli.inputs import check_outputs
 from bevviz.errors import UserError, first_line, interrupt_in
 
 _log = logging.getLogger(__name__)
@@ -62,6 +63,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         options = _parser().parse_args(arguments)
         if options.verbose:
             _log_to_stderr()
+        check_outputs(options)
         run: Callable[[argparse.Namespace], int] = options.run
         return run(options)
     except UserError as error:
@@ -75,7 +77,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         sys.stdout = open(os.devnull, "w")  # noqa: SIM115, PTH123
         return 0
     except Exception as error:
-        if interrupt_in(error):
+        if interrupt_in(error) or interrupts.came():
             print("bevviz: interrupted", file=sys.stderr)
             return 130
         _log.error("an error that nobody foresaw", exc_info=error)

@@ -92,6 +92,7 @@ def add_output(parser: argparse.ArgumentParser, blueprint: str | None = "debug")
         metavar="PORT",
         help="web viewer on this machine (default: 9090)",
     )
+    add_bind(group, "--serve")
     group.add_argument(
         "--connect", metavar="URL", help="a viewer elsewhere, e.g. rerun+http://laptop:9876/proxy"
     )
@@ -104,6 +105,16 @@ def add_output(parser: argparse.ArgumentParser, blueprint: str | None = "debug")
             help=f"debug, live, explain, bug_report, compare, tune, a .py or a .rbl (default: {blueprint})",
         )
     return group
+
+
+def add_bind(group: argparse._ArgumentGroup, option: str) -> None:
+    """For whom a server is open."""
+    group.add_argument(
+        "--bind",
+        default="127.0.0.1",
+        metavar="ADDRESS",
+        help=f"{option} at this address (default: 127.0.0.1, for this machine alone; 0.0.0.0: for everybody)",
+    )
 
 
 def add_ros_args(parser: argparse.ArgumentParser) -> None:

@@ -141,4 +141,4 @@ def _show(result: FrameResult, answers: Sequence[Answer], scene: Scene, outputs:
         log_answers(sinks.recording, result.frame, answers, limit)
         if outputs.save is not None:
             say(f"saved in {outputs.save}")
-        outputs.keep_serving(sinks.recording)
+        outputs.keep_serving(sinks)
