@@ -25,6 +25,7 @@ from bevviz.cli import (
     tune,
     why,
 )
+from bevviz.cli.options import with_negatives
 from bevviz.errors import UserError, first_line, interrupt_in
 
 _log = logging.getLogger(__name__)
@@ -59,7 +60,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if arguments is None:
         interrupts.install()
     try:
-        options = _parser().parse_args(arguments)
+        options = _parser().parse_args(with_negatives(sys.argv[1:] if arguments is None else arguments))
         if options.verbose:
             _log_to_stderr()
         run: Callable[[argparse.Namespace], int] = options.run
