@@ -571,3 +571,25 @@ def test_wrong_numbers(bag: Path, capsys: Capture, arguments: list[str]) -> None
         main(["why", str(bag), "--at", "0", *arguments])
     assert ended.value.code == 2
     assert "error: argument" in capsys.readouterr().err
+
+
+# --- the page ----------------------------------------------------------------------------------
+
+
+def test_the_page_shows_what_the_command_says(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capture
+) -> None:
+    """Word for word; numbers may differ a little where another processor adds up in another order."""
+    page = (Path(__file__).parents[1] / "docs/why.md").read_text()
+    sample = next(block for block in page.split("```") if "bevviz demo" in block).removeprefix("console\n")
+    demo, command, *shown = sample.splitlines()
+    monkeypatch.chdir(tmp_path)
+    assert main(demo.removeprefix("$ bevviz ").split()) == 0
+    capsys.readouterr()
+    assert main(command.removeprefix("$ bevviz ").split()) == 0
+    said, told = (
+        (NUMBER.split(text), NUMBER.findall(text))
+        for text in (" ".join(capsys.readouterr().out.split()), " ".join(" ".join(shown).split()))
+    )
+    assert told[0] == said[0]
+    assert [float(x) for x in told[1]] == pytest.approx([float(x) for x in said[1]], rel=0.02, abs=0.02)
