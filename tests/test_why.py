@@ -307,6 +307,19 @@ def test_the_nearest_missed_is_near_and_missed() -> None:
     assert [a.distance for a in missed] == sorted(a.distance for a in missed)
 
 
+def test_weak_detections_are_not_told_unasked_and_the_surest_comes_first() -> None:
+    result = run("merged_people", "default")
+    blind = Questioner(replace(result, frame=replace(result.frame, truth=None)), classes=CLASSES)
+    told, everything = (blind.explain(Selection(), 0, everything=flag) for flag in (False, True))
+    weak = [a for a in everything if a.weak]
+    scores = [a.evidence.best.score for a in weak if a.evidence.best is not None]
+    assert len(scores) == len(weak) > 20 and scores == sorted(scores, reverse=True)
+    assert everything[-len(weak) :] == weak and not any(a.folded for a in told)
+    assert f"{len(weak)} weak detections (folded: --all)" in summary(blind.ask(Selection()))
+    for answer in everything:  # what is missed has a place, too: where the middle of its box has most points
+        assert np.isfinite(answer.distance) or answer.points == 0
+
+
 # --- stages that did not run -------------------------------------------------------------------
 
 

@@ -130,8 +130,9 @@ def _why(options: argparse.Namespace) -> int:
         if options.json:
             _print_json(result, answers, beside, in_short)
         else:
-            print(printable(f"frame {frame.index}, preset {config.preset}: {in_short}") + "\n")
-            print(plain(answers, options.limit, beside))
+            print(printable(f"frame {frame.index}, preset {config.preset}: {in_short}"))
+            if answers:
+                print(f"\n{plain(answers, options.limit, beside)}")
         if outputs := Outputs.of(options):
             _show(result, answers, source.scene, outputs, options.limit)
     return 0

@@ -52,7 +52,7 @@ class Answer:
 
     @property
     def weak(self) -> bool:
-        """Whether it is a weak detection of nothing, which is what thresholds are for."""
+        """Whether it is a weak detection of no known object, which is what thresholds are for."""
         low = self.verdict.reason in (Reason.BELOW_THRESHOLD, Reason.SUPPRESSED)
         return self.subject.kind == "detection" and low
 
@@ -149,10 +149,11 @@ class Questioner:
             UserError: as ``ask``.
         """
         answers = self.ask(selection)
-        if not everything:
-            if not (selection.label or selection.one):
-                answers = [a for a in answers if a.verdict.reason is not Reason.REPORTED]
-            answers = [a for a in answers if not a.folded] or answers
+        unfolded = [answer for answer in answers if not answer.folded]
+        if not everything and (selection.label or selection.one):
+            answers = unfolded or answers
+        elif not everything:
+            answers = [answer for answer in unfolded if answer.verdict.reason is not Reason.REPORTED]
         return [*map(self.with_hints, progress(answers[:hints])), *answers[hints:]]
 
     def candidates(self, selection: Selection) -> list[Answer]:
@@ -216,9 +217,11 @@ def why(
     return Questioner(result, loader, classes).explain(selection, hints, everything=everything)
 
 
-def _rank(answer: Answer) -> tuple[bool, bool, bool, bool, float]:
-    v = answer.verdict
-    return answer.folded, v.reported, v.reason is Reason.REPORTED, not answer.near, _far(answer)
+def _rank(answer: Answer) -> tuple[bool, bool, bool, bool, bool, float]:
+    v, best = answer.verdict, answer.evidence.best
+    if answer.weak and best is not None:  # the surest first
+        return True, True, False, False, False, -best.score
+    return answer.folded, False, v.reported, v.reason is Reason.REPORTED, not answer.near, _far(answer)
 
 
 def _place_rank(answer: Answer, shows: bool) -> tuple[bool, bool, int, bool, float]:

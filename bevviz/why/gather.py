@@ -163,7 +163,7 @@ def _distance(subject: Subject, traces: Traces, points: I64, main: int) -> float
         return float(np.hypot(*subject.box.center[0, :2]))
     if main >= 0 and result.clusters is not None:
         return float(np.hypot(*result.clusters.centroid[main, :2]))
-    if subject.kind == "pixel" and len(points):
+    if subject.kind in ("pixel", "detection") and len(points):
         return float(np.median(np.hypot(*result.frame.points[points, :2].T)))
     return float("nan")
 

@@ -54,7 +54,7 @@ def summary(answers: Sequence[Answer]) -> str:
         said.append(f"{len(hopeless)} hidden, out of view or without points")
     weak = len(answers) - len(things)
     if weak:
-        said.append(f"{count(weak, 'weak detection')} of nothing")
+        said.append(count(weak, "weak detection"))
     if any(a.verdict.reason is Reason.NOT_RUN for a in missed):
         said.append("the detector never ran")
     folded = " (folded: --all)" if any(a.folded for a in answers) else ""
