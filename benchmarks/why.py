@@ -203,7 +203,7 @@ def main() -> None:
         help="drives",
     )
     parser.add_argument("--frames", type=int, default=100, help="length of each drive in scans")
-    parser.add_argument("--every", type=int, default=10, help="each N-th scan is asked about")
+    parser.add_argument("--every", type=int, default=20, help="each N-th scan is asked about")
     parser.add_argument("--wrong", action="store_true", help="also say each wrong answer")
     parser.add_argument("--write", type=Path, help="page whose section is replaced, instead of printing it")
     options = parser.parse_args()
