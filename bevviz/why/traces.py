@@ -19,6 +19,7 @@ from bevviz.frame import (
     Boxes3D,
     CameraResult,
     Decision,
+    Detections,
     FrameResult,
 )
 from bevviz.stages.robot import in_points_frame
@@ -68,8 +69,16 @@ class Traces:
         self.classes = tuple(dict.fromkeys([*classes, *seen]))
         self._places: dict[tuple[object, ...], I64] = {}
         self._uv: dict[str, F32] = {}
-        self._owners: dict[str, I64] = {}
+        self._owners: dict[str, tuple[Detections, I64]] = {}  # with what they are the owners of
         self._labels: dict[int, I32] = {}
+
+    def again(self, result: FrameResult) -> Traces:
+        """For another result of the same frame: what hangs on the frame alone is shared."""
+        other = Traces(result, self.classes)
+        other._places, other._uv, other._owners = self._places, self._uv, dict(self._owners)
+        other.truth, other.shown = self.truth, self.shown
+        other.directions, other._by_x = self.directions, self._by_x
+        return other
 
     def origin(self, section: str) -> StageOrigin:
         """Whose the stage of a section is."""
@@ -146,11 +155,12 @@ class Traces:
 
     def place(self, subject: Subject) -> I64:
         """Rows of the raw points at the subject's place: its own, in its box or sphere, or in its frustum."""
-        if subject.is_place:  # there is no end of them
+        if subject.is_place or subject.points is not None:  # of places there is no end
             return self._place(subject)
-        if subject.key not in self._places:
-            self._places[subject.key] = self._place(subject)
-        return self._places[subject.key]
+        key = subject.key if subject.xyxy is None else (*subject.key, *subject.xyxy.tolist())
+        if key not in self._places:
+            self._places[key] = self._place(subject)
+        return self._places[key]
 
     def _place(self, subject: Subject) -> I64:
         if subject.points is not None:
@@ -283,14 +293,15 @@ class Traces:
         of it, so that two IoU count: with the projected box of the object, and with the image box around its
         own points, which are not where another is before it; the greater one three times.
         """
-        name = camera.camera.name
-        if name not in self._owners:
-            self._owners[name] = self._find_owners(camera)
-        return self._owners[name]
-
-    def _find_owners(self, camera: CameraResult) -> I64:
-        detections = camera.detections
+        name, detections = camera.camera.name, camera.detections
         assert detections is not None
+        known, owners = self._owners.get(name, (None, None))
+        if owners is None or known is None or not _same_boxes(known, detections):
+            owners = self._find_owners(camera, detections)
+            self._owners[name] = detections, owners
+        return owners
+
+    def _find_owners(self, camera: CameraResult, detections: Detections) -> I64:
         owner = np.full(len(detections), -1, np.int64)
         column = [c.camera.name for c in self.result.cameras].index(camera.camera.name)
         rows = [row for row in range(len(self.truth)) if self.shown[row, column] > 0]
@@ -329,6 +340,11 @@ class Traces:
                 kept = camera.detections.kept & (self.owners(camera) < 0)
                 found += [detection_subject(camera, d) for d in np.flatnonzero(kept).tolist()]
         return tuple(found)
+
+
+def _same_boxes(a: Detections, b: Detections) -> bool:
+    """Whether they differ in their states only."""
+    return a is b or (a.names == b.names and np.array_equal(a.xyxy, b.xyxy))
 
 
 def joined(boxes: Sequence[Boxes3D]) -> Boxes3D:

@@ -106,7 +106,7 @@ class WhatIf:
                 self._runs[key] = None
             else:
                 result = perceive(self._result.frame, config, stages, self._memo)
-                self._runs[key] = Traces(result, self._traces.classes)
+                self._runs[key] = self._traces.again(result)
             while len(self._runs) > RESULTS:
                 del self._runs[next(iter(self._runs))]
         return self._runs[key]
