@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from bevviz.config import Config
+from bevviz.config import OURS, Config
 from bevviz.frame import (
     CameraResult,
     Clusters,
@@ -18,6 +18,7 @@ from bevviz.frame import (
     Fusion,
     Pair,
 )
+from bevviz.plugins import TOPIC
 
 
 def explain(
@@ -125,10 +126,18 @@ def _unclustered(
     kinds = []
     for label, count in zip(*np.unique(labels, return_counts=True), strict=True):
         if label < 0:
-            kinds.append(f"{count} noise (clustering.min_points is {config.clustering.min_points})")
+            kinds.append(f"{count} noise ({_noise(config)})")
         else:
             kinds.append(f"{count} of cluster {label} ({_set_aside(int(clusters.state[label]), config)})")
     return f"{_points(len(labels))} in its frustum: {', '.join(kinds)}"
+
+
+def _noise(config: Config) -> str:
+    """What it hung on; of somebody else's clustering that is not known."""
+    method = config.clustering.method
+    if method in OURS:
+        return f"clustering.min_points is {config.clustering.min_points}"
+    return f"by {method.removeprefix(TOPIC)}"
 
 
 # --- clusters ----------------------------------------------------------------------------------

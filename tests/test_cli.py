@@ -18,6 +18,7 @@ import pytest
 from rosbags.typesys import get_types_from_msg
 
 from bevviz.cli import main
+from bevviz.cli.options import with_negatives
 from bevviz.files import unfinished
 from bevviz.frame import FrameResult
 from bevviz.logging.logger import Logger
@@ -101,6 +102,19 @@ def test_info_names_sensors_and_what_is_missing(capsys: Capture) -> None:
     said = capsys.readouterr().out
     assert bags.CLOUD in said
     assert "--model" in said
+
+
+def test_several_numbers_may_begin_below_zero() -> None:
+    """argparse takes lone negative numbers for values, but not -5,1,0."""
+    assert with_negatives(["why", "--point", "-5,1,0", "--at", "-3"]) == [
+        "why",
+        "--point=-5,1,0",
+        "--at",
+        "-3",
+    ]
+    assert with_negatives(["--point", "-.5,-1e-3,0"]) == ["--point=-.5,-1e-3,0"]
+    kept = ["--point=1,2", "-5,1", "-v", "--set", "-x=1,2", "bag", "-1,2"]
+    assert with_negatives(kept) == kept
 
 
 def test_config_is_read_back(capsys: Capture, tmp_path: Path) -> None:

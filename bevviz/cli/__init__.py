@@ -26,6 +26,7 @@ from bevviz.cli import (
     why,
 )
 from bevviz.cli.inputs import check_outputs
+from bevviz.cli.options import with_negatives
 from bevviz.errors import UserError, first_line, interrupt_in
 
 _log = logging.getLogger(__name__)
@@ -60,7 +61,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if arguments is None:
         interrupts.install()
     try:
-        options = _parser().parse_args(arguments)
+        options = _parser().parse_args(with_negatives(sys.argv[1:] if arguments is None else arguments))
         if options.verbose:
             _log_to_stderr()
         check_outputs(options)

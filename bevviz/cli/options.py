@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import argparse
+import re
+from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeAlias
 
@@ -15,6 +17,8 @@ Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
 
 TIMES = """A time is in seconds from the start of the bag (12.5), since 1970 (1700000000.0) or
 ISO 8601 (2026-11-21T10:00:00)."""
+
+_NEGATIVES = re.compile(r"-[\d.][-+\d.eE]*(,[-+\d.eE]+)+")  # several numbers, the first below zero
 
 
 def add_bag(parser: argparse.ArgumentParser, *, detector: bool = True) -> argparse._ArgumentGroup:
@@ -134,6 +138,18 @@ def load_config(options: argparse.Namespace) -> Config:
     model = getattr(options, "model", None)
     more = [f"detector.model={model}"] if model else []
     return load(options.config, [*options.set, *more], options.preset)
+
+
+def with_negatives(arguments: Iterable[str]) -> list[str]:
+    """The arguments with ``--point -5,1,0`` as ``--point=-5,1,0``: argparse takes it for an option."""
+    joined: list[str] = []
+    for argument in arguments:
+        option = joined[-1] if joined else ""
+        if option.startswith("--") and "=" not in option and _NEGATIVES.fullmatch(argument):
+            joined[-1] = f"{option}={argument}"
+        else:
+            joined.append(argument)
+    return joined
 
 
 def positive(text: str) -> int:
