@@ -1,0 +1,539 @@
+"""What a camera's boxes say of the clusters: which points are one object, and how large it is."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from bevviz import geometry
+from bevviz.config import ClusteringConfig, FusionConfig, ObjectsConfig
+from bevviz.frame import (
+    F32,
+    F64,
+    I32,
+    I64,
+    Bool,
+    CameraResult,
+    Claims,
+    Clusters,
+    ClusterState,
+    Detections,
+    DetectionState,
+    Intrinsics,
+    Splits,
+)
+from bevviz.stages.boxfit import NO_EDGE, fit
+from bevviz.stages.cells import sort_by
+from bevviz.stages.clustering import redescribe
+from bevviz.stages.kernel import kernel
+
+EDGE_PIXELS = 2.0  # one sigma of the edges of an image box,
+EDGE_SHARE = 0.03  # or this share of its width, where that is more
+TALL_SHARE = 0.08  # the same of a height, which also depends on where the object stands in the box
+TAIL = 4.0  # degrees of freedom of Student's distribution, of how far a height is from its class's
+LOWEST = 2.0  # sigmas: what is hidden may be as low as it likes
+LOWEST_CUT = 1.0  # of what the image cuts off
+MARGIN = 0.05  # of a box's width that is looked at on either side of it
+AROUND = 0.5  # of its width, in which points tell that an object goes on
+REACH_SPREAD = 2.0  # sigmas of its size that an object may be deep
+WINDOWS = 8  # that overlap at each depth
+BORDER = 2.0  # pixels from the border of the image that a box is cut off at
+SAME = 0.7  # IoU from which image boxes of two classes show one object: NMS is by class
+SKIN = 0.1  # metres around a box in which a point is still its own
+KIN = 0.1  # share of an object's points from which a cluster is one that it is made of
+SLACK = 0.5  # metres around a box in which what is left of a cluster, too small to be one, is its own
+
+
+def claim(
+    points: F32,
+    height: F32 | None,
+    clusters: Clusters,
+    cameras: Sequence[CameraResult],
+    fusion: FusionConfig,
+    objects: ObjectsConfig,
+    clustering: ClusteringConfig,
+) -> tuple[Clusters, tuple[Claims | None, ...], Splits]:
+    """Split and merge clusters by the boxes of detections.
+
+    In the frustum of each kept detection, what holds together seen from above (gaps below ``fusion.max_gap``)
+    and is not deeper than the class can be is a candidate. It is rated::
+
+        score * overlap * t(height) * share
+
+    with the part of the image box that the candidate's outline covers; how well the box's height in metres at
+    the candidate's distance agrees with that of the class (Student's t, lenient with what is lower, as it may
+    be hidden in part); and how much of what it hangs together with is in the box. The best rated detection of
+    all takes its points, others that wanted them look again, and so on. What is taken in the end is what lies
+    in the box of the class's size that is fitted (``boxfit.fit``) to the candidate: that joins what something
+    in front has parted, and leaves out what stands too near.
+
+    Noise can be taken, clusters outside the size limits cannot. A cluster that an earlier camera has shaped
+    is not shaped again, but can be taken as it is.
+
+    Args:
+        points: (P, 3) obstacle points, z up.
+        height: (P,) metres above the ground, where known: objects of known size stand on it.
+        clusters: of those points.
+        cameras: their detections, and the points in their images; those that lack either are skipped.
+        fusion: rules.
+        objects: sizes of the classes.
+        clustering: size limits.
+
+    Returns:
+        The clusters as they are now, every point of the old ones in one of them; for each camera what its
+        detections took; and what was split and merged.
+    """
+    work = _Work(points, height, clusters, fusion, objects.sizes, clustering.min_cluster_points)
+    taken = [work.look(result) for result in cameras]
+    now, row_of, splits = _relabelled(
+        points, clusters, work.parts, [c.camera.name for c in cameras], clustering
+    )
+    claims = tuple(
+        None if claims is None else Claims(row_of[claims.cluster], claims.fit, claims.boxes, claims.seen)
+        for claims in taken
+    )
+    return now, claims, splits
+
+
+@dataclass(slots=True)
+class _Part:
+    """What one detection took."""
+
+    camera: int
+    detection: int
+    rows: I64
+
+
+@dataclass(frozen=True, slots=True)
+class _Candidate:
+    fit: float
+    rows: I64
+    depth: float  # metres on the ground to where it begins
+
+
+class _Work:
+    """One frame: the points that are still free, and the parts that were taken."""
+
+    def __init__(
+        self,
+        points: F32,
+        height: F32 | None,
+        clusters: Clusters,
+        config: FusionConfig,
+        sizes: Mapping[str, tuple[float, ...] | None],
+        smallest: int,
+    ) -> None:
+        self.points, self.height, self.clusters, self.config = points, height, clusters, config
+        self.sizes, self.smallest = sizes, smallest
+        self.parts: list[_Part] = []
+        kept = np.append(clusters.state == ClusterState.KEPT, True)  # noise is the last
+        self._usable = kept[clusters.labels]
+        self._owner = np.full(len(points), -1, np.int64)
+        self._cameras = 0
+        order, self._start = sort_by(clusters.labels + np.int32(1), len(clusters) + 1)  # noise comes first
+        self._order = order.astype(np.int64)
+
+    def look(self, result: CameraResult) -> Claims | None:
+        """What the detections of one camera take; clusters are numbers of parts."""
+        camera, number = result.camera, self._cameras
+        self._cameras += 1
+        if (
+            result.detections is None
+            or result.uv is None
+            or result.depth is None
+            or camera.intrinsics is None
+            or camera.camera_from_points is None
+        ):
+            return None
+        view = _View(
+            result.uv, result.depth, result.detections, camera.intrinsics, camera.camera_from_points, self
+        )
+        found = result.detections
+        claims = Claims.none(len(found))
+        waiting = {d: view.best(d) for d in np.flatnonzero(found.state == DetectionState.KEPT).tolist()}
+        same = geometry.iou(found.xyxy, found.xyxy) >= SAME
+        same &= np.array([[a != b for b in found.names] for a in found.names], bool).reshape(same.shape)
+        while waiting:
+            d = max(waiting, key=lambda d: waiting[d].fit * float(found.score[d]))
+            candidate = waiting.pop(d)
+            claims.fit[d] = candidate.fit
+            if candidate.fit * float(found.score[d]) < self.config.min_rating:
+                continue
+            part = self._owned(candidate.rows)
+            if part >= 0:
+                rows = self.parts[part].rows
+                _, box, seen = view.settled(d, replace(candidate, rows=rows), grow=False)
+            else:
+                rows = candidate.rows[self.unowned(candidate.rows)]
+                if len(rows) < self.config.min_points:
+                    continue
+                candidate = replace(candidate, rows=rows)
+                rows, box, seen = view.settled(d, candidate, grow=True)
+                part = len(self.parts)
+                self.parts.append(_Part(number, d, rows))
+                self._owner[rows] = part
+            claims.cluster[d] = part
+            claims.boxes.center[d], claims.boxes.size[d], claims.boxes.yaw[d] = box[:3], box[3:6], box[6]
+            claims.seen[d] = seen
+            view.free[rows] = False
+            for other in list(waiting):
+                if same[other, d] and not view.free[waiting[other].rows].all():
+                    claims.fit[other] = waiting.pop(other).fit
+                elif not view.free[waiting[other].rows].all():
+                    waiting[other] = view.best(other)
+        return claims
+
+    def _owned(self, rows: I64) -> int:
+        """The part of an earlier camera that most of these points are of, -1: none."""
+        owners = self._owner[rows]
+        owners = owners[owners >= 0]
+        return int(np.bincount(owners).argmax()) if 2 * len(owners) > len(rows) else -1
+
+    def unused(self) -> Bool:
+        """(P,) points that can be taken."""
+        return self._usable.copy()
+
+    def unowned(self, rows: I64) -> Bool:
+        """(N,) which of these points no part has."""
+        return np.asarray(self._owner[rows] < 0)
+
+    def free_of(self, k: int) -> I64:
+        """Points of a cluster that no part has."""
+        rows = self._order[self._start[k + 1] : self._start[k + 2]]
+        return rows[self._owner[rows] < 0]
+
+
+class _View:
+    """The points as one camera sees them, from above with the camera at the origin."""
+
+    def __init__(
+        self,
+        uv: F32,
+        depth: F32,
+        detections: Detections,
+        intrinsics: Intrinsics,
+        camera_from_points: F64,
+        work: _Work,
+    ) -> None:
+        self._work, self._uv, self._detections = work, uv, detections
+        self._intrinsics = intrinsics
+        points_from_camera = geometry.inverse(camera_from_points)
+        self._place = points_from_camera[:3, 3]
+        self.free = work.unused()
+        u = uv[:, 0]
+        seen = np.flatnonzero(np.isfinite(u) & (depth > 0) & (depth <= work.config.max_depth))
+        self._order = seen[np.argsort(u[seen])]
+        self._u = u[self._order]
+        # Directions of the middles of the left, upper, right and lower edge of each box.
+        x0, y0, x1, y1 = detections.xyxy.T.astype(np.float64)
+        mx, my = (x0 + x1) / 2, (y0 + y1) / 2
+        corners = np.stack([x0, my, mx, y0, x1, my, mx, y1], axis=1).reshape(-1, 2)
+        rays = geometry.rays(corners, intrinsics).reshape(-1, 4, 3)
+        middle = (rays[:, 0] + rays[:, 2]) / 2
+        flat = np.hypot(middle[:, 0], 1)  # of a ray's length, what lies on the ground
+        self._tall = (rays[:, 3, 1] - rays[:, 1, 1]) / flat  # metres high for each metre of distance
+        self._wide = (rays[:, 2, 0] - rays[:, 0, 0]) / flat
+        across = rays[:, [0, 2]] @ points_from_camera[:2, :3].T  # (D, 2, 2) on the ground
+        across /= np.maximum(np.linalg.norm(across, axis=2, keepdims=True), 1e-9)
+        self._normals = np.stack([-across[..., 1], across[..., 0]], axis=2)
+        self._normals[:, 1] *= -1
+        self._cut = np.stack(
+            [
+                x0 <= BORDER,
+                y0 <= BORDER,
+                x1 >= intrinsics.width - 1 - BORDER,
+                y1 >= intrinsics.height - 1 - BORDER,
+            ],
+            axis=1,
+        )
+
+    def _size(self, d: int) -> tuple[float, ...] | None:
+        return self._work.sizes.get(self._detections.names[d].lower())
+
+    def best(self, d: int) -> _Candidate:
+        """The best rated of what is free in a detection's frustum."""
+        config, size = self._work.config, self._size(d)
+        x0, _, x1, _ = self._detections.xyxy[d].astype(np.float64)
+        around = AROUND * (x1 - x0)
+        rows = self._between(d, x0 - around, x1 + around)
+        rows = rows[self.free[rows]]
+        uv = self._uv[rows].astype(np.float64)
+        xy = self._work.points[rows, :2] - self._place[:2]
+        reach = (
+            np.nan
+            if size is None
+            else math.hypot(size[0] + REACH_SPREAD * size[3], size[1] + REACH_SPREAD * size[4])
+        )
+        chosen, rating, depth = _choose(
+            xy,
+            uv,
+            self._detections.xyxy[d].astype(np.float64),
+            config.max_gap,
+            reach,
+            max(self._tall[d], self._wide[d]),
+            self._tall[d],
+            np.nan if size is None else size[2],
+            np.nan if size is None else math.hypot(size[5], TALL_SHARE * size[2]),
+            LOWEST_CUT if self._cut[d, [1, 3]].any() else LOWEST,
+            config.min_points,
+            config.min_iou,
+        )
+        return _Candidate(rating, rows[chosen], depth)
+
+    def settled(self, d: int, candidate: _Candidate, grow: bool) -> tuple[I64, F64, Bool]:
+        """The object's points, its box (centre, size, heading), and which of its sides were seen."""
+        work, rows = self._work, candidate.rows
+        if not grow:
+            return rows, *self._fitted(d, rows, candidate.depth)
+        # Its clusters are its own beyond the image that cuts it off, and beyond a box that is too tight.
+        sources, counts = np.unique(work.clusters.labels[rows], return_counts=True)
+        kin = [work.free_of(k) for k in sources[(sources >= 0) & (counts >= KIN * len(rows))].tolist()]
+        if self._cut[d, [0, 2]].any():
+            size, place = self._size(d), work.points[rows, :2].mean(axis=0)
+            long = candidate.depth * self._wide[d] if size is None else size[0]
+            for own in kin:
+                beyond = own[np.isnan(self._uv[own, 0])]
+                away = work.points[beyond, :2] - place
+                rows = np.concatenate([rows, beyond[np.hypot(away[:, 0], away[:, 1]) <= long]])
+        box, _ = self._fitted(d, rows, candidate.depth)
+        x0, _, x1, _ = self._detections.xyxy[d]
+        margin = MARGIN * (x1 - x0)
+        near = np.concatenate([self._between(d, x0 - margin, x1 + margin), *kin])
+        near = near[self.free[near] & work.unowned(near)]
+        inside = np.unique(near[_within(work.points[near], box, SKIN)])
+        rows = inside if len(inside) >= work.config.min_points else candidate.rows
+        box, seen = self._fitted(d, rows, candidate.depth, about=box[6])
+        # What is left beside it and too small to be a cluster stays with it.
+        for own in kin:
+            rest = np.setdiff1d(own, rows, assume_unique=True)
+            if len(rest) < work.smallest and _within(work.points[rest], box, SLACK).all():
+                rows = np.concatenate([rows, rest])
+        return rows, box, seen
+
+    def _between(self, d: int, left: float, right: float) -> I64:
+        """Points from one column of pixels to another, in the rows of a detection's box."""
+        _, y0, _, y1 = self._detections.xyxy[d]
+        first, last = np.searchsorted(self._u, (left, right))
+        rows = self._order[first:last]
+        v = self._uv[rows, 1]
+        return np.asarray(rows[(v >= y0) & (v <= y1)])
+
+    def _fitted(self, d: int, rows: I64, depth: float, about: float = np.nan) -> tuple[F64, Bool]:
+        work, size = self._work, self._size(d)
+        points = work.points[rows]
+        width = float(self._detections.xyxy[d, 2] - self._detections.xyxy[d, 0])
+        sigma = max(EDGE_PIXELS / max(width, 1.0), EDGE_SHARE) * self._wide[d] * depth
+        edge = np.where(self._cut[d, [0, 2]], NO_EDGE, max(sigma, 1e-3))
+        prior = np.full(4, np.nan) if size is None else np.array([size[0], size[3], size[1], size[4]])
+        longest = max(self._wide[d], self._tall[d]) * depth
+        flat, facing = fit(points[:, :2] - self._place[:2], self._normals[d], edge, prior, longest, about)
+        length, width, heading = flat[2:]
+        seen = np.array([facing[0] > 0, facing[0] < 0, facing[1] > 0, facing[1] < 0])
+        if size is None and width > length:
+            length, width, heading = width, length, heading - np.pi / 2
+            seen = seen[[3, 2, 0, 1]]
+        if not -np.pi / 2 < heading <= np.pi / 2:
+            heading += np.pi if heading < 0 else -np.pi
+            seen = seen[[1, 0, 3, 2]]
+        low, high = float(points[:, 2].min()), float(points[:, 2].max())
+        if size is not None and work.height is not None:
+            low = float(np.median(points[:, 2] - work.height[rows]))
+            high = max(high, low + size[2] - size[5])
+        x, y = flat[:2] + self._place[:2]
+        least = 0.01
+        box = [x, y, (low + high) / 2, max(length, least), max(width, least), max(high - low, least), heading]
+        return np.array(box), seen
+
+
+def _within(points: F32, box: F64, skin: float) -> Bool:
+    """(N,) which points are in a box, seen from above, or as near as ``skin``."""
+    c, s = math.cos(box[6]), math.sin(box[6])
+    x, y = (points[:, :2] - box[:2]).T
+    along, across = np.abs(c * x + s * y), np.abs(c * y - s * x)
+    return np.asarray((along <= box[3] / 2 + skin) & (across <= box[4] / 2 + skin))
+
+
+@kernel
+def _choose(
+    xy: F64,
+    uv: F64,
+    box: F64,
+    gap: float,
+    reach: float,
+    ratio: float,
+    tall: float,
+    height: float,
+    sigma: float,
+    lowest: float,
+    fewest: int,
+    least: float,
+) -> tuple[I64, float, float]:
+    """Rows of the best candidate, how well it fits and how far away it begins.
+
+    Args:
+        xy: (N, 2) metres from the camera, points in the image box and as far to its sides as is looked.
+        uv: (N, 2) their pixels.
+        box: (4,) the image box.
+        gap: points that are this near hold together.
+        reach: how deep an object can be; NaN: as deep as it is large.
+        ratio: how large it is for each metre of distance.
+        tall: how high it is for each metre of distance.
+        height: of its class, NaN where unknown.
+        sigma: of that.
+        lowest: in sigmas, how much lower it may be for nothing more.
+        fewest: points.
+        least: part of the image box that is covered.
+    """
+    n = len(xy)
+    nothing = np.zeros(0, np.int64)
+    margin = MARGIN * (box[2] - box[0])
+    inside = np.empty(n, np.bool_)
+    far = np.empty(n)
+    low_x, low_y, high_x, high_y = np.inf, np.inf, -np.inf, -np.inf
+    for i in range(n):
+        far[i] = math.hypot(xy[i, 0], xy[i, 1])
+        inside[i] = box[0] - margin <= uv[i, 0] <= box[2] + margin
+        if inside[i]:
+            low_x, high_x = min(low_x, xy[i, 0]), max(high_x, xy[i, 0])
+            low_y, high_y = min(low_y, xy[i, 1]), max(high_y, xy[i, 1])
+    if high_x < low_x:
+        return nothing, 0.0, 0.0
+
+    # What holds together: cells half as wide as the gap, flooded two cells far. -1: to be flooded, -2: empty.
+    cell = gap / 2
+    columns, rows = int((high_x - low_x) / cell) + 1, int((high_y - low_y) / cell) + 1
+    grid = np.full((columns, rows), -2, np.int32)
+    at = np.empty((n, 2), np.int64)
+    for i in range(n):
+        at[i, 0], at[i, 1] = (
+            math.floor((xy[i, 0] - low_x) / cell),
+            math.floor((xy[i, 1] - low_y) / cell),
+        )
+        if inside[i]:
+            grid[at[i, 0], at[i, 1]] = -1
+    stack = np.empty((n, 2), np.int64)
+    bodies = 0
+    for i in range(n):
+        if not inside[i] or grid[at[i, 0], at[i, 1]] != -1:
+            continue
+        grid[at[i, 0], at[i, 1]] = bodies
+        stack[0, 0], stack[0, 1] = at[i, 0], at[i, 1]
+        top = 1
+        while top:
+            top -= 1
+            column, row = stack[top, 0], stack[top, 1]
+            for p in range(max(column - 2, 0), min(column + 3, columns)):
+                for q in range(max(row - 2, 0), min(row + 3, rows)):
+                    if grid[p, q] == -1:
+                        grid[p, q] = bodies
+                        stack[top, 0], stack[top, 1] = p, q
+                        top += 1
+        bodies += 1
+    start = np.zeros(bodies + 1, np.int64)
+    body = np.full(n, -1, np.int64)
+    for i in range(n):
+        for p in range(max(at[i, 0] - 2, 0), min(at[i, 0] + 3, columns)):
+            for q in range(max(at[i, 1] - 2, 0), min(at[i, 1] + 3, rows)):
+                if grid[p, q] >= 0 and (body[i] < 0 or (p == at[i, 0] and q == at[i, 1])):
+                    body[i] = grid[p, q]
+        if body[i] >= 0:
+            start[body[i] + 1] += 1
+    for k in range(bodies):
+        start[k + 1] += start[k]
+    end, by_body = start[:-1].copy(), np.empty(start[-1], np.int64)
+    for i in np.argsort(far):
+        if body[i] >= 0:
+            by_body[end[body[i]]] = i
+            end[body[i]] += 1
+
+    area = (box[2] - box[0]) * (box[3] - box[1])
+    best, best_first, best_last, best_far = 0.0, 0, 0, 0.0
+    for k in range(bodies):
+        first = start[k]
+        while first < start[k + 1]:
+            begin = far[by_body[first]]
+            deep = ratio * begin if np.isnan(reach) else reach
+            u0, v0, u1, v1 = np.inf, np.inf, -np.inf, -np.inf
+            held = 0
+            last = first
+            while last < start[k + 1] and far[by_body[last]] <= begin + deep:
+                i = by_body[last]
+                if inside[i]:
+                    held += 1
+                    u0, u1 = min(u0, uv[i, 0]), max(u1, uv[i, 0])
+                    v0, v1 = min(v0, uv[i, 1]), max(v1, uv[i, 1])
+                last += 1
+            if held >= fewest:
+                covered = max(min(u1, box[2]) - max(u0, box[0]), 0.0) * max(
+                    min(v1, box[3]) - max(v0, box[1]), 0.0
+                )
+                overlap = covered / area if area > 0 else 0.0
+                front = far[by_body[first + (last - 1 - first) // WINDOWS]]
+                rating = overlap * held / (last - first)
+                if not np.isnan(height):
+                    z = max((tall * front - height) / sigma, -lowest)
+                    rating /= 1 + z * z / TAIL
+                if overlap >= least and rating > best:
+                    best, best_first, best_last, best_far = rating, first, last, front
+            if last == start[k + 1]:
+                break
+            while first < start[k + 1] and far[by_body[first]] < begin + deep / WINDOWS:
+                first += 1
+    chosen = by_body[best_first:best_last]
+    return chosen[inside[chosen]], best, best_far
+
+
+def _relabelled(
+    points: F32, clusters: Clusters, parts: list[_Part], cameras: list[str], config: ClusteringConfig
+) -> tuple[Clusters, I32, Splits]:
+    """The clusters with the parts as clusters of their own, the row of each part (-1 at the end), and why."""
+    before = len(clusters)
+    labels = clusters.labels.copy()
+    for j, part in enumerate(parts):
+        labels[part.rows] = before + j
+    left = np.bincount(labels[labels >= 0], minlength=before + len(parts))
+    # A part that holds all of a cluster has its number, and no new one.
+    name = np.arange(before + len(parts))
+    changed = left[:before] != clusters.count
+    origin: list[tuple[int, int, int]] = []  # part, cluster, points
+    for j, part in enumerate(parts):
+        sources, counts = np.unique(clusters.labels[part.rows], return_counts=True)
+        whole = [
+            (n, k)
+            for k, n in zip(sources.tolist(), counts.tolist(), strict=True)
+            if k >= 0 and left[k] == 0 and n == clusters.count[k]
+        ]
+        if whole:
+            name[before + j] = max(whole)[1]
+            changed[max(whole)[1]] = len(sources) > 1
+        if len(sources) > 1 or not whole:
+            origin += [(j, k, n) for k, n in zip(sources.tolist(), counts.tolist(), strict=True)]
+    fresh = name[before:] >= before
+    alive = np.concatenate([(left[:before] > 0), fresh])
+    alive[name[before:]] = True
+    row = np.append(np.where(alive, np.cumsum(alive) - 1, -1), -1).astype(np.int32)
+    part_rows = np.append(row[name[before:]], -1).astype(np.int32)
+    if not origin:
+        return clusters, part_rows, Splits.none()
+    labels = np.where(labels >= 0, row[name[labels]], -1).astype(np.int32)
+    old = np.flatnonzero(alive[:before])
+    keep = np.full(int(alive.sum()), -1)
+    keep[row[old]] = np.where(changed[old], -1, old)
+    now = redescribe(points, labels, clusters, keep, part_rows[:-1], config)
+    part, source, taken = np.array(origin, np.int32).T
+    rest = np.where((source >= 0) & (left[source] > 0), row[source], -1).astype(np.int32)
+    return (
+        now,
+        part_rows,
+        Splits(
+            camera=tuple(cameras[parts[j].camera] for j in part),
+            detection=np.array([parts[j].detection for j in part], np.int32),
+            cluster=part_rows[part],
+            rest=rest,
+            points=taken,
+            of=np.where(source >= 0, clusters.count[source], taken).astype(np.int32),
+        ),
+    )
