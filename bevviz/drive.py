@@ -342,11 +342,11 @@ def simulate(
 
 
 def _load(
-    model: str | PathLike[str], stated: Settings, config: str | PathLike[str] | None, preset: Preset | None
+    model: str | PathLike[str], settings: Settings, config: str | PathLike[str] | None, preset: Preset | None
 ) -> Config:
-    settings = list(stated) if not isinstance(stated, Mapping) else _settings(stated)
+    given = _settings(settings) if isinstance(settings, Mapping) else list(settings)
     named = [f"detector.model={model}"] if model else []
-    return load(None if config is None else Path(config), [*named, *settings], preset)
+    return load(None if config is None else Path(config), [*named, *given], preset)
 
 
 def _settings(tree: Mapping[str, Any]) -> list[str]:

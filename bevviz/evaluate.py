@@ -123,13 +123,13 @@ def truth_source(
     if kitti is not None:
         files = label_files(kitti)
 
-        def labelled(frame: Frame) -> Truth | None:
+        def truth(frame: Frame) -> Truth | None:
             if not frame.index < len(files):
                 return None
-            stated = read_labels(files[frame.index])
-            return truth_of(frame, stated, [ACCEPTED[label] for label in stated.labels])
+            labelled = read_labels(files[frame.index])
+            return truth_of(frame, labelled, [ACCEPTED[label] for label in labelled.labels])
 
-        return labelled
+        return truth
     there = (*roles.robot_detections_3d, *([roles.truth] if roles.truth else []))
     if topic is not None and topic not in there:
         raise UserError(
@@ -139,15 +139,15 @@ def truth_source(
         return None
 
     def published(frame: Frame) -> Truth | None:
-        stated = frame.truth if topic in (None, roles.truth) else None
-        stated = stated or next((boxes for boxes in frame.robot_boxes if boxes.topic == topic), None)
-        return None if stated is None else truth_of(frame, stated)
+        labelled = frame.truth if topic in (None, roles.truth) else None
+        labelled = labelled or next((boxes for boxes in frame.robot_boxes if boxes.topic == topic), None)
+        return None if labelled is None else truth_of(frame, labelled)
 
     return published
 
 
 def truth_of(
-    frame: Frame, stated: LabelledBoxes3D, accepted: Sequence[frozenset[str]] | None = None
+    frame: Frame, labelled: LabelledBoxes3D, accepted: Sequence[frozenset[str]] | None = None
 ) -> Truth:
     """Labelled boxes as truth for a frame.
 
@@ -156,16 +156,16 @@ def truth_of(
 
     Args:
         frame: the frame.
-        stated: boxes, in any frame whose pose they come with.
+        labelled: boxes, in any frame whose pose they come with.
         accepted: names that are right for each box, in lower case; default: its label alone.
     """
-    boxes = in_points_frame(frame, stated)
+    boxes = in_points_frame(frame, labelled)
     must = (np.hypot(*boxes.center[:, :2].T) <= RANGE) & _in_view(frame, boxes)
     must[must] = [
         geometry.inside(frame.points, boxes, k).sum() >= MIN_HITS for k in np.flatnonzero(must).tolist()
     ]
-    own = [frozenset((label.lower(),)) for label in stated.labels]
-    return Truth(boxes, stated.labels, tuple(accepted if accepted is not None else own), must)
+    own = [frozenset((label.lower(),)) for label in labelled.labels]
+    return Truth(boxes, labelled.labels, tuple(accepted if accepted is not None else own), must)
 
 
 def _in_view(frame: Frame, boxes: Boxes3D) -> Bool:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from bevviz.run import Items, Observer
+from bevviz.text import printable
 
 
 class Progress(Observer[object]):
@@ -21,7 +22,7 @@ class Progress(Observer[object]):
     def begin(self, items: Items[object]) -> None:
         from tqdm import tqdm
 
-        description = self._what or items.scene.name
+        description = self._what or printable(items.scene.name)
         self._bar = tqdm(total=items.total, unit=self._unit, desc=description, disable=None)
 
     def see(self, result: object) -> None:

@@ -308,7 +308,7 @@ def _newest(
 ) -> Generator[R, None, None]:
     """Yield what is made of the newest items: drawing, work and the caller each in a thread of its own."""
     incoming: NewestQueue[T] = dropping.queue("incoming", dropping.incoming_size)
-    made: NewestQueue[R] = dropping.queue("results", dropping.results_size)
+    done: NewestQueue[R] = dropping.queue("results", dropping.results_size)
     errors: list[BaseException] = []
 
     def guarded(work: Callable[[], None], queue: NewestQueue[T] | NewestQueue[R]) -> threading.Thread:
@@ -334,12 +334,12 @@ def _newest(
         for item in incoming:
             if stop.is_set():
                 return
-            made.put(work(item))
+            done.put(work(item))
 
     guarded(receive, incoming)  # it may block in its source for good
-    worker = guarded(stages, made)
+    worker = guarded(stages, done)
     try:
-        yield from made
+        yield from done
     finally:
         incoming.close()
         worker.join(PATIENCE)

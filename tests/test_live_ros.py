@@ -226,7 +226,7 @@ def test_made_types_meet_compiled_ones(pair: tuple[Node, Node]) -> None:
     from sensor_msgs.msg import CameraInfo
 
     kind = "sensor_msgs/msg/CameraInfo"
-    made = typesupport._made(kind)
+    made = typesupport._from_definition(kind)
     compiled: list[Any] = []
     raw: list[bytes] = []
     one, two = (session.node for session in pair)

@@ -159,21 +159,21 @@ class BagFile:
             for connection, time, data in self._reader.messages(known, low, high):
                 yield known[connection.id], time, data
             return
-        again = low  # where the rescuer begins
+        resume = low  # where the rescuer begins
         try:
             for connection, time, data in self._sound.messages(known, low, high):
                 if time != latest:
-                    latest = again = time
+                    latest = resume = time
                     at_latest.clear()
                 at_latest.append((connection.id, data))
                 given += 1
                 total += time
                 yield known[connection.id], time, data
-            latest, again = LAST, low  # all of it was given, as far as it is known
+            latest, resume = LAST, low  # all of it was given, as far as it is known
             self._check(known, low, high, (given, total))
         except DamageError as error:
             self._change(error)
-            for connection, time, data in self._reader.messages(known, again, high):
+            for connection, time, data in self._reader.messages(known, resume, high):
                 if time == latest and (connection.id, data) in at_latest:
                     at_latest.remove((connection.id, data))
                 elif time >= latest:

@@ -54,8 +54,8 @@ def run_local(jobs: Sequence[Job], workers: int, retries: int, on_frame: Callabl
                     on_frame()
                     continue
                 busy.remove(worker)
-                again, result = _judge(worker, message)
-                if again and attempts[worker.job.name] < retries:
+                retry, result = _judge(worker, message)
+                if retry and attempts[worker.job.name] < retries:
                     attempts[worker.job.name] += 1
                     waiting.append(worker.job)
                 else:

@@ -114,12 +114,12 @@ def _watch_robot(source: LiveSource, settings: Settings, options: argparse.Names
     from bevviz.ros.orders import Orders
     from bevviz.ros.publish import Publisher
 
-    said = ""
+    shown = ""
     with suppress(KeyboardInterrupt):
         while not source.wait(1.0):
-            if source.missing != said:
-                said = source.missing
-                say(f"waiting: {said}")
+            if source.missing != shown:
+                shown = source.missing
+                say(f"waiting: {shown}")
     if not source.wait(0):
         return 1
     publisher = Publisher(source.node, settings.config, notes.warn) if options.publish else None

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from bevviz.cli.interrupts import wait_for_interrupt
+from bevviz.text import printable
 
 if TYPE_CHECKING:
     from rerun import RecordingStream
@@ -82,7 +83,7 @@ class Outputs:
 
 
 def say(line: str) -> None:
-    print(f"bevviz: {line}", file=sys.stderr)
+    print(f"bevviz: {printable(line)}", file=sys.stderr)
 
 
 def warn(warnings: Iterable[str]) -> None:

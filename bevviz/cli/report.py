@@ -66,7 +66,7 @@ def _make(options: argparse.Namespace) -> int:
 
     if options.at is None:
         raise UserError("--at TIME is missing: the time that the report is about")
-    made = make(
+    report = make(
         ReportRequest(
             paths=options.paths,
             config=load_config(options),
@@ -81,14 +81,14 @@ def _make(options: argparse.Namespace) -> int:
             force=options.force,
         )
     )
-    for warning in made.warnings:
+    for warning in report.warnings:
         say(f"warning: {warning}")
-    written = ", ".join(f"{path} ({megabytes(path.stat().st_size)})" for path in made.files)
-    if made.interrupted:
-        say(f"interrupted after {made.frames} frames; what was made until then is complete: {written}")
+    files = ", ".join(f"{path} ({megabytes(path.stat().st_size)})" for path in report.files)
+    if report.interrupted:
+        say(f"interrupted after {report.frames} frames; what was made until then is complete: {files}")
         return 130
-    say(f"{made.frames} frames: {written}")
-    return 0 if made.frames else 1
+    say(f"{report.frames} frames: {files}")
+    return 0 if report.frames else 1
 
 
 def _check(options: argparse.Namespace) -> int:

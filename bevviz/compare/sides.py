@@ -131,18 +131,18 @@ def robot_topic(topics: tuple[str, ...], asked: str) -> str:
 
 def published(frame: Frame, topic: str, config: Config) -> FrameResult | None:
     """What the robot says of the frame, as if a run had made it; None where it says nothing."""
-    stated = next((boxes for boxes in frame.robot_boxes if boxes.topic == topic), None)
-    if stated is None:
+    labelled = next((boxes for boxes in frame.robot_boxes if boxes.topic == topic), None)
+    if labelled is None:
         return None
     cameras = tuple(_published_2d(frame, camera) for camera in frame.cameras)
-    return replace(FrameResult.unprocessed(frame, config, cameras), objects=_objects(stated, frame))
+    return replace(FrameResult.unprocessed(frame, config, cameras), objects=_objects(labelled, frame))
 
 
-def _objects(stated: LabelledBoxes3D, frame: Frame) -> Objects:
+def _objects(labelled: LabelledBoxes3D, frame: Frame) -> Objects:
     """The robot's boxes in the frame of the points."""
-    boxes = in_points_frame(frame, stated)
+    boxes = in_points_frame(frame, labelled)
     none = np.full(len(boxes), -1, np.int32)
-    return Objects(boxes, stated.labels, stated.scores, none, ("",) * len(boxes), none)
+    return Objects(boxes, labelled.labels, labelled.scores, none, ("",) * len(boxes), none)
 
 
 def _published_2d(frame: Frame, camera: Camera) -> CameraResult:

@@ -105,7 +105,7 @@ class LiveSource(Closing):
         self._tell: Callable[[str], None] = tell or (lambda text: None)
         self._damaged: Counter[str] = Counter()
         self._first_damage: dict[str, str] = {}
-        self._told: dict[str, str] = {}  # what a sentence is about -> the sentence, while it holds
+        self._notes: dict[str, str] = {}  # what a sentence is about -> the sentence, while it holds
         self._known: dict[str, PublishedTopic] = {}  # that could play a role, or have
         self._subscriptions: dict[str, _Subscription] = {}
         self._handlers: dict[str, Handler[LiveMessage]] = {}
@@ -212,7 +212,7 @@ class LiveSource(Closing):
                 f"{count} message(s) of {topic} were lost on the way, see docs/live.md"
                 for topic, count in self.lost.items()
             ]
-            return [*self._told.values(), *lost, *damaged, *self._sync.report.warnings()]
+            return [*self._notes.values(), *lost, *damaged, *self._sync.report.warnings()]
 
     def __iter__(self) -> Iterator[Frame]:
         while True:
@@ -303,9 +303,9 @@ class LiveSource(Closing):
 
     def _note(self, about: str, text: str, over: str) -> None:
         """Tell ``text`` when it begins to hold, and ``over`` when it is empty again."""
-        before = self._told.pop(about, "")
+        before = self._notes.pop(about, "")
         if text:
-            self._told[about] = text
+            self._notes[about] = text
         if text != before:
             self._tell(text or over)
 
@@ -390,13 +390,13 @@ def _resolved(config: SourceConfig, resolve: Callable[[str], str]) -> SourceConf
 
 
 def _without_absent(topics: list[Topic], config: SourceConfig) -> tuple[list[Topic], SourceConfig]:
-    """A stated topic that is not there yet is waited for; no other one may take its role meanwhile."""
+    """A given topic that is not there yet is waited for; no other one may take its role meanwhile."""
     names = {topic.name for topic in topics}
     changes: dict[str, Any] = {}
     for key, kinds in (("lidar_topics", {"PointCloud2"}), ("camera_topics", {"Image", "CompressedImage"})):
-        stated = getattr(config, key)
-        changes[key] = tuple(name for name in stated if name in names)
-        if stated and not changes[key]:
+        given = getattr(config, key)
+        changes[key] = tuple(name for name in given if name in names)
+        if given and not changes[key]:
             topics = [topic for topic in topics if topic.kind not in kinds]
     changes["camera_info_topics"] = {
         image: info for image, info in config.camera_info_topics.items() if {image, info} <= names

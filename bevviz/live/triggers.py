@@ -22,8 +22,8 @@ class Triggers:
         self._fired = -math.inf
 
     def check(self, result: FrameResult) -> str | None:
-        news = self._onsets.of(result.anomalies)  # whether or not one is reported
-        reasons = [anomaly.text for anomaly in news if anomaly.kind in self.config.triggers]
+        onsets = self._onsets.of(result.anomalies)  # whether or not one is reported
+        reasons = [anomaly.text for anomaly in onsets if anomaly.kind in self.config.triggers]
         now = time.monotonic()
         if not reasons or now - self._fired < self.config.trigger_pause:
             return None

@@ -28,10 +28,10 @@ from bevviz.logging.clusters import log_clusters, log_clusters_looks
 from bevviz.logging.decisions import log_decisions
 from bevviz.logging.frustums import log_frustums
 from bevviz.logging.health import log_health
+from bevviz.logging.labelled import log_robot, log_truth, log_truth_looks
 from bevviz.logging.objects import log_objects, log_objects_looks
 from bevviz.logging.origin import log_origin
 from bevviz.logging.pieces import transform
-from bevviz.logging.stated import log_robot, log_truth, log_truth_looks
 from bevviz.logging.states import COLORS, StateLanes, states_of, track_states
 from bevviz.logging.tracks import Lanes, log_speeds, log_tracks, log_tracks_looks
 from bevviz.logging.writer import Writer

@@ -58,14 +58,14 @@ def describe_qos(topic: PublishedTopic) -> str:
     """Who publishes a topic, and how."""
     from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
 
-    said = []
+    lines = []
     for publisher in topic.publishers:
         qos = publisher.qos_profile
         words = ["reliable" if qos.reliability == ReliabilityPolicy.RELIABLE else "best effort"]
         if qos.durability == DurabilityPolicy.TRANSIENT_LOCAL:
             words.append("latched")
-        said.append(f"{_full_name(publisher)} ({', '.join(words)})")
-    return f"from {', '.join(said)}"
+        lines.append(f"{_full_name(publisher)} ({', '.join(words)})")
+    return f"from {', '.join(lines)}"
 
 
 def _full_name(publisher: Any) -> str:
@@ -82,5 +82,5 @@ def mismatches(topic: PublishedTopic, qos: Any) -> Iterable[str]:
         compatible, reason = qos_check_compatible(publisher.qos_profile, qos)
         if compatible == QoSCompatibility.ERROR:
             who = _full_name(publisher)
-            said = reason.removeprefix("ERROR: ").rstrip(".;")
-            yield f"{topic.name}: {who} is not heard, its quality of service does not fit ({said})"
+            text = reason.removeprefix("ERROR: ").rstrip(".;")
+            yield f"{topic.name}: {who} is not heard, its quality of service does not fit ({text})"

@@ -32,14 +32,14 @@ def message_type(name: str) -> Any:
     try:
         module = importlib.import_module(f"{package}.msg")
     except ImportError:
-        return _made(name)
+        return _from_definition(name)
     found = getattr(module, short, None)
     if found is None:
         raise UserError(f"the installed {package} has no message {short}")
     return found
 
 
-def _made(name: str) -> Any:
+def _from_definition(name: str) -> Any:
     from rclpy.utilities import get_rmw_implementation_identifier
     from std_msgs.msg import Empty
 

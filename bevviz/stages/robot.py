@@ -90,8 +90,8 @@ def find_objects(frame: Frame, topic: str, obstacles: F32 | None, clusters: Clus
     Raises:
         StageError: there are none at this time.
     """
-    stated = _boxes(frame, topic)
-    return placed(in_points_frame(frame, stated), stated.labels, stated.scores, obstacles, clusters)
+    labelled = _boxes(frame, topic)
+    return placed(in_points_frame(frame, labelled), labelled.labels, labelled.scores, obstacles, clusters)
 
 
 def detections_of(found: LabelledBoxes2D) -> Detections:
@@ -104,19 +104,19 @@ def detections_of(found: LabelledBoxes2D) -> Detections:
     return Detections(found.xyxy[order], found.scores[order], zero, names, kept, zero - 1, nothing)
 
 
-def in_points_frame(frame: Frame, stated: LabelledBoxes3D) -> Boxes3D:
+def in_points_frame(frame: Frame, labelled: LabelledBoxes3D) -> Boxes3D:
     """Boxes that somebody else states, in the frame of the points."""
-    if stated.world_from_boxes is None:
-        return stated.boxes
-    points_from_boxes = geometry.inverse(frame.pose) @ stated.world_from_boxes
-    turned = stated.boxes.yaw + np.float32(geometry.yaw(points_from_boxes))
-    return Boxes3D(geometry.apply(points_from_boxes, stated.boxes.center), stated.boxes.size, turned)
+    if labelled.world_from_boxes is None:
+        return labelled.boxes
+    points_from_boxes = geometry.inverse(frame.pose) @ labelled.world_from_boxes
+    turned = labelled.boxes.yaw + np.float32(geometry.yaw(points_from_boxes))
+    return Boxes3D(geometry.apply(points_from_boxes, labelled.boxes.center), labelled.boxes.size, turned)
 
 
 def _boxes(frame: Frame, topic: str) -> LabelledBoxes3D:
-    for stated in frame.robot_boxes:
-        if stated.topic == topic:
-            return stated
+    for labelled in frame.robot_boxes:
+        if labelled.topic == topic:
+            return labelled
     raise _missing(topic, "boxes")
 
 

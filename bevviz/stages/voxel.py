@@ -57,9 +57,9 @@ def _thin(points: F32, keys: I64, average: bool) -> tuple[F32, I32]:
 
 
 @kernel
-def of_points(said: NDArray[S], inverse: I32) -> NDArray[S]:
-    """(N,) for each point what is said of its voxel."""
-    found = np.empty(len(inverse), said.dtype)
+def of_points(values: NDArray[S], inverse: I32) -> NDArray[S]:
+    """(N,) for each point what is values of its voxel."""
+    found = np.empty(len(inverse), values.dtype)
     for i in range(len(inverse)):
-        found[i] = said[inverse[i]]
+        found[i] = values[inverse[i]]
     return found

@@ -53,7 +53,7 @@ class SyncReport:
 
     def warnings(self) -> tuple[str, ...]:
         """One sentence each."""
-        said = [
+        counted = [
             (self.reordered, "{} came out of order and {} put back in order"),
             (self.late, "{} came after a newer one had gone on and {} dropped"),
             (self.duplicates, "{} had the stamp of another one and {} dropped"),
@@ -61,7 +61,7 @@ class SyncReport:
         ]
         found = [
             text.format("1 cloud" if n == 1 else f"{n} clouds", "was" if n == 1 else "were")
-            for n, text in said
+            for n, text in counted
             if n
         ]
         if self.resets:
@@ -473,8 +473,8 @@ class Synchronizer:
         path = self.tf.ancestors(points_frame)
         fixed = [f for f in path if f in self._odometry_frames or _words(f) & FIXED_FRAMES]
         near = [f for f in fixed if not _words(f) & GLOBE_FRAMES] or fixed
-        stated = self._config.source.fixed_frame.lstrip("/")
-        return stated or (near[-1] if near else ""), near[0] if near else stated
+        given = self._config.source.fixed_frame.lstrip("/")
+        return given or (near[-1] if near else ""), near[0] if near else given
 
     def pose(self, points_frame: str, stamp: int) -> F64 | None:
         """(4, 4) where a frame is in the smoothest fixed frame, as far as the transforms reach so far."""

@@ -284,10 +284,10 @@ class _Cast:
     def _walk(self, lateral: float, speed: float, places: list[float]) -> None:
         for s in places:
             turn = 0.0 if speed > 0 else np.pi
-            aside = (0.0, 0.6) if self.rng.random() < 0.25 else (self.rng.normal(0, 0.1),)
-            for offset in aside:
+            offsets = (0.0, 0.6) if self.rng.random() < 0.25 else (self.rng.normal(0, 0.1),)
+            for offset in offsets:
                 model = models.person(self.rng)
-                pace = speed * (1.0 if len(aside) == 2 else self.rng.uniform(0.97, 1.03))
+                pace = speed * (1.0 if len(offsets) == 2 else self.rng.uniform(0.97, 1.03))
                 self._add("person", model, s, lateral - np.sign(lateral) * offset, KERB, turn, pace)
 
 

@@ -40,23 +40,23 @@ def log_truth(to: Writer, frame: Frame, config: BevConfig) -> None:
 
 def log_robot(to: Writer, frame: Frame, config: BevConfig) -> None:
     """Under the names of its topics."""
-    for stated in frame.robot_boxes:
-        if len(stated.boxes):
-            _log_boxes(to, entities.robot(stated.topic), stated, _ROBOT_COLOR)
-            _log_outlines(to, entities.robot_overlay(stated.topic), frame, stated, config, _ROBOT_COLOR)
+    for labelled in frame.robot_boxes:
+        if len(labelled.boxes):
+            _log_boxes(to, entities.robot(labelled.topic), labelled, _ROBOT_COLOR)
+            _log_outlines(to, entities.robot_overlay(labelled.topic), frame, labelled, config, _ROBOT_COLOR)
     for found in frame.robot_detections:
         if len(found.xyxy):
             _log_image_boxes(to, found)
 
 
-def _log_boxes(to: Writer, path: str, stated: LabelledBoxes3D, color: Color | None) -> None:
+def _log_boxes(to: Writer, path: str, labelled: LabelledBoxes3D, color: Color | None) -> None:
     to.put(
         path,
-        transform(_pose(stated)),
+        transform(_pose(labelled)),
         boxes3d(
-            stated.boxes,
-            np.arange(len(stated.boxes)),
-            scored(stated.labels, stated.scores),
+            labelled.boxes,
+            np.arange(len(labelled.boxes)),
+            scored(labelled.labels, labelled.scores),
             colors=None if color is None else [color],
         ),
     )
@@ -72,27 +72,27 @@ def _log_image_boxes(to: Writer, found: LabelledBoxes2D) -> None:
 
 
 def _log_outlines(
-    to: Writer, path: str, frame: Frame, stated: LabelledBoxes3D, config: BevConfig, color: Color
+    to: Writer, path: str, frame: Frame, labelled: LabelledBoxes3D, config: BevConfig, color: Color
 ) -> None:
     """Boxes seen from above, over the bird's-eye image; only those whose centre is in it."""
-    points_from_boxes = geometry.inverse(frame.pose) @ _pose(stated)
+    points_from_boxes = geometry.inverse(frame.pose) @ _pose(labelled)
     reach = np.array([config.range_x, config.range_y], np.float32)
-    inside = (np.abs(geometry.apply(points_from_boxes, stated.boxes.center)[:, :2]) < reach).all(axis=1)
+    inside = (np.abs(geometry.apply(points_from_boxes, labelled.boxes.center)[:, :2]) < reach).all(axis=1)
     if not inside.any():
         return
-    outlines = footprints(geometry.corners(stated.boxes)[inside])
+    outlines = footprints(geometry.corners(labelled.boxes)[inside])
     to.put(
         path,
         rr.LineStrips2D(
             seen_from_above(config, points_from_boxes, outlines),
             colors=[color],
             radii=rr.Radius.ui_points(0.75),
-            labels=[stated.labels[k] for k in np.flatnonzero(inside)],
+            labels=[labelled.labels[k] for k in np.flatnonzero(inside)],
             show_labels=False,
             draw_order=10.0,
         ),
     )
 
 
-def _pose(stated: LabelledBoxes3D) -> F64:
-    return np.eye(4) if stated.world_from_boxes is None else stated.world_from_boxes
+def _pose(labelled: LabelledBoxes3D) -> F64:
+    return np.eye(4) if labelled.world_from_boxes is None else labelled.world_from_boxes
