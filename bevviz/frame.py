@@ -378,7 +378,7 @@ class Claims:
     cluster: I32  # (D,) row in the clusters, -1: it takes nothing
     fit: F32  # (D,) 0 to 1: how well the best that it could take suits its box and its class
     boxes: Boxes3D  # (D,) of the whole object, what was not seen completed; NaN where nothing is taken
-    seen: Bool  # (D, 4) sides of that box that face the camera: front (+x), back, left (+y), right
+    seen: Bool  # (D, 4) SIDES of that box that face the camera
 
     @staticmethod
     def none(count: int) -> Claims:
@@ -400,6 +400,7 @@ class Splits:
     detection: I32  # (S,) row in that camera's detections
     cluster: I32  # (S,) row in the clusters, of what it took
     rest: I32  # (S,) row of what is left of the cluster it took them of; -1: nothing is, or they were noise
+    is_noise: Bool  # (S,) they were of no cluster
     points: I32  # (S,) that it took
     of: I32  # (S,) that the cluster had
 
@@ -409,7 +410,7 @@ class Splits:
     @staticmethod
     def none() -> Splits:
         i = np.zeros(0, np.int32)
-        return Splits((), i, i, i, i, i)
+        return Splits((), i, i, i, np.zeros(0, np.bool_), i, i)
 
 
 @dataclass(frozen=True, slots=True)
@@ -445,6 +446,9 @@ class CameraResult:
     depth: F32 | None = None  # (P,) metres along the optical axis
 
 
+SIDES = ("front", "back", "left", "right")  # of a box: +x, -x, +y, -y
+
+
 @dataclass(frozen=True, slots=True)
 class Objects:
     """Fused boxes: one row for each named object, in Frame.points_frame."""
@@ -456,7 +460,7 @@ class Objects:
     camera: tuple[str, ...]
     detection: I32  # (J,) row in that camera's detections
     measured: Boxes3D | None = None  # (J,) around what was seen of each; None: ``boxes`` are that
-    seen: Bool | None = None  # (J, 4) sides that were: front (+x), back, left (+y), right; None: not known
+    seen: Bool | None = None  # (J, 4) SIDES that were seen; None: not known
 
     def __len__(self) -> int:
         return len(self.names)

@@ -317,7 +317,7 @@ def describe(result: FrameResult) -> FrameResult:
         result.clusters,
         config.bev,
     )
-    explanations = log.run("explain", explain, result.cameras, result.clusters, config)
+    explanations = log.run("explain", explain, result.cameras, result.clusters, config, result.splits)
     wall = time.perf_counter() - start
     return replace(
         result,

@@ -490,50 +490,52 @@ def _relabelled(
     points: F32, clusters: Clusters, parts: list[_Part], cameras: list[str], config: ClusteringConfig
 ) -> tuple[Clusters, I32, Splits]:
     """The clusters with the parts as clusters of their own, the row of each part (-1 at the end), and why."""
-    before = len(clusters)
+    before, fresh = len(clusters), 0
+    origins = [np.unique(clusters.labels[part.rows], return_counts=True) for part in parts]
+    left = clusters.count.astype(np.int64)
+    for sources, counts in origins:
+        known = sources >= 0
+        left[sources[known]] -= counts[known]
+    unchanged, alive = left == clusters.count, left > 0
+    number = np.empty(len(parts), np.int64)
+    made: list[tuple[int, int, int]] = []  # part, cluster that it took from, points
+    for j, (sources, counts) in enumerate(origins):
+        pairs = list(zip(sources.tolist(), counts.tolist(), strict=True))
+        whole = [(n, k) for k, n in pairs if k >= 0 and n == clusters.count[k]]
+        if whole:  # a part that holds all of a cluster has its number
+            number[j] = max(whole)[1]
+            alive[number[j]] = True
+            unchanged[number[j]] = len(pairs) == 1
+        else:
+            number[j] = before + fresh
+            fresh += 1
+        if not whole or len(pairs) > 1:
+            made += [(j, k, n) for k, n in pairs]
+    if not made:
+        return clusters, np.append(number, -1).astype(np.int32), Splits.none()
+
     labels = clusters.labels.copy()
-    for j, part in enumerate(parts):
-        labels[part.rows] = before + j
-    left = np.bincount(labels[labels >= 0], minlength=before + len(parts))
-    # A part that holds all of a cluster has its number, and no new one.
-    name = np.arange(before + len(parts))
-    changed = left[:before] != clusters.count
-    origin: list[tuple[int, int, int]] = []  # part, cluster, points
-    for j, part in enumerate(parts):
-        sources, counts = np.unique(clusters.labels[part.rows], return_counts=True)
-        whole = [
-            (n, k)
-            for k, n in zip(sources.tolist(), counts.tolist(), strict=True)
-            if k >= 0 and left[k] == 0 and n == clusters.count[k]
-        ]
-        if whole:
-            name[before + j] = max(whole)[1]
-            changed[max(whole)[1]] = len(sources) > 1
-        if len(sources) > 1 or not whole:
-            origin += [(j, k, n) for k, n in zip(sources.tolist(), counts.tolist(), strict=True)]
-    fresh = name[before:] >= before
-    alive = np.concatenate([(left[:before] > 0), fresh])
-    alive[name[before:]] = True
+    for part, k in zip(parts, number.tolist(), strict=True):
+        labels[part.rows] = k
+    alive = np.concatenate([alive, np.ones(fresh, np.bool_)])
     row = np.append(np.where(alive, np.cumsum(alive) - 1, -1), -1).astype(np.int32)
-    part_rows = np.append(row[name[before:]], -1).astype(np.int32)
-    if not origin:
-        return clusters, part_rows, Splits.none()
-    labels = np.where(labels >= 0, row[name[labels]], -1).astype(np.int32)
-    old = np.flatnonzero(alive[:before])
-    keep = np.full(int(alive.sum()), -1)
-    keep[row[old]] = np.where(changed[old], -1, old)
-    now = redescribe(points, labels, clusters, keep, part_rows[:-1], config)
-    part, source, taken = np.array(origin, np.int32).T
-    rest = np.where((source >= 0) & (left[source] > 0), row[source], -1).astype(np.int32)
+    if not alive.all():
+        labels = row[labels]
+    kept = np.concatenate([np.where(unchanged, np.arange(before), -1), np.full(fresh, -1)])[alive]
+    rows = np.append(row[number], -1).astype(np.int32)
+    now = redescribe(points, labels, clusters, kept, rows[:-1], config)
+    part_of, source, taken = np.array(made, np.int32).T
+    was_noise = source < 0
     return (
         now,
-        part_rows,
+        rows,
         Splits(
-            camera=tuple(cameras[parts[j].camera] for j in part),
-            detection=np.array([parts[j].detection for j in part], np.int32),
-            cluster=part_rows[part],
-            rest=rest,
+            camera=tuple(cameras[parts[j].camera] for j in part_of),
+            detection=np.array([parts[j].detection for j in part_of], np.int32),
+            cluster=rows[part_of],
+            rest=np.where(~was_noise & (np.append(left, 0)[source] > 0), row[source], -1).astype(np.int32),
+            is_noise=was_noise,
             points=taken,
-            of=np.where(source >= 0, clusters.count[source], taken).astype(np.int32),
+            of=np.where(was_noise, taken, np.append(clusters.count, 0)[source]).astype(np.int32),
         ),
     )

@@ -94,8 +94,9 @@ def fuse(
             matched = allowed[_assign_pairs(pairs, allowed)]
         else:
             matched = np.flatnonzero(claims.cluster[pairs.detection] == pairs.cluster)
-            taken = np.isin(pairs.cluster, claims.cluster[claims.cluster >= 0])
-            reason[(reason == Decision.TAKEN) & ~taken] = Decision.MISFIT
+            has_other = claims.cluster[pairs.detection] >= 0
+            is_taken = np.isin(pairs.cluster, claims.cluster[claims.cluster >= 0])
+            reason[(reason == Decision.TAKEN) & ~has_other & ~is_taken] = Decision.MISFIT
         # Permitted pairs come first as the most telling, then those that fit best.
         order = np.lexsort((-pairs.points, -pairs.iou, pairs.cost))
 

@@ -40,6 +40,7 @@ class Reason(StrEnum):
     TOO_FEW_POINTS = "too few points"
     TOO_FAR = "too far"
     TAKEN = "taken"
+    MISFIT = "misfit"
     OTHER_CLUSTER = "other cluster"
 
 
@@ -48,6 +49,7 @@ _REFUSED = {
     Decision.TOO_FEW_POINTS: Reason.TOO_FEW_POINTS,
     Decision.TOO_FAR: Reason.TOO_FAR,
     Decision.TAKEN: Reason.TAKEN,
+    Decision.MISFIT: Reason.MISFIT,
     Decision.NO_CLUSTER: Reason.OTHER_CLUSTER,
 }
 
@@ -206,7 +208,7 @@ def _because(subject: Subject, reason: Reason, e: Evidence, result: FrameResult,
         if reason is Reason.BORROWED:
             also = f"that also names {others}" if others else "that is not on it"
             return f"{with_} by a box {also} ({_method(config)})"
-        return f"{with_} by {label(best)}" if best is not None else with_
+        return f"{with_} by {label(best)}{_split_off(result, main)}" if best is not None else with_
     if reason is Reason.FAILED:
         return "; ".join(f"{f.stage} failed: {f.reason}" for f in result.failures) or "there are no clusters"
     if reason is Reason.OUT_OF_VIEW:
@@ -268,6 +270,9 @@ def _because_detected(
     if reason is Reason.LOW_OVERLAP:
         both = f"{label(best)} and cluster {best.cluster}"
         return f"{both} overlap with {pair}, fusion.min_iou is {fusion.min_iou:g}"
+    if reason is Reason.MISFIT:
+        suits = f"nothing of cluster {best.cluster} suits {label(best)} in outline and size"
+        return f"{suits}, fusion.min_rating is {fusion.min_rating:g}"
     if reason is Reason.TOO_FEW_POINTS:
         return f"{label(best)} has {pair} of cluster {best.cluster}, fusion.min_points is {fusion.min_points}"
     if reason is Reason.TOO_FAR:
@@ -284,6 +289,18 @@ def _because_detected(
         if best.cluster >= 0
         else f"{label(best)} found no cluster"
     )
+
+
+def _split_off(result: FrameResult, cluster: int) -> str:
+    """Where a cluster's points were taken from."""
+    splits = result.splits
+    if splits is None:
+        return ""
+    texts = []
+    for row in np.flatnonzero((splits.cluster == cluster) & (splits.points < splits.of)).tolist():
+        off = f"cluster {splits.rest[row]}" if splits.rest[row] >= 0 else "a cluster"
+        texts.append(f", which split it off {off} ({splits.points[row]:,} of {splits.of[row]:,} points)")
+    return "".join(texts)
 
 
 def _pair(result: FrameResult, best: Candidate) -> str:
