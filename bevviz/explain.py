@@ -20,6 +20,8 @@ from bevviz.frame import (
     Splits,
 )
 
+SOME = 0.1  # share of an object's points from which noise is worth a word
+
 
 def explain(
     cameras: Sequence[CameraResult],
@@ -200,7 +202,8 @@ def _splits(cameras: Sequence[CameraResult], splits: Splits) -> Iterator[Explana
         assert detections is not None
         by = f"by {_label(detections, d)}"
         whole, noise = [], 0
-        for row in (row for row, key in enumerate(keys) if key == (camera, d, part)):
+        rows = [row for row, key in enumerate(keys) if key == (camera, d, part)]
+        for row in rows:
             rest, points = int(splits.rest[row]), int(splits.points[row])
             share = f"{points:,} of {splits.of[row]:,} points"
             if rest >= 0:
@@ -213,7 +216,7 @@ def _splits(cameras: Sequence[CameraResult], splits: Splits) -> Iterator[Explana
                 noise = points
             else:
                 whole.append(f"{points:,}")
-        if len(whole) > 1 or noise:
+        if len(whole) > 1 or noise > SOME * splits.points[rows].sum():
             pieces = [f"clusters of {' and '.join(whole)} points"] if len(whole) > 1 else []
             pieces += [f"a cluster of {whole[0]} points"] if len(whole) == 1 else []
             pieces += [f"{_points(noise)} of noise"] if noise else []

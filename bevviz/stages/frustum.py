@@ -27,7 +27,7 @@ from bevviz.frame import (
 )
 from bevviz.stages.boxfit import NO_EDGE, fit
 from bevviz.stages.cells import sort_by
-from bevviz.stages.clustering import redescribe
+from bevviz.stages.clustering import MIN_SIZE, redescribe
 from bevviz.stages.kernel import kernel
 
 EDGE_PIXELS = 2.0  # one sigma of the edges of an image box,
@@ -98,6 +98,12 @@ def claim(
     return now, claims, splits
 
 
+def _same(found: Detections, a: int, b: int) -> bool:
+    """Whether two boxes show one object under two names."""
+    overlap = geometry.iou(found.xyxy[[a]], found.xyxy[[b]])[0, 0]
+    return found.names[a] != found.names[b] and bool(overlap >= SAME)
+
+
 @dataclass(slots=True)
 class _Part:
     """What one detection took."""
@@ -153,9 +159,8 @@ class _Work:
         )
         found = result.detections
         claims = Claims.none(len(found))
-        waiting = {d: view.best(d) for d in np.flatnonzero(found.state == DetectionState.KEPT).tolist()}
-        same = geometry.iou(found.xyxy, found.xyxy) >= SAME
-        same &= np.array([[a != b for b in found.names] for a in found.names], bool).reshape(same.shape)
+        kept = np.flatnonzero(found.state == DetectionState.KEPT).tolist()
+        waiting = {d: view.best(d) for d in kept}
         while waiting:
             d = max(waiting, key=lambda d: waiting[d].fit * float(found.score[d]))
             candidate = waiting.pop(d)
@@ -179,10 +184,10 @@ class _Work:
             claims.boxes.center[d], claims.boxes.size[d], claims.boxes.yaw[d] = box[:3], box[3:6], box[6]
             claims.seen[d] = seen
             view.free[rows] = False
-            for other in list(waiting):
-                if same[other, d] and not view.free[waiting[other].rows].all():
+            for other in [other for other, wanted in waiting.items() if not view.free[wanted.rows].all()]:
+                if _same(found, d, other):
                     claims.fit[other] = waiting.pop(other).fit
-                elif not view.free[waiting[other].rows].all():
+                else:
                     waiting[other] = view.best(other)
         return claims
 
@@ -223,10 +228,7 @@ class _View:
         points_from_camera = geometry.inverse(camera_from_points)
         self._place = points_from_camera[:3, 3]
         self.free = work.unused()
-        u = uv[:, 0]
-        seen = np.flatnonzero(np.isfinite(u) & (depth > 0) & (depth <= work.config.max_depth))
-        self._order = seen[np.argsort(u[seen])]
-        self._u = u[self._order]
+        self._seen = np.flatnonzero((depth > 0) & (depth <= work.config.max_depth) & ~np.isnan(uv[:, 0]))
         # Directions of the middles of the left, upper, right and lower edge of each box.
         x0, y0, x1, y1 = detections.xyxy.T.astype(np.float64)
         mx, my = (x0 + x1) / 2, (y0 + y1) / 2
@@ -287,10 +289,10 @@ class _View:
         """The object's points, its box (centre, size, heading), and which of its sides were seen."""
         work, rows = self._work, candidate.rows
         if not grow:
-            return rows, *self._fitted(d, rows, candidate.depth)
+            return rows, *self._upright(d, rows, *self._fitted(d, rows, candidate.depth))
         # Its clusters are its own beyond the image that cuts it off, and beyond a box that is too tight.
-        sources, counts = np.unique(work.clusters.labels[rows], return_counts=True)
-        kin = [work.free_of(k) for k in sources[(sources >= 0) & (counts >= KIN * len(rows))].tolist()]
+        counts = np.bincount(work.clusters.labels[rows] + 1)
+        kin = [work.free_of(k) for k in np.flatnonzero(counts[1:] > KIN * len(rows)).tolist()]
         if self._cut[d, [0, 2]].any():
             size, place = self._size(d), work.points[rows, :2].mean(axis=0)
             long = candidate.depth * self._wide[d] if size is None else size[0]
@@ -298,39 +300,46 @@ class _View:
                 beyond = own[np.isnan(self._uv[own, 0])]
                 away = work.points[beyond, :2] - place
                 rows = np.concatenate([rows, beyond[np.hypot(away[:, 0], away[:, 1]) <= long]])
-        box, _ = self._fitted(d, rows, candidate.depth)
+        flat, _ = self._fitted(d, rows, candidate.depth)
         x0, _, x1, _ = self._detections.xyxy[d]
         margin = MARGIN * (x1 - x0)
         near = np.concatenate([self._between(d, x0 - margin, x1 + margin), *kin])
         near = near[self.free[near] & work.unowned(near)]
-        inside = np.unique(near[_within(work.points[near], box, SKIN)])
+        inside = _distinct(near[_within(work.points, near, flat, SKIN)], len(work.points))
         rows = inside if len(inside) >= work.config.min_points else candidate.rows
-        box, seen = self._fitted(d, rows, candidate.depth, about=box[6])
+        flat, facing = self._fitted(d, rows, candidate.depth, about=flat[4])
+        box, seen = self._upright(d, rows, flat, facing)
         # What is left beside it and too small to be a cluster stays with it.
         for own in kin:
-            rest = np.setdiff1d(own, rows, assume_unique=True)
-            if len(rest) < work.smallest and _within(work.points[rest], box, SLACK).all():
+            if len(own) >= len(rows) + work.smallest:
+                continue
+            rest = _distinct(np.concatenate([rows, own]), len(work.points))[len(rows) :]
+            if len(rest) < work.smallest and _within(work.points, rest, flat, SLACK).all():
                 rows = np.concatenate([rows, rest])
         return rows, box, seen
 
     def _between(self, d: int, left: float, right: float) -> I64:
         """Points from one column of pixels to another, in the rows of a detection's box."""
-        _, y0, _, y1 = self._detections.xyxy[d]
-        first, last = np.searchsorted(self._u, (left, right))
-        rows = self._order[first:last]
-        v = self._uv[rows, 1]
-        return np.asarray(rows[(v >= y0) & (v <= y1)])
+        _, top, _, bottom = self._detections.xyxy[d]
+        return _in_window(self._uv, self._seen, left, top, right, bottom)
 
-    def _fitted(self, d: int, rows: I64, depth: float, about: float = np.nan) -> tuple[F64, Bool]:
+    def _fitted(self, d: int, rows: I64, depth: float, about: float = np.nan) -> tuple[F64, I64]:
+        """Place, length, width and heading on the ground, and the sides that face the camera."""
         work, size = self._work, self._size(d)
-        points = work.points[rows]
         width = float(self._detections.xyxy[d, 2] - self._detections.xyxy[d, 0])
         sigma = max(EDGE_PIXELS / max(width, 1.0), EDGE_SHARE) * self._wide[d] * depth
         edge = np.where(self._cut[d, [0, 2]], NO_EDGE, max(sigma, 1e-3))
         prior = np.full(4, np.nan) if size is None else np.array([size[0], size[3], size[1], size[4]])
         longest = max(self._wide[d], self._tall[d]) * depth
-        flat, facing = fit(points[:, :2] - self._place[:2], self._normals[d], edge, prior, longest, about)
-        length, width, heading = flat[2:]
+        points = work.points[rows, :2] - self._place[:2]
+        flat, facing = fit(points, self._normals[d], edge, prior, longest, about)
+        flat[:2] += self._place[:2]
+        return flat, facing
+
+    def _upright(self, d: int, rows: I64, flat: F64, facing: I64) -> tuple[F64, Bool]:
+        """The box (centre, size, heading), longer than wide without a class, and which sides are seen."""
+        work, size = self._work, self._size(d)
+        x, y, length, width, heading = flat.tolist()
         seen = np.array([facing[0] > 0, facing[0] < 0, facing[1] > 0, facing[1] < 0])
         if size is None and width > length:
             length, width, heading = width, length, heading - np.pi / 2
@@ -338,22 +347,49 @@ class _View:
         if not -np.pi / 2 < heading <= np.pi / 2:
             heading += np.pi if heading < 0 else -np.pi
             seen = seen[[1, 0, 3, 2]]
-        low, high = float(points[:, 2].min()), float(points[:, 2].max())
+        z = work.points[rows, 2]
+        low, high = float(z.min()), float(z.max())
         if size is not None and work.height is not None:
-            low = float(np.median(points[:, 2] - work.height[rows]))
+            low = float(np.partition(z - work.height[rows], len(z) // 2)[len(z) // 2])
             high = max(high, low + size[2] - size[5])
-        x, y = flat[:2] + self._place[:2]
-        least = 0.01
-        box = [x, y, (low + high) / 2, max(length, least), max(width, least), max(high - low, least), heading]
-        return np.array(box), seen
+        length, width, tall = (max(side, MIN_SIZE) for side in (length, width, high - low))
+        return np.array([x, y, (low + high) / 2, length, width, tall, heading]), seen
 
 
-def _within(points: F32, box: F64, skin: float) -> Bool:
-    """(N,) which points are in a box, seen from above, or as near as ``skin``."""
-    c, s = math.cos(box[6]), math.sin(box[6])
-    x, y = (points[:, :2] - box[:2]).T
-    along, across = np.abs(c * x + s * y), np.abs(c * y - s * x)
-    return np.asarray((along <= box[3] / 2 + skin) & (across <= box[4] / 2 + skin))
+@kernel
+def _in_window(uv: F32, rows: I64, left: float, top: float, right: float, bottom: float) -> I64:
+    """Those of the points whose pixels are in a part of the image."""
+    found = np.empty(len(rows), np.int64)
+    n = 0
+    for i in rows:
+        found[n] = i
+        n += left <= uv[i, 0] <= right and top <= uv[i, 1] <= bottom
+    return found[:n]
+
+
+@kernel
+def _distinct(rows: I64, count: int) -> I64:
+    """Each number once, numbers below ``count``."""
+    known = np.zeros(count, np.bool_)
+    found = np.empty(len(rows), np.int64)
+    n = 0
+    for i in rows:
+        found[n] = i
+        n += not known[i]
+        known[i] = True
+    return found[:n]
+
+
+@kernel
+def _within(points: F32, rows: I64, flat: F64, skin: float) -> Bool:
+    """(N,) which of these points are in a box seen from above (place, length, width, heading) or near it."""
+    inside = np.empty(len(rows), np.bool_)
+    c, s = math.cos(flat[4]), math.sin(flat[4])
+    for k, i in enumerate(rows):
+        x, y = points[i, 0] - flat[0], points[i, 1] - flat[1]
+        along, across = abs(c * x + s * y), abs(c * y - s * x)
+        inside[k] = along <= flat[2] / 2 + skin and across <= flat[3] / 2 + skin
+    return inside
 
 
 @kernel
@@ -491,7 +527,11 @@ def _relabelled(
 ) -> tuple[Clusters, I32, Splits]:
     """The clusters with the parts as clusters of their own, the row of each part (-1 at the end), and why."""
     before, fresh = len(clusters), 0
-    origins = [np.unique(clusters.labels[part.rows], return_counts=True) for part in parts]
+    origins = []
+    for part in parts:
+        counts = np.bincount(clusters.labels[part.rows] + 1)
+        sources = np.flatnonzero(counts)
+        origins.append((sources - 1, counts[sources]))
     left = clusters.count.astype(np.int64)
     for sources, counts in origins:
         known = sources >= 0

@@ -29,6 +29,7 @@ class _State:
     mean: F64  # (T, 2, 3) position and velocity
     covariance: F64  # (T, 2, 2) the same for each axis
     size: F64  # (T, 3)
+    whole: Bool  # the size is that of all of it, not of what was seen
     yaw: F64
     hits: I32
     sightings: I32
@@ -39,11 +40,12 @@ class _State:
 
     @staticmethod
     def empty() -> _State:
-        return _State.new(np.zeros(0, np.int64), Boxes3D.empty(), 0, 0, 0, TrackingConfig())
+        nothing = np.zeros(0, np.bool_)
+        return _State.new(np.zeros(0, np.int64), Boxes3D.empty(), nothing, 0, 0, 0, TrackingConfig())
 
     @staticmethod
     def new(
-        ids: I64, boxes: Boxes3D, stamp: int, classes: int, length: int, config: TrackingConfig
+        ids: I64, boxes: Boxes3D, whole: Bool, stamp: int, classes: int, length: int, config: TrackingConfig
     ) -> _State:
         n = len(ids)
         mean = np.zeros((n, 2, 3))
@@ -53,6 +55,7 @@ class _State:
             mean=mean,
             covariance=np.tile(np.diag([config.position_noise**2, INITIAL_SPEED**2]), (n, 1, 1)),
             size=boxes.size.astype(np.float64),
+            whole=whole,
             yaw=boxes.yaw.astype(np.float64),
             hits=np.ones(n, np.int32),
             sightings=np.zeros(n, np.int32),
@@ -104,7 +107,8 @@ class Tracker:
 
         Args:
             frame: for its stamp and pose. A stamp twice is the same instant seen again.
-            clusters: only those that were kept are tracked, by their oriented boxes.
+            clusters: only those that were kept are tracked, by their oriented boxes, or by those of the
+                objects that they are, where these are completed to the size of their class.
             in_view: (K,) clusters that some camera could name: without a name they lose the one they had.
             objects: names of clusters.
             config: noise, gate, birth and death.
@@ -120,13 +124,17 @@ class Tracker:
             self._state.votes = np.zeros((0, len(self._classes)))
         kept = np.flatnonzero(clusters.kept)
         pose = frame.pose
-        boxes = _placed(clusters.obb, kept, pose)
+        seen = _placed(clusters.obb, kept, pose)
+        boxes, whole = _completed(seen, kept, objects, pose)
 
         self._predict(dt, config)
         column = self._assign(boxes, dt, config)
         old = np.flatnonzero(column >= 0)
         innovation = np.full(len(column), np.nan, np.float32)
-        innovation[old] = self._correct(old, boxes, column[old], config)
+        measured = self._as_known(
+            old, boxes.chosen(column[old]), whole[column[old]], seen.chosen(column[old]), pose
+        )
+        innovation[old] = self._correct(old, measured, config)
         self._state.hits[old] += 1
         self._state.seen[old] = frame.stamp
         cluster = np.where(column >= 0, np.append(kept, -1)[column], -1)
@@ -138,9 +146,9 @@ class Tracker:
         fresh = np.setdiff1d(np.arange(len(boxes)), column)
         ids = self._next + np.arange(len(fresh))
         self._next += len(fresh)
-        rows = Boxes3D(boxes.center[fresh], boxes.size[fresh], boxes.yaw[fresh])
         length, classes = len(self._stamps), len(self._classes)
-        self._state = self._state.joined(_State.new(ids, rows, frame.stamp, classes, length, config))
+        born = _State.new(ids, boxes.chosen(fresh), whole[fresh], frame.stamp, classes, length, config)
+        self._state = self._state.joined(born)
         cluster = np.concatenate([cluster, kept[fresh]])
         innovation = np.concatenate([innovation, np.full(len(fresh), np.nan, np.float32)])
 
@@ -179,21 +187,47 @@ class Tracker:
         column[rows] = np.where(chosen >= 0, np.append(columns, -1)[chosen], -1)
         return column
 
-    def _correct(self, rows: NDArray[Any], boxes: Boxes3D, measured: I32, config: TrackingConfig) -> F32:
+    def _as_known(self, rows: NDArray[Any], boxes: Boxes3D, whole: Bool, seen: Boxes3D, pose: F64) -> Boxes3D:
+        """The measured boxes with what earlier frames saw: a track that knows all of it keeps its size.
+
+        Where only a part is measured of what was whole before, the box goes on away from the sensor. Where
+        the whole is measured for the first time, the track moves to its centre, which is no motion.
+        """
+        state = self._state
+        first = whole & ~state.whole[rows]
+        state.mean[rows[first], 0] += boxes.center[first] - seen.center[first]
+        state.size[rows[first]], state.yaw[rows[first]] = boxes.size[first], boxes.yaw[first]
+        state.whole[rows] |= whole
+        part = np.flatnonzero(state.whole[rows] & ~whole)
+        if len(part) == 0:
+            return boxes
+        center, size = boxes.center.copy(), boxes.size.copy()
+        _, quarters = _turn(boxes.yaw[part], state.yaw[rows[part]])
+        known = state.size[rows[part]]
+        known[:, :2] = np.where((quarters % 2 == 1)[:, None], known[:, 1::-1], known[:, :2])
+        yaw = boxes.yaw[part]
+        ahead = np.stack([np.cos(yaw), np.sin(yaw)], axis=1)
+        for axis, direction in enumerate((ahead, np.stack([-ahead[:, 1], ahead[:, 0]], axis=1))):
+            away = ((center[part, :2] - pose[:2, 3]) * direction).sum(axis=1)
+            missing = np.maximum(known[:, axis] - size[part, axis], 0)
+            behind = np.where(np.abs(away) > size[part, axis] / 2, np.sign(away) * missing / 2, 0)
+            center[part, :2] += behind[:, None] * direction
+            size[part, axis] += missing
+        return Boxes3D(center, size, boxes.yaw)
+
+    def _correct(self, rows: NDArray[Any], boxes: Boxes3D, config: TrackingConfig) -> F32:
         """Update with the measured boxes; how far on the ground they are from where they were expected."""
         state = self._state
         covariance = state.covariance[rows]
         gain = covariance[:, :, 0] / (covariance[:, :1, 0] + config.position_noise**2)
-        innovation = boxes.center[measured] - state.mean[rows, 0]
+        innovation = boxes.center - state.mean[rows, 0]
         state.mean[rows] += gain[:, :, None] * innovation[:, None]
         state.covariance[rows] = covariance - gain[:, :, None] * covariance[:, :1]
 
-        # A fitted rectangle has no front: of its four headings the nearest is meant.
-        turn = boxes.yaw[measured] - state.yaw[rows]
-        quarters = np.round(turn / (np.pi / 2)).astype(np.int64)
-        size = boxes.size[measured].astype(np.float64)
+        turn, quarters = _turn(boxes.yaw, state.yaw[rows])
+        size = boxes.size.astype(np.float64)
         size[:, :2] = np.where((quarters % 2 == 1)[:, None], size[:, 1::-1], size[:, :2])
-        state.yaw[rows] += SHAPE_GAIN * (turn - quarters * (np.pi / 2))
+        state.yaw[rows] += SHAPE_GAIN * turn
         state.size[rows] += SHAPE_GAIN * (size - state.size[rows])
         velocity = state.mean[rows, 1]
         backwards = np.cos(state.yaw[rows] - np.arctan2(velocity[:, 1], velocity[:, 0])) < 0
@@ -284,6 +318,28 @@ def _costs(place: F64, gate: F64, extent: F64, center: F32, measured: F64) -> tu
                 near_track[t] += 1
                 near_box[k] += 1
     return cost, near_track, near_box
+
+
+def _turn(measured: F32, expected: F64) -> tuple[F64, I64]:
+    """How far rectangles are turned from the nearest of their four headings, and which that is."""
+    turn = measured - expected
+    quarters = np.round(turn / (np.pi / 2)).astype(np.int64)
+    return turn - quarters * (np.pi / 2), quarters
+
+
+def _completed(seen: Boxes3D, kept: NDArray[Any], objects: Objects | None, pose: F64) -> tuple[Boxes3D, Bool]:
+    """The boxes of clusters, those of named objects instead where they are whole; and which these are."""
+    whole = np.zeros(len(kept), np.bool_)
+    if objects is None or objects.seen is None or not len(objects) or not len(kept):
+        return seen, whole
+    place = np.searchsorted(kept, objects.cluster)
+    there = np.flatnonzero(np.append(kept, -2)[place] == objects.cluster)
+    named = _placed(objects.boxes, there, pose)
+    boxes = Boxes3D(seen.center.copy(), seen.size.copy(), seen.yaw.copy())
+    rows = place[there]
+    boxes.center[rows], boxes.size[rows], boxes.yaw[rows] = named.center, named.size, named.yaw
+    whole[rows] = True
+    return boxes, whole
 
 
 def _placed(boxes: Boxes3D, rows: NDArray[Any], pose: F64) -> Boxes3D:
