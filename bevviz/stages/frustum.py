@@ -37,6 +37,7 @@ TAIL = 4.0  # degrees of freedom of Student's distribution, of how far a height 
 LOWEST = 2.0  # sigmas: what is hidden may be as low as it likes
 LOWEST_CUT = 1.0  # of what the image cuts off
 MARGIN = 0.05  # of a box's width that is looked at on either side of it
+TIGHT = 0.15  # of a box's sides that it may be too tight by
 AROUND = 0.5  # of its width, in which points tell that an object goes on
 REACH_SPREAD = 2.0  # sigmas of its size that an object may be deep
 WINDOWS = 8  # that overlap at each depth
@@ -290,9 +291,13 @@ class _View:
         work, rows = self._work, candidate.rows
         if not grow:
             return rows, *self._upright(d, rows, *self._fitted(d, rows, candidate.depth))
-        # Its clusters are its own beyond the image that cuts it off, and beyond a box that is too tight.
+        # Its clusters are its own beyond the image that cuts it off, and beside a box that is too tight.
         counts = np.bincount(work.clusters.labels[rows] + 1)
         kin = [work.free_of(k) for k in np.flatnonzero(counts[1:] > KIN * len(rows)).tolist()]
+        x0, y0, x1, y1 = self._detections.xyxy[d]
+        across, along = TIGHT * (x1 - x0), TIGHT * (y1 - y0)
+        window = x0 - across, y0 - along, x1 + across, y1 + along
+        near = [_in_window(self._uv, own, *window, bool(self._cut[d].any())) for own in kin]
         if self._cut[d, [0, 2]].any():
             size, place = self._size(d), work.points[rows, :2].mean(axis=0)
             long = candidate.depth * self._wide[d] if size is None else size[0]
@@ -301,11 +306,10 @@ class _View:
                 away = work.points[beyond, :2] - place
                 rows = np.concatenate([rows, beyond[np.hypot(away[:, 0], away[:, 1]) <= long]])
         flat, _ = self._fitted(d, rows, candidate.depth)
-        x0, _, x1, _ = self._detections.xyxy[d]
         margin = MARGIN * (x1 - x0)
-        near = np.concatenate([self._between(d, x0 - margin, x1 + margin), *kin])
-        near = near[self.free[near] & work.unowned(near)]
-        inside = _distinct(near[_within(work.points, near, flat, SKIN)], len(work.points))
+        there = np.concatenate([self._between(d, x0 - margin, x1 + margin), *near])
+        there = there[self.free[there] & work.unowned(there)]
+        inside = _distinct(there[_within(work.points, there, flat, SKIN)], len(work.points))
         rows = inside if len(inside) >= work.config.min_points else candidate.rows
         flat, facing = self._fitted(d, rows, candidate.depth, about=flat[4])
         box, seen = self._upright(d, rows, flat, facing)
@@ -321,7 +325,7 @@ class _View:
     def _between(self, d: int, left: float, right: float) -> I64:
         """Points from one column of pixels to another, in the rows of a detection's box."""
         _, top, _, bottom = self._detections.xyxy[d]
-        return _in_window(self._uv, self._seen, left, top, right, bottom)
+        return _in_window(self._uv, self._seen, left, top, right, bottom, False)
 
     def _fitted(self, d: int, rows: I64, depth: float, about: float = np.nan) -> tuple[F64, I64]:
         """Place, length, width and heading on the ground, and the sides that face the camera."""
@@ -357,13 +361,14 @@ class _View:
 
 
 @kernel
-def _in_window(uv: F32, rows: I64, left: float, top: float, right: float, bottom: float) -> I64:
-    """Those of the points whose pixels are in a part of the image."""
+def _in_window(uv: F32, rows: I64, left: float, top: float, right: float, bottom: float, unseen: bool) -> I64:
+    """Those of the points whose pixels are in a part of the image, or, with ``unseen``, outside of it."""
     found = np.empty(len(rows), np.int64)
     n = 0
     for i in rows:
         found[n] = i
-        n += left <= uv[i, 0] <= right and top <= uv[i, 1] <= bottom
+        inside = left <= uv[i, 0] <= right and top <= uv[i, 1] <= bottom
+        n += inside or (unseen and np.isnan(uv[i, 0]))
     return found[:n]
 
 
