@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, fields
 from typing import Any
 
@@ -125,10 +126,10 @@ class Tracker:
         kept = np.flatnonzero(clusters.kept)
         pose = frame.pose
         seen = _placed(clusters.obb, kept, pose)
-        boxes, whole = _completed(seen, kept, objects, pose)
+        boxes, whole = _completed(seen, kept, objects, pose, config.gate)
 
         self._predict(dt, config)
-        column = self._assign(boxes, dt, config)
+        column = self._assign(boxes, whole, pose, config)
         old = np.flatnonzero(column >= 0)
         innovation = np.full(len(column), np.nan, np.float32)
         measured = self._as_known(
@@ -163,11 +164,12 @@ class Tracker:
         self._state.mean = step @ self._state.mean
         self._state.covariance = step @ self._state.covariance @ step.T + np.outer(disturbed, disturbed)
 
-    def _assign(self, boxes: Boxes3D, dt: float, config: TrackingConfig) -> I32:
+    def _assign(self, boxes: Boxes3D, whole: Bool, pose: F64, config: TrackingConfig) -> I32:
         """(T,) box of each track, -1: none. Least squared distance on the ground, relative to the gate.
 
         The gate is ``tracking.gate``, wider where the place is uncertain to more than a third of it (three
-        sigma). Sizes that differ cost as well.
+        sigma). Sizes that differ cost as well. Of a part of an object that was whole before, the centre may
+        lie nearer to the sensor, and it may be smaller, for nothing more.
         """
         state = self._state
         column = np.full(len(state), -1, np.int32)
@@ -176,7 +178,12 @@ class Tracker:
         gate = np.maximum(config.gate**2, 9 * (state.covariance[:, 0, 0] + config.position_noise**2))
         extent = np.log(np.maximum(np.sort(state.size[:, :2]), 0.1))
         measured = np.log(np.maximum(np.sort(boxes.size[:, :2]), 0.1))
-        cost, near_track, near_box = _costs(state.mean[:, 0], gate, extent, boxes.center, measured)
+        sight = state.mean[:, 0, :2] - pose[:2, 3]
+        sight /= np.maximum(np.linalg.norm(sight, axis=1, keepdims=True), 1e-9)
+        part = state.whole[:, None] & ~whole
+        cost, near_track, near_box = _costs(
+            state.mean[:, 0], gate, extent, sight, boxes.center, measured, part
+        )
         # Most boxes have one track near, and it has no other: only the rest has to be assigned.
         nearest = cost.argmin(1)
         alone = (near_track == 1) & (near_box[nearest] == 1)
@@ -304,16 +311,24 @@ class Tracker:
 
 
 @kernel
-def _costs(place: F64, gate: F64, extent: F64, center: F32, measured: F64) -> tuple[F64, I32, I32]:
+def _costs(
+    place: F64, gate: F64, extent: F64, sight: F64, center: F32, measured: F64, part: Bool
+) -> tuple[F64, I32, I32]:
     """(T, K) costs, inf beyond the squared gate, and how many of the others are near each track and box."""
     cost = np.full((len(place), len(center)), np.inf)
     near_track, near_box = np.zeros(len(place), np.int32), np.zeros(len(center), np.int32)
     for t in range(len(place)):
         for k in range(len(center)):
             dx, dy = place[t, 0] - center[k, 0], place[t, 1] - center[k, 1]
+            shorter, narrower = extent[t, 1] - measured[k, 1], extent[t, 0] - measured[k, 0]
+            if part[t, k]:
+                hidden = max(math.exp(extent[t, 1]) - math.exp(measured[k, 1]), 0.0) / 2
+                nearer = min(max(dx * sight[t, 0] + dy * sight[t, 1], 0.0), hidden)
+                dx, dy = dx - nearer * sight[t, 0], dy - nearer * sight[t, 1]
+                shorter, narrower = min(shorter, 0.0), min(narrower, 0.0)
             distance = (dx * dx + dy * dy) / gate[t]
             if distance <= 1:
-                size = abs(extent[t, 0] - measured[k, 0]) + abs(extent[t, 1] - measured[k, 1])
+                size = abs(narrower) + abs(shorter)
                 cost[t, k] = distance + SIZE_WEIGHT * size / 2
                 near_track[t] += 1
                 near_box[k] += 1
@@ -327,13 +342,19 @@ def _turn(measured: F32, expected: F64) -> tuple[F64, I64]:
     return turn - quarters * (np.pi / 2), quarters
 
 
-def _completed(seen: Boxes3D, kept: NDArray[Any], objects: Objects | None, pose: F64) -> tuple[Boxes3D, Bool]:
-    """The boxes of clusters, those of named objects instead where they are whole; and which these are."""
+def _completed(
+    seen: Boxes3D, kept: NDArray[Any], objects: Objects | None, pose: F64, gate: float
+) -> tuple[Boxes3D, Bool]:
+    """The boxes of clusters, those of named objects instead where they are whole; and which these are.
+
+    What is smaller than the gate stays as measured: its centre is known well enough, and more steadily.
+    """
     whole = np.zeros(len(kept), np.bool_)
     if objects is None or objects.seen is None or not len(objects) or not len(kept):
         return seen, whole
     place = np.searchsorted(kept, objects.cluster)
-    there = np.flatnonzero(np.append(kept, -2)[place] == objects.cluster)
+    there = np.append(kept, -2)[place] == objects.cluster
+    there = np.flatnonzero(there & (objects.boxes.size[:, :2].max(axis=1) > gate))
     named = _placed(objects.boxes, there, pose)
     boxes = Boxes3D(seen.center.copy(), seen.size.copy(), seen.yaw.copy())
     rows = place[there]
