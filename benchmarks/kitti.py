@@ -115,12 +115,21 @@ def read(root: Path, name: str) -> Shot:
     return Shot(name, frame, tuple(labels), np.array(ignored).reshape(-1, 4))
 
 
-def oracle(shot: Shot) -> Detect:
-    """The labels' own boxes as detections, so that only what comes after the detector is judged."""
+def oracle(shot: Shot, off: float = 0.0) -> Detect:
+    """The labels' own boxes as detections, so that only what comes after the detector is judged.
+
+    Args:
+        shot: the frame.
+        off: one sigma that their edges are off, as a share of their width and height.
+    """
     n = len(shot.labels)
     none = np.zeros(n, np.int32)
+    boxes = np.array([label.xyxy for label in shot.labels], np.float32).reshape(-1, 4)
+    size = boxes[:, 2:] - boxes[:, :2]
+    random = np.random.default_rng(shot.frame.index)
+    boxes += (off * random.normal(size=boxes.shape) * np.hstack([size, size])).astype(np.float32)
     found = Detections(
-        xyxy=np.array([label.xyxy for label in shot.labels], np.float32).reshape(-1, 4),
+        xyxy=boxes,
         score=np.full(n, 0.9, np.float32),
         class_id=none,
         names=tuple(label.kind.lower() for label in shot.labels),
@@ -239,15 +248,41 @@ def shots(root: Path, names: Iterable[str] | None = None) -> Iterator[Shot]:
         yield read(root, name)
 
 
-def measure(root: Path, cases: Mapping[str, tuple[Config, bool]]) -> dict[str, Tally]:
-    """Every case on every frame. A case is a configuration, and whether the labels are its detections."""
-    tallies = {case: Tally() for case in cases}
+@dataclass(frozen=True, slots=True)
+class Case:
+    """A configuration, and what detects: the labels, whose boxes may be off, or the network that it names."""
+
+    config: Config
+    by_labels: bool = True
+    off: float = 0.0
+
+
+def measure(root: Path, cases: Mapping[str, Case], names: Iterable[str] | None = None) -> dict[str, Tally]:
+    """Every case on every frame, or on those that are named."""
+    tallies = {name: Tally() for name in cases}
     loader = StageLoader()
-    for shot in tqdm(list(shots(root)), unit="frame", disable=None):
-        for case, (config, by_labels) in cases.items():
-            session = Session(config, oracle(shot) if by_labels else None, loader=loader)
-            tallies[case].add(shot, session.alone(shot.frame))
+    for shot in tqdm(list(shots(root, names)), unit="frame", disable=None):
+        for name, case in cases.items():
+            detect = oracle(shot, case.off) if case.by_labels else None
+            tallies[name].add(shot, Session(case.config, detect, loader=loader).alone(shot.frame))
     return tallies
+
+
+def cases(data: Path, settings: Sequence[str] = ()) -> dict[str, Case]:
+    """Both presets, with what can be had of detections."""
+    model = f"detector.model={data / 'models/yolox_nano.onnx'}"
+    reference = load(settings=[model], preset="reference")
+    return {
+        "`reference`, labels' boxes": Case(reference),
+        "`default`, labels' boxes, clusters as they are": Case(load(settings=["fusion.split=false"])),
+        "`default`, labels' boxes": Case(load(settings=settings)),
+        "`default`, labels' boxes, edges 5 % off": Case(load(settings=settings), off=0.05),
+        "`reference`, YOLOX-nano": Case(reference, by_labels=False),
+        "`default`, YOLOX-nano, clusters as they are": Case(
+            load(settings=[model, "fusion.split=false"]), by_labels=False
+        ),
+        "`default`, YOLOX-nano": Case(load(settings=[model, *settings]), by_labels=False),
+    }
 
 
 def table(tallies: Mapping[str, Tally]) -> str:
@@ -262,16 +297,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     shared = Path(__file__).resolve().parents[2] / "shared/data"
     parser.add_argument("--data", type=Path, default=shared, help="folder with kitti/ and models/")
+    parser.add_argument("--frame", action="append", metavar="NUMBER", help="only this one, as 000008")
     parser.add_argument("--objects", action="store_true", help="list every object")
     parser.add_argument("--set", action="append", default=[], help="key=value for the default preset")
     options = parser.parse_args(arguments)
-    model = f"detector.model={options.data / 'models/yolox_nano.onnx'}"
-    cases: dict[str, tuple[Config, bool]] = {
-        "default, labels' boxes": (load(settings=options.set), True),
-        "default, YOLOX-nano": (load(settings=[model, *options.set]), False),
-        "reference, YOLOX-nano": (load(settings=[model], preset="reference"), False),
-    }
-    tallies = measure(options.data / "kitti", cases)
+    tallies = measure(options.data / "kitti", cases(options.data, options.set), options.frame)
     print(table(tallies))
     if options.objects:
         for case, tally in tallies.items():

@@ -143,7 +143,7 @@ def test_what_cannot_be_a_person_is_refused_with_the_reason() -> None:
     before = cluster(points, CLUSTERING)
     after, (claims,), splits = claimed(points, before, found)
     assert claims is not None and claims.cluster[0] == -1 and len(splits) == 0
-    assert 0 < claims.fit[0] < 0.05
+    assert 0 < claims.fit[0] < 0.05 < FusionConfig().min_rating
     assert after is before
     assert found.uv is not None and found.depth is not None
     fusion = fuse(found.uv, found.depth, after, detections, CAMERA, CAMERA_FROM_LIDAR, FusionConfig(), claims)
@@ -320,7 +320,7 @@ def test_sizes_are_stated_class_by_class() -> None:
 
 @pytest.fixture(scope="module")
 def tally(shared: Path) -> kitti.Tally:
-    return kitti.measure(shared / "kitti", {"default": (load(), True)})["default"]
+    return kitti.measure(shared / "kitti", {"default": kitti.Case(load())})["default"]
 
 
 def test_objects_of_labelled_frames(tally: kitti.Tally) -> None:
