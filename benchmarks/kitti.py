@@ -6,6 +6,7 @@ The judging shares no code with what it judges: labels are read here, and boxes 
 from __future__ import annotations
 
 import argparse
+import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -20,6 +21,7 @@ from bevviz.frame import Camera, Detections, Frame, FrameResult, Image, Intrinsi
 from bevviz.perceive import Detect, StageLoader
 from bevviz.session import Session
 
+DATA = Path(os.environ.get("BEVVIZ_DATA") or Path(__file__).resolve().parents[2] / "shared/data")
 RANGE = 40.0  # metres, on the ground, of an object that must be found
 MIN_HITS = 10  # LiDAR points in its box
 FOUND = 2.0  # metres between the centres of an object and the box that finds it
@@ -293,10 +295,44 @@ def table(tallies: Mapping[str, Tally]) -> str:
     return "\n".join(lines)
 
 
+RINGS = ((0, 15), (15, 25), (25, RANGE))  # metres
+
+
+def by_distance(tallies: Mapping[str, Tally]) -> str:
+    """Objects found, and of those that have an IoU of 0.5."""
+    heads = [f"{low:.0f} to {high:.0f} m: found, IoU 0.5" for low, high in RINGS]
+    lines = ["| case | " + " | ".join(heads) + " |", "| --- |" + " ---: |" * len(heads)]
+    for case, tally in tallies.items():
+        cells = []
+        for low, high in RINGS:
+            there = [v for v in tally.objects if low <= np.hypot(*v.label.center[:2]) < high]
+            found, good = sum(v.distance <= FOUND for v in there), sum(v.iou >= 0.5 for v in there)
+            cells.append(f"{found}, {good} of {len(there)}")
+        lines.append(f"| {case} | " + " | ".join(cells) + " |")
+    return "\n".join(lines)
+
+
+def page(data: Path) -> str:
+    """For docs/accuracy.md."""
+    tallies = measure(data / "kitti", cases(data))
+    return f"""
+## Real frames: objects, with the labels' own 2D boxes and with a detector
+
+Twelve labelled frames of the KITTI object benchmark (Geiger et al. 2012), 000000 to 000011: few, and of one
+city. An object must be found if it lies within {RANGE:.0f} m and has at least {MIN_HITS} LiDAR points;
+it is, if a box of a right class has its centre within {FOUND:.0f} m. IoU is seen from above. A box is
+wrong if no labelled object of any class is within {FOUND:.0f} m of it. With the labels' own boxes only what
+comes after the detector is judged.
+
+{table(tallies)}
+
+{by_distance(tallies)}
+"""
+
+
 def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    shared = Path(__file__).resolve().parents[2] / "shared/data"
-    parser.add_argument("--data", type=Path, default=shared, help="folder with kitti/ and models/")
+    parser.add_argument("--data", type=Path, default=DATA, help="folder with kitti/ and models/")
     parser.add_argument("--frame", action="append", metavar="NUMBER", help="only this one, as 000008")
     parser.add_argument("--objects", action="store_true", help="list every object")
     parser.add_argument("--set", action="append", default=[], help="key=value for the default preset")

@@ -33,8 +33,8 @@ def explain(
 
     A detection's distances are along its camera's optical axis, a cluster's are horizontal, from the
     origin of its frame. A cluster is explained once for each camera that has it in view, otherwise once.
-    Problems have the subject ``camera``, row -1 and the state ``problem``. What a camera made of a cluster is
-    said of what is left of it, in the state ``split``, and of what was made of several, in ``merged``.
+    Problems have the subject ``camera``, row -1 and the state ``problem``. What a camera made of clusters has
+    the subject ``split``: what is left of one the state ``split``, what was made of several ``merged``.
 
     Args:
         cameras: results of all cameras.
@@ -208,10 +208,10 @@ def _splits(cameras: Sequence[CameraResult], splits: Splits) -> Iterator[Explana
             share = f"{points:,} of {splits.of[row]:,} points"
             if rest >= 0:
                 text = f"cluster {rest} split {by}: {share} are cluster {part}"
-                yield Explanation("cluster", camera, rest, "split", text)
+                yield Explanation("split", camera, rest, "split", text)
             elif points < splits.of[row]:
                 text = f"cluster {part} split {by}: {share} of a cluster that others have the rest of"
-                yield Explanation("cluster", camera, part, "split", text)
+                yield Explanation("split", camera, part, "split", text)
             elif splits.is_noise[row]:
                 noise = points
             else:
@@ -221,7 +221,7 @@ def _splits(cameras: Sequence[CameraResult], splits: Splits) -> Iterator[Explana
             pieces += [f"a cluster of {whole[0]} points"] if len(whole) == 1 else []
             pieces += [f"{_points(noise)} of noise"] if noise else []
             yield Explanation(
-                "cluster", camera, part, "merged", f"cluster {part} made {by} of {' and '.join(pieces)}"
+                "split", camera, part, "merged", f"cluster {part} made {by} of {' and '.join(pieces)}"
             )
 
 

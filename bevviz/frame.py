@@ -562,7 +562,7 @@ class FrameResult:
 class Explanation:
     """One decision in words. ``state`` is the lower-case name of the Decision or DetectionState."""
 
-    subject: str  # "detection" or "cluster"
+    subject: str  # "detection", "cluster", "split" or "camera"
     camera: str  # "" where no camera is involved
     row: int
     state: str

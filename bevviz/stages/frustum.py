@@ -71,8 +71,8 @@ def claim(
     in the box of the class's size that is fitted (``boxfit.fit``) to the candidate: that joins what something
     in front has parted, and leaves out what stands too near.
 
-    Noise can be taken, clusters outside the size limits cannot. A cluster that an earlier camera has shaped
-    is not shaped again, but can be taken as it is.
+    Noise can be taken, clusters outside the size limits cannot, nor is anything made that is smaller. A
+    cluster that an earlier camera has shaped is not shaped again, but can be taken as it is.
 
     Args:
         points: (P, 3) obstacle points, z up.
@@ -135,6 +135,7 @@ class _Work:
     ) -> None:
         self.points, self.height, self.clusters, self.config = points, height, clusters, config
         self.sizes, self.smallest = sizes, smallest
+        self.fewest = max(config.min_points, smallest)
         self.parts: list[_Part] = []
         kept = np.append(clusters.state == ClusterState.KEPT, True)  # noise is the last
         self._usable = kept[clusters.labels]
@@ -174,7 +175,7 @@ class _Work:
                 _, box, seen = view.settled(d, replace(candidate, rows=rows), grow=False)
             else:
                 rows = candidate.rows[self.unowned(candidate.rows)]
-                if len(rows) < self.config.min_points:
+                if len(rows) < self.fewest:
                     continue
                 candidate = replace(candidate, rows=rows)
                 rows, box, seen = view.settled(d, candidate, grow=True)
@@ -281,7 +282,7 @@ class _View:
             np.nan if size is None else size[2],
             np.nan if size is None else math.hypot(size[5], TALL_SHARE * size[2]),
             LOWEST_CUT if self._cut[d, [1, 3]].any() else LOWEST,
-            config.min_points,
+            self._work.fewest,
             config.min_iou,
         )
         return _Candidate(rating, rows[chosen], depth)
@@ -310,7 +311,7 @@ class _View:
         there = np.concatenate([self._between(d, x0 - margin, x1 + margin), *near])
         there = there[self.free[there] & work.unowned(there)]
         inside = _distinct(there[_within(work.points, there, flat, SKIN)], len(work.points))
-        rows = inside if len(inside) >= work.config.min_points else candidate.rows
+        rows = inside if len(inside) >= work.fewest else candidate.rows
         flat, facing = self._fitted(d, rows, candidate.depth, about=flat[4])
         box, seen = self._upright(d, rows, flat, facing)
         # What is left beside it and too small to be a cluster stays with it.
