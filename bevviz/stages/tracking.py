@@ -129,7 +129,7 @@ class Tracker:
         boxes, whole = _completed(seen, kept, objects, pose, config.gate)
 
         self._predict(dt, config)
-        column = self._assign(boxes, whole, pose, config)
+        column = self._assign(boxes, whole, seen, pose, config)
         old = np.flatnonzero(column >= 0)
         innovation = np.full(len(column), np.nan, np.float32)
         measured = self._as_known(
@@ -164,25 +164,30 @@ class Tracker:
         self._state.mean = step @ self._state.mean
         self._state.covariance = step @ self._state.covariance @ step.T + np.outer(disturbed, disturbed)
 
-    def _assign(self, boxes: Boxes3D, whole: Bool, pose: F64, config: TrackingConfig) -> I32:
+    def _assign(self, boxes: Boxes3D, whole: Bool, seen: Boxes3D, pose: F64, config: TrackingConfig) -> I32:
         """(T,) box of each track, -1: none. Least squared distance on the ground, relative to the gate.
 
         The gate is ``tracking.gate``, wider where the place is uncertain to more than a third of it (three
-        sigma). Sizes that differ cost as well. Of a part of an object that was whole before, the centre may
-        lie nearer to the sensor, and it may be smaller, for nothing more.
+        sigma). Sizes that differ cost as well. A track that never was whole is compared with what is seen. Of
+        a part of an object that was whole before, the centre may lie nearer to the sensor, and it may be
+        smaller, for nothing more.
         """
         state = self._state
         column = np.full(len(state), -1, np.int32)
         if len(state) == 0 or len(boxes) == 0:
             return column
         gate = np.maximum(config.gate**2, 9 * (state.covariance[:, 0, 0] + config.position_noise**2))
-        extent = np.log(np.maximum(np.sort(state.size[:, :2]), 0.1))
-        measured = np.log(np.maximum(np.sort(boxes.size[:, :2]), 0.1))
         sight = state.mean[:, 0, :2] - pose[:2, 3]
         sight /= np.maximum(np.linalg.norm(sight, axis=1, keepdims=True), 1e-9)
-        part = state.whole[:, None] & ~whole
         cost, near_track, near_box = _costs(
-            state.mean[:, 0], gate, extent, sight, boxes.center, measured, part
+            state.mean[:, 0],
+            gate,
+            _extent(state.size),
+            sight,
+            state.whole,
+            np.stack([seen.center, boxes.center]),
+            np.stack([_extent(seen.size), _extent(boxes.size)]),
+            whole,
         )
         # Most boxes have one track near, and it has no other: only the rest has to be assigned.
         nearest = cost.argmin(1)
@@ -310,19 +315,31 @@ class Tracker:
         )
 
 
+def _extent(size: F32 | F64) -> F64:
+    """(N, 2) logarithms of the shorter and the longer side on the ground."""
+    return np.asarray(np.log(np.maximum(np.sort(size[:, :2]), 0.1)), np.float64)
+
+
 @kernel
 def _costs(
-    place: F64, gate: F64, extent: F64, sight: F64, center: F32, measured: F64, part: Bool
+    place: F64, gate: F64, extent: F64, sight: F64, known: Bool, center: F32, measured: F64, whole: Bool
 ) -> tuple[F64, I32, I32]:
-    """(T, K) costs, inf beyond the squared gate, and how many of the others are near each track and box."""
-    cost = np.full((len(place), len(center)), np.inf)
-    near_track, near_box = np.zeros(len(place), np.int32), np.zeros(len(center), np.int32)
+    """(T, K) costs, inf beyond the squared gate, and how many of the others are near each track and box.
+
+    ``center`` and ``measured`` are (2, K, ...): as seen, and as completed where that is known (``whole``).
+    """
+    cost = np.full((len(place), len(whole)), np.inf)
+    near_track, near_box = np.zeros(len(place), np.int32), np.zeros(len(whole), np.int32)
     for t in range(len(place)):
-        for k in range(len(center)):
-            dx, dy = place[t, 0] - center[k, 0], place[t, 1] - center[k, 1]
-            shorter, narrower = extent[t, 1] - measured[k, 1], extent[t, 0] - measured[k, 0]
-            if part[t, k]:
-                hidden = max(math.exp(extent[t, 1]) - math.exp(measured[k, 1]), 0.0) / 2
+        for k in range(len(whole)):
+            as_whole = 1 if known[t] and whole[k] else 0
+            dx, dy = place[t, 0] - center[as_whole, k, 0], place[t, 1] - center[as_whole, k, 1]
+            narrower, shorter = (
+                extent[t, 0] - measured[as_whole, k, 0],
+                extent[t, 1] - measured[as_whole, k, 1],
+            )
+            if known[t] and not whole[k]:
+                hidden = max(math.exp(extent[t, 1]) - math.exp(measured[0, k, 1]), 0.0) / 2
                 nearer = min(max(dx * sight[t, 0] + dy * sight[t, 1], 0.0), hidden)
                 dx, dy = dx - nearer * sight[t, 0], dy - nearer * sight[t, 1]
                 shorter, narrower = min(shorter, 0.0), min(narrower, 0.0)
