@@ -45,6 +45,7 @@ BORDER = 2.0  # pixels from the border of the image that a box is cut off at
 SAME = 0.7  # IoU from which image boxes of two classes show one object: NMS is by class
 SKIN = 0.1  # metres around a box in which a point is still its own
 KIN = 0.1  # share of an object's points from which a cluster is one that it is made of
+NOBODY = -2  # in place of the detection that has a point: nobody can have it
 SLACK = 0.5  # metres around a box in which what is left of a cluster, too small to be one, is its own
 
 
@@ -138,8 +139,8 @@ class _Work:
         self.fewest = max(config.min_points, smallest)
         self.parts: list[_Part] = []
         kept = np.append(clusters.state == ClusterState.KEPT, True)  # noise is the last
-        self._usable = kept[clusters.labels]
-        self._owner = np.full(len(points), -1, np.int64)
+        self.usable = kept[clusters.labels]
+        self.owner = np.full(len(points), -1, np.int64)
         self._cameras = 0
         order, self._start = sort_by(clusters.labels + np.int32(1), len(clusters) + 1)  # noise comes first
         self._order = order.astype(np.int64)
@@ -163,11 +164,17 @@ class _Work:
         claims = Claims.none(len(found))
         kept = np.flatnonzero(found.state == DetectionState.KEPT).tolist()
         waiting = {d: view.best(d) for d in kept}
+        scores = found.score.tolist()
         while waiting:
-            d = max(waiting, key=lambda d: waiting[d].fit * float(found.score[d]))
+            d = max(waiting, key=lambda d: waiting[d].fit * scores[d])
             candidate = waiting.pop(d)
             claims.fit[d] = candidate.fit
-            if candidate.fit * float(found.score[d]) < self.config.min_rating:
+            if candidate.fit * scores[d] < self.config.min_rating:
+                continue
+            takers = view.taker[candidate.rows]
+            if (lost := takers.max(initial=-1)) >= 0:  # others were better: what is left?
+                if not _same(found, int(lost), d):
+                    waiting[d] = view.best(d)
                 continue
             part = self._owned(candidate.rows)
             if part >= 0:
@@ -181,36 +188,27 @@ class _Work:
                 rows, box, seen = view.settled(d, candidate, grow=True)
                 part = len(self.parts)
                 self.parts.append(_Part(number, d, rows))
-                self._owner[rows] = part
+                self.owner[rows] = part
             claims.cluster[d] = part
             claims.boxes.center[d], claims.boxes.size[d], claims.boxes.yaw[d] = box[:3], box[3:6], box[6]
             claims.seen[d] = seen
-            view.free[rows] = False
-            for other in [other for other, wanted in waiting.items() if not view.free[wanted.rows].all()]:
-                if _same(found, d, other):
-                    claims.fit[other] = waiting.pop(other).fit
-                else:
-                    waiting[other] = view.best(other)
+            view.taker[rows] = d
         return claims
 
     def _owned(self, rows: I64) -> int:
         """The part of an earlier camera that most of these points are of, -1: none."""
-        owners = self._owner[rows]
+        owners = self.owner[rows]
         owners = owners[owners >= 0]
         return int(np.bincount(owners).argmax()) if 2 * len(owners) > len(rows) else -1
 
-    def unused(self) -> Bool:
-        """(P,) points that can be taken."""
-        return self._usable.copy()
-
     def unowned(self, rows: I64) -> Bool:
         """(N,) which of these points no part has."""
-        return np.asarray(self._owner[rows] < 0)
+        return np.asarray(self.owner[rows] < 0)
 
     def free_of(self, k: int) -> I64:
         """Points of a cluster that no part has."""
         rows = self._order[self._start[k + 1] : self._start[k + 2]]
-        return rows[self._owner[rows] < 0]
+        return rows[self.owner[rows] < 0]
 
 
 class _View:
@@ -226,10 +224,9 @@ class _View:
         work: _Work,
     ) -> None:
         self._work, self._uv, self._detections = work, uv, detections
-        self._intrinsics = intrinsics
         points_from_camera = geometry.inverse(camera_from_points)
-        self._place = points_from_camera[:3, 3]
-        self.free = work.unused()
+        self._place = points_from_camera[:2, 3].copy()
+        self.taker = np.where(work.usable, np.int32(-1), np.int32(NOBODY))  # detection that has each point
         self._seen = np.flatnonzero((depth > 0) & (depth <= work.config.max_depth) & ~np.isnan(uv[:, 0]))
         # Directions of the middles of the left, upper, right and lower edge of each box.
         x0, y0, x1, y1 = detections.xyxy.T.astype(np.float64)
@@ -254,38 +251,34 @@ class _View:
             axis=1,
         )
 
-    def _size(self, d: int) -> tuple[float, ...] | None:
-        return self._work.sizes.get(self._detections.names[d].lower())
+        with_sigma = np.maximum(EDGE_PIXELS / np.maximum(x1 - x0, 1.0), EDGE_SHARE) * self._wide
+        # (D, 2) sigma of the left and right edge for each metre of distance
+        self._edge = np.where(self._cut[:, [0, 2]], NO_EDGE, np.maximum(with_sigma, 1e-6)[:, None])
+        self._boxes = detections.xyxy.astype(np.float64)
+        sizes = [work.sizes.get(name.lower()) for name in detections.names]
+        self._size = np.array([size or (np.nan,) * 6 for size in sizes], np.float64).reshape(-1, 6)
 
     def best(self, d: int) -> _Candidate:
         """The best rated of what is free in a detection's frustum."""
-        config, size = self._work.config, self._size(d)
-        x0, _, x1, _ = self._detections.xyxy[d].astype(np.float64)
-        around = AROUND * (x1 - x0)
-        rows = self._between(d, x0 - around, x1 + around)
-        rows = rows[self.free[rows]]
-        uv = self._uv[rows].astype(np.float64)
-        xy = self._work.points[rows, :2] - self._place[:2]
-        reach = (
-            np.nan
-            if size is None
-            else math.hypot(size[0] + REACH_SPREAD * size[3], size[1] + REACH_SPREAD * size[4])
-        )
-        chosen, rating, depth = _choose(
-            xy,
-            uv,
-            self._detections.xyxy[d].astype(np.float64),
+        config, (length, width, height, *spread) = self._work.config, self._size[d].tolist()
+        rows, rating, depth = _choose(
+            self._work.points,
+            self._place,
+            self._uv,
+            self._seen,
+            self.taker,
+            self._boxes[d],
             config.max_gap,
-            reach,
+            math.hypot(length + REACH_SPREAD * spread[0], width + REACH_SPREAD * spread[1]),
             max(self._tall[d], self._wide[d]),
             self._tall[d],
-            np.nan if size is None else size[2],
-            np.nan if size is None else math.hypot(size[5], TALL_SHARE * size[2]),
-            LOWEST_CUT if self._cut[d, [1, 3]].any() else LOWEST,
+            height,
+            math.hypot(spread[2], TALL_SHARE * height),
+            LOWEST_CUT if self._cut[d, 1] or self._cut[d, 3] else LOWEST,
             self._work.fewest,
             config.min_iou,
         )
-        return _Candidate(rating, rows[chosen], depth)
+        return _Candidate(rating, rows, depth)
 
     def settled(self, d: int, candidate: _Candidate, grow: bool) -> tuple[I64, F64, Bool]:
         """The object's points, its box (centre, size, heading), and which of its sides were seen."""
@@ -294,114 +287,152 @@ class _View:
             return rows, *self._upright(d, rows, *self._fitted(d, rows, candidate.depth))
         # Its clusters are its own beyond the image that cuts it off, and beside a box that is too tight.
         counts = np.bincount(work.clusters.labels[rows] + 1)
-        kin = [work.free_of(k) for k in np.flatnonzero(counts[1:] > KIN * len(rows)).tolist()]
-        x0, y0, x1, y1 = self._detections.xyxy[d]
-        across, along = TIGHT * (x1 - x0), TIGHT * (y1 - y0)
-        window = x0 - across, y0 - along, x1 + across, y1 + along
-        near = [_in_window(self._uv, own, *window, bool(self._cut[d].any())) for own in kin]
-        if self._cut[d, [0, 2]].any():
-            size, place = self._size(d), work.points[rows, :2].mean(axis=0)
-            long = candidate.depth * self._wide[d] if size is None else size[0]
-            for own in kin:
-                beyond = own[np.isnan(self._uv[own, 0])]
-                away = work.points[beyond, :2] - place
-                rows = np.concatenate([rows, beyond[np.hypot(away[:, 0], away[:, 1]) <= long]])
+        own = [work.free_of(k) for k in np.flatnonzero(counts[1:] > KIN * len(rows)).tolist()]
+        kin = np.concatenate([*own, np.zeros(0, np.int64)])
+        cut = self._cut[d]
+        if cut[0] or cut[2]:
+            beyond = kin[np.isnan(self._uv[kin, 0])]
+            away = work.points[beyond, :2] - work.points[rows, :2].mean(axis=0)
+            long = np.nan_to_num(self._size[d, 0], nan=candidate.depth * self._wide[d])
+            rows = np.concatenate([rows, beyond[np.hypot(away[:, 0], away[:, 1]) <= long]])
         flat, _ = self._fitted(d, rows, candidate.depth)
-        margin = MARGIN * (x1 - x0)
-        there = np.concatenate([self._between(d, x0 - margin, x1 + margin), *near])
-        there = there[self.free[there] & work.unowned(there)]
-        inside = _distinct(there[_within(work.points, there, flat, SKIN)], len(work.points))
+        inside = _inside(
+            work.points, self._uv, self._seen, kin, self.taker, work.owner, self._boxes[d], flat, cut.any()
+        )
         rows = inside if len(inside) >= work.fewest else candidate.rows
         flat, facing = self._fitted(d, rows, candidate.depth, about=flat[4])
         box, seen = self._upright(d, rows, flat, facing)
-        # What is left beside it and too small to be a cluster stays with it.
-        for own in kin:
-            if len(own) >= len(rows) + work.smallest:
-                continue
-            rest = _distinct(np.concatenate([rows, own]), len(work.points))[len(rows) :]
-            if len(rest) < work.smallest and _within(work.points, rest, flat, SLACK).all():
-                rows = np.concatenate([rows, rest])
+        for points in own:
+            rest = _rest(work.points, points, rows, flat, work.smallest)
+            rows = np.concatenate([rows, rest]) if len(rest) else rows
         return rows, box, seen
-
-    def _between(self, d: int, left: float, right: float) -> I64:
-        """Points from one column of pixels to another, in the rows of a detection's box."""
-        _, top, _, bottom = self._detections.xyxy[d]
-        return _in_window(self._uv, self._seen, left, top, right, bottom, False)
 
     def _fitted(self, d: int, rows: I64, depth: float, about: float = np.nan) -> tuple[F64, I64]:
         """Place, length, width and heading on the ground, and the sides that face the camera."""
-        work, size = self._work, self._size(d)
-        width = float(self._detections.xyxy[d, 2] - self._detections.xyxy[d, 0])
-        sigma = max(EDGE_PIXELS / max(width, 1.0), EDGE_SHARE) * self._wide[d] * depth
-        edge = np.where(self._cut[d, [0, 2]], NO_EDGE, max(sigma, 1e-3))
-        prior = np.full(4, np.nan) if size is None else np.array([size[0], size[3], size[1], size[4]])
+        prior = self._size[d, [0, 3, 1, 4]]
         longest = max(self._wide[d], self._tall[d]) * depth
-        points = work.points[rows, :2] - self._place[:2]
-        flat, facing = fit(points, self._normals[d], edge, prior, longest, about)
-        flat[:2] += self._place[:2]
-        return flat, facing
+        edge = self._edge[d] * depth
+        return _fit(self._work.points, rows, self._place, self._normals[d], edge, prior, longest, about)
 
     def _upright(self, d: int, rows: I64, flat: F64, facing: I64) -> tuple[F64, Bool]:
         """The box (centre, size, heading), longer than wide without a class, and which sides are seen."""
-        work, size = self._work, self._size(d)
-        x, y, length, width, heading = flat.tolist()
-        seen = np.array([facing[0] > 0, facing[0] < 0, facing[1] > 0, facing[1] < 0])
-        if size is None and width > length:
-            length, width, heading = width, length, heading - np.pi / 2
-            seen = seen[[3, 2, 0, 1]]
-        if not -np.pi / 2 < heading <= np.pi / 2:
-            heading += np.pi if heading < 0 else -np.pi
-            seen = seen[[1, 0, 3, 2]]
+        work, (x, y, length, width, heading) = self._work, flat.tolist()
+        has_size = not math.isnan(self._size[d, 0])
+        seen = [facing[0] > 0, facing[0] < 0, facing[1] > 0, facing[1] < 0]
+        if not has_size and width > length:
+            length, width, heading = width, length, heading - math.pi / 2
+            seen = [seen[3], seen[2], seen[0], seen[1]]
+        if not -math.pi / 2 < heading <= math.pi / 2:
+            heading += math.pi if heading < 0 else -math.pi
+            seen = [seen[1], seen[0], seen[3], seen[2]]
         z = work.points[rows, 2]
         low, high = float(z.min()), float(z.max())
-        if size is not None and work.height is not None:
+        if has_size and work.height is not None:
             low = float(np.partition(z - work.height[rows], len(z) // 2)[len(z) // 2])
-            high = max(high, low + size[2] - size[5])
+            high = max(high, low + self._size[d, 2] - self._size[d, 5])
         length, width, tall = (max(side, MIN_SIZE) for side in (length, width, high - low))
-        return np.array([x, y, (low + high) / 2, length, width, tall, heading]), seen
+        return np.array([x, y, (low + high) / 2, length, width, tall, heading]), np.array(seen)
 
 
 @kernel
-def _in_window(uv: F32, rows: I64, left: float, top: float, right: float, bottom: float, unseen: bool) -> I64:
-    """Those of the points whose pixels are in a part of the image, or, with ``unseen``, outside of it."""
-    found = np.empty(len(rows), np.int64)
-    n = 0
-    for i in rows:
-        found[n] = i
-        inside = left <= uv[i, 0] <= right and top <= uv[i, 1] <= bottom
-        n += inside or (unseen and np.isnan(uv[i, 0]))
-    return found[:n]
-
-
-@kernel
-def _distinct(rows: I64, count: int) -> I64:
-    """Each number once, numbers below ``count``."""
-    known = np.zeros(count, np.bool_)
-    found = np.empty(len(rows), np.int64)
-    n = 0
-    for i in rows:
-        found[n] = i
-        n += not known[i]
-        known[i] = True
-    return found[:n]
-
-
-@kernel
-def _within(points: F32, rows: I64, flat: F64, skin: float) -> Bool:
-    """(N,) which of these points are in a box seen from above (place, length, width, heading) or near it."""
-    inside = np.empty(len(rows), np.bool_)
-    c, s = math.cos(flat[4]), math.sin(flat[4])
+def _fit(
+    points: F32, rows: I64, place: F64, normals: F64, edge: F64, prior: F64, longest: float, about: float
+) -> tuple[F64, I64]:
+    """``boxfit.fit`` of some points seen from a place."""
+    xy = np.empty((len(rows), 2))
     for k, i in enumerate(rows):
-        x, y = points[i, 0] - flat[0], points[i, 1] - flat[1]
-        along, across = abs(c * x + s * y), abs(c * y - s * x)
-        inside[k] = along <= flat[2] / 2 + skin and across <= flat[3] / 2 + skin
-    return inside
+        xy[k, 0], xy[k, 1] = points[i, 0] - place[0], points[i, 1] - place[1]
+    flat, facing = fit(xy, normals, edge, prior, longest, about)
+    flat[0] += place[0]
+    flat[1] += place[1]
+    return flat, facing
+
+
+@kernel
+def _within(points: F32, i: int, flat: F64, skin: float) -> bool:
+    """Whether a point is in a box seen from above (place, length, width, heading), or as near as ``skin``."""
+    c, s = math.cos(flat[4]), math.sin(flat[4])
+    x, y = points[i, 0] - flat[0], points[i, 1] - flat[1]
+    along, across = abs(c * x + s * y), abs(c * y - s * x)
+    return bool(along <= flat[2] / 2 + skin and across <= flat[3] / 2 + skin)
+
+
+@kernel
+def _inside(
+    points: F32,
+    uv: F32,
+    seen: I64,
+    kin: I64,
+    taker: I32,
+    owner: I64,
+    box: F64,
+    flat: F64,
+    unseen: bool,
+) -> I64:
+    """Points in an object's box that nobody has: of those in the image box, and of its clusters beside that.
+
+    Args:
+        points: (P, 3).
+        uv: (P, 2) their pixels.
+        seen: those in the image.
+        kin: those of the object's clusters.
+        taker: (P,) -1 where no detection of this camera has it.
+        owner: (P,) -1 where none of any camera has.
+        box: (4,) image box.
+        flat: (5,) place, length, width and heading of the object's box.
+        unseen: those of its clusters that are outside the image count, too.
+    """
+    margin, across, along = MARGIN * (box[2] - box[0]), TIGHT * (box[2] - box[0]), TIGHT * (box[3] - box[1])
+    found = np.empty(len(seen) + len(kin), np.int64)
+    known = np.zeros(len(points), np.bool_)
+    n = 0
+    for i in seen:
+        if (
+            box[0] - margin <= uv[i, 0] <= box[2] + margin
+            and box[1] <= uv[i, 1] <= box[3]
+            and taker[i] == -1
+            and owner[i] == -1
+            and _within(points, i, flat, SKIN)
+        ):
+            found[n] = i
+            known[i] = True
+            n += 1
+    for i in kin:
+        if known[i] or taker[i] != -1 or owner[i] != -1:
+            continue
+        beside = (
+            box[0] - across <= uv[i, 0] <= box[2] + across and box[1] - along <= uv[i, 1] <= box[3] + along
+        )
+        if (beside or (unseen and np.isnan(uv[i, 0]))) and _within(points, i, flat, SKIN):
+            found[n] = i
+            n += 1
+    return found[:n]
+
+
+@kernel
+def _rest(points: F32, own: I64, rows: I64, flat: F64, smallest: int) -> I64:
+    """What is left of a cluster, where that is beside the object and too small to be one; else nothing."""
+    taken = np.zeros(len(points), np.bool_)
+    for i in rows:
+        taken[i] = True
+    rest = np.empty(len(own), np.int64)
+    n = 0
+    for i in own:
+        if not taken[i]:
+            if n + 1 >= smallest or not _within(points, i, flat, SLACK):
+                return rest[:0]
+            rest[n] = i
+            n += 1
+    return rest[:n]
 
 
 @kernel
 def _choose(
-    xy: F64,
-    uv: F64,
+    points: F32,
+    place: F64,
+    uv: F32,
+    seen: I64,
+    taker: I32,
     box: F64,
     gap: float,
     reach: float,
@@ -413,11 +444,14 @@ def _choose(
     fewest: int,
     least: float,
 ) -> tuple[I64, float, float]:
-    """Rows of the best candidate, how well it fits and how far away it begins.
+    """Points of the best candidate, how well it fits and how far away it begins.
 
     Args:
-        xy: (N, 2) metres from the camera, points in the image box and as far to its sides as is looked.
-        uv: (N, 2) their pixels.
+        points: (P, 3).
+        place: (2,) where the camera is.
+        uv: (P, 2) pixels.
+        seen: points in the image.
+        taker: (P,) -1 where nobody has it.
         box: (4,) the image box.
         gap: points that are this near hold together.
         reach: how deep an object can be; NaN: as deep as it is large.
@@ -429,20 +463,26 @@ def _choose(
         fewest: points.
         least: part of the image box that is covered.
     """
-    n = len(xy)
-    nothing = np.zeros(0, np.int64)
-    margin = MARGIN * (box[2] - box[0])
-    inside = np.empty(n, np.bool_)
-    far = np.empty(n)
+    margin, around = MARGIN * (box[2] - box[0]), AROUND * (box[2] - box[0])
+    there = np.empty(len(seen), np.int64)
+    n = 0
+    for i in seen:
+        there[n] = i
+        beside = box[0] - around <= uv[i, 0] <= box[2] + around
+        n += beside and box[1] <= uv[i, 1] <= box[3] and taker[i] == -1
+    there = there[:n]
+    inside, far = np.empty(n, np.bool_), np.empty(n)
+    xy = np.empty((n, 2))
     low_x, low_y, high_x, high_y = np.inf, np.inf, -np.inf, -np.inf
     for i in range(n):
+        xy[i, 0], xy[i, 1] = points[there[i], 0] - place[0], points[there[i], 1] - place[1]
         far[i] = math.hypot(xy[i, 0], xy[i, 1])
-        inside[i] = box[0] - margin <= uv[i, 0] <= box[2] + margin
+        inside[i] = box[0] - margin <= uv[there[i], 0] <= box[2] + margin
         if inside[i]:
             low_x, high_x = min(low_x, xy[i, 0]), max(high_x, xy[i, 0])
             low_y, high_y = min(low_y, xy[i, 1]), max(high_y, xy[i, 1])
     if high_x < low_x:
-        return nothing, 0.0, 0.0
+        return there[:0], 0.0, 0.0
 
     # What holds together: cells half as wide as the gap, flooded two cells far. -1: to be flooded, -2: empty.
     cell = gap / 2
@@ -505,8 +545,8 @@ def _choose(
                 i = by_body[last]
                 if inside[i]:
                     held += 1
-                    u0, u1 = min(u0, uv[i, 0]), max(u1, uv[i, 0])
-                    v0, v1 = min(v0, uv[i, 1]), max(v1, uv[i, 1])
+                    u, v = uv[there[i], 0], uv[there[i], 1]
+                    u0, u1, v0, v1 = min(u0, u), max(u1, u), min(v0, v), max(v1, v)
                 last += 1
             if held >= fewest:
                 covered = max(min(u1, box[2]) - max(u0, box[0]), 0.0) * max(
@@ -525,7 +565,7 @@ def _choose(
             while first < start[k + 1] and far[by_body[first]] < begin + deep / WINDOWS:
                 first += 1
     chosen = by_body[best_first:best_last]
-    return chosen[inside[chosen]], best, best_far
+    return there[chosen[inside[chosen]]], best, best_far
 
 
 def _relabelled(
