@@ -143,7 +143,7 @@ def test_what_cannot_be_a_person_is_refused_with_the_reason() -> None:
     before = cluster(points, CLUSTERING)
     after, (claims,), splits = claimed(points, before, found)
     assert claims is not None and claims.cluster[0] == -1 and len(splits) == 0
-    assert 0 < claims.fit[0] < 0.05 < FusionConfig().min_rating
+    assert 0 < claims.fit[0] < FusionConfig().min_rating
     assert after is before
     assert found.uv is not None and found.depth is not None
     fusion = fuse(found.uv, found.depth, after, detections, CAMERA, CAMERA_FROM_LIDAR, FusionConfig(), claims)
