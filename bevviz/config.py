@@ -140,6 +140,10 @@ class SyncConfig(Section):
     """How images and transforms are found for a cloud."""
 
     tolerance: Seconds = Field(0.1, gt=0, le=10, description="largest |image stamp - cloud stamp|")
+    offsets: Mapping[str, Seconds] = Field({}, description="topic -> time added to its stamps")
+    by: Literal["stamp", "received"] = Field(
+        "stamp", description="what tells the time of a message: its own stamp, or when it was received"
+    )
     tf_tolerance: Seconds = Field(0.2, ge=0, le=60, description="how far past its samples TF is held")
     motion_compensation: bool = Field(
         True, description="move the cloud to the image's time before projection"
@@ -199,7 +203,7 @@ class DetectorConfig(StageSection):
         "(H, W, 3) BGR -> xyxy, score, names; or topic:/detections of the robot; empty: no detector",
     )
     names: str = Field(
-        "", description="file with one class name a line; empty: the model's metadata, else COCO"
+        "", description="file with one class name a line, coco or coco91; empty: the model's, else COCO's"
     )
     conf_threshold: float = Field(0.25, gt=0, le=1, description="lowest score of a detection")
     iou_threshold: float = Field(0.45, gt=0, le=1, description="class-wise NMS")

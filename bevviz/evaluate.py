@@ -12,7 +12,7 @@ import numpy as np
 from bevviz import geometry
 from bevviz.datasets.kitti import ACCEPTED, label_files, read_labels
 from bevviz.errors import UserError
-from bevviz.frame import F32, Bool, Boxes3D, Frame, LabelledBoxes3D, Objects
+from bevviz.frame import F32, F64, I32, Bool, Boxes3D, Frame, LabelledBoxes3D, Objects
 from bevviz.ros.roles import Roles
 from bevviz.stages.robot import in_points_frame
 
@@ -42,18 +42,16 @@ class Score:
     def add(self, found: Objects, truth: Truth) -> None:
         """Pair one frame's objects with the truth, best score first, and count."""
         self.names.update(*truth.accepted)
-        best_first = np.argsort(-found.score, kind="stable")
-        names = [found.names[j].lower() for j in best_first]
-        away = found.boxes.center[best_first][:, None, :2] - truth.boxes.center[None, :, :2]
-        right = np.array([[name in accepted for accepted in truth.accepted] for name in names], bool)
-        distance = np.where(right.reshape(away.shape[:2]), np.linalg.norm(away, axis=2), np.inf)
-        partners, free = pair_in_order(distance, MAX_DISTANCE)
-        for row, (name, partner) in enumerate(zip(names, partners.tolist(), strict=True)):
+        partners, distance = match(found, truth)
+        free = np.ones(len(truth.labels), bool)
+        free[partners[partners >= 0]] = False
+        for j in np.argsort(-found.score, kind="stable").tolist():
+            partner = int(partners[j])
             if partner < 0:
-                self.classes[name]["fp"] += 1
+                self.classes[found.names[j].lower()]["fp"] += 1
             elif truth.must[partner]:
                 self.classes[truth.labels[partner].lower()]["tp"] += 1
-                self.errors.append(float(distance[row, partner]))
+                self.errors.append(float(distance[j]))
         for k in np.flatnonzero(free & truth.must):
             self.classes[truth.labels[k].lower()]["fn"] += 1
 
@@ -86,6 +84,26 @@ def _share(right: int, wrong: int) -> float:
     return right / (right + wrong) if right + wrong else float("nan")
 
 
+def match(found: Objects, truth: Truth) -> tuple[I32, F64]:
+    """Which box of the truth each object is: of the same class, the nearest within 2 m, best score first.
+
+    Returns:
+        partner: (J,) row of the truth, else -1.
+        distance: (J,) metres on the ground plane to that one, else NaN.
+    """
+    best_first = np.argsort(-found.score, kind="stable")
+    names = [found.names[j].lower() for j in best_first]
+    away = found.boxes.center[best_first][:, None, :2] - truth.boxes.center[None, :, :2]
+    right = np.array([[name in accepted for accepted in truth.accepted] for name in names], bool)
+    distance = np.where(right.reshape(away.shape[:2]), np.linalg.norm(away, axis=2), np.inf)
+    partners, _ = pair_in_order(distance, MAX_DISTANCE)
+    partner, error = np.full(len(names), -1, np.int32), np.full(len(names), np.nan)
+    partner[best_first] = partners
+    paired = np.flatnonzero(partners >= 0)
+    error[best_first[paired]] = distance[paired, partners[paired]]
+    return partner, error
+
+
 def pair_in_order(distance: F32, limit: float) -> tuple[np.ndarray[tuple[int], np.dtype[np.int32]], Bool]:
     """Each row in turn takes the nearest column within ``limit`` that is still free.
 
@@ -108,7 +126,7 @@ def pair_in_order(distance: F32, limit: float) -> tuple[np.ndarray[tuple[int], n
 
 
 def truth_source(
-    roles: Roles, topic: str | None, kitti: Path | None
+    roles: Roles, topic: str | None, kitti: Path | None, scans: int
 ) -> Callable[[Frame], Truth | None] | None:
     """Where the truth of each frame comes from; None: there is none.
 
@@ -116,20 +134,24 @@ def truth_source(
         roles: of the bag's topics.
         topic: Detection3DArray that was asked for; None: the one that is called ground truth.
         kitti: label file or folder that was asked for.
+        scans: how many the bag has, each of which has its labels.
 
     Raises:
-        UserError: no such topic or file.
+        UserError: no such topic or file, or not as many label files as scans.
     """
     if kitti is not None:
         files = label_files(kitti)
+        if len(files) != scans:
+            count = f"{len(files)} label file{'s' * (len(files) > 1)}"
+            raise UserError(
+                f"--kitti-labels {kitti}: {count} and {scans} scans: one for each scan, in order, is needed"
+            )
 
-        def truth(frame: Frame) -> Truth | None:
-            if not frame.index < len(files):
-                return None
+        def of_kitti(frame: Frame) -> Truth | None:
             labelled = read_labels(files[frame.index])
             return truth_of(frame, labelled, [ACCEPTED[label] for label in labelled.labels])
 
-        return truth
+        return of_kitti
     there = (*roles.robot_detections_3d, *([roles.truth] if roles.truth else []))
     if topic is not None and topic not in there:
         raise UserError(

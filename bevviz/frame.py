@@ -52,7 +52,7 @@ def data_frame(columns: Mapping[str, Any] | Sequence[Mapping[str, Any]]) -> Data
 
 @dataclass(frozen=True, slots=True)
 class Cloud:
-    """One LiDAR scan as received: only finite points are kept, ``dropped`` counts the others."""
+    """One LiDAR scan as received: returns with finite coordinates; ``dropped`` counts the others."""
 
     stamp: int
     frame_id: str
@@ -60,7 +60,7 @@ class Cloud:
     fields: Mapping[str, NDArray[Any]] = field(default_factory=dict)  # extra (N,) fields by name
     topic: str = ""
     received: int = 0
-    dropped: int = 0  # points of the message that were NaN or infinite
+    dropped: int = 0  # points of the message that were NaN, infinite or (0, 0, 0)
     name: str = ""  # entity name of the LiDAR
 
 
@@ -73,6 +73,7 @@ class Intrinsics:
     K: F64  # (3, 3)
     distortion_model: str = ""  # "", plumb_bob, rational_polynomial or equidistant
     D: F64 = field(default_factory=lambda: np.zeros(0))  # coefficients in ROS order
+    baseline: tuple[float, float] = (0.0, 0.0)  # metres right of and below the first camera of a stereo pair
     assumed: bool = False  # True: no CameraInfo was seen, these are the configured defaults
 
 
@@ -175,7 +176,8 @@ class Frame:
     """One LiDAR scan with all that belongs to its time.
 
     ``points`` are the points of every LiDAR in ``points_frame``: the LiDAR's own frame where there is
-    one LiDAR, the base frame where several are merged.
+    one LiDAR, the base frame where several are merged. Where that frame is not upright, they are turned
+    about its origin by ``upright``, so that z points up.
     """
 
     index: int
@@ -185,6 +187,7 @@ class Frame:
     points: F32  # (N, 3)
     points_frame: str
     fields: Mapping[str, NDArray[Any]] = field(default_factory=dict)  # extra fields common to all clouds
+    upright: F64 | None = None  # (4, 4) points from points_frame; None: z of points_frame points up
     world_frame: str = ""  # name of the fixed frame; equal to points_frame where there is none
     world_from_points: F64 | None = None  # None: no TF to the fixed frame (identity is assumed)
     clouds: tuple[Cloud, ...] = ()

@@ -24,7 +24,7 @@ from bevviz.plugins import TOPIC
 PACKAGES = (  # those that are not installed do not count: some libraries come as one of several
     *("rerun-sdk", "rosbags", "numpy"),
     *("numba", "llvmlite"),  # compile every LiDAR stage
-    *("opencv-python-headless", "opencv-python"),  # decodes images, and prepares them for the network
+    *("opencv-python-headless", "opencv-python", "pillow"),  # decode images, and prepare them for the network
     *("onnxruntime", "onnxruntime-gpu"),
 )
 
@@ -120,8 +120,11 @@ def model_path(config: Config) -> Path | None:
 
 
 def names_path(config: Config) -> Path | None:
-    """The file with the detector's class names; None: there is none."""
-    return Path(config.detector.names) if config.detector.names and config.detector.model else None
+    """The file with the detector's class names; None: there is none, or they are known by a name."""
+    from bevviz.stages.detector.names import GIVEN
+
+    name = config.detector.names
+    return Path(name) if name and name not in GIVEN and config.detector.model else None
 
 
 def file_hash(path: Path) -> str:

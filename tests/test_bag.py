@@ -482,13 +482,20 @@ def test_a_lidar_topic_without_messages(tmp_path: Path, form: str) -> None:
     messages = bags.Messages(form == "ros1")
     items = [i for i in bags.small_items(messages) if i.topic != bags.CLOUD]
     path = bags.write(tmp_path / "drive.bag", items, messages, form=form, topics=[(bags.CLOUD, CLOUD)])
-    with pytest.raises(UserError, match=r"topic /velodyne_points has no messages.*source\.lidar_topics"):
+    with pytest.raises(UserError, match=r"topic /velodyne_points has no messages; nor has any other"):
         frames_of(path)
+
+
+def test_the_lidar_topic_that_is_offered_has_messages(tmp_path: Path) -> None:
+    path = bags.write(tmp_path / "drive", bags.small_items(), topics=[("/rear/points", CLOUD)])
+    with pytest.raises(UserError, match=r"--set source\.lidar_topics=\[/velodyne_points\]$"):
+        frames_of(path, config=load(settings=["source.lidar_topics=[/rear/points]"]))
+    assert frames_of(path, config=load(settings=["source.lidar_topics=[/velodyne_points]"]))
 
 
 def test_no_lidar(tmp_path: Path) -> None:
     path = bags.write(tmp_path / "drive", [i for i in bags.small_items() if i.topic != bags.CLOUD])
-    with pytest.raises(UserError, match=r"no LiDAR.*/tf \(TFMessage\).*source\.lidar_topics"):
+    with pytest.raises(UserError, match=r"no LiDAR: none of 4 topics is .*/tf \(TFMessage\)"):
         frames_of(path)
 
 

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from rosbags.typesys import get_types_from_msg
 
 from bevviz.cli import main
 from bevviz.frame import FrameResult
@@ -153,12 +154,64 @@ def test_a_lidar_topic_without_messages(capsys: Capture) -> None:
     bags.write(Path("drive"), items, topics=[(bags.CLOUD, "sensor_msgs/msg/PointCloud2")])
     said = error_of(capsys, "bag", "drive")
     assert bags.CLOUD in said
-    assert "source.lidar_topics" in said
+    assert "nor has any other" in said
 
 
 def test_a_bag_without_a_lidar(capsys: Capture) -> None:
     small_bag(without(bags.CLOUD))
-    assert "source.lidar_topics" in error_of(capsys, "bag", "drive")
+    assert "none of 4 topics is a sensor_msgs/PointCloud2" in error_of(capsys, "bag", "drive")
+
+
+def told_of_the_model(capsys: Capture) -> str:
+    """The line about a model that no image is shown to, which comes once."""
+    assert main(["bag", "drive", "--model", "demo", "--save", "out.rrd"]) == 0
+    (line,) = [line for line in capsys.readouterr().err.splitlines() if "detector.model" in line]
+    return line
+
+
+def test_a_model_and_only_video(capsys: Capture) -> None:
+    kind = "foxglove_msgs/msg/CompressedVideo"
+    fields = "builtin_interfaces/Time timestamp\nstring frame_id\nuint8[] data\nstring format"
+
+    def change(items: list[bags.Item], messages: bags.Messages) -> None:
+        messages.store.register(get_types_from_msg(fields, kind))
+        for i, item in enumerate(items):
+            if item.topic == bags.IMAGE:
+                time, data = item.message.header.stamp, np.zeros(4, np.uint8)
+                video = messages.make(kind, timestamp=time, frame_id="camera", data=data, format="h264")
+                items[i] = bags.Item("/camera/video", kind, item.received, video)
+
+    small_bag(change)
+    line = told_of_the_model(capsys)
+    assert "detector.model demo sees nothing: no camera that can be read: /camera/video holds video" in line
+    assert line.endswith("republish it as images (image_transport) and record these")
+
+
+def test_a_model_and_images_that_are_video(capsys: Capture) -> None:
+    def change(items: list[bags.Item], messages: bags.Messages) -> None:
+        for i, item in enumerate(items):
+            if item.topic == bags.IMAGE:
+                video = messages.compressed(item.received, b"\0\0\0\1\x67abc", "h264")
+                items[i] = item._replace(type="sensor_msgs/msg/CompressedImage", message=video)
+
+    small_bag(change)
+    line = told_of_the_model(capsys)
+    assert f"detector.model demo has seen nothing in 5 frames: {bags.IMAGE}: 'h264' is video" in line
+
+
+def test_a_model_and_no_image_at_the_time_of_a_scan(capsys: Capture) -> None:
+    def change(items: list[bags.Item], messages: bags.Messages) -> None:
+        items[:] = [i for i in items if i.topic != bags.IMAGE or i.received == bags.START]
+        items[:] = [i for i in items if i.topic != bags.CLOUD or i.received > bags.START + 3 * bags.PERIOD]
+
+    small_bag(change)
+    assert "has seen nothing in 2 frames: no image at the time of any scan" in told_of_the_model(capsys)
+
+
+def test_a_model_that_sees_something_is_not_spoken_of(capsys: Capture) -> None:
+    small_bag()
+    assert main(["bag", "drive", "--model", "demo", "--save", "out.rrd"]) == 0
+    assert "detector.model" not in capsys.readouterr().err
 
 
 def test_a_topic_that_is_not_there(capsys: Capture) -> None:
@@ -247,7 +300,7 @@ def test_no_camera_info(tmp_path: Path) -> None:
     assert main(["bag", "drive", "--model", "demo", "--save", "out.rrd"]) == 0
     texts = Recording(tmp_path / "out.rrd").text("/explain")
     assert len(texts) == 5
-    assert "source.camera_info_topics" in texts[0]
+    assert "no CameraInfo topic for camera 'camera': nothing can be projected into it; record one" in texts[0]
 
 
 def test_no_transforms(tmp_path: Path) -> None:

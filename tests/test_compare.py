@@ -32,7 +32,7 @@ from bevviz.geometry import transform
 from bevviz.perceive import Memo, describe
 from bevviz.session import Session
 from bevviz.stages import detector
-from bevviz.synthetic import SyntheticSource
+from bevviz.synthetic import SyntheticSource, write_bag
 from bevviz.variants import Variants, check_same_frames, without_motion
 from tests import bags
 from tests.recordings import Recording, verify
@@ -391,7 +391,7 @@ def detection(messages: bags.Messages, stamp: int, label: str) -> Any:
         (["a.rrd"], "compare OLD.rrd NEW.rrd"),
         (["drive", "a.rrd"], "compare OLD.rrd NEW.rrd"),
         (["a.rrd", "b.rrd"], "a.rrd: cannot be read"),
-        (["a.rrd", "b.rrd", "--set-a", "voxel.size=0.2"], "leave the sides out"),
+        (["a.rrd", "b.rrd", "--set-a", "voxel.size=0.2"], "leave the sides and the truth out"),
         (["drive", "--robot", "--set-a", "voxel.size=0.2"], "leave --a and --b out"),
         (["drive", "--robot"], "the bag has no vision_msgs/Detection3DArray"),
         (["drive", "--set-b", "sync.tolerance=0.05"], "A and B differ in sync.tolerance"),
@@ -419,3 +419,37 @@ def test_files_and_presets_as_sides(capsys: Capture) -> None:
     assert "A: default\nB: b.yaml\nparameters that differ, A -> B:\n  clustering.eps  0.5 -> 0.9\n\n" in said
     assert main(["compare", "drive", "--save", "c.rrd"]) == 0
     assert capsys.readouterr().out.startswith("A: reference\nB: default\n")
+
+
+@pytest.fixture(scope="module")
+def demo(tmp_path_factory: pytest.TempPathFactory) -> str:
+    path = tmp_path_factory.mktemp("truth") / "demo.mcap"
+    write_bag(SyntheticSource(frames=3), path)
+    return str(path)
+
+
+def test_the_truth_says_which_side_is_right(demo: str, capsys: Capture) -> None:
+    """B sees nothing of what A sees, and the other way round."""
+    blind = "detector.conf_threshold=0.999"
+    tables = {}
+    for side, other in (("b", "fixed"), ("a", "broke")):
+        call = ["compare", demo, "--model", "demo", f"--set-{side}", blind]
+        assert main([*call, "--save", "c.rrd", "--json", "c.json"]) == 0
+        tables[other] = json.loads(Path("c.json").read_text())["truth"]
+        said = capsys.readouterr().out
+        assert "of the truth" in said and "objects that are none" in said
+        assert ("fixed 0" in said) == (side == "b") and ("broke 0" in said) == (side == "a")
+        assert ("broke person" in said or "broke car" in said) == (side == "b")
+    there = {name: counts["there"] for name, counts in tables["broke"]["classes"].items()}
+    assert sum(there.values()) > 10
+    for name, counts in tables["broke"]["classes"].items():
+        assert counts["B"] == counts.get("fixed", 0) == tables["fixed"]["classes"][name].get("broke", 0)
+    (page,) = Recording(Path("c.rrd")).at["/compare"]["TextDocument:text"][0]
+    assert "#### Fixed by B: " in page and "found of" in page
+
+
+def test_without_a_detector_it_is_not_said_that_nothing_differs(demo: str, capsys: Capture) -> None:
+    assert main(["compare", demo, "--save", "c.rrd"]) == 0
+    said = capsys.readouterr().out
+    assert "no difference" not in said.replace("parameters: no difference", "")
+    assert "no detector (--model FILE.onnx), so no objects; the number of clusters differs in 3 of 3" in said

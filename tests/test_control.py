@@ -147,6 +147,7 @@ def test_a_stopped_process_is_told_within_seconds(tmp_path: Path) -> None:
         assert process.stdout is not None and process.stdout.readline() == "ready\n"
         assert snap(pid=process.pid) == Path("/x.rrd")
         process.send_signal(signal.SIGSTOP)
+        os.waitpid(process.pid, os.WUNTRACED)
         start = time.monotonic()
         with pytest.raises(
             UserError, match=f"process {process.pid} does not answer: it is stopped, or hangs"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -68,9 +69,9 @@ def test_gaps_are_found_in_the_index(tmp_path: Path) -> None:
 def test_what_is_missing_and_the_option_that_gives_it(tmp_path: Path) -> None:
     path = write(tmp_path / "drive", "/tf_static", "/tf", bags.INFO)
     text = render(describe([path], Config()))
-    assert "--set source.camera_info_topics='{/camera/image_rect_color: /camera_info}'" in text
+    assert "camera 'camera' has no CameraInfo, and there is no topic of that kind: record it" in text
     assert "--set source.extrinsics='{velodyne camera_optical: [x, y, z, qx, qy, qz, qw]}'" in text
-    assert "--set source.odometry_topic=/topic" in text
+    assert "--set source.fixed_frame=name" in text
     assert "--model FILE.onnx" in text
     assert all(len(line) <= WIDTH for line in text.splitlines())
 
@@ -83,10 +84,24 @@ def test_the_option_that_is_offered_is_accepted(tmp_path: Path) -> None:
     assert "not placed" not in render(describe([path], config))
 
 
+def test_the_camera_info_that_is_offered_is_there_and_accepted(tmp_path: Path) -> None:
+    def moved(item: bags.Item) -> bags.Item:
+        if item.topic != bags.INFO:
+            return item
+        header = replace(item.message.header, frame_id="lens")
+        return item._replace(topic="/calibration/lens", message=replace(item.message, header=header))
+
+    path = bags.write(tmp_path / "drive", map(moved, bags.small_items()))
+    offered = "source.camera_info_topics='{/camera/image_rect_color: /calibration/lens}'"
+    assert f"--set {offered}" in render(describe([path], Config()))
+    config = load(settings=[offered.replace("'", "")])
+    assert describe([path], config).missing == ("no detector: --model FILE.onnx",)
+
+
 def test_a_bag_without_a_lidar_is_described_all_the_same(tmp_path: Path) -> None:
     info = describe([write(tmp_path / "drive", bags.CLOUD)], Config())
     assert [t.name for t in info.topics] == [bags.INFO, bags.IMAGE, "/tf", "/tf_static"]
-    assert "source.lidar_topics" in info.missing[0]
+    assert info.missing[0].startswith("drive: no LiDAR: none of 4 topics is a sensor_msgs/PointCloud2; there")
     assert "no LiDAR" in render(info)
 
 

@@ -137,7 +137,11 @@ def unpack(msg: Message) -> list[dict[str, float]]:
 @given(layouts())
 def test_any_layout_equals_unpacking_point_by_point(msg: Message) -> None:
     expected = unpack(msg)
-    kept = [p for p in expected if all(math.isfinite(p[axis]) for axis in "xyz")]
+    kept = [
+        p
+        for p in expected
+        if all(math.isfinite(p[axis]) for axis in "xyz") and any(np.float32(p[axis]) for axis in "xyz")
+    ]
     cloud = messages.decode_cloud(msg, "/points", 7)
     assert cloud.dropped == len(expected) - len(kept)
     assert (
@@ -428,14 +432,40 @@ def test_a_grey_png_of_16_bits_is_shown_as_it_was_reduced() -> None:
     assert np.abs(image.bgr[..., 1] - pixels * 255.0 / 4095).max() <= 0.5
 
 
+@pytest.mark.parametrize("channels", [3, 4])  # with transparency the file has another header
+@pytest.mark.parametrize("quality", [95, 101])  # with loss, and without
+def test_webp_is_decoded_and_goes_on_raw(channels: int, quality: int) -> None:
+    """Rerun reads none, so that the bytes do not go along."""
+    pixels = cv2.GaussianBlur(random_pixels(48, 64, channels), (0, 0), 5)
+    pixels[..., 3:] = 255 - np.arange(64)[None, :, None] // 32  # nearly opaque
+    _, data = cv2.imencode(".webp", pixels, [cv2.IMWRITE_WEBP_QUALITY, quality])
+    image = messages.decode_compressed_image(compressed(data.tobytes(), "webp"), "/image", 0)
+    assert image.bgr.shape == (48, 64, 3) and image.encoded is None and not image.media_type
+    worst = 0 if quality > 100 and channels == 3 else 3
+    assert np.abs(image.bgr.astype(int) - pixels[..., :3]).mean() <= worst
+
+
+def test_a_webp_that_is_too_large_is_known_before_it_is_decoded() -> None:
+    _, encoding = cv2.imencode(".webp", random_pixels(8, 8, 4), [cv2.IMWRITE_WEBP_QUALITY, 80])
+    data = bytearray(encoding)
+    assert data[12:16] == b"VP8X"
+    data[24:30] = b"\xff\xff\x00" * 2
+    with pytest.raises(MessageError, match="an image of 65536 x 65536 pixels is not taken"):
+        messages.decode_compressed_image(compressed(bytes(data), "webp"), "/image", 0)
+
+
 def test_bad_compressed_images_are_named() -> None:
+    webp = encoded(".webp", random_pixels(64, 48, 3))
     jpeg, png = encoded(".jpg", random_pixels(64, 48, 3)), encoded(".png", random_pixels(64, 48, 3))
-    for data in (jpeg[: len(jpeg) // 2], png[: len(png) // 2], png[:8], jpeg[:3] + b"\xff\xd9"):
+    cut = [data[: len(data) // 2] for data in (jpeg, png, webp)]
+    for data in (*cut, png[:8], webp[:20], webp[:-1], jpeg[:3] + b"\xff\xd9", webp[:12] + bytes(len(webp))):
         with pytest.raises(
-            MessageError, match=r"/image: the image/(jpeg|png) data \(\d+ bytes\) is damaged or cut"
+            MessageError, match=r"/image: the image/(jpeg|png|webp) data \(\d+ bytes\) is damaged or cut"
         ):
             messages.decode_compressed_image(compressed(data, ""), "/image", 0)
-    with pytest.raises(MessageError, match=r"/image: .*'h264' holds neither JPEG nor PNG data"):
+    with pytest.raises(MessageError, match=r"/image: .*'avif' holds neither JPEG, PNG nor WebP data"):
+        messages.decode_compressed_image(compressed(b"\0\0\0\x1cftypavif", "avif"), "/image", 0)
+    with pytest.raises(MessageError, match=r"/image: 'h264' is video, which is not decoded here: republish"):
         messages.decode_compressed_image(compressed(b"\0\0\0\1abc", "h264"), "/image", 0)
     with pytest.raises(MessageError, match="/image: '16UC1; compressedDepth png' is a depth image"):
         messages.decode_compressed_image(compressed(png, "16UC1; compressedDepth png"), "/image", 0)
@@ -729,11 +759,14 @@ def test_a_png_whose_parts_are_longer_than_it_is(monkeypatch: pytest.MonkeyPatch
     width=st.integers(1, 80),
     height=st.integers(1, 80),
     grey=st.booleans(),
-    form=st.sampled_from([".jpg", ".png"]),
+    form=st.sampled_from([".jpg", ".png", ".webp"]),
 )
 def test_the_size_in_a_header_is_that_of_the_image(width: int, height: int, grey: bool, form: str) -> None:
     pixels = random_pixels(height, width) if grey else random_pixels(height, width, 3)
-    options = [cv2.IMWRITE_JPEG_PROGRESSIVE, int(width % 2)] if form == ".jpg" else []
+    options = {
+        ".jpg": [cv2.IMWRITE_JPEG_PROGRESSIVE, int(width % 2)],
+        ".webp": [cv2.IMWRITE_WEBP_QUALITY, 80 + 21 * (width % 2)],  # above 100: without loss
+    }.get(form, [])
     data = bytes(cv2.imencode(form, pixels, options)[1].tobytes())
     assert messages._size_of(data) == (width, height)
 

@@ -92,6 +92,9 @@ def test_files_are_told_apart_by_content(tmp_path: Path) -> None:
     (only,) = differences(after, provenance(load(settings=settings)))
     assert only.startswith("detector.model was b.onnx (SHA-256 ")
     assert "detector.model" not in dependencies_of(load())
+    assert "detector.names" not in dependencies_of(
+        load(settings=[f"detector.model={moved}", "detector.names=coco"])
+    )
 
 
 def test_a_stage_of_the_users_own_fits_in() -> None:

@@ -19,7 +19,7 @@ from bevviz.cli import main
 from bevviz.config import DetectorConfig
 from bevviz.frame import F32, U8
 from bevviz.report.pictures import shrink
-from bevviz.report.redact import CELLS, Redactor, grown, hide
+from bevviz.report.redact import CELLS, Redactor, _encoded, grown, hide
 from bevviz.report.summary import STRIP_WIDTH
 from bevviz.ros.messages import decode_compressed_image, decode_image
 from tests import bags
@@ -190,7 +190,6 @@ def test_every_candidate_is_hidden_however_many_the_configuration_keeps(
 ) -> None:
     """126 people on top of each other, each a little weaker: all but a few are suppressed."""
     pytest.importorskip("onnx", reason="the test networks are built with onnx")
-    from bevviz.stages.detector import Layout
     from tests.test_detector import CELLS as PEOPLE
     from tests.test_detector import H, W, constant, head
 
@@ -199,7 +198,7 @@ def test_every_candidate_is_hidden_however_many_the_configuration_keeps(
     boxes = np.hstack([corner, corner + np.array([30, 40])])
     scores = np.linspace(0.9, 0.02, PEOPLE)
     names = {"names": "['person', 'car', 'dog']"}
-    output = head(Layout.YOLOV8, boxes, scores, np.zeros(PEOPLE, int))
+    output = head("YOLOv8", boxes, scores, np.zeros(PEOPLE, int))
     config = DetectorConfig(
         model=constant(tmp_path / "crowd.onnx", output, metadata=names),
         threads=1,
@@ -210,6 +209,30 @@ def test_every_candidate_is_hidden_however_many_the_configuration_keeps(
     with Bag([bag]) as recording:
         found = Redactor(config, recording).find(np.zeros((H, W, 3), np.uint8))
     assert len(found) == PEOPLE
+
+
+def test_what_lies_outside_the_image_hides_nobody_in_it(tmp_path: Path) -> None:
+    """A stronger box that nobody sees would suppress one that somebody does."""
+    pytest.importorskip("onnx", reason="the test networks are built with onnx")
+    from tests.test_detector import H, W, constant, head
+
+    boxes = np.array([[-50.0, 0, -1, 40], [-45, 0, 6, 40]])
+    output = head("YOLOv8", boxes, np.array([0.9, 0.8]), np.array([0, 0]))
+    names = {"names": "['person', 'car', 'dog']"}
+    config = DetectorConfig(model=constant(tmp_path / "edge.onnx", output, metadata=names), threads=1)
+    bag = bags.write(tmp_path / "drive", bags.small_items(scans=1))
+    with Bag([bag]) as recording:
+        found = Redactor(config, recording).find(np.zeros((H, W, 3), np.uint8))
+    np.testing.assert_allclose(found, [[-0.5, -0.5, 5.5, 39.5]], atol=1e-4)
+
+
+@pytest.mark.parametrize("form", [".jpg", ".png", ".webp"])
+def test_what_was_changed_keeps_its_form(form: str) -> None:
+    magic = cv2.imencode(form, np.zeros((8, 8, 3), np.uint8))[1].tobytes()[:8]
+    grey = np.full((16, 16, 3), 77, np.uint8)
+    data = _encoded(grey, magic)
+    assert data[:4].tobytes() == magic[:4]
+    np.testing.assert_allclose(np.asarray(cv2.imdecode(data, cv2.IMREAD_COLOR), int), 77, atol=1)
 
 
 # --- hiding ------------------------------------------------------------------------------------

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -176,7 +178,55 @@ def test_a_derived_cloud_plays_where_there_is_no_other() -> None:
     assert find_roles([result, derived], DEFAULT).lidars == ("/camera/depth/points",)
     assert find_roles([result], DEFAULT).lidars == ("/map",)
     assert find_roles([silent], DEFAULT).lidars == ("/lidar",)
-    assert find_roles([], DEFAULT) == Roles()
+    nothing = find_roles([], DEFAULT)
+    assert nothing.no_lidar == "no LiDAR: none of 0 topics is a sensor_msgs/PointCloud2; there are none"
+    assert nothing.no_camera == "no camera: there is no topic of sensor_msgs/Image or CompressedImage"
+    assert nothing == Roles()
+
+
+@pytest.mark.parametrize(
+    ("kind", "helps"),
+    [
+        ("livox_ros_driver2/msg/CustomMsg", "set the driver's xfer_format to 0 for PointCloud2"),
+        ("velodyne_msgs/msg/VelodyneScan", "play them through its driver and record its PointCloud2"),
+        ("ouster_sensor_msgs/msg/PacketMsg", "play them through its driver"),
+        ("nebula_msgs/msg/NebulaPackets", "play them through its driver"),
+        ("sensor_msgs/msg/LaserScan", "laserscan_to_pointcloud makes a PointCloud2 of it"),
+        ("sensor_msgs/PointCloud", "point_cloud_converter makes a PointCloud2 of it"),
+    ],
+)
+def test_points_in_another_form_have_a_remedy_that_works(kind: str, helps: str) -> None:
+    """To state such a topic is none: that is refused with the same remedy."""
+    topics = [Topic("/points", kind, 9, "lidar"), Topic("/tf", "tf2_msgs/msg/TFMessage", 9)]
+    roles = find_roles(topics, DEFAULT)
+    assert roles.lidars == () and "set source.lidar_topics" not in roles.no_lidar
+    assert roles.no_lidar.startswith(
+        "no LiDAR: none of 2 topics is a sensor_msgs/PointCloud2; /points holds "
+    )
+    assert helps in roles.no_lidar and helps in roles.notes["/points"]
+    with pytest.raises(UserError, match="but must be PointCloud2; it holds ") as error:
+        find_roles(topics, SourceConfig(lidar_topics=("/points",)))
+    assert helps in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("topic", "said"),
+    [
+        (
+            Topic("/cam", "foxglove_msgs/msg/CompressedVideo", 9),
+            "/cam holds video, .* republish it as images",
+        ),
+        (Topic("/cam", "ffmpeg_image_transport_msgs/msg/FFMPEGPacket", 9), "/cam holds video"),
+        (Topic("/cam", "theora_image_transport/msg/Packet", 9), "/cam holds video"),
+        (Topic("/debug", IMAGE, 9), r"among the images: --set source\.camera_topics=\[/debug\]$"),
+        (Topic("/cam", IMAGE, 0), "there are no messages on /cam"),
+    ],
+)
+def test_why_there_is_no_camera(topic: Topic, said: str) -> None:
+    roles = find_roles([Topic("/lidar", CLOUD, 9), topic], DEFAULT)
+    assert roles.cameras == () and re.search(f"^no camera.*{said}", roles.no_camera)
+    if "camera_topics" in said:  # the remedy works
+        assert cameras(find_roles([topic], SourceConfig(camera_topics=(topic.name,))))
 
 
 def test_an_unknown_name_of_a_cloud_is_no_hindrance() -> None:

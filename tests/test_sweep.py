@@ -261,12 +261,19 @@ def test_a_grid_is_a_heat_map(drive: str) -> None:
 def test_kitti_as_truth(shared: Path, capsys: Capture) -> None:
     bag = bags.write(Path("kitti"), bags.kitti_items(shared))
     arguments = ["--model", str(shared / "models/yolox_nano.onnx"), "--frames", ":1"]
-    where = ["--kitti-labels", str(shared / "kitti/label_2")]
+    for name in ("label_2/000000.txt", "label_2/000001.txt", "calib/000000.txt", "calib/000001.txt"):
+        (Path("labels") / name).parent.mkdir(parents=True, exist_ok=True)
+        (Path("labels") / name).write_bytes((shared / "kitti" / name).read_bytes())
+    where = ["--kitti-labels", "labels/label_2"]
     swept = ["--set", "detector.conf_threshold=0.3,0.99", "--csv", "s.csv"]
     assert main(["sweep", str(bag), *arguments, *where, *swept]) == 0
     low, high = csv.DictReader(Path("s.csv").read_text().splitlines())
     assert (low["pedestrian tp"], low["pedestrian fn"]) == ("1", "0")  # the one of 000000
     assert (high["pedestrian tp"], high["pedestrian fn"]) == ("0", "1")
+    capsys.readouterr()
+    assert main(["sweep", str(bag), *where[:1], "labels/label_2/000000.txt", *swept]) == 2
+    said = "1 label file and 2 scans: one for each scan, in order, is needed"
+    assert said in capsys.readouterr().err
 
 
 def test_another_topic_as_truth() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from types import SimpleNamespace
@@ -27,6 +28,7 @@ from bevviz.frame import (
 )
 from bevviz.ros.messages import StampedTransform
 from bevviz.ros.roles import CameraRole, Roles
+from bevviz.sync.clocks import Clocks
 from bevviz.sync.feed import make_handlers
 from bevviz.sync.synchronizer import Synchronizer
 
@@ -95,8 +97,16 @@ class Feed:
 
         self.sync.add_image(camera.topic, ns(seconds), frame, ns(seconds + late), decode)
 
-    def info(self, camera: CameraRole = LEFT, width: int = 640, height: int = 360) -> None:
-        self.sync.add_camera_info(camera.info_topic, Intrinsics(width, height, K))
+    def info(
+        self,
+        camera: CameraRole = LEFT,
+        width: int = 640,
+        height: int = 360,
+        at: float = 0.0,
+        zoom: float = 1.0,
+    ) -> None:
+        intrinsics = Intrinsics(width, height, np.diag([zoom, zoom, 1.0]) @ K)
+        self.sync.add_camera_info(camera.info_topic, intrinsics, ns(at), ns(at))
 
     def calibration(self) -> None:
         self.sync.add_transform(edge("base_link", "rslidar", pose(0.3, 0, 1.2)), static=True)
@@ -246,6 +256,8 @@ def test_undecodable_image_is_a_problem_of_its_camera() -> None:
     assert frame.cameras[0].image is None
     assert frame.cameras[0].problems == ("/zed/image: encoding 'yuv9' is not known",)
     assert feed.sync.report.undecodable == {"zed": 1}
+    said = "could not be decoded once, the first: /zed/image: encoding 'yuv9' is not known"
+    assert feed.sync.report.warnings()[0] == f"camera 'zed': an image {said}"
 
 
 def test_without_transforms_the_frame_is_made_and_names_the_option() -> None:
@@ -287,7 +299,14 @@ def test_without_camera_info() -> None:
     (frame,) = feed.sync.flush()
     assert frame.cameras[0].intrinsics is None
     assert "no CameraInfo on /zed/camera_info" in frame.cameras[0].problems[0]
-    assert "source.camera_info_topics" in frame.cameras[0].problems[0]
+    assert frame.cameras[0].problems[0].endswith("; record one")
+
+    other = Feed(replace(ONE, camera_infos=("/zed/camera_info", "/zed/left/camera_info")))
+    other.sync.add_cloud(cloud(0.0))
+    other.image(0.0)
+    (frame,) = other.sync.flush()
+    offered = f"--set source.camera_info_topics='{{{LEFT.topic}: /zed/left/camera_info}}'"
+    assert any(problem.endswith(offered) for problem in frame.cameras[0].problems)
 
     tutorial = Feed(ONE, preset="reference")
     tutorial.calibration()
@@ -307,7 +326,7 @@ def test_camera_info_follows_the_image_size_and_later_changes() -> None:
     frames: list[Frame] = []
     for t, size in ((0.0, (1280, 720)), (0.1, (640, 480)), (0.2, (640, 360))):
         if t == 0.2:
-            feed.sync.add_camera_info(LEFT.info_topic, Intrinsics(640, 360, 2 * K))
+            feed.info(at=0.2, zoom=2.0)
         feed.sync.add_cloud(cloud(t))
         feed.image(t, size=size)
         frames += feed.sync.ready()
@@ -628,3 +647,164 @@ def test_odometry_is_decoded_only_while_tf_says_nothing() -> None:
     sync.tf.forget_after(0)  # the clock went back, and /tf may not come again
     handle(SimpleNamespace(topic="/odometry", received=1))
     assert decoded == [1, 2, 1]
+
+
+# --- clocks ------------------------------------------------------------------------------------
+
+
+def of_clocks(offset: float, *settings: str, frames: int = 40) -> tuple[list[Frame], Synchronizer]:
+    """A drive whose camera's clock is ``offset`` seconds behind; images come 30 ms after they are taken."""
+    feed = Feed(ONE, *settings)
+    feed.calibration()
+    feed.info()
+    made: list[Frame] = []
+    for i in range(frames):
+        t = i * 0.1
+        feed.sync.add_cloud(cloud(t, late=0.1))
+        feed.image(t + 0.015 - offset, late=offset + 0.03)
+        made += feed.sync.ready()
+    return [*made, *feed.sync.flush()], feed.sync
+
+
+@pytest.mark.parametrize("offset", [1.5, -1.5])
+def test_a_clock_that_is_off_is_named_and_can_be_set_right(offset: float) -> None:
+    frames, sync = of_clocks(offset)
+    (doubt,) = [text for text in sync.report.warnings() if "clock" in text and "sync.offsets" in text]
+    where = "behind" if offset > 0 else "ahead of"
+    assert re.match(rf"/zed/image: its clock is 1\.[45]\d s {where} that of /rslidar_points", doubt)
+    fused = [f.cameras[0] for f in frames[5:] if f.cameras[0].image is not None]
+    assert bool(fused) == (offset < 0), "images of a clock that is ahead are near in stamp"
+    assert all("its image is of another time" in " ".join(c.problems) for c in fused)
+
+    setting = re.search(r"--set (sync\.offsets='\{.*?\}')", doubt)
+    assert setting is not None
+    frames, sync = of_clocks(offset, setting[1].replace("'", ""))
+    assert not [text for text in sync.report.warnings() if "clock" in text]
+    errors = [abs(f.cameras[0].sync_error) for f in frames if f.cameras[0].image is not None]
+    assert len(errors) >= len(frames) - 1 and max(errors) < 0.11
+
+
+def test_times_of_receipt_instead_of_stamps() -> None:
+    frames, sync = of_clocks(1.5, "sync.by=received")
+    assert not [text for text in sync.report.warnings() if "clock" in text]
+    assert [f.stamp for f in frames[:2]] == [ns(0.1), ns(0.2)]
+    assert all(f.cameras[0].image is not None for f in frames[:-1])
+
+
+def test_a_slow_way_is_no_wrong_clock() -> None:
+    for offset in (0.3, -0.09):
+        _, sync = of_clocks(offset)
+        assert not [text for text in sync.report.warnings() if "clock" in text]
+
+
+@pytest.mark.parametrize(
+    ("offset", "words"),
+    [
+        (1.7e9, "count from when its clock was started, not from 1970; --set sync.by=received"),
+        (-37.0, "37 s ahead of that of /rslidar_points, as TAI is of UTC; --set sync.offsets"),
+    ],
+)
+def test_other_epochs_are_told_by_name(offset: float, words: str) -> None:
+    clocks = Clocks({}, "stamp")
+    for i in range(5):
+        clocks.stamp("/rslidar_points", ns(i), ns(i + 0.1))
+        clocks.stamp("/zed/image", ns(i - offset), ns(i + 0.03))
+    (doubt,) = clocks.doubts(["/rslidar_points", "/zed/image"])
+    assert words in doubt
+
+
+def test_too_few_messages_tell_nothing() -> None:
+    clocks = Clocks({}, "stamp")
+    clocks.stamp("/a", ns(0), ns(9))
+    clocks.stamp("/b", ns(0), ns(0))
+    assert clocks.lag("/a") is None and not list(clocks.doubts(["/a", "/b"]))
+
+
+# --- calibration by stamp ----------------------------------------------------------------------
+
+
+def test_a_zoom_that_is_told_just_after_its_image() -> None:
+    feed = Feed()
+    feed.calibration()
+    frames: list[Frame] = []
+    for i in range(10):
+        zoom = 1.0 if i < 5 else 2.0
+        feed.sync.add_cloud(cloud(0.1 * i))
+        feed.image(0.1 * i)
+        frames += feed.sync.ready()
+        feed.info(at=0.1 * i, zoom=zoom)
+        frames += feed.sync.ready()
+    frames += feed.sync.flush()
+    found = [f.cameras[0].intrinsics for f in frames]
+    assert [i.K[0, 0] for i in found if i is not None] == [320.0] * 5 + [640.0] * 5
+
+
+def test_a_calibration_that_is_sent_once_is_not_waited_for_again() -> None:
+    feed = Feed()
+    feed.calibration()
+    feed.info()
+    for i in range(5):
+        feed.sync.add_cloud(cloud(0.1 * i))
+        feed.image(0.1 * i)
+        assert len(list(feed.sync.ready())) == 1
+
+
+# --- what cannot be, and is said ---------------------------------------------------------------
+
+
+def test_points_in_millimetres_are_said() -> None:
+    feed = Feed()
+    far = np.random.default_rng(0).normal(size=(4000, 3)) * 20_000
+    feed.sync.add_cloud(cloud(0.0, points=far))
+    list(feed.sync.flush())
+    (text,) = [text for text in feed.sync.report.warnings() if "millimetres" in text]
+    assert text.startswith("/rslidar_points: half of its points are farther than")
+
+
+def test_a_camera_without_a_frame_is_not_at_the_lidar() -> None:
+    feed = Feed()
+    feed.info()
+    feed.sync.add_cloud(cloud(0.0, frame=""))
+    feed.image(0.0, frame="")
+    (frame,) = feed.sync.flush()
+    assert frame.cameras[0].camera_from_points is None
+    assert "a message states no frame_id; its driver must" in " ".join(frame.cameras[0].problems)
+
+
+def test_a_static_transform_that_was_sent_once_on_tf() -> None:
+    feed = Feed()
+    feed.info()
+    feed.sync.add_transform(edge("base_link", "rslidar", pose(0.3, 0, 1.2)), static=True)
+    feed.sync.add_transform(edge("base_link", "optical", pose(0.5, 0.06, 0.9) @ OPTICAL, 0.0))
+    feed.sync.add_cloud(cloud(5.0))
+    feed.image(5.0)
+    (frame,) = feed.sync.flush()
+    text = " ".join(frame.cameras[0].problems)
+    assert "5.00 s before the asked stamp (it was sent once, as if it were static: sync.tf_tolerance" in text
+
+
+def test_the_second_camera_of_a_stereo_pair() -> None:
+    """In the frame of the first one it is a baseline beside it; in a frame of its own it is where TF says."""
+    right = CameraRole("right", "/right/image", "/right/camera_info", True, False)
+    roles = Roles(lidars=ONE.lidars, lidar_names=ONE.lidar_names, cameras=(LEFT, right))
+    places = {}
+    for frame in ("optical", "right_optical"):
+        feed = Feed(roles)
+        feed.calibration()
+        feed.sync.add_transform(
+            edge("base_link", "right_optical", pose(0.5, -0.06, 0.9) @ OPTICAL), static=True
+        )
+        feed.info()
+        beside = Intrinsics(640, 360, K, baseline=(0.12, 0.0))
+        feed.sync.add_camera_info(right.info_topic, beside, ns(0), ns(0))
+        feed.sync.add_cloud(cloud(0.0))
+        feed.image(0.0)
+        feed.image(0.0, camera=right, frame=frame)
+        (made,) = feed.sync.flush()
+        matrix = made.cameras[1].camera_from_points
+        assert matrix is not None
+        places[frame] = matrix
+        assert any("'right_optical' is taken as its own" in t for t in feed.sync.report.doubts()) == (
+            frame == "right_optical"
+        )
+    np.testing.assert_allclose(places["optical"], places["right_optical"], atol=1e-9)

@@ -110,7 +110,7 @@ def _describe(
         points_frame=frame.points_frame if frame else "",
         world_frame=frame.world_frame if frame and frame.world_from_points is not None else "",
         missing=tuple(missing),
-        warnings=tuple(recording.warnings),
+        warnings=(*recording.warnings, *(source.doubts if source else ())),
     )
 
 
@@ -142,14 +142,16 @@ def find_missing(roles: Roles, frame: Frame | None, config: Config) -> list[str]
     if frame is None:
         return ["no scan could be read"]
     found = []
-    if not roles.cameras:
-        found.append("no camera: --set source.camera_topics=[/topic]")
+    if roles.no_camera:
+        found.append(roles.no_camera)
     for role, camera in zip(roles.cameras, frame.cameras, strict=True):
         about = f"camera '{role.name}'"
         placed = camera.camera_from_points is not None or camera.image is None
         if not role.info_topic:
-            setting = f"source.camera_info_topics='{{{role.topic}: /camera_info}}'"
-            found.append(f"{about} has no CameraInfo: --set {setting}")
+            helps = "and there is no topic of that kind: record it"
+            if roles.camera_infos:
+                helps = f"--set source.camera_info_topics='{{{role.topic}: {roles.camera_infos[0]}}}'"
+            found.append(f"{about} has no CameraInfo{': ' if roles.camera_infos else ', '}{helps}")
         if not placed and camera.image is not None:
             between = f"'{frame.points_frame}' to '{camera.image.frame_id}'"
             edge = f"{frame.points_frame} {camera.image.frame_id}"
@@ -160,7 +162,8 @@ def find_missing(roles: Roles, frame: Frame | None, config: Config) -> list[str]
     if frame.world_from_points is None:
         found.append(
             f"no fixed frame above '{frame.points_frame}', so that motion is not compensated: "
-            "--set source.odometry_topic=/topic or --set source.fixed_frame=name"
+            "record nav_msgs/Odometry or the transforms above it, or name another frame that stands still: "
+            "--set source.fixed_frame=name"
         )
     return [*found, *frame.problems]
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import replace
 from datetime import UTC, datetime
 from functools import cached_property
@@ -20,7 +19,7 @@ from bevviz.frame import F64, I64, Frame, Scene
 from bevviz.ros.messages import MessageError, decode_transforms
 from bevviz.ros.roles import find_roles
 from bevviz.sync.feed import Handler, make_handlers
-from bevviz.sync.synchronizer import Synchronizer
+from bevviz.sync.synchronizer import Synchronizer, blindness
 
 SECOND = 1_000_000_000
 MARGIN = 2 * SECOND  # what else belongs to the first and the last cloud is looked for this far outside
@@ -97,7 +96,18 @@ class BagSource(Closing):
             f"{count} message(s) of {topic} could not be used, the first: {self._first_damage[topic]}"
             for topic, count in self._damaged.items()
         ]
-        return [*self.recording.warnings, *damaged, *(self._sync.report.warnings() if self._sync else ())]
+        synced = self._sync.report.warnings() if self._sync else ()
+        blind = blindness(self.config, self.roles, self._sync.report if self._sync else None)
+        return [*self.recording.warnings, *damaged, *blind, *synced]
+
+    @property
+    def doubts(self) -> Sequence[str]:
+        """What of the frames read so far may make all of them wrong, one sentence each."""
+        damaged = [
+            f"{topic}: {count} message(s) could not be used, the first: {self._first_damage[topic]}"
+            for topic, count in self._damaged.items()
+        ]
+        return [*damaged, *(self._sync.report.doubts() if self._sync else ())]
 
     @property
     def span(self) -> tuple[int, int]:
@@ -114,7 +124,7 @@ class BagSource(Closing):
 
         None: no fixed frame above the points, or the transforms read so far do not reach the stamp.
         """
-        return self._sync.pose(frame.points_frame, stamp) if self._sync else None
+        return self._sync.pose(frame, stamp) if self._sync else None
 
     @cached_property
     def scans(self) -> I64:
@@ -153,7 +163,9 @@ class BagSource(Closing):
         self._damaged.clear()
         handlers = make_handlers(sync, self.roles, self.recording.decode)
         self._hold_throughout(sync, handlers, low)
-        numbers: dict[int, int] = {}  # stamp -> number of the scan, for those not yet delivered
+        numbers: dict[
+            int, list[int]
+        ] = {}  # time of receipt -> numbers of the scans that are not yet delivered
         number = -1
         stop = high + MARGIN
         for message in self.recording.messages(handlers.keys(), low - MARGIN, stop):
@@ -167,20 +179,20 @@ class BagSource(Closing):
                     continue
                 if number == chosen[-1]:
                     stop = message.received + MARGIN
-                with suppress(MessageError):  # told when the scan is decoded
-                    numbers[message.header()[0] or message.received] = first + number
+                numbers.setdefault(message.received, []).append(first + number)
             elif message.topic in self.roles.lidars and not (number in chosen or number + 1 in chosen):
                 continue
             self._handle(handlers[message.topic], message)
             yield from self._numbered(sync.ready(message.received), numbers)
         yield from self._numbered(sync.flush(), numbers)
 
-    def _numbered(self, frames: Iterator[Frame], numbers: dict[int, int]) -> Iterator[Frame]:
+    def _numbered(self, frames: Iterator[Frame], numbers: dict[int, list[int]]) -> Iterator[Frame]:
         """The frames, each with the number of its scan in the part of the recording that is read."""
         for frame in frames:
-            yield replace(frame, index=numbers.pop(frame.stamp, frame.index))
-            for stamp in [s for s in numbers if s < frame.stamp - 10 * MARGIN]:
-                del numbers[stamp]  # of scans that were dropped
+            same = numbers.get(frame.received, ())
+            yield replace(frame, index=same.pop(0) if same else frame.index)
+            for received in [t for t in numbers if t < frame.received - 10 * MARGIN]:
+                del numbers[received]  # of scans that were dropped
 
     def _handle(self, handler: Handler[RawMessage], message: RawMessage) -> None:
         try:
@@ -212,19 +224,18 @@ class BagSource(Closing):
 
     def _find_driver(self) -> str:
         """The first LiDAR: its scans make the frames."""
-        topics = {topic.name: topic for topic in self.recording.topics}
-        if not self.roles.lidars:
-            there = ", ".join(f"{t.name} ({t.kind})" for t in topics.values())
-            raise UserError(
-                f"{self.recording.name}: no LiDAR (no sensor_msgs/PointCloud2 topic) among {there}; "
-                "set by hand with --set source.lidar_topics=[/topic]"
-            )
+        if self.roles.no_lidar:
+            raise UserError(f"{self.recording.name}: {self.roles.no_lidar}")
+        counts = {t.name: t.count for t in self.recording.topics if t.kind == "PointCloud2"}
         driver = self.roles.lidars[0]
-        if not topics[driver].count:
-            raise UserError(
-                f"{self.recording.name}: the LiDAR's topic {driver} has no messages; "
-                "choose another one with --set source.lidar_topics=[/topic]"
+        if not counts[driver]:
+            others = [name for name, count in counts.items() if count]
+            helps = (
+                f"choose another one: --set source.lidar_topics=[{others[0]}]"
+                if others
+                else "nor has any other"
             )
+            raise UserError(f"{self.recording.name}: the LiDAR's topic {driver} has no messages; {helps}")
         return driver
 
     def _time(self, text: str | None, default: int) -> int:

@@ -15,7 +15,7 @@ from bevviz.frame import F64
 class Axis:
     """One of them. What is computed is in radians, metres and seconds, what is told in ``unit``.
 
-    ``prior`` is how wrong such a number usually is at most, and holds what the scene does not: an error of
+    ``prior`` is more than such a number is usually wrong, and holds what the scene does not: an error of
     that size costs as much as one standard deviation of the edges. ``floor`` is what remains between
     the edges of perfectly calibrated sensors (docs/calib.md), and part of every uncertainty that is told.
     """
@@ -29,7 +29,7 @@ class Axis:
     prior: float  # in ``unit``, as all below
     floor: float
     least: float  # a smaller error is not worth a word
-    sure: float  # a wider confidence interval (two standard deviations) says nothing
+    sure: float  # what is fine may be no more off than that
     reach: float  # the score is plotted this far to both sides
     decimals: int
 
@@ -37,30 +37,30 @@ class Axis:
 _DEGREES: dict[str, Any] = {
     "unit": "deg",
     "scale": 180 / np.pi,
-    "prior": 2.0,
+    "prior": 5.0,
     "floor": 0.05,
     "least": 0.1,
-    "sure": 0.3,
+    "sure": 0.4,
     "reach": 2.0,
     "decimals": 2,
 }
 _CM: dict[str, Any] = {
     "unit": "cm",
     "scale": 100.0,
-    "prior": 10.0,
+    "prior": 30.0,
     "floor": 1.0,
     "least": 1.5,
-    "sure": 5.0,
+    "sure": 6.0,
     "reach": 30.0,
     "decimals": 1,
 }
 _MS: dict[str, Any] = {
     "unit": "ms",
     "scale": 1000.0,
-    "prior": 50.0,
+    "prior": 100.0,
     "floor": 1.0,
     "least": 5.0,
-    "sure": 20.0,
+    "sure": 25.0,
     "reach": 100.0,
     "decimals": 1,
 }
@@ -77,6 +77,7 @@ AXES: tuple[Axis, ...] = (
 TIME = 6  # row of the last one
 SCALES = np.array([axis.scale for axis in AXES])
 PRIOR = np.array([axis.prior for axis in AXES]) / SCALES
+FLOOR = np.array([axis.floor for axis in AXES]) / SCALES
 
 
 def error_pose(offsets: F64) -> F64:

@@ -5,7 +5,10 @@ between neighbouring beams, the image should have an edge. Three things are done
 looked for along the rings and across them; an edge of the cloud lies half-way between the two beams that it
 separates, not on the nearer point, which would shift all left borders to the right and all right ones to the
 left; and borders of reflectance (road markings, kerbs) count too, which lie near and on the ground where
-silhouettes are few. Those count within a ring only: beams are seldom calibrated to each other.
+silhouettes are few. What reflects more is mostly brighter in the image as well, so that such a border is
+looked for with its sign, as mutual information would (Pandey et al. 2012, "Automatic Targetless Extrinsic
+Calibration of a 3D Lidar and Camera by Maximizing Mutual Information"), but without calibrated reflectance.
+They count within a ring only: beams are seldom calibrated to each other.
 """
 
 from __future__ import annotations
@@ -22,16 +25,20 @@ ROW = np.radians(0.4)  # height of a row of beams where the cloud does not tell 
 JUMP = 0.12  # least share by which the inverse range falls at a border
 STEP = 0.4  # metres, least jump of the range
 FLAT = 0.03  # largest share by which the inverse range changes at a border of reflectance
-CONTRAST = 0.1  # least step of reflectance, as share of the cloud's brightest
+CONTRAST = 0.15  # least step of reflectance, as share of the cloud's brightest
+USUAL = 8.0  # pixels around, over which the usual change of an image is taken
+NOISE = 4.0  # grey values by which an image changes without an edge
+LEVELS = 60  # steps of a change in an image that are told apart, for each multiple of what is usual
 TURN = 10.0  # more than the azimuths of a ring span, so that ring and azimuth are one number
 
 
 @dataclass(frozen=True, slots=True)
 class Edges:
-    """Points on borders. ``across``: 0 the image should change along u, 1 along v."""
+    """Points on borders, in the frame of the cloud."""
 
-    xyz: F32  # (E, 3) in the frame of the cloud
-    across: U8  # (E,)
+    xyz: F32  # (E, 3)
+    towards: F32  # (E, 3) across the border, to where it is farther or reflects more
+    bright: Bool  # (E,) of reflectance, not of range
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,14 +59,19 @@ def cloud_edges(cloud: Cloud) -> Edges:
     """The borders in one scan: jumps of range and steps of reflectance between neighbouring beams."""
     rings = _arrange(cloud)
     if rings is None:
-        return Edges(np.zeros((0, 3), np.float32), np.zeros(0, np.uint8))
-    along = [_jumps(rings, rings.right, rings.left), _jumps(rings, rings.left, rings.right)]
-    over = [_jumps(rings, rings.above, rings.below), _jumps(rings, rings.below, rings.above)]
+        return Edges(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.float32), np.zeros(0, np.bool_))
+    sides = (
+        (rings.right, rings.left),
+        (rings.left, rings.right),
+        (rings.above, rings.below),
+        (rings.below, rings.above),
+    )
+    found = [_jumps(rings, beyond, before) for beyond, before in sides]
+    jumps = sum(len(xyz) for xyz, _ in found)
     if rings.reflectance is not None:
-        along.append(_steps_along(rings, rings.reflectance))
-    xyz = np.concatenate([*along, *over]).astype(np.float32)
-    count = sum(map(len, along))
-    return Edges(xyz, (np.arange(len(xyz)) >= count).astype(np.uint8))
+        found.append(_steps_along(rings, rings.reflectance))
+    xyz, towards = (np.concatenate(parts).astype(np.float32) for parts in zip(*found, strict=True))
+    return Edges(xyz, towards, np.arange(len(xyz)) >= jumps)
 
 
 def _arrange(cloud: Cloud) -> _Rings | None:
@@ -111,8 +123,8 @@ def _nearest(keys: F64, wanted: F64, tolerance: float) -> I64:
     return np.where(np.abs(keys[nearest] - wanted) < tolerance, nearest, -1)
 
 
-def _jumps(rings: _Rings, beyond: I64, before: I64) -> F64:
-    """(J, 3) borders of what is nearer than its neighbour ``beyond``.
+def _jumps(rings: _Rings, beyond: I64, before: I64) -> tuple[F64, F64]:
+    """(J, 3) borders of what is nearer than its neighbour ``beyond``, and where that lies.
 
     On a plane the inverse range is all but linear from beam to beam, however flat the beam meets it: the road
     far ahead is no row of borders. So the neighbour must lie behind what the one ``before`` leads to.
@@ -125,35 +137,43 @@ def _jumps(rings: _Rings, beyond: I64, before: I64) -> F64:
     jump = (inverse[far] < (1 - JUMP) * expected) & (rings.range[far] - rings.range[near] > STEP)
     near, far = near[jump], far[jump]
     between = rings.unit[near] + rings.unit[far]
-    return np.asarray(between * (rings.range[near] / np.linalg.norm(between, axis=1))[:, None], np.float64)
+    xyz = between * (rings.range[near] / np.linalg.norm(between, axis=1))[:, None]
+    return xyz, rings.unit[far] - rings.unit[near]
 
 
-def _steps_along(rings: _Rings, reflectance: F64) -> F64:
-    """Steps of reflectance within a ring, two beams on either side being alike."""
+def _steps_along(rings: _Rings, reflectance: F64) -> tuple[F64, F64]:
+    """Steps of reflectance within a ring, two beams on either side being alike, and where it is more."""
     a = np.flatnonzero((rings.left >= 0) & (rings.right >= 0))
     a = a[rings.right[rings.right[a]] >= 0]
     b = a + 1
     inverse = 1 / rings.range
     near, far = (reflectance[a - 1], reflectance[a]), (reflectance[b], reflectance[b + 1])
     found = _clear_step(near, far) & (np.abs(inverse[a] - inverse[b]) < FLAT * inverse[a])
-    return (rings.xyz[a[found]] + rings.xyz[b[found]]) / 2
+    a, b = a[found], b[found]
+    more = np.sign(reflectance[b] + reflectance[b + 1] - reflectance[a] - reflectance[a - 1])
+    return (rings.xyz[a] + rings.xyz[b]) / 2, (rings.unit[b] - rings.unit[a]) * more[:, None]
 
 
 def _clear_step(near: tuple[F64, F64], far: tuple[F64, F64]) -> Bool:
     """Where two samples on one side, the second next to the border, differ from two on the other."""
     step = np.abs(near[0] + near[1] - far[0] - far[1]) / 2
     noise = np.maximum(np.abs(near[0] - near[1]), np.abs(far[0] - far[1]))
-    clear: Bool = (step > CONTRAST) & (np.abs(near[1] - far[0]) > 0.7 * step) & (noise < 0.6 * step)
+    clear: Bool = (step > CONTRAST) & (np.abs(near[1] - far[0]) > 0.5 * step) & (noise < step)
     return clear
 
 
-def image_edges(bgr: U8) -> F32:
-    """(2, H, W) how much the image changes along u and along v, as multiple of what is usual around there."""
+def image_edges(bgr: U8) -> U8:
+    """(4, H, W) how much it brightens to the right, to the left, downwards and upwards.
+
+    In 1 / LEVELS of what is usual around there, so that a bright wall does not outshout a grey one, and a
+    hedge is no better a place than a road.
+    """
     gray = cv2.cvtColor(bgr, cv2.COLOR_BGR2GRAY).astype(np.float32)
     gray = cv2.GaussianBlur(gray, (0, 0), 0.8)
-    found = np.empty((2, *gray.shape), np.float32)
+    found = np.empty((4, *gray.shape), np.uint8)
     for k, (dx, dy) in enumerate(((1, 0), (0, 1))):
-        change = np.abs(cv2.Sobel(gray, cv2.CV_32F, dx, dy))
-        usual = cv2.GaussianBlur(change, (0, 0), 20) + 8.0  # grey values: noise is no edge
-        found[k] = np.minimum(change / usual, 4.0)
+        change = cv2.Sobel(gray, cv2.CV_32F, dx, dy)
+        usual = cv2.GaussianBlur(np.abs(change), (0, 0), USUAL) + NOISE
+        for sign in (0, 1):
+            found[2 * k + sign] = np.clip((1 - 2 * sign) * LEVELS * change / usual, 0, 4 * LEVELS)
     return found

@@ -9,7 +9,7 @@ import rerun as rr
 
 from bevviz import geometry, table
 from bevviz.calib.axes import TIME, error_pose
-from bevviz.calib.result import Calibration, Verdict
+from bevviz.calib.result import Calibration, Finding
 from bevviz.calib.shots import Shot
 from bevviz.colors import bins
 from bevviz.config import LoggingConfig
@@ -20,7 +20,12 @@ from bevviz.logging.pieces import CORNER, document, encode_image
 from bevviz.text import fenced, markdown
 
 _STATED, _CORRECTED = (255, 80, 80), (90, 230, 120)
-_COLORS = {Verdict.FINE: (70, 160, 90), Verdict.OFF: (210, 70, 70), Verdict.UNKNOWN: (130, 130, 145)}
+_COLORS = {
+    Finding.FINE: (70, 160, 90),
+    Finding.OFF: (210, 70, 70),
+    Finding.UNKNOWN: (130, 130, 145),
+    Finding.CONFLICT: (225, 160, 60),
+}
 
 
 def log_calibration(
@@ -40,7 +45,7 @@ def log_calibration(
         path = entities.calib_curve(camera, axis.axis.name)
         width = np.full(len(axis.score), axis.abscissa[1] - axis.abscissa[0], np.float32)
         height = axis.score - min(curve.score.min() for curve in result.axes)
-        bars = rr.BarChart(height, abscissa=axis.abscissa, widths=width, color=_COLORS[axis.verdict])
+        bars = rr.BarChart(height, abscissa=axis.abscissa, widths=width, color=_COLORS[axis.finding])
         recording.log(path, bars, static=True)
     for path in (entities.calib_stated(camera), entities.calib_corrected(camera)):
         recording.log(f"{path}/points", depth_annotations(), static=True)
@@ -101,10 +106,10 @@ def _page(result: Calibration) -> str:
     return "\n".join(
         [
             f"## {markdown(result.answer)}\n",
-            table.markdown([("axis", "offset of what is stated", "verdict"), *rows], "lll"),
-            f"\n{result.frames} frames, {result.edges} edges. Score {result.score_stated:.3f} as stated, "
+            table.markdown([("axis", "offset of what is stated", "finding"), *rows], "lll"),
+            f"\n{result.measured_from}. Score {result.score_stated:.3f} as stated, "
             f"{result.score_corrected:.3f} as corrected.\n",
             *map(markdown, result.notes),
-            f"\n{fenced(result.config, 'yaml')}",
+            f"\n{fenced(result.config, 'yaml')}" if result.moved else "",
         ]
     )

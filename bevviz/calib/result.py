@@ -12,10 +12,13 @@ from bevviz.calib.axes import AXES, TIME, Axis
 from bevviz.frame import F64
 
 
-class Verdict(StrEnum):
+class Finding(StrEnum):
+    """What is found of one axis."""
+
     FINE = "fine"
     OFF = "off"
-    UNKNOWN = "cannot tell"
+    UNKNOWN = "cannot tell"  # too little data
+    CONFLICT = "no agreement"  # enough of it, but the parts contradict each other
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,22 +28,27 @@ class AxisResult:
     axis: Axis
     offset: float  # of what is stated from what fits best
     interval: float
-    verdict: Verdict
-    reason: str  # of a verdict UNKNOWN
+    finding: Finding
+    reason: str  # of a finding UNKNOWN or CONFLICT
     abscissa: F64  # (S,) offsets along this axis, the other axes being as they fit best
     score: F64  # (S,)
 
     @property
     def measured(self) -> str:
+        if self.interval >= 2 * self.axis.prior:
+            return "not known"
         n = self.axis.decimals
         return f"{self.offset:+.{n}f} +- {self.interval:.{n}f} {self.axis.unit}"
 
     @property
     def told(self) -> str:
-        """The verdict in words."""
-        if self.verdict is Verdict.OFF:
+        """The finding in words."""
+        if self.finding is Finding.OFF:
             return f"off: {self.axis.positive if self.offset > 0 else self.axis.negative}"
-        return f"{self.verdict}: {self.reason}" if self.reason else str(self.verdict)
+        if self.finding is Finding.FINE:
+            most = abs(self.offset) + self.interval
+            return f"fine: off by no more than {most:.{self.axis.decimals}f} {self.axis.unit}"
+        return f"{self.finding}: {self.reason}" if self.reason else str(self.finding)
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,6 +58,8 @@ class Calibration:
     camera: str
     parent: str  # frame of the points
     child: str  # optical frame
+    topic: str  # of the images
+    offset: float  # seconds that are added to their stamps already
     axes: tuple[AxisResult, ...]
     frames: int
     edges: int
@@ -60,33 +70,49 @@ class Calibration:
     score_corrected: float
     notes: tuple[str, ...] = ()
 
-    def by(self, verdict: Verdict) -> list[AxisResult]:
-        return [axis for axis in self.axes if axis.verdict is verdict]
+    def by(self, finding: Finding) -> list[AxisResult]:
+        """The axes of which that was found."""
+        return [axis for axis in self.axes if axis.finding is finding]
 
     @property
     def answer(self) -> str:
         """The whole result in one or two sentences."""
-        off, unknown = self.by(Verdict.OFF), self.by(Verdict.UNKNOWN)
-        if len(unknown) == len(self.axes):
-            reasons = dict.fromkeys(axis.reason for axis in unknown)
-            return f"Camera '{self.camera}': cannot tell: {'; '.join(reasons)}."
+        reasons = {axis.reason for axis in self.axes}
+        if len(reasons) == 1 and (reason := reasons.pop()):
+            return f"Camera '{self.camera}': {self.axes[0].finding}: {reason}."
+        off, fine, unknown = (self.by(kind) for kind in (Finding.OFF, Finding.FINE, Finding.UNKNOWN))
         if off:
             said = f"Camera '{self.camera}' is off: {'; '.join(_error(axis) for axis in off)}."
+        elif not fine:
+            said = f"Camera '{self.camera}': too little data to hold any axis."
+        elif unknown:
+            said = f"Camera '{self.camera}': what can be told is fine: the {_names(fine)}."
         else:
-            said = f"Camera '{self.camera}': calibration and clock are fine, as far as this drive shows."
-        if unknown:
-            said += f" It cannot tell the {', '.join(axis.axis.what for axis in unknown)}."
-        return said
+            said = f"Camera '{self.camera}': calibration and clock are fine."
+        return f"{said} It cannot tell the {_names(unknown)}." if unknown else said
+
+    @property
+    def measured_from(self) -> str:
+        """``30 frames, 43192 edges``."""
+        return f"{self.frames} frame{'s' * (self.frames != 1)}, {self.edges} edges"
+
+    @property
+    def moved(self) -> bool:
+        """Whether mounting or clock are put right, and not left as stated."""
+        return bool(self.correction.any())
 
     @property
     def config(self) -> str:
-        """The corrected extrinsics as a configuration, in YAML."""
+        """What puts it right as a configuration, in YAML."""
         return configuration([self])
 
     def table(self) -> str:
         """The axes in lines of fixed width."""
-        rows = [("axis", "offset of what is stated", "verdict")]
-        rows += [(f"{axis.axis.name}  {axis.axis.what}", axis.measured, axis.told) for axis in self.axes]
+        rows = [("axis", "offset of what is stated", "finding")]
+        same = len({axis.reason for axis in self.axes}) == 1  # it is in the answer
+        for axis in self.axes:
+            told = str(axis.finding) if same and axis.reason else axis.told
+            rows.append((f"{axis.axis.name}  {axis.axis.what}", axis.measured, told))
         widths = [max(len(row[i]) for row in rows) for i in range(2)]
         return "\n".join(f"{a:<{widths[0]}}  {b:>{widths[1]}}  {c}" for a, b, c in rows)
 
@@ -104,7 +130,7 @@ class Calibration:
                     "unit": axis.axis.unit,
                     "offset": axis.offset,
                     "interval": axis.interval,
-                    "verdict": str(axis.verdict),
+                    "finding": str(axis.finding),
                     "reason": axis.reason,
                 }
                 for axis in self.axes
@@ -117,12 +143,15 @@ class Calibration:
 
 
 def configuration(results: Sequence[Calibration]) -> str:
-    """The corrected extrinsics of several cameras as one configuration, in YAML."""
+    """What puts several cameras right as one configuration, in YAML: extrinsics, and offsets of stamps."""
     lines = ["source:", "  extrinsics:"]
     for result in results:
         pose = [*result.corrected[:3, 3], *geometry.quaternion(result.corrected)]
         numbers = ", ".join(f"{float(number):.6f}" for number in pose)
         lines.append(f"    {result.parent} {result.child}: [{numbers}]")
+    late = [result for result in results if result.correction[TIME] or result.offset]
+    lines += ["sync:", "  offsets:"] if late else []
+    lines += [f"    {r.topic}: {r.offset - float(r.correction[TIME]):.4f}" for r in late]
     return "\n".join(lines) + "\n"
 
 
@@ -134,3 +163,20 @@ def _error(result: AxisResult) -> str:
     if axis is AXES[TIME]:
         return f"{how}, by {size}"
     return f"it {how}, by {size} ({axis.what})"
+
+
+def _names(results: Sequence[AxisResult]) -> str:
+    """``turns about x and z, shift along z and time of the image``, of the camera's axes."""
+    kinds: dict[str, list[str]] = {}
+    for result in results:
+        kind, _, axis = result.axis.what.partition(" the camera's ")
+        kinds.setdefault(kind, []).append(axis.removesuffix(" axis"))
+    named = []
+    for kind, axes in kinds.items():
+        noun, _, rest = kind.partition(" ")
+        named.append(f"{noun}{'s' * (len(axes) > 1)} {rest} {_listed(axes)}".rstrip())
+    return _listed(named)
+
+
+def _listed(words: Sequence[str]) -> str:
+    return " and ".join(filter(None, [", ".join(words[:-1]), words[-1]]))

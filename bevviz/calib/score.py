@@ -1,10 +1,11 @@
 """How well the edges of clouds lie on the edges of images, and which way they would rather go.
 
-The edges of an image, blurred by ``sigma`` pixels, are taken for the density that the projected edges of the
-cloud are drawn from, beside a share that fits nowhere: the score is the mean of log(1 + density / OUTLIER).
-It has the same peak as the inverse distance transform of Levinson and Thrun, is smooth, needs no
-threshold, and its gradient with its information matrix gives the step of an expectation-maximisation,
-which climbs without a step size to choose.
+The edges of an image, blurred by ``sigma`` pixels, are taken for the density that a ``SHARE`` of the cloud's
+edges are drawn from once projected, the others falling anywhere: the score of an edge is the logarithm of
+1 - SHARE + SHARE * density, the density's mean over the image being 1. An edge outside the image has 0. So
+the scores of any two poses compare, and of any two images. It has the same peak as the inverse distance
+transform of Levinson and Thrun, is smooth, and needs no threshold; its gradient with the information of the
+edges that fit gives the step of an expectation-maximisation, which a climb can start with.
 """
 
 from __future__ import annotations
@@ -16,23 +17,44 @@ import cv2
 import numpy as np
 
 from bevviz.calib.axes import AXES, TIME, error_pose
-from bevviz.calib.shots import GROUPS, Shot
-from bevviz.frame import F32, F64, I32, U8
+from bevviz.calib.shots import CELLS, Shot
+from bevviz.frame import F32, F64, I32, I64, Bool
 from bevviz.stages.kernel import kernel
 
-OUTLIER = 0.5  # density, in multiples of the usual change, at which an edge fits as well as not
+SHARE = 0.2  # of the edges of a cloud that an image shows
+AGAINST = 0.25  # what is darker though it reflects more (leaves) counts so much beside what is brighter
 PIXEL = 1.5  # pixels^2, variance of the edges themselves
 MOMENT = 0.01  # seconds over which the motion of the robot is differenced
+PARTS = CELLS[0] * CELLS[1]
+
+# What an edge of a cloud may be in the image, as weights of the four rows of ``image_edges``: a change along
+# u, along v; brighter to the right, to the left, downwards, upwards.
+CHANGES = np.array(
+    [
+        [1, 1, 0, 0],
+        [0, 0, 1, 1],
+        [1, AGAINST, 0, 0],
+        [AGAINST, 1, 0, 0],
+        [0, 0, 1, AGAINST],
+        [0, 0, AGAINST, 1],
+    ],
+    np.float32,
+)
+ALONG_V = np.array([0, 1, 0, 0, 1, 1], np.bool_)
 
 
 @dataclass(frozen=True, slots=True)
 class Sums:
-    """Over the edges of each group, so that a part of the frames can be left out."""
+    """Over the edges in each part of each shot, so that shots and parts can be compared and left out."""
 
-    score: F64  # (G,)
-    count: F64  # (G,)
-    gradient: F64  # (G, 7)
-    information: F64  # (G, 7, 7)
+    score: F64  # (S, PARTS)
+    count: F64  # (S, PARTS)
+    gradient: F64  # (S, PARTS, 7)
+    information: F64  # (7, 7) of the edges that fit, were they known
+
+    @property
+    def mean(self) -> float:
+        return float(self.score.sum() / max(float(self.count.sum()), 1.0))
 
 
 class Scorer:
@@ -44,53 +66,79 @@ class Scorer:
     """
 
     def __init__(self, shots: Sequence[Shot], sigma: float) -> None:
-        self._shots = shots
-        self._maps = [np.stack([cv2.GaussianBlur(m, (0, 0), sigma) for m in shot.maps]) for shot in shots]
+        self.shots = shots
+        self.sigma = sigma
         self.variance = sigma * sigma + PIXEL
+        self.edges = sum(len(shot.xyz) for shot in shots)
+        self._densities = [densities(shot, sigma) for shot in shots]
 
-    def __call__(self, offsets: F64, slopes: bool = True) -> Sums:
-        """At (7,) offsets: radians, metres, seconds. Without ``slopes``, score and count alone."""
+    def __call__(self, offsets: F64, slopes: bool = True, information: bool = False) -> Sums:
+        """At (7,) offsets: radians, metres, seconds. What is not asked for stays zero."""
         size = len(AXES)
-        score, count = np.zeros(GROUPS), np.zeros(GROUPS)
-        gradient, information = np.zeros((GROUPS, size)), np.zeros((GROUPS, size, size))
+        score, count = np.zeros((2, len(self.shots), PARTS))
+        gradient, fitting = np.zeros((len(self.shots), PARTS, size)), np.zeros((size, size))
         error, late = error_pose(offsets), float(offsets[TIME])
-        for shot, density in zip(self._shots, self._maps, strict=True):
-            pose = error @ shot.camera_from_points(late)
-            before, after = (shot.camera_from_points(late + t) for t in (-MOMENT / 2, MOMENT / 2))
-            change = error @ (after - before) / MOMENT
+        for i, (shot, (density, row, along_v)) in enumerate(zip(self.shots, self._densities, strict=True)):
+            pose, change = error @ shot.camera_from_points(late), np.zeros((4, 4))
+            if slopes and shot.motion is not None:
+                before, after = (shot.camera_from_points(late + t) for t in (-MOMENT / 2, MOMENT / 2))
+                change = error @ (after - before) / MOMENT
             _add(
                 shot.xyz,
-                shot.across,
-                shot.group,
+                row,
+                along_v,
+                shot.cell,
                 pose,
                 change,
                 shot.K,
                 density,
                 self.variance,
                 slopes,
-                score,
-                count,
-                gradient,
                 information,
+                score[i],
+                count[i],
+                gradient[i],
+                fitting,
             )
-        return Sums(score, count, gradient, information)
+        return Sums(score, count, gradient, fitting)
+
+
+def densities(shot: Shot, sigma: float) -> tuple[F32, I64, Bool]:
+    """What the shot's edges are drawn from.
+
+    Returns:
+        density: (D, H, W) of mean 1, for each of ``CHANGES`` that there are.
+        row: (E,) which of them each edge is compared with.
+        along_v: (D,) whether it changes along v.
+    """
+    changes, row = np.unique(shot.change, return_inverse=True)
+    blurred = [cv2.GaussianBlur(rows.astype(np.float32), (0, 0), sigma) for rows in shot.maps]
+    density = np.ones((len(changes), *shot.maps.shape[1:]), np.float32)
+    for made, change in zip(density, changes, strict=True):
+        total = sum(float(CHANGES[change, k]) * blurred[k] for k in np.flatnonzero(CHANGES[change]))
+        mean = float(np.mean(total))
+        if mean > 0:
+            np.divide(total, mean, out=made)
+    return density, row.astype(np.int64), ALONG_V[changes]
 
 
 @kernel
 def _add(
     xyz: F32,
-    across: U8,
-    group: I32,
+    which: I64,
+    along_v: Bool,
+    cell: I32,
     pose: F64,
     change: F64,
     K: F64,
     density: F32,
     variance: float,
     slopes: bool,
+    information: bool,
     score: F64,
     count: F64,
     gradient: F64,
-    information: F64,
+    fitting: F64,
 ) -> None:
     """Add the edges of one shot. ``change`` is how ``pose`` changes in a second of time offset."""
     height, width = density.shape[1:]
@@ -99,7 +147,7 @@ def _add(
     for i in range(len(xyz)):
         for a in range(3):
             p[a] = pose[a, 0] * xyz[i, 0] + pose[a, 1] * xyz[i, 1] + pose[a, 2] * xyz[i, 2] + pose[a, 3]
-        g = group[i]
+        g = cell[i]
         count[g] += 1
         if p[2] < 1.0:
             continue
@@ -107,12 +155,13 @@ def _add(
         u, v = fx * x + cx, fy * y + cy
         if not (0 <= u < width - 1 and 0 <= v < height - 1):
             continue
-        col, row, k = int(u), int(v), across[i]
+        col, row, k = int(u), int(v), which[i]
         s, t = u - col, v - row
         d00, d01 = density[k, row, col], density[k, row, col + 1]
         d10, d11 = density[k, row + 1, col], density[k, row + 1, col + 1]
         d = (1 - t) * ((1 - s) * d00 + s * d01) + t * ((1 - s) * d10 + s * d11)
-        score[g] += np.log(1 + d / OUTLIER)
+        fit = 1 - SHARE + SHARE * d
+        score[g] += np.log(fit)
         if not slopes:
             continue
         du = (1 - t) * (d01 - d00) + t * (d11 - d10)
@@ -127,9 +176,12 @@ def _add(
         ju[5], jv[5] = -fx * x / p[2], -fy * y / p[2]
         ju[6] = fx * (speed[0] - x * speed[2]) / p[2]
         jv[6] = fy * (speed[1] - y * speed[2]) / p[2]
-        weight = 1 / (d + OUTLIER)
+        du, dv = SHARE / fit * du, SHARE / fit * dv
         for a in range(7):
-            gradient[g, a] += weight * (du * ju[a] + dv * jv[a])
-            ja = ju[a] if k == 0 else jv[a]
+            gradient[g, a] += du * ju[a] + dv * jv[a]
+        if not information:
+            continue
+        j, weight = jv if along_v[k] else ju, SHARE * d / fit / variance
+        for a in range(7):
             for b in range(7):
-                information[g, a, b] += d * weight / variance * ja * (ju[b] if k == 0 else jv[b])
+                fitting[a, b] += weight * j[a] * j[b]

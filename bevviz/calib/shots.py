@@ -10,13 +10,12 @@ import cv2
 import numpy as np
 
 from bevviz import geometry
-from bevviz.calib.edges import cloud_edges, image_edges
-from bevviz.frame import F32, F64, I32, U8, Camera, Frame, Intrinsics
+from bevviz.calib.edges import Edges, cloud_edges, image_edges
+from bevviz.frame import F32, F64, I32, U8, Bool, Camera, Frame, Intrinsics
 
-GROUPS = 8  # parts of the data that are compared with each other
-STRIPS = 4  # a frame is cut into so many upright parts where there are fewer frames than groups
+CELLS = (8, 4)  # along u and v: parts of the image, whose edges err together
 PIXELS = 500_000  # larger images are scaled down to this size
-MARGIN = 0.05  # edges that project this share of the image outside may still come in
+REACH = np.radians(3.5)  # edges that project this far outside the image may still come in
 NEAREST, FARTHEST = 2.0, 60.0  # metres: the robot itself; an edge of more than a pixel
 STEPS = np.arange(-15, 16) * 10_000_000  # nanoseconds around the image at which the pose is looked up
 
@@ -30,10 +29,10 @@ class Shot:
     frame: Frame
     camera: Camera
     K: F64  # (3, 3) of the image that the edges are from, free of distortion
-    maps: F32  # (2, H, W) see ``image_edges``
+    maps: U8  # (4, H, W) see ``image_edges``
     xyz: F32  # (E, 3) edges of the cloud, in Frame.points_frame
-    across: U8  # (E,) map that each edge is compared with
-    group: I32  # (E,) below GROUPS
+    change: U8  # (E,) what each edge should be in the image: a row of ``score.CHANGES``
+    cell: I32  # (E,) where it is in the image, as stated
     mounting: F64  # (4, 4) camera_from_points as stated, the robot standing still
     motion: F64 | None  # (T, 4, 4) points at the image's stamp + STEPS from points at the cloud's
 
@@ -41,9 +40,10 @@ class Shot:
         """As stated, for an image that was taken ``late`` seconds before its stamp."""
         if self.motion is None:
             return self.mounting
-        at = float(np.clip((-late * 1e9 - STEPS[0]) / (STEPS[1] - STEPS[0]), 0, len(STEPS) - 1))
+        at = min(max((-late * 1e9 - STEPS[0]) / (STEPS[1] - STEPS[0]), 0.0), len(STEPS) - 1.0)
         i = min(int(at), len(STEPS) - 2)
-        return self.mounting @ geometry.interpolate(self.motion[i], self.motion[i + 1], at - i)
+        moved = (i + 1 - at) * self.motion[i] + (at - i) * self.motion[i + 1]  # all but rigid: 10 ms apart
+        return np.asarray(self.mounting @ moved, np.float64)
 
 
 @dataclass(slots=True)
@@ -79,17 +79,21 @@ def gather(frames: Iterable[Frame], cameras: Iterable[str], pose: Pose) -> dict[
         last = frame
     if last is not None:
         _take(last, found, pose)
-    for shots in found.values():
-        _group(shots.shots)
     return found
 
 
 def _take(frame: Frame, found: dict[str, Shots], pose: Pose) -> None:
-    edges = [cloud_edges(cloud) for cloud in frame.clouds]
-    xyz = np.concatenate(
-        [geometry.apply(p, e.xyz) for e, p in zip(edges, frame.points_from_clouds, strict=True)]
-    )
-    across = np.concatenate([e.across for e in edges])
+    parts = []
+    for cloud, points_from_cloud in zip(frame.clouds, frame.points_from_clouds, strict=True):
+        edges = cloud_edges(cloud)
+        parts.append(
+            Edges(
+                geometry.apply(points_from_cloud, edges.xyz),
+                edges.towards @ points_from_cloud[:3, :3].T.astype(np.float32),
+                edges.bright,
+            )
+        )
+    together = Edges(*(np.concatenate(columns) for columns in zip(*map(_columns, parts), strict=True)))
     for camera in frame.cameras:
         if camera.name not in found:
             continue
@@ -98,10 +102,14 @@ def _take(frame: Frame, found: dict[str, Shots], pose: Pose) -> None:
             reason = camera.problems[0] if camera.problems else "no image, calibration or transform"
             shots.refused[reason] += 1
             continue
-        shots.shots.append(_shot(frame, camera, xyz, across, pose))
+        shots.shots.append(_shot(frame, camera, together, pose))
 
 
-def _shot(frame: Frame, camera: Camera, xyz: F32, across: U8, pose: Pose) -> Shot:
+def _columns(edges: Edges) -> tuple[F32, F32, Bool]:
+    return edges.xyz, edges.towards, edges.bright
+
+
+def _shot(frame: Frame, camera: Camera, edges: Edges, pose: Pose) -> Shot:
     assert camera.image is not None and camera.intrinsics is not None
     assert camera.camera_from_points is not None
     motion = _motion(frame, camera.image.stamp, pose)
@@ -110,14 +118,26 @@ def _shot(frame: Frame, camera: Camera, xyz: F32, across: U8, pose: Pose) -> Sho
         mounting = mounting @ geometry.inverse(motion[len(STEPS) // 2])
     picture, K = _flatten(camera.image.bgr, camera.intrinsics)
     height, width = picture.shape[:2]
-    seen = geometry.apply(camera.camera_from_points, xyz)
-    uv, depth = geometry.project(seen, Intrinsics(width, height, K))
-    margin = np.array([width, height], np.float32) * MARGIN
+    size = np.array([width, height], np.float32)
+    flat = Intrinsics(width, height, K)
+    uv, depth = geometry.project(geometry.apply(camera.camera_from_points, edges.xyz), flat)
+    margin = np.tan(REACH) * np.array([K[0, 0], K[1, 1]], np.float32)
     with np.errstate(invalid="ignore"):
-        inside = ((uv > -margin) & (uv < np.array([width, height]) + margin)).all(axis=1)
+        inside = ((uv > -margin) & (uv < size + margin)).all(axis=1)
     inside &= (depth > NEAREST) & (depth < FARTHEST)
-    strip = np.clip(uv[inside, 0] / width * STRIPS, 0, STRIPS - 1).astype(np.int32)
-    return Shot(frame, camera, K, image_edges(picture), xyz[inside], across[inside], strip, mounting, motion)
+    xyz, towards, bright, uv = edges.xyz[inside], edges.towards[inside], edges.bright[inside], uv[inside]
+    beside = xyz + towards * np.linalg.norm(xyz, axis=1, keepdims=True)
+    away = geometry.project(geometry.apply(camera.camera_from_points, beside), flat)[0] - uv
+    column, row = np.clip(uv / size * CELLS, 0, np.array(CELLS) - 1).astype(np.int32).T
+    cell = row * CELLS[0] + column
+    return Shot(frame, camera, K, image_edges(picture), xyz, _change(away, bright), cell, mounting, motion)
+
+
+def _change(away: F32, bright: Bool) -> U8:
+    """Row of ``score.CHANGES`` of edges with (E, 2) directions in the image."""
+    along_v = np.abs(away[:, 1]) > np.abs(away[:, 0])
+    negative = np.where(along_v, away[:, 1], away[:, 0]) < 0
+    return np.where(bright, 2 + 2 * along_v + negative, along_v).astype(np.uint8)
 
 
 def _motion(frame: Frame, stamp: int, pose: Pose) -> F64 | None:
@@ -144,10 +164,3 @@ def _flatten(bgr: U8, intrinsics: Intrinsics) -> tuple[U8, F64]:
     sx, sy = size[0] / width, size[1] / height
     shrink = np.array([[sx, 0, (sx - 1) / 2], [0, sy, (sy - 1) / 2], [0, 0, 1]])
     return cv2.resize(picture, size, interpolation=cv2.INTER_AREA), shrink @ K
-
-
-def _group(shots: list[Shot]) -> None:
-    """Deal the edges out: whole frames in turn where there are enough of them, else strips of frames."""
-    for number, shot in enumerate(shots):
-        shot.group[:] = number if len(shots) >= GROUPS else number * STRIPS + shot.group
-        shot.group[:] %= GROUPS

@@ -58,13 +58,14 @@ def _calib(options: argparse.Namespace) -> int:
                 warn(source.warnings)
             results = []
             for name in names:
-                with tqdm(unit="step", desc=f"align {name}", disable=None) as steps:
+                form = "{desc}: {percentage:3.0f}%|{bar}| {elapsed}{postfix}"
+                with tqdm(total=100, desc=f"align {name}", bar_format=form, disable=None) as steps:
 
-                    def show(what: str, steps: tqdm = steps) -> None:
+                    def show(done: float, what: str, steps: tqdm = steps) -> None:
                         steps.set_postfix_str(what, refresh=False)
-                        steps.update()
+                        steps.update(round(100 * done) - steps.n)
 
-                    results.append(calibrate(shots[name], show))
+                    results.append(calibrate(shots[name], show, config.sync.offsets))
         except KeyboardInterrupt:
             say("interrupted: nothing was found yet")
             return 130
@@ -99,11 +100,11 @@ def _print(results: list[Calibration], as_json: bool) -> None:
     for result in results:
         print(result.answer)
         print(f"\n{result.table()}\n")
-        print(f"{result.frames} frames, {result.edges} edges; an interval is two standard deviations wide")
+        print(f"{result.measured_from}; an interval is two standard deviations wide")
         for note in result.notes:
             print(note)
-        if result.correction[:6].any():
-            print(f"\nThe mounting with that put right, for --config:\n\n{result.config}")
+        if result.moved:
+            print(f"\nWith that put right, for --config:\n\n{result.config}")
 
 
 def _write(results: list[Calibration], path: Path) -> None:
@@ -114,7 +115,7 @@ def _write(results: list[Calibration], path: Path) -> None:
         path.write_text(configuration(results))
     except OSError as error:
         raise UserError(f"--write {path}: {error.strerror}") from None
-    say(f"configuration in {path}")
+    say(f"configuration in {path}{'' if any(r.moved for r in results) else ': all as it is stated'}")
 
 
 def _log(

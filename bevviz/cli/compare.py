@@ -3,10 +3,19 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
-from bevviz.cli.options import Commands, add_bag, add_config, add_output, add_selection, open_bag
+from bevviz.cli.options import (
+    Commands,
+    add_bag,
+    add_config,
+    add_output,
+    add_selection,
+    add_truth,
+    open_bag,
+)
 from bevviz.cli.outputs import Outputs, hint, say
 from bevviz.cli.run import logged
 from bevviz.errors import UserError
@@ -18,6 +27,7 @@ if TYPE_CHECKING:
     from bevviz.compare.sides import ComparedFrame
     from bevviz.compare.summary import ComparisonSummary
     from bevviz.config import Config, Preset
+    from bevviz.evaluate import Truth
     from bevviz.frame import Frame
     from bevviz.run import Observer, Processor
 
@@ -51,6 +61,7 @@ def add(commands: Commands) -> None:
         metavar="TOPIC",
         help="A is bevviz, B what the robot published (default: its fused Detection3DArray)",
     )
+    add_truth(compare)
     output = add_output(compare, blueprint="compare")
     output.add_argument("--json", type=Path, metavar="FILE", help="the table and every difference")
     output.add_argument("--csv", type=Path, metavar="FILE", help="a row for each object that differs")
@@ -70,11 +81,13 @@ def _compare(options: argparse.Namespace) -> int:
 
 def _configurations(options: argparse.Namespace) -> int:
     from bevviz.compare.sides import ComparedSessions
-    from bevviz.variants import common_frames
+    from bevviz.variants import check_same_frames, common_frames
 
     names, (a, b) = _sides(options)
-    sessions, decoded = ComparedSessions(a, b), common_frames([a, b])
+    check_same_frames({"A": a, "B": b})
+    decoded = common_frames([a, b])
     with open_bag(options, decoded) as source:
+        sessions = ComparedSessions(a, b, _truth(options, source))
         return _run(sessions, source, decoded, names, (a, b), options)
 
 
@@ -89,8 +102,14 @@ def _robot(options: argparse.Namespace) -> int:
     with open_bag(options, config) as source:
         topic = robot_topic(source.roles.robot_detections_3d, options.robot)
         names = "bevviz", f"the robot's {topic}"
-        compared = ComparedRobot(Session(config), topic)
+        compared = ComparedRobot(Session(config), topic, _truth(options, source))
         return _run(compared, source, config, names, (config, config), options)
+
+
+def _truth(options: argparse.Namespace, source: BagSource) -> Callable[[Frame], Truth | None] | None:
+    from bevviz.evaluate import truth_source
+
+    return truth_source(source.roles, options.truth, options.kitti_labels, len(source.scans))
 
 
 def _run(
@@ -130,8 +149,9 @@ def _saved(options: argparse.Namespace) -> int:
     from bevviz.compare.saved import SavedPair, SavedPairRecorder
     from bevviz.config import Config
 
-    if options.robot is not None or options.a or options.b or options.set_a or options.set_b:
-        raise UserError("compare: two .rrd files are compared as they were saved; leave the sides out")
+    own = options.robot is not None or options.a or options.b or options.set_a or options.set_b
+    if own or options.truth or options.kitti_labels:
+        raise UserError("compare: two .rrd files are compared as they are; leave the sides and the truth out")
     pair = SavedPair(*options.paths)
     return logged(
         pair,

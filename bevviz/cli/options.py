@@ -30,6 +30,17 @@ def add_bag(parser: argparse.ArgumentParser, *, detector: bool = True) -> argpar
     return group
 
 
+def add_truth(parser: argparse.ArgumentParser) -> None:
+    truth = parser.add_argument_group("ground truth", "The bag's own (.../ground_truth) is found by itself.")
+    truth.add_argument("--truth", metavar="TOPIC", help="a Detection3DArray that states what is there")
+    truth.add_argument(
+        "--kitti-labels",
+        type=Path,
+        metavar="FILE|DIR",
+        help="label_2 of KITTI, calib beside it; one file for each scan",
+    )
+
+
 def add_selection(group: argparse._ArgumentGroup) -> None:
     """Which of its frames."""
     group.add_argument("--start", metavar="TIME", help="skip what is before this time")

@@ -77,8 +77,11 @@ def logged(
         The exit status.
     """
     with outputs.opened(items.scene, config) as sinks:
-        end = through(items, processor, observers(sinks.recording))
-        warn(items.warnings)
+        seen = observers(sinks.recording)
+        early = list(items.warnings)  # known before an hour's work, and said before it
+        warn(early)
+        end = through(items, processor, seen)
+        warn(warning for warning in items.warnings if warning not in early)
         finish()
         if end.frames and not end.interrupted:
             outputs.keep_serving(sinks.recording, f"{end.frames} frames; ")

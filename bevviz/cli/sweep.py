@@ -8,7 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from bevviz.cli.options import Commands, add_bag, add_config, add_output, add_selection, open_bag
+from bevviz.cli.options import Commands, add_bag, add_config, add_output, add_selection, add_truth, open_bag
 from bevviz.cli.outputs import Outputs, hint, say, warn
 from bevviz.cli.run import through
 
@@ -25,14 +25,7 @@ def add(commands: Commands) -> None:
     )
     group = add_bag(sweep)
     add_selection(group)
-    truth = sweep.add_argument_group("ground truth", "The bag's own (.../ground_truth) is found by itself.")
-    truth.add_argument("--truth", metavar="TOPIC", help="a Detection3DArray that states what is there")
-    truth.add_argument(
-        "--kitti-labels",
-        type=Path,
-        metavar="FILE|DIR",
-        help="label_2 of KITTI, calib beside it; scan by scan",
-    )
+    add_truth(sweep)
     add_config(sweep)
     output = add_output(sweep, blueprint=None)
     output.add_argument("--csv", type=Path, metavar="FILE", help="the table, with each stage and class")
@@ -55,7 +48,7 @@ def _sweep(options: argparse.Namespace) -> int:
     configs = combine(parameters, configured)
     config = common_frames(configs.values())
     with open_bag(options, config) as source:
-        truth = truth_source(source.roles, options.truth, options.kitti_labels)
+        truth = truth_source(source.roles, options.truth, options.kitti_labels, len(source.scans))
         sweep = Sweep(parameters, configs, truth)
         outputs = replace(Outputs.of(options), blueprint=layout(sweep))
         with ExitStack() as stack:

@@ -10,6 +10,7 @@ from enum import StrEnum
 import numpy as np
 
 from bevviz import geometry
+from bevviz.compare.truth import Judged
 from bevviz.frame import F32, F64, Boxes3D, FrameResult
 from bevviz.stages.fusion import assign
 
@@ -86,6 +87,7 @@ class FrameDifferences:
     b: Seen
     objects: tuple[Difference, ...]
     images: Mapping[str, tuple[Difference, ...]]  # by camera
+    judged: Judged | None = None  # where it is known what is really there
 
     @property
     def counts(self) -> Counter[Change]:
@@ -114,7 +116,7 @@ def seen(result: FrameResult) -> Seen:
     return Seen(result.objects.boxes, result.objects.names, result.objects.score, images, clusters)
 
 
-def differences(index: int, stamp: int, a: Seen, b: Seen) -> FrameDifferences:
+def differences(index: int, stamp: int, a: Seen, b: Seen, judged: Judged | None = None) -> FrameDifferences:
     """How two sides differ in the frame."""
     both = [camera for camera in a.images if camera in b.images]
     return FrameDifferences(
@@ -124,6 +126,7 @@ def differences(index: int, stamp: int, a: Seen, b: Seen) -> FrameDifferences:
         b,
         compare_objects(a, b),
         {camera: compare_images(a.images[camera], b.images[camera]) for camera in both},
+        judged,
     )
 
 

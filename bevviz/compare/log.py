@@ -144,6 +144,13 @@ def _lines(found: FrameDifferences) -> Iterator[str]:
     yield f"### Frame {found.index}"
     yield ""
     yield table.markdown([("", "A", "B"), *_totals(found)])
+    if (judged := found.judged) is not None:
+        for what, objects in (("Broken by B", judged.broken), ("Fixed by B", judged.fixed)):
+            if objects:
+                yield ""
+                yield f"#### {what}: {len(objects)}"
+                yield ""
+                yield from (f"- {markdown(judged.text(row))}" for row in objects)
     for change in (*DIFFERENT, Change.SAME):
         mine = [d for d in found.objects if d.change is change]
         if mine:
@@ -170,6 +177,8 @@ def _totals(found: FrameDifferences) -> Iterator[tuple[str, str, str]]:
             "-" if a.clusters is None else str(a.clusters),
             "-" if b.clusters is None else str(b.clusters),
         )
+    if (judged := found.judged) is not None:
+        yield f"found of {len(judged.labels)} that are there", str(judged.a.sum()), str(judged.b.sum())
     for camera in found.images:
         yield f"detections, {camera}", str(len(a.images[camera].names)), str(len(b.images[camera].names))
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 
@@ -11,8 +12,10 @@ import rerun as rr
 from bevviz.compare.differences import FrameDifferences, differences, seen
 from bevviz.compare.log import DifferenceLogger
 from bevviz.compare.summary import ComparisonSummary
+from bevviz.compare.truth import judge
 from bevviz.config import Config
 from bevviz.errors import UserError
+from bevviz.evaluate import Truth
 from bevviz.frame import Camera, CameraResult, Frame, FrameResult, LabelledBoxes3D, Objects
 from bevviz.logging import entities
 from bevviz.logging.logger import Logger
@@ -32,16 +35,23 @@ class ComparedFrame:
     found: FrameDifferences | None = None
 
 
+Truths = Callable[[Frame], Truth | None]
+
+
 class ComparedSessions:
     """Two configurations on the same frames.
+
+    Args:
+        a, b: the configurations.
+        truth: what is really there in a frame, where that is known.
 
     Raises:
         UserError: a detector's model cannot be used, or they need different frames.
     """
 
-    def __init__(self, a: Config, b: Config) -> None:
+    def __init__(self, a: Config, b: Config, truth: Truths | None = None) -> None:
         check_same_frames({"A": a, "B": b})
-        self._sessions = Sessions([a, b])
+        self._sessions, self._truth = Sessions([a, b]), truth
 
     def perceive(self, frame: Frame, network: Executor | None = None) -> ComparedFrame:
         a, b = self._sessions.perceive(frame, network)
@@ -50,14 +60,15 @@ class ComparedSessions:
     def finish(self, compared: ComparedFrame) -> ComparedFrame:
         assert compared.a is not None
         assert compared.b is not None
-        return _differing(compared.frame, *self._sessions.finish((compared.a, compared.b)))
+        a, b = self._sessions.finish((compared.a, compared.b))
+        return _differing(compared.frame, a, b, self._truth)
 
 
 class ComparedRobot:
     """What a session makes, and what the robot published on a Detection3DArray topic."""
 
-    def __init__(self, session: Session, topic: str) -> None:
-        self._session, self._topic = session, topic
+    def __init__(self, session: Session, topic: str, truth: Truths | None = None) -> None:
+        self._session, self._topic, self._truth = session, topic, truth
 
     def perceive(self, frame: Frame, network: Executor | None = None) -> ComparedFrame:
         return ComparedFrame(frame, self._session.perceive(frame, network), None)
@@ -65,13 +76,15 @@ class ComparedRobot:
     def finish(self, compared: ComparedFrame) -> ComparedFrame:
         assert compared.a is not None
         theirs = published(compared.frame, self._topic, compared.a.config)
-        return _differing(compared.frame, self._session.finish(compared.a), theirs)
+        return _differing(compared.frame, self._session.finish(compared.a), theirs, self._truth)
 
 
-def _differing(frame: Frame, a: FrameResult, b: FrameResult | None) -> ComparedFrame:
+def _differing(frame: Frame, a: FrameResult, b: FrameResult | None, truths: Truths | None) -> ComparedFrame:
     if b is None:
         return ComparedFrame(frame, a, b)
-    return ComparedFrame(frame, a, b, differences(frame.index, frame.stamp, seen(a), seen(b)))
+    truth = None if truths is None else truths(frame)
+    judged = None if truth is None else judge(a, b, truth)
+    return ComparedFrame(frame, a, b, differences(frame.index, frame.stamp, seen(a), seen(b), judged))
 
 
 class ComparisonRecorder(Observer[ComparedFrame]):

@@ -14,12 +14,14 @@ import numpy as np
 from bevviz import table
 from bevviz.compare.differences import DIFFERENT, WORST_FIRST, Change, Difference, FrameDifferences
 from bevviz.compare.log import place
+from bevviz.compare.truth import Judged
 from bevviz.config import ParameterChange
 from bevviz.errors import UserError
 from bevviz.run import Observer
 from bevviz.text import fenced, printable
 
 WORST = 10  # frames in the table
+EXAMPLES = 2  # of each
 COLUMNS = ("objects A", "objects B", *(change.value for change in (Change.SAME, *DIFFERENT)))
 
 
@@ -45,6 +47,11 @@ class ComparisonSummary(Observer[Compared]):
         self._classes: dict[str, Counter[str]] = defaultdict(Counter)
         self._detections: dict[str, Counter[str]] = defaultdict(Counter)
         self._clusters: Counter[str] = Counter()
+        self._other_clusters = 0  # frames with more of them on one side
+        self._detected = False
+        self._judged: dict[str, Counter[str]] = defaultdict(Counter)  # by class of the truth
+        self._wrong: dict[str, Counter[str]] = {"A": Counter(), "B": Counter()}  # by name
+        self._names: set[str] = set()  # that the truth has
         self._moved: list[float] = []
 
     @property
@@ -69,12 +76,18 @@ class ComparisonSummary(Observer[Compared]):
         for side, what in ((found.a, "objects A"), (found.b, "objects B")):
             if side.clusters is not None:
                 self._clusters[what] += side.clusters
+        self._other_clusters += found.a.clusters != found.b.clusters
+        self._detected |= bool(found.a.images or found.b.images)
+        if found.judged is not None:
+            self._judge(found.judged)
         differing = [d for d in found.objects if d.change is not Change.SAME]
         self.frames.append(
             {
                 "frame": found.index,
                 "stamp": found.stamp,
                 "number": found.number,
+                "fixed": [] if found.judged is None else [*map(found.judged.text, found.judged.fixed)],
+                "broke": [] if found.judged is None else [*map(found.judged.text, found.judged.broken)],
                 "objects": [_row(d, found) for d in differing],
                 "detections": [
                     {
@@ -92,10 +105,36 @@ class ComparisonSummary(Observer[Compared]):
             }
         )
 
+    def _judge(self, judged: Judged) -> None:
+        self._names |= judged.names
+        self._wrong["A"].update(judged.wrong_a)
+        self._wrong["B"].update(judged.wrong_b)
+        for row, label in enumerate(judged.labels):
+            counts = self._judged[label.lower()]
+            counts["there"] += 1
+            counts["A"] += bool(judged.a[row])
+            counts["B"] += bool(judged.b[row])
+        for what, rows in (("fixed", judged.fixed), ("broke", judged.broken)):
+            for row in rows:
+                self._judged[judged.labels[row].lower()][what] += 1
+
+    @property
+    def truth(self) -> Mapping[str, Any] | None:
+        """What both find of what is there, by class, and how much of it is wrong; None: not known."""
+        if not self._judged:
+            return None
+        wrong = {
+            side: sum(n for name, n in w.items() if name in self._names) for side, w in self._wrong.items()
+        }
+        return {"classes": self._judged, "wrong": wrong}
+
     @property
     def worst(self) -> Sequence[Mapping[str, Any]]:
-        """Frames that differ, those with most differences first."""
-        return sorted((f for f in self.frames if f["number"]), key=lambda f: (-f["number"], f["frame"]))
+        """Frames that differ: those in which something is no longer found first, then by differences."""
+        return sorted(
+            (f for f in self.frames if f["number"]),
+            key=lambda f: (-len(f["broke"]), -f["number"], f["frame"]),
+        )
 
     def table(self) -> str:
         """For the terminal."""
@@ -116,10 +155,11 @@ class ComparisonSummary(Observer[Compared]):
         if self._clusters:
             yield ""
             yield f"clusters: {self._clusters['objects A']} in A, {self._clusters['objects B']} in B"
+        yield from self._truth_lines()
         yield ""
         worst = self.worst
         if not worst:
-            yield f"no difference in {len(self.frames)} frames"
+            yield self._no_difference()
             return
         yield f"{len(worst)} of {len(self.frames)} frames differ; the worst:"
         for frame in worst[:WORST]:
@@ -127,8 +167,38 @@ class ComparisonSummary(Observer[Compared]):
             counts = Counter(d["change"] for d in found)
             how = ", ".join(f"{counts[change]} {change}" for change in WORST_FIRST if counts[change])
             found.sort(key=lambda d: WORST_FIRST.index(d["change"]))
-            examples = "; ".join(f"{d['text']} {d['place']}" for d in found[:2])
-            yield f"  frame {frame['frame']}: {how} ({examples}{'; ...' if found[2:] else ''})"
+            examples = [f"{what} {text}" for what in ("broke", "fixed") for text in frame[what]]
+            examples = examples or [f"{d['text']} {d['place']}" for d in found]
+            more = "; ..." if examples[EXAMPLES:] else ""
+            yield f"  frame {frame['frame']}: {how} ({'; '.join(examples[:EXAMPLES])}{more})"
+
+    def _truth_lines(self) -> Iterator[str]:
+        truth = self.truth
+        if truth is None or not self._detected:
+            return
+        total: Counter[str] = sum(self._judged.values(), Counter())
+        columns = ("there", "A", "B", "fixed", "broke")
+        rows = [(name, *(str(c[column]) for column in columns)) for name, c in sorted(self._judged.items())]
+        yield ""
+        yield from table.lines(
+            [
+                ("of the truth", "there", "found by A", "found by B", "fixed by B", "broken by B"),
+                *rows,
+                ("all", *(str(total[column]) for column in columns)),
+            ]
+        )
+        wrong = truth["wrong"]
+        yield (
+            f"B fixed {total['fixed']}, broke {total['broke']}; objects that are none: "
+            f"{wrong['A']} in A, {wrong['B']} in B"
+        )
+
+    def _no_difference(self) -> str:
+        frames = f"{len(self.frames)} frames"
+        if not self._other_clusters:
+            return f"no difference in {frames}"
+        objects = "no object differs" if self._detected else "no detector (--model FILE.onnx), so no objects"
+        return f"{objects}; the number of clusters differs in {self._other_clusters} of {frames}"
 
     def write_json(self, path: Path) -> None:
         """Everything that the table is made of, and each difference.
@@ -143,6 +213,7 @@ class ComparisonSummary(Observer[Compared]):
             "objects": self._classes,
             "detections": self._detections,
             "clusters": {"A": self._clusters["objects A"], "B": self._clusters["objects B"]},
+            "truth": self.truth,
             "frames": self.frames,
         }
         try:

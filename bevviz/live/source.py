@@ -20,7 +20,7 @@ from bevviz.ros.node import Node
 from bevviz.ros.roles import Roles, Topic, find_roles
 from bevviz.ros.typesupport import message_type
 from bevviz.sync.feed import Handler, make_handlers
-from bevviz.sync.synchronizer import Synchronizer
+from bevviz.sync.synchronizer import Synchronizer, blindness
 
 LOOK = 0.5  # seconds between two looks at the graph
 TICK = 0.05  # seconds between two looks at the clouds that have waited long enough
@@ -177,10 +177,7 @@ class LiveSource(Closing):
         if absent := stated - present.keys():
             return f"nobody publishes {', '.join(sorted(absent))}, which source.lidar_topics states"
         if not self.roles.lidars:
-            return (
-                f"no LiDAR (no sensor_msgs/PointCloud2) among {len(present)} topics; 'bevviz info --live' "
-                f"shows them, --set source.lidar_topics=[/topic] states one"
-            )
+            return self.roles.no_lidar or "the topics are still changing"
         silent = [topic for topic in self.roles.lidars if not self.received[topic]]
         return f"no message on {', '.join(silent)} yet" if silent else "the topics are still changing"
 
@@ -212,7 +209,9 @@ class LiveSource(Closing):
                 f"{count} message(s) of {topic} were lost on the way, see docs/live.md"
                 for topic, count in self.lost.items()
             ]
-            return [*self._notes.values(), *lost, *damaged, *self._sync.report.warnings()]
+            report = self._sync.report
+            blind = blindness(self.config, self.roles, report) if self._settled.is_set() else []
+            return [*self._notes.values(), *lost, *damaged, *blind, *report.warnings()]
 
     def __iter__(self) -> Iterator[Frame]:
         while True:

@@ -59,7 +59,8 @@ class Redactor:
             "classes": (),
             "conf_threshold": SCORE,
             "explain_threshold": SCORE,
-            "max_candidates": MAX_CANDIDATES,  # all of them: suppressed ones are the first to go
+            "iou_threshold": 1.0,  # nothing is suppressed: what lies outside the image would do that, too
+            "max_candidates": MAX_CANDIDATES,
         }
         self._detector = Detector(config.model_copy(update=settings))
         names = [name.lower() for name in self._detector.names]
@@ -165,9 +166,12 @@ def grown(boxes: F32, width: int, height: int) -> Sequence[tuple[int, int, int, 
 
 
 def _encoded(bgr: U8, magic: bytes) -> U8:
-    """In the form that the first bytes tell: PNG without loss, JPEG with little."""
-    png = magic.startswith(b"\x89PNG")
-    form, options = (".png", []) if png else (".jpg", [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
+    """In the form that the first bytes tell: PNG without loss, JPEG and WebP with little."""
+    form, options = ".jpg", [cv2.IMWRITE_JPEG_QUALITY, QUALITY]
+    if magic.startswith(b"\x89PNG"):
+        form, options = ".png", []
+    elif magic.startswith(b"RIFF"):
+        form, options = ".webp", [cv2.IMWRITE_WEBP_QUALITY, QUALITY]
     _, data = cv2.imencode(form, bgr, options)
     encoded: U8 = data.reshape(-1)
     return encoded

@@ -97,13 +97,23 @@ def encode_camera_info(image: Image, intrinsics: Intrinsics) -> Any:
     )
 
 
-def encode_boxes_3d(stamp: int, frame_id: str, boxes: Boxes3D, results: Iterable[Hypotheses]) -> Any:
-    """A vision_msgs/Detection3DArray; ``results`` has the hypotheses of each box."""
+def encode_boxes_3d(
+    stamp: int, frame_id: str, boxes: Boxes3D, results: Iterable[Hypotheses], pose: F64 | None = None
+) -> Any:
+    """A vision_msgs/Detection3DArray.
+
+    Args:
+        stamp, frame_id: of the header.
+        boxes: in a frame of theirs.
+        results: the hypotheses of each box.
+        pose: (4, 4) frame_id from the frame of the boxes; None: it is the same.
+    """
+    turn = np.eye(4) if pose is None else pose
     about = _header(stamp, frame_id)
     detections = []
     for center, size, yaw, hypotheses in zip(boxes.center, boxes.size, boxes.yaw, results, strict=True):
         half = float(yaw) / 2
-        place = _pose(geometry.transform(center, np.array([0, 0, np.sin(half), np.cos(half)])))
+        place = _pose(turn @ geometry.transform(center, np.array([0, 0, np.sin(half), np.cos(half)])))
         box = _make("vision_msgs/msg/BoundingBox3D", center=place, size=_vector("Vector3", size))
         detections.append(
             _make(

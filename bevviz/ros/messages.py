@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import logging
 import math
+import re
 import struct
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
@@ -22,6 +23,7 @@ from numpy.typing import NDArray
 from bevviz import geometry
 from bevviz.errors import UserError, first_line
 from bevviz.frame import F32, F64, U8, Boxes3D, Cloud, Image, Intrinsics, LabelledBoxes2D, LabelledBoxes3D
+from bevviz.ros.roles import VIDEO
 
 logger = logging.getLogger(__name__)
 
@@ -104,9 +106,10 @@ def decode_cloud(msg: Any, topic: str, received: int) -> Cloud:
     """Points and extra fields of a sensor_msgs/PointCloud2.
 
     Any field types, offsets, padding and byte order; organised clouds are flattened row by row. Points
-    with a coordinate that is NaN or infinite are dropped, and so are those that the header announces
-    but cut data no longer holds; both are counted in ``Cloud.dropped``. A field of several elements
-    becomes one field for each: ``name_0``, ``name_1`` ...
+    with a coordinate that is NaN or infinite are dropped, and so are those at (0, 0, 0), by which
+    drivers mean a beam without a return, and those that the header announces but cut data no longer
+    holds; all are counted in ``Cloud.dropped``. A field of several elements becomes one field for each:
+    ``name_0``, ``name_1`` ...
 
     Raises:
         MessageError: x, y or z is missing, a field does not fit into its point, or the header announces more
@@ -121,8 +124,11 @@ def decode_cloud(msg: Any, topic: str, received: int) -> Cloud:
     grid = _point_grid(msg, layout)
     with np.errstate(over="ignore", invalid="ignore"):  # a float64 beyond float32 is infinite, and dropped
         xyz = _positions(grid)
-        finite = np.isfinite(xyz[:, 0] + xyz[:, 1] + xyz[:, 2])
-    kept = None if finite.all() else np.flatnonzero(finite)
+        total = xyz[:, 0] + xyz[:, 1] + xyz[:, 2]
+    usable = np.isfinite(total)
+    if not total.all():
+        usable &= xyz.any(axis=1)
+    kept = None if usable.all() else np.flatnonzero(usable)
     fields: dict[str, NDArray[Any]] = {}
     for name in layout.fields or ():
         if name not in _AXES:
@@ -309,15 +315,21 @@ def to_8_bits(pixels: NDArray[np.uint16]) -> U8:
     return scaled
 
 
-_MEDIA_TYPES = {b"\xff\xd8\xff": "image/jpeg", b"\x89PNG\r\n\x1a\n": "image/png"}
+_MEDIA_TYPES = {  # by what the data begins with
+    "image/jpeg": re.compile(rb"\xff\xd8\xff"),
+    "image/png": re.compile(rb"\x89PNG\r\n\x1a\n"),
+    "image/webp": re.compile(rb"RIFF.{4}WEBP", re.DOTALL),
+}
+_ANNEX_B = (b"\0\0\0\1", b"\0\0\1")  # what every unit of an H.264 or H.265 stream begins with
 
 
 @_guarded
 def decode_compressed_image(msg: Any, topic: str, received: int) -> Image:
-    """A JPEG or PNG in a sensor_msgs/CompressedImage, decoded, with the encoded bytes untouched beside.
+    """A JPEG, PNG or WebP in a sensor_msgs/CompressedImage, decoded.
 
-    The kind is taken from the data, as the format field has many spellings. A PNG of 16 bits is reduced
-    as ``to_8_bits`` says, and the encoded one, which would look different, is not kept.
+    The kind is taken from the data, as the format field has many spellings. The encoded bytes are kept
+    beside, untouched, but of WebP, which Rerun does not read, and of a PNG of 16 bits: it is reduced as
+    ``to_8_bits`` says, and would look different.
 
     Raises:
         MessageError: depth images, other kinds, data that is damaged or cut, and more than ``MOST_PIXELS``
@@ -327,10 +339,12 @@ def decode_compressed_image(msg: Any, topic: str, received: int) -> Image:
         raise MessageError(f"{topic}: '{msg.format}' is a depth image; choose a topic with colour images")
     data = np.frombuffer(msg.data, np.uint8)
     encoded = data.tobytes()
-    media_type = next((kind for magic, kind in _MEDIA_TYPES.items() if encoded.startswith(magic)), "")
+    media_type = next((kind for kind, magic in _MEDIA_TYPES.items() if magic.match(encoded)), "")
+    if encoded.startswith(_ANNEX_B):
+        raise MessageError(f"{topic}: '{msg.format}' is {VIDEO}")
     if not media_type:
         raise MessageError(
-            f"{topic}: compressed image of format '{msg.format}' holds neither JPEG nor PNG data "
+            f"{topic}: compressed image of format '{msg.format}' holds neither JPEG, PNG nor WebP data "
             f"({len(encoded)} bytes)"
         )
     width, height = _size_of(encoded)
@@ -350,19 +364,22 @@ def decode_compressed_image(msg: Any, topic: str, received: int) -> Image:
     if bgr is None:
         raise MessageError(f"{topic}: the {media_type} data ({len(encoded)} bytes) is damaged or cut")
     deep = bgr.dtype == np.uint16
+    kept = not deep and media_type != "image/webp"
     return Image(
         stamp=stamp_ns(msg.header.stamp),
         frame_id=_frame(msg.header.frame_id),
         bgr=to_8_bits(bgr) if deep else bgr,
-        encoded=None if deep else encoded,
-        media_type="" if deep else media_type,
+        encoded=encoded if kept else None,
+        media_type=media_type if kept else "",
         topic=topic,
         received=received,
     )
 
 
 def _size_of(encoded: bytes) -> tuple[int, int]:
-    """Width and height that the header of a PNG or a JPEG states; 0 where there is none, or a PNG is cut."""
+    """Width and height in the header of a PNG, JPEG or WebP; 0 where there is none, or the data is cut."""
+    if encoded.startswith(b"RIFF"):
+        return _size_of_webp(encoded)
     if encoded.startswith(b"\x89PNG"):
         at = 8
         while encoded[at + 4 : at + 8] != b"IEND":  # a decoder makes room for a part before it reads it
@@ -383,6 +400,19 @@ def _size_of(encoded: bytes) -> tuple[int, int]:
         else:
             at += 2 if marker in (0x01, *range(0xD0, 0xD9)) else 2 + max(size, 2)
     return 0, 0
+
+
+def _size_of_webp(encoded: bytes) -> tuple[int, int]:
+    """As RFC 9649 has it."""
+    if len(encoded) < max(30, 8 + int.from_bytes(encoded[4:8], "little")):
+        return 0, 0
+    first, bits = encoded[12:16], int.from_bytes(encoded[21:25], "little")
+    if first == b"VP8X":  # with alpha, a profile or several pictures
+        return 1 + int.from_bytes(encoded[24:27], "little"), 1 + int.from_bytes(encoded[27:30], "little")
+    if first == b"VP8L":  # lossless
+        return 1 + (bits & 0x3FFF), 1 + (bits >> 14 & 0x3FFF)
+    width, height = struct.unpack_from("<HH", encoded, 26)
+    return (width & 0x3FFF, height & 0x3FFF) if first == b"VP8 " else (0, 0)
 
 
 # --- camera models -----------------------------------------------------------------------------
@@ -412,9 +442,10 @@ def decode_camera_info(msg: Any, rectified: bool, topic: str = "camera_info") ->
         MessageError: an uncalibrated camera, or a distortion model that is not known.
     """
     K, D, P = (np.asarray(_either(msg, n, n.lower()), np.float64) for n in "KDP")
-    matrix = K.reshape(3, 3)
+    matrix, baseline = K.reshape(3, 3), (0.0, 0.0)
     if rectified and P[0]:
         matrix = P.reshape(3, 4)[:, :3]
+        baseline = -float(P[3] / P[0]), -float(P[7] / P[5] if P[5] else 0.0)
     if not np.isfinite(matrix).all() or matrix[0, 0] <= 0 or matrix[1, 1] <= 0:
         raise MessageError(f"{topic}: the camera is uncalibrated (K is zero or not finite); calibrate it")
     model = ""
@@ -426,7 +457,7 @@ def decode_camera_info(msg: Any, rectified: bool, topic: str = "camera_info") ->
     binning = np.array([max(int(msg.binning_x), 1), max(int(msg.binning_y), 1)])
     matrix[:2] /= binning[:, None]
     width, height = np.array([msg.roi.width or msg.width, msg.roi.height or msg.height], int) // binning
-    return Intrinsics(int(width), int(height), matrix, model, D if model else np.zeros(0))
+    return Intrinsics(int(width), int(height), matrix, model, D if model else np.zeros(0), baseline)
 
 
 def _distortion(name: str, D: F64, topic: str) -> str:
@@ -482,6 +513,29 @@ def decode_odometry(msg: Any, topic: str = "odometry") -> StampedTransform:
     """
     pose = msg.pose.pose
     return _stamped(msg.header, msg.child_frame_id, pose.position, pose.orientation, topic)
+
+
+@dataclass(frozen=True, slots=True)
+class Acceleration:
+    """What an Imu feels, in its own frame: at rest one g upwards."""
+
+    stamp: int
+    frame_id: str
+    acceleration: F64  # (3,) m/s^2, or in g: drivers differ
+
+
+def decode_acceleration(msg: Any, topic: str = "imu") -> Acceleration:
+    """Of a sensor_msgs/Imu.
+
+    Raises:
+        MessageError: the message says that it has none.
+    """
+    if msg.linear_acceleration_covariance[0] == -1:
+        raise MessageError(f"{topic}: its covariance says that no acceleration is measured")
+    felt = msg.linear_acceleration
+    return Acceleration(
+        stamp_ns(msg.header.stamp), _frame(msg.header.frame_id), np.array([felt.x, felt.y, felt.z])
+    )
 
 
 def _stamped(header: Any, child: str, translation: Any, rotation: Any, topic: str) -> StampedTransform:

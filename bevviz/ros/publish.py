@@ -7,9 +7,10 @@ from typing import Any
 
 import numpy as np
 
+from bevviz import geometry
 from bevviz.config import Config
 from bevviz.errors import UserError
-from bevviz.frame import I64, Boxes3D, Cloud, FrameResult, Image
+from bevviz.frame import F32, F64, I64, Boxes3D, Cloud, FrameResult, Image
 from bevviz.ros.encode import encode_boxes_2d, encode_boxes_3d, encode_cloud, encode_image, typestore
 from bevviz.ros.typesupport import message_type
 
@@ -55,22 +56,23 @@ class Publisher:
         """Send what there is of a frame. Several cameras take turns on one topic."""
         frame = result.frame
         stamp, frame_id = frame.stamp, frame.points_frame
+        back = None if frame.upright is None else geometry.inverse(frame.upright)
         if result.bev is not None and self._wanted(BEV):
             self._send(BEV, encode_image(Image(stamp, frame_id, result.bev.image)))
         if result.obstacles is not None and self._wanted(OBSTACLES):
-            self._send(OBSTACLES, encode_cloud(Cloud(stamp, frame_id, result.obstacles)))
+            self._send(OBSTACLES, encode_cloud(Cloud(stamp, frame_id, _moved(result.obstacles, back))))
         if result.clusters is not None and self._wanted(CLUSTERS):
             rows = np.flatnonzero(result.clusters.kept)
             boxes = _rows(result.clusters.boxes(self._config.clustering), rows)
             names = [[(f"cluster_{row}", 1.0)] for row in rows]
-            self._send(CLUSTERS, encode_boxes_3d(stamp, frame_id, boxes, names))
+            self._send(CLUSTERS, encode_boxes_3d(stamp, frame_id, boxes, names, back))
         if self._wanted(DETECTIONS):
             self._send_detections(result)
         if result.objects is not None and self._wanted(FUSED):
             objects = result.objects
             scored = zip(objects.cluster.tolist(), objects.names, objects.score.tolist(), strict=True)
             results = [[(f"cluster_{row}", 1.0), (name, score)] for row, name, score in scored]
-            self._send(FUSED, encode_boxes_3d(stamp, frame_id, objects.boxes, results))
+            self._send(FUSED, encode_boxes_3d(stamp, frame_id, objects.boxes, results, back))
 
     def _send_detections(self, result: FrameResult) -> None:
         for camera in result.cameras:
@@ -87,6 +89,10 @@ class Publisher:
 
     def _send(self, topic: str, message: Any) -> None:
         self._publishers[topic].publish(bytes(typestore().serialize_cdr(message, TOPICS[topic])))
+
+
+def _moved(points: F32, pose: F64 | None) -> F32:
+    return points if pose is None else geometry.apply(pose, points)
 
 
 def _rows(boxes: Boxes3D, rows: I64) -> Boxes3D:

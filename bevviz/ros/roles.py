@@ -49,12 +49,51 @@ class Roles:
     tf: tuple[str, ...] = ()
     tf_static: tuple[str, ...] = ()
     odometry: str = ""
+    imus: tuple[str, ...] = ()  # tell which way is up, where transforms do not
     robot_detections_2d: tuple[str, ...] = ()
     robot_detections_3d: tuple[str, ...] = ()
     robot_clouds: tuple[str, ...] = ()  # of obstacles, where the ground stage is the robot's
     stages: tuple[str, ...] = ()  # the robot's results that our stages are taken from
     truth: str = ""
+    # What follows is for sentences: it changes with topics that play no role.
+    camera_infos: tuple[str, ...] = field(default=(), compare=False)  # all of them, whoever uses them
+    no_lidar: str = field(default="", compare=False)  # why there is none, and what would help
+    no_camera: str = field(default="", compare=False)  # the same of cameras
     notes: Mapping[str, str] = field(default_factory=dict)
+
+
+MANY = 12  # topics; more are not listed in a sentence
+VIDEO = "video, which is not decoded here: republish it as images (image_transport) and record these"
+_FOREIGN = (  # what holds points or pixels in a form that nothing here reads, and what would help
+    ("camera", re.compile(r"video|ffmpeg|theora|h26[45]", re.IGNORECASE), VIDEO),
+    (
+        "LiDAR",
+        re.compile(r"livox.*/CustomMsg$", re.IGNORECASE),
+        "Livox's own kind of cloud: set the driver's xfer_format to 0 for PointCloud2, and record that",
+    ),
+    (
+        "LiDAR",
+        re.compile(
+            r"VelodyneScan$|PandarScan$|RslidarScan|^(ouster|hesai|rslidar|nebula).*Packets?", re.IGNORECASE
+        ),
+        "packets of the sensor: play them through its driver and record its PointCloud2",
+    ),
+    (
+        "LiDAR",
+        re.compile(r"sensor_msgs/(msg/)?(Multi)?(Echo)?LaserScan$"),
+        "one plane: pointcloud_to_laserscan's laserscan_to_pointcloud makes a PointCloud2 of it, record that",
+    ),
+    (
+        "LiDAR",
+        re.compile(r"sensor_msgs/(msg/)?PointCloud$"),
+        "the older kind of cloud: point_cloud_converter makes a PointCloud2 of it, record that",
+    ),
+)
+
+
+def _foreign(topic: Topic, sensor: str = "") -> str:
+    """What a topic that nothing here reads holds and what would help; empty where it is not known."""
+    return next((why for of, kind, why in _FOREIGN if sensor in ("", of) and kind.search(topic.type)), "")
 
 
 STAGE_KINDS = {  # what the robot publishes as the result of a stage
@@ -83,7 +122,7 @@ def find_roles(
         UserError: a stated topic does not exist, or is of another type.
     """
     topics = sorted(topics, key=lambda t: t.name)  # the order of a bag's or a graph's topics is chance
-    notes = {topic.name: f"not used: nothing here reads {topic.type}" for topic in topics}
+    notes = {t.name: f"not used: {_foreign(t) or f'nothing here reads {t.type}'}" for t in topics}
     staged = {key: _stated(name, topics, key, STAGE_KINDS[key]) for key, name in stages.items()}
     obstacles = [topic for key, topic in staged.items() if key == "ground.method"]
     lidars = _find_lidars([t for t in topics if t not in obstacles], config, notes)
@@ -106,6 +145,8 @@ def find_roles(
     _note(notes, static, "static transforms")
     _note(notes, moving, "transforms")
     odometry = _find_odometry(topics, config, notes)
+    imus = [topic for topic in _of(topics, "Imu") if topic.count != 0]
+    _note(notes, imus, "gravity, where the transforms have no upright frame")
     boxes = _of(topics, "Detection3DArray")
     truth = [t for t in boxes if t.name.endswith("ground_truth")][:1]
     boxes = [t for t in boxes if t not in truth]
@@ -121,13 +162,39 @@ def find_roles(
         tf=_names(moving),
         tf_static=_names(static),
         odometry=odometry,
+        imus=_names(imus),
         robot_detections_2d=_names(detections),
         robot_detections_3d=_names(boxes),
         robot_clouds=_names(obstacles),
         stages=_names(staged.values()),
         truth=truth[0].name if truth else "",
+        camera_infos=_names(_of(topics, "CameraInfo")),
+        no_lidar="" if lidars else _no_lidar(topics),
+        no_camera="" if images else _no_camera(topics),
         notes=notes,
     )
+
+
+def _no_lidar(topics: Sequence[Topic]) -> str:
+    said = f"no LiDAR: none of {len(topics)} topics is a sensor_msgs/PointCloud2"
+    if held := [f"{t.name} holds {why}" for t in topics if (why := _foreign(t, "LiDAR"))]:
+        return f"{said}; {'; '.join(held)}"
+    if taken := _names(_of(topics, "PointCloud2")):
+        return f"no LiDAR: {', '.join(taken)} is the result of a stage"
+    if len(topics) > MANY:
+        return f"{said}; 'bevviz info' shows them"
+    return f"{said}; there are {', '.join(f'{t.name} ({t.kind})' for t in topics) or 'none'}"
+
+
+def _no_camera(topics: Sequence[Topic]) -> str:
+    images = _of(topics, *_IMAGES)
+    if held := [f"{t.name} holds {why}" for t in topics if (why := _foreign(t, "camera"))]:
+        return f"no camera that can be read: {'; '.join(held)}"
+    if with_messages := _names(t for t in images if t.count != 0):
+        return f"no camera among the images: --set source.camera_topics=[{with_messages[0]}]"
+    if images:
+        return f"no camera: there are no messages on {', '.join(_names(images))}"
+    return "no camera: there is no topic of sensor_msgs/Image or CompressedImage"
 
 
 def _names(topics: Iterable[Topic]) -> tuple[str, ...]:
@@ -149,7 +216,9 @@ def _stated(name: str, topics: Sequence[Topic], key: str, *kinds: str) -> Topic:
         if topic.name == name:
             if topic in fitting:
                 return topic
-            raise UserError(f"{key}: {name} is a {topic.type}, but must be {' or '.join(kinds)}")
+            why = _foreign(topic)
+            helps = f"; it holds {why}" if why else ""
+            raise UserError(f"{key}: {name} is a {topic.type}, but must be {' or '.join(kinds)}{helps}")
     near = difflib.get_close_matches(name, _names(fitting), n=3, cutoff=0.4) or _names(fitting)
     there = f"the nearest are {', '.join(near)}" if near else f"there is no {' or '.join(kinds)} topic"
     raise UserError(f"{key}: there is no topic {name}; {there}")

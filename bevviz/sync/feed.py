@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from typing import Any, Protocol, TypeVar
 
 from bevviz.frame import Image
 from bevviz.ros.messages import (
+    StampedTransform,
+    decode_acceleration,
     decode_camera_info,
     decode_cloud,
     decode_compressed_image,
@@ -47,7 +50,12 @@ def make_handlers(sync: Synchronizer, roles: Roles, decode: Callable[[M], Any]) 
 
     def add_transforms(message: M, static: bool) -> None:
         for transform in decode_transforms(decode(message), message.topic):
-            sync.add_transform(transform, static=static)
+            sync.add_transform(clocked(message, transform), static=static)
+
+    def clocked(message: M, transform: StampedTransform) -> StampedTransform:
+        """With the stamp to go by."""
+        stamp = sync.clocks.stamp(message.topic, transform.stamp, message.received)
+        return transform if stamp == transform.stamp else replace(transform, stamp=stamp)
 
     def load_image(message: M, compressed: bool) -> Image:
         decode_pixels = decode_compressed_image if compressed else decode_image
@@ -60,7 +68,7 @@ def make_handlers(sync: Synchronizer, roles: Roles, decode: Callable[[M], Any]) 
 
     def add_info(message: M, rectified: bool) -> None:
         info = decode_camera_info(decode(message), rectified, message.topic)
-        sync.add_camera_info(message.topic, info)
+        sync.add_camera_info(message.topic, info, message.header()[0], message.received)
 
     followed = ""  # the frame that odometry places
 
@@ -70,7 +78,11 @@ def make_handlers(sync: Synchronizer, roles: Roles, decode: Callable[[M], Any]) 
             return
         transform = decode_odometry(decode(message), message.topic)
         followed = transform.child
-        sync.add_transform(transform, fallback=True)
+        sync.add_transform(clocked(message, transform), fallback=True)
+
+    def add_imu(message: M) -> None:
+        if sync.upright.needs_gravity:
+            sync.upright.add_acceleration(decode_acceleration(decode(message), message.topic))
 
     handlers: dict[str, Handler[M]] = {}
     for topic in roles.lidars:
@@ -85,6 +97,8 @@ def make_handlers(sync: Synchronizer, roles: Roles, decode: Callable[[M], Any]) 
         handlers[topic] = partial(add_transforms, static=True)
     if roles.odometry:
         handlers[roles.odometry] = add_odometry
+    for topic in roles.imus:
+        handlers[topic] = add_imu
     for topic in roles.robot_clouds:
         handlers[topic] = lambda m: sync.add_robot_cloud(decode_cloud(decode(m), m.topic, m.received))
     for topic in roles.robot_detections_2d:

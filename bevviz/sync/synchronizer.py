@@ -17,9 +17,12 @@ from bevviz import geometry
 from bevviz.config import Config
 from bevviz.errors import UserError
 from bevviz.frame import F32, F64, Camera, Cloud, Frame, Image, Intrinsics, LabelledBoxes2D, LabelledBoxes3D
+from bevviz.plugins import TOPIC
 from bevviz.ros.messages import StampedTransform
 from bevviz.ros.roles import CameraRole, Roles, entity_name
+from bevviz.sync.clocks import Clocks
 from bevviz.sync.tf import Lookup, Origin, TransformBuffer, TransformError
+from bevviz.sync.upright import Upright
 
 T = TypeVar("T")
 
@@ -27,6 +30,7 @@ SECOND = 1_000_000_000
 JUMP = SECOND  # a stamp that is this much older than its topic's newest means that the clock was reset
 LATENCY = 2 * SECOND  # the longest a cloud is expected to arrive after an image of the same stamp
 FIXED_FRAMES = {"map", "odom", "world", "earth", "global", "utm", "enu", "ned", "mocap", "vicon", "init"}
+FAR = 500.0  # metres that no LiDAR has half of its points beyond
 GLOBE_FRAMES = {"earth", "ecef", "utm"}  # coordinates too large for the float32 of a viewer
 TUTORIAL_K = np.array([[267.0, 0.0, 320.0], [0.0, 267.0, 180.0], [0.0, 0.0, 1.0]])
 
@@ -47,9 +51,19 @@ class SyncReport:
     idle: str = ""  # topic of the LiDAR that should drive, while only others deliver
     unstamped: Counter[str] = field(default_factory=Counter)  # topic -> messages with stamp zero
     without_image: Counter[str] = field(default_factory=Counter)  # camera -> frames
+    images: int = 0  # of all cameras, decoded
     undecodable: Counter[str] = field(default_factory=Counter)  # camera -> images
+    first_undecodable: dict[str, str] = field(default_factory=dict)  # camera -> why the first was
     problems: Counter[str] = field(default_factory=Counter)  # missing transforms and CameraInfo -> frames
     tf: TransformBuffer = field(default_factory=TransformBuffer)  # for what looked wrong in the transforms
+    upright: Mapping[str, str] = field(default_factory=dict)  # for what is doubtful about the vertical
+    clocks: Clocks = field(default_factory=lambda: Clocks({}, "stamp"))
+    clocked: tuple[str, ...] = ()  # topics whose clocks must be one
+    oddities: dict[str, str] = field(default_factory=dict)  # topic -> what its messages should not say
+
+    def doubts(self) -> tuple[str, ...]:
+        """One sentence for whatever may make every frame wrong: clocks, units, which way is up."""
+        return (*self.clocks.doubts(self.clocked), *self.oddities.values(), *self.upright.values())
 
     def warnings(self) -> tuple[str, ...]:
         """One sentence each."""
@@ -78,9 +92,26 @@ class SyncReport:
         for camera, n in self.without_image.items():
             found.append(f"{n} of {self.frames} frames have no image of camera '{camera}'")
         for camera, n in self.undecodable.items():
-            found.append(f"camera '{camera}': an image could not be decoded {_times(n)}")
+            first = self.first_undecodable[camera]
+            found.append(f"camera '{camera}': an image could not be decoded {_times(n)}, the first: {first}")
         found += [f"{text} ({n} of {self.frames} frames)" for text, n in self.problems.items()]
-        return (*found, *self.tf.problems)
+        return (*self.doubts(), *found, *self.tf.problems)
+
+
+def blindness(config: Config, roles: Roles, report: SyncReport | None) -> list[str]:
+    """Why the detector's model was shown no image at all, in one sentence; empty where it was shown one.
+
+    ``report``: of the frames so far; None: there were none yet.
+    """
+    model = config.detector.model
+    if not model or model.startswith(TOPIC):
+        return []
+    if roles.no_camera:
+        return [f"detector.model {model} sees nothing: {roles.no_camera}"]
+    if report is None or not report.frames or report.images:
+        return []
+    reasons = [*report.first_undecodable.values(), "no image at the time of any scan"]
+    return [f"detector.model {model} has seen nothing in {report.frames} frames: {reasons[0]}"]
 
 
 def _times(n: int) -> str:
@@ -157,8 +188,17 @@ class _Place:
     points_frame: str
     world_frame: str  # "" where there is none
     inertial_frame: str  # the smoothest fixed frame, to compensate motion with; "" where there is none
+    upright: F64 | None = None  # (4, 4) points from points_frame; None: it is upright
     world_from_points: F64 | None = None
     tf_age: float = float("nan")
+
+    def points_from(self, frame: Lookup) -> Lookup:
+        """Of what was looked up in ``points_frame``."""
+        return frame if self.upright is None else replace(frame, matrix=self.upright @ frame.matrix)
+
+    def from_points(self, matrix: F64) -> F64:
+        """The same the other way round."""
+        return matrix if self.upright is None else matrix @ geometry.inverse(self.upright)
 
 
 class Synchronizer:
@@ -173,6 +213,10 @@ class Synchronizer:
         self.report = SyncReport()
         self.absent: frozenset[str] = frozenset()  # topics that nobody publishes now: not waited for
         self.tf = self.report.tf
+        self.upright = Upright(self.tf, config.source.base_frame, config.sync.tf_tolerance)
+        self.report.upright = self.upright.warnings
+        self.clocks = self.report.clocks = Clocks(config.sync.offsets, config.sync.by)
+        self.report.clocked = (*roles.lidars, *(c.topic for c in roles.cameras), *roles.tf)
         self._roles = roles
         self._config = config
         self._tolerance = round(config.sync.tolerance * 1e9)
@@ -188,6 +232,9 @@ class Synchronizer:
         self._images: dict[str, _Track[_Undecoded]] = self._make_tracks(*(c.topic for c in roles.cameras))
         self._camera_frames: dict[str, str] = {}  # image topic -> optical frame
         self.intrinsics: dict[str, Intrinsics] = {}  # CameraInfo topic -> the newest
+        self._infos: dict[str, _Track[Intrinsics]] = {}  # by topic
+        self._info_counts: Counter[str] = Counter()
+        self._image_counts: Counter[str] = Counter()
         self._odometry_frames: set[str] = set()
         self._boxes: dict[str, _Track[LabelledBoxes3D]] = self._make_tracks(*roles.robot_detections_3d)
         self._detections: dict[str, _Track[LabelledBoxes2D]] = self._make_tracks(*roles.robot_detections_2d)
@@ -201,8 +248,11 @@ class Synchronizer:
 
     def take_over(self, former: Synchronizer) -> None:
         """Go on with the transforms, calibrations and counts of ``former``, when the roles change."""
+        clocked = self.report.clocked
         self.report, self.absent = former.report, former.absent
-        self.tf, self.intrinsics = former.tf, former.intrinsics
+        self.report.clocked = clocked
+        self.tf, self.upright, self.clocks = former.tf, former.upright, former.clocks
+        self.intrinsics, self._infos = former.intrinsics, former._infos
         self._odometry_frames = former._odometry_frames
 
     # --- what comes in -------------------------------------------------------------------------
@@ -213,6 +263,7 @@ class Synchronizer:
             return
         stamp = self._arrived(cloud.topic, cloud.stamp, cloud.received)
         cloud = replace(cloud, stamp=stamp, name=self._lidar_name(cloud))
+        self._check_units(cloud)
         self.report.clouds += 1
         if cloud.topic in self._partners:
             self._partners[cloud.topic].add(cloud.stamp, cloud)
@@ -238,11 +289,15 @@ class Synchronizer:
         if topic in self._images:
             stamp = self._arrived(topic, stamp, received)
             self._camera_frames[topic] = frame_id
+            self._image_counts[topic] += 1
             self._images[topic].add(stamp, _Undecoded(stamp, frame_id, load))
 
-    def add_camera_info(self, topic: str, intrinsics: Intrinsics) -> None:
-        """``topic`` is that of the CameraInfo; the newest one holds."""
+    def add_camera_info(self, topic: str, intrinsics: Intrinsics, stamp: int, received: int) -> None:
+        """``topic`` is that of the CameraInfo; for an image the one that is nearest in stamp holds."""
         self.intrinsics[topic] = intrinsics
+        self._info_counts[topic] += 1
+        track = self._infos.setdefault(topic, _Track(self._horizon))
+        track.add(self._arrived(topic, stamp, received), intrinsics)
 
     def add_transform(
         self, transform: StampedTransform, static: bool = False, fallback: bool = False
@@ -280,7 +335,17 @@ class Synchronizer:
         if stamp == 0:
             self.report.unstamped[topic] += 1
             return received
-        return stamp
+        return self.clocks.stamp(topic, stamp, received)
+
+    def _check_units(self, cloud: Cloud) -> None:
+        """In millimetres nothing is within the reach of any stage, and nothing would be said."""
+        if cloud.topic not in self.report.oddities and len(cloud.xyz):
+            middle = float(np.median(np.abs(cloud.xyz[::16]).max(axis=1)))
+            if middle > FAR:
+                self.report.oddities[cloud.topic] = (
+                    f"{cloud.topic}: half of its points are farther than {middle:,.0f} m, as coordinates in "
+                    f"millimetres are; a PointCloud2 is in metres (REP 103): correct its driver"
+                )
 
     def _watch_clock(self, stamp: int) -> None:
         newest = self._clouds[-1].stamp if self._clouds else self._last
@@ -366,8 +431,18 @@ class Synchronizer:
         infos = {camera.info_topic for camera in self._roles.cameras} - {""}
         if infos - self.absent - self.intrinsics.keys():
             return False
+        if not all(self._info_reaches(camera, stamp) for camera in self._roles.cameras):
+            return False
         lacking = not self.absent.isdisjoint((*self._roles.tf, self._roles.odometry))
         return lacking or self._transforms_reach(self._clouds[0])
+
+    def _info_reaches(self, role: CameraRole, stamp: int) -> bool:
+        """Whether the calibration of the image of this time has come, where each image has one of its own."""
+        track, image = self._infos.get(role.info_topic), self._images[role.topic].nearest(stamp)
+        if track is None or track.newest is None or image is None or role.info_topic in self.absent:
+            return True
+        one_each = self._info_counts[role.info_topic] * 2 > self._image_counts[role.topic] > 1
+        return not one_each or track.newest >= image[0]
 
     def _may_be_of_next(self, track: _Track[Any], stamp: int) -> bool:
         nearest = track.nearest(stamp)
@@ -401,7 +476,8 @@ class Synchronizer:
         problems: list[str] = []
         place = self._place(cloud, problems)
         clouds, poses = self._gather(cloud, place, problems)
-        points, fields = _merge(clouds, poses, cloud.frame_id.lstrip("/") == place.points_frame)
+        in_place = place.upright is None and cloud.frame_id.lstrip("/") == place.points_frame
+        points, fields = _merge(clouds, poses, in_place)
         cameras = tuple(self._camera(role, place) for role in self._roles.cameras)
         first, last = self._window(cloud.stamp)
         boxes = [track.take(cloud.stamp, first, last) for track in self._boxes.values()]
@@ -415,6 +491,7 @@ class Synchronizer:
             lidar="lidars" if self._partners else cloud.name,
             points=points,
             points_frame=place.points_frame,
+            upright=place.upright,
             fields=fields,
             world_frame=place.world_frame or place.points_frame,
             world_from_points=place.world_from_points,
@@ -449,6 +526,9 @@ class Synchronizer:
         place = _Place(cloud.stamp, points_frame, world, inertial)
         if problems is None:
             return place
+        turn = self.upright.turn(cloud, world)
+        if points_frame == cloud.frame_id.lstrip("/"):
+            place = replace(place, upright=turn)
         if self._partners and points_frame != base:
             self._complain(
                 problems,
@@ -466,7 +546,7 @@ class Synchronizer:
         except TransformError as error:
             self._complain(problems, f"{error}: the cloud has no place in the world")
             return place
-        return replace(place, world_from_points=found.matrix, tf_age=found.age)
+        return replace(place, world_from_points=place.from_points(found.matrix), tf_age=found.age)
 
     def _fixed(self, points_frame: str) -> tuple[str, str]:
         """The world's frame and the smoothest fixed frame above ``points_frame``; "" where there is none."""
@@ -476,21 +556,22 @@ class Synchronizer:
         given = self._config.source.fixed_frame.lstrip("/")
         return given or (near[-1] if near else ""), near[0] if near else given
 
-    def pose(self, points_frame: str, stamp: int) -> F64 | None:
-        """(4, 4) where a frame is in the smoothest fixed frame, as far as the transforms reach so far."""
-        inertial = self._fixed(points_frame)[1]
+    def pose(self, frame: Frame, stamp: int) -> F64 | None:
+        """(4, 4) smoothest fixed frame from points, as far as the transforms reach so far."""
+        inertial = self._fixed(frame.points_frame)[1]
         if not inertial:
             return None
         try:
-            return self.tf.lookup(inertial, points_frame, stamp, self._config.sync.tf_tolerance).matrix
+            found = self.tf.lookup(inertial, frame.points_frame, stamp, self._config.sync.tf_tolerance)
         except TransformError:
             return None
+        return found.matrix if frame.upright is None else found.matrix @ geometry.inverse(frame.upright)
 
     def _gather(
         self, cloud: Cloud, place: _Place, problems: list[str]
     ) -> tuple[tuple[Cloud, ...], tuple[F64, ...]]:
         """The clouds of every LiDAR nearest to ``cloud``, each with points_from_cloud."""
-        clouds, poses = [cloud], [np.eye(4)]
+        clouds, poses = [cloud], [np.eye(4) if place.upright is None else place.upright]
         if place.points_frame != cloud.frame_id.lstrip("/"):
             try:
                 poses[0] = self._moved(place, cloud.stamp, cloud.frame_id)[0].matrix
@@ -516,12 +597,13 @@ class Synchronizer:
         tolerance = self._config.sync.tf_tolerance
         if self._compensates(place):
             try:
-                return self.tf.lookup_moving(
+                found = self.tf.lookup_moving(
                     place.points_frame, place.stamp, frame, stamp, place.inertial_frame, tolerance
-                ), True
+                )
+                return place.points_from(found), True
             except TransformError:
                 pass  # without motion is the next best
-        return self.tf.lookup(place.points_frame, frame, place.stamp, tolerance), False
+        return place.points_from(self.tf.lookup(place.points_frame, frame, place.stamp, tolerance)), False
 
     def _compensates(self, place: _Place) -> bool:
         return self._config.sync.motion_compensation and bool(place.inertial_frame)
@@ -529,31 +611,61 @@ class Synchronizer:
     def _camera(self, role: CameraRole, place: _Place) -> Camera:
         problems: list[str] = []
         image, stamp = self._image(role, place.stamp, problems)
-        intrinsics = self._camera_intrinsics(role, image, problems)
+        intrinsics = self._camera_intrinsics(role, image, stamp, problems)
         camera = Camera(role.name, image, intrinsics, None, None, problems=tuple(problems))
         if image is not None:
             camera = replace(camera, sync_error=(stamp - place.stamp) * 1e-9)
+            off = self.clocks.apart(role.topic, self._roles.lidars[0])
+            if off:
+                self._complain(
+                    problems,
+                    f"the clocks of camera '{role.name}' and the LiDAR are {abs(off):.2f} s apart: "
+                    f"its image is of another time",
+                )
+                camera = replace(camera, problems=tuple(problems))
         frame = self._camera_frames.get(role.topic)
         if frame is None:
             return camera
         try:
             found, compensated = self._moved(place, stamp, frame)
         except TransformError as error:
-            lacking = not self.tf.knows(place.points_frame, frame)
+            lacking = frame and place.points_frame and not self.tf.knows(place.points_frame, frame)
             self._complain(problems, f"{error}; source.extrinsics can state it" if lacking else str(error))
             return replace(camera, problems=tuple(problems))
         if image is not None and not compensated and self._compensates(place):
             self._complain(problems, f"no motion compensation: '{place.inertial_frame}' is out of reach")
         world = np.eye(4) if place.world_from_points is None else place.world_from_points
+        first_from_camera = self._second_of_stereo(role, intrinsics, frame)
+        points_from_camera = found.matrix @ first_from_camera
+        mounting = self._mounting(place, frame) if compensated else None
         return replace(
             camera,
-            camera_from_points=geometry.inverse(found.matrix),
-            world_from_camera=world @ found.matrix,
+            camera_from_points=geometry.inverse(points_from_camera),
+            world_from_camera=world @ points_from_camera,
             tf_age=found.age,
             motion_compensated=compensated,
-            mounting=self._mounting(place, frame) if compensated else None,
+            mounting=None if mounting is None else geometry.inverse(first_from_camera) @ mounting,
             problems=tuple(problems),
         )
+
+    def _second_of_stereo(self, role: CameraRole, intrinsics: Intrinsics | None, frame: str) -> F64:
+        """(4, 4) frame of the image from its camera: the second of a stereo pair is in the first one's.
+
+        See P in sensor_msgs/CameraInfo. Many drivers give the second camera a frame of its own, and P all the
+        same; then it is where TF says.
+        """
+        pose = np.eye(4)
+        if intrinsics is None or intrinsics.baseline == (0.0, 0.0):
+            return pose
+        if any(there == frame for topic, there in self._camera_frames.items() if topic != role.topic):
+            pose[:2, 3] = intrinsics.baseline
+        else:
+            self.report.oddities.setdefault(
+                role.info_topic,
+                f"{role.info_topic}: its P tells of a camera {math.hypot(*intrinsics.baseline):.3f} m beside "
+                f"another one's frame; '{frame}' is taken as its own, as no other camera is in it",
+            )
+        return pose
 
     def _mounting(self, place: _Place, frame: str) -> F64 | None:
         """frame from points at the cloud's stamp, None where TF does not say."""
@@ -561,7 +673,7 @@ class Synchronizer:
             found = self.tf.lookup(place.points_frame, frame, place.stamp, self._config.sync.tf_tolerance)
         except TransformError:
             return None
-        return geometry.inverse(found.matrix)
+        return geometry.inverse(place.points_from(found).matrix)
 
     def _image(self, role: CameraRole, stamp: int, problems: list[str]) -> tuple[Image | None, int]:
         """The decoded image nearest to ``stamp``, and its stamp; without one, ``stamp``."""
@@ -571,9 +683,12 @@ class Synchronizer:
             problems.append(f"no image of camera '{role.name}' {self._nearest(nearest, stamp)}")
             return None, stamp
         try:
-            return replace(nearest[1].load(), stamp=nearest[0]), nearest[0]
+            image = replace(nearest[1].load(), stamp=nearest[0])
+            self.report.images += 1
+            return image, nearest[0]
         except UserError as error:
             self.report.undecodable[role.name] += 1
+            self.report.first_undecodable.setdefault(role.name, str(error))
             problems.append(str(error))
             return None, stamp
 
@@ -585,9 +700,11 @@ class Synchronizer:
         return f"{within}: nearest is {abs(away):.2f} s {'later' if away > 0 else 'earlier'}"
 
     def _camera_intrinsics(
-        self, role: CameraRole, image: Image | None, problems: list[str]
+        self, role: CameraRole, image: Image | None, stamp: int, problems: list[str]
     ) -> Intrinsics | None:
-        intrinsics = self.intrinsics.get(role.info_topic or "")
+        infos = self._infos.get(role.info_topic)
+        nearest = None if infos is None else infos.nearest(stamp)
+        intrinsics = None if nearest is None else nearest[1]
         if intrinsics is not None and image is not None:
             return self._fitted(role, intrinsics, image, problems)
         if intrinsics is not None:
@@ -597,10 +714,11 @@ class Synchronizer:
             self._complain(problems, f"{missing} yet: using fx = fy = 267, cx 320, cy 180 of the reference")
             height, width = image.bgr.shape[:2] if image is not None else (360, 640)
             return Intrinsics(width, height, TUTORIAL_K, assumed=True)
+        others = [topic for topic in self._roles.camera_infos if topic != role.info_topic]
+        setting = f"source.camera_info_topics='{{{role.topic}: {others[0]}}}'" if others else ""
+        helps = f"name the topic with --set {setting}" if setting else "record one"
         self._complain(
-            problems,
-            f"{missing} for camera '{role.name}': nothing can be projected into it; "
-            f"name the topic with source.camera_info_topics",
+            problems, f"{missing} for camera '{role.name}': nothing can be projected into it; {helps}"
         )
         return None
 
@@ -646,7 +764,7 @@ class Synchronizer:
         except TransformError as error:
             self._complain(problems, f"{error}: the boxes of {boxes.topic} have no place in the world")
             return boxes
-        return replace(boxes, world_from_boxes=found.matrix)
+        return replace(boxes, world_from_boxes=(found if known else place.points_from(found)).matrix)
 
     def _robot_detections(
         self, cameras: tuple[Camera, ...], stamp: int, first: int, last: int

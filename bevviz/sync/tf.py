@@ -220,14 +220,16 @@ class TransformBuffer:
     def _chains(self, target: str, source: str) -> tuple[Sequence[str], Sequence[str]]:
         """The frames below the common ancestor: from source upwards, from target upwards."""
         up, down = self.ancestors(source), self.ancestors(target)
+        if not up[0] or not down[0]:
+            raise TransformError(
+                f"no transform from '{up[0]}' to '{down[0]}': a message states no frame_id; its driver must"
+            )
         if up[-1] == down[-1]:
             common = next(frame for frame in up if frame in down)
             return up[: up.index(common)], down[: down.index(common)]
         known = self.frames()
         lacking = [frame for frame in (up[0], down[0]) if frame not in known]
-        if not up[0] or not down[0]:
-            reason = "a message states no frame_id"
-        elif lacking:
+        if lacking:
             reason = f"frame '{lacking[0]}' is unknown"
         else:
             reason = f"they are in two unconnected trees (roots '{up[-1]}' and '{down[-1]}')"
@@ -242,9 +244,10 @@ class TransformBuffer:
             pose, age, past = edge.at(stamp)
             if abs(past) > tolerance * 1e9:
                 ends = "ends {:.2f} s before" if past > 0 else "begins {:.2f} s after"
+                once = " (it was sent once, as if it were static: sync.tf_tolerance holds it for longer)"
                 raise TransformError(
-                    f"no transform from '{_name(source)}' to '{_name(target)}': "
-                    f"'{edge.parent}' -> '{frame}' {ends.format(age)} the asked stamp"
+                    f"no transform from '{_name(source)}' to '{_name(target)}': '{edge.parent}' -> '{frame}' "
+                    f"{ends.format(age)} the asked stamp{once if len(edge.stamps) == 1 else ''}"
                 )
             matrix, worst = pose @ matrix, max(worst, age)
         return matrix, worst

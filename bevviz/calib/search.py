@@ -1,0 +1,212 @@
+"""Where the score has its peaks: a grid over turns and sideways shifts, and a climb from its best places.
+
+An error of a degree is many times as wide as a peak, so that a climb from what is stated ends on any peak
+that lies between. The grid sees all of them; what is told of the highest depends on how the others compare.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+
+from bevviz import geometry
+from bevviz.calib.axes import AXES, PRIOR, error_pose
+from bevviz.calib.score import SHARE, Scorer, Sums, densities
+from bevviz.calib.shots import REACH, Shot
+from bevviz.frame import F32, F64, I64, Bool
+from bevviz.stages.kernel import kernel
+
+STEP = np.radians(0.32)  # of the grid about x and y
+ROLL = np.radians(0.7)  # about z, where an error moves the middle of the image little
+ROLLS = 4  # steps to both sides
+SHIFTS = (-0.15, 0.0, 0.15)  # metres along x and y
+SAMPLE = 5000  # edges, about, that the grid is made with; of the others on a border there is little news
+MOST = 6 * SAMPLE  # that anything is made with
+STARTS = 16  # peaks of the grid that are climbed
+FINALISTS = 6  # peaks that are climbed to the end
+LADDER = 2.5  # pixels of blur between that of the grid and the finest
+FINEST = 1.5
+APART = np.radians(0.3)  # turns by which two peaks differ
+WORTH = 1000.0  # independent edges, at most, that the edges count for beside the prior
+ROUNDS = 30  # steps at one blur, at most
+SETTLED = 0.01  # pixels
+FARTHEST = 2.0  # blurs that a step may move the edges
+HALVINGS = 4
+
+
+@dataclass(frozen=True, slots=True)
+class Peak:
+    offsets: F64  # (7,)
+    sums: Sums
+    metric: F64  # (7, 7) inverse of the curvature, about
+    pixels: F64  # (7, 7) mean square of how far offsets move the edges
+
+    @property
+    def height(self) -> float:
+        return float(self.sums.score.sum())
+
+
+def search(
+    shots: Sequence[Shot], free: Bool, progress: Callable[[float, str], None]
+) -> tuple[Scorer, list[Peak]]:
+    """The peaks, highest first, over the (7,) ``free`` axes, and the scorer that they were found with.
+
+    Without data there may be none.
+    """
+    progress(0.0, "grid")
+    blur, starts = _grid(thin(shots, SAMPLE))
+    starts.insert(0, np.zeros(len(AXES)))
+    progress(0.1, "coarse")
+    peaks = _climbs(Scorer(thin(shots, 2 * SAMPLE), blur), starts, free)
+    progress(0.2, "fine")
+    shots = thin(shots, MOST)
+    peaks = _climbs(Scorer(thin(shots, MOST // 2), LADDER), [p.offsets for p in peaks[:FINALISTS]], free)
+    progress(0.4, "finest")
+    scorer = Scorer(shots, FINEST)
+    return scorer, _climbs(scorer, [peak.offsets for peak in peaks], free)
+
+
+def _climbs(scorer: Scorer, starts: list[F64], free: Bool) -> list[Peak]:
+    """The distinct peaks that the starts lead to, highest first. One that is nowhere near is none."""
+    found = [climb(scorer, start, free) for start in starts]
+    near = [peak for peak in found if (np.abs(peak.offsets) < 2 * PRIOR).all()]
+    kept: list[Peak] = []
+    for peak in sorted(near, key=lambda peak: -peak.height):
+        if all(np.abs(peak.offsets - other.offsets)[:3].max() > APART for other in kept):
+            kept.append(peak)
+    return kept
+
+
+def climb(
+    scorer: Scorer,
+    start: F64,
+    free: Bool,
+    near: Peak | None = None,
+    weight: F64 | float = 1.0,
+    settled: float = SETTLED,
+) -> Peak:
+    """Up the score and the prior, by BFGS (Nocedal and Wright 2006, chapter 6) over the ``free`` axes.
+
+    Args:
+        scorer: of the score to be climbed.
+        start: (7,) offsets.
+        free: (7,) whether an axis moves.
+        near: a peak of about the same shape; without one, the first step is one of expectation-maximisation.
+        weight: (S, PARTS) or one number, how much each part of each shot counts.
+        settled: pixels: a step that moves the edges less is the last.
+    """
+    worth = min(1.0, WORTH / max(scorer.edges, 1))
+    hold = np.where(free, 1 / PRIOR**2, 0.0)
+    offsets = start
+    sums = scorer(offsets, information=near is None)
+    if near is None:
+        pixels = sums.information * scorer.variance / max(SHARE * scorer.edges, 1.0)
+        metric = np.asarray(np.linalg.inv(worth * sums.information + np.diag(1 / PRIOR**2)), np.float64)
+    else:
+        pixels, metric = near.pixels, near.metric
+    metric = metric * np.outer(free, free)
+    slope = worth * _total(sums.gradient, weight) - hold * offsets
+    for _ in range(ROUNDS):
+        step = metric @ slope
+        step *= min(1.0, FARTHEST * scorer.sigma / max(float(np.sqrt(step @ pixels @ step)), 1e-12))
+        for _ in range(HALVINGS):
+            tried = scorer(offsets + step)
+            gain = worth * float(((tried.score - sums.score) * weight).sum())
+            gain -= 0.5 * float((hold * ((offsets + step) ** 2 - offsets**2)).sum())
+            if gain > 0:
+                break
+            step = step / 4
+        else:
+            break
+        offsets, sums, before = offsets + step, tried, slope
+        slope = worth * _total(sums.gradient, weight) - hold * offsets
+        bend = (before - slope) * free
+        if (along := float(step @ bend)) > 0:
+            project = np.eye(len(step)) - np.outer(step, bend) / along
+            metric = project @ metric @ project.T + np.outer(step, step) / along
+        if step @ pixels @ step < settled**2:
+            break
+    return Peak(offsets, sums, metric, pixels)
+
+
+def _total(gradient: F64, weight: F64 | float) -> F64:
+    return np.asarray((gradient * np.asarray(weight)[..., None]).sum((0, 1)), np.float64)
+
+
+def thin(shots: Sequence[Shot], edges: int) -> list[Shot]:
+    """The same with about so many edges, or fewer."""
+    every = -(-sum(len(shot.xyz) for shot in shots) // edges)
+    return [
+        replace(s, xyz=s.xyz[::every], change=s.change[::every], cell=s.cell[::every]) if every > 1 else s
+        for s in shots
+    ]
+
+
+# --- the grid ----------------------------------------------------------------------------------
+
+
+def _grid(shots: Sequence[Shot]) -> tuple[float, list[F64]]:
+    """The blur of the grid in pixels, and the (7,) offsets of its highest peaks."""
+    focal = float(np.mean([shot.K[0, 0] for shot in shots]))
+    blur = max(focal * STEP, FINEST)
+    shrink = max(1, round(blur))
+    sides = round(REACH / STEP)
+    axis = np.arange(-sides, sides + 1) * STEP
+    roll = np.arange(-ROLLS, ROLLS + 1) * ROLL
+    turns = np.stack(np.meshgrid(axis, axis, roll, indexing="ij"), -1)
+    rotations = np.stack([error_pose(np.append(turn, np.zeros(4)))[:3, :3] for turn in turns.reshape(-1, 3)])
+    parts = [_shrunk(shot, blur, shrink) for shot in shots]
+    found: list[tuple[float, F64]] = []
+    for along_x, along_y in itertools.product(SHIFTS, SHIFTS):
+        shift = np.array([along_x, along_y, 0.0])
+        sums = np.zeros(len(rotations))
+        for xyz, row, logs, K in parts:
+            _sample(xyz, row, logs, (K @ rotations).astype(np.float32), (K @ shift).astype(np.float32), sums)
+        score = sums.reshape(turns.shape[:3])
+        for place in np.argwhere(_highest(score) & (score > 0)):
+            at = tuple(place)
+            found.append((float(score[at]), np.concatenate([turns[at], shift, [0.0]])))
+    found.sort(key=lambda peak: -peak[0])
+    return blur, [offsets for _, offsets in found[:STARTS]]
+
+
+def _shrunk(shot: Shot, blur: float, shrink: int) -> tuple[F32, I64, F32, F64]:
+    """Its edges as the stated camera sees them, the row of each, the score of every pixel, and K of those."""
+    density, row, _ = densities(shot, blur)
+    height, width = (-(-size // shrink) for size in density.shape[1:])
+    small = [cv2.resize(d, (width, height), interpolation=cv2.INTER_AREA) for d in density]
+    sx, sy = width / density.shape[2], height / density.shape[1]
+    scale = np.array([[sx, 0, (sx - 1) / 2], [0, sy, (sy - 1) / 2], [0, 0, 1]])
+    xyz = geometry.apply(shot.camera_from_points(0.0), shot.xyz)
+    return xyz, row, np.log(1 - SHARE + SHARE * np.stack(small)), scale @ shot.K
+
+
+@kernel
+def _sample(xyz: F32, which: I64, logs: F32, turns: F32, shift: F32, score: F64) -> None:
+    """Add the score of one shot at each of the (T, 3, 3) pixels_from_camera."""
+    height, width = logs.shape[1:]
+    half = np.float32(0.5)
+    for j in range(len(turns)):
+        m, total = turns[j], 0.0
+        for i in range(len(xyz)):
+            x, y, z = xyz[i, 0], xyz[i, 1], xyz[i, 2]
+            depth = np.float32(1) / (m[2, 0] * x + m[2, 1] * y + m[2, 2] * z + shift[2])
+            u = (m[0, 0] * x + m[0, 1] * y + m[0, 2] * z + shift[0]) * depth + half
+            v = (m[1, 0] * x + m[1, 1] * y + m[1, 2] * z + shift[1]) * depth + half
+            if 0 <= u < width and 0 <= v < height:
+                total += logs[which[i], int(v), int(u)]
+        score[j] += total
+
+
+def _highest(score: F64) -> Bool:
+    """Which places of a grid no neighbour overtops."""
+    around = np.pad(score, 1, constant_values=-np.inf)
+    highest = np.ones(score.shape, np.bool_)
+    for steps in itertools.product(range(3), repeat=score.ndim):
+        inner = [slice(step, step + size) for step, size in zip(steps, score.shape, strict=True)]
+        highest &= score >= around[tuple(inner)]
+    return highest

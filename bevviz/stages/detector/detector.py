@@ -1,0 +1,280 @@
+"""A detector: image in, boxes out, with what the thresholds made of every candidate."""
+
+from __future__ import annotations
+
+import difflib
+from copy import copy
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnxruntime as ort
+
+from bevviz.config import DetectorConfig
+from bevviz.errors import UserError, first_line
+from bevviz.frame import I32, U8, Detections, DetectionState
+from bevviz.stages.detector.image import Placement
+from bevviz.stages.detector.layouts import Facts, find_head
+from bevviz.stages.detector.names import literal, metadata_names, read_names
+from bevviz.stages.detector.suppression import nms
+
+DEMO_MODEL = Path(__file__).parents[2] / "data" / "demo_detector.onnx"
+DEFAULT_SIZE = 640  # of models that leave their input size open, as most families are trained
+MAX_CANDIDATES = 30_000  # that enter the NMS, best first, as Ultralytics bounds what a nonsense model costs
+
+# From the fastest down. DirectML and others that are not named here are used when asked for.
+PREFERRED_PROVIDERS = ("Tensorrt", "CUDA", "MIGraphX", "ROCM", "OpenVINO", "CoreML", "CPU")
+TYPES = {"tensor(float)": np.float32, "tensor(float16)": np.float16, "tensor(uint8)": np.uint8}
+
+
+@dataclass(frozen=True, slots=True)
+class Inference:
+    """What a network said of an image, before any threshold."""
+
+    outputs: tuple[Any, ...]
+    where: Placement
+
+
+class Detector:
+    """An ONNX detector: BGR image in, 2D boxes in that image's pixels out.
+
+    What the model wants (input size, type, colour order, letterbox) and how its output is to be read
+    (``layout``) comes from the model itself: its inputs, its metadata, and what one run on an image that
+    shows nothing returns.
+
+    Args:
+        config: model file, thresholds, provider and threads.
+
+    Attributes:
+        names: class names by class id, empty where nobody tells them.
+        layout: how the output is read.
+        provider: onnxruntime execution provider in use, such as ``CPU``.
+        input_size: height, width of the network's input; the largest one where the model leaves it open.
+        description: all of this in one line.
+
+    Raises:
+        UserError: no such file, no ONNX file, no detector that is known, wrong class names, or no such
+            provider.
+    """
+
+    def __init__(self, config: DetectorConfig) -> None:
+        self._config = config
+        path = DEMO_MODEL if config.model == "demo" else Path(config.model)
+        self._where = f"detector.model {path}"
+        self._session, self.provider = _open(path, config)
+        metadata = self._session.get_modelmeta().custom_metadata_map
+        image, *others = self._session.get_inputs()
+        self._input, self._rank = image.name, len(image.shape)
+        self._check_inputs(image, others)
+        self._dtype = TYPES[image.type]
+        self._sized = others[0].name if others else None  # an input for the size of the image
+
+        self._stride = int(literal(metadata.get("stride"), int) or 32)
+        size = literal(metadata.get("imgsz"), list) or []
+        size = size if len(size) == 2 else [DEFAULT_SIZE, DEFAULT_SIZE]
+        height, width = image.shape[-2:]
+        self._is_open = not isinstance(height, int), not isinstance(width, int)
+        self.input_size: tuple[int, int] = (
+            int(size[0]) if self._is_open[0] else height,
+            int(size[1]) if self._is_open[1] else width,
+        )
+        names = read_names(config.names) if config.names else metadata_names(metadata)
+        facts = Facts(
+            metadata=metadata,
+            inputs=tuple(i.name for i in (image, *others)),
+            dtype=self._dtype,
+            rank=self._rank,
+            size=self.input_size,
+            names=names,
+            outputs=self._probe(),
+        )
+        try:
+            self._head = find_head(facts)
+        except ValueError as error:
+            raise UserError(f"{self._where}: {error}") from None
+        self.names, self.layout = self._head.names, self._head.layout
+        self._wanted = self._wanted_classes()
+        self.description = (
+            f"{path.name}: {self.layout}, {self.input_size[1]} x {self.input_size[0]}, "
+            f"{len(self.names) or 'unnamed'} classes, {self.provider}"
+        )
+
+    def __call__(self, bgr: U8) -> Detections:
+        """Detect in an (H, W, 3) uint8 BGR image.
+
+        Returns:
+            Candidates with a score of ``detector.explain_threshold`` or more, best first: every one that
+            is KEPT, and the best of the others up to ``detector.max_candidates`` in all. Those
+            BELOW_THRESHOLD are exactly what a lower ``detector.conf_threshold`` would keep: a weak
+            candidate that overlaps a stronger one of its class is SUPPRESSED.
+
+        Raises:
+            UserError: the model answers with what it should not, such as scores above 1.
+        """
+        return self.interpret(self.infer(bgr)) if bgr.size else Detections.empty()
+
+    def restated(self, config: DetectorConfig) -> Detector:
+        """The same network with other thresholds or classes; it is not loaded again.
+
+        Raises:
+            UserError: wrong class names.
+        """
+        other = copy(self)
+        other._config = config
+        other._wanted = other._wanted_classes()
+        return other
+
+    def prepare(self, bgr: U8) -> tuple[Any, Placement]:
+        """The network's input for an image that is not empty, and where the image lies in it."""
+        feed, size = self.layout.feed, (bgr.shape[0], bgr.shape[1])
+        where = feed.place(size, self.input_size, self._is_open, self._stride)
+        return feed.blob(bgr, where, self._dtype), where
+
+    def infer(self, bgr: U8) -> Inference:
+        """Run the network alone, on an image that is not empty."""
+        blob, where = self.prepare(bgr)
+        return Inference(tuple(self._run(list(self._head.outputs), blob)), where)
+
+    def interpret(self, found: Inference) -> Detections:
+        """What the thresholds make of the network's output; ``__call__`` says what.
+
+        Raises:
+            UserError: as ``__call__``.
+        """
+        config, where = self._config, found.where
+        try:
+            xyxy, score, class_id = self._head.candidates(
+                found.outputs, where.input_size, config.explain_threshold
+            )
+        except ValueError as error:
+            raise UserError(f"{self._where}: {error}") from None
+        sound = np.isfinite(xyxy).all(axis=1)
+        if self._wanted is not None:
+            sound &= np.isin(class_id, self._wanted)
+        order = np.flatnonzero(sound)
+        order = order[np.argsort(-score[order], kind="stable")[:MAX_CANDIDATES]]
+        xyxy, score, class_id = xyxy[order], score[order], class_id[order]
+
+        offset = self.layout.class_offset
+        if offset is None:
+            suppressor, overlap = np.full(len(order), -1, np.int32), np.zeros(len(order), np.float32)
+        else:
+            suppressor, overlap = nms(xyxy, class_id, config.iou_threshold, offset)
+        # Clipped after the NMS, as in the families' own post-processing: what lies outside suppresses, too.
+        xyxy = where.to_image(xyxy)
+        np.clip(xyxy, 0, np.array(where.image_size[::-1] * 2, np.float32), out=xyxy)
+        seen = (xyxy[:, 2] > xyxy[:, 0]) & (xyxy[:, 3] > xyxy[:, 1])
+        seen &= (suppressor < 0) | seen[suppressor]
+        state = np.where(score >= config.conf_threshold, DetectionState.KEPT, DetectionState.BELOW_THRESHOLD)
+        state[suppressor >= 0] = DetectionState.SUPPRESSED
+
+        row = _best(np.flatnonzero(seen), state, config.max_candidates)
+        suppressor = np.where(suppressor[row] >= 0, np.searchsorted(row, suppressor[row]), -1)
+        return Detections(
+            xyxy=xyxy[row] - np.float32(0.5),  # networks count from the corner of the first pixel
+            score=score[row],
+            class_id=class_id[row],
+            names=tuple(self._name(c) for c in class_id[row].tolist()),
+            state=state[row].astype(np.int32),
+            suppressed_by=suppressor.astype(np.int32),
+            overlap=overlap[row],
+        )
+
+    def _check_inputs(self, image: Any, others: list[Any]) -> None:
+        shape = image.shape
+        found = ", ".join(f"{i.name} {i.shape}" for i in (image, *others))
+        batch = shape[0] if self._rank == 4 and isinstance(shape[0], int) else 1
+        sizes = [i.type == "tensor(int64)" and len(i.shape) == 2 and i.shape[1] == 2 for i in others]
+        if self._rank not in (3, 4) or shape[-3] != 3 or len(sizes) > 1 or not all(sizes):
+            raise UserError(
+                f"{self._where}: no detector of one colour image [1, 3, height, width]; its inputs: {found}"
+            )
+        if batch != 1:
+            raise UserError(
+                f"{self._where}: takes {batch} images at a time ({found}); export it with a batch of 1"
+            )
+        if image.type not in TYPES:
+            raise UserError(f"{self._where}: its input is {image.type}; supported: {', '.join(TYPES)}")
+
+    def _run(self, outputs: list[str] | None, blob: Any) -> list[Any]:
+        given = {self._input: blob if self._rank == 4 else blob[0]}
+        if self._sized is not None:
+            given[self._sized] = np.array([blob.shape[:1:-1]], np.int64)  # boxes come in pixels of the input
+        found: list[Any] = self._session.run(outputs, given)
+        return found
+
+    def _probe(self) -> dict[str, Any]:
+        """What the network returns for grey patches: it can tell its layout, and shows nothing.
+
+        This also pays the first run's allocations before the first real image.
+        """
+        height, width = self.input_size
+        patch = np.random.default_rng(0).uniform(0.3, 0.6, (1, 3, -(-height // 32), -(-width // 32)))
+        grey = patch.repeat(32, axis=2).repeat(32, axis=3)[:, :, :height, :width]
+        whole = self._dtype is np.uint8
+        blob = (grey * 255 if whole else grey).astype(self._dtype)
+        try:
+            found = self._run(None, blob)
+        except Exception as error:  # onnxruntime's errors have no common base class
+            raise UserError(
+                f"{self._where}: fails on an input of {list(blob.shape)}: {first_line(error)}"
+            ) from None
+        return {o.name: output for o, output in zip(self._session.get_outputs(), found, strict=True)}
+
+    def _wanted_classes(self) -> I32 | None:
+        for name in self._config.classes:
+            if name not in self.names:
+                near = difflib.get_close_matches(name, self.names, 1)
+                hint = f"; did you mean '{near[0]}'?" if near else ""
+                raise UserError(f"detector.classes: the model has no class '{name}'{hint}")
+        if not self._config.classes:
+            return None
+        return np.array([self.names.index(name) for name in self._config.classes], np.int32)
+
+    def _name(self, class_id: int) -> str:
+        return self.names[class_id] if 0 <= class_id < len(self.names) else f"class_{class_id}"
+
+
+def _best(row: Any, state: Any, limit: int) -> Any:
+    """Every row that is KEPT, and the best of the others up to that many in all; rows have the best first."""
+    kept = state[row] == DetectionState.KEPT
+    room = max(limit - np.count_nonzero(kept), 0)
+    others = np.flatnonzero(~kept)
+    # Survivors of NMS first: a duplicate is the least worth a word, and never outlives its suppressor.
+    others = others[np.argsort(state[row[others]], kind="stable")]
+    return np.delete(row, others[room:])
+
+
+def _open(path: Path, config: DetectorConfig) -> tuple[Any, str]:
+    """The session of an ONNX file and the short name of the execution provider it runs on."""
+    if not path.is_file():
+        raise UserError(f"detector.model {path}: no such file")
+    if path.suffix == ".pt":
+        raise UserError(
+            f"detector.model {path}: PyTorch weights; export them: yolo export model={path} format=onnx"
+        )
+    available = {name.removesuffix("ExecutionProvider"): name for name in ort.get_available_providers()}
+    chosen = [name for name in PREFERRED_PROVIDERS if name in available]
+    if config.provider.lower() != "auto":
+        asked = config.provider.lower().removesuffix("executionprovider")
+        chosen = [name for name in available if name.lower() == asked]
+        if not chosen:
+            raise UserError(
+                f"detector.provider {config.provider}: not here; available: {', '.join(available)}"
+            )
+    options = ort.SessionOptions()
+    options.intra_op_num_threads = config.threads
+    options.log_severity_level = 3
+    # Threads that spin between runs cost as much processor time as the network, and the LiDAR stages need it.
+    options.add_session_config_entry("session.intra_op.allow_spinning", "0")
+    try:
+        session = ort.InferenceSession(path, options, [available[name] for name in chosen])
+    except Exception as error:  # onnxruntime's errors have no common base class
+        raise UserError(f"detector.model {path}: onnxruntime cannot load it: {first_line(error)}") from None
+    used = session.get_providers()[0].removesuffix("ExecutionProvider")
+    if config.provider.lower() != "auto" and used != chosen[0]:
+        raise UserError(
+            f"detector.provider {config.provider}: could not be started, onnxruntime fell back to {used}"
+        )
+    return session, used

@@ -1,0 +1,110 @@
+"""How an image becomes the input of a network, and how boxes come back."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+from typing import Any
+
+import cv2
+import numpy as np
+from PIL import Image
+
+from bevviz.frame import F32, U8
+
+GREY = 114  # of the letterbox's border, the same in all these families
+
+
+class Fit(Enum):
+    """How an image is laid into an input of another shape."""
+
+    CENTRE = "letterbox, the image in its middle"
+    CORNER = "letterbox, the image at the top left"
+    STRETCH = "stretched"
+    NATIVE = "as it is, where the input's size is open, else as CENTRE"
+
+
+class Resampling(Enum):
+    """What the family was trained and tested with."""
+
+    FOUR = "of the four nearest pixels, rounded to bytes"  # OpenCV
+    ALL = "of all pixels that a new one covers, rounded to bytes"  # Pillow, and torchvision of its images
+    UNROUNDED = "of the four nearest pixels, not rounded"  # torchvision of tensors
+
+
+@dataclass(frozen=True, slots=True)
+class Placement:
+    """Where an image lies in a network's input."""
+
+    input_size: tuple[int, int]  # height, width
+    inner: tuple[int, int]  # height, width of the image in there ...
+    corner: tuple[int, int]  # ... and the row and column of its first pixel
+    image_size: tuple[int, int]  # height, width of the image itself
+
+    def to_image(self, xyxy: F32) -> F32:
+        """Boxes of the input in pixels of the image, counted from the corner of its first one."""
+        scale = np.array([inner / image for inner, image in zip(self.inner, self.image_size, strict=True)])
+        moved: F32 = xyxy - np.array(self.corner[::-1] * 2, np.float32)
+        moved /= np.tile(scale[::-1], 2).astype(np.float32)
+        return moved
+
+
+@dataclass(frozen=True, slots=True)
+class Feed:
+    """The input that a family of networks was trained with, in float32."""
+
+    fit: Fit
+    rgb: bool = True
+    divisor: float = 255.0  # 1: values of 0..255
+    resampling: Resampling = Resampling.FOUR
+    margin: int = 0  # pixels that the letterbox keeps free in height and width
+    mean: tuple[float, float, float] = (0.0, 0.0, 0.0)  # taken off each channel after the division ...
+    std: tuple[float, float, float] = (1.0, 1.0, 1.0)  # ... and then divided by
+
+    def place(
+        self, image_size: tuple[int, int], size: tuple[int, int], is_open: tuple[bool, bool], stride: int
+    ) -> Placement:
+        """Where an image goes.
+
+        Args:
+            image_size: height, width.
+            size: of the network's input, height and width, the largest where an axis is open.
+            is_open: which of the two may be smaller ...
+            stride: ... by multiples of this.
+        """
+        if self.fit is Fit.STRETCH:
+            return Placement(size, size, (0, 0), image_size)
+        if self.fit is Fit.NATIVE and all(is_open):
+            return Placement(image_size, image_size, (0, 0), image_size)
+        given, whole = np.array(image_size), np.array(size)
+        exact = given * float(np.min((whole - self.margin) / given))
+        # Megvii cuts the resized image's fraction of a pixel off, the others round it.
+        inner = np.maximum(exact.astype(int) if self.fit is Fit.CORNER else np.rint(exact).astype(int), 1)
+        outer = np.where(is_open, -(-inner // stride) * stride, whole)
+        corner = 0 * outer if self.fit is Fit.CORNER else (outer - inner) // 2
+        (h, w), (height, width), (top, left) = outer.tolist(), inner.tolist(), corner.tolist()
+        return Placement((h, w), (height, width), (top, left), image_size)
+
+    def blob(self, bgr: U8, where: Placement, dtype: type) -> Any:
+        """The (1, 3, height, width) input."""
+        (height, width), (top, left) = where.inner, where.corner
+        inner: Any = bgr
+        if self.resampling is Resampling.UNROUNDED:
+            inner = bgr.astype(np.float32) / np.float32(self.divisor)
+        if bgr.shape[:2] != where.inner:
+            if self.resampling is Resampling.ALL:
+                small = Image.fromarray(bgr).resize((width, height), Image.Resampling.BILINEAR)
+                inner = np.asarray(small)
+            else:
+                inner = cv2.resize(inner, (width, height))
+        canvas = inner
+        if where.inner != where.input_size:
+            canvas = np.full((*where.input_size, 3), GREY, inner.dtype)
+            canvas[top : top + height, left : left + width] = inner
+        blob = cv2.dnn.blobFromImage(canvas, swapRB=self.rgb)
+        if canvas.dtype == np.uint8 and self.divisor != 1:
+            blob /= np.float32(self.divisor)  # a product with the reciprocal has other last digits
+        if any(self.mean):
+            blob -= np.array(self.mean, np.float32)[:, None, None]
+            blob /= np.array(self.std, np.float32)[:, None, None]
+        return blob.astype(dtype, copy=False)

@@ -1,0 +1,386 @@
+"""A table of the layouts that outputs of models have, and what tells one from the other.
+
+A file says little of this itself. What its exporter wrote into the metadata counts first, then names and
+shapes of its outputs, then their values for an image that shows nothing. What these do not settle is refused:
+boxes read from the wrong columns look like a bad detector.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from bevviz.stages.detector import outputs as read
+from bevviz.stages.detector.image import Feed, Fit, Resampling
+from bevviz.stages.detector.names import COCO, COCO_CATEGORIES, default_names
+from bevviz.stages.detector.outputs import Boxes, Candidates, Listed, Scored
+
+CLASS_OFFSET = 7680.0  # pixels by which Ultralytics moves the boxes of each class in its NMS
+
+
+class Found(NamedTuple):
+    """The outputs that a layout is to be read from."""
+
+    outputs: tuple[str, ...]
+    classes: int | None = None  # None: the outputs do not tell how many
+
+
+@dataclass(frozen=True, slots=True)
+class Facts:
+    """What can be known of a model without its documentation."""
+
+    metadata: Mapping[str, str]
+    inputs: tuple[str, ...]  # names
+    dtype: type  # of the image's input ...
+    rank: int  # ... its number of axes ...
+    size: tuple[int, int]  # ... and its height and width
+    names: tuple[str, ...] | None  # of the classes
+    outputs: Mapping[str, Any]  # name -> array, for an image that shows nothing
+
+    @property
+    def ultralytics(self) -> bool:
+        return self.metadata.get("author") == "Ultralytics"
+
+    @property
+    def task(self) -> str:
+        return self.metadata.get("task", "")
+
+    @property
+    def tables(self) -> dict[str, Any]:
+        """name -> (rows, columns) of the outputs that have these for one image."""
+        return {name: o[0] for name, o in self.outputs.items() if o.ndim == 3 and len(o) == 1}
+
+    @property
+    def masks(self) -> int:
+        """Columns that weigh prototypes of masks, which are an output of their own of a quarter's size."""
+        quarter = tuple(n // 4 for n in self.size)
+        return next((o.shape[1] for o in self.outputs.values() if o.ndim == 4 and o.shape[2:] == quarter), 0)
+
+    def named(self, *names: str) -> tuple[str, ...] | None:
+        """The outputs that are called so, or end so after the name of a graph."""
+        found = [[o for o in self.outputs if o == name or o.endswith(f"_{name}")] for name in names]
+        return tuple(o[0] for o in found) if all(len(o) == 1 for o in found) else None
+
+    def classes(self, columns: int) -> int | str:
+        """How many of the columns that follow the boxes are classes, or why that does not fit."""
+        if self.names is None:
+            return columns - self.masks if columns > self.masks else "it has no scores of classes"
+        more = columns - len(self.names)
+        if more in (0, self.masks) or (more > 0 and self.task in ("segment", "pose")):
+            return len(self.names)
+        return f"it scores {columns} classes, but has {len(self.names)} class names"
+
+
+Finder = Callable[[Facts], Found | str | None]
+"""Which outputs to read; None: it is another layout; a sentence: it is this one, but cannot be read."""
+
+
+@dataclass(frozen=True, slots=True)
+class Layout:
+    """How one family of networks states what it found, and the image that it wants."""
+
+    name: str
+    find: Finder
+    split: Callable[..., Scored | Listed]
+    boxes: Boxes
+    feed: Feed
+    class_offset: float | None = None  # in the NMS; None: the network itself leaves one box an object
+    batch: bool = True  # the outputs' first axis is that of the images
+    background: bool = False  # class 0 is none
+
+    def __str__(self) -> str:
+        return self.name
+
+
+@dataclass(frozen=True, slots=True)
+class Head:
+    """How one model is to be read."""
+
+    layout: Layout
+    outputs: tuple[str, ...]
+    classes: int | None
+    names: tuple[str, ...]  # of the classes, empty where nobody tells
+
+    def split(self, outputs: Sequence[Any]) -> Scored | Listed:
+        batch = self.layout.batch
+        return self.layout.split(self.classes, *(output[0] if batch else output for output in outputs))
+
+    def candidates(self, outputs: Sequence[Any], size: tuple[int, int], least: float) -> Candidates:
+        """What a run found with a score of ``least`` or more.
+
+        Args:
+            outputs: those that are named, of one image.
+            size: height and width of the input.
+            least: score.
+
+        Raises:
+            ValueError: the numbers cannot be what they are taken for.
+        """
+        split = self.split(outputs)
+        found = read.candidates(split, self.layout.boxes, size, least)
+        class_id = split.class_id[split.score >= least] if isinstance(split, Listed) else found.class_id
+        wrong = read.wrong_list(found.score, class_id, self.names)
+        if wrong:
+            raise ValueError(f"read as {self.layout}, {wrong}")
+        return found
+
+    def doubt(self, facts: Facts) -> str:
+        """Why the outputs for an image that shows nothing cannot be what they are taken for, else empty."""
+        found = self.split([facts.outputs[name] for name in self.outputs])
+        if isinstance(found, Listed):
+            real = found.score > 0
+            found = Listed(*(column[real] for column in found))
+            wrong = read.wrong_list(found.score, found.class_id, self.names)
+        else:
+            counted = facts.ultralytics or facts.names is not None or self.classes == len(COCO)
+            wrong = read.wrong_scores(found, counted)
+        return wrong or read.wrong_boxes(found.boxes, self.layout.boxes, facts.ultralytics)
+
+
+# --- what tells them apart ---------------------------------------------------------------------
+
+
+def _in_a_table(find: Callable[[Facts, str, Any], Found | str | None]) -> Finder:
+    """``find`` in the first table that it knows; not where the boxes have a table of their own."""
+
+    def find_in_any(facts: Facts) -> Found | str | None:
+        if any(table.shape[1] == 4 for table in facts.tables.values()):
+            return None
+        reason = None
+        for name, table in facts.tables.items():
+            answer = find(facts, name, table)
+            if isinstance(answer, Found):
+                return answer
+            reason = reason or answer
+        return reason
+
+    return find_in_any
+
+
+def _found(outputs: tuple[str, ...], classes: int | str) -> Found | str:
+    return classes if isinstance(classes, str) else Found(outputs, classes)
+
+
+def _whole(values: Any) -> bool:
+    return bool((values == np.rint(values)).all())
+
+
+def _is_rtdetr(facts: Facts) -> bool:
+    """Of Ultralytics; older files do not name the head."""
+    head = facts.metadata.get("head")
+    described = "rtdetr" in facts.metadata.get("description", "").lower()
+    return facts.ultralytics and (head == "RTDETRDecoder" or (head is None and described))
+
+
+@_in_a_table
+def _rtdetr_list(facts: Facts, name: str, table: Any) -> Found | str | None:
+    listed = table.shape[1] == 6 and _whole(table[:, 5])
+    return Found((name,)) if listed and _is_rtdetr(facts) else None
+
+
+@_in_a_table
+def _rtdetr_scores(facts: Facts, name: str, table: Any) -> Found | str | None:
+    return _found((name,), facts.classes(table.shape[1] - 4)) if _is_rtdetr(facts) else None
+
+
+def _rtdetr_repository(facts: Facts) -> Found | str | None:
+    names = facts.named("boxes", "scores", "labels")
+    return Found(names) if names and "orig_target_sizes" in facts.inputs else None
+
+
+def _rfdetr(facts: Facts) -> Found | str | None:
+    names = facts.named("dets", "labels")
+    if names is None or any(name not in facts.tables for name in names):
+        return None
+    columns = facts.tables[names[1]].shape[1]
+    # COCO's weights have a column for each category id, all others one for the background, as the last.
+    classes = columns if columns == len(COCO_CATEGORIES) else columns - 1
+    if facts.names is not None and len(facts.names) != classes:
+        return f"it scores {classes} classes, but has {len(facts.names)} class names"
+    return Found(names, classes)
+
+
+def _supergradients(*names: str) -> Finder:
+    def find(facts: Facts) -> Found | str | None:
+        found = facts.named(*names)
+        if found and facts.dtype is not np.uint8:
+            return "nothing tells how YOLO-NAS wants its pixels: export it with preprocessing=True"
+        return Found(found) if found else None
+
+    return find
+
+
+def _torchvision(facts: Facts) -> Found | str | None:
+    if facts.rank != 3:
+        return None
+    boxes = [name for name, o in facts.outputs.items() if o.ndim == 2 and o.shape[1] == 4]
+    score = [name for name, o in facts.outputs.items() if o.ndim == 1 and o.dtype.kind == "f"]
+    label = [name for name, o in facts.outputs.items() if o.ndim == 1 and o.dtype.kind == "i"]
+    return Found((boxes[0], score[0], label[0])) if boxes and score and label else None
+
+
+def _two_tables(facts: Facts) -> Found | str | None:
+    shapes = {name: table.shape for name, table in facts.tables.items()}
+    boxes = next((name for name, shape in shapes.items() if shape[1] == 4), None)
+    if boxes is None:
+        return None
+    scores = [name for name in shapes if name != boxes and shapes[name][0] == shapes[boxes][0]]
+    if not scores:
+        return None
+    if not facts.ultralytics:
+        return "nothing tells how it wants its image; export YOLO-NAS with its pre- and postprocessing"
+    return _found((boxes, scores[0]), facts.classes(shapes[scores[0]][1]))
+
+
+def _yolov7_list(facts: Facts) -> Found | str | None:
+    lists = [name for name, o in facts.outputs.items() if o.ndim == 2 and o.shape[1] == 7]
+    return Found((lists[0],)) if lists else None
+
+
+@_in_a_table
+def _yolov8(facts: Facts, name: str, table: Any) -> Found | str | None:
+    rows, columns = table.shape
+    # These boxes need no grid to be decoded: the right count of classes will do.
+    known = columns in read.cells(facts.size) or (facts.names is not None and rows - 4 == len(facts.names))
+    return _found((name,), facts.classes(rows - 4)) if known and columns > rows > 4 else None
+
+
+def _with_objectness(facts: Facts, name: str, table: Any, anchors: int) -> Found | str | None:
+    """A row for each of a cell's anchors: box, objectness, classes."""
+    rows, columns = table.shape
+    # Rows could also be those of a list, 300 as a rule, so that only whole pyramids count.
+    pyramids = [count for count, strides in read.cells(facts.size).items() if {8, 16, 32} <= set(strides)]
+    if rows % anchors or rows // anchors not in pyramids or columns < 6:
+        return None
+    if facts.ultralytics or (columns == 6 and table[:, 5].any() and _whole(table[:, 5])):
+        return None  # none of Ultralytics' heads has an objectness, and whole numbers are a list's classes
+    return _found((name,), facts.classes(columns - 5))
+
+
+@_in_a_table
+def _yolov5(facts: Facts, name: str, table: Any) -> Found | str | None:
+    return _with_objectness(facts, name, table, anchors=3)
+
+
+@_in_a_table
+def _yolox(facts: Facts, name: str, table: Any) -> Found | str | None:
+    near = np.median(np.abs(table[:, :2])) <= 8  # in strides; pixels would lie all over the input
+    return _with_objectness(facts, name, table, anchors=1) if near else None
+
+
+@_in_a_table
+def _yolov6(facts: Facts, name: str, table: Any) -> Found | str | None:
+    constant = table.shape[1] > 4 and (table[:, 4] == 1).all()
+    return _with_objectness(facts, name, table, anchors=1) if constant else None
+
+
+@_in_a_table
+def _yolox_decoded(facts: Facts, name: str, table: Any) -> Found | str | None:
+    found = _with_objectness(facts, name, table, anchors=1)
+    if isinstance(found, Found) and facts.names is None and found.classes != len(COCO):
+        return "its fifth column may be an objectness or a class: set detector.names"
+    return found
+
+
+@_in_a_table
+def _end_to_end(facts: Facts, name: str, table: Any) -> Found | str | None:
+    said = facts.metadata.get("end2end") == "True" or "'nms': True" in facts.metadata.get("args", "")
+    more = table.shape[1] - 6
+    known = more in (0, facts.masks) or (more > 0 and facts.ultralytics and said)
+    return Found((name,)) if known else None
+
+
+# --- the table ---------------------------------------------------------------------------------
+
+LETTERBOX = Feed(Fit.CENTRE)
+SQUARE = Feed(Fit.STRETCH)
+MEGVII = Feed(Fit.CORNER, rgb=False, divisor=1)
+DETR = Feed(Fit.STRETCH, resampling=Resampling.ALL)
+ROBOFLOW = Feed(
+    Fit.STRETCH, resampling=Resampling.UNROUNDED, mean=(0.485, 0.456, 0.406), std=(0.229, 0.224, 0.225)
+)
+DECI = Feed(Fit.CENTRE, divisor=1, margin=4)  # pixels are divided in the network
+NATIVE = Feed(Fit.NATIVE)
+
+NAS_LISTS = _supergradients("pred_boxes", "pred_scores", "pred_classes")
+NAS_LIST = _supergradients("flat_predictions")
+
+# The first that is found counts: what has names or metadata of its own comes before what only has a shape.
+LAYOUTS = (
+    Layout("RT-DETR", _rtdetr_list, read.one_list(0, 4, 5), Boxes.FRACTIONS, SQUARE),
+    Layout("RT-DETR", _rtdetr_scores, read.rows, Boxes.FRACTIONS, SQUARE),
+    Layout("RT-DETR or D-FINE", _rtdetr_repository, read.three_lists, Boxes.CORNERS, DETR),
+    Layout("RF-DETR", _rfdetr, read.queries, Boxes.FRACTIONS, ROBOFLOW),
+    Layout("YOLO-NAS", NAS_LISTS, read.three_lists, Boxes.CORNERS, DECI),
+    Layout("YOLO-NAS", NAS_LIST, read.one_list(1, 5, 6), Boxes.CORNERS, DECI, batch=False),
+    Layout("YOLO-NAS", _two_tables, read.two_tables, Boxes.CORNERS, LETTERBOX, CLASS_OFFSET),
+    Layout(
+        "torchvision", _torchvision, read.three_lists, Boxes.CORNERS, NATIVE, batch=False, background=True
+    ),
+    Layout("YOLOv7 with NMS", _yolov7_list, read.one_list(1, 6, 5), Boxes.CORNERS, LETTERBOX, batch=False),
+    Layout("YOLOv8", _yolov8, read.columns, Boxes.CENTRE, LETTERBOX, CLASS_OFFSET),
+    Layout("YOLOv5", _yolov5, read.rows_with_objectness, Boxes.CENTRE, LETTERBOX, CLASS_OFFSET),
+    Layout("YOLOv6", _yolov6, read.rows_with_objectness, Boxes.CENTRE, LETTERBOX, CLASS_OFFSET),
+    Layout("YOLOX", _yolox, read.rows_with_objectness, Boxes.CELLS, MEGVII, 0.0),
+    Layout("YOLOX decoded", _yolox_decoded, read.rows_with_objectness, Boxes.CENTRE, MEGVII, 0.0),
+    Layout("end-to-end", _end_to_end, read.one_list(0, 4, 5), Boxes.CORNERS, LETTERBOX),
+)
+SUPPORTED = ", ".join(dict.fromkeys(map(str, LAYOUTS)))
+
+
+def find_head(facts: Facts) -> Head:
+    """How a model is to be read.
+
+    Raises:
+        ValueError: it cannot be; why, and what to do.
+    """
+    stranger = _stranger(facts)
+    if stranger:
+        raise ValueError(stranger)
+    reason = "no detector that is known here"
+    for layout in LAYOUTS:
+        found = layout.find(facts)
+        if isinstance(found, Found):
+            head = Head(layout, found.outputs, found.classes, _names(layout, found, facts))
+            doubt = _bytes(layout, facts) or head.doubt(facts)
+            if not doubt:
+                return head
+            found = f"read as {layout}, {doubt}"
+        if found is not None:
+            reason = found
+            break
+    shapes = ", ".join(f"{name} {list(np.shape(output))}" for name, output in facts.outputs.items())
+    raise ValueError(f"{reason}; its outputs: {shapes}; supported: {SUPPORTED}")
+
+
+def _names(layout: Layout, found: Found, facts: Facts) -> tuple[str, ...]:
+    names = facts.names or default_names(found.classes)
+    if names and layout.background and names[0].strip("_").lower() != "background":
+        return ("background", *names)
+    return names
+
+
+def _bytes(layout: Layout, facts: Facts) -> str:
+    """Only of networks that divide their pixels themselves is it known which colour they want first."""
+    if facts.dtype is np.uint8 and layout.feed is not DECI:
+        return "it takes pixels as bytes, and nothing tells the order of colours: export it for floats"
+    return ""
+
+
+def _stranger(facts: Facts) -> str:
+    """What is known not to be readable, and what to do, else empty."""
+    names, maps = set(facts.outputs), [o for o in facts.outputs.values() if o.ndim in (4, 5)]
+    if facts.ultralytics and facts.task not in ("", "detect", "segment", "pose"):
+        return f"a model for the task '{facts.task}': export one for detect, segment or pose"
+    if {"logits", "pred_boxes"} <= names:
+        return "a DETR of Hugging Face, whose file does not tell how it wants its image: export the original"
+    if {"num_dets", "det_boxes"} <= names:
+        return "a YOLO with NMS, whose file does not tell the order of colours: export without --end2end"
+    if {"dets", "labels"} <= names and facts.outputs["dets"].shape[-1] == 5:
+        return "a model of MMDeploy, whose file does not tell how it wants its image"
+    if len(maps) > 1 and len(maps) == len(names):
+        return "feature maps, not boxes: export with the grid (YOLOv7: --grid)"
+    return ""

@@ -1,0 +1,193 @@
+"""What the numbers in a model's outputs mean, and whether they can mean that."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from enum import Enum
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from bevviz.frame import F32, I32
+
+SLACK = 0.01  # by which half precision and quantisation may take a score above 1 ...
+NEGATIVE = -1e-3  # ... and below 0
+PIXELS = 2.0  # boxes that all lie within this are not in pixels
+EVERYWHERE = 0.2  # the median score that no class has over all places of an image that shows nothing
+
+
+class Boxes(Enum):
+    """How four numbers state a box."""
+
+    CENTRE = "centre and size in pixels of the input"
+    CORNERS = "corners in pixels of the input"
+    FRACTIONS = "centre and size as fractions of the input"
+    CELLS = "centre relative to the grid cell, logarithm of the size, both in strides"
+
+
+class Scored(NamedTuple):
+    """Boxes with a score of each class."""
+
+    boxes: Any  # (N, 4)
+    scores: Any  # (N, classes)
+    objectness: Any = None  # (N,) that the scores are to be multiplied with
+
+
+class Listed(NamedTuple):
+    """Boxes with one class. Rows that fill the list up have a score of 0 or less."""
+
+    boxes: Any  # (N, 4)
+    score: Any  # (N,)
+    class_id: Any  # (N,)
+
+
+class Candidates(NamedTuple):
+    """What a network found, in pixels of its input, beyond its border too."""
+
+    xyxy: F32  # (N, 4)
+    score: F32  # (N,)
+    class_id: I32  # (N,)
+
+
+# --- which columns -----------------------------------------------------------------------------
+# Each takes the count of classes and outputs of one image.
+
+
+def columns(classes: int | None, table: Any) -> Scored:
+    return Scored(table[:4].T, table[4:].T[:, :classes])
+
+
+def rows(classes: int | None, table: Any) -> Scored:
+    return Scored(table[:, :4], table[:, 4:][:, :classes])
+
+
+def rows_with_objectness(classes: int | None, table: Any) -> Scored:
+    return Scored(table[:, :4], table[:, 5:][:, :classes], table[:, 4])
+
+
+def two_tables(classes: int | None, boxes: Any, scores: Any) -> Scored:
+    return Scored(boxes, scores[:, :classes])
+
+
+def three_lists(_: int | None, boxes: Any, score: Any, class_id: Any) -> Listed:
+    return Listed(boxes, score, class_id)
+
+
+def one_list(box: int, score: int, class_id: int) -> Callable[[int | None, Any], Listed]:
+    """With these in that column, the box from there on."""
+    return lambda _, table: Listed(table[:, box : box + 4], table[:, score], table[:, class_id])
+
+
+def queries(classes: int | None, boxes: Any, logits: Any) -> Listed:
+    """The best pairs of query and class, as many as there are queries (RF-DETR's ``PostProcess``)."""
+    score = 1 / (1 + np.exp(-logits[:, :classes].astype(np.float32)))
+    best = np.argsort(-score, axis=None, kind="stable")[: len(boxes)]
+    query, class_id = np.divmod(best, score.shape[1])
+    return Listed(boxes[query], score[query, class_id], class_id)
+
+
+# --- reading them ------------------------------------------------------------------------------
+
+
+def cells(size: tuple[int, int]) -> dict[int, tuple[int, ...]]:
+    """Count of grid cells -> strides, for every run of neighbouring strides that divide the input."""
+    height, width = size
+    whole = [s for s in (4, 8, 16, 32, 64) if height % s == 0 and width % s == 0]
+    runs = [tuple(whole[i:j]) for i in range(len(whole)) for j in range(i + 1, len(whole) + 1)]
+    return {sum((height // s) * (width // s) for s in run): run for run in runs}
+
+
+def candidates(found: Scored | Listed, boxes: Boxes, size: tuple[int, int], least: float) -> Candidates:
+    """Everything with a score of ``least`` or more, in an input of this height and width."""
+    if isinstance(found, Listed):
+        row = np.flatnonzero(found.score >= least)
+        score, class_id = found.score[row], found.class_id[row]
+    else:
+        row, score, class_id = _best_classes(found, least)
+    xyxy = _corners(boxes, found.boxes[row], row, len(found.boxes), size)
+    return Candidates(xyxy, score.astype(np.float32), class_id.astype(np.int32))
+
+
+def _best_classes(found: Scored, least: float) -> tuple[Any, Any, Any]:
+    """Rows whose best class reaches that score, with the score and the class."""
+    if found.objectness is None:
+        row = np.flatnonzero(found.scores.max(axis=1) >= least)
+        scores = found.scores[row]
+    else:  # no product with a class's score exceeds it
+        row = np.flatnonzero(found.objectness >= least)
+        scores = found.scores[row] * found.objectness[row, None]
+    class_id = scores.argmax(axis=1)
+    score = np.take_along_axis(scores, class_id[:, None], axis=1)[:, 0]
+    strong = score >= least
+    return row[strong], score[strong], class_id[strong]
+
+
+def _corners(kind: Boxes, boxes: Any, row: Any, count: int, size: tuple[int, int]) -> F32:
+    """Corners in pixels. Half precision is added up as such: so do the exporters."""
+    xyxy: F32
+    if kind is Boxes.CORNERS:
+        xyxy = boxes.astype(np.float32)
+        return xyxy
+    center, extent = boxes[:, :2], boxes[:, 2:]
+    if kind is Boxes.CELLS:
+        cell, stride = _grid(size, cells(size)[count])
+        center, extent = (center + cell[row]) * stride[row], np.exp(extent) * stride[row]
+    half = extent / 2
+    xyxy = np.hstack([center - half, center + half]).astype(np.float32)
+    if kind is Boxes.FRACTIONS:
+        xyxy *= np.array(size[::-1] * 2, np.float32)
+    return xyxy
+
+
+def _grid(size: tuple[int, int], strides: tuple[int, ...]) -> tuple[F32, F32]:
+    """(N, 2) column and row, and (N, 1) stride, of each cell in the order of YOLOX's output."""
+    cell, stride = [], []
+    for s in strides:
+        at = np.indices((size[0] // s, size[1] // s), np.float32)[::-1].reshape(2, -1).T
+        cell.append(at)
+        stride.append(np.full((len(at), 1), s, np.float32))
+    return np.concatenate(cell), np.concatenate(stride)
+
+
+# --- whether they can be right -----------------------------------------------------------------
+
+
+def wrong_list(score: Any, class_id: Any, names: tuple[str, ...]) -> str:
+    """Why these cannot be scores and classes, empty where they can."""
+    if score.size and score.max() > 1 + SLACK:
+        return f"it has scores up to {score.max():.3g}"
+    odd = class_id[(class_id != np.rint(class_id)) | (class_id < 0)]
+    if odd.size:
+        return f"it has classes such as {odd[0]:.3g}"
+    if names and class_id.size and class_id.max() >= len(names):
+        return f"it has class {class_id.max():.0f}, but {len(names)} class names"
+    return ""
+
+
+def wrong_scores(found: Scored, counted: bool) -> str:
+    """Why these cannot be scores for an image that shows nothing, empty where they can.
+
+    ``counted``: something tells that there are so many classes.
+    """
+    tables = [found.scores] if found.objectness is None else [found.scores, found.objectness]
+    low, high = min(t.min() for t in tables), max(t.max() for t in tables)
+    if low < NEGATIVE or high > 1 + SLACK:
+        return f"it has scores from {low:.3g} to {high:.3g}"
+    if found.objectness is None and not counted and np.median(found.scores[:, -1]) > EVERYWHERE:
+        return (
+            "its last class is everywhere, like angles of oriented boxes; where it is one, set detector.names"
+        )
+    return ""
+
+
+def wrong_boxes(boxes: Any, kind: Boxes, trusted: bool) -> str:
+    """Why these cannot be boxes, empty where they can."""
+    largest = np.abs(boxes).max() if boxes.size else 0.0
+    if kind in (Boxes.CENTRE, Boxes.CORNERS) and 0 < largest <= PIXELS:
+        return f"its boxes are not in pixels, but numbers up to {largest:.3g}"
+    if kind is Boxes.FRACTIONS and largest > 10:
+        return f"its boxes are not fractions of the image, but numbers up to {largest:.3g}"
+    inverted = boxes.size and (boxes[:, 2:] < boxes[:, :2]).any(axis=1).mean() > 0.1
+    if kind is Boxes.CORNERS and inverted and not trusted:
+        return "its boxes are not corners: the second lies to the left of the first, or above"
+    return ""

@@ -1,0 +1,79 @@
+"""The clocks that stamp messages, held against the one that received them.
+
+A camera with a clock of its own is fused with scans of another time, and nothing in its stamps tells.
+The time from a stamp to the receipt of its message does: of one robot's sensors it is the same but for delay.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict, deque
+from collections.abc import Iterable, Iterator, Mapping
+from statistics import median
+
+APART = 0.6  # seconds between the lags of two topics, from which on no delay is a likely reason
+ENOUGH, LAST = 3, 50  # messages of a topic that a lag is told from, at least and at most
+TAI = 37.0  # seconds that TAI is ahead of UTC since 2017
+EPOCH = (
+    10 * 365 * 86_400.0
+)  # seconds: no clock is off by ten years, but one may count from when it was started
+
+
+class Clocks:
+    """Corrects stamps as configured, and remembers how far they are from the time of receipt.
+
+    Args:
+        offsets: seconds to be added to the stamps, by topic.
+        by: ``stamp``, or ``received``: go by the time of receipt instead.
+    """
+
+    def __init__(self, offsets: Mapping[str, float], by: str) -> None:
+        self._offsets = {topic: round(seconds * 1e9) for topic, seconds in offsets.items()}
+        self._received = by == "received"
+        self._lags: dict[str, deque[int]] = defaultdict(lambda: deque(maxlen=LAST))
+
+    def stamp(self, topic: str, stamp: int, received: int) -> int:
+        """The stamp to go by, nanoseconds."""
+        stamp = (received if self._received else stamp) + self._offsets.get(topic, 0)
+        self._lags[topic].append(received - stamp)
+        return stamp
+
+    def lag(self, topic: str) -> float | None:
+        """Seconds from a stamp to its receipt, the median of the last ones; None: not known yet."""
+        lags = self._lags.get(topic, ())
+        return median(lags) * 1e-9 if len(lags) >= ENOUGH else None
+
+    def apart(self, topic: str, other: str) -> float:
+        """Seconds that the clock of ``topic`` is behind that of ``other``; 0 where it may be a delay."""
+        lag, others = self.lag(topic), self.lag(other)
+        difference = 0.0 if lag is None or others is None else lag - others
+        return difference if abs(difference) > APART else 0.0
+
+    def doubts(self, topics: Iterable[str]) -> Iterator[str]:
+        """A sentence for each topic whose clock is off.
+
+        Args:
+            topics: whose messages belong together.
+        """
+        lags = {topic: lag for topic in topics if (lag := self.lag(topic)) is not None}
+        right = min(lags, key=lambda topic: abs(lags[topic]), default="")
+        for topic in lags:
+            off = self.apart(topic, right)
+            if off:
+                yield f"{topic}: {_clock(off, right)}; {_remedy(topic, off)}"
+
+
+def _clock(off: float, right: str) -> str:
+    if off > EPOCH:
+        return "its stamps count from when its clock was started, not from 1970"
+    if abs(off + TAI) < APART:
+        return f"its clock is {TAI:.0f} s ahead of that of {right}, as TAI is of UTC"
+    if off > 0:
+        return f"its clock is {off:.2f} s behind that of {right}, or its messages take as long"
+    return f"its clock is {-off:.2f} s ahead of that of {right}"
+
+
+def _remedy(topic: str, off: float) -> str:
+    by_receipt = "--set sync.by=received goes by the time of receipt"
+    if abs(off) > EPOCH:
+        return f"{by_receipt}; or let its driver stamp with the system's time"
+    return f"--set sync.offsets='{{{topic}: {off:.2f}}}' sets it right, {by_receipt}"
