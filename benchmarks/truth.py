@@ -299,6 +299,8 @@ class Rule:
             return Reason.TOO_FAR
         if pairs.iou[rows[0]] < config.min_iou:
             return Reason.LOW_OVERLAP
+        if self.fusion.detection_decision[d] == Decision.MISFIT:
+            return Reason.MISFIT
         return Reason.OTHER_CLUSTER if self.fusion.detection_decision[d] == Decision.MATCHED else Reason.TAKEN
 
 

@@ -325,6 +325,21 @@ def test_fused_boxes_say_why(record: Callable[..., Recording]) -> None:
     assert "matched" in reason
 
 
+def test_what_was_seen_is_beside_the_whole_box(record: Callable[..., Recording]) -> None:
+    plain = make()
+    assert plain.objects is not None
+    seen = plain.objects.boxes
+    whole = dataclasses.replace(seen, size=seen.size + f32(1.0, 0.5, 0.0))
+    sides = np.array([[False, True, True, False]])
+    objects = dataclasses.replace(plain.objects, boxes=whole, measured=seen, seen=sides)
+    found = record([make(objects=objects)])
+    np.testing.assert_allclose(found.at["/world/fused"]["Boxes3D:half_sizes"][0], whole.size / 2, rtol=1e-5)
+    measured = found.at["/world/fused/measured"]
+    np.testing.assert_allclose(measured["Boxes3D:half_sizes"][0], seen.size / 2, rtol=1e-5)
+    assert found.at["/world/fused"]["seen"][0] == ["back, left"]
+    assert "/world/fused/measured" not in record([plain]).at, "nothing was completed"
+
+
 def test_frustums_end_at_the_matched_depth(record: Callable[..., Recording]) -> None:
     found = record([make()])
     strips = found.at["/world/frustums"]["LineStrips3D:strips"][0]

@@ -98,11 +98,17 @@ def test_a_flat_car_taken_for_ground() -> None:
     assert of_truth(again, row).verdict.reported
 
 
+@cache
+def merged_people(preset: str) -> FrameResult:
+    """Two people in one cluster, which the camera is not asked to split."""
+    settings = ["fusion.split=false"] if preset == "default" else []
+    return Session(config_of(preset, *settings)).run(at("merged_people").frame)
+
+
 @pytest.mark.parametrize("preset", ["default", "reference"])
 def test_two_people_in_one_cluster(preset: str) -> None:
-    answers = [
-        of_truth(asked("merged_people", preset, "person"), r) for r in planted("merged_people", "person", 9.9)
-    ]
+    asked_of = why(merged_people(preset), Selection(label="person"), CLASSES, hints=0)
+    answers = [of_truth(asked_of, r) for r in planted("merged_people", "person", 9.9)]
     assert [a.verdict.reason for a in answers] == [Reason.MERGED] * 2
     assert sorted(a.verdict.reported for a in answers) == [False, True]
     lost = next(a for a in answers if not a.verdict.reported)
@@ -113,15 +119,23 @@ def test_two_people_in_one_cluster(preset: str) -> None:
     assert "clustering.eps is 0.5 m" in lost.verdict.text
 
 
+def test_two_people_whom_the_camera_parts() -> None:
+    answers = asked("merged_people", "default", "person")
+    both = [of_truth(answers, row) for row in planted("merged_people", "person", 9.9)]
+    assert [a.verdict.reason for a in both] == [Reason.REPORTED] * 2
+    texts = [e.text for e in run("merged_people", "default").explanations if e.state == "split"]
+    assert any(re.fullmatch(r"cluster \d+ split by person 0.\d+: \d+ of [\d,]+ points.*", t) for t in texts)
+    assert any(re.search(r"which split it off (a )?cluster", a.verdict.text) for a in both)
+
+
 def test_the_hint_that_parts_two_people_is_proved() -> None:
-    result = run("merged_people", "default")
+    result = merged_people("default")
     answers = why(result, Selection(label="person"), CLASSES, hints=1)
     lost = next(a for a in answers if a.verdict.reason is Reason.MERGED and not a.verdict.reported)
     assert lost is answers[0]
-    assert lost.hints[0].settings[0].startswith("clustering.eps=0.")
-    assert f"; change {lost.hints[0].settings[0]}: it is cluster " in lost.verdict.text
-    better = config_of("default", *lost.hints[0].settings)
-    session = Session(better)
+    assert lost.hints[0].settings == ("fusion.split=true",)
+    assert "; change fusion.split=true: it is cluster " in lost.verdict.text
+    session = Session(config_of("default", *lost.hints[0].settings))
     again = why(session.run(result.frame), Selection(label="person"), CLASSES, hints=0)
     assert all(
         of_truth(again, row).verdict.reason is Reason.REPORTED
@@ -130,7 +144,7 @@ def test_the_hint_that_parts_two_people_is_proved() -> None:
 
 
 def test_two_people_without_ground_truth() -> None:
-    result = run("merged_people", "default")
+    result = merged_people("default")
     blind = replace(result, frame=replace(result.frame, truth=None))
     answers = why(blind, Selection(label="person"), CLASSES, hints=0)
     merged = [a for a in answers if a.verdict.reason is Reason.MERGED]

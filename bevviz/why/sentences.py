@@ -75,6 +75,7 @@ class Because:
             Reason.TOO_FEW_POINTS: self._too_few_points,
             Reason.TOO_FAR: self._too_far,
             Reason.TAKEN: self._taken,
+            Reason.MISFIT: self._misfit,
             Reason.OTHER_CLUSTER: self._other_cluster,
             Reason.NOT_AMONG: self._not_among,
             Reason.LOST_IN_FUSION: self._lost_in_fusion,
@@ -110,7 +111,18 @@ class Because:
         assert named is not None
         if not named.camera or self.result.objects is None:
             return text
-        return f"{text} by {named.name} {self.result.objects.score[named.row]:.2f}"
+        score = self.result.objects.score[named.row]
+        return f"{text} by {named.name} {score:.2f}{self._split_off(named.cluster)}"
+
+    def _split_off(self, cluster: int) -> str:
+        """Where a cluster's points were taken from."""
+        splits, texts = self.result.splits, []
+        if splits is None:
+            return ""
+        for row in np.flatnonzero((splits.cluster == cluster) & (splits.points < splits.of)).tolist():
+            off = f"cluster {splits.rest[row]}" if splits.rest[row] >= 0 else "a cluster"
+            texts.append(f", which split it off {off} ({splits.points[row]:,} of {splits.of[row]:,} points)")
+        return "".join(texts)
 
     def _also(self) -> str:
         assert self.e.named is not None
@@ -308,6 +320,10 @@ class Because:
 
     def _pair(self) -> str:
         return self._pair_text(self._best.row, self._best.camera, self._cluster)
+
+    def _misfit(self) -> str:
+        suits = f"nothing of cluster {self._cluster} suits {label(self._best)} in outline and size"
+        return f"{suits}, fusion.min_rating is {self.config.fusion.min_rating:g}"
 
     def _low_overlap(self) -> str:
         both = f"{label(self._best)} and cluster {self._cluster}"

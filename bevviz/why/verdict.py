@@ -40,6 +40,7 @@ class Reason(StrEnum):
     TOO_FEW_POINTS = "too few points"
     TOO_FAR = "too far"
     TAKEN = "taken"
+    MISFIT = "misfit"
     OTHER_CLUSTER = "other cluster"
     NOT_AMONG = "not among the objects"  # of a 3D detector, or the robot's whose stages are not known
     LOST_IN_FUSION = "lost in the fusion"  # the robot's, which had a cluster and a detection
@@ -53,6 +54,7 @@ _REFUSED = {
     Decision.TOO_FEW_POINTS: Reason.TOO_FEW_POINTS,
     Decision.TOO_FAR: Reason.TOO_FAR,
     Decision.TAKEN: Reason.TAKEN,
+    Decision.MISFIT: Reason.MISFIT,
     Decision.NO_CLUSTER: Reason.TOO_FEW_POINTS,
 }
 
@@ -202,6 +204,8 @@ def pair_reason(fusion: Fusion, traces: Traces, detection: int, cluster: int) ->
     decision, matched = fusion.detection_decision[detection], fusion.detection_cluster[detection]
     if decision == Decision.MATCHED and matched == cluster:
         return Reason.REPORTED
+    if decision == Decision.MISFIT:
+        return Reason.MISFIT
     return Reason.OTHER_CLUSTER if decision == Decision.MATCHED else Reason.TAKEN
 
 

@@ -232,6 +232,8 @@ def _of_ours(e: Evidence, reason: Reason, config: Config) -> Iterator[Change]:
     elif reason is Reason.TOO_LARGE:
         yield {"clustering.max_cluster_points": _aside(e)}
     elif reason is Reason.MERGED:
+        if config.fusion.method == "frustum" and not config.fusion.split:
+            yield {"fusion.split": True}
         if e.finer:
             yield from ({"clustering.eps": round(e.finer * f, 3)} for f in (1.0, 0.85, 0.7))
         elif not e.others:
@@ -259,6 +261,9 @@ def _for_detection(reason: Reason, best: Candidate, config: Config) -> Iterator[
     elif reason is Reason.LOW_OVERLAP:
         yield from ({"fusion.min_iou": round(config.fusion.min_iou * f, 3)} for f in (0.5, 0.2, 0.0))
         yield {"clustering.eps": round(config.clustering.eps * 0.6, 3)}
+    elif reason is Reason.MISFIT:
+        yield from ({"fusion.min_rating": round(config.fusion.min_rating * f, 4)} for f in (0.5, 0.2))
+        yield {"fusion.split": False}
     elif reason is Reason.TOO_FEW_POINTS:
         yield from ({"fusion.min_points": value} for value in range(config.fusion.min_points - 1, 0, -1))
     elif reason in (Reason.SHARED_BOX, Reason.BORROWED, Reason.TAKEN, Reason.OTHER_CLUSTER, Reason.MISNAMED):
@@ -294,4 +299,6 @@ def _below(neighbours: int, limit: int) -> list[int]:
 
 
 def _written(value: Any) -> str:
+    if isinstance(value, bool):
+        return str(value).lower()
     return f"{value:g}" if isinstance(value, float) else str(value)
