@@ -322,7 +322,7 @@ class Because:
         return self._pair_text(self._best.row, self._best.camera, self._cluster)
 
     def _misfit(self) -> str:
-        suits = f"nothing of cluster {self._cluster} suits {label(self._best)} in outline and size"
+        suits = f"no part of cluster {self._cluster} suits {label(self._best)} in outline and size"
         return f"{suits}, fusion.min_rating is {self.config.fusion.min_rating:g}"
 
     def _low_overlap(self) -> str:
