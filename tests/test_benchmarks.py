@@ -118,7 +118,7 @@ def test_the_rule_knows_the_planted_faults_and_a_wrong_answer_counts_as_wrong(
         "shared_box": ("person", 8.7, Reason.SHARED_BOX),
     }
     for name, (label, ahead, reason) in reasons.items():
-        preset = "default" if name == "merged_people" else "reference"
+        preset = "lidar" if name == "merged_people" else "reference"
         scene = scene_of(drive(), at(name))
         rule = Rule(at(name), scene, run_fault(name, preset))
         assert {rule.cause(row).reason for row in planted(name, label, ahead)} == {reason}
