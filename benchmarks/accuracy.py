@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
+from benchmarks import kitti
 from benchmarks.tracking import Tallies, TrackTally, add_tracks, truth_of
 from bevviz.config import Preset, load
 from bevviz.evaluate import MAX_DISTANCE, MIN_HITS, RANGE, pair_in_order
@@ -26,18 +27,23 @@ PRESETS: tuple[Preset, ...] = ("reference", "default")
 CLASSES = ("person", "cyclist", "car")
 MIN_HEIGHT = 20  # visible pixels in height of an object that must be found
 
-INTRO = f"""# Accuracy
+INTRO = """# Accuracy
 
-*How well does it see?* Measured on the synthetic drive against its exact ground truth, by `make accuracy`,
-with the shipped demo network. Both presets process the same frames, from drives whose seeds the network was
-not trained on. A simulator is kinder than a street: read the figures as a comparison of methods and as a
-guard against regressions, not as a promise about your robot.
+*How well does it see?* Measured by `make accuracy` on labelled real frames and on the synthetic drive. Read
+the figures as a comparison of methods and as a guard against regressions, not as a promise about your robot.
+"""
+
+SYNTHETIC = f"""
+## Synthetic drives
+
+Measured against exact ground truth, with the shipped demo network. Both presets process the same frames, from
+drives whose seeds the network was not trained on. A simulator is kinder than a street.
 
 An object must be found if it lies within {RANGE:.0f} m, has at least {MIN_HITS} LiDAR points and at least
 {MIN_HEIGHT} px of visible height in the image. Others are neither required nor counted as false when found.
 A fused box is right if an object of its class has its centre within {MAX_DISTANCE:.0f} m on the ground plane,
-one box for one object; the centre error is that of the right ones. LiDAR boxes enclose what the sensor saw,
-so that the centre of a half-seen car lies towards the sensor.
+one box for one object; the centre error is that of the right ones. The boxes of `reference` enclose what the
+sensor saw, so that the centre of a half-seen car lies towards the sensor.
 """
 
 
@@ -69,6 +75,7 @@ def main() -> None:
         default=[1010, 1011, 1012],  # the tracker's defaults were chosen on 1000 and 1001
         help="drives that tracking is measured on",
     )
+    parser.add_argument("--data", type=Path, default=kitti.DATA, help="folder of real frames and models")
     parser.add_argument("--write", type=Path, help="Markdown page to write, instead of printing it")
     options = parser.parse_args()
 
@@ -89,8 +96,11 @@ def main() -> None:
     tracked = Tallies(TrackTally)
     for seed in options.tracked_seeds:
         track(tracked, SyntheticSource(options.frames, seed), options.tracked)
+    real = kitti.page(options.data) if (options.data / "kitti").is_dir() else ""
     page = (
         INTRO
+        + real
+        + SYNTHETIC
         + f"\n{len(shots)} frames, seeds {options.seeds}, Python {platform.python_version()}.\n"
         + tables(tallies)
         + track_table(tracked, options.tracked, options.tracked_seeds)
@@ -212,7 +222,7 @@ def tables(tallies: dict[Preset, Tally]) -> str:
         return f"{part / whole:.3f}" if whole else "-"
 
     lines = [
-        "\n## Ground\n",
+        "\n### Ground\n",
         "| preset | precision | recall | IoU | object points kept |",
         "| --- | ---: | ---: | ---: | ---: |",
     ]
@@ -223,7 +233,7 @@ def tables(tallies: dict[Preset, Tally]) -> str:
             f"| {share(g['tp'], g['tp'] + g['fp'] + g['fn'])} | {share(g['object kept'], g['object'])} |"
         )
     lines += [
-        "\n## Clusters: objects that have one of their own\n",
+        "\n### Clusters: objects that have one of their own\n",
         "| class | objects | " + " | ".join(tallies) + " |",
     ]
     lines.append("| --- | ---: |" + " ---: |" * len(tallies))
@@ -231,13 +241,13 @@ def tables(tallies: dict[Preset, Tally]) -> str:
         first = next(iter(tallies.values()))
         shares = [share(t.clusters[name]["alone"], t.clusters[name]["all"]) for t in tallies.values()]
         lines.append(f"| {name} | {first.clusters[name]['all']} | " + " | ".join(shares) + " |")
-    lines.append("\n## Image detections: demo network, IoU 0.5, the same in both presets\n")
+    lines.append("\n### Image detections: demo network, IoU 0.5, the same in both presets\n")
     lines += ["| class | objects | precision | recall |", "| --- | ---: | ---: | ---: |"]
     for name in CLASSES:
         c = tallies["default"].detections[name]
         found, all_found, all_there = c["tp"], c["tp"] + c["fp"], c["tp"] + c["fn"]
         lines.append(f"| {name} | {all_there} | {share(found, all_found)} | {share(found, all_there)} |")
-    lines.append("\n## Fused objects: class and place\n")
+    lines.append("\n### Fused objects: class and place\n")
     lines.append("| class | preset | precision | recall | centre error, median m | 90 % m |")
     lines.append("| --- | --- | ---: | ---: | ---: | ---: |")
     for name in (*CLASSES, "all"):
@@ -253,7 +263,7 @@ def tables(tallies: dict[Preset, Tally]) -> str:
 
 def track_table(tallies: Tallies, frames: int, seeds: list[int]) -> str:
     lines = [
-        "\n## Tracks: ids and speeds, `default` preset\n",
+        "\n### Tracks: ids and speeds, `default` preset\n",
         f"{frames} scans in a row of each of the drives {seeds}, on which nothing was chosen. All tracks",
         "count that are shown and have a cluster, be they named in that scan or not, in view of the camera",
         "or not: outside of it one can be false, but not right. A car of which only the rear is seen has its",

@@ -19,7 +19,7 @@ from bevviz.run import Observer
 from bevviz.stages.fusion import in_view
 
 KINDS: tuple[AnomalyKind, ...] = get_args(AnomalyKind)
-UNMATCHED = (Decision.NO_CLUSTER, Decision.TOO_FEW_POINTS, Decision.LOW_OVERLAP)
+UNMATCHED = (Decision.NO_CLUSTER, Decision.TOO_FEW_POINTS, Decision.LOW_OVERLAP, Decision.MISFIT)
 SAME_BOX = 0.3  # IoU of the image boxes of one object in consecutive frames
 MOVING = 1.0  # m/s that makes an object of a cluster that was never named
 SETTLED = 1.0  # seconds that such a cluster must have been tracked for: its speed is sure by then

@@ -15,7 +15,15 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args
 
-from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    PositiveFloat,
+    ValidationError,
+)
 from pydantic.fields import FieldInfo
 from pydantic_core import PydanticCustomError
 
@@ -215,7 +223,69 @@ class FusionConfig(Section):
     match_radius: Pixels = Field(150.0, gt=0, description="centroid: largest pixel distance")
     min_points: int = Field(3, ge=1, description="frustum: fewest points of a cluster inside")
     min_iou: float = Field(0.1, ge=0, le=1, description="frustum: least IoU of 2D box and projected cluster")
+    min_rating: float = Field(
+        0.05, ge=0, le=1, description="frustum: least score of a detection times how well points fit it"
+    )
+    max_gap: Metres = Field(
+        0.5, gt=0, le=20, description="frustum: what is nearer on the ground holds together in a frustum"
+    )
+    split: bool = Field(
+        True, description="frustum: detections split and merge clusters; false: they name whole ones"
+    )
     max_depth: Metres = Field(120.0, gt=0, description="frustum: farther clusters are out of range")
+
+
+# Mean length, width and height of a class in metres, and the spread (one sigma) of each. Means of road users
+# are KITTI's (Geiger et al. 2012, as Qi et al. 2018 give them for Frustum PointNets), of what KITTI has not
+# those of nuScenes (Caesar et al. 2020, as Zhu et al. 2019 give them for CBGS); truck is between them, since
+# COCO calls a pickup one, too. Spreads are those of KITTI's cars (wider across: cars elsewhere are 2 m wide),
+# else wider than the two sets differ. What stands below the line is our own estimate.
+SIZES: dict[str, tuple[float, ...]] = {
+    "car": (3.88, 1.63, 1.53, 0.43, 0.15, 0.14),
+    "van": (5.07, 1.90, 2.21, 0.50, 0.15, 0.25),
+    "truck": (8.50, 2.55, 3.05, 2.50, 0.25, 0.50),
+    "bus": (10.50, 2.94, 3.47, 2.00, 0.25, 0.35),
+    "train": (16.17, 2.53, 3.53, 6.00, 0.20, 0.30),
+    "tram": (16.17, 2.53, 3.53, 6.00, 0.20, 0.30),
+    "trailer": (12.29, 2.90, 3.87, 3.00, 0.30, 0.60),
+    "construction_vehicle": (6.37, 2.85, 3.19, 1.60, 0.50, 0.60),
+    "motorcycle": (2.11, 0.77, 1.47, 0.30, 0.15, 0.20),
+    "bicycle": (1.70, 0.60, 1.28, 0.25, 0.15, 0.25),
+    "cyclist": (1.76, 0.60, 1.74, 0.20, 0.12, 0.15),
+    "person": (0.84, 0.66, 1.76, 0.24, 0.14, 0.14),
+    "pedestrian": (0.84, 0.66, 1.76, 0.24, 0.14, 0.14),
+    "person_sitting": (0.80, 0.60, 1.27, 0.20, 0.12, 0.14),
+    "traffic_cone": (0.41, 0.41, 1.07, 0.10, 0.10, 0.25),
+    "barrier": (2.53, 0.50, 0.98, 0.60, 0.15, 0.15),
+    # ---
+    "fire hydrant": (0.35, 0.35, 0.75, 0.08, 0.08, 0.12),
+    "bench": (1.60, 0.60, 0.85, 0.40, 0.15, 0.15),
+    "chair": (0.55, 0.55, 0.90, 0.12, 0.12, 0.15),
+    "couch": (2.00, 0.90, 0.85, 0.40, 0.15, 0.15),
+    "dog": (0.90, 0.35, 0.65, 0.25, 0.10, 0.18),
+    "horse": (2.20, 0.60, 1.60, 0.30, 0.12, 0.20),
+    "cow": (2.30, 0.75, 1.45, 0.30, 0.12, 0.15),
+}
+
+
+def _with_known(given: Any) -> Any:
+    """What is stated changes single classes."""
+    if not isinstance(given, Mapping):
+        return given
+    return {**SIZES, **{str(name).lower(): size for name, size in given.items()}}
+
+
+def _six(given: tuple[float, ...]) -> tuple[float, ...]:
+    if len(given) != 6:
+        raise PydanticCustomError(
+            "size",
+            "has {count} numbers, a class has six: length, width, height and the spread of each",
+            {"count": len(given)},
+        )
+    return given
+
+
+ClassSize = Annotated[tuple[PositiveFloat, ...], AfterValidator(_six)]
 
 
 class ObjectsConfig(StageSection):
@@ -225,6 +295,11 @@ class ObjectsConfig(StageSection):
         "frustum",
         description="frustum: clusters that detections name; or module:function, (N, 4) points and intensity "
         "-> (K, 7) boxes x y z length width height yaw, score, names; or topic:/objects of the robot",
+    )
+    sizes: Annotated[Mapping[str, ClassSize | None], BeforeValidator(_with_known)] = Field(
+        SIZES,
+        description="frustum: by class, mean length, width, height in metres and the spread of each; "
+        "a class that is stated changes alone, null: it has none",
     )
 
 
@@ -397,7 +472,11 @@ class ParameterChange:
     after: Any
 
     def __str__(self) -> str:
-        return f"{self.before} -> {self.after}"
+        if not isinstance(self.before, Mapping) or not isinstance(self.after, Mapping):
+            return f"{self.before} -> {self.after}"
+        both = dict.fromkeys([*self.before, *self.after])
+        pairs = {key: (self.before.get(key), self.after.get(key)) for key in both}
+        return "; ".join(f"{key}: {old} -> {new}" for key, (old, new) in pairs.items() if old != new)
 
 
 def changes(old: Config | Mapping[str, Any], new: Config | Mapping[str, Any]) -> dict[str, ParameterChange]:
@@ -552,7 +631,12 @@ def dump(config: Config) -> str:
         lines.append(f"{section}:")
         params = content.pop("params", {})
         for name, value in content.items():
-            lines.append(f"  {name}: {json.dumps(value)}{_note(f'{section}.{name}', about)}")
+            note = _note(f"{section}.{name}", about)
+            if isinstance(value, dict) and value:
+                lines.append(f"  {name}:{note}")
+                lines += [f"    {json.dumps(key)}: {json.dumps(inner)}" for key, inner in value.items()]
+            else:
+                lines.append(f"  {name}: {json.dumps(value)}{note}")
         if params:
             lines.append("  params:")
         for name, value in params.items():
@@ -647,9 +731,13 @@ def _flatten(tree: Mapping[str, Any]) -> dict[str, Any]:
 
 def _read_yaml(path: Path) -> Mapping[str, Any]:
     try:
-        text = path.read_text()
+        if path.is_fifo() and path.parts[1:2] not in (("dev",), ("proc",)):  # <(...) of a shell is welcome
+            raise UserError(f"{path}: cannot read the configuration: it is no file")
+        text = path.read_text(encoding="utf-8")
     except OSError as error:
         raise UserError(f"{path}: cannot read the configuration: {error.strerror}") from None
+    except UnicodeDecodeError as error:
+        raise UserError(f"{path}: is no UTF-8 text: {error.reason} at byte {error.start}") from None
     tree = _yaml_value(text, str(path))
     if tree is None:
         return {}
@@ -669,3 +757,7 @@ def _yaml_value(text: str, where: str) -> Any:
         mark = getattr(error, "problem_mark", None)
         line = f" line {mark.line + 1}" if mark else ""
         raise UserError(f"{where}:{line} is not valid YAML: {problem}") from None
+    except RecursionError:
+        raise UserError(f"{where}: is not valid YAML for a configuration: too deep") from None
+    except (ValueError, OverflowError) as error:  # a date that is none
+        raise UserError(f"{where}: is not valid YAML: {error}") from None

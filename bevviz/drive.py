@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from pandas import DataFrame
     from rerun.blueprint import Blueprint
 
-    from bevviz.why import Answer
+    from bevviz.why import Answer, Questioner
 
 Settings = Mapping[str, Any] | Sequence[str]
 KEPT = 8  # results of single frames that are kept for those who ask again
@@ -74,6 +74,7 @@ class Drive(Closing):
     def __init__(self, frames: Frames, config: Config) -> None:
         self.frames, self.session = frames, Session(config)
         self._results: OrderedDict[tuple[int, int], FrameResult] = OrderedDict()
+        self._questioner: Questioner | None = None
 
     def close(self) -> None:
         self.frames.close()
@@ -156,31 +157,68 @@ class Drive(Closing):
         box: Sequence[float] = (),
         point: Sequence[float] = (),
         radius: float = 0.5,
+        cell: Sequence[int] = (),
+        cluster: int | None = None,
+        detection: int | None = None,
         camera: str = "",
         hints: int = 5,
+        everything: bool = False,
     ) -> list[Answer]:
         """Why objects of a frame were reported, or were not: what ``bevviz why`` answers.
 
         Args:
             time, frame: which scan, as for ``at``.
-            cls: all of that class; with neither class, box nor point: whatever went wrong.
+            cls: all of that class; with no selection at all: whatever went wrong.
             box: what is at the pixel u, v, or in the image box u0, v0, u1, v1.
             point: what is at x, y, z, in metres of the points' frame.
-            radius: metres around that point.
-            camera: of the pixel, where there are several.
+            radius: metres around that point or cell.
+            cell: what is in that row and column of the bird's-eye view.
+            cluster, detection: that one, by its row in the frame's result.
+            camera: of the pixel or detection, where there are several.
             hints: for how many answers it is tried what would change them.
+            everything: also what went well, and what nothing could be done about.
 
         Returns:
             Worst first.
 
         Raises:
-            UserError: as ``at``; no such class, camera or pixel.
+            UserError: as ``at``; no such class, camera, pixel, cell, cluster or detection.
         """
-        from bevviz.why import Selection, why
+        from bevviz.why import Selection
 
-        selection = Selection(cls, tuple(box), tuple(point), radius, camera)
+        selection = Selection(
+            label=cls,
+            box=tuple(box),
+            point=tuple(point),
+            radius=radius,
+            cell=tuple(cell),
+            cluster=cluster,
+            detection=detection,
+            camera=camera,
+        )
+        return self.questioner(time, frame=frame).explain(selection, hints, everything=everything)
+
+    def questioner(self, time: str | float | None = None, *, frame: int | None = None) -> Questioner:
+        """Answers any number of questions about one scan; what they have in common is worked out once.
+
+        Args:
+            time, frame: which scan, as for ``at``.
+
+        Raises:
+            UserError: as ``at``.
+
+        Example:
+            >>> questioner = drive.questioner(12.5)
+            >>> for answer in questioner.missed():
+            ...     print(questioner.with_hints(answer).verdict.text)
+        """
+        from bevviz.why import Questioner
+
         result = self.at(frame=self._number(time, frame))
-        return why(result, selection, self.session.stages.class_names, hints, loader=self.session.loader)
+        if self._questioner is None or self._questioner.traces.result is not result:
+            names = self.session.stages.class_names
+            self._questioner = Questioner(result, self.session.loader, names)
+        return self._questioner
 
     def configure(self, *settings: str, **more: Any) -> dict[str, ParameterChange]:
         """Change parameters for what is asked from now on.
@@ -227,13 +265,14 @@ class Drive(Closing):
         Raises:
             UserError: the file cannot be written, or there is no such blueprint.
         """
-        from bevviz.logging.recorder import Recorder
+        from bevviz.logging.recorder import DiskWatch, Recorder
         from bevviz.logging.sinks import open_recording
         from bevviz.progress import Progress
 
         target = Path(path)
         with open_recording(self.scene, self.config, save=target, blueprint=blueprint) as sinks:
-            if self.run([Recorder(sinks.recording, self.config), Progress()]).interrupted:
+            recorder = Recorder(sinks.recording, self.config)
+            if self.run([recorder, DiskWatch(sinks), Progress()]).interrupted:
                 raise KeyboardInterrupt
         return target
 

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from bevviz.config import Config
+from bevviz.config import OURS, Config
 from bevviz.frame import (
     CameraResult,
     Clusters,
@@ -17,22 +17,31 @@ from bevviz.frame import (
     Explanation,
     Fusion,
     Pair,
+    Splits,
 )
+from bevviz.plugins import TOPIC
+
+SOME = 0.1  # share of an object's points from which noise is worth a word
 
 
 def explain(
-    cameras: Sequence[CameraResult], clusters: Clusters | None, config: Config
+    cameras: Sequence[CameraResult],
+    clusters: Clusters | None,
+    config: Config,
+    splits: Splits | None = None,
 ) -> tuple[Explanation, ...]:
-    """One self-contained sentence for each detection, each cluster and each problem of a camera.
+    """One self-contained sentence for each detection, each cluster, each split and each problem of a camera.
 
     A detection's distances are along its camera's optical axis, a cluster's are horizontal, from the
     origin of its frame. A cluster is explained once for each camera that has it in view, otherwise once.
-    Problems have the subject ``camera``, row -1 and the state ``problem``.
+    Problems have the subject ``camera``, row -1 and the state ``problem``. What a camera made of clusters has
+    the subject ``split``: what is left of one the state ``split``, what was made of several ``merged``.
 
     Args:
         cameras: results of all cameras.
         clusters: the frame's clusters, None where their stage failed.
         config: what the frame was run with.
+        splits: where detections split and merged clusters.
     """
     found: list[Explanation] = []
     for result in cameras:
@@ -41,6 +50,8 @@ def explain(
             found.extend(_detections(result, result.detections, clusters, config))
     if clusters is not None:
         found.extend(_clusters(cameras, clusters, config))
+    if splits is not None:
+        found.extend(_splits(cameras, splits))
     return tuple(found)
 
 
@@ -106,7 +117,7 @@ def _detection(
         return f"{evidence}, matched; {also} the same box"
     if decision is Decision.TAKEN:
         return f"no match: {evidence}, taken by {_label(detections, int(fusion.cluster_detection[k]))}"
-    return f"no match: {evidence}, {_rule(decision, config)}"
+    return f"no match: {evidence}, {_rule(decision, d, fusion, detections, config)}"
 
 
 def _unclustered(
@@ -125,10 +136,18 @@ def _unclustered(
     kinds = []
     for label, count in zip(*np.unique(labels, return_counts=True), strict=True):
         if label < 0:
-            kinds.append(f"{count} noise (clustering.min_points is {config.clustering.min_points})")
+            kinds.append(f"{count} noise ({_noise(config)})")
         else:
             kinds.append(f"{count} of cluster {label} ({_set_aside(int(clusters.state[label]), config)})")
     return f"{_points(len(labels))} in its frustum: {', '.join(kinds)}"
+
+
+def _noise(config: Config) -> str:
+    """What it hung on; of somebody else's clustering that is not known."""
+    method = config.clustering.method
+    if method in OURS:
+        return f"clustering.min_points is {config.clustering.min_points}"
+    return f"by {method.removeprefix(TOPIC)}"
 
 
 # --- clusters ----------------------------------------------------------------------------------
@@ -181,7 +200,38 @@ def _cluster(decision: Decision, k: int, fusion: Fusion, detections: Detections,
         evidence = f"{_points(pair.points)} in the frustum of {label}, IoU {pair.iou:.2f}"
     if decision is Decision.TAKEN:
         return f"{evidence}, taken by cluster {fusion.detection_cluster[d]}"
-    return f"{evidence}, {_rule(decision, config)}"
+    return f"{evidence}, {_rule(decision, d, fusion, detections, config)}"
+
+
+def _splits(cameras: Sequence[CameraResult], splits: Splits) -> Iterator[Explanation]:
+    by_name = {result.camera.name: result.detections for result in cameras}
+    keys = list(zip(splits.camera, splits.detection.tolist(), splits.cluster.tolist(), strict=True))
+    for camera, d, part in dict.fromkeys(keys):
+        detections = by_name[camera]
+        assert detections is not None
+        by = f"by {_label(detections, d)}"
+        whole, noise = [], 0
+        rows = [row for row, key in enumerate(keys) if key == (camera, d, part)]
+        for row in rows:
+            rest, points = int(splits.rest[row]), int(splits.points[row])
+            share = f"{points:,} of {splits.of[row]:,} points"
+            if rest >= 0:
+                text = f"cluster {rest} split {by}: {share} are cluster {part}"
+                yield Explanation("split", camera, rest, "split", text)
+            elif points < splits.of[row]:
+                text = f"cluster {part} split {by}: {share} of a cluster that others have the rest of"
+                yield Explanation("split", camera, part, "split", text)
+            elif splits.is_noise[row]:
+                noise = points
+            else:
+                whole.append(f"{points:,}")
+        if len(whole) > 1 or noise > SOME * splits.points[rows].sum():
+            pieces = [f"clusters of {' and '.join(whole)} points"] if len(whole) > 1 else []
+            pieces += [f"a cluster of {whole[0]} points"] if len(whole) == 1 else []
+            pieces += [f"{_points(noise)} of noise"] if noise else []
+            yield Explanation(
+                "split", camera, part, "merged", f"cluster {part} made {by} of {' and '.join(pieces)}"
+            )
 
 
 def _pair(fusion: Fusion, d: int, k: int) -> Pair:
@@ -202,9 +252,14 @@ def _points(count: int | np.integer) -> str:
     return f"{count} point" if count == 1 else f"{count} points"
 
 
-def _rule(decision: Decision, config: Config) -> str:
+def _rule(decision: Decision, d: int, result: Fusion, detections: Detections, config: Config) -> str:
     """The parameter that forbade a pair."""
     fusion = config.fusion
+    if decision is Decision.MISFIT and result.claims is not None:
+        fit, name = float(result.claims.fit[d]), detections.names[d]
+        rating = f"{fit:.2g} x score {detections.score[d]:.2f}"
+        limit = f"fusion.min_rating is {fusion.min_rating:g}"
+        return f"nothing there suits a {name} better than {rating}, {limit}"
     if decision is Decision.TOO_FEW_POINTS:
         return f"fusion.min_points is {fusion.min_points}"
     if decision is Decision.LOW_OVERLAP:

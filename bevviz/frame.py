@@ -121,6 +121,20 @@ class Boxes3D:
     def empty() -> Boxes3D:
         return Boxes3D(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.float32), np.zeros(0, np.float32))
 
+    @staticmethod
+    def joined(parts: Sequence[Boxes3D]) -> Boxes3D:
+        """One after the other."""
+        if not parts:
+            return Boxes3D.empty()
+        return Boxes3D(
+            *(np.concatenate([getattr(p, name) for p in parts]) for name in ("center", "size", "yaw"))
+        )
+
+    def chosen(self, rows: Sequence[int] | NDArray[Any]) -> Boxes3D:
+        """Some of them."""
+        chosen = np.asarray(rows, np.int64) if len(rows) == 0 else rows
+        return Boxes3D(self.center[chosen], self.size[chosen], self.yaw[chosen])
+
     @property
     def columns(self) -> dict[str, F32]:
         """For a table: centre, size and heading."""
@@ -332,6 +346,7 @@ class Decision(IntEnum):
     OUT_OF_VIEW = 5  # cluster: outside the image, or behind the camera
     NO_DETECTION = 6  # cluster: in view, but under no detection
     NOT_KEPT = 7  # detection below threshold or suppressed; cluster outside the size limits
+    MISFIT = 9  # nothing of the cluster has the size and outline of what was detected
     TOO_FAR = 8  # reference: nearest 2D box centre is beyond match_radius; default: beyond fusion.max_depth
 
 
@@ -360,6 +375,48 @@ class Pair:
 
 
 @dataclass(frozen=True, slots=True)
+class Claims:
+    """What one camera's detections take of the obstacle points. Row d belongs to detection d."""
+
+    cluster: I32  # (D,) row in the clusters, -1: it takes nothing
+    fit: F32  # (D,) 0 to 1: how well the best that it could take suits its box and its class
+    boxes: Boxes3D  # (D,) of the whole object, what was not seen completed; NaN where nothing is taken
+    seen: Bool  # (D, 4) SIDES of that box that face the camera
+
+    @staticmethod
+    def none(count: int) -> Claims:
+        """To be filled in."""
+        nan = np.full((count, 3), np.nan, np.float32)
+        return Claims(
+            np.full(count, -1, np.int32),
+            np.zeros(count, np.float32),
+            Boxes3D(nan, nan.copy(), nan[:, 0].copy()),
+            np.zeros((count, 4), np.bool_),
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Splits:
+    """Clusters that a camera divided or joined: a row for a detection and a cluster it took points of."""
+
+    camera: tuple[str, ...]
+    detection: I32  # (S,) row in that camera's detections
+    cluster: I32  # (S,) row in the clusters, of what it took
+    rest: I32  # (S,) row of what is left of the cluster it took them of; -1: nothing is, or they were noise
+    is_noise: Bool  # (S,) they were of no cluster
+    points: I32  # (S,) that it took
+    of: I32  # (S,) that the cluster had
+
+    def __len__(self) -> int:
+        return len(self.camera)
+
+    @staticmethod
+    def none() -> Splits:
+        i = np.zeros(0, np.int32)
+        return Splits((), i, i, i, np.zeros(0, np.bool_), i, i)
+
+
+@dataclass(frozen=True, slots=True)
 class Fusion:
     """Result for one camera. Row d belongs to detection d, row k to cluster k."""
 
@@ -370,6 +427,7 @@ class Fusion:
     cluster_detection: I32  # (K,) matched detection, or the best candidate that was refused, else -1
     pairs: Pairs
     cluster_uv: F32  # (K, 4) x0, y0, x1, y1 around the projected cluster, NaN where not in view
+    claims: Claims | None = None  # None: clusters are matched as they are
 
     def pair(self, detection: int, cluster: int) -> Pair | None:
         """The evidence of a detection and a cluster; None: the fusion did not look at them together."""
@@ -391,16 +449,21 @@ class CameraResult:
     depth: F32 | None = None  # (P,) metres along the optical axis
 
 
+SIDES = ("front", "back", "left", "right")  # of a box: +x, -x, +y, -y
+
+
 @dataclass(frozen=True, slots=True)
 class Objects:
     """Fused boxes: one row for each named object, in Frame.points_frame."""
 
-    boxes: Boxes3D
+    boxes: Boxes3D  # of the whole object, where sizes of its class are known; else of what was seen
     names: tuple[str, ...]
     score: F32  # (J,)
     cluster: I32  # (J,)
     camera: tuple[str, ...]
     detection: I32  # (J,) row in that camera's detections
+    measured: Boxes3D | None = None  # (J,) around what was seen of each; None: ``boxes`` are that
+    seen: Bool | None = None  # (J, 4) SIDES that were seen; None: not known
 
     def __len__(self) -> int:
         return len(self.names)
@@ -486,6 +549,7 @@ class FrameResult:
     failures: tuple[Failure, ...] = ()
     tracks: Tracks | None = None
     anomalies: tuple[Anomaly, ...] = ()
+    splits: Splits | None = None  # None: clusters are as the LiDAR alone has them
 
     @staticmethod
     def unprocessed(
@@ -501,7 +565,7 @@ class FrameResult:
 class Explanation:
     """One decision in words. ``state`` is the lower-case name of the Decision or DetectionState."""
 
-    subject: str  # "detection" or "cluster"
+    subject: str  # "detection", "cluster", "split" or "camera"
     camera: str  # "" where no camera is involved
     row: int
     state: str

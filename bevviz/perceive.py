@@ -7,7 +7,7 @@ import threading
 import time
 import traceback
 from collections import OrderedDict
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from typing import Any, TypeVar, TypeVarTuple, cast
@@ -23,6 +23,7 @@ from bevviz.frame import (
     F32,
     Camera,
     CameraResult,
+    Claims,
     Clusters,
     Detections,
     Failure,
@@ -31,6 +32,7 @@ from bevviz.frame import (
     Fusion,
     Ground,
     Objects,
+    Splits,
     Voxels,
 )
 from bevviz.plugins import TOPIC
@@ -39,6 +41,7 @@ from bevviz.stages.bev import bev
 from bevviz.stages.clustering import cluster
 from bevviz.stages.detector import Detector
 from bevviz.stages.foreign import Foreign
+from bevviz.stages.frustum import claim
 from bevviz.stages.fusion import fuse, merge
 from bevviz.stages.ground import segment_ground
 from bevviz.stages.voxel import of_points, voxel_grid
@@ -253,14 +256,28 @@ def perceive(
 
     cameras = []
     for i, camera in enumerate(frame.cameras):
-        uv = depth = fusion = None
+        uv = depth = None
         if obstacles is not None:
             projected = log.run("projection", _project, obstacles, camera)
             uv, depth = projected or (None, None)
         detections = found[i].result() if network is not None else detect(camera)
-        if uv is not None and depth is not None and clusters is not None and detections is not None:
-            fusion = log.run("fusion", _fuse, uv, depth, clusters, detections, camera, config.fusion)
-        cameras.append(CameraResult(camera, detections, fusion, uv, depth))
+        cameras.append(CameraResult(camera, detections, None, uv, depth))
+    splits: Splits | None = None
+    claims: Sequence[Claims | None] = [None] * len(cameras)
+    if obstacles is not None and clusters is not None and _splits(config):
+        height = None if ground is None else ground.height.compress(~ground.mask)
+        seen = tuple(cameras)
+        sections = config.fusion, config.objects, config.clustering
+        made = log.run("fusion", claim, obstacles, height, clusters, seen, *sections)
+        if made is not None:
+            clusters, claims, splits = made
+    for i, (result, claimed) in enumerate(zip(cameras, claims, strict=True)):
+        uv, depth, found_there = result.uv, result.depth, result.detections
+        if uv is not None and depth is not None and clusters is not None and found_there is not None:
+            fusion = log.run(
+                "fusion", _fuse, uv, depth, clusters, found_there, result.camera, config.fusion, claimed
+            )
+            cameras[i] = replace(result, fusion=fusion)
     log.timings.update(detector_log.timings)
     log.failures.extend(detector_log.failures)
 
@@ -276,6 +293,7 @@ def perceive(
         clusters=clusters,
         cameras=tuple(cameras),
         objects=objects,
+        splits=splits,
         bev=None,
         timings=log.timings,
         failures=tuple(log.failures),
@@ -299,7 +317,7 @@ def describe(result: FrameResult) -> FrameResult:
         result.clusters,
         config.bev,
     )
-    explanations = log.run("explain", explain, result.cameras, result.clusters, config)
+    explanations = log.run("explain", explain, result.cameras, result.clusters, config, result.splits)
     wall = time.perf_counter() - start
     return replace(
         result,
@@ -378,12 +396,24 @@ def _project(points: F32, camera: Camera) -> tuple[F32, F32] | None:
     return uv, depth
 
 
+def _splits(config: Config) -> bool:
+    """Whether detections split clusters: those of the robot stay as it published them."""
+    ours = not _topic(config.clustering.method)
+    return config.fusion.method == "frustum" and config.fusion.split and ours
+
+
 def _fuse(
-    uv: F32, depth: F32, clusters: Clusters, detections: Detections, camera: Camera, config: FusionConfig
+    uv: F32,
+    depth: F32,
+    clusters: Clusters,
+    detections: Detections,
+    camera: Camera,
+    config: FusionConfig,
+    claims: Claims | None,
 ) -> Fusion | None:
     if camera.intrinsics is None or camera.camera_from_points is None:
         return None
-    return fuse(uv, depth, clusters, detections, camera.intrinsics, camera.camera_from_points, config)
+    return fuse(uv, depth, clusters, detections, camera.intrinsics, camera.camera_from_points, config, claims)
 
 
 def _objects(

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import re
+from pathlib import Path
 
 # What Markdown would take for its own anywhere, and what only at the beginning of a line.
 _MARKS = re.compile(r"[\\`*\[\]<~|&$]|_(?:(?<![^\W_]_)|(?![^\W_]))")
@@ -19,6 +21,11 @@ def printable(text: str) -> str:
     if text.isprintable():
         return text
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
+
+
+def path_text(path: Path | str) -> str:
+    """A file name as text that can be stored: bytes of it that are no UTF-8 are told as Python would."""
+    return os.fsencode(path).decode("utf-8", "backslashreplace")
 
 
 def markdown(text: str) -> str:

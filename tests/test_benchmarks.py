@@ -11,10 +11,16 @@ from benchmarks.bags import repeat
 from benchmarks.measure import interleaved, run
 from benchmarks.runs import counted, logged_points
 from benchmarks.stages import same_clusters, side_by_side
+from benchmarks.truth import Rule, scene_of
+from benchmarks.why import Bench, ask_all, configurations, section_of
 from bevviz.bags.recording import Recording
 from bevviz.cli import main
+from bevviz.perceive import StageLoader
 from bevviz.stages.clustering import dbscan
+from bevviz.why.verdict import HOPELESS, Reason
 from tests import bags
+from tests.test_faults import at, drive, planted
+from tests.test_faults import run as run_fault
 
 
 def test_a_repeated_bag_goes_on_in_time(tmp_path: Path) -> None:
@@ -88,3 +94,36 @@ def test_memory_is_that_of_the_program_alone() -> None:
     large = run("python", "-c", "import time; held = bytearray(b'1') * 200_000_000; time.sleep(0.3)")
     assert small.memory < 100 < 200 < large.memory < 300
     assert mine.all()
+
+
+def test_why_is_right_about_objects_and_its_hints_hold() -> None:
+    """Two frames of a fixed drive, three configurations; the whole of it is in docs/accuracy.md."""
+    tallies = ask_all([1040], frames=31, every=30)
+    every = [tally.of([reason for reason in Reason if reason not in HOPELESS]) for tally in tallies.values()]
+    asked, right = (sum(counts[key] for counts in every) for key in ("asked", "right"))
+    assert asked >= 100 and right / asked >= 0.95
+    given, hold = (sum(tally.hints[key] for tally in tallies.values()) for key in ("given", "hold"))
+    assert given >= 10 and hold / given >= 0.9
+    section = section_of(tallies, "2 frames.")
+    assert "| merged |" in section and "A question takes " in section
+
+
+def test_the_rule_knows_the_planted_faults_and_a_wrong_answer_counts_as_wrong(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    reasons = {
+        "hidden_person": ("person", 16.3, Reason.HIDDEN),
+        "flat_car": ("car", 10.0, Reason.GROUND),
+        "merged_people": ("person", 9.9, Reason.MERGED),
+        "shared_box": ("person", 8.7, Reason.SHARED_BOX),
+    }
+    for name, (label, ahead, reason) in reasons.items():
+        preset = "default" if name == "merged_people" else "reference"
+        scene = scene_of(drive(), at(name))
+        rule = Rule(at(name), scene, run_fault(name, preset))
+        assert {rule.cause(row).reason for row in planted(name, label, ahead)} == {reason}
+    monkeypatch.setattr("bevviz.why.answer.find_reason", lambda *_: (Reason.NOISE, False))
+    bench = Bench(configurations()["default"], StageLoader())
+    bench.frame(at("flat_car"), scene_of(drive(), at("flat_car")), "frame")
+    noise, all_ = bench.tally.of([Reason.NOISE]), bench.tally.of([*Reason])
+    assert noise["right"] == noise["asked"] == all_["right"] and len(bench.tally.wrong) > 50

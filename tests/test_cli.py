@@ -18,6 +18,8 @@ import pytest
 from rosbags.typesys import get_types_from_msg
 
 from bevviz.cli import main
+from bevviz.cli.options import with_negatives
+from bevviz.files import unfinished
 from bevviz.frame import FrameResult
 from bevviz.logging.logger import Logger
 from tests import bags
@@ -100,6 +102,19 @@ def test_info_names_sensors_and_what_is_missing(capsys: Capture) -> None:
     said = capsys.readouterr().out
     assert bags.CLOUD in said
     assert "--model" in said
+
+
+def test_several_numbers_may_begin_below_zero() -> None:
+    """argparse takes lone negative numbers for values, but not -5,1,0."""
+    assert with_negatives(["why", "--point", "-5,1,0", "--at", "-3"]) == [
+        "why",
+        "--point=-5,1,0",
+        "--at",
+        "-3",
+    ]
+    assert with_negatives(["--point", "-.5,-1e-3,0"]) == ["--point=-.5,-1e-3,0"]
+    kept = ["--point=1,2", "-5,1", "-v", "--set", "-x=1,2", "bag", "-1,2"]
+    assert with_negatives(kept) == kept
 
 
 def test_config_is_read_back(capsys: Capture, tmp_path: Path) -> None:
@@ -248,7 +263,9 @@ def test_a_recording_never_overwrites_a_bag(capsys: Capture) -> None:
     small_bag()
     before = {path: path.read_bytes() for path in Path("drive").iterdir()}
     for path in before:
-        assert "ends in .rrd" in error_of(capsys, "bag", "drive", "--save", path)
+        assert "is what is read" in error_of(capsys, "bag", "drive", "--save", path)
+    Path("other.mcap").write_text("another bag")
+    assert "ends in .rrd" in error_of(capsys, "bag", "drive", "--save", "other.mcap")
     assert {path: path.read_bytes() for path in Path("drive").iterdir()} == before
 
 
@@ -331,7 +348,7 @@ def test_an_interrupted_run_leaves_a_readable_recording(tmp_path: Path, number: 
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env=environment()) as run:
         try:
             while run.poll() is None and time.monotonic() < deadline:
-                if saved.exists() and saved.stat().st_size > 4_000_000:
+                if unfinished(saved).exists() and unfinished(saved).stat().st_size > 4_000_000:
                     break
                 time.sleep(0.1)
             run.send_signal(number)

@@ -15,6 +15,7 @@ import bevviz
 from bevviz.cli import main
 from bevviz.frame import FrameResult
 from bevviz.synthetic import BagWriter, SyntheticSource
+from bevviz.why import Selection
 from tests.recordings import Recording, verify
 
 
@@ -75,6 +76,18 @@ def test_the_answer_is_that_of_the_command(
     told = json.loads(capsys.readouterr().out)["answers"]
     assert len(answers) > 2
     assert [answer.verdict.text for answer in answers] == [answer["verdict"] for answer in told]
+
+
+def test_one_questioner_answers_for_a_scan(drive: bevviz.Drive) -> None:
+    questioner = drive.questioner(0.5)
+    assert drive.questioner(0.5) is questioner
+    number = len(drive.at(0.5).clusters or ())
+    (answer,) = drive.why(0.5, cluster=number - 1, hints=0)
+    assert answer.subject.kind == "cluster" and answer.subject.row == number - 1
+    assert answer is questioner.ask(Selection(cluster=number - 1))[0]
+    told, everything = (drive.why(0.5, hints=0, everything=flag) for flag in (False, True))
+    assert 0 < len(told) < len(everything)
+    assert drive.questioner(0.0) is not questioner
 
 
 def test_a_change_is_for_what_is_asked_from_then_on(drive: bevviz.Drive) -> None:

@@ -19,6 +19,7 @@ from bevviz.frame import (
     DetectionState,
     Explanation,
     Image,
+    Splits,
 )
 from bevviz.geometry import apply, project
 from bevviz.stages.fusion import fuse
@@ -61,6 +62,37 @@ def test_a_match_and_what_was_refused() -> None:
         ("cluster", "zed", 0, "low_overlap"),
         ("cluster", "zed", 1, "matched"),
         ("cluster", "", 2, "out_of_view"),
+    ]
+
+
+def test_what_the_camera_made_of_clusters() -> None:
+    points, clusters = clusters_of([slab(15, 0, 0, 20, 4), PERSON, slab(9, 5, 0, 1, 1)])
+    result = run(points, clusters, detections_of([silhouette(PERSON)] * 2), DEFAULT)
+    i32 = np.int32
+    splits = Splits(
+        camera=("zed",) * 6,
+        detection=np.array([0, 0, 0, 1, 1, 1], i32),
+        cluster=np.array([1, 1, 1, 2, 2, 2], i32),
+        rest=np.array([0, -1, -1, -1, -1, -1], i32),
+        is_noise=np.array([False, False, True, False, False, True]),
+        points=np.array([1377, 60, 3, 40, 50, 31], i32),
+        of=np.array([8241, 130, 3, 40, 50, 31], i32),
+    )
+    found = [e for e in explain([result], clusters, DEFAULT, splits) if e.subject == "split"]
+    assert [(e.camera, e.row, e.state, e.text) for e in found] == [
+        ("zed", 0, "split", "cluster 0 split by person 0.90: 1,377 of 8,241 points are cluster 1"),
+        (
+            "zed",
+            1,
+            "split",
+            "cluster 1 split by person 0.90: 60 of 130 points of a cluster that others have the rest of",
+        ),
+        (
+            "zed",
+            2,
+            "merged",
+            "cluster 2 made by person 0.89 of clusters of 40 and 50 points and 31 points of noise",
+        ),
     ]
 
 

@@ -29,7 +29,8 @@ def at(name: str) -> Snapshot:
 
 @cache
 def run(name: str, preset: str) -> FrameResult:
-    config = load(None, ["detector.model=demo"], "reference" if preset == "reference" else "default")
+    settings = ["detector.model=demo", *(["fusion.split=false"] if preset == "lidar" else [])]
+    config = load(None, settings, "reference" if preset == "reference" else "default")
     session = Session(config)
     return session.run(at(name).frame)
 
@@ -71,7 +72,7 @@ def test_the_flat_car_is_ground_for_one_plane_only() -> None:
     assert not (clusters_on("flat_car", "reference", row) >= 0).any()
 
 
-@pytest.mark.parametrize("preset", ["default", "reference"])
+@pytest.mark.parametrize("preset", ["lidar", "reference"])
 def test_the_two_people_are_one_cluster(preset: str) -> None:
     rows = planted("merged_people", "person", 9.9)
     assert len(rows) == 2

@@ -25,6 +25,7 @@ from bevviz.anomalies import KINDS
 from bevviz.config import Config, load
 from bevviz.errors import UserError
 from bevviz.explain import explain
+from bevviz.files import unfinished
 from bevviz.frame import (
     Anomaly,
     Boxes3D,
@@ -324,6 +325,21 @@ def test_fused_boxes_say_why(record: Callable[..., Recording]) -> None:
     assert "matched" in reason
 
 
+def test_what_was_seen_is_beside_the_whole_box(record: Callable[..., Recording]) -> None:
+    plain = make()
+    assert plain.objects is not None
+    seen = plain.objects.boxes
+    whole = dataclasses.replace(seen, size=seen.size + f32(1.0, 0.5, 0.0))
+    sides = np.array([[False, True, True, False]])
+    objects = dataclasses.replace(plain.objects, boxes=whole, measured=seen, seen=sides)
+    found = record([make(objects=objects)])
+    np.testing.assert_allclose(found.at["/world/fused"]["Boxes3D:half_sizes"][0], whole.size / 2, rtol=1e-5)
+    measured = found.at["/world/fused/measured"]
+    np.testing.assert_allclose(measured["Boxes3D:half_sizes"][0], seen.size / 2, rtol=1e-5)
+    assert found.at["/world/fused"]["seen"][0] == ["back, left"]
+    assert "/world/fused/measured" not in record([plain]).at, "nothing was completed"
+
+
 def test_frustums_end_at_the_matched_depth(record: Callable[..., Recording]) -> None:
     found = record([make()])
     strips = found.at["/world/frustums"]["LineStrips3D:strips"][0]
@@ -510,6 +526,8 @@ def test_numbers_that_wait_for_others_are_the_same(tmp_path: Path) -> None:
             for result in results:
                 logger.log(result)
             raise ValueError("cut")
+        assert not path.exists()
+        path = unfinished(path)  # whole all the same: an error leaves it under this name
         verify(path)
         rows = {e: r for e, r in Recording(path).rows.items() if e.startswith("/health")}
         found.append({e: sorted(r, key=lambda row: int(row["frame"])) for e, r in rows.items()})
@@ -713,7 +731,12 @@ def test_a_killed_process_leaves_what_it_had_logged(tmp_path: Path) -> None:
     env = {**os.environ, "PYTHONPATH": str(root)}
     done = subprocess.run([sys.executable, "-c", textwrap.dedent(script)], cwd=root, env=env, timeout=120)
     assert done.returncode == -signal.SIGKILL
-    assert sorted(Recording(path).at["/world/lidar/points"]["Points3D:positions"]) == [0, 1, 2, 3, 4]
+    left = tmp_path / "killed.partial.rrd"
+    assert not path.exists()
+    assert sorted(Recording(left).at["/world/lidar/points"]["Points3D:positions"]) == [0, 1, 2, 3, 4]
+    with open_recording(SCENE, load(), save=path) as sinks:  # the next run tells
+        assert sinks.warnings == ["killed.partial.rrd, which a run that did not end had left, is overwritten"]
+    assert path.exists() and not left.exists()
 
 
 @pytest.mark.parametrize(

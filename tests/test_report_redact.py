@@ -13,15 +13,18 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from bevviz.bags.recording import Recording as Bag
 from bevviz.cli import main
 from bevviz.config import DetectorConfig
 from bevviz.frame import F32, U8
+from bevviz.report.contents import Contents
 from bevviz.report.pictures import shrink
 from bevviz.report.redact import CELLS, Redactor, _encoded, grown, hide
 from bevviz.report.summary import STRIP_WIDTH
-from bevviz.ros.messages import decode_compressed_image, decode_image
+from bevviz.ros.messages import MessageError, decode_compressed_image, decode_image
+from bevviz.synthetic import SyntheticSource
 from tests import bags
 from tests.recordings import Recording, verify
 from tests.test_cli import Capture, error_of
@@ -233,6 +236,173 @@ def test_what_was_changed_keeps_its_form(form: str) -> None:
     data = _encoded(grey, magic)
     assert data[:4].tobytes() == magic[:4]
     np.testing.assert_allclose(np.asarray(cv2.imdecode(data, cv2.IMREAD_COLOR), int), 77, atol=1)
+
+
+# --- pictures inside other messages --------------------------------------------------------------
+
+OLD_VISION = {
+    "vision_msgs/msg/ObjectHypothesisWithPose": "string id\nfloat64 score\n"
+    "geometry_msgs/PoseWithCovariance pose",
+    "vision_msgs/msg/BoundingBox2D": "geometry_msgs/Pose2D center\nfloat64 size_x\nfloat64 size_y",
+    "vision_msgs/msg/Detection2D": "std_msgs/Header header\nObjectHypothesisWithPose[] results\n"
+    "BoundingBox2D bbox\nsensor_msgs/Image source_img",
+    "vision_msgs/msg/Detection2DArray": "std_msgs/Header header\nDetection2D[] detections",
+    "robot_msgs/msg/Snapshot": "std_msgs/Header header\nsensor_msgs/CompressedImage picture\nstring note",
+    "robot_msgs/msg/State": "float64 speed",
+}
+SECRET = np.random.default_rng(7).integers(0, 256, 48, np.uint8).tobytes()  # within every picture
+FRAMES = 3
+
+
+def crowded_items(messages: bags.Messages) -> list[bags.Item]:
+    """The synthetic drive, and what a robot says beside it."""
+    store = messages.store = get_typestore(Stores.ROS2_JAZZY)
+    types = {}
+    for name, text in OLD_VISION.items():
+        types.update(get_types_from_msg(text, name))
+    store.register(types)
+    found: list[bags.Item] = []
+    items = bags.small_items(messages, scans=FRAMES)
+    drive = {bags.START + i * bags.PERIOD: f for i, f in enumerate(SyntheticSource(frames=FRAMES))}
+    secret = np.frombuffer(SECRET, np.uint8).reshape(4, 4, 3)
+    for item in items:
+        if item.topic == bags.IMAGE:
+            camera = drive[item.received].cameras[0]
+            assert camera.image is not None
+            item = item._replace(message=messages.image(item.received, camera.image.bgr))
+        found.append(item)
+    for stamp in drive:
+        crop = messages.image(stamp, secret)
+        box = messages.make(
+            "vision_msgs/msg/BoundingBox2D",
+            center=messages.make("geometry_msgs/msg/Pose2D", x=1.0, y=2.0, theta=0.0),
+            size_x=3.0,
+            size_y=4.0,
+        )
+        about = messages.header(stamp, "camera")
+        one = messages.make(
+            "vision_msgs/msg/Detection2D", header=about, results=[], bbox=box, source_img=crop
+        )
+        both = messages.make("vision_msgs/msg/Detection2DArray", header=about, detections=[one, one])
+        picture = messages.compressed(stamp, SECRET)
+        snapshot = messages.make("robot_msgs/msg/Snapshot", header=about, picture=picture, note="a note")
+        layout = messages.make("std_msgs/msg/MultiArrayLayout", dim=[], data_offset=0)
+        array = "std_msgs/msg/UInt8MultiArray"
+        large = messages.make(array, layout=layout, data=np.frombuffer(SECRET * 20, np.uint8))
+        small = messages.make(array, layout=layout, data=np.zeros(3, np.uint8))
+        state = messages.make("robot_msgs/msg/State", speed=2.0)
+        found += [
+            bags.Item("/crops", "vision_msgs/msg/Detection2DArray", stamp, both),
+            bags.Item("/snapshot", "robot_msgs/msg/Snapshot", stamp, snapshot),
+            bags.Item("/bytes", array, stamp, large),
+            bags.Item("/key", array, stamp, small),
+            bags.Item("/state", "robot_msgs/msg/State", stamp, state),
+        ]
+    return found
+
+
+@pytest.fixture(scope="module")
+def crowded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    messages = bags.Messages()
+    items = crowded_items(messages)
+    return bags.write(tmp_path_factory.mktemp("crowded") / "drive", items, messages)
+
+
+def redacted_report(bag: Path, output: Path, *more: str) -> Path:
+    call = ["report", str(bag), "--at", "0", "-o", str(output), "--redact", "--model", "demo", *more]
+    assert main(call) == 0
+    return output
+
+
+def contents(bag: Path) -> dict[str, list[bytes]]:
+    found: dict[str, list[bytes]] = {}
+    with Bag([bag]) as recording:
+        for message in recording.messages([topic.name for topic in recording.topics]):
+            found.setdefault(message.topic, []).append(bytes(message.content()))
+    return found
+
+
+def test_pictures_inside_other_messages(crowded: Path, tmp_path: Path) -> None:
+    report = redacted_report(crowded, tmp_path / "bug.rrd")
+    before, after = contents(crowded), contents(report.with_suffix(".mcap"))
+    assert all(any(SECRET in m for m in before[topic]) for topic in ("/crops", "/snapshot", "/bytes"))
+    assert not any(SECRET in m for messages in after.values() for m in messages)
+    assert before.keys() - after.keys() == {"/snapshot", "/bytes", "/state"}
+    for topic in after.keys() - {"/crops", bags.IMAGE}:
+        assert after[topic] == before[topic]
+    with Bag([report.with_suffix(".mcap")]) as recording:
+        message = recording.first("/crops")
+        assert message is not None
+        detections = recording.decode(message).detections  # the message itself stays
+    assert [(d.bbox.size_x, len(d.source_img.data)) for d in detections] == [(3.0, 0), (3.0, 0)]
+    told = " ".join(json.loads(Recording(report).static["/__properties/report"]["about"][0])["warnings"])
+    for words in (
+        f"{FRAMES} message(s) of /crops without the pictures in it (detections.source_img of",
+        "/snapshot left out: bevviz does not know what a robot_msgs/msg/Snapshot shows",
+        "/state left out",
+        "/bytes left out: nobody can tell what the 960 values of 'data' show",
+    ):
+        assert words in told
+    assert "/snapshot left out" in report.with_suffix(".html").read_text()
+
+
+def test_an_image_of_the_synthetic_drive_is_hidden(crowded: Path, tmp_path: Path) -> None:
+    report = redacted_report(crowded, tmp_path / "bug.rrd")
+    with Bag([crowded]) as old, Bag([report.with_suffix(".mcap")]) as new:
+        images = []
+        for bag in (old, new):
+            first = bag.first(bags.IMAGE)
+            assert first is not None
+            images.append(decode_image(bag.decode(first), first.topic, 0).bgr)
+        redactor = Redactor(DetectorConfig(model="demo"), old)
+    changed = (images[0] != images[1]).any(axis=2)
+    places = grown(redactor.find(images[0]), images[0].shape[1], images[0].shape[0])
+    assert places and changed.any()
+    for left, top, right, bottom in places:
+        changed[top:bottom, left:right] = False
+    assert not changed.any()
+
+
+def test_what_is_asked_for_is_kept_and_said(crowded: Path, tmp_path: Path, capsys: Capture) -> None:
+    report = redacted_report(crowded, tmp_path / "bug.rrd", "--unredacted", "/s*", "/bytes")
+    capsys.readouterr()
+    before, after = contents(crowded), contents(report.with_suffix(".mcap"))
+    assert after["/state"] == before["/state"] and after["/bytes"] == before["/bytes"]
+    assert not any(SECRET in m for m in after["/snapshot"] + after["/crops"])  # pictures all the same
+    assert all(b"a note" in m for m in after["/snapshot"])
+    call = ["report", str(crowded), "--at", "0", "-o", str(tmp_path / "other.rrd"), "--model", "demo"]
+    assert "--unredacted /absent: no topic fits" in error_of(
+        capsys, *call, "--redact", "--unredacted", "/absent"
+    )
+    assert "--unredacted: everything is" in error_of(capsys, *call, "--unredacted", "/bytes")
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [("sensor_msgs/Absent part", "nobody knows what a"), ("Loop[] again", "nobody knows what a")],
+)
+def test_definitions_that_lead_nowhere(text: str, reason: str) -> None:
+    types = get_types_from_msg(text, "robot_msgs/msg/Loop")
+    with pytest.raises(MessageError, match=reason):
+        Contents("robot_msgs/msg/Loop", types)
+
+
+def test_no_older_report_is_left_when_redaction_ends_early(
+    crowded: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Killed at any time, nobody may take the older, unredacted page for the new one."""
+    output = tmp_path / "bug.rrd"
+    call = ["report", str(crowded), "--at", "0", "-o", str(output), "--model", "demo"]
+    assert main(call) == 0
+    assert len(list(tmp_path.iterdir())) == 3
+
+    def killed(*_: object) -> None:
+        raise SystemExit(9)
+
+    monkeypatch.setattr("bevviz.report.make._detect", killed)
+    with pytest.raises(SystemExit):
+        main([*call, "--redact", "--force"])
+    assert list(tmp_path.iterdir()) == []
 
 
 # --- hiding ------------------------------------------------------------------------------------

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.torture import damage, fuzz
+from benchmarks.torture import damage, fuzz, kill
 from benchmarks.torture.__main__ import SHARE
 from benchmarks.torture.damage import DAMAGES, Tally, judged
 from benchmarks.torture.judges import judges, taken
@@ -35,6 +35,21 @@ def test_fuzzed_messages() -> None:
     assert not (total.tracebacks or total.broken or total.hangs), total.examples
     assert total.slowest < 5
     assert total.memory < 400
+
+
+def test_signals_at_any_time() -> None:
+    for _, tally in kill.run(seed=1, count=8, names=("bag", "report --check")):
+        assert tally.signals == 4
+        assert tally.well, tally.examples
+
+
+def test_what_counts_as_false_or_unreadable(tmp_path: Path) -> None:
+    assert kill._falsehood(tmp_path, "bag", 0, "") == "and not all frames"
+    assert kill._falsehood(tmp_path, "report --check", 0, f"{kill.SCANS} frames: the same in every bit") == ""
+    assert kill._falsehood(tmp_path, "report --check", 0, "1 of 40 frames differ")
+    assert kill._falsehood(tmp_path, "bag", 3, "") and not kill._falsehood(tmp_path, "bag", 130, "")
+    (tmp_path / "cut.rrd").write_bytes(b"RRF2\0\0")
+    assert kill._unreadable(tmp_path / "cut.rrd")
 
 
 @pytest.mark.parametrize("name", FORMATS)
@@ -70,8 +85,8 @@ def test_a_worker_that_hangs_is_replaced(tmp_path: Path, monkeypatch: pytest.Mon
 def test_the_command_says_which_parts_there_are(capsys: pytest.CaptureFixture[str]) -> None:
     from benchmarks.torture.__main__ import PARTS, damaged_bags
 
-    options = argparse.Namespace(seed=2, bags=10, format="ros1, bz2", messages=1)
-    assert set(PARTS) >= {"damage", "fuzz"}
+    options = argparse.Namespace(seed=2, bags=10, format="ros1, bz2", messages=1, signals=1)
+    assert set(PARTS) == {"damage", "fuzz", "kill"}
     assert damaged_bags(options)
     lines = capsys.readouterr().out.splitlines()
     assert "Damaged bags, seed 2" in lines

@@ -192,6 +192,29 @@ def test_a_rectangle_turned_by_a_quarter_is_the_same_car() -> None:
     assert np.cos(turn) < 0, "it comes: its front is the side towards the robot"
 
 
+def test_what_was_whole_once_stays_so() -> None:
+    """A car of which only the rear is seen: named with all of its length, then not named any more."""
+    tracker = Tracker()
+    for i in range(12):
+        frame, clusters, objects = scene(i, [(18.2, 0, 0)], (0.4, 1.7, 1.5), ("car",) if 2 <= i < 8 else ())
+        if len(objects):
+            whole = Boxes3D(
+                objects.boxes.center + f32(1.8, 0, 0), f32(4.0, 1.7, 1.5)[None], objects.boxes.yaw
+            )
+            sides = np.array([[False, True, False, False]])
+            objects = replace(objects, boxes=whole, measured=objects.boxes, seen=sides)
+        tracks = tracker.update(frame, clusters, np.ones(1, bool), objects, CONFIG)
+        assert tracks.id.tolist() == [0]
+        length = 4.0 if i >= 2 else 1.7
+        assert tracks.boxes.size[0, :2].max() == pytest.approx(length, abs=0.05)
+        assert tracks.boxes.center[0, 0] == pytest.approx(20.0 if i >= 2 else 18.2, abs=0.05)
+        assert tracks.speed[0] < 0.1, "to become whole is no motion"
+
+
+def f32(*values: float) -> F32:
+    return np.array(values, np.float32)
+
+
 @pytest.mark.parametrize("stamp", [5, 100], ids=["back", "far forward"])
 def test_a_jump_of_the_clock_begins_anew(stamp: int) -> None:
     tracker, _ = walk(20)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -17,10 +18,11 @@ from bevviz.config import Config, load
 from bevviz.errors import UserError
 from bevviz.frame import Boxes3D, DetectionState, FrameResult, LabelledBoxes3D
 from bevviz.session import Session
-from bevviz.synthetic import BagWriter
-from bevviz.why import Answer, Selection, why
-from bevviz.why.evidence import Fate
-from bevviz.why.subject import projected, truth_box
+from bevviz.synthetic import BagWriter, SyntheticSource
+from bevviz.why import Answer, Questioner, Selection, why
+from bevviz.why.subject import projected
+from bevviz.why.text import summary
+from bevviz.why.traces import Fate, Traces
 from bevviz.why.verdict import Reason
 from tests import bags
 from tests.recordings import Recording
@@ -28,6 +30,7 @@ from tests.test_faults import at, drive, planted, run
 
 CLASSES = ("car", "person", "cyclist")
 Capture = pytest.CaptureFixture[str]
+NUMBER = re.compile(r"-?\d+(?:\.\d+)?")
 
 
 def config_of(preset: str, *settings: str) -> Config:
@@ -36,7 +39,7 @@ def config_of(preset: str, *settings: str) -> Config:
 
 @cache
 def asked(name: str, preset: str, label: str = "") -> list[Answer]:
-    return why(run(name, preset), Selection(label=label), CLASSES, hints=0)
+    return why(run(name, preset), Selection(label=label), CLASSES, hints=0, everything=True)
 
 
 def of_truth(answers: list[Answer], row: int) -> Answer:
@@ -46,7 +49,8 @@ def of_truth(answers: list[Answer], row: int) -> Answer:
 def about(name: str, preset: str, row: int) -> Answer:
     """The answer about one object, with hints: asked for by its place in the image."""
     result = run(name, preset)
-    box = projected(truth_box(result.frame, row), result.frame.cameras[0])
+    place = Traces(result).truth[row].box
+    box = projected(place, result.frame.cameras[0]) if place is not None else None
     assert box is not None
     (answer,) = why(result, Selection(box=tuple(box.tolist())), CLASSES, hints=1)
     assert (answer.subject.kind, answer.subject.row) == ("truth", row)
@@ -94,11 +98,17 @@ def test_a_flat_car_taken_for_ground() -> None:
     assert of_truth(again, row).verdict.reported
 
 
+@cache
+def merged_people(preset: str) -> FrameResult:
+    """Two people in one cluster, which the camera is not asked to split."""
+    settings = ["fusion.split=false"] if preset == "default" else []
+    return Session(config_of(preset, *settings)).run(at("merged_people").frame)
+
+
 @pytest.mark.parametrize("preset", ["default", "reference"])
 def test_two_people_in_one_cluster(preset: str) -> None:
-    answers = [
-        of_truth(asked("merged_people", preset, "person"), r) for r in planted("merged_people", "person", 9.9)
-    ]
+    asked_of = why(merged_people(preset), Selection(label="person"), CLASSES, hints=0)
+    answers = [of_truth(asked_of, r) for r in planted("merged_people", "person", 9.9)]
     assert [a.verdict.reason for a in answers] == [Reason.MERGED] * 2
     assert sorted(a.verdict.reported for a in answers) == [False, True]
     lost = next(a for a in answers if not a.verdict.reported)
@@ -109,15 +119,23 @@ def test_two_people_in_one_cluster(preset: str) -> None:
     assert "clustering.eps is 0.5 m" in lost.verdict.text
 
 
+def test_two_people_whom_the_camera_parts() -> None:
+    answers = asked("merged_people", "default", "person")
+    both = [of_truth(answers, row) for row in planted("merged_people", "person", 9.9)]
+    assert [a.verdict.reason for a in both] == [Reason.REPORTED] * 2
+    texts = [e.text for e in run("merged_people", "default").explanations if e.state == "split"]
+    assert any(re.fullmatch(r"cluster \d+ split by person 0.\d+: \d+ of [\d,]+ points.*", t) for t in texts)
+    assert any(re.search(r"which split it off (a )?cluster", a.verdict.text) for a in both)
+
+
 def test_the_hint_that_parts_two_people_is_proved() -> None:
-    result = run("merged_people", "default")
+    result = merged_people("default")
     answers = why(result, Selection(label="person"), CLASSES, hints=1)
     lost = next(a for a in answers if a.verdict.reason is Reason.MERGED and not a.verdict.reported)
     assert lost is answers[0]
-    assert lost.hints[0].settings[0].startswith("clustering.eps=0.")
-    assert f"; change {lost.hints[0].settings[0]}: it is cluster " in lost.verdict.text
-    better = config_of("default", *lost.hints[0].settings)
-    session = Session(better)
+    assert lost.hints[0].settings == ("fusion.split=true",)
+    assert "; change fusion.split=true: it is cluster " in lost.verdict.text
+    session = Session(config_of("default", *lost.hints[0].settings))
     again = why(session.run(result.frame), Selection(label="person"), CLASSES, hints=0)
     assert all(
         of_truth(again, row).verdict.reason is Reason.REPORTED
@@ -126,7 +144,7 @@ def test_the_hint_that_parts_two_people_is_proved() -> None:
 
 
 def test_two_people_without_ground_truth() -> None:
-    result = run("merged_people", "default")
+    result = merged_people("default")
     blind = replace(result, frame=replace(result.frame, truth=None))
     answers = why(blind, Selection(label="person"), CLASSES, hints=0)
     merged = [a for a in answers if a.verdict.reason is Reason.MERGED]
@@ -154,12 +172,18 @@ def test_a_box_that_names_two_clusters() -> None:
 
 
 def test_without_a_selection_what_went_wrong_comes_worst_first() -> None:
-    answers = asked("merged_people", "default")
-    assert all(a.verdict.reason is not Reason.REPORTED for a in answers)
-    reported = [a.verdict.reported for a in answers]
+    everything = asked("merged_people", "default")
+    folded = [a.folded for a in everything]
+    assert folded == sorted(folded) and any(folded) and not folded[0]
+    open_ = why(run("merged_people", "default"), Selection(), CLASSES, hints=0)
+    wrong = [a for a in everything if not a.folded and a.verdict.reason is not Reason.REPORTED]
+    assert [a.subject.name for a in open_] == [a.subject.name for a in wrong]
+    reported = [a.verdict.reported for a in open_]
     assert reported == sorted(reported) and not reported[0]
-    lost = [a.distance for a in answers if not a.verdict.reported and not np.isnan(a.distance)]
-    assert lost == sorted(lost)
+    for near in (True, False):
+        lost = [a.distance for a in open_ if not a.verdict.reported and a.near is near]
+        assert lost and np.isfinite(lost[:-1]).all() and lost == sorted(lost)
+    assert [a.near for a in open_[: len(lost)]] == sorted([a.near for a in open_[: len(lost)]], reverse=True)
 
 
 def test_a_pixel_is_the_detection_there() -> None:
@@ -188,11 +212,187 @@ def test_the_fates_add_up() -> None:
     """Every raw point at the place has one fate, and nothing else has any but what hides it."""
     shot = at("merged_people")
     for answer in asked("merged_people", "default", "person"):
-        there = answer.subject.place(shot.frame, shot.frame.points)
+        there = np.zeros(len(shot.frame.points), bool)
+        there[answer.evidence.points] = True
         others = answer.fate[~there]
         assert set(np.unique(others)) <= {Fate.ELSEWHERE, Fate.IN_FRONT}
         assert not np.isin(answer.fate[there], [Fate.ELSEWHERE, Fate.IN_FRONT]).any()
         assert numbers(answer, "raw cloud")["points"] == there.sum()
+
+
+def test_a_pixel_lists_all_that_lies_there_and_begins_with_what_it_shows() -> None:
+    """A cyclist that is missed before a car: neither the pixel nor the box is answered for the car."""
+    shot, questioner = at("merged_people"), Questioner(run("merged_people", "default"), classes=CLASSES)
+    asked_for = 0
+    for row, number in enumerate(shot.truth_object.tolist()):
+        ys, xs = np.nonzero(shot.pixel_object == number)
+        if len(xs) < 400 or xs.min() == 0:  # of what is cut off no box fits the rest
+            continue
+        middle = np.argmin((xs - xs.mean()) ** 2 + (ys - ys.mean()) ** 2)
+        pixel = Selection(box=(float(xs[middle]), float(ys[middle])))
+        around = Selection(box=(float(xs.min()), float(ys.min()), float(xs.max()), float(ys.max())))
+        for selection in (pixel, around):
+            found = questioner.candidates(selection)
+            assert questioner.ask(selection)[0].subject is found[0].subject
+            assert (found[0].subject.kind, found[0].subject.row) == ("truth", row), found[0].subject.name
+        assert len({a.subject.key for a in questioner.candidates(pixel)}) == len(questioner.candidates(pixel))
+        asked_for += 1
+    assert asked_for >= 4
+
+
+def test_an_empty_place_says_what_is_there() -> None:
+    questioner = Questioner(run("flat_car", "default"), classes=CLASSES)
+    (road,) = questioner.ask(Selection(point=(-5.0, 1.0, -1.9)))
+    assert road.verdict.text.startswith("There is only ground at -5, 1, -1.9 m: ")
+    assert "points, all ground, -0.0" in road.verdict.text
+    (air,) = questioner.ask(Selection(point=(-5.0, 1.0, 5.0)))
+    assert air.verdict.reason is Reason.NO_POINTS
+    assert "There is nothing at -5, 1, 5 m: the LiDAR has no points within 0.5 m" in air.verdict.text
+    assert not questioner.candidates(Selection(point=(-5.0, 1.0, 5.0)))
+    (pixel,) = questioner.ask(Selection(box=(320.0, 340.0)))
+    assert pixel.verdict.text.startswith("There is only ground at pixel 320, 340: ")
+
+
+def test_a_cell_of_the_birds_eye_view_is_the_column_over_it() -> None:
+    result = run("merged_people", "default")
+    questioner, clusters = Questioner(result, classes=CLASSES), result.clusters
+    assert clusters is not None and result.bev is not None
+    for k in np.flatnonzero(clusters.kept)[:10].tolist():
+        inside = result.frame.points[questioner.traces.cluster == k]
+        x, y = inside[len(inside) // 2, :2].tolist()
+        reach, step = result.config.bev.range_x, result.config.bev.resolution
+        cell = Selection(cell=(int((reach - x) / step), int((reach - y) / step)))
+        (answer,) = questioner.ask(cell)
+        assert answer.subject.kind == "cell" and k in {part.cluster for part in answer.evidence.parts}
+        there = result.frame.points[answer.evidence.points]
+        assert np.abs(there[:, :2] - (x, y)).max() <= 0.5 + 0.1 + 0.02
+        names = {a.subject.row for a in questioner.candidates(cell) if a.subject.kind == "cluster"}
+        assert k in names or any(a.subject.kind == "truth" for a in questioner.candidates(cell))
+    with pytest.raises(UserError, match="cell 900, 3: outside the bird's-eye view, which has 800 rows"):
+        questioner.ask(Selection(cell=(900, 3)))
+
+
+def test_a_track_is_its_cluster_or_the_place_where_it_is_expected() -> None:
+    source, session = SyntheticSource(20, seed=3), Session(config_of("default"))
+    for index in range(6):
+        result = session.run(source.frame(index))
+    tracks = result.tracks
+    assert tracks is not None
+    questioner = Questioner(result, classes=CLASSES)
+    seen = int(np.flatnonzero((tracks.cluster >= 0) & (tracks.object >= 0))[0])
+    (answer,) = questioner.ask(Selection(track=int(tracks.id[seen])))
+    assert answer.verdict.reported and answer.subject.label == tracks.names[seen]
+    assert answer.evidence.main == tracks.cluster[seen]
+    expected = np.flatnonzero(tracks.cluster < 0)
+    assert len(expected)
+    (lost,) = questioner.ask(Selection(track=int(tracks.id[expected[0]])))
+    assert not lost.verdict.reported and lost.subject.box is not None
+    with pytest.raises(UserError, match="there is no track 9999 in this frame; there are "):
+        questioner.ask(Selection(track=9999))
+    with pytest.raises(UserError, match="tracks are known in a run over the drive only"):
+        Questioner(session.alone(source.frame(6))).ask(Selection(track=1))
+
+
+def test_a_row_is_what_the_result_has_there() -> None:
+    result = run("merged_people", "default")
+    questioner = Questioner(result, classes=CLASSES)
+    assert result.objects is not None and result.clusters is not None
+    (thing,) = questioner.ask(Selection(object=0))
+    assert thing.verdict.reported and thing.subject.label == result.objects.names[0]
+    (cluster,) = questioner.ask(Selection(cluster=int(result.objects.cluster[0])))
+    assert cluster.verdict.reported and f"is named {result.objects.names[0]}" in cluster.verdict.text
+    (detection,) = questioner.ask(Selection(detection=int(result.objects.detection[0]), camera="zed"))
+    assert detection.verdict.reported and detection.subject.kind == "detection"
+    for wrong in (
+        Selection(object=99),
+        Selection(cluster=999),
+        Selection(detection=999),
+        Selection(truth=999),
+    ):
+        with pytest.raises(UserError, match=r"there is no .*99"):
+            questioner.ask(wrong)
+
+
+def test_the_nearest_missed_is_near_and_missed() -> None:
+    missed = Questioner(run("merged_people", "default"), classes=CLASSES).missed()
+    assert len(missed) >= 2
+    assert not any(a.verdict.reported or a.folded for a in missed)
+    assert all(a.distance <= 40 and a.points >= 10 for a in missed)
+    assert [a.distance for a in missed] == sorted(a.distance for a in missed)
+
+
+def test_weak_detections_are_not_told_unasked_and_the_surest_comes_first() -> None:
+    result = run("merged_people", "default")
+    blind = Questioner(replace(result, frame=replace(result.frame, truth=None)), classes=CLASSES)
+    told, everything = (blind.explain(Selection(), 0, everything=flag) for flag in (False, True))
+    weak = [a for a in everything if a.weak]
+    scores = [a.evidence.best.score for a in weak if a.evidence.best is not None]
+    assert len(scores) == len(weak) > 20 and scores == sorted(scores, reverse=True)
+    assert everything[-len(weak) :] == weak and not any(a.folded for a in told)
+    assert f"{len(weak)} weak detections (folded: --all)" in summary(blind.ask(Selection()))
+    for answer in everything:  # what is missed has a place, too: where the middle of its box has most points
+        assert np.isfinite(answer.distance) or answer.points == 0
+
+
+# --- stages that did not run -------------------------------------------------------------------
+
+
+def test_without_a_model_or_an_image_the_detector_is_not_said_to_have_looked() -> None:
+    frame = at("merged_people").frame
+    lens = replace(frame.cameras[0], image=None, problems=("no image within 0.1 s",))
+    no_model = Session(load()).run(frame)
+    no_image = Session(config_of("default")).run(replace(frame, cameras=(lens,)))
+    no_camera = Session(config_of("default")).run(replace(frame, cameras=()))
+    for result, what in (
+        (no_model, "the detector never ran: detector.model is not set"),
+        (no_image, "the detector never ran: no image within 0.1 s"),
+        (no_camera, "the detector never ran: there is no camera"),
+    ):
+        answers = why(result, Selection(label="person"), CLASSES, hints=1)
+        never = [a for a in answers if a.verdict.reason is Reason.NOT_RUN]
+        assert len(never) >= 2 and all(what in a.verdict.text for a in never)
+        assert not any(a.verdict.reported or "no candidate" in str(a.as_dict()) for a in answers)
+        assert "the detector never ran" in summary(answers)
+        box = never[0].subject.box
+        assert box is not None
+        (there,) = why(result, Selection(point=tuple(box.center[0].tolist())), CLASSES)
+        assert there.verdict.reason is Reason.NOT_RUN
+
+
+def test_a_camera_without_a_place_compares_nothing() -> None:
+    frame = at("merged_people").frame
+    lens = replace(frame.cameras[0], camera_from_points=None, problems=("no transform to zed",))
+    result = Session(config_of("default")).run(replace(frame, cameras=(lens,)))
+    answers = why(result, Selection(label="person"), CLASSES, hints=0)
+    clustered = [a for a in answers if a.subject.kind == "truth" and a.evidence.main >= 0]
+    assert clustered and {a.verdict.reason for a in clustered} == {Reason.NOT_FUSED}
+    assert "zed could not be compared with clusters: no transform to zed" in clustered[0].verdict.text
+
+
+def test_what_is_too_weak_was_not_suppressed() -> None:
+    """A rival is not to blame for what would have been dropped without it."""
+    result = Session(config_of("default", "detector.conf_threshold=0.5")).run(at("merged_people").frame)
+    questioner, detections = Questioner(result, classes=CLASSES), result.cameras[0].detections
+    assert detections is not None
+    suppressed = np.flatnonzero(detections.state == DetectionState.SUPPRESSED)
+    weak = suppressed[detections.score[suppressed] < 0.5]
+    assert len(weak) and len(weak) < len(suppressed)
+    for row in suppressed.tolist():
+        (answer,) = questioner.ask(Selection(detection=row))
+        right = Reason.BELOW_THRESHOLD if row in weak else Reason.SUPPRESSED
+        assert answer.verdict.reason is right
+
+
+def test_a_hint_says_what_else_it_changes() -> None:
+    (row,) = planted("flat_car", "car", 10.0)
+    answer = about("flat_car", "reference", row)
+    effects = answer.hints[0].effects
+    assert any(name.startswith("car at 10.") for name in effects.fixed)
+    assert f"(in this frame it {effects.text})" in answer.verdict.text
+    before = run("flat_car", "reference").objects
+    after = Session(config_of("reference", *answer.hints[0].settings)).run(at("flat_car").frame).objects
+    assert before is not None and after is not None
+    assert len(after) - len(before) == len(effects.fixed) + len(effects.added) - len(effects.lost)
 
 
 @pytest.mark.parametrize(
@@ -347,6 +547,32 @@ def test_the_command_for_machines(bag: Path, capsys: Capture) -> None:
     assert [step["stage"] for step in answer["chain"]][:3] == ["camera zed", "raw cloud", "occlusion"]
 
 
+def test_a_number_below_zero_a_scan_by_its_number_and_what_is_folded(bag: Path, capsys: Capture) -> None:
+    command = ["why", str(bag), "--model", "demo"]
+    assert main([*command, "--at-frame", "0", "--point", "-5,1,-1.9"]) == 0
+    said = capsys.readouterr().out
+    assert said.startswith("frame 0, preset default: what is at -5, 1, -1.9 m\n")
+    assert "There is only ground at -5, 1, -1.9 m" in said
+    assert main([*command, "--at-frame", "1", "--limit", "1"]) == 0
+    said = capsys.readouterr().out
+    first, _, rest = said.partition("\n")
+    counts = re.fullmatch(r"frame 1, preset default: (\d+) objects: (\d+) reported.*, (\d+) hidden.*", first)
+    assert counts is not None and first.endswith("(folded: --all)")
+    assert "is hidden" not in rest and "no camera has it in view" not in rest
+    assert main([*command, "--at-frame", "1", "--all", "--limit", "1"]) == 0
+    everything = capsys.readouterr().out
+    assert len(everything.splitlines()) >= len(said.splitlines()) + int(counts[2]) - 3 + int(counts[3])
+    assert everything.count("is hidden: ") + everything.count("no camera has it") > 0
+    assert main([*command, "--at-frame", "99"]) == 2
+    assert "frame 99: " in capsys.readouterr().err
+
+
+def test_what_else_lies_at_a_place_is_listed(bag: Path, capsys: Capture) -> None:
+    assert main(["why", str(bag), "--model", "demo", "--at-frame", "0", "--point", "10,-2.7,-1.6"]) == 0
+    said = capsys.readouterr().out
+    assert "also there:\n- The car at 10.3 m was reported" in said
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -354,6 +580,7 @@ def test_the_command_for_machines(bag: Path, capsys: Capture) -> None:
         (["--at", "noon"], "'noon' is no time"),
         (["--at", "0", "--class", "zebra", "--model", "demo"], "--class zebra: no such class"),
         (["--at", "0", "--box", "1000,1000"], "outside the image of zed"),
+        (["--at-frame", "0", "--cluster", "999"], "there is no cluster 999 in this frame: it has "),
     ],
 )
 def test_wrong_questions(bag: Path, capsys: Capture, arguments: list[str], message: str) -> None:
@@ -371,3 +598,25 @@ def test_wrong_numbers(bag: Path, capsys: Capture, arguments: list[str]) -> None
         main(["why", str(bag), "--at", "0", *arguments])
     assert ended.value.code == 2
     assert "error: argument" in capsys.readouterr().err
+
+
+# --- the page ----------------------------------------------------------------------------------
+
+
+def test_the_page_shows_what_the_command_says(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capture
+) -> None:
+    """Word for word; numbers may differ a little where another processor adds up in another order."""
+    page = (Path(__file__).parents[1] / "docs/why.md").read_text()
+    sample = next(block for block in page.split("```") if "bevviz demo" in block).removeprefix("console\n")
+    demo, command, *shown = sample.splitlines()
+    monkeypatch.chdir(tmp_path)
+    assert main(demo.removeprefix("$ bevviz ").split()) == 0
+    capsys.readouterr()
+    assert main(command.removeprefix("$ bevviz ").split()) == 0
+    said, told = (
+        (NUMBER.split(text), NUMBER.findall(text))
+        for text in (" ".join(capsys.readouterr().out.split()), " ".join(" ".join(shown).split()))
+    )
+    assert told[0] == said[0]
+    assert [float(x) for x in told[1]] == pytest.approx([float(x) for x in said[1]], rel=0.02, abs=0.02)

@@ -1,7 +1,8 @@
-"""Torture: damaged bags and fuzzed messages, beside what other readers make of them.
+"""Torture: damaged bags and fuzzed messages, beside what other readers make of them, and killed processes.
 
 Prints a table for each part and what went wrong in it, and ends with status 1 where anything did: a
-traceback, a hang, a loss without a word, or fewer messages than 99.5 % of what the best other reader gives.
+traceback, a hang, a loss without a word, fewer messages than 99.5 % of what the best other reader gives, a
+false result after a signal, or a file that cannot be read after a kill.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ import argparse
 import sys
 from collections.abc import Callable, Mapping
 
-from benchmarks.torture import damage, fuzz
+from benchmarks.torture import damage, fuzz, kill
 from benchmarks.torture.samples import FORMATS
 
 EXAMPLES = 40  # of what went wrong that are printed
@@ -41,6 +42,17 @@ def fuzzed_messages(options: argparse.Namespace) -> bool:
     return not (total.tracebacks or total.broken or total.hangs)
 
 
+def killed_processes(options: argparse.Namespace) -> bool:
+    print(f"\nSignals at any time, seed {options.seed}\n\n{kill.HEAD}")
+    well, examples = True, list[str]()
+    for name, tally in kill.run(options.seed, options.signals):
+        print(kill.row(name, tally), flush=True)
+        well &= tally.well
+        examples += tally.examples
+    _print_examples(examples)
+    return well
+
+
 def _print_examples(examples: list[str]) -> None:
     for example in examples[:EXAMPLES]:
         print(f"- {example}")
@@ -48,7 +60,7 @@ def _print_examples(examples: list[str]) -> None:
         print(f"- and {len(examples) - EXAMPLES} more")
 
 
-PARTS: Mapping[str, Part] = {"damage": damaged_bags, "fuzz": fuzzed_messages}
+PARTS: Mapping[str, Part] = {"damage": damaged_bags, "fuzz": fuzzed_messages, "kill": killed_processes}
 
 
 def main() -> int:
@@ -62,6 +74,7 @@ def main() -> int:
     parser.add_argument("--bags", type=int, default=900, help="damaged bags (default: 900)")
     parser.add_argument("--format", metavar="NAME", help="only the formats whose name has this in it")
     parser.add_argument("--messages", type=int, default=2000, help="fuzzed messages (default: 2000)")
+    parser.add_argument("--signals", type=int, default=240, help="signals sent to commands (default: 240)")
     options = parser.parse_args()
     if unknown := set(options.parts) - set(PARTS):
         parser.error(f"{', '.join(sorted(unknown))}: no such part; there are {', '.join(PARTS)}")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import struct
 from binascii import crc32
 from collections import Counter, defaultdict
@@ -37,6 +38,7 @@ from bevviz.bags.mcap import (
     SCHEMA,
 )
 from bevviz.errors import UserError
+from bevviz.files import claim, unfinished
 
 HEADER, CHUNK_INDEX, STATISTICS = 1, 8, 0x0B
 CHUNK_SIZE = 1 << 22  # bytes that a chunk is closed at
@@ -44,6 +46,8 @@ CHUNK_SIZE = 1 << 22  # bytes that a chunk is closed at
 
 class McapWriter:
     """Context manager: ``write`` messages in order of log time. The file appears when all went well.
+
+    Until then it is NAME.partial.mcap, which a process that is killed leaves, and which can be read.
 
     The messages of ROS 1 stay what they are: with the encoding ``ros1``, which MCAP has beside ``cdr``.
 
@@ -65,8 +69,8 @@ class McapWriter:
         ros1: bool = False,
         compress: bool = True,
     ) -> None:
-        self._path = path
-        self._part = path.with_name(f".{path.name}.part")
+        self._path = path.resolve()
+        self._part = unfinished(self._path)
         self._define = define
         self._profile = "ros1" if ros1 else "ros2"
         self._compression = "zstd" if compress else ""
@@ -81,10 +85,8 @@ class McapWriter:
         self._span = (2**63 - 1, 0)
 
     def __enter__(self) -> Self:
-        try:
-            self._file: IO[bytes] = self._part.open("wb")
-        except OSError as error:
-            raise UserError(f"{self._path}: cannot write the bag: {error.strerror}") from None
+        self._lock = claim(self._path, "bag")
+        self._file: IO[bytes] = self._part.open("wb")
         self._file.write(MAGIC + _record(HEADER, _text(self._profile) + _text(f"bevviz {__version__}")))
         return self
 
@@ -101,6 +103,7 @@ class McapWriter:
             raise UserError(f"{self._path}: cannot write the bag: {failure.strerror}") from None
         finally:
             self._part.unlink(missing_ok=True)
+            os.close(self._lock)
 
     def write(self, connection: Connection, time: int, data: bytes | memoryview) -> None:
         """Append a message.

@@ -10,7 +10,6 @@ from dataclasses import dataclass
 from functools import cached_property
 from operator import itemgetter
 from pathlib import Path, PurePath
-from tempfile import TemporaryDirectory, mkdtemp
 from typing import Any, Literal
 
 import numpy as np
@@ -40,10 +39,12 @@ from bevviz.bags.reader import (
 from bevviz.bags.sqlite import SoundSqlite, SqliteRescuer
 from bevviz.closing import Closing
 from bevviz.errors import UserError
+from bevviz.files import Scratch
 from bevviz.frame import I64
 from bevviz.ros import vision_msgs
 from bevviz.ros.messages import MessageError, read_header
 from bevviz.ros.roles import Topic
+from bevviz.text import path_text
 
 ZSTD = b"\x28\xb5\x2f\xfd"
 FRAME = re.compile(re.escape(ZSTD))
@@ -141,7 +142,7 @@ class Recording(Closing):
         self._notes: list[str] = []
         self._stores: dict[tuple[object, ...], Typestore] = {}
         self._default = Stores.ROS2_JAZZY
-        self._folder = TemporaryDirectory(prefix="bevviz-", ignore_cleanup_errors=True)
+        self._scratch = Scratch()
         try:
             for path in paths:
                 self._open(path)
@@ -154,11 +155,11 @@ class Recording(Closing):
     def close(self) -> None:
         while self.files:
             self.files.pop().close()
-        self._folder.cleanup()
+        self._scratch.close()
 
     @property
     def name(self) -> str:
-        return self.paths[0].resolve().name
+        return path_text(self.paths[0].resolve().name)
 
     @cached_property
     def size(self) -> int:
@@ -268,6 +269,10 @@ class Recording(Closing):
             return connection.msgdef
         return MessageDefinition(MessageDefinitionFormat.MSG, text)
 
+    def definitions(self, connection: Connection) -> Mapping[str, Any]:
+        """The fields of every type that a connection's messages may be made of, as rosbags has them."""
+        return self._store(connection).fielddefs
+
     def _store(self, connection: Connection) -> Typestore:
         """The types that the bag itself defines, else those of the ROS release."""
         ros1, definition = is_ros1(connection), connection.msgdef
@@ -370,6 +375,8 @@ class Recording(Closing):
             return {}
 
     def _open_file(self, path: Path) -> BagFile:
+        if path.exists() and not path.is_file():  # a pipe would be waited for
+            raise UserError(f"{path}: no bag: it is no file")
         with path.open("rb") as file:
             head = file.read(16)
         if head.startswith(ZSTD):
@@ -395,12 +402,12 @@ class Recording(Closing):
     def _open_as(self, kind: Kind, path: Path) -> BagFile:
         public = path
         if path.suffix != kind.suffix or set("?#%") & set(str(path)):  # the latter mean something in a URI
-            public = Path(mkdtemp(dir=self._folder.name)) / f"bag{kind.suffix}"
+            public = self._scratch.new() / f"bag{kind.suffix}"
             public.symlink_to(path.resolve())
         return BagFile(path, kind.name, lambda: kind.sound(path, public), lambda: kind.rescue(path))
 
     def _unpack(self, path: Path) -> Path:
-        target = Path(mkdtemp(dir=self._folder.name)) / path.stem
+        target = self._scratch.new() / path.stem
         damaged, whole = unpack_file(path, target)
         if damaged or not whole:
             what = f"{damaged} damaged place(s) in it" if damaged else "its end is missing"

@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
-
-import rerun as rr
 
 from bevviz.batch.summary import Link
 from bevviz.batch.table import RunInfo
 from bevviz.errors import UserError, first_line
-from bevviz.logging import blueprints, entities
-from bevviz.logging.sinks import APPLICATION, check_port, free_port
+from bevviz.logging import blueprints, entities, rerun_cli
+from bevviz.logging.ports import LOOPBACK, check_port, free_port, host_for, origins, own_address
+from bevviz.logging.sinks import APPLICATION
 
 TIMEOUT = 600  # seconds
 
@@ -66,18 +65,20 @@ def register(url: str, name: str, results: Sequence[tuple[Path, RunInfo]], bluep
 
 
 @contextmanager
-def served(port: int) -> Iterator[tuple[str, str]]:
-    """A catalog server on this machine, and a web viewer: their addresses.
+def served(port: int, bind: str = LOOPBACK) -> Iterator[tuple[str, str]]:
+    """A catalog server at an address of this machine, and a web viewer: their addresses.
 
     Raises:
-        UserError: a port is in use.
+        UserError: a port is in use, or the address is not of this machine.
     """
+    address = own_address(bind)
     check_port(port, "--serve-catalog")
-    web_port = free_port(9090, but=port)
-    try:
-        server = rr.server.Server(host="127.0.0.1", port=port)
-        rr.serve_web_viewer(web_port=web_port, open_browser=False)
-    except (RuntimeError, ValueError, OSError) as error:
-        raise UserError(f"--serve-catalog {port}: {first_line(error)}") from None
-    with server:
-        yield f"rerun+http://127.0.0.1:{port}", f"http://localhost:{web_port}"
+    web_port, host = free_port(9090, but=port), host_for(address)
+    url = f"rerun+http://{host}:{port}"
+    arguments = ["server", "--host", address, "--port", str(port)]
+    for origin in origins(address, web_port):
+        arguments += ["--cors-allow-origin", origin]
+    with ExitStack() as stack:
+        stack.callback(rerun_cli.end, rerun_cli.start(arguments, address, port))
+        stack.callback(rerun_cli.end, rerun_cli.page(address, web_port, url))
+        yield url, f"http://{host}:{web_port}"

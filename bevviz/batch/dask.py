@@ -9,7 +9,7 @@ from urllib.parse import urlsplit
 from bevviz.batch.jobs import Job
 from bevviz.batch.work import JobResult, JobResults
 from bevviz.errors import UserError, first_line
-from bevviz.logging.sinks import answers
+from bevviz.logging.ports import answers
 
 
 def run_dask(jobs: Sequence[Job], address: str, retries: int, on_frame: Callable[[], None]) -> JobResults:

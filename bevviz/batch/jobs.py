@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 import re
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
@@ -16,6 +17,7 @@ from bevviz.batch.table import RunInfo, read_info
 from bevviz.config import Config
 from bevviz.errors import UserError
 from bevviz.provenance import dependencies_of, file_hash, model_path
+from bevviz.text import path_text
 
 PARTIAL = ".partial"  # folder of what is not complete
 
@@ -60,7 +62,10 @@ class Job:
         """Another one for another bag, selection, configuration, model, layout or version."""
         files = {"detector": {"model", "names"}}  # they count by their content, below
         content = {
-            "bag": [[file.name, file.stat().st_size, file.stat().st_mtime_ns] for file in _files(self.bag)],
+            "bag": [
+                [path_text(file.name), file.stat().st_size, file.stat().st_mtime_ns]
+                for file in _files(self.bag)
+            ],
             "selection": asdict(self.selection),
             "config": self.config.model_dump(mode="json", exclude={"live": True, **files}),
             "blueprint": file_hash(Path(self.blueprint)) if _is_file(self.blueprint) else self.blueprint,
@@ -159,7 +164,7 @@ def name_bags(bags: Sequence[Path], owners: Mapping[str, str]) -> dict[Path, str
         bags: absolute paths, each once.
         owners: bag -> name of the results that are there.
     """
-    names = {bag: owners[str(bag)] for bag in bags if str(bag) in owners}
+    names = {bag: owners[path_text(bag)] for bag in bags if path_text(bag) in owners}
     taken = {"summary", *owners.values()}
     new = [bag for bag in bags if bag not in names]
     deepest = max((len(bag.parts) for bag in new), default=0)
@@ -170,7 +175,7 @@ def name_bags(bags: Sequence[Path], owners: Mapping[str, str]) -> dict[Path, str
         new = [bag for bag in new if bag not in names]
         taken |= set(names.values())
     for bag in new:  # same letters, apart from those that no file name should have
-        names[bag] = f"{_name(bag, 1)}-{hashlib.sha256(str(bag).encode()).hexdigest()[:8]}"
+        names[bag] = f"{_name(bag, 1)}-{hashlib.sha256(os.fsencode(bag)).hexdigest()[:8]}"
     return names
 
 

@@ -25,7 +25,14 @@ STAGES = (
 )
 
 FAILURE, PROBLEM, ANOMALY = 10.0, 3.0, 0.5
-UNMATCHED = {"no_cluster": 2.0, "too_few_points": 1.5, "low_overlap": 1.0, "taken": 1.0, "too_far": 0.5}
+UNMATCHED = {
+    "no_cluster": 2.0,
+    "too_few_points": 1.5,
+    "low_overlap": 1.0,
+    "misfit": 1.0,
+    "taken": 1.0,
+    "too_far": 0.5,
+}
 
 _integers = (
     *("points", "invalid_points", "voxels", "ground_points", "obstacle_points", "clusters", "set_aside"),

@@ -14,12 +14,14 @@ from bevviz.bags.source import BagSource
 from bevviz.batch.jobs import PARTIAL, Job
 from bevviz.batch.table import RunInfo, row, write
 from bevviz.errors import UserError
+from bevviz.files import unfinished
 from bevviz.frame import FrameResult
-from bevviz.logging.recorder import Recorder
+from bevviz.logging.recorder import DiskWatch, Recorder
 from bevviz.logging.sinks import open_recording
 from bevviz.run import Observer
 from bevviz.run import run as run_frames
 from bevviz.session import Session
+from bevviz.text import path_text
 
 
 class WithdrawnError(Exception):
@@ -82,15 +84,21 @@ def run(job: Job, threads: int, on_frame: Callable[[], None] = lambda: None) -> 
                 blueprint=job.blueprint,
                 recording_id=job.recording_id,
             ) as sinks:
-                table_rows = _Rows(job, recording, on_frame)
-                if run_frames(source, session, [Recorder(sinks.recording, config), table_rows]).interrupted:
+                assert sinks.file is not None
+                table_rows = _Rows(job, sinks.file, on_frame)
+                observers: list[Observer[FrameResult]] = [
+                    Recorder(sinks.recording, config),
+                    table_rows,
+                    DiskWatch(sinks),
+                ]
+                if run_frames(source, session, observers).interrupted:
                     raise KeyboardInterrupt
             rows = table_rows.rows
             scene, warnings = source.scene, tuple(source.warnings)
         if not rows:
             raise UserError("; ".join([f"{job.bag.name}: no frame in it", *warnings]))
         seconds = time.perf_counter() - start
-        info = RunInfo(job.key, str(job.bag), job.recording_id, len(rows), seconds, scene, warnings)
+        info = RunInfo(job.key, path_text(job.bag), job.recording_id, len(rows), seconds, scene, warnings)
         write(table, rows, info)
         job.table.unlink(missing_ok=True)  # of an older result: it must not vouch for the new recording
         recording.replace(job.recording)
@@ -98,7 +106,7 @@ def run(job: Job, threads: int, on_frame: Callable[[], None] = lambda: None) -> 
     except UserError as error:
         return JobResult(job.name, len(rows), time.perf_counter() - start, str(error))
     finally:
-        for path in (recording, table):
+        for path in (recording, unfinished(recording), table):
             path.unlink(missing_ok=True)
     return JobResult(job.name, len(rows), seconds)
 
@@ -112,7 +120,7 @@ class _Rows(Observer[FrameResult]):
 
     def see(self, result: FrameResult) -> None:
         self.rows.append(
-            {**row(result, result.config), "bag": str(self._job.bag), "recording": self._job.name}
+            {**row(result, result.config), "bag": path_text(self._job.bag), "recording": self._job.name}
         )
         self._on_frame()
         if not self._recording.exists():

@@ -27,6 +27,8 @@ from bevviz.cli import (
     why,
     workbench,
 )
+from bevviz.cli.inputs import check_outputs
+from bevviz.cli.options import with_negatives
 from bevviz.errors import UserError, first_line, interrupt_in
 
 _log = logging.getLogger(__name__)
@@ -63,12 +65,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
         interrupts.install()
     try:
         parser, commands = _parser()
-        given = sys.argv[1:] if arguments is None else arguments
+        given = with_negatives(sys.argv[1:] if arguments is None else arguments)
         if given and given[0] not in commands and Path(given[0]).exists():
             given = ["open", *given]
         options = parser.parse_args(given)
         if options.verbose:
             _log_to_stderr()
+        check_outputs(options)
         run: Callable[[argparse.Namespace], int] = options.run
         return run(options)
     except UserError as error:
@@ -82,7 +85,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         sys.stdout = open(os.devnull, "w")  # noqa: SIM115, PTH123
         return 0
     except Exception as error:
-        if interrupt_in(error):
+        if interrupt_in(error) or interrupts.came():
             print("bevviz: interrupted", file=sys.stderr)
             return 130
         _log.error("an error that nobody foresaw", exc_info=error)

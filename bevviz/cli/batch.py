@@ -14,6 +14,7 @@ from bevviz.cli.interrupts import terminable, wait_for_interrupt
 from bevviz.cli.options import (
     TIMES,
     Commands,
+    add_bind,
     add_config,
     add_selection,
     load_config,
@@ -69,6 +70,7 @@ def add(commands: Commands) -> None:
         metavar="PORT",
         help="start one here (default: 51234), and a web viewer; until Ctrl-C",
     )
+    add_bind(results, "--serve-catalog")
     results.add_argument("--dataset", metavar="NAME", help="in the catalog (default: name of DIR)")
     add_config(batch)
     batch.set_defaults(run=_batch)
@@ -174,7 +176,7 @@ def _sum_up(
         elif options.serve_catalog:
             from bevviz.batch.catalog import served
 
-            url, viewer = stack.enter_context(served(options.serve_catalog))
+            url, viewer = stack.enter_context(served(options.serve_catalog, options.bind))
         if url:
             from bevviz.batch.catalog import register
 

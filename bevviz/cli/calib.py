@@ -137,4 +137,4 @@ def _log(
             log_calibration(sinks.recording, result, shots[result.camera].shots, config.logging)
         if outputs.save is not None:
             say(f"pictures and curves in {outputs.save}")
-        outputs.keep_serving(sinks.recording)
+        outputs.keep_serving(sinks)

@@ -11,6 +11,14 @@ from typing import NoReturn
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
+_came = Event()  # a signal, whatever became of its exception
+
+
+def came() -> bool:
+    """Whether the process was interrupted: an exception among imports comes out of them as another one."""
+    return _came.is_set()
+
+
 def install() -> None:
     """For the whole process, before anything else: a signal among the imports is an interrupt, too."""
     for number in SIGNALS:
@@ -24,6 +32,7 @@ def ignore() -> None:
 
 
 def _interrupt(number: int, stack: object) -> NoReturn:
+    _came.set()
     raise KeyboardInterrupt
 
 
@@ -38,6 +47,8 @@ def terminable() -> Iterator[Event]:
 
     def interrupt(number: int, stack: object) -> NoReturn:
         ended.set()
+        if before[signal.SIGINT] is _interrupt:  # of a process that is a command
+            _came.set()
         raise KeyboardInterrupt
 
     before = {number: signal.signal(number, interrupt) for number in SIGNALS}

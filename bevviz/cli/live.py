@@ -55,9 +55,6 @@ def add(commands: Commands) -> None:
         "--split", type=_split, metavar="SIZE|TIME", help="--save in parts, e.g. 500MB or 10min"
     )
     output.add_argument(
-        "--bind", default="127.0.0.1", metavar="ADDRESS", help="--serve at this address (0.0.0.0: at all)"
-    )
-    output.add_argument(
         "--flight", metavar="TIME", help="what the flight recorder holds (default: 30 s), for 'bevviz snap'"
     )
     add_ros_args(live)
@@ -83,7 +80,7 @@ def _live(options: argparse.Namespace) -> int:
     os.environ.setdefault("RUST_LOG", "warn,re_log_encoding=error")
     from bevviz.live.notes import Notes
     from bevviz.live.settings import Settings
-    from bevviz.logging.sinks import check_port
+    from bevviz.logging.ports import check_port, own_address
 
     given = {
         "detector.model": options.model,
@@ -98,7 +95,8 @@ def _live(options: argparse.Namespace) -> int:
         more.append(options.split)
     settings = Settings(options.config, [*options.set, *more], options.preset)
     if options.serve is not None:
-        check_port(options.serve)  # before a robot is waited for
+        own_address(options.bind)  # before a robot is waited for
+        check_port(options.serve)
     notes = Notes(say)
     with terminable():
         if options.synthetic:

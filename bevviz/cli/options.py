@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import argparse
+import re
+from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeAlias
 
@@ -15,6 +17,8 @@ Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
 
 TIMES = """A time is in seconds from the start of the bag (12.5), since 1970 (1700000000.0) or
 ISO 8601 (2026-11-21T10:00:00)."""
+
+_NEGATIVES = re.compile(r"-[\d.][-+\d.eE]*(,[-+\d.eE]+)+")  # several numbers, the first below zero
 
 
 def add_bag(parser: argparse.ArgumentParser, *, detector: bool = True) -> argparse._ArgumentGroup:
@@ -92,6 +96,7 @@ def add_output(parser: argparse.ArgumentParser, blueprint: str | None = "debug")
         metavar="PORT",
         help="web viewer on this machine (default: 9090)",
     )
+    add_bind(group, "--serve")
     group.add_argument(
         "--connect", metavar="URL", help="a viewer elsewhere, e.g. rerun+http://laptop:9876/proxy"
     )
@@ -104,6 +109,16 @@ def add_output(parser: argparse.ArgumentParser, blueprint: str | None = "debug")
             help=f"debug, live, explain, bug_report, compare, tune, a .py or a .rbl (default: {blueprint})",
         )
     return group
+
+
+def add_bind(group: argparse._ArgumentGroup, option: str) -> None:
+    """For whom a server is open."""
+    group.add_argument(
+        "--bind",
+        default="127.0.0.1",
+        metavar="ADDRESS",
+        help=f"{option} at this address (default: 127.0.0.1, for this machine alone; 0.0.0.0: for everybody)",
+    )
 
 
 def add_ros_args(parser: argparse.ArgumentParser) -> None:
@@ -123,6 +138,18 @@ def load_config(options: argparse.Namespace) -> Config:
     model = getattr(options, "model", None)
     more = [f"detector.model={model}"] if model else []
     return load(options.config, [*options.set, *more], options.preset)
+
+
+def with_negatives(arguments: Iterable[str]) -> list[str]:
+    """The arguments with ``--point -5,1,0`` as ``--point=-5,1,0``: argparse takes it for an option."""
+    joined: list[str] = []
+    for argument in arguments:
+        option = joined[-1] if joined else ""
+        if option.startswith("--") and "=" not in option and _NEGATIVES.fullmatch(argument):
+            joined[-1] = f"{option}={argument}"
+        else:
+            joined.append(argument)
+    return joined
 
 
 def positive(text: str) -> int:

@@ -15,7 +15,6 @@ from bevviz.cli.interrupts import wait_for_interrupt
 from bevviz.text import printable
 
 if TYPE_CHECKING:
-    from rerun import RecordingStream
     from rerun.blueprint import Blueprint
 
     from bevviz.config import Config
@@ -29,6 +28,7 @@ class Outputs:
 
     save: Path | None = None
     serve: int | None = None  # port
+    bind: str = "127.0.0.1"  # address that it is at
     connect: str | None = None  # URL
     viewer: bool = False
     blueprint: str | Blueprint = "debug"
@@ -36,7 +36,7 @@ class Outputs:
     @staticmethod
     def of(options: argparse.Namespace) -> Outputs:
         blueprint = getattr(options, "blueprint", "debug")
-        return Outputs(options.save, options.serve, options.connect, options.viewer, blueprint)
+        return Outputs(options.save, options.serve, options.bind, options.connect, options.viewer, blueprint)
 
     def __bool__(self) -> bool:
         """Whether anything is asked for."""
@@ -66,19 +66,21 @@ class Outputs:
             config,
             save=self.save,
             serve=self.serve,
+            bind=self.bind,
             connect=self.connect,
             spawn=self.viewer,
             blueprint=self.blueprint,
         ) as sinks:
             for url in sinks.urls:
                 say(f"viewer at {url}")
+            warn(sinks.warnings)
             yield sinks
 
-    def keep_serving(self, recording: RecordingStream, what: str = "") -> None:
+    def keep_serving(self, sinks: Sinks, what: str = "") -> None:
         """Until the user ends it, where a server was asked for."""
         if self.serve is not None:
             say(f"{what}serving until Ctrl-C")
-            recording.flush()
+            sinks.check()
             wait_for_interrupt()
 
 

@@ -43,6 +43,13 @@ def add(commands: Commands) -> None:
     content.add_argument(
         "--redact", action="store_true", help="hide the people and vehicles that the detector finds"
     )
+    content.add_argument(
+        "--unredacted",
+        nargs="+",
+        default=[],
+        metavar="TOPIC",
+        help="with --redact: topics that are kept although nobody can tell what they show",
+    )
     content.add_argument("--include-model", action="store_true", help="copy the detector's file beside it")
     content.add_argument("--force", action="store_true", help="overwrite an older report")
     report.add_argument(
@@ -66,6 +73,8 @@ def _make(options: argparse.Namespace) -> int:
 
     if options.at is None:
         raise UserError("--at TIME is missing: the time that the report is about")
+    if options.unredacted and not options.redact:
+        raise UserError("--unredacted: everything is, without --redact")
     report = make(
         ReportRequest(
             paths=options.paths,
@@ -77,6 +86,7 @@ def _make(options: argparse.Namespace) -> int:
             note=options.note if options.note_file is None else _read(options.note_file),
             topics=options.topics,
             redact=options.redact,
+            unredacted=options.unredacted,
             include_model=options.include_model,
             force=options.force,
         )

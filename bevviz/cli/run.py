@@ -76,15 +76,17 @@ def logged(
     Returns:
         The exit status.
     """
+    from bevviz.logging.recorder import DiskWatch
+
     with outputs.opened(items.scene, config) as sinks:
-        seen = observers(sinks.recording)
+        seen = [*observers(sinks.recording), DiskWatch(sinks)]
         early = list(items.warnings)  # known before an hour's work, and said before it
         warn(early)
         end = through(items, processor, seen)
         warn(warning for warning in items.warnings if warning not in early)
         finish()
         if end.frames and not end.interrupted:
-            outputs.keep_serving(sinks.recording, f"{end.frames} frames; ")
+            outputs.keep_serving(sinks, f"{end.frames} frames; ")
     target = f" in {outputs.save}" if outputs.save is not None else ""
     if end.interrupted:
         say(f"interrupted after {end.frames} frames; what was made until then is complete{target}")

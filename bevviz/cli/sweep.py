@@ -63,7 +63,7 @@ def _sweep(options: argparse.Namespace) -> int:
             if sinks is not None:
                 log_sweep(sinks.recording, sweep, source.scene.name)
                 if not end.interrupted:
-                    outputs.keep_serving(sinks.recording)
+                    outputs.keep_serving(sinks)
     if end.interrupted:
         say(f"interrupted after {end.frames} frames; the table is of these")
         return 130

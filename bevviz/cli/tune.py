@@ -36,7 +36,7 @@ def add(commands: Commands) -> None:
 def _tune(options: argparse.Namespace) -> int:
     from bevviz.config import dump, load
     from bevviz.live.settings import Settings
-    from bevviz.logging.sinks import free_port
+    from bevviz.logging.ports import free_port
     from bevviz.run import Dropping, run
     from bevviz.tune import OneFrame, Saves, Version, VersionRecorder, create
 

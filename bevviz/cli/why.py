@@ -13,13 +13,13 @@ from bevviz.errors import UserError
 
 if TYPE_CHECKING:
     from bevviz.frame import FrameResult, Scene
-    from bevviz.why import Answer
+    from bevviz.why import Answer, Questioner, Selection
 
 EXAMPLES = """examples:
   bevviz why drive.mcap --at 12.5 --model yolo11n.onnx                  whatever went wrong in that frame
   bevviz why drive.mcap --at 12.5 --model yolo11n.onnx --class person   every person, however weakly detected
-  bevviz why drive.mcap --at 12.5 --model yolo11n.onnx --box 320,180    what is at that pixel
-  bevviz why drive.mcap --at 12.5 --point=8.2,-1.5,-0.8 --serve         what is there, shown in a browser"""
+  bevviz why drive.mcap --at-frame 125 --model yolo11n.onnx --box 320,180    what is at that pixel
+  bevviz why drive.mcap --at 12.5 --point 8.2,-1.5,-0.8 --serve         what is there, shown in a browser"""
 
 
 def add(commands: Commands) -> None:
@@ -31,8 +31,10 @@ def add(commands: Commands) -> None:
         epilog=EXAMPLES,
     )
     group = add_bag(why)
-    group.add_argument("--at", required=True, metavar="TIME", help="the scan nearest to this time")
-    what = why.add_argument_group("what to explain", "Nothing: whatever did not end as an object of its own.")
+    scan = group.add_mutually_exclusive_group(required=True)
+    scan.add_argument("--at", metavar="TIME", help="the scan nearest to this time")
+    scan.add_argument("--at-frame", type=_number, metavar="N", help="scan N, counted from 0")
+    what = why.add_argument_group("what to explain", "Nothing: what did not end as an object of its own.")
     one = what.add_mutually_exclusive_group()
     one.add_argument("--class", dest="label", default="", metavar="NAME", help="all of that class")
     one.add_argument(
@@ -43,14 +45,28 @@ def add(commands: Commands) -> None:
         type=_numbers(3),
         default=(),
         metavar="X,Y,Z",
-        help="there, in metres of the points' frame (--point=-1,2,0 where it begins with a minus)",
+        help="there, in metres of the points' frame",
+    )
+    one.add_argument(
+        "--cell",
+        type=_numbers(2),
+        default=(),
+        metavar="ROW,COLUMN",
+        help="what is in that cell of the bird's-eye view",
+    )
+    one.add_argument("--cluster", type=_number, metavar="N", help="the cluster of that number")
+    one.add_argument("--detection", type=_number, metavar="N", help="the detection in that row")
+    what.add_argument(
+        "--radius", type=_metres, default=0.5, metavar="M", help="around the point or cell (default: 0.5)"
     )
     what.add_argument(
-        "--radius", type=_metres, default=0.5, metavar="M", help="around that point (default: 0.5)"
+        "--camera", default="", metavar="NAME", help="of pixel or detection, if there are several"
     )
-    what.add_argument("--camera", default="", metavar="NAME", help="of the pixel, where there are several")
     what.add_argument(
         "--limit", type=positive, default=5, metavar="N", help="the N worst with their chain (default: 5)"
+    )
+    what.add_argument(
+        "--all", action="store_true", help="also what went well, and what nothing could be done about"
     )
     why.add_argument("--json", action="store_true", help="for machines")
     add_config(why)
@@ -82,38 +98,86 @@ def _metres(text: str) -> float:
     return value
 
 
+def _number(text: str) -> int:
+    if not text.isdecimal():
+        raise argparse.ArgumentTypeError(f"'{text}' is no number, counted from 0")
+    return int(text)
+
+
 def _why(options: argparse.Namespace) -> int:
     from bevviz.bags.source import BagSource
     from bevviz.perceive import StageLoader
     from bevviz.session import Session
-    from bevviz.why import Selection, why
+    from bevviz.text import printable
+    from bevviz.why import Questioner
     from bevviz.why.text import plain
 
-    config = load_config(options)
-    selection = Selection(options.label, options.box, options.point, options.radius, options.camera)
+    config, selection = load_config(options), _selection(options)
     with terminable(), BagSource(options.paths, config, at=options.at) as source:
         loader = StageLoader()
         session = Session(config, loader=loader)
-        frame = next(iter(source), None)
+        number = options.at_frame
+        frame = next(iter(source), None) if number is None else source.frame(number)
         warn(source.warnings)
         if frame is None:
-            raise UserError(f"--at {options.at}: the scan there cannot be read")
+            asked = f"--at {options.at}" if number is None else f"--at-frame {number}"
+            raise UserError(f"{asked}: the scan there cannot be read")
         result = session.run(frame)
-        answers = why(result, selection, session.stages.class_names, options.limit, _progress, loader)
+        questioner = Questioner(result, loader, session.stages.class_names)
+        answers = questioner.explain(selection, options.limit, _progress, everything=options.all)
+        beside = _beside(questioner, selection, answers)
+        in_short = _in_short(questioner, selection)
         if options.json:
-            _print_json(result, answers)
+            _print_json(result, answers, beside, in_short)
         else:
-            print(f"frame {frame.index}, preset {config.preset}\n")
-            print(plain(answers, options.limit) or _nothing(options.label))
+            print(printable(f"frame {frame.index}, preset {config.preset}: {in_short}"))
+            if answers:
+                print(f"\n{plain(answers, options.limit, beside)}")
         if outputs := Outputs.of(options):
             _show(result, answers, source.scene, outputs, options.limit)
     return 0
 
 
-def _nothing(label: str) -> str:
-    if label:
-        return f"There is no {label} in this frame: the detector has no candidate, however weak."
-    return "Everything that was detected or stated in this frame ended as an object of its own."
+def _selection(options: argparse.Namespace) -> Selection:
+    from bevviz.why import Selection
+
+    return Selection(
+        label=options.label,
+        box=options.box,
+        point=options.point,
+        radius=options.radius,
+        cell=tuple(map(int, options.cell)),
+        cluster=options.cluster,
+        detection=options.detection,
+        camera=options.camera,
+    )
+
+
+def _beside(questioner: Questioner, selection: Selection, answers: Sequence[Answer]) -> list[Answer]:
+    """What else lies at the place that was asked about."""
+    if not (selection.box or selection.point or selection.cell):
+        return []
+    told = {answer.subject.key for answer in answers}
+    return [answer for answer in questioner.candidates(selection) if answer.subject.key not in told]
+
+
+def _in_short(questioner: Questioner, selection: Selection) -> str:
+    """What was asked about in one line; why there is nothing to say where there is not."""
+    from bevviz.why.sentences import not_run
+    from bevviz.why.text import summary
+
+    found = questioner.ask(selection)
+    if selection.one:
+        return found[0].subject.name
+    if found:
+        return summary(found)
+    never = "; ".join(not_run(questioner.traces.result, selection.camera))
+    what = f"no {selection.label} is known" if selection.label else "no object is known"
+    if never:
+        return f"{what}, as the detector never ran ({never}); ask for a place with --point x,y,z"
+    if selection.label:
+        return f"{what}: the detector has no candidate, however weak"
+    return f"{what}: there is no detection, however weak"
 
 
 def _progress(answers: Sequence[Answer]) -> Iterable[Answer]:
@@ -122,12 +186,15 @@ def _progress(answers: Sequence[Answer]) -> Iterable[Answer]:
     yield from tqdm(answers, unit="object", desc="what would change it", leave=False, disable=None)
 
 
-def _print_json(result: FrameResult, answers: Sequence[Answer]) -> None:
+def _print_json(
+    result: FrameResult, answers: Sequence[Answer], beside: Sequence[Answer], in_short: str
+) -> None:
     import json
 
     frame = result.frame
-    head = {"frame": frame.index, "stamp": frame.stamp, "preset": result.config.preset}
-    print(json.dumps({**head, "answers": [answer.as_dict() for answer in answers]}, indent=2))
+    head = {"frame": frame.index, "stamp": frame.stamp, "preset": result.config.preset, "summary": in_short}
+    there = [{"name": a.subject.name, "verdict": a.verdict.text} for a in beside]
+    print(json.dumps({**head, "answers": [a.as_dict() for a in answers], "beside": there}, indent=2))
 
 
 def _show(result: FrameResult, answers: Sequence[Answer], scene: Scene, outputs: Outputs, limit: int) -> None:
@@ -141,4 +208,4 @@ def _show(result: FrameResult, answers: Sequence[Answer], scene: Scene, outputs:
         log_answers(sinks.recording, result.frame, answers, limit)
         if outputs.save is not None:
             say(f"saved in {outputs.save}")
-        outputs.keep_serving(sinks.recording)
+        outputs.keep_serving(sinks)

@@ -10,10 +10,11 @@ from pathlib import Path
 
 from bevviz.config import LiveConfig
 from bevviz.errors import UserError
+from bevviz.files import lock, write_all
 from bevviz.live.encoder import Encoder, Packet
 from bevviz.live.notes import Notes
 from bevviz.live.output import Output
-from bevviz.logging.sinks import rerun_program
+from bevviz.logging import rerun_cli
 
 MEGABYTE = 1_000_000
 INDEXED = 1000 * MEGABYTE  # the index is made in memory; a larger file stays without
@@ -39,8 +40,10 @@ class Indexer:
 
     def _index(self, path: Path) -> None:
         indexed = path.with_suffix(".rrd.part")
-        command = ["nice", "-n", "19", rerun_program(), "rrd", "optimize", str(path), "-o", str(indexed)]
-        done = subprocess.run(command, capture_output=True, check=False, start_new_session=True)
+        command = ["nice", "-n", "19", rerun_cli.program(), "rrd", "optimize", str(path), "-o", str(indexed)]
+        done = subprocess.run(
+            command, capture_output=True, check=False, env=rerun_cli.environment(), start_new_session=True
+        )
         if done.returncode == 0 and indexed.exists():
             indexed.replace(path)
         else:
@@ -113,7 +116,14 @@ class Saver(Output):
 
     def _open(self) -> None:
         path = self._next
-        self._file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, 0o666)
+        self._file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_CLOEXEC, 0o666)
+        try:
+            lock(self._file, f"{path}: another process is writing it")
+        except UserError:
+            os.close(self._file)
+            raise
+        with suppress(OSError):  # no file but a device
+            os.ftruncate(self._file, 0)
         self.paths.append(path)
         self._written = self._whole = 0
 
@@ -131,10 +141,3 @@ class Saver(Output):
         os.close(self._file)
         if self._written:
             self._indexer.add(self.paths[-1])
-
-
-def write_all(file: int, data: bytes) -> None:
-    """``os.write`` until all is written: a disk that fills up takes a part first."""
-    rest = memoryview(data)
-    while rest:
-        rest = rest[os.write(file, rest) :]

@@ -10,8 +10,9 @@ from pathlib import Path
 
 from bevviz.config import LiveConfig
 from bevviz.errors import UserError
+from bevviz.files import write_all
 from bevviz.live.encoder import Encoder, Packet
-from bevviz.live.files import MEGABYTE, Indexer, write_all
+from bevviz.live.files import MEGABYTE, Indexer
 
 
 class FlightRecorder:

@@ -21,7 +21,8 @@ import rerun as rr
 from rerun.chunk import RrdReader
 
 from bevviz.logging.blueprints import Saved
-from bevviz.logging.sinks import APPLICATION, answers, check_viewer
+from bevviz.logging.ports import answers
+from bevviz.logging.sinks import APPLICATION, check_viewer
 
 PROBE = 2.0  # seconds between two looks whether the viewer is there
 MAGIC = 4  # bytes that tell a recording

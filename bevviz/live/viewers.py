@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import socket
 import subprocess
 import sys
 from collections.abc import Callable, Sequence
@@ -12,8 +11,20 @@ from dataclasses import dataclass
 from bevviz.live.encoder import Encoder, Packet
 from bevviz.live.notes import Notes
 from bevviz.live.output import Output
+from bevviz.logging import rerun_cli
 from bevviz.logging.logger import Context
-from bevviz.logging.sinks import answers, check_port, check_viewer, free_port, rerun_program, viewer_address
+from bevviz.logging.ports import (
+    FIRST_DATA_PORT,
+    LOOPBACK,
+    answers,
+    check_port,
+    free_port,
+    host_for,
+    origins,
+    own_address,
+    viewer_address,
+)
+from bevviz.logging.sinks import check_viewer
 
 RETRY = 3.0  # seconds until a viewer that is gone is tried again
 
@@ -35,7 +46,8 @@ class Program:
 
 def window() -> Program:
     """The viewer on this machine."""
-    command = [rerun_program(), "-", "--port", "auto", "--memory-limit", "50%", "--hide-welcome-screen"]
+    command = [rerun_cli.program(), "-", "--bind", LOOPBACK, "--port", "auto"]
+    command += ["--memory-limit", "50%", "--hide-welcome-screen"]
     return Program("window", command, lasting=False)
 
 
@@ -43,17 +55,16 @@ def server(port: int, bind: str, memory: float) -> tuple[Program, str]:
     """A web viewer at ``port`` of the address ``bind``, which keeps ``memory`` MB, and what to open.
 
     Raises:
-        UserError: the port is in use.
+        UserError: the port is in use, or the address is not of this machine.
     """
+    address = own_address(bind)
     check_port(port)
-    data_port = free_port(9876, but=port)
-    command = [rerun_program(), "-", "--serve-web", "--bind", bind, "--port", str(data_port)]
+    data_port = free_port(FIRST_DATA_PORT, but=port)
+    command = [rerun_cli.program(), "-", "--serve-web", "--bind", address, "--port", str(data_port)]
     command += ["--web-viewer-port", str(port), "--server-memory-limit", f"{memory:.0f}MB"]
-    command += ["--cors-allow-origin", f"http://*:{port}"]
-    host = (
-        "localhost" if bind in ("127.0.0.1", "::1") else socket.gethostname() if bind == "0.0.0.0" else bind
-    )
-    return Program("web", command), viewer_address(host, port, data_port)
+    for origin in origins(address, port):
+        command += ["--cors-allow-origin", origin]
+    return Program("web", rerun_cli.tied(command)), viewer_address(host_for(address), port, data_port)
 
 
 def remote(url: str, recording_id: str) -> Program:
@@ -95,6 +106,7 @@ class Viewer(Output):
             stdin=subprocess.PIPE,
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
+            env=rerun_cli.environment(),
             start_new_session=True,  # Ctrl-C is for us alone
         )
 

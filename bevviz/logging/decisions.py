@@ -57,6 +57,8 @@ def _lines(result: FrameResult) -> Iterator[str]:
         yield from _clusters(
             [e for e in result.explanations if e.subject == "cluster" and e.camera == name], name
         )
+        made = [e for e in result.explanations if e.subject == "split" and e.camera == name]
+        yield from _section(f"{name}: clusters split and merged", map(_item, made))
     yield from _clusters([e for e in result.explanations if e.subject == "cluster" and not e.camera], "")
 
 

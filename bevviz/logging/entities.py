@@ -18,6 +18,7 @@ RECEIVED = "received"  # when the cloud was received, or logged into the bag
 
 WORLD = "/world"
 FUSED = "/world/fused"
+MEASURED = "/world/fused/measured"
 FRUSTUMS = "/world/frustums"
 GRID = "/world/bev"
 TRUTH = "/world/ground_truth"

@@ -1,12 +1,15 @@
-"""Logs every result of a run."""
+"""Logs every result of a run, and sees to it that it is written."""
 
 from __future__ import annotations
+
+from typing import Any
 
 import rerun as rr
 
 from bevviz.config import Config
 from bevviz.frame import FrameResult
 from bevviz.logging.logger import Logger
+from bevviz.logging.sinks import Sinks
 from bevviz.logging.writer import WAIT
 from bevviz.run import Items, Observer
 
@@ -31,3 +34,13 @@ class Recorder(Observer[FrameResult]):
 
     def end(self) -> None:
         self.logger.flush()
+
+
+class DiskWatch(Observer[Any]):
+    """Ends a run whose recording cannot be written any more: the rest would be for nothing."""
+
+    def __init__(self, sinks: Sinks) -> None:
+        self._sinks = sinks
+
+    def see(self, result: object) -> None:
+        self._sinks.check()

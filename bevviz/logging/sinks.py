@@ -5,18 +5,30 @@ from __future__ import annotations
 import socket
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from urllib.parse import quote, urlsplit
+from urllib.parse import urlsplit
 
 import rerun as rr
 import rerun.blueprint as rrb
 
 from bevviz.config import Config
-from bevviz.errors import UserError, first_line
+from bevviz.errors import UserError
+from bevviz.files import Unfinished, written
 from bevviz.frame import Scene
-from bevviz.logging import blueprints
+from bevviz.logging import blueprints, rerun_cli
+from bevviz.logging.file_writer import FileWriter
+from bevviz.logging.ports import (
+    FIRST_DATA_PORT,
+    LOOPBACK,
+    check_port,
+    free_port,
+    host_for,
+    origins,
+    own_address,
+    viewer_address,
+)
 
 APPLICATION = "bevviz"
 MEMORY = "25%"  # of the machine's, for what a server keeps for those who join late, and for the viewer
@@ -24,10 +36,24 @@ MEMORY = "25%"  # of the machine's, for what a server keeps for those who join l
 
 @dataclass(frozen=True, slots=True)
 class Sinks:
-    """An open recording. ``urls``: what to open in a browser or viewer, one for each server."""
+    """An open recording.
+
+    Attributes:
+        urls: what to open in a browser or viewer, one for each server.
+        warnings: one sentence each.
+        file: where the recording is until it is whole; None: in no file.
+    """
 
     recording: rr.RecordingStream
     urls: list[str] = field(default_factory=list)
+    warnings: list[str] = field(default_factory=list)
+    file: Path | None = None
+    writer: FileWriter | None = None
+
+    def check(self) -> None:
+        """Raises UserError where the file cannot be written any more."""
+        if self.writer is not None:
+            self.writer.check()
 
 
 @contextmanager
@@ -37,6 +63,7 @@ def open_recording(
     *,
     save: Path | None = None,
     serve: int | None = None,
+    bind: str = LOOPBACK,
     connect: str | None = None,
     spawn: bool = False,
     blueprint: str | rrb.Blueprint = "debug",
@@ -44,13 +71,15 @@ def open_recording(
 ) -> Iterator[Sinks]:
     """Open a recording that goes to everything that is asked for, with the blueprint.
 
-    A file is written while the recording goes on: what was logged before an interruption is in it.
+    A file is written while the recording goes on, beside its place (see ``bevviz.files.written``): what was
+    logged before an interruption is in it.
 
     Args:
         scene: names of the sensors, for the blueprint.
         config: the configuration.
-        save: .rrd file; overwritten.
+        save: .rrd file; overwritten in the end.
         serve: port of the web viewer on this machine.
+        bind: its address at which ``serve`` listens, for the page and for the data.
         connect: URL of a viewer that listens, rerun+http://host:9876/proxy.
         spawn: open the viewer on this machine.
         blueprint: name of a layout, a .py or .rbl file, or a layout.
@@ -58,36 +87,52 @@ def open_recording(
             random one, the same for all recordings of a process.
 
     Raises:
-        UserError: unknown blueprint, file that cannot be written, port in use, no viewer found or reached;
+        UserError: unknown blueprint, file that cannot be written or that another
+            process writes, port in use, no viewer found or reached;
             on leaving, when not everything could be written.
     """
     layout = blueprints.load(blueprint, scene) if isinstance(blueprint, str) else blueprint
     sinks: list[rr.FileSink | rr.GrpcSink | rr.GrpcServerSink] = []
     urls: list[str] = []
-    if save is not None:
-        sinks.append(_file(save))
-    if connect is not None:
-        sinks.append(_connection(connect))
-    if spawn:
-        sinks.append(_viewer())
-    if serve is not None:
-        server, address = _server(serve)
-        sinks.append(server)
-        urls.append(address)
-    recording = rr.RecordingStream(APPLICATION, recording_id=recording_id)
-    recording.set_log_time_enabled(False)  # frames have their own clocks
-    try:
-        recording.set_sinks(*sinks, default_blueprint=layout)
-    except (RuntimeError, ValueError) as error:
-        raise UserError(f"cannot open the outputs: {error}") from None
-    try:
-        yield Sinks(recording, urls)
-    finally:
-        _close(recording)
+    warnings: list[str] = []
+    file = writer = None
+    with ExitStack() as stack:
+        if save is not None:
+            given = stack.enter_context(_file(save))
+            file = given.path
+            writer = FileWriter(file)
+            stack.callback(writer.close)
+            sinks.append(writer.sink)
+            if given.leftover:
+                warnings.append(f"{file.name}, which a run that did not end had left, is overwritten")
+        if connect is not None:
+            sinks.append(_connection(connect))
+        if spawn:
+            sinks.append(_viewer())
+        if serve is not None:
+            server, address = stack.enter_context(_served(serve, bind))
+            sinks.append(server)
+            urls.append(address)
+        recording = rr.RecordingStream(APPLICATION, recording_id=recording_id)
+        recording.set_log_time_enabled(False)  # frames have their own clocks
+        try:
+            recording.set_sinks(*sinks, default_blueprint=layout)
+        except (RuntimeError, ValueError) as error:
+            raise UserError(f"cannot open the outputs: {error}") from None
+        if writer is not None:
+            writer.begin()
+        try:
+            yield Sinks(recording, urls, warnings, file, writer)
+        finally:
+            _close(recording)
+            if writer is not None:
+                writer.close()
+        if writer is not None:
+            writer.check()
 
 
 def _close(recording: rr.RecordingStream) -> None:
-    """Write what is still on its way. An error that is already on its way out goes first."""
+    """Hand over what is still on its way. An error that is already on its way out goes first."""
     pending = sys.exc_info()[0] is not None
     try:
         recording.flush()
@@ -98,15 +143,12 @@ def _close(recording: rr.RecordingStream) -> None:
         recording.disconnect()
 
 
-def _file(path: Path) -> rr.FileSink:
-    if path.suffix != ".rrd":  # a slip must not overwrite the bag itself
-        raise UserError(f"--save {path}: expected a file name that ends in .rrd")
-    try:
-        with path.open("wb"):
-            pass
-    except OSError as error:
-        raise UserError(f"{path}: cannot write the recording: {error.strerror}") from None
-    return rr.FileSink(path)
+def _file(path: Path) -> AbstractContextManager[Unfinished]:
+    for name in (path, path.resolve()):  # a slip must not overwrite the bag itself, also not through a link
+        if name.suffix != ".rrd":
+            link = f" (it is a link to {name})" if name != path else ""
+            raise UserError(f"--save {path}: expected a file name that ends in .rrd{link}")
+    return written(path, "recording")
 
 
 def _connection(url: str) -> rr.GrpcSink:
@@ -138,75 +180,29 @@ def check_viewer(url: str) -> tuple[str, int]:
     return host, port
 
 
-def answers(host: str, port: int) -> bool:
-    """Whether somebody listens there."""
-    try:
-        socket.create_connection((host, port), timeout=5).close()
-    except OSError:
-        return False
-    return True
-
-
 def _viewer() -> rr.GrpcSink:
-    """The viewer on this machine."""
-    port = free_port(9876)
+    """The viewer on this machine, for this machine. (The SDK's own way opens it to everybody.)"""
+    port = free_port(FIRST_DATA_PORT)
+    arguments = ["--bind", LOOPBACK, "--port", str(port), "--memory-limit", "50%"]
+    arguments += ["--server-memory-limit", MEMORY, "--expect-data-soon", "--hide-welcome-screen"]
     try:
-        rr.spawn(
-            port=port,
-            connect=False,
-            memory_limit="50%",
-            server_memory_limit=MEMORY,
-            hide_welcome_screen=True,
-            executable_path=rerun_program(),
-        )
-    except RuntimeError as error:
-        raise UserError(
-            f"cannot start the viewer: {first_line(error)}; --save or --serve need none"
-        ) from None
-    return rr.GrpcSink(f"rerun+http://127.0.0.1:{port}/proxy")
+        rerun_cli.start(arguments, LOOPBACK, port, lasting=True)
+    except UserError as error:
+        raise UserError(f"cannot start the viewer: {error}; --save or --serve need none") from None
+    return rr.GrpcSink(f"rerun+http://{LOOPBACK}:{port}/proxy")
 
 
-def rerun_program() -> str:
-    """Rerun's viewer and tools, of the very version that came with the SDK."""
-    binary = Path(rr.__file__).parents[1] / "rerun_cli" / "rerun"
-    return str(binary) if binary.exists() else "rerun"
-
-
-def _server(port: int) -> tuple[rr.GrpcServerSink, str]:
-    """The web viewer at ``port`` and beside it the server that it takes the data from."""
+@contextmanager
+def _served(port: int, bind: str) -> Iterator[tuple[rr.GrpcServerSink, str]]:
+    """The web viewer at ``port`` of an address and beside it the server that it takes the data from."""
+    address = own_address(bind)
     check_port(port)
-    data_port = free_port(9876, but=port)
+    data_port, host = free_port(FIRST_DATA_PORT, but=port), host_for(address)
     server = rr.GrpcServerSink(
-        port=data_port, server_memory_limit=MEMORY, cors_allow_origin=[f"http://*:{port}"]
+        address, data_port, server_memory_limit=MEMORY, cors_allow_origin=origins(address, port)
     )
+    page = rerun_cli.page(address, port, f"rerun+http://{host}:{data_port}/proxy")
     try:
-        rr.serve_web_viewer(web_port=port, open_browser=False)
-    except RuntimeError as error:
-        raise UserError(f"--serve {port}: {first_line(error)}") from None
-    return server, viewer_address("localhost", port, data_port)
-
-
-def viewer_address(host: str, port: int, data_port: int) -> str:
-    """What to open in a browser."""
-    return f"http://{host}:{port}/?url={quote(f'rerun+http://{host}:{data_port}/proxy', safe='')}"
-
-
-def check_port(port: int, option: str = "--serve") -> None:
-    """Raises UserError with a free port where this one is in use."""
-    if not _is_free(port):
-        raise UserError(f"{option} {port}: the port is in use; another one: {option} {free_port(port + 1)}")
-
-
-def _is_free(port: int) -> bool:
-    with socket.socket() as probe:
-        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        try:
-            probe.bind(("", port))
-        except OSError:
-            return False
-    return True
-
-
-def free_port(port: int, but: int = 0) -> int:
-    """The port, or the next one that is free."""
-    return next(p for p in range(port, 65536) if p != but and _is_free(p))
+        yield server, viewer_address(host, port, data_port)
+    finally:
+        rerun_cli.end(page)

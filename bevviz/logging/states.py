@@ -24,6 +24,7 @@ COLORS: Mapping[str, Color] = {
     "no cluster": (210, 70, 70),
     "too few points": (220, 160, 50),
     "low overlap": (220, 160, 50),
+    "misfit": (220, 160, 50),
     "taken": (150, 120, 220),
     "too far": (110, 130, 160),
     "not fused": (110, 110, 120),

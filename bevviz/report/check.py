@@ -3,20 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from contextlib import closing
 from dataclasses import dataclass, field, replace
 from math import inf
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from threading import Event
 from typing import Any
 
 import numpy as np
 from rerun.chunk import RrdReader
 
-from bevviz.config import Config, changes, load
+from bevviz.config import STAGES, Config, changes, flat_yaml, load
 from bevviz.errors import UserError, first_line
+from bevviz.files import Scratch
 from bevviz.frame import FrameResult
 from bevviz.logging import entities
+from bevviz.plugins import is_foreign
 from bevviz.progress import Progress
 from bevviz.provenance import differences, file_hash, model_path, provenance
 from bevviz.report.digest import (
@@ -89,6 +91,11 @@ class CheckResult:
                 f"{self.frames} frames: the same; {self.exact} in every bit, the others to "
                 f"{self.rounding:.1g} of their numbers (rounding, up to {ROUNDING:g})"
             )
+        if self.same:
+            yield (
+                "compared: what the stages make of each frame of the bag; not compared: how the recording "
+                "and the page show it, their texts, times and tracks"
+            )
         if self.redacted:
             yield "the images are redacted: detections are taken from the report, all else was computed again"
         yield from (f"not as it was: {text}" for text in self.changed)
@@ -111,8 +118,8 @@ def check(rrd: Path, *, model: Path | None = None, settings: Sequence[str] = ())
     info, bag = stored.info, rrd.with_suffix(".mcap")
     if not bag.exists():
         raise UserError(f"{bag}: the bag of the report is not there; it has the name of the recording")
-    with TemporaryDirectory(prefix="bevviz-") as folder:
-        then, now = _configs(rrd, stored, model, settings, Path(folder))
+    with closing(Scratch()) as scratch:
+        then, now = _configs(rrd, stored, model, settings, scratch.new())
         result = CheckResult(redacted=info.redacted)
         detections = {
             key: value for stages in stored.frames.values() for key, value in detections_of(stages).items()
@@ -188,6 +195,7 @@ def _configs(
     info, file, names = stored.info, folder / "config.yaml", folder / "names.txt"
     file.write_text(stored.config)
     names.write_bytes(info.names.encode())
+    _check_functions(rrd, stored.config, settings)
     then = load(file)
     needed = model_path(then)
     here = [f"detector.names={names}"] if info.names else []
@@ -200,6 +208,19 @@ def _configs(
             raise UserError(f"{rrd}: it was made with {used}, which is not beside it: give --model FILE")
         here.append(f"detector.model={beside}")
     return then, load(file, [*here, *settings])
+
+
+def _check_functions(rrd: Path, config: str, settings: Sequence[str]) -> None:
+    """A report comes from somebody else: code that it names is run where the user names it, too."""
+    stated = flat_yaml(config, str(rrd))
+    for section, name in STAGES.items():
+        key = f"{section}.{name}"
+        function = str(stated.get(key, ""))
+        if is_foreign(function) and f"{key}={function}" not in settings:
+            raise UserError(
+                f"{rrd}: it was made with the function {function}, and to check it is to run that module; "
+                f"if you trust it, add --set {key}={function}"
+            )
 
 
 def _changed_input(info: ReportInfo, bag: Path, then: Config, now: Config) -> Iterator[str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
@@ -17,10 +18,12 @@ from bevviz.bags.recording import RawMessage
 from bevviz.bags.source import MARGIN, BagSource
 from bevviz.config import Config, changes, load
 from bevviz.errors import UserError
+from bevviz.files import claim, unfinished
+from bevviz.files import written as write_beside
 from bevviz.frame import Camera, Detections, Frame, FrameResult
 from bevviz.logging import entities
 from bevviz.logging.pieces import document
-from bevviz.logging.recorder import Recorder
+from bevviz.logging.recorder import DiskWatch, Recorder
 from bevviz.logging.sinks import open_recording
 from bevviz.progress import Progress
 from bevviz.provenance import Provenance, file_hash, model_path, names_path, provenance, versions
@@ -30,7 +33,7 @@ from bevviz.report.origin import ReportInfo, shareable
 from bevviz.report.page import page
 from bevviz.report.redact import Redactor
 from bevviz.report.summary import WindowSummary
-from bevviz.report.window import Cut, Window, choose_topics, cut, find_window, open_window
+from bevviz.report.window import Cut, Window, choose_topics, cut, find_window, fits, open_window
 from bevviz.run import Observer, run
 from bevviz.session import Session
 from bevviz.stages.detector import Detector
@@ -43,7 +46,8 @@ class ReportRequest:
     """What is asked for.
 
     ``before`` and ``after`` are in seconds; ``topics``: patterns of those that go into the bag beside the
-    ones that the pipeline reads, None: all; ``redact``: hide people and vehicles; ``force``: overwrite.
+    ones that the pipeline reads, None: all; ``redact``: hide people and vehicles; ``unredacted``: patterns of
+    topics that are kept even so where nobody can tell what they show; ``force``: overwrite.
     """
 
     paths: Sequence[Path]
@@ -55,6 +59,7 @@ class ReportRequest:
     note: str = ""
     topics: Sequence[str] | None = None
     redact: bool = False
+    unredacted: Sequence[str] = ()
     include_model: bool = False
     force: bool = False
 
@@ -89,7 +94,17 @@ def make(request: ReportRequest) -> WrittenReport:
         topics = choose_topics(whole.recording, whole.roles, request.topics)
         redactor = found = None
         if request.redact:
-            redactor = Redactor(request.config.detector, whole.recording, whole.roles.lidars)
+            fits(whole.recording, request.unredacted, "--unredacted")
+            redactor = Redactor(
+                request.config.detector, whole.recording, whole.roles.lidars, request.unredacted
+            )
+        # Whatever ends this run, nobody must take an older report for this one, least of all unredacted.
+        for target in (rrd, html, bag):
+            handle = claim(target, "report")
+            target.unlink(missing_ok=True)
+            unfinished(target).unlink()
+            os.close(handle)
+        if request.redact:
             found = _detect(request, window)
         detect = None if found is None else replay(found)
         session = Session(request.config, detect)
@@ -101,12 +116,12 @@ def make(request: ReportRequest) -> WrittenReport:
 
         public = shareable(request.config)
         source = stack.enter_context(open_window([bag], request.config, window.low, window.high))
-        sinks = open_recording(whole.scene, public, save=rrd, blueprint="bug_report")
-        recording = stack.enter_context(sinks).recording
+        sinks = stack.enter_context(open_recording(whole.scene, public, save=rrd, blueprint="bug_report"))
+        recording = sinks.recording
         written.files.insert(0, rrd)
         summary = WindowSummary(window.at, source.total, len(whole.scene.cameras))
         recorder = _ReportRecorder(recording, public, summary, window.at, request.note)
-        written.interrupted = run(source, session, [recorder, Progress("run")]).interrupted
+        written.interrupted = run(source, session, [recorder, DiskWatch(sinks), Progress("run")]).interrupted
         written.frames = len(summary.frames)
         written.warnings += [w for w in source.warnings if w not in written.warnings]
         written.warnings = [_without_folders(w, [*request.paths, bag]) for w in written.warnings]
@@ -115,10 +130,11 @@ def make(request: ReportRequest) -> WrittenReport:
         info = _info(request, window, written, made_with, bag)
         recording.send_property("report", rr.AnyValues(about=info.dump()))
         recording.log(entities.REPORT, document(facts.markdown()), static=True)
-    try:
-        html.write_text(page(facts, summary), encoding="utf-8")
-    except OSError as error:
-        raise UserError(f"{html}: cannot write the page: {error.strerror}") from None
+    with write_beside(html, "page") as given:
+        try:
+            given.path.write_text(page(facts, summary), encoding="utf-8")
+        except OSError as error:
+            raise UserError(f"{html}: cannot write the page: {error.strerror}") from None
     written.files.insert(1, html)
     return written
 

@@ -82,7 +82,7 @@ def page(facts: Facts, summary: WindowSummary) -> str:
 def _frame(result: FrameResult, facts: Facts) -> FramePage:
     loud = [e for e in result.explanations if e.state not in _QUIET]
     detections = [e for e in loud if e.subject == "detection"]
-    clusters = [e for e in loud if e.subject == "cluster"]
+    clusters = [e for e in loud if e.subject in ("cluster", "split")]
     return FramePage(
         when=f"{(result.frame.received - facts.start) / SECOND:.3f} s",
         verdict=list(_verdict(result)),

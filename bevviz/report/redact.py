@@ -6,15 +6,28 @@ import re
 from collections import Counter
 from collections.abc import Collection, Sequence
 from dataclasses import replace
+from fnmatch import fnmatchcase
 from typing import Any
 
 import cv2
 import numpy as np
+from rosbags.interfaces import MessageDefinition
 
+from bevviz.bags.reader import normalized
 from bevviz.bags.recording import RawMessage, Recording
 from bevviz.config import DetectorConfig
 from bevviz.errors import UserError
 from bevviz.frame import F32, U8
+from bevviz.report.contents import (
+    CLOUD,
+    COMPRESSED,
+    IMAGE,
+    OLD_CLOUD,
+    PICTURES,
+    Contents,
+    is_coloured,
+    is_known,
+)
 from bevviz.ros.messages import MessageError, decode_compressed_image, decode_image
 from bevviz.stages.detector import MAX_CANDIDATES, Detector
 
@@ -28,10 +41,6 @@ PEOPLE = re.compile(r"person|people|pedestrian|rider|cyclist|human|man\b|child|f
 VEHICLES = re.compile(
     r"car\b|van\b|truck|bus\b|tram|train|motor|bike|bicycle|cycle|trailer|caravan|vehicle|taxi|scooter|plate"
 )
-IMAGES = ("Image", "CompressedImage")
-# Pictures in other clothes, which nothing here can decode.
-PICTURES = re.compile(r"image|video|ffmpeg|theora|h26[45]|jpeg|png|disparity", re.IGNORECASE)
-COLOUR_FIELDS = {"rgb", "rgba", "r", "red", "color"}  # of a cloud that is a picture, too
 
 
 class Redactor:
@@ -45,12 +54,19 @@ class Redactor:
         config: the detector. Its thresholds, limits and choice of classes do not count here.
         recording: which the messages are of.
         lidars: topics whose clouds are kept even where their points have colours.
+        unredacted: patterns of topics that are written even where nobody can tell what they show.
 
     Raises:
         UserError: no model, or one that knows no people or no vehicles.
     """
 
-    def __init__(self, config: DetectorConfig, recording: Recording, lidars: Collection[str] = ()) -> None:
+    def __init__(
+        self,
+        config: DetectorConfig,
+        recording: Recording,
+        lidars: Collection[str] = (),
+        unredacted: Sequence[str] = (),
+    ) -> None:
         if not config.model:
             raise UserError(
                 "--redact needs a detector that finds people and vehicles: give --model FILE.onnx"
@@ -69,7 +85,8 @@ class Redactor:
                 raise UserError(
                     f"--redact: {config.model} finds no {what}, but {', '.join(names) or 'unnamed'}"
                 )
-        self._recording, self._lidars = recording, lidars
+        self._recording, self._lidars, self._unredacted = recording, lidars, unredacted
+        self._contents: dict[tuple[str, MessageDefinition], Contents] = {}
         self._left_out: Counter[str] = Counter()
         self.images = 0
         self.hidden = 0  # boxes
@@ -81,24 +98,43 @@ class Redactor:
 
     def __call__(self, message: RawMessage, data: bytes | memoryview) -> bytes | memoryview | None:
         """The message as it may be written: untouched where it shows nobody, None where nobody can tell."""
-        msgtype = message.connection.msgtype
-        package, _, kind = msgtype.rpartition("/")
+        asked = any(fnmatchcase(message.topic, pattern) for pattern in self._unredacted)
         try:
-            if kind in IMAGES and package.startswith("sensor_msgs"):
-                return self._redacted(message, data, kind == "CompressedImage")
-            if PICTURES.search(msgtype):
-                raise MessageError(f"a {msgtype} cannot be looked into")
-            if kind == "PointCloud2" and message.topic not in self._lidars and self._is_coloured(message):
-                raise MessageError("its points have the colours of a picture")
+            return self._looked_into(message, data, asked)
         except MessageError as error:
             reason = str(error).removeprefix(f"{message.topic}: ")
-            self._left_out[f"{message.topic} left out: {reason}"] += 1
-            return None
-        return data
+            kept = "as it was recorded, as --unredacted says" if asked else "left out"
+            self._left_out[f"{message.topic} {kept}: {reason}"] += 1
+            return data if asked else None
 
-    def _is_coloured(self, message: RawMessage) -> bool:
-        names = {field.name.lower() for field in self._recording.decode(message).fields}
-        return not names.isdisjoint(COLOUR_FIELDS)
+    def _looked_into(self, message: RawMessage, data: bytes | memoryview, asked: bool) -> bytes | memoryview:
+        msgtype = normalized(message.connection.msgtype)
+        if msgtype in (IMAGE, COMPRESSED):
+            return self._redacted(message, data, msgtype == COMPRESSED)
+        if message.topic in self._lidars:
+            return data
+        if PICTURES.search(msgtype):
+            raise MessageError(f"a {msgtype} cannot be looked into")
+        if not is_known(msgtype) and not asked:
+            raise MessageError(f"bevviz does not know what a {msgtype} shows (--unredacted keeps it)")
+        key = msgtype, message.connection.msgdef
+        contents = self._contents.get(key)
+        if contents is None:
+            definitions = self._recording.definitions(message.connection)
+            contents = self._contents[key] = Contents(msgtype, definitions)
+        if not contents.may_show:
+            return data
+        content = self._recording.decode(message)
+        if msgtype in (CLOUD, OLD_CLOUD):
+            if is_coloured(content):
+                raise MessageError("its points have the colours of a picture")
+            return data
+        stripped, pictures = contents.without_pictures(content, lenient=asked)
+        if not pictures:
+            return data
+        for path in pictures:
+            self._left_out[f"{message.topic} without the pictures in it ({path} of {msgtype})"] += 1
+        return self._recording.encode(message, stripped)
 
     def _redacted(
         self, message: RawMessage, data: bytes | memoryview, compressed: bool

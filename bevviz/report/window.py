@@ -64,11 +64,17 @@ def choose_topics(recording: Recording, roles: Roles, patterns: Sequence[str] | 
     there = [topic.name for topic in recording.topics]
     if patterns is None:
         return there
-    for pattern in patterns:
-        if not any(fnmatchcase(name, pattern) for name in there):
-            raise UserError(f"--topics {pattern}: no topic fits among {', '.join(there)}")
+    fits(recording, patterns, "--topics")
     needed = set(_read(roles))
     return [n for n in there if n in needed or any(fnmatchcase(n, pattern) for pattern in patterns)]
+
+
+def fits(recording: Recording, patterns: Sequence[str], option: str) -> None:
+    """Raises UserError for a pattern that no topic fits."""
+    there = [topic.name for topic in recording.topics]
+    for pattern in patterns:
+        if not any(fnmatchcase(name, pattern) for name in there):
+            raise UserError(f"{option} {pattern}: no topic fits among {', '.join(there)}")
 
 
 def _read(roles: Roles) -> list[str]:

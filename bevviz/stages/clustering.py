@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from bevviz.config import ClusteringConfig
 from bevviz.frame import F32, F64, I32, I64, Boxes3D, Clusters, ClusterState
@@ -46,6 +48,40 @@ def describe(points: F32, labels: I32, config: ClusteringConfig) -> Clusters:
         np.float32(0.5) * (low + high), np.maximum(high - low, MIN_SIZE), np.zeros(len(count), np.float32)
     )
     return Clusters(labels, state, count, centroid, aligned, _upright(oriented))
+
+
+def redescribe(
+    points: F32, labels: I32, before: Clusters, kept_rows: I64, named: I32, config: ClusteringConfig
+) -> Clusters:
+    """As ``describe``, of clusters of which some are as they were.
+
+    Args:
+        points: (P, 3) float32 finite points.
+        labels: (P,) int32, as in ``describe``.
+        before: the clusters that they were.
+        kept_rows: (K,) row in these of each cluster that is unchanged, -1 for the others.
+        named: rows that are no smaller and no larger than they should be, whatever the limits.
+        config: the size limits.
+    """
+    fresh = np.flatnonzero(kept_rows < 0)
+    number = np.full(len(kept_rows) + 1, -1, np.int32)
+    number[fresh] = np.arange(len(fresh), dtype=np.int32)
+    touched = np.flatnonzero(number[labels] >= 0)
+    new = describe(points[touched], number[labels[touched]], config)
+    old = np.flatnonzero(kept_rows >= 0)
+    place = np.empty(len(kept_rows), np.int64)
+    place[old], place[fresh] = np.arange(len(old)), len(old) + np.arange(len(fresh))
+
+    def joined(a: NDArray[Any], b: NDArray[Any]) -> NDArray[Any]:
+        return np.concatenate([a[kept_rows[old]], b])[place]
+
+    def boxes(a: Boxes3D, b: Boxes3D) -> Boxes3D:
+        return Boxes3D(joined(a.center, b.center), joined(a.size, b.size), joined(a.yaw, b.yaw))
+
+    state = joined(before.state, new.state)
+    state[named] = ClusterState.KEPT
+    count, centroid = joined(before.count, new.count), joined(before.centroid, new.centroid)
+    return Clusters(labels, state, count, centroid, boxes(before.aabb, new.aabb), boxes(before.obb, new.obb))
 
 
 def dbscan(points: F32, eps: float, min_points: int) -> I32:

@@ -15,6 +15,7 @@ from bevviz.frame import (
     Bool,
     Boxes3D,
     CameraResult,
+    Claims,
     Clusters,
     Decision,
     Detections,
@@ -38,6 +39,7 @@ def fuse(
     intrinsics: Intrinsics,
     camera_from_points: F64,
     config: FusionConfig,
+    claims: Claims | None = None,
 ) -> Fusion:
     """Match one camera's detections with the clusters.
 
@@ -51,7 +53,8 @@ def fuse(
     with the IoU of the detection and the box around the projected cluster, and the median depth of the
     points in the frustum relative to that of the nearest permitted cluster in it. The matches are the
     one-to-one assignment of greatest total rating: of two boxes on one object the surer one gets it,
-    and of two clusters that fit equally the near one is taken.
+    and of two clusters that fit equally the near one is taken. With ``claims`` the clusters were made for the
+    detections (``frustum.claim``), and each has the one that was.
 
     ``centroid``: the tutorial's way. Each cluster's centroid, projected without distortion, takes the
     nearest centre of a 2D box within ``match_radius``, so that one box may name several clusters.
@@ -64,6 +67,7 @@ def fuse(
         intrinsics: the camera.
         camera_from_points: (4, 4) optical frame from the clusters' frame.
         config: method and its thresholds.
+        claims: what each detection took, where they split the clusters.
 
     Returns:
         The matches, and for every detection and cluster the decision and the evidence.
@@ -85,8 +89,14 @@ def fuse(
         matched = nearest[np.isfinite(pairs.cost[nearest])]
     else:
         pairs, reason = _frustum_pairs(inside, depth, labels, cluster_uv, clusters, detections, config)
-        allowed = np.flatnonzero(reason == Decision.TAKEN)
-        matched = allowed[_assign_pairs(pairs, allowed)]
+        if claims is None:
+            allowed = np.flatnonzero(reason == Decision.TAKEN)
+            matched = allowed[_assign_pairs(pairs, allowed)]
+        else:
+            matched = np.flatnonzero(claims.cluster[pairs.detection] == pairs.cluster)
+            has_other = claims.cluster[pairs.detection] >= 0
+            is_taken = np.isin(pairs.cluster, claims.cluster[claims.cluster >= 0])
+            reason[(reason == Decision.TAKEN) & ~has_other & ~is_taken] = Decision.MISFIT
         # Permitted pairs come first as the most telling, then those that fit best.
         order = np.lexsort((-pairs.points, -pairs.iou, pairs.cost))
 
@@ -121,6 +131,7 @@ def fuse(
         cluster_detection=cluster_detection,
         pairs=pairs,
         cluster_uv=cluster_uv,
+        claims=claims,
     )
 
 
@@ -130,9 +141,10 @@ def merge(clusters: Clusters, cameras: Sequence[CameraResult], config: Clusterin
     Args:
         clusters: the frame's clusters.
         cameras: results; those without fusion are skipped.
-        config: ``boxes`` chooses oriented or axis-aligned ones.
+        config: ``boxes`` chooses oriented or axis-aligned ones. Oriented ones are those that were fitted when
+            detections split the clusters, where they did.
     """
-    best: dict[int, tuple[float, str, str, int]] = {}
+    best: dict[int, tuple[float, str, str, int, Claims | None]] = {}
     for result in cameras:
         if result.fusion is None or result.detections is None:
             continue
@@ -140,16 +152,23 @@ def merge(clusters: Clusters, cameras: Sequence[CameraResult], config: Clusterin
             d = int(result.fusion.cluster_detection[k])
             score = float(result.detections.score[d])
             if k not in best or score > best[k][0]:
-                best[k] = score, result.detections.names[d], result.camera.name, d
+                best[k] = score, result.detections.names[d], result.camera.name, d, result.fusion.claims
     rows = sorted(best)
-    boxes = clusters.boxes(config)
+    measured = clusters.boxes(config).chosen(rows)
+    boxes, seen = measured, None
+    whole = [(claims, d) for *_, d, claims in (best[k] for k in rows) if claims is not None]
+    if config.boxes == "oriented" and len(whole) == len(rows):
+        boxes = Boxes3D.joined([claims.boxes.chosen([d]) for claims, d in whole])
+        seen = np.array([claims.seen[d] for claims, d in whole], bool).reshape(-1, 4)
     return Objects(
-        boxes=Boxes3D(boxes.center[rows], boxes.size[rows], boxes.yaw[rows]),
+        boxes=boxes,
         names=tuple(best[k][1] for k in rows),
         score=np.array([best[k][0] for k in rows], np.float32),
         cluster=np.array(rows, np.int32),
         camera=tuple(best[k][2] for k in rows),
         detection=np.array([best[k][3] for k in rows], np.int32),
+        measured=measured,
+        seen=seen,
     )
 
 

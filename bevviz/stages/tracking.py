@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, fields
 from typing import Any
 
@@ -29,6 +30,7 @@ class _State:
     mean: F64  # (T, 2, 3) position and velocity
     covariance: F64  # (T, 2, 2) the same for each axis
     size: F64  # (T, 3)
+    whole: Bool  # the size is that of all of it, not of what was seen
     yaw: F64
     hits: I32
     sightings: I32
@@ -39,11 +41,12 @@ class _State:
 
     @staticmethod
     def empty() -> _State:
-        return _State.new(np.zeros(0, np.int64), Boxes3D.empty(), 0, 0, 0, TrackingConfig())
+        nothing = np.zeros(0, np.bool_)
+        return _State.new(np.zeros(0, np.int64), Boxes3D.empty(), nothing, 0, 0, 0, TrackingConfig())
 
     @staticmethod
     def new(
-        ids: I64, boxes: Boxes3D, stamp: int, classes: int, length: int, config: TrackingConfig
+        ids: I64, boxes: Boxes3D, whole: Bool, stamp: int, classes: int, length: int, config: TrackingConfig
     ) -> _State:
         n = len(ids)
         mean = np.zeros((n, 2, 3))
@@ -53,6 +56,7 @@ class _State:
             mean=mean,
             covariance=np.tile(np.diag([config.position_noise**2, INITIAL_SPEED**2]), (n, 1, 1)),
             size=boxes.size.astype(np.float64),
+            whole=whole,
             yaw=boxes.yaw.astype(np.float64),
             hits=np.ones(n, np.int32),
             sightings=np.zeros(n, np.int32),
@@ -104,7 +108,8 @@ class Tracker:
 
         Args:
             frame: for its stamp and pose. A stamp twice is the same instant seen again.
-            clusters: only those that were kept are tracked, by their oriented boxes.
+            clusters: only those that were kept are tracked, by their oriented boxes, or by those of the
+                objects that they are, where these are completed to the size of their class.
             in_view: (K,) clusters that some camera could name: without a name they lose the one they had.
             objects: names of clusters.
             config: noise, gate, birth and death.
@@ -120,13 +125,17 @@ class Tracker:
             self._state.votes = np.zeros((0, len(self._classes)))
         kept = np.flatnonzero(clusters.kept)
         pose = frame.pose
-        boxes = _placed(clusters.obb, kept, pose)
+        seen = _placed(clusters.obb, kept, pose)
+        boxes, whole = _completed(seen, kept, objects, pose, config.gate)
 
         self._predict(dt, config)
-        column = self._assign(boxes, dt, config)
+        column = self._assign(boxes, whole, seen, pose, config)
         old = np.flatnonzero(column >= 0)
         innovation = np.full(len(column), np.nan, np.float32)
-        innovation[old] = self._correct(old, boxes, column[old], config)
+        measured = self._as_known(
+            old, boxes.chosen(column[old]), whole[column[old]], seen.chosen(column[old]), pose
+        )
+        innovation[old] = self._correct(old, measured, config)
         self._state.hits[old] += 1
         self._state.seen[old] = frame.stamp
         cluster = np.where(column >= 0, np.append(kept, -1)[column], -1)
@@ -138,9 +147,9 @@ class Tracker:
         fresh = np.setdiff1d(np.arange(len(boxes)), column)
         ids = self._next + np.arange(len(fresh))
         self._next += len(fresh)
-        rows = Boxes3D(boxes.center[fresh], boxes.size[fresh], boxes.yaw[fresh])
         length, classes = len(self._stamps), len(self._classes)
-        self._state = self._state.joined(_State.new(ids, rows, frame.stamp, classes, length, config))
+        born = _State.new(ids, boxes.chosen(fresh), whole[fresh], frame.stamp, classes, length, config)
+        self._state = self._state.joined(born)
         cluster = np.concatenate([cluster, kept[fresh]])
         innovation = np.concatenate([innovation, np.full(len(fresh), np.nan, np.float32)])
 
@@ -155,20 +164,31 @@ class Tracker:
         self._state.mean = step @ self._state.mean
         self._state.covariance = step @ self._state.covariance @ step.T + np.outer(disturbed, disturbed)
 
-    def _assign(self, boxes: Boxes3D, dt: float, config: TrackingConfig) -> I32:
+    def _assign(self, boxes: Boxes3D, whole: Bool, seen: Boxes3D, pose: F64, config: TrackingConfig) -> I32:
         """(T,) box of each track, -1: none. Least squared distance on the ground, relative to the gate.
 
         The gate is ``tracking.gate``, wider where the place is uncertain to more than a third of it (three
-        sigma). Sizes that differ cost as well.
+        sigma). Sizes that differ cost as well. A track that never was whole is compared with what is seen. Of
+        a part of an object that was whole before, the centre may lie nearer to the sensor, and it may be
+        smaller, for nothing more.
         """
         state = self._state
         column = np.full(len(state), -1, np.int32)
         if len(state) == 0 or len(boxes) == 0:
             return column
         gate = np.maximum(config.gate**2, 9 * (state.covariance[:, 0, 0] + config.position_noise**2))
-        extent = np.log(np.maximum(np.sort(state.size[:, :2]), 0.1))
-        measured = np.log(np.maximum(np.sort(boxes.size[:, :2]), 0.1))
-        cost, near_track, near_box = _costs(state.mean[:, 0], gate, extent, boxes.center, measured)
+        sight = state.mean[:, 0, :2] - pose[:2, 3]
+        sight /= np.maximum(np.linalg.norm(sight, axis=1, keepdims=True), 1e-9)
+        cost, near_track, near_box = _costs(
+            state.mean[:, 0],
+            gate,
+            _extent(state.size),
+            sight,
+            state.whole,
+            np.stack([seen.center, boxes.center]),
+            np.stack([_extent(seen.size), _extent(boxes.size)]),
+            whole,
+        )
         # Most boxes have one track near, and it has no other: only the rest has to be assigned.
         nearest = cost.argmin(1)
         alone = (near_track == 1) & (near_box[nearest] == 1)
@@ -179,21 +199,47 @@ class Tracker:
         column[rows] = np.where(chosen >= 0, np.append(columns, -1)[chosen], -1)
         return column
 
-    def _correct(self, rows: NDArray[Any], boxes: Boxes3D, measured: I32, config: TrackingConfig) -> F32:
+    def _as_known(self, rows: NDArray[Any], boxes: Boxes3D, whole: Bool, seen: Boxes3D, pose: F64) -> Boxes3D:
+        """The measured boxes with what earlier frames saw: a track that knows all of it keeps its size.
+
+        Where only a part is measured of what was whole before, the box goes on away from the sensor. Where
+        the whole is measured for the first time, the track moves to its centre, which is no motion.
+        """
+        state = self._state
+        first = whole & ~state.whole[rows]
+        state.mean[rows[first], 0] += boxes.center[first] - seen.center[first]
+        state.size[rows[first]], state.yaw[rows[first]] = boxes.size[first], boxes.yaw[first]
+        state.whole[rows] |= whole
+        part = np.flatnonzero(state.whole[rows] & ~whole)
+        if len(part) == 0:
+            return boxes
+        center, size = boxes.center.copy(), boxes.size.copy()
+        _, quarters = _turn(boxes.yaw[part], state.yaw[rows[part]])
+        known = state.size[rows[part]]
+        known[:, :2] = np.where((quarters % 2 == 1)[:, None], known[:, 1::-1], known[:, :2])
+        yaw = boxes.yaw[part]
+        ahead = np.stack([np.cos(yaw), np.sin(yaw)], axis=1)
+        for axis, direction in enumerate((ahead, np.stack([-ahead[:, 1], ahead[:, 0]], axis=1))):
+            away = ((center[part, :2] - pose[:2, 3]) * direction).sum(axis=1)
+            missing = np.maximum(known[:, axis] - size[part, axis], 0)
+            behind = np.where(np.abs(away) > size[part, axis] / 2, np.sign(away) * missing / 2, 0)
+            center[part, :2] += behind[:, None] * direction
+            size[part, axis] += missing
+        return Boxes3D(center, size, boxes.yaw)
+
+    def _correct(self, rows: NDArray[Any], boxes: Boxes3D, config: TrackingConfig) -> F32:
         """Update with the measured boxes; how far on the ground they are from where they were expected."""
         state = self._state
         covariance = state.covariance[rows]
         gain = covariance[:, :, 0] / (covariance[:, :1, 0] + config.position_noise**2)
-        innovation = boxes.center[measured] - state.mean[rows, 0]
+        innovation = boxes.center - state.mean[rows, 0]
         state.mean[rows] += gain[:, :, None] * innovation[:, None]
         state.covariance[rows] = covariance - gain[:, :, None] * covariance[:, :1]
 
-        # A fitted rectangle has no front: of its four headings the nearest is meant.
-        turn = boxes.yaw[measured] - state.yaw[rows]
-        quarters = np.round(turn / (np.pi / 2)).astype(np.int64)
-        size = boxes.size[measured].astype(np.float64)
+        turn, quarters = _turn(boxes.yaw, state.yaw[rows])
+        size = boxes.size.astype(np.float64)
         size[:, :2] = np.where((quarters % 2 == 1)[:, None], size[:, 1::-1], size[:, :2])
-        state.yaw[rows] += SHAPE_GAIN * (turn - quarters * (np.pi / 2))
+        state.yaw[rows] += SHAPE_GAIN * turn
         state.size[rows] += SHAPE_GAIN * (size - state.size[rows])
         velocity = state.mean[rows, 1]
         backwards = np.cos(state.yaw[rows] - np.arctan2(velocity[:, 1], velocity[:, 0])) < 0
@@ -269,21 +315,69 @@ class Tracker:
         )
 
 
+def _extent(size: F32 | F64) -> F64:
+    """(N, 2) logarithms of the shorter and the longer side on the ground."""
+    return np.asarray(np.log(np.maximum(np.sort(size[:, :2]), 0.1)), np.float64)
+
+
 @kernel
-def _costs(place: F64, gate: F64, extent: F64, center: F32, measured: F64) -> tuple[F64, I32, I32]:
-    """(T, K) costs, inf beyond the squared gate, and how many of the others are near each track and box."""
-    cost = np.full((len(place), len(center)), np.inf)
-    near_track, near_box = np.zeros(len(place), np.int32), np.zeros(len(center), np.int32)
+def _costs(
+    place: F64, gate: F64, extent: F64, sight: F64, known: Bool, center: F32, measured: F64, whole: Bool
+) -> tuple[F64, I32, I32]:
+    """(T, K) costs, inf beyond the squared gate, and how many of the others are near each track and box.
+
+    ``center`` and ``measured`` are (2, K, ...): as seen, and as completed where that is known (``whole``).
+    """
+    cost = np.full((len(place), len(whole)), np.inf)
+    near_track, near_box = np.zeros(len(place), np.int32), np.zeros(len(whole), np.int32)
     for t in range(len(place)):
-        for k in range(len(center)):
-            dx, dy = place[t, 0] - center[k, 0], place[t, 1] - center[k, 1]
+        for k in range(len(whole)):
+            as_whole = 1 if known[t] and whole[k] else 0
+            dx, dy = place[t, 0] - center[as_whole, k, 0], place[t, 1] - center[as_whole, k, 1]
+            narrower, shorter = (
+                extent[t, 0] - measured[as_whole, k, 0],
+                extent[t, 1] - measured[as_whole, k, 1],
+            )
+            if known[t] and not whole[k]:
+                hidden = max(math.exp(extent[t, 1]) - math.exp(measured[0, k, 1]), 0.0) / 2
+                nearer = min(max(dx * sight[t, 0] + dy * sight[t, 1], 0.0), hidden)
+                dx, dy = dx - nearer * sight[t, 0], dy - nearer * sight[t, 1]
+                shorter, narrower = min(shorter, 0.0), min(narrower, 0.0)
             distance = (dx * dx + dy * dy) / gate[t]
             if distance <= 1:
-                size = abs(extent[t, 0] - measured[k, 0]) + abs(extent[t, 1] - measured[k, 1])
+                size = abs(narrower) + abs(shorter)
                 cost[t, k] = distance + SIZE_WEIGHT * size / 2
                 near_track[t] += 1
                 near_box[k] += 1
     return cost, near_track, near_box
+
+
+def _turn(measured: F32, expected: F64) -> tuple[F64, I64]:
+    """How far rectangles are turned from the nearest of their four headings, and which that is."""
+    turn = measured - expected
+    quarters = np.round(turn / (np.pi / 2)).astype(np.int64)
+    return turn - quarters * (np.pi / 2), quarters
+
+
+def _completed(
+    seen: Boxes3D, kept: NDArray[Any], objects: Objects | None, pose: F64, gate: float
+) -> tuple[Boxes3D, Bool]:
+    """The boxes of clusters, those of named objects instead where they are whole; and which these are.
+
+    What is smaller than the gate stays as measured: its centre is known well enough, and more steadily.
+    """
+    whole = np.zeros(len(kept), np.bool_)
+    if objects is None or objects.seen is None or not len(objects) or not len(kept):
+        return seen, whole
+    place = np.searchsorted(kept, objects.cluster)
+    there = np.append(kept, -2)[place] == objects.cluster
+    there = np.flatnonzero(there & (objects.boxes.size[:, :2].max(axis=1) > gate))
+    named = _placed(objects.boxes, there, pose)
+    boxes = Boxes3D(seen.center.copy(), seen.size.copy(), seen.yaw.copy())
+    rows = place[there]
+    boxes.center[rows], boxes.size[rows], boxes.yaw[rows] = named.center, named.size, named.yaw
+    whole[rows] = True
+    return boxes, whole
 
 
 def _placed(boxes: Boxes3D, rows: NDArray[Any], pose: F64) -> Boxes3D:

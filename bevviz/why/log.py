@@ -13,9 +13,9 @@ from bevviz.logging import entities
 from bevviz.logging.camera import over_image
 from bevviz.logging.pieces import boxes2d, document, edges, transform
 from bevviz.why.answer import Answer
-from bevviz.why.evidence import Fate
 from bevviz.why.subject import projected
 from bevviz.why.text import page
+from bevviz.why.traces import Fate
 
 COLORS = {
     Fate.GROUND: (170, 110, 60),

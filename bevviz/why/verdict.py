@@ -1,4 +1,4 @@
-"""Which of the stages decided, and the sentence that says so."""
+"""Which of the stages decided."""
 
 from __future__ import annotations
 
@@ -7,20 +7,18 @@ from enum import StrEnum
 
 import numpy as np
 
-from bevviz.config import Config
-from bevviz.frame import ClusterState, Decision, DetectionState, FrameResult
-from bevviz.why.evidence import Candidate, Evidence, Part
-from bevviz.why.subject import LINK, Subject, projected
+from bevviz.frame import CameraResult, ClusterState, Decision, DetectionState, FrameResult, Fusion
+from bevviz.why.evidence import MOST, Candidate, Evidence, Named, fusion_of
+from bevviz.why.subject import Subject
+from bevviz.why.traces import FEW, PART, Traces
 
-FEW = 3  # raw points that are as good as none
-MOST = 0.5  # share from which something is called the cause
-DIVIDED = 0.7  # share of an object's clustered points that its main cluster has at least, if it is whole
+WHOLE = 0.7  # share of an object's clustered points that its named cluster has at least, if it is whole
 
 
 class Reason(StrEnum):
     REPORTED = "reported"
     SHARED_BOX = "shared box"  # reported, but its box names other clusters, too
-    BORROWED = "borrowed name"  # nothing that a detection is of: named by the box of another cluster
+    BORROWED = "borrowed name"  # named by a detection that is not its own
     SPLIT = "split"
     MERGED = "merged"
     MISNAMED = "misnamed"
@@ -30,8 +28,10 @@ class Reason(StrEnum):
     NO_POINTS = "no points"
     GROUND = "ground"
     NOISE = "noise"
+    NO_CLUSTER = "no cluster"  # of somebody's function or the robot's: why is not known
     TOO_SMALL = "too small"
     TOO_LARGE = "too large"
+    NOT_RUN = "detector not run"
     NOT_DETECTED = "not detected"
     BELOW_THRESHOLD = "below threshold"
     SUPPRESSED = "suppressed"
@@ -40,15 +40,22 @@ class Reason(StrEnum):
     TOO_FEW_POINTS = "too few points"
     TOO_FAR = "too far"
     TAKEN = "taken"
+    MISFIT = "misfit"
     OTHER_CLUSTER = "other cluster"
+    NOT_AMONG = "not among the objects"  # of a 3D detector, or the robot's whose stages are not known
+    LOST_IN_FUSION = "lost in the fusion"  # the robot's, which had a cluster and a detection
 
+
+FLAWED = {Reason.SHARED_BOX, Reason.MERGED, Reason.SPLIT}
+HOPELESS = {Reason.OUT_OF_VIEW, Reason.HIDDEN, Reason.NO_POINTS}
 
 _REFUSED = {
     Decision.LOW_OVERLAP: Reason.LOW_OVERLAP,
     Decision.TOO_FEW_POINTS: Reason.TOO_FEW_POINTS,
     Decision.TOO_FAR: Reason.TOO_FAR,
     Decision.TAKEN: Reason.TAKEN,
-    Decision.NO_CLUSTER: Reason.OTHER_CLUSTER,
+    Decision.MISFIT: Reason.MISFIT,
+    Decision.NO_CLUSTER: Reason.TOO_FEW_POINTS,
 }
 
 
@@ -61,268 +68,197 @@ class Verdict:
     text: str
 
 
-def judge(subject: Subject, evidence: Evidence, result: FrameResult, config: Config) -> Verdict:
-    """The first stage at which the subject was lost, or what is wrong with how it was reported."""
-    reason = _find(subject, evidence, result, config)
-    good = {Reason.REPORTED, Reason.SHARED_BOX, Reason.SPLIT, Reason.BORROWED}
-    reported = reason in good or (reason is Reason.MERGED and _represents(subject, evidence, result))
-    because = _because(subject, reason, evidence, result, config)
-    head = subject.name[0].upper() + subject.name[1:]
-    was = "was" if reported else "was not"
-    if reason is Reason.REPORTED:
-        text = f"{head} was reported: {because}."
-    elif reported:
-        text = f"{head} {was} reported, but {because}."
-    else:
-        text = f"{head} {was} reported because {because}."
-    return Verdict(reason, reported, text)
+def find_reason(subject: Subject, e: Evidence, traces: Traces) -> tuple[Reason, bool]:
+    """The first stage at which the subject was lost, or what is wrong with how it was reported.
+
+    Returns:
+        reason: that stage.
+        reported: whether it is an object of a right class all the same.
+    """
+    if e.named is not None and subject.accepts(e.named.name):
+        return _flaw(subject, e, e.named, traces), True
+    if e.named is not None and not any(c.kept and subject.accepts(c.name) for c in e.candidates):
+        return Reason.MISNAMED, False
+    if traces.result.objects is None:
+        return Reason.FAILED, False
+    if traces.origin("objects").ours:
+        return _loss(subject, e, traces), False
+    return _loss_of_others(subject, e, traces), False
 
 
-def _find(subject: Subject, e: Evidence, result: FrameResult, config: Config) -> Reason:
-    if result.clusters is None:
-        return Reason.FAILED
-    main = e.parts[0] if e.parts else None
-    best = e.candidates[0] if e.candidates else None
-    kept = best is not None and best.state == DetectionState.KEPT and subject.accepts(best.name)
-    object_ = name_of(result, main.cluster) if main is not None else ""
+def _flaw(subject: Subject, e: Evidence, named: Named, traces: Traces) -> Reason:
+    if named.detection < 0 or subject.kind == "object":
+        return Reason.SHARED_BOX if named.also else Reason.REPORTED
+    if e.mates or (subject.kind == "truth" and e.purity < MOST):
+        return Reason.MERGED
+    if not named.own and (subject.kind == "truth" or traces.result.config.fusion.method == "centroid"):
+        return Reason.BORROWED
+    if named.also:
+        return Reason.SHARED_BOX
+    whole = sum(part.points for part in e.parts)
+    part = e.part(named.cluster)
+    several = subject.kind == "truth" and len([p for p in e.parts if p.kept]) > 1
+    return Reason.SPLIT if several and part is not None and part.points < WHOLE * whole else Reason.REPORTED
+
+
+def _loss(subject: Subject, e: Evidence, traces: Traces) -> Reason:
+    """Of what our own fusion was to name."""
     if subject.kind == "detection":
-        return _find_detection(e, result, best)
-    if main is not None and object_:
-        return _find_reported(subject, e, result, config, main)
-    if not _in_view(subject, result):
+        return _loss_of_detection(e, traces)
+    if not subject.is_place and not e.in_view:
         return Reason.OUT_OF_VIEW
     if e.raw < FEW:
-        return Reason.HIDDEN if e.in_front > MOST * max(e.aimed, 1) else Reason.NO_POINTS
-    if main is None or main.state != ClusterState.KEPT:
-        return _lost(e, main)
-    if not kept or best is None:
-        if best is None or not subject.accepts(best.name):
-            return Reason.NOT_DETECTED
-        return _weak(best)
-    if e.others and best.decision in (Decision.TAKEN, Decision.LOW_OVERLAP):
+        return _without_points(e)
+    if e.main < 0:
+        return _unclustered(e, traces)
+    if not detector_ran(traces.result, subject.camera):
+        return Reason.NOT_RUN
+    if all(camera.fusion is None for camera in cameras_of(traces.result, subject.camera)):
+        return Reason.NOT_FUSED
+    if not e.in_view:
+        return Reason.OUT_OF_VIEW
+    best = e.best
+    if best is None or not subject.accepts(best.name):
+        return Reason.NOT_DETECTED
+    if not best.kept:
+        return _weakness(best, traces)
+    return _refusal(subject, e, best, traces)
+
+
+def _without_points(e: Evidence) -> Reason:
+    return Reason.HIDDEN if e.in_front > MOST * e.aimed else Reason.NO_POINTS
+
+
+def _unclustered(e: Evidence, traces: Traces) -> Reason:
+    """Of what has points but no usable cluster: what took most of them."""
+    aside = next((part for part in e.parts if not part.kept), None)
+    if aside is not None and aside.points >= max(e.noise, len(e.ground)):
+        return Reason.TOO_SMALL if aside.state == ClusterState.TOO_SMALL else Reason.TOO_LARGE
+    if len(e.ground) >= e.noise:
+        return Reason.GROUND
+    return Reason.NOISE if traces.origin("clustering").ours else Reason.NO_CLUSTER
+
+
+def cameras_of(result: FrameResult, camera: str) -> list[CameraResult]:
+    """The one of that name; empty: all."""
+    return [c for c in result.cameras if camera in ("", c.camera.name)]
+
+
+def detector_ran(result: FrameResult, camera: str) -> bool:
+    """Whether the detector has looked at an image: of the camera, or of any."""
+    return any(c.detections is not None for c in cameras_of(result, camera))
+
+
+def _weakness(best: Candidate, traces: Traces) -> Reason:
+    """What was suppressed but is below the threshold anyway has nothing to blame a rival for."""
+    least = traces.result.config.detector.conf_threshold
+    strong = best.state == DetectionState.SUPPRESSED and best.score >= least
+    return Reason.SUPPRESSED if strong else Reason.BELOW_THRESHOLD
+
+
+def _refusal(subject: Subject, e: Evidence, best: Candidate, traces: Traces) -> Reason:
+    """Of what has a cluster and a detection: what kept the two apart."""
+    _, fusion = fusion_of(traces.result, best.camera)
+    if fusion is None:
+        return Reason.NOT_FUSED
+    reason = pair_reason(fusion, traces, best.row, e.main)
+    main = e.part(e.main)
+    if subject.kind != "truth" or main is None:
+        return reason
+    if e.purity < MOST or _taken_by_mate(e, fusion, best.camera, traces):
         return Reason.MERGED
-    return Reason.OTHER_CLUSTER if best.decision is Decision.MATCHED else _REFUSED[best.decision]
+    if reason in (Reason.LOW_OVERLAP, Reason.TOO_FEW_POINTS):
+        return _fragment(e, main.points, traces) or reason
+    return reason
 
 
-def _find_reported(subject: Subject, e: Evidence, result: FrameResult, config: Config, main: Part) -> Reason:
-    name = name_of(result, main.cluster)
-    if not subject.accepts(name):
-        return Reason.MERGED if e.others else Reason.MISNAMED
-    if e.others:
-        return Reason.MERGED
-    camera, row, sharing = box_of(result, main.cluster)
-    own = any((c.camera, c.row) == (camera, row) and c.overlap >= LINK for c in e.candidates)
-    if not own and config.fusion.method == "centroid":
-        return Reason.BORROWED  # a name that merely was the nearest
-    if sharing:
-        return Reason.SHARED_BOX
-    kept = [part for part in e.parts if part.state == ClusterState.KEPT]
-    whole = sum(part.points for part in e.parts)
-    return Reason.SPLIT if len(kept) > 1 and main.points < DIVIDED * whole else Reason.REPORTED
+def _taken_by_mate(e: Evidence, fusion: Fusion, camera: str, traces: Traces) -> bool:
+    """Whether the subject's cluster has the name of another object that is in it as well."""
+    if fusion.cluster_decision[e.main] != Decision.MATCHED:
+        return False
+    found, _ = fusion_of(traces.result, camera)
+    return int(traces.owners(found)[fusion.cluster_detection[e.main]]) in e.mates
 
 
-def _find_detection(e: Evidence, result: FrameResult, best: Candidate | None) -> Reason:
+def _fragment(e: Evidence, inside: int, traces: Traces) -> Reason | None:
+    """What took the most of an object of which less than half is in its cluster."""
+    if inside >= MOST * e.voxels:
+        return None
+    rest = e.obstacles - inside - e.noise
+    noise = Reason.NOISE if traces.origin("clustering").ours else Reason.NO_CLUSTER
+    return max((len(e.ground), Reason.GROUND), (e.noise, noise), (rest, Reason.SPLIT))[1]
+
+
+def pair_reason(fusion: Fusion, traces: Traces, detection: int, cluster: int) -> Reason:
+    """The rule of our fusion that keeps a detection and a cluster apart; REPORTED: none does."""
+    config, pair = traces.result.config.fusion, fusion.pair(detection, cluster)
+    if config.method == "centroid":
+        if pair is None or not np.isfinite(pair.cost):
+            return Reason.TOO_FAR
+    elif pair is None or pair.points < config.min_points:
+        return Reason.TOO_FEW_POINTS
+    elif pair.depth > config.max_depth:
+        return Reason.TOO_FAR
+    elif pair.iou < config.min_iou:
+        return Reason.LOW_OVERLAP
+    decision, matched = fusion.detection_decision[detection], fusion.detection_cluster[detection]
+    if decision == Decision.MATCHED and matched == cluster:
+        return Reason.REPORTED
+    if decision == Decision.MISFIT:
+        return Reason.MISFIT
+    return Reason.OTHER_CLUSTER if decision == Decision.MATCHED else Reason.TAKEN
+
+
+def _loss_of_detection(e: Evidence, traces: Traces) -> Reason:
+    best = e.best
     if best is None:
         return Reason.NOT_DETECTED
-    if best.state != DetectionState.KEPT:
-        return _weak(best)
-    found = next(c for c in result.cameras if c.camera.name == best.camera)
-    if found.fusion is None:
+    if not best.kept:
+        return _weakness(best, traces)
+    _, fusion = fusion_of(traces.result, best.camera)
+    if fusion is None:
         return Reason.NOT_FUSED
-    if best.decision is Decision.MATCHED:
-        return Reason.SHARED_BOX if box_of(result, best.cluster)[2] else Reason.REPORTED
-    if best.decision is Decision.NO_CLUSTER:
-        return Reason.NO_POINTS if e.raw < FEW else _lost(e, e.parts[0] if e.parts else None)
-    if best.decision is Decision.TAKEN and e.others:
-        return Reason.MERGED
-    obstacles = e.noise + sum(part.points for part in e.parts)
-    if best.decision is Decision.TOO_FAR and len(e.ground) > MOST * max(e.voxels, 1) and not e.parts:
-        return Reason.GROUND
-    return Reason.NO_POINTS if obstacles == 0 and e.raw < FEW else _REFUSED[best.decision]
+    if best.decision is Decision.NO_CLUSTER or best.cluster < 0:
+        return Reason.NO_POINTS if e.raw < FEW else _unclustered(e, traces)
+    if best.decision is Decision.MATCHED:  # and yet no object: another camera's name has won
+        return Reason.TAKEN
+    held = max((part.points for part in e.parts if part.kept), default=0)
+    if e.voxels >= FEW and held < max(FEW, PART * e.obstacles):
+        return _unclustered(e, traces)
+    return Reason.MERGED if best.decision is Decision.TAKEN and e.mates else _REFUSED[best.decision]
 
 
-def _lost(e: Evidence, main: Part | None) -> Reason:
-    """Of what has points but no usable cluster: what took most of them."""
-    if main is not None:
-        return Reason.TOO_SMALL if main.state == ClusterState.TOO_SMALL else Reason.TOO_LARGE
-    return Reason.NOISE if e.noise > len(e.ground) else Reason.GROUND
+# --- objects that our fusion did not make ------------------------------------------------------
 
 
-def _weak(best: Candidate) -> Reason:
-    if best.state == DetectionState.BELOW_THRESHOLD:
-        return Reason.BELOW_THRESHOLD
-    return Reason.SUPPRESSED
+def _loss_of_others(subject: Subject, e: Evidence, traces: Traces) -> Reason:
+    """Of a 3D detector, or of the robot, whose stages are blamed as far as they are known."""
+    if subject.kind != "detection" and e.raw < FEW:
+        return _without_points(e)
+    robot = {s for s in ("ground", "clustering", "detector", "objects") if traces.origin(s).topic}
+    if "objects" not in robot:
+        return Reason.NOT_AMONG
+    cluster = has_cluster(subject, e)
+    if "clustering" in robot and traces.result.clusters is not None and not cluster:
+        return Reason.GROUND if "ground" in robot and len(e.ground) >= e.noise else Reason.NO_CLUSTER
+    detected = any(c.kept and subject.accepts(c.name) for c in e.candidates)
+    ran = detector_ran(traces.result, subject.camera)
+    if "detector" in robot and ran and not detected:
+        return Reason.NOT_DETECTED if subject.is_place or e.in_view else Reason.OUT_OF_VIEW
+    known = {"clustering", "detector"} <= robot and cluster and detected
+    return Reason.LOST_IN_FUSION if known else Reason.NOT_AMONG
 
 
-def _in_view(subject: Subject, result: FrameResult) -> bool:
-    if subject.box is None:
-        return True
-    return any(projected(subject.box, c.camera) is not None for c in result.cameras)
+def has_cluster(subject: Subject, e: Evidence) -> bool:
+    """Whether there is a cluster at the place; of a detection, one that our fusion finds no fault with."""
+    if subject.kind != "detection":
+        return e.main >= 0
+    return e.best is not None and e.best.kept and e.best.decision in (Decision.MATCHED, Decision.TAKEN)
 
 
 def name_of(result: FrameResult, cluster: int) -> str:
     """Class of the object that a cluster became, empty for none."""
-    if result.objects is None:
+    if result.objects is None or cluster < 0:
         return ""
     rows = np.flatnonzero(result.objects.cluster == cluster)
     return result.objects.names[rows[0]] if len(rows) else ""
-
-
-def box_of(result: FrameResult, cluster: int) -> tuple[str, int, list[int]]:
-    """Camera and row of the detection that named a cluster, and the other clusters that it named."""
-    for found in result.cameras:
-        fusion = found.fusion
-        if fusion is None or fusion.cluster_decision[cluster] != Decision.MATCHED:
-            continue
-        d = int(fusion.cluster_detection[cluster])
-        named = (fusion.cluster_decision == Decision.MATCHED) & (fusion.cluster_detection == d)
-        return found.camera.name, d, [k for k in np.flatnonzero(named).tolist() if k != cluster]
-    return "", -1, []
-
-
-def _represents(subject: Subject, e: Evidence, result: FrameResult) -> bool:
-    """Of those in one cluster, whether this is the one whose detection named it."""
-    best = e.candidates[0] if e.candidates else None
-    return best is not None and best.decision is Decision.MATCHED and subject.accepts(best.name)
-
-
-# --- words -------------------------------------------------------------------------------------
-
-
-def label(candidate: Candidate) -> str:
-    return f"{candidate.name} {candidate.score:.2f}"
-
-
-def _because(subject: Subject, reason: Reason, e: Evidence, result: FrameResult, config: Config) -> str:
-    best = e.candidates[0] if e.candidates else None
-    main = e.parts[0].cluster if e.parts else -1
-    if subject.kind == "detection" and best is not None and best.cluster >= 0:
-        main = best.cluster
-    if reason in (Reason.REPORTED, Reason.SHARED_BOX, Reason.BORROWED):
-        with_ = f"cluster {main} is named {name_of(result, main)}"
-        others = " and ".join(f"cluster {k}" for k in box_of(result, main)[2])
-        if reason is Reason.SHARED_BOX:
-            return f"its box also names {others} ({_method(config)})"
-        if reason is Reason.BORROWED:
-            also = f"that also names {others}" if others else "that is not on it"
-            return f"{with_} by a box {also} ({_method(config)})"
-        return f"{with_} by {label(best)}" if best is not None else with_
-    if reason is Reason.FAILED:
-        return "; ".join(f"{f.stage} failed: {f.reason}" for f in result.failures) or "there are no clusters"
-    if reason is Reason.OUT_OF_VIEW:
-        return "no camera has it in view, and only a camera names objects"
-    if reason is Reason.HIDDEN:
-        return f"it is hidden: {_count(e.raw, 'point')} on it, and {_in_front(e, result)}"
-    if reason is Reason.NO_POINTS:
-        return f"the LiDAR has {_count(e.raw, 'point')} there"
-    if reason is Reason.GROUND:
-        return (
-            f"it was taken for ground: {len(e.ground)} of its {e.voxels} voxels, up to "
-            f"{_height(e):.2f} m high (ground.distance_threshold is {config.ground.distance_threshold:g} m)"
-        )
-    if reason is Reason.NOISE:
-        return (
-            f"its {_count(e.noise, 'obstacle point')} are noise: none has more than {e.neighbours} neighbours"
-            f" within {config.clustering.eps:g} m (clustering.min_points is {config.clustering.min_points})"
-        )
-    if reason is Reason.TOO_SMALL:
-        limit = config.clustering.min_cluster_points
-        return f"its cluster {main} has {e.parts[0].count} points (clustering.min_cluster_points is {limit})"
-    if reason is Reason.TOO_LARGE:
-        limit = config.clustering.max_cluster_points or 0
-        return f"its cluster {main} has {e.parts[0].count} points (clustering.max_cluster_points is {limit})"
-    if reason is Reason.MERGED:
-        names = " and ".join(name for name, _ in e.others)
-        return (
-            f"cluster {main} holds {names}, too: the gap between them is {e.gap:.2f} m and "
-            f"clustering.eps is {config.clustering.eps:g} m"
-        )
-    if reason is Reason.SPLIT:
-        kept = " and ".join(str(p.cluster) for p in e.parts if p.state == ClusterState.KEPT)
-        return f"it is split into clusters {kept}, {e.apart:.2f} m apart"
-    return _because_detected(reason, e, result, config, best, main)
-
-
-def _because_detected(
-    reason: Reason, e: Evidence, result: FrameResult, config: Config, best: Candidate | None, main: int
-) -> str:
-    """Reasons that lie with the detections and the fusion."""
-    if reason is Reason.MISNAMED:
-        return f"cluster {main} is named {name_of(result, main)}"
-    if reason is Reason.NOT_DETECTED or best is None:
-        least = config.detector.explain_threshold
-        if not config.detector.model:
-            return "there is no detector (detector.model is not set)"
-        other = f"; the camera has {label(best)} there" if best is not None else ""
-        return f"the detector has no candidate of its class there, not even with a score of {least:g}{other}"
-    if reason is Reason.BELOW_THRESHOLD:
-        limit = config.detector.conf_threshold
-        score = f"{best.name} {best.score:.3g}"
-        return f"its detection is too weak: {score}, detector.conf_threshold is {limit:g}"
-    fusion = config.fusion
-    pair = _pair(result, best)
-    if reason is Reason.SUPPRESSED:
-        return f"its detection {label(best)} was suppressed by a better one"
-    if reason is Reason.NOT_FUSED:
-        return f"{best.camera} could not be compared with clusters"
-    if reason is Reason.LOW_OVERLAP:
-        both = f"{label(best)} and cluster {best.cluster}"
-        return f"{both} overlap with {pair}, fusion.min_iou is {fusion.min_iou:g}"
-    if reason is Reason.TOO_FEW_POINTS:
-        return f"{label(best)} has {pair} of cluster {best.cluster}, fusion.min_points is {fusion.min_points}"
-    if reason is Reason.TOO_FAR:
-        limit_ = (
-            f"fusion.match_radius is {fusion.match_radius:g} px"
-            if fusion.method == "centroid"
-            else f"fusion.max_depth is {fusion.max_depth:g} m"
-        )
-        return f"cluster {best.cluster} is too far from {label(best)} ({pair}), {limit_}"
-    if reason is Reason.TAKEN:
-        return f"cluster {best.cluster}, the best for {label(best)}, was taken by {_taker(result, best)}"
-    return (
-        f"{label(best)} went to cluster {best.cluster}, not to its own, cluster {main}"
-        if best.cluster >= 0
-        else f"{label(best)} found no cluster"
-    )
-
-
-def _pair(result: FrameResult, best: Candidate) -> str:
-    """The number that the fusion's rule looked at."""
-    fusion = next(c for c in result.cameras if c.camera.name == best.camera).fusion
-    pair = None if fusion is None else fusion.pair(best.row, best.cluster)
-    if pair is None:
-        return ""
-    if best.decision is Decision.LOW_OVERLAP:
-        return f"IoU {pair.iou:.2f}"
-    if best.decision is Decision.TOO_FEW_POINTS:
-        return _count(pair.points, "point")
-    return f"{pair.distance:.0f} px, {pair.depth:.1f} m"
-
-
-def _taker(result: FrameResult, best: Candidate) -> str:
-    found = next(c for c in result.cameras if c.camera.name == best.camera)
-    if found.fusion is None or found.detections is None:
-        return "another detection"
-    d = int(found.fusion.cluster_detection[best.cluster])
-    return f"{found.detections.names[d]} {found.detections.score[d]:.2f}"
-
-
-def _in_front(e: Evidence, result: FrameResult) -> str:
-    what = ""
-    if e.front >= 0:
-        name = name_of(result, e.front)
-        what = f", most of them on cluster {e.front}" + (f" ({name})" if name else "")
-    return f"{e.in_front} of the {e.aimed} returns in its direction end in front of it{what}"
-
-
-def _height(e: Evidence) -> float:
-    known = e.ground[np.isfinite(e.ground)]
-    return float(known.max(initial=0))
-
-
-def _count(number: int, what: str) -> str:
-    return f"{number} {what}" if number == 1 else f"{number or 'no'} {what}s"
-
-
-def _method(config: Config) -> str:
-    return f"fusion.method is {config.fusion.method}: each cluster takes the nearest box"

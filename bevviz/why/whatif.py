@@ -3,80 +3,122 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from pydantic import ValidationError
 
-from bevviz.config import Config
+from bevviz.config import Config, plugin_of
 from bevviz.errors import UserError
 from bevviz.frame import Camera, Detections, DetectionState, FrameResult
 from bevviz.perceive import Detect, Memo, StageLoader, perceive
-from bevviz.why.evidence import Candidate, Evidence, Traces, gather
+from bevviz.why.effects import Effects, effects
+from bevviz.why.evidence import Candidate, Evidence
+from bevviz.why.gather import gather
 from bevviz.why.subject import Subject
-from bevviz.why.verdict import Reason, Verdict, judge, name_of
+from bevviz.why.traces import Traces
+from bevviz.why.verdict import FLAWED, Reason, find_reason
 
 TRIES = 10  # configurations that are run for one subject
-FLAWED = {Reason.SHARED_BOX, Reason.MERGED, Reason.SPLIT}
+RESULTS = 20  # of other configurations that are kept, for further subjects of the frame
 
 Change = Mapping[str, Any]  # dotted key -> value
+
+# Applied by bevviz to what somebody's function gave.
+_WHOEVER = {"min_cluster_points", "max_cluster_points", "conf_threshold"}
+_SECTION = {  # whose parameters may help, by the reason
+    Reason.GROUND: "ground",
+    Reason.NOISE: "clustering",
+    Reason.NO_CLUSTER: "clustering",
+    Reason.MERGED: "clustering",
+    Reason.SPLIT: "clustering",
+    Reason.NOT_DETECTED: "detector",
+    Reason.BELOW_THRESHOLD: "detector",
+    Reason.NOT_AMONG: "objects",
+    Reason.MISNAMED: "objects",
+}
 
 
 @dataclass(frozen=True, slots=True)
 class Hint:
-    """Settings that change the verdict when the stages are run again, and what happens then."""
+    """Settings that change the verdict when the stages are run again, and what happens then.
 
-    settings: tuple[str, ...]  # as --set takes them
+    Attributes:
+        settings: as ``--set`` takes them.
+        text: what becomes of the subject.
+        effects: what else they change in the frame.
+    """
+
+    settings: tuple[str, ...]
     text: str
+    effects: Effects
 
 
 class WhatIf:
     """Runs a frame with other configurations, each once.
 
     Args:
-        result: what was made of the frame.
+        traces: what was made of the frame.
         loader: that has the networks already.
     """
 
-    def __init__(self, result: FrameResult, loader: StageLoader | None = None) -> None:
-        self._result = result
+    def __init__(self, traces: Traces, loader: StageLoader | None = None) -> None:
+        self._traces, self._result = traces, traces.result
         self._loader, self._memo = loader or StageLoader(), Memo()
         self._runs: dict[tuple[tuple[str, Any], ...], Traces | None] = {}
 
-    def hints(
-        self, subject: Subject, evidence: Evidence, verdict: Verdict, others: Sequence[Subject]
-    ) -> tuple[Hint, ...]:
-        """The first change that helps of those that the reason suggests, mildest first."""
-        for count, change in enumerate(_changes(evidence, verdict.reason, self._result.config)):
-            if count == TRIES:
+    def hints(self, subject: Subject, evidence: Evidence, reason: Reason, reported: bool) -> tuple[Hint, ...]:
+        """The best change of those that the reason suggests: the mildest that makes nothing worse.
+
+        Where each that helps makes something worse, the one that does the least harm.
+        """
+        found: list[Hint] = []
+        for number, change in enumerate(_changes(evidence, reason, self._traces)):
+            if number == TRIES:
                 break
-            run = self._run(change)
-            if run is None:
-                continue
-            text = _outcome(subject, verdict, run, others)
-            if text:
-                return (Hint(tuple(f"{key}={_written(value)}" for key, value in change.items()), text),)
-        return ()
+            after = self._run(change)
+            hint = None if after is None else self._tried(subject, change, reason, reported, after)
+            if hint is not None:
+                found.append(hint)
+                if not hint.effects.harm:
+                    break
+        return tuple(sorted(found, key=lambda hint: hint.effects.harm)[:1])
+
+    def _tried(
+        self, subject: Subject, change: Change, reason: Reason, reported: bool, after: Traces
+    ) -> Hint | None:
+        text, own = _outcome(subject, reason, reported, after)
+        if not text:
+            return None
+        row = subject.row if subject.kind == "truth" else -1
+        settings = tuple(f"{key}={_written(value)}" for key, value in change.items())
+        return Hint(settings, text, effects(self._traces, after, row, own))
 
     def _run(self, change: Change) -> Traces | None:
         key = tuple(change.items())
         if key not in self._runs:
             config = changed(self._result.config, change)
             try:
-                stages = self._loader.load(config, self._known_detections(config))
+                stages = self._loader.load(config, self._known_detections(config, change))
             except UserError:  # the model file has gone meanwhile: nothing can be proved
                 self._runs[key] = None
             else:
-                self._runs[key] = Traces(perceive(self._result.frame, config, stages, self._memo))
+                result = perceive(self._result.frame, config, stages, self._memo)
+                self._runs[key] = self._traces.again(result)
+            while len(self._runs) > RESULTS:
+                del self._runs[next(iter(self._runs))]
         return self._runs[key]
 
-    def _known_detections(self, config: Config) -> Detect | None:
+    def _known_detections(self, config: Config, change: Change) -> Detect | None:
         """Detections for other thresholds: the network need not be run. None: it has to be.
 
-        What NMS leaves cannot be told from the candidates that were kept to be explained.
+        What NMS leaves cannot be told from the candidates that were kept to be explained, nor what somebody's
+        detector makes of other parameters; the robot's are what they are.
         """
-        if config.detector.iou_threshold != self._result.config.detector.iou_threshold:
+        touched = {key for key in change if key.startswith("detector.")} - {"detector.conf_threshold"}
+        if touched or self._traces.origin("detector").topic:
             return None
         known = {c.camera.name: c.detections for c in self._result.cameras}
 
@@ -96,30 +138,84 @@ def changed(config: Config, change: Change) -> Config:
     """The configuration with other values."""
     tree = config.model_dump()
     for key, value in change.items():
-        section, name = key.split(".")
-        tree[section][name] = value
+        *path, name = key.split(".")
+        section = tree
+        for part in path:
+            section = section[part]
+        section[name] = value
     return Config.model_validate(tree)
 
 
-def _outcome(subject: Subject, verdict: Verdict, traces: Traces, others: Sequence[Subject]) -> str:
-    """What has become of the subject, empty where it is no better off."""
-    evidence, result = gather(subject, traces, others), traces.result
-    after = judge(subject, evidence, result, result.config)
-    if verdict.reason is Reason.BORROWED:
-        named = evidence.parts and name_of(result, evidence.parts[0].cluster)
-        return "" if named else "it is not named any more"
-    better = after.reported and (not verdict.reported or verdict.reason in FLAWED)
-    if not better or after.reason in FLAWED | {Reason.BORROWED}:
-        return ""
-    best = evidence.candidates[0] if evidence.candidates else None
-    matched = best is not None and best.cluster >= 0 and subject.kind == "detection"
-    cluster = best.cluster if best is not None and matched else evidence.parts[0].cluster
-    return f"it is cluster {cluster} then, named {name_of(result, cluster)}"
+def _outcome(subject: Subject, reason: Reason, reported: bool, after: Traces) -> tuple[str, int]:
+    """What has become of the subject, empty where it is no better off, and its object's row."""
+    evidence = gather(subject, after)
+    new, now_reported = find_reason(subject, evidence, after)
+    named = evidence.named
+    if reason is Reason.BORROWED and subject.kind != "truth":
+        return ("" if named is not None else "it is not named any more"), -1
+    better = now_reported and (not reported or reason in FLAWED | {Reason.BORROWED})
+    if not better or named is None or new is not Reason.REPORTED:
+        return "", -1
+    if named.cluster < 0 or not after.origin("objects").ours:
+        return f"{after.origin('objects').name} has {named.name} there then", named.row
+    return f"it is cluster {named.cluster} then, named {named.name}", named.row
 
 
-def _changes(e: Evidence, reason: Reason, config: Config) -> Iterator[Change]:
-    """What might help, by the reason."""
-    c, best = config.clustering, e.candidates[0] if e.candidates else None
+# --- what to try -------------------------------------------------------------------------------
+
+
+def _changes(e: Evidence, reason: Reason, traces: Traces) -> Iterator[Change]:
+    """What might help, by the reason: parameters of ours, or of the function that was at fault."""
+    result = traces.result
+    section = _SECTION.get(reason, "")
+    if section and not traces.origin(section).ours:
+        yield from _of_function(result, section)
+    if not traces.origin("objects").ours:
+        return
+    config = result.config
+    for change in _of_ours(e, reason, config):
+        if all(_is_ours(key, traces) for key in change):
+            yield change
+
+
+def _is_ours(key: str, traces: Traces) -> bool:
+    """Whether a parameter has a say: those of a stage that is somebody else's have none."""
+    section, _, name = key.partition(".")
+    if section not in ("ground", "clustering", "detector"):
+        return True
+    there = traces.origin(section)
+    shared = {
+        "min_cluster_points",
+        "max_cluster_points",
+        "conf_threshold",
+    }  # bevviz's own, whoever's stage it is
+    return there.ours or (bool(there.function) and name in shared)
+
+
+def _of_function(result: FrameResult, section: str) -> Iterator[Change]:
+    """Halves and doubles of the numbers among the parameters of somebody's function, within their bounds."""
+    try:
+        plugin = plugin_of(result.config, section)
+    except UserError:
+        return
+    if plugin is None or plugin.params is None:
+        return
+    given = dict(getattr(result.config, section).params)
+    for factor in (0.5, 2.0):
+        for name, value in given.items():
+            if isinstance(value, bool) or not isinstance(value, int | float) or not value:
+                continue
+            other = type(value)(round(value * factor)) if isinstance(value, int) else round(value * factor, 6)
+            try:
+                plugin.params.model_validate({**given, name: other})
+            except ValidationError:
+                continue
+            if other != value:
+                yield {f"{section}.params.{name}": other}
+
+
+def _of_ours(e: Evidence, reason: Reason, config: Config) -> Iterator[Change]:
+    c, best = config.clustering, e.best
     if reason is Reason.GROUND:
         yield from _lower_ground(config)
     elif reason is Reason.NOISE:
@@ -131,20 +227,28 @@ def _changes(e: Evidence, reason: Reason, config: Config) -> Iterator[Change]:
             yield {"clustering.eps": round(c.eps * factor, 3)}
         yield from _lower_ground(config)
     elif reason is Reason.TOO_SMALL:
-        yield {"clustering.min_cluster_points": max(e.parts[0].count, 1)}
+        yield {"clustering.min_cluster_points": max(_aside(e), 1)}
         yield {"clustering.eps": round(c.eps * 1.5, 3)}
     elif reason is Reason.TOO_LARGE:
-        yield {"clustering.max_cluster_points": e.parts[0].count}
+        yield {"clustering.max_cluster_points": _aside(e)}
     elif reason is Reason.MERGED:
+        if config.fusion.method == "frustum" and not config.fusion.split:
+            yield {"fusion.split": True}
         if e.finer:
-            yield {"clustering.eps": e.finer}
-            yield from ({"clustering.eps": round(e.finer * f, 3)} for f in (0.85, 0.7))
+            yield from ({"clustering.eps": round(e.finer * f, 3)} for f in (1.0, 0.85, 0.7))
+        elif not e.others:
+            yield from ({"clustering.eps": round(c.eps * f, 3)} for f in (0.8, 0.6, 0.4))
     elif reason is Reason.SPLIT:
         yield {"clustering.eps": round(max(e.apart * 1.1, c.eps * 1.1), 3)}
         yield {"clustering.min_points": max(1, c.min_points // 2)}
         yield {"clustering.eps": round(c.eps * 1.5, 3)}
     elif best is not None:
         yield from _for_detection(reason, best, config)
+
+
+def _aside(e: Evidence) -> int:
+    """Points of the cluster that was set aside."""
+    return next(part.count for part in e.parts if not part.kept)
 
 
 def _for_detection(reason: Reason, best: Candidate, config: Config) -> Iterator[Change]:
@@ -157,6 +261,9 @@ def _for_detection(reason: Reason, best: Candidate, config: Config) -> Iterator[
     elif reason is Reason.LOW_OVERLAP:
         yield from ({"fusion.min_iou": round(config.fusion.min_iou * f, 3)} for f in (0.5, 0.2, 0.0))
         yield {"clustering.eps": round(config.clustering.eps * 0.6, 3)}
+    elif reason is Reason.MISFIT:
+        yield from ({"fusion.min_rating": round(config.fusion.min_rating * f, 4)} for f in (0.5, 0.2))
+        yield {"fusion.split": False}
     elif reason is Reason.TOO_FEW_POINTS:
         yield from ({"fusion.min_points": value} for value in range(config.fusion.min_points - 1, 0, -1))
     elif reason in (Reason.SHARED_BOX, Reason.BORROWED, Reason.TAKEN, Reason.OTHER_CLUSTER, Reason.MISNAMED):
@@ -192,4 +299,6 @@ def _below(neighbours: int, limit: int) -> list[int]:
 
 
 def _written(value: Any) -> str:
+    if isinstance(value, bool):
+        return str(value).lower()
     return f"{value:g}" if isinstance(value, float) else str(value)

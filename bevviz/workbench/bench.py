@@ -29,9 +29,9 @@ from bevviz.logging.writer import WAIT
 from bevviz.perceive import describe
 from bevviz.run import Items, Observer, run
 from bevviz.variants import Variants, check_same_frames
-from bevviz.why import Answer
+from bevviz.why import Answer, Questioner
 from bevviz.why.log import log_answers
-from bevviz.workbench.answers import Answers
+from bevviz.workbench.answers import selection
 from bevviz.workbench.film import Film
 from bevviz.workbench.missed import Find, finds
 from bevviz.workbench.pick import Pick, pick
@@ -71,6 +71,7 @@ class Bench(Closing):
         self._tracks: dict[int, Tracks] = {}
         self._results: OrderedDict[tuple[int, Settings], FrameResult] = OrderedDict()
         self._variants, self._looking = Variants(drive.session.loader), threading.RLock()
+        self._asked: Questioner | None = None
         self._stop, self._quiet = threading.Event(), threading.Event()
         self._quiet.set()
         recording_id = f"bench-{time.time_ns()}"
@@ -233,15 +234,21 @@ class Bench(Closing):
         Raises:
             UserError: there is no such thing in the frame.
         """
-        result = self.look(number, settings)
-        answer = self._answers(result).ask(what, hints)
-        if not hints:
-            self._mark(result, [answer])
-        return answer
+        questioner = self._questioner(self.look(number, settings))
+        found = questioner.ask(selection(what))
+        if not found:
+            raise UserError(f"there is nothing to say about {what}")
+        if hints:
+            return questioner.with_hints(found[0])
+        self._mark(questioner.traces.result, found[:1])
+        return found[0]
 
-    def _answers(self, result: FrameResult) -> Answers:
-        session = self.drive.session
-        return Answers(result, session.loader, session.stages.class_names)
+    def _questioner(self, result: FrameResult) -> Questioner:
+        """What questions about one result have in common is worked out once."""
+        if self._asked is None or self._asked.traces.result is not result:
+            session = self.drive.session
+            self._asked = Questioner(result, session.loader, session.stages.class_names)
+        return self._asked
 
     def _mark(self, result: FrameResult, answers: Sequence[Answer]) -> None:
         frame = result.frame

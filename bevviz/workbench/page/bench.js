@@ -171,7 +171,9 @@ function hints(all) {
     const button = document.createElement("button");
     const effect = document.createElement("small");
     button.textContent = `try ${hint.settings.join(", ")}`;
-    effect.textContent = hint.text;
+    const also = Object.entries({ fixes: hint.fixed, adds: hint.added, "wrongly adds": hint.false, loses: hint.lost })
+      .filter(([, names]) => names?.length).map(([what, names]) => `${what} ${names.join(", ")}`);
+    effect.textContent = [hint.text, ...also].join("; ");
     button.append(effect);
     button.onclick = () => change(hint.settings);
     return button;
@@ -371,10 +373,12 @@ $("copy").onclick = () => navigator.clipboard.writeText(state.set.map((one) => `
 $("here").onchange = () => { current = -1; list(); };
 $("search").oninput = showControls;
 window.addEventListener("keydown", (event) => {
-  const typing = ["INPUT", "SELECT", "TEXTAREA"].includes(event.target.tagName);
+  const own = event.target.closest?.("aside"); // the viewer has inputs of its own, hidden ones
+  const typing = own && ["INPUT", "SELECT"].includes(event.target.tagName);
   if (typing || event.ctrlKey || event.metaKey || event.altKey || !(event.key in actions)) return;
   event.preventDefault();
+  event.stopPropagation();
   actions[event.key]();
-});
+}, true);
 
 connect();

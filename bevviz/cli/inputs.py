@@ -1,0 +1,52 @@
+"""What is read must not be written over."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator
+from contextlib import suppress
+from pathlib import Path
+
+from bevviz.errors import UserError
+
+READ = ("paths", "config", "model", "a", "b", "kitti_labels", "note_file", "blueprint")
+WRITTEN = {
+    "save": "--save",
+    "output": "-o",
+    "csv": "--csv",
+    "json": "--json",
+    "write": "--write",
+    "bag": "--bag",
+}
+
+
+def check_outputs(options: argparse.Namespace) -> None:
+    """Raises UserError where an option's output is one of the command's inputs, by whatever name or link."""
+    if getattr(options, "check", False):  # it writes nothing
+        return
+    inputs = {identity: path for path in _inputs(options) for identity in _identities(path)}
+    for name, option in WRITTEN.items():
+        target = getattr(options, name, None)
+        if not isinstance(target, Path) or target.is_dir():
+            continue
+        for identity in _identities(target):
+            if identity in inputs:
+                same = "" if inputs[identity] == target else f" ({inputs[identity]})"
+                raise UserError(f"{option} {target}: is what is read{same}; give another name")
+
+
+def _inputs(options: argparse.Namespace) -> Iterator[Path]:
+    for name in READ:
+        given = getattr(options, name, None)
+        for value in given if isinstance(given, list) else [given]:
+            if isinstance(value, str | Path) and str(value):
+                yield Path(value)
+
+
+def _identities(path: Path) -> Iterator[tuple[int, int]]:
+    """Of a file, or of the files in a folder."""
+    with suppress(OSError, ValueError):
+        for file in path.iterdir() if path.is_dir() else [path]:
+            with suppress(OSError):
+                about = file.stat()
+                yield about.st_dev, about.st_ino

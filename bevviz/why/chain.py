@@ -1,0 +1,234 @@
+"""What each stage made of a subject, in words and in numbers."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from bevviz.frame import Decision, DetectionState
+from bevviz.why.evidence import Candidate, Evidence, fusion_of
+from bevviz.why.sentences import label, not_run, state_text
+from bevviz.why.subject import Subject, projected
+from bevviz.why.traces import Traces
+from bevviz.why.verdict import detector_ran, name_of
+
+_SHOWN = 5  # candidates that the chain names
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """What one stage made of the subject, in words and in numbers."""
+
+    stage: str
+    text: str
+    numbers: Mapping[str, Any] = field(default_factory=dict)
+
+
+def chain(subject: Subject, e: Evidence, traces: Traces) -> Iterator[Step]:
+    """Stage by stage, as far as they were run."""
+    result, config = traces.result, traces.result.config
+    for failure in result.failures:
+        yield Step("failure", f"{failure.stage}: {failure.reason}")
+    yield from _clock(subject, traces)
+    where = {"truth": "in its box", "point": "around it", "cell": "over it and around"}
+    where |= dict.fromkeys(("object", "cluster", "track"), "in it")
+    yield Step("raw cloud", f"{e.raw} points {where.get(subject.kind, 'in its frustum')}", {"points": e.raw})
+    if subject.box is not None and e.aimed:
+        share = e.in_front / e.aimed
+        text = f"{e.in_front} of {e.aimed} returns in its direction end in front of it"
+        if e.front >= 0:
+            text += f", most on cluster {e.front}" + _named(traces, e.front)
+        yield Step("occlusion", text, {"in_front": e.in_front, "aimed": e.aimed, "share": round(share, 3)})
+    if e.raw and result.voxels is not None and result.ground is not None:
+        merged = max(e.raw - e.voxels, 0)
+        yield Step(
+            "voxel grid",
+            f"{e.voxels} voxels of {config.voxel.size:g} m, {merged} points merged into them",
+            {"voxels": e.voxels, "merged": merged},
+        )
+        yield _ground(e, traces)
+        if result.clusters is not None:
+            yield _clustering(e, traces)
+            yield from _merged(e, traces)
+    yield from _detected(subject, e, traces)
+    yield from _objects(e, traces)
+
+
+def _clock(subject: Subject, traces: Traces) -> Iterator[Step]:
+    for camera in (c.camera for c in traces.result.cameras):
+        if subject.camera and camera.name != subject.camera:
+            continue
+        said, numbers = [], {}
+        if np.isfinite(camera.sync_error):
+            said.append(f"image {1e3 * camera.sync_error:+.0f} ms from the cloud")
+            numbers["sync_error_ms"] = round(1e3 * camera.sync_error, 1)
+        if np.isfinite(camera.tf_age):
+            said.append(f"transform {1e3 * camera.tf_age:.0f} ms old")
+            numbers["tf_age_ms"] = round(1e3 * camera.tf_age, 1)
+        said.append(
+            "moved to the image's time" if camera.motion_compensated else "not moved to the image's time"
+        )
+        said += camera.problems
+        box = projected(subject.box, camera) if subject.box is not None else None
+        if box is not None:
+            u, v = (box[:2] + box[2:]) / 2
+            said.append(f"expected at pixel {u:.0f}, {v:.0f}")
+        yield Step(f"camera {camera.name}", ", ".join(said), numbers)
+
+
+def _ground(e: Evidence, traces: Traces) -> Step:
+    known = e.ground[np.isfinite(e.ground)]
+    text = f"{len(e.ground)} of {e.voxels} voxels removed as ground"
+    numbers: dict[str, Any] = {"removed": len(e.ground)}
+    if len(known):
+        text += f", {float(known.min()):z.2f} to {float(known.max()):z.2f} m above the local ground"
+        numbers |= {"lowest": round(float(known.min()), 3), "highest": round(float(known.max()), 3)}
+    config, there = traces.result.config.ground, traces.origin("ground")
+    if not there.ours:
+        return Step("ground", f"{text} ({there.name})", {**numbers, "by": there.name})
+    numbers["threshold"] = config.distance_threshold
+    return Step(
+        "ground",
+        f"{text} (ground.distance_threshold {config.distance_threshold:g} m, {config.method})",
+        numbers,
+    )
+
+
+def _clustering(e: Evidence, traces: Traces) -> Step:
+    said, rows = [], []
+    clusters, there = traces.result.clusters, traces.origin("clustering")
+    assert clusters is not None
+    boxes = clusters.boxes(traces.result.config.clustering)
+    for part in e.parts[:_SHOWN]:
+        size = " x ".join(f"{v:.1f}" for v in boxes.size[part.cluster])
+        state = "" if part.kept else f", {state_text(part.state)}"
+        name = _named(traces, part.cluster)
+        said.append(f"{part.points} in cluster {part.cluster}{name} of {part.count}, {size} m{state}")
+        rows.append(
+            {
+                "cluster": part.cluster,
+                "points": part.points,
+                "count": part.count,
+                "state": part.state.name.lower(),
+            }
+        )
+    if len(e.parts) > _SHOWN:
+        said.append(f"{len(e.parts) - _SHOWN} clusters more")
+    if e.noise and there.ours:
+        c = traces.result.config.clustering
+        said.append(
+            f"{e.noise} noise: at most {e.neighbours} neighbours within {c.eps:g} m, "
+            f"clustering.min_points is {c.min_points}"
+        )
+    elif e.noise:
+        said.append(f"{e.noise} in no cluster")
+    if np.isfinite(e.apart):
+        said.append(f"the two largest are {e.apart:.2f} m apart")
+    numbers: dict[str, Any] = {"clusters": rows, "noise": e.noise}
+    if there.ours:
+        numbers["best_neighbours"] = e.neighbours
+    else:
+        numbers["by"] = there.name
+        said.append(f"by {there.name}")
+    return Step("clustering", "; ".join(said) or "no obstacle point", numbers)
+
+
+def _merged(e: Evidence, traces: Traces) -> Iterator[Step]:
+    if not np.isfinite(e.gap):
+        return
+    names = ", ".join(f"{name} ({points} points)" for name, points in e.others)
+    part, there = e.part(e.main), traces.origin("clustering")
+    names = names or f"{part.count - part.points if part is not None else 0} points that are not its own"
+    text = f"the cluster also holds {names}; gap {e.gap:.2f} m"
+    numbers: dict[str, Any] = {"others": [name for name, _ in e.others], "gap": round(e.gap, 3)}
+    if there.ours:
+        finer = f"with eps {e.finer:g} m they fall apart" if e.finer else "no smaller eps parts them"
+        text += f", clustering.eps {traces.result.config.clustering.eps:g} m; {finer}"
+        numbers["eps_that_parts"] = e.finer
+    yield Step("merged", text, numbers)
+
+
+def _named(traces: Traces, cluster: int) -> str:
+    name = name_of(traces.result, cluster)
+    return f" ({name})" if name else ""
+
+
+def _detected(subject: Subject, e: Evidence, traces: Traces) -> Iterator[Step]:
+    result, config = traces.result, traces.result.config
+    if not detector_ran(result, subject.camera):
+        yield Step("detector", "never ran: " + "; ".join(not_run(result, subject.camera)), {"candidates": 0})
+        return
+    by = "" if traces.origin("detector").ours else f" of {traces.origin('detector').name}"
+    if not e.candidates:
+        yield Step("detector", f"no candidate{by} there", {"candidates": 0})
+    for c in e.candidates[:_SHOWN]:
+        found, fusion = fusion_of(result, c.camera)
+        detections = found.detections
+        assert detections is not None
+        numbers = {"name": c.name, "score": round(c.score, 3), "state": c.state.name.lower(), "row": c.row}
+        text = f"{label(c)}{by}, overlap {c.overlap:.2f}: "
+        if c.state == DetectionState.BELOW_THRESHOLD:
+            text += f"below detector.conf_threshold {config.detector.conf_threshold:g}"
+        elif c.state == DetectionState.SUPPRESSED:
+            d = int(detections.suppressed_by[c.row])
+            text += (
+                f"suppressed by {detections.names[d]} {detections.score[d]:.2f}, IoU "
+                f"{detections.overlap[c.row]:.2f} > detector.iou_threshold {config.detector.iou_threshold:g}"
+            )
+            numbers["suppressed_by"] = d
+        else:
+            text += "kept"
+        yield Step("detector", text, numbers)
+        if c.kept and fusion is not None:
+            yield from _pairs(c, e, traces)
+    more = len(e.candidates) - _SHOWN
+    if more > 0:
+        yield Step("detector", f"{more} weaker candidates more", {"more": more})
+
+
+def _pairs(c: Candidate, e: Evidence, traces: Traces) -> Iterator[Step]:
+    """The evidence of the pairs of a detection: with the clusters there, and with the one it got."""
+    _, fusion = fusion_of(traces.result, c.camera)
+    assert fusion is not None
+    ours = traces.origin("objects").ours
+    stage = "fusion" if ours else "our fusion"
+    key = "detection", c.camera, c.row
+    said = next((x for x in traces.result.explanations if (x.subject, x.camera, x.row) == key), None)
+    if said is not None:
+        yield Step(stage, said.text, {"decision": c.decision.name.lower(), "cluster": c.cluster})
+    pairs = fusion.pairs
+    interesting = {part.cluster for part in e.parts[:3]} - {c.cluster}
+    for row in np.flatnonzero(pairs.detection == c.row).tolist():
+        k = int(pairs.cluster[row])
+        if k not in interesting:
+            continue
+        decision = state_text(Decision(int(fusion.cluster_decision[k])))
+        cost = "refused" if np.isinf(pairs.cost[row]) else f"cost {pairs.cost[row]:.2f}"
+        yield Step(
+            stage,
+            f"{label(c)} with cluster {k}: {pairs.points[row]} points, IoU {pairs.iou[row]:.2f}, "
+            f"{pairs.distance[row]:.0f} px, {pairs.depth[row]:.1f} m, {cost}; that cluster ended {decision}",
+            {
+                "cluster": k,
+                "points": int(pairs.points[row]),
+                "iou": round(float(pairs.iou[row]), 3),
+                "distance_px": round(float(pairs.distance[row]), 1),
+            },
+        )
+
+
+def _objects(e: Evidence, traces: Traces) -> Iterator[Step]:
+    """Where they are not made of clusters and detections."""
+    there, objects = traces.origin("objects"), traces.result.objects
+    if there.ours:
+        return
+    if e.named is None or objects is None:
+        number = "no" if objects is None else str(len(objects))
+        yield Step("objects", f"none of the {number} objects of {there.name} is there", {"by": there.name})
+        return
+    score = float(objects.score[e.named.row])
+    text = f"{there.name} has {e.named.name} {score:.2f} there"
+    yield Step("objects", text, {"by": there.name, "row": e.named.row, "score": round(score, 3)})

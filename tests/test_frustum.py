@@ -1,0 +1,340 @@
+"""What cameras make of clusters: scenes whose answer is known, what always holds, labelled KITTI frames."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from benchmarks import kitti
+from bevviz.config import SIZES, ClusteringConfig, FusionConfig, ObjectsConfig, load
+from bevviz.errors import UserError
+from bevviz.frame import (
+    F32,
+    F64,
+    Camera,
+    CameraResult,
+    Claims,
+    Clusters,
+    ClusterState,
+    Decision,
+    Detections,
+    Splits,
+)
+from bevviz.geometry import apply, project
+from bevviz.stages.boxfit import MAX_SPREAD, NO_EDGE, fit
+from bevviz.stages.clustering import cluster
+from bevviz.stages.frustum import claim
+from bevviz.stages.fusion import fuse, merge
+from tests.test_fusion import CAMERA, CAMERA_FROM_LIDAR, detections_of, silhouette, slab
+
+CLUSTERING = ClusteringConfig()
+Claimed = tuple[Clusters, tuple[Claims | None, ...], Splits]
+
+
+def looked(
+    points: F32, detections: Detections, turn: F64 = CAMERA_FROM_LIDAR, name: str = "front"
+) -> CameraResult:
+    """The points as a camera sees them."""
+    uv, depth = project(apply(turn, points), CAMERA)
+    outside = ~((uv >= -0.5) & (uv < [CAMERA.width - 0.5, CAMERA.height - 0.5])).all(axis=1)
+    uv[outside] = np.nan
+    return CameraResult(Camera(name, None, CAMERA, turn, None), detections, None, uv, depth)
+
+
+def claimed(
+    points: F32, clusters: Clusters, *cameras: CameraResult, config: FusionConfig | None = None
+) -> Claimed:
+    return claim(points, None, clusters, cameras, config or FusionConfig(), ObjectsConfig(), CLUSTERING)
+
+
+def outcome(points: F32, detections: Detections) -> tuple[Clusters, Claims, Splits]:
+    clusters, (claims,), splits = claimed(points, cluster(points, CLUSTERING), looked(points, detections))
+    assert claims is not None
+    return clusters, claims, splits
+
+
+def car(x: float, y: float, yaw: float, length: float = 3.9, width: float = 1.6) -> F32:
+    """What a LiDAR at the origin sees of a car's outline: the sides that face it."""
+    c, s = math.cos(yaw), math.sin(yaw)
+    sides = []
+    for nx, ny, half, along in (
+        (1, 0, length, width),
+        (-1, 0, length, width),
+        (0, 1, width, length),
+        (0, -1, width, length),
+    ):
+        normal = np.array([c * nx - s * ny, s * nx + c * ny])
+        middle = np.array([x, y]) + normal * half / 2
+        if middle @ normal < 0:
+            t = np.arange(-along / 2, along / 2 + 1e-6, 0.1)[:, None]
+            sides.append(middle + t * np.array([-normal[1], normal[0]]))
+    flat = np.concatenate(sides)
+    z = np.arange(-1.3, 0.01, 0.15)
+    return np.concatenate([np.column_stack([flat, np.full(len(flat), h)]) for h in z]).astype(np.float32)
+
+
+# --- known scenes ------------------------------------------------------------------------------
+
+
+def test_a_person_before_a_wall_is_a_cluster_of_its_own() -> None:
+    person, wall = slab(8, 0, -0.7, 0.5, 1.7), slab(8.4, 0, -0.2, 8, 2.6)
+    points = np.concatenate([person, wall])
+    before = cluster(points, CLUSTERING)
+    assert len(before) == 1, "the wall is near enough to be one with the person"
+    after, claims, splits = outcome(points, detections_of([silhouette(person)]))
+    mine = int(claims.cluster[0])
+    taken = after.labels == mine
+    assert taken[: len(person)].all(), "all of the person"
+    assert taken[len(person) :].mean() < 0.1, "next to nothing of the wall"
+    assert len(after) == 2 and after.count.sum() == before.count.sum()
+    assert splits.points[0] == taken.sum() and splits.of[0] == len(points)
+    assert splits.cluster[0] == mine and splits.rest[0] == 1 - mine
+
+
+def test_two_people_side_by_side_in_one_cluster() -> None:
+    people = [slab(8, y, -0.7, 0.5, 1.7) for y in (0.4, -0.4)]
+    after, claims, _ = outcome(np.concatenate(people), detections_of([silhouette(p) for p in people]))
+    assert len(after) == 2
+    for k, y in zip(claims.cluster, (0.4, -0.4), strict=True):
+        assert after.centroid[k, 1] == pytest.approx(y, abs=0.15)
+
+
+def test_a_car_that_a_pole_parts_is_one() -> None:
+    whole = car(14, 0, math.pi / 2)
+    parts = np.abs(whole[:, 1] - 0.2) > 0.35
+    pole = slab(9, 0.15, -0.3, 0.1, 2.4, 0.05)
+    points = np.concatenate([whole[parts], pole])
+    before = cluster(points, CLUSTERING)
+    assert len(before) == 3
+    after, claims, splits = outcome(points, detections_of([silhouette(whole)], names="car"))
+    assert len(after) == 2
+    assert (after.labels[: parts.sum()] == claims.cluster[0]).all()
+    assert (after.labels[parts.sum() :] != claims.cluster[0]).all()
+    assert sorted(splits.points.tolist()) == sorted(
+        before.count[before.labels[[0, parts.sum() - 1]]].tolist()
+    )
+    assert (splits.rest == -1).all()
+
+
+def test_a_car_from_behind_goes_on_where_it_was_not_seen() -> None:
+    rear = car(12.0, 0, 0)
+    assert np.ptp(rear[:, 0]) < 0.1
+    _, claims, _ = outcome(rear, detections_of([silhouette(rear)], names="car"))
+    boxes = claims.boxes
+    assert abs(boxes.size[0, 0] - SIZES["car"][0]) < SIZES["car"][3]
+    np.testing.assert_allclose(boxes.center[0, :2], [12.0, 0], atol=0.3)
+    assert abs(math.sin(float(boxes.yaw[0]))) < 0.1
+    back = 1 if math.cos(float(boxes.yaw[0])) > 0 else 0
+    assert claims.seen[0].tolist() == [i == back for i in range(4)], "its rear and nothing else was seen"
+
+
+def test_what_cannot_be_a_person_is_refused_with_the_reason() -> None:
+    wall = slab(40, 0, 3, 12, 14, 0.2)  # fills the image box of somebody at 10 m
+    box = silhouette(slab(10, 0, -0.7, 0.6, 1.75))
+    detections = detections_of([box])
+    points = wall
+    found = looked(points, detections)
+    before = cluster(points, CLUSTERING)
+    after, (claims,), splits = claimed(points, before, found)
+    assert claims is not None and claims.cluster[0] == -1 and len(splits) == 0
+    assert 0 < claims.fit[0] < FusionConfig().min_rating
+    assert after is before
+    assert found.uv is not None and found.depth is not None
+    fusion = fuse(found.uv, found.depth, after, detections, CAMERA, CAMERA_FROM_LIDAR, FusionConfig(), claims)
+    assert fusion.detection_decision[0] in (Decision.MISFIT, Decision.LOW_OVERLAP)
+
+
+def test_two_names_for_one_thing() -> None:
+    """NMS is by class: a van that is called car and truck is one object, not one and something behind it."""
+    van, behind = car(14, 0, math.pi / 2), slab(18, 0, 0, 10, 3)
+    box = silhouette(van)
+    found = detections_of([box, box + np.float32(1)], names="car truck")
+    _, claims, _ = outcome(np.concatenate([van, behind]), found)
+    assert (claims.cluster >= 0).tolist() == [True, False]
+
+
+def test_the_second_camera_finds_what_the_first_has_split() -> None:
+    person, wall = slab(8, 0, -0.7, 0.5, 1.7), slab(8.4, 0, -0.2, 8, 2.6)
+    points = np.concatenate([person, wall])
+    aside = CAMERA_FROM_LIDAR.copy()
+    aside[0, 3] = 0.4
+    uv, _ = project(apply(aside, person), CAMERA)
+    other = detections_of([np.concatenate([uv.min(axis=0) - 2, uv.max(axis=0) + 2])])
+    views = looked(points, detections_of([silhouette(person)])), looked(points, other, aside, "left")
+    before = cluster(points, CLUSTERING)
+    after, (first, second), splits = claimed(points, before, *views)
+    assert first is not None and second is not None
+    assert first.cluster[0] == second.cluster[0] >= 0
+    assert set(splits.camera) == {"front"}
+    with_fusion = []
+    for view, claims in zip(views, (first, second), strict=True):
+        assert view.uv is not None and view.depth is not None and view.detections is not None
+        turn = view.camera.camera_from_points
+        assert turn is not None
+        fusion = fuse(view.uv, view.depth, after, view.detections, CAMERA, turn, FusionConfig(), claims)
+        with_fusion.append(replace(view, fusion=fusion))
+    objects = merge(after, with_fusion, CLUSTERING)
+    assert len(objects) == 1 and objects.seen is not None and objects.measured is not None
+    assert objects.measured.size[0, 2] < objects.boxes.size[0, 2] + 0.2
+
+
+def test_clusters_set_aside_stay_so() -> None:
+    person = slab(8, 0, -0.7, 0.5, 1.7)
+    before = cluster(person, ClusteringConfig(min_cluster_points=1000))
+    assert before.state.tolist() == [ClusterState.TOO_SMALL]
+    after, (claims,), _ = claimed(person, before, looked(person, detections_of([silhouette(person)])))
+    assert after is before and claims is not None and claims.cluster[0] == -1
+
+
+def test_without_a_camera_nothing_changes() -> None:
+    points = np.concatenate([slab(8, 0, -0.7, 0.5, 1.7), slab(8.4, 0, -0.2, 8, 2.6)])
+    before = cluster(points, CLUSTERING)
+    blind = replace(looked(points, Detections.empty()), uv=None)
+    for cameras in ((), (blind,), (looked(points, Detections.empty()),)):
+        after, claims, splits = claimed(points, before, *cameras)
+        assert after is before and len(splits) == 0 and len(claims) == len(cameras)
+
+
+# --- what always holds -------------------------------------------------------------------------
+
+
+@st.composite
+def scenes(draw: st.DrawFn) -> tuple[F32, Detections]:
+    """Things of all sizes at random places, some boxes on them and some anywhere."""
+    random = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
+    parts, boxes, names = [], [], []
+    for _ in range(draw(st.integers(1, 6))):
+        x, y = random.uniform(4, 30), random.uniform(-6, 6)
+        part = slab(x, y, random.uniform(-1, 0.5), random.uniform(0.2, 8), random.uniform(0.3, 2.5))
+        part += random.normal(0, 0.05, part.shape).astype(np.float32)
+        part[:, 0] += random.uniform(-1, 1) * (part[:, 1] - y)
+        parts.append(part)
+        if random.random() < 0.8:
+            box = silhouette(part)
+            box += (random.normal(0, 0.1, 4) * np.tile(box[2:] - box[:2], 2)).astype(np.float32)
+            boxes.append(np.concatenate([np.minimum(box[:2], box[2:]), np.maximum(box[:2], box[2:])]))
+            names.append(str(random.choice(["person", "car", "chair", "umbrella", "truck"])))
+    parts.append(random.uniform([2, -10, -1], [40, 10, 1], (20, 3)).astype(np.float32))
+    order = np.arange(len(boxes))
+    scores = random.uniform(0.1, 1, len(boxes)).tolist()
+    found = detections_of([boxes[i] for i in order], scores or None)
+    found = replace(found, names=tuple(names), score=np.sort(found.score)[::-1].astype(np.float32))
+    return np.concatenate(parts), found
+
+
+@given(scenes())
+@settings(max_examples=60, deadline=None)
+def test_points_are_neither_lost_nor_shared(scene: tuple[F32, Detections]) -> None:
+    points, found = scene
+    before = cluster(points, CLUSTERING)
+    after, claims, splits = outcome_of(points, before, found)
+    assert set(np.unique(after.labels)) <= set(range(-1, len(after)))
+    np.testing.assert_array_equal(after.count, np.bincount(after.labels + 1, minlength=len(after) + 1)[1:])
+    assert (after.count > 0).all()
+    assert ((before.labels < 0) | (after.labels >= 0)).all(), "no clustered point becomes noise"
+    own = claims.cluster[claims.cluster >= 0]
+    assert len(set(own.tolist())) == len(own), "one box, one object"
+    assert (after.state[own] == ClusterState.KEPT).all()
+    free = np.flatnonzero(~np.isin(after.labels, own))
+    for k in np.unique(after.labels[free]).tolist():
+        assert len(np.unique(before.labels[after.labels == k])) == 1, "what nobody took is as it was"
+    for row in range(len(splits)):
+        part, rest = int(splits.cluster[row]), int(splits.rest[row])
+        came_from = before.labels[after.labels == part]
+        if splits.is_noise[row]:
+            assert (came_from == -1).sum() == splits.points[row]
+            continue
+        source = next(
+            k
+            for k in np.unique(came_from[came_from >= 0]).tolist()
+            if (came_from == k).sum() == splits.points[row] and before.count[k] == splits.of[row]
+        )
+        now = after.labels[before.labels == source]
+        assert (now == part).sum() == splits.points[row]
+        assert rest < 0 or ((now == rest).sum() == after.count[rest] <= splits.of[row] - splits.points[row])
+        assert rest >= 0 or np.isin(now, own).all(), "nothing is left: others have it"
+
+
+def outcome_of(points: F32, before: Clusters, found: Detections) -> tuple[Clusters, Claims, Splits]:
+    after, (claims,), splits = claimed(points, before, looked(points, found))
+    again, (claims_again,), _ = claimed(points, before, looked(points, found))
+    assert claims is not None and claims_again is not None
+    np.testing.assert_array_equal(after.labels, again.labels)
+    np.testing.assert_array_equal(claims.boxes.center, claims_again.boxes.center)
+    return after, claims, splits
+
+
+@given(scenes())
+@settings(max_examples=40, deadline=None)
+def test_no_box_is_larger_than_its_class_can_be(scene: tuple[F32, Detections]) -> None:
+    points, found = scene
+    _, claims, _ = outcome_of(points, cluster(points, CLUSTERING), found)
+    for d in np.flatnonzero(claims.cluster >= 0).tolist():
+        size = SIZES.get(found.names[d])
+        box = claims.boxes.size[d]
+        assert np.isfinite(claims.boxes.center[d]).all() and (box > 0).all()
+        assert -math.pi / 2 < claims.boxes.yaw[d] <= math.pi / 2 + 1e-6
+        if size is not None:
+            assert box[0] <= size[0] + MAX_SPREAD * size[3] + 1e-3
+            assert box[1] <= size[1] + MAX_SPREAD * size[4] + 1e-3
+        else:
+            assert box[0] >= box[1]
+
+
+@given(
+    st.floats(6, 30), st.floats(-math.pi / 4, math.pi / 4), st.floats(-math.pi, math.pi), st.floats(3.4, 4.4)
+)
+@settings(max_examples=60, deadline=None)
+def test_a_cars_heading_and_place(distance: float, bearing: float, yaw: float, length: float) -> None:
+    """Both sides seen: the fit finds the car. One seen: it is as far away as its class's size allows."""
+    x, y = distance * math.cos(bearing), distance * math.sin(bearing)
+    points = car(x, y, yaw, length)[:, :2].astype(np.float64)
+    L, W, _, spread, narrow, _ = SIZES["car"]
+    normals, edge = np.zeros((2, 2)), np.full(2, NO_EDGE)
+    box, _ = fit(points, normals, edge, np.array([L, spread, W, narrow]), 10.0, np.nan)
+    turned = (box[4] - yaw + math.pi / 2) % math.pi - math.pi / 2
+    looked_at = abs(math.remainder(yaw - bearing, math.pi))
+    both = math.radians(15) < looked_at < math.radians(75)
+    if both:
+        assert abs(turned) < math.radians(6)
+    assert math.hypot(box[0] - x, box[1] - y) < (0.45 if both else 2.2)
+
+
+def test_sizes_are_stated_class_by_class() -> None:
+    config = load(settings=["objects.sizes={kiosk: [2, 2, 2.5, 0.3, 0.3, 0.3], chair: null}"])
+    assert config.objects.sizes["kiosk"] == (2, 2, 2.5, 0.3, 0.3, 0.3)
+    assert config.objects.sizes["chair"] is None
+    assert config.objects.sizes["car"] == SIZES["car"]
+    with pytest.raises(UserError, match="six: length, width, height and the spread of each"):
+        load(settings=["objects.sizes={kiosk: [2, 2]}"])
+
+
+# --- real frames -------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def tally(shared: Path) -> kitti.Tally:
+    return kitti.measure(shared / "kitti", {"default": kitti.Case(load())})["default"]
+
+
+def test_objects_of_labelled_frames(tally: kitti.Tally) -> None:
+    """Floors well below what was measured: docs/accuracy.md has the figures."""
+    assert len(tally.objects) == 30
+    assert sum(v.distance <= 2 for v in tally.objects) >= 28
+    assert sum(v.iou >= 0.5 for v in tally.objects) >= 23
+    cars = [v for v in tally.objects if v.label.kind == "Car"]
+    assert sum(v.iou >= 0.7 for v in cars) >= 15
+    assert sum(b.nearest > 2 for b in tally.boxes) <= 1
+
+
+def test_nothing_named_in_them_is_too_large(tally: kitti.Tally) -> None:
+    for box in tally.boxes:
+        size = SIZES.get(box.name.lower())
+        limit = 8.0 if size is None else size[0] + MAX_SPREAD * size[3] + 0.01
+        assert box.size[:2].max() <= limit, box

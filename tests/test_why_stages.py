@@ -1,0 +1,216 @@
+"""What ``bevviz why`` says where stages are somebody's function or the robot's: whose it was, and no more."""
+
+from __future__ import annotations
+
+import sys
+import textwrap
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from bevviz import plugins
+from bevviz.config import load
+from bevviz.frame import Boxes3D, Frame, FrameResult, LabelledBoxes2D, LabelledBoxes3D
+from bevviz.session import Session
+from bevviz.why import Answer, Questioner, Selection
+from bevviz.why.verdict import Reason
+from tests.test_faults import at
+
+CLASSES = ("car", "person", "cyclist")
+MODULE = '''
+import numpy as np
+from pydantic import BaseModel
+
+
+class Params(BaseModel):
+    cell: float = 0.8
+
+
+def cells(points, params):
+    """A cluster is a cell seen from above; the even ones are dropped."""
+    cell = np.floor(points[:, :2] / params.cell).astype(np.int64)
+    _, label = np.unique(cell, axis=0, return_inverse=True)
+    label = label.ravel()
+    return np.where(cell.sum(axis=1) % 2, label, -1)
+
+
+def flat(points):
+    return np.ones(len(points), bool)
+
+
+def blind(bgr):
+    return np.zeros((0, 4)), np.zeros(0), []
+
+
+def pillars(points):
+    return np.array([[10.0, 0, 0, 4, 2, 1.5, 0.3]]), [0.9], ["car"]
+'''
+
+
+@pytest.fixture
+def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """Where somebody's module is found."""
+    (tmp_path / "somebody.py").write_text(textwrap.dedent(MODULE))
+    monkeypatch.chdir(tmp_path)
+    yield tmp_path
+    plugins.find.cache_clear()
+    sys.modules.pop("somebody", None)
+
+
+@cache
+def frame() -> Frame:
+    return at("merged_people").frame
+
+
+@cache
+def ours() -> FrameResult:
+    return Session(load(settings=["detector.model=demo"])).run(frame())
+
+
+def ask(result: FrameResult, hints: bool = False) -> list[Answer]:
+    questioner = Questioner(result, classes=CLASSES)
+    answers = [a for a in questioner.ask(Selection()) if a.subject.kind == "truth"]
+    return [questioner.with_hints(a) for a in answers[:5]] if hints else answers
+
+
+def of(answers: Sequence[Answer], reason: Reason) -> list[Answer]:
+    return [a for a in answers if a.verdict.reason is reason]
+
+
+def parameters_in(answer: Answer, *sections: str) -> list[str]:
+    """Parameters of ours that the verdict or the chain names."""
+    said = " ".join([answer.verdict.text, *(step.text for step in answer.steps)])
+    return [word for word in said.split() if word.lstrip("(").startswith(sections)]
+
+
+# --- somebody's functions ----------------------------------------------------------------------
+
+
+def test_what_somebodys_clustering_lost_is_said_with_its_name(here: Path) -> None:
+    result = Session(load(settings=["detector.model=demo", "clustering.method=somebody:cells"])).run(frame())
+    assert result.failures == ()
+    lost = of(ask(result), Reason.NO_CLUSTER)
+    assert lost and not of(ask(result), Reason.NOISE)
+    for answer in lost:
+        assert "in a cluster of somebody:cells." in answer.verdict.text
+        assert not parameters_in(answer, "clustering.eps", "clustering.min_points")
+
+
+def test_a_hint_may_be_a_parameter_of_somebodys_function(here: Path) -> None:
+    """Of ours only those that still have a say."""
+    result = Session(load(settings=["detector.model=demo", "clustering.method=somebody:cells"])).run(frame())
+    questioner = Questioner(result, classes=CLASSES)
+    hints = [hint for a in questioner.ask(Selection())[:25] for hint in questioner.hints(a)]
+    keys = {setting.partition("=")[0] for hint in hints for setting in hint.settings}
+    assert "clustering.params.cell" in keys
+    assert not keys & {"clustering.eps", "clustering.min_points"}
+
+
+def test_somebodys_ground_and_detector_are_named(here: Path) -> None:
+    flat = Session(load(settings=["detector.model=demo", "ground.method=somebody:flat"])).run(frame())
+    ground = of(ask(flat), Reason.GROUND)
+    assert ground and all("(by somebody:flat)" in a.verdict.text for a in ground)
+    assert not any(parameters_in(a, "ground.") for a in ground)
+    blind = Session(load(settings=["detector.model=somebody:blind"])).run(frame())
+    unseen = of(ask(blind), Reason.NOT_DETECTED)
+    assert unseen and all("somebody:blind gave no detection" in a.verdict.text for a in unseen)
+
+
+def test_a_detector_of_objects_is_not_asked_for_its_clusters(here: Path) -> None:
+    result = Session(load(settings=["objects.method=somebody:pillars"])).run(frame())
+    answers = ask(result, hints=True)
+    missed = of(answers, Reason.NOT_AMONG)
+    assert missed and all("not among the objects of somebody:pillars" in a.verdict.text for a in missed)
+    assert not any(parameters_in(a, "fusion.") or a.hints for a in missed)
+
+
+# --- the robot's -------------------------------------------------------------------------------
+
+
+def published(drop_cluster: int = -1, drop_detection: int = -1, drop_object: int = -1) -> Frame:
+    """The frame with what a robot published that does as we do, but for what it lost."""
+    result = ours()
+    clusters, objects, detections = result.clusters, result.objects, result.cameras[0].detections
+    assert clusters is not None and objects is not None and detections is not None
+    head = frame().stamp, frame().points_frame
+    kept = np.array([k for k in np.flatnonzero(clusters.kept).tolist() if k != drop_cluster])
+    sure = [d for d in np.flatnonzero(detections.kept).tolist() if d != drop_detection]
+    rows = [j for j in range(len(objects)) if j != drop_object]
+
+    def boxes(of: Boxes3D, which: Sequence[int]) -> Boxes3D:
+        chosen = list(which)
+        return Boxes3D(of.center[chosen], of.size[chosen], of.yaw[chosen])
+
+    stated = LabelledBoxes3D(
+        "/clusters",
+        *head,
+        boxes(clusters.obb, kept.tolist()),
+        ("cluster",) * len(kept),
+        np.ones(len(kept), "f4"),
+    )
+    names = tuple(objects.names[j] for j in rows)
+    fused = LabelledBoxes3D("/fused", *head, boxes(objects.boxes, rows), names, objects.score[rows])
+    labels = tuple(detections.names[d] for d in sure)
+    seen = LabelledBoxes2D(
+        "/camera_2d", frame().stamp, "zed", detections.xyxy[sure], labels, detections.score[sure], "zed"
+    )
+    return replace(frame(), robot_boxes=(stated, fused), robot_detections=(seen,))
+
+
+ROBOT = (
+    "clustering.method=topic:/clusters",
+    "detector.model=topic:/camera_2d",
+    "objects.method=topic:/fused",
+)
+
+
+def reported_object() -> tuple[int, int]:
+    """Row of the truth and of the object of one that went well, alone in its cluster and in its box."""
+    for answer in ask(ours()):
+        named = answer.evidence.named
+        if answer.verdict.reason is Reason.REPORTED and named is not None and answer.distance < 25:
+            return answer.subject.row, named.row
+    raise AssertionError("nothing is reported")
+
+
+def robots_answer(robot: Frame, row: int, *settings: str) -> Answer:
+    result = Session(load(settings=settings)).run(robot)
+    assert result.failures == ()
+    return next(a for a in ask(result) if a.subject.row == row)
+
+
+def test_each_of_the_robots_stages_is_blamed_for_what_it_lost() -> None:
+    row, j = reported_object()
+    objects = ours().objects
+    assert objects is not None
+    k, d = int(objects.cluster[j]), int(objects.detection[j])
+    well = robots_answer(published(), row, *ROBOT)
+    assert well.verdict.reported and "/fused has " in well.verdict.text
+    fusion = robots_answer(published(drop_object=j), row, *ROBOT)
+    assert fusion.verdict.reason is Reason.LOST_IN_FUSION
+    assert "the robot's fusion lost it: cluster " in fusion.verdict.text
+    assert "of /clusters and " in fusion.verdict.text and "of /camera_2d are there" in fusion.verdict.text
+    clustering = robots_answer(published(drop_cluster=k, drop_object=j), row, *ROBOT)
+    assert clustering.verdict.reason is Reason.NO_CLUSTER
+    assert "the robot's clustering lost it" in clustering.verdict.text
+    detector = robots_answer(published(drop_detection=d, drop_object=j), row, *ROBOT)
+    assert detector.verdict.reason is Reason.NOT_DETECTED
+    assert "the robot's detector lost it: /camera_2d has no detection" in detector.verdict.text
+    for answer in (well, fusion, clustering, detector):
+        assert not parameters_in(answer, "detector.", "fusion."), answer.steps
+        assert not parameters_in(answer, "clustering.eps", "clustering.min_points")
+
+
+def test_our_fusion_of_the_robots_clusters_and_detections() -> None:
+    """Parameters of the fusion are ours, those of the robot's clusters are not."""
+    row, j = reported_object()
+    objects = ours().objects
+    assert objects is not None
+    answer = robots_answer(published(drop_cluster=int(objects.cluster[j])), row, *ROBOT[:2])
+    assert answer.verdict.reason is Reason.NO_CLUSTER and not answer.hints
+    assert "the robot's clustering lost it" in answer.verdict.text
+    assert not parameters_in(answer, "clustering.eps", "clustering.min_points")
