@@ -244,8 +244,9 @@ function control(one, own) {
   input.id = `control-${one.key}`;
   label.htmlFor = input.id;
   label.textContent = one.key;
-  const range = [one.low, one.high].map((limit) => limit ?? "").join(" to ");
-  about.textContent = [one.about, one.unit, range === " to " ? "" : range, `default ${one.value ?? "empty"}`]
+  const low = one.low === undefined ? "" : `from ${one.low}`;
+  const high = one.high === undefined ? "" : `up to ${one.high}`;
+  about.textContent = [one.about, one.unit, `${low} ${high}`.trim(), `opened with ${one.value ?? "nothing"}`]
     .filter(Boolean).join("; ");
   if (one.kind === "choice") input.append(...one.choices.map((name) => new Option(name, name, false, name === value)));
   else if (one.kind === "switch") { input.type = "checkbox"; input.checked = String(value) === "true"; }
