@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from playwright.sync_api import Browser, Page
 
 FRAMES = 6
+POLL = 0.5  # seconds: a page that draws without a graphics card has little time to be asked
 WAIT = 60.0  # seconds: a browser without a graphics card on a machine with other work
 SOFTWARE_GL = [
     "--no-sandbox",
@@ -112,7 +113,7 @@ def opened(browser: Browser, address: str) -> Iterator[Page]:
 
 
 def click(page: Page, x: int, y: int) -> None:
-    """Until the viewer says that something is selected: without a graphics card it may miss one."""
+    """Until the viewer says that an entity is selected: without a graphics card it may miss one."""
     number = len(events(page, "selection_change"))
 
     def selected() -> bool:
@@ -122,7 +123,8 @@ def click(page: Page, x: int, y: int) -> None:
         page.wait_for_timeout(300)
         page.mouse.click(x, y, delay=60)
         page.wait_for_timeout(2000)
-        return any(event["items"] for event in events(page, "selection_change")[number:])
+        new = [item for event in events(page, "selection_change")[number:] for item in event["items"]]
+        return any(item["type"] == "entity" for item in new)  # rather than the view
 
     until(selected)
 
@@ -138,7 +140,7 @@ def until(done: Callable[[], Any], seconds: float = WAIT) -> Any:
     end = time.monotonic() + seconds
     while not (found := done()):
         assert time.monotonic() < end, "it has not come about"
-        time.sleep(0.05)
+        time.sleep(POLL)
     return found
 
 
