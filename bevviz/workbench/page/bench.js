@@ -37,13 +37,28 @@ const viewerReady = new Promise((ready) => {
   });
 });
 const toViewer = (message, buffers) => listeners["msg:custom"](message, buffers);
-const seek = (stamp) => toViewer({ type: "time_ctrl", timeline: TIMELINE, timestamp_nanos: String(stamp), play: false });
+const move = () => toViewer({ type: "time_ctrl", timeline: TIMELINE, timestamp_nanos: target, play: false });
+
+// A viewer that has just opened a recording goes to its beginning of itself, and takes no time before that.
+let target = null; // stamp that the viewer is on its way to
+let tries = 0;
+function seek(stamp) {
+  target = String(stamp);
+  tries = 3;
+  move();
+}
 
 let settling = 0;
 function viewerEvent(event) {
   window.dispatchEvent(new CustomEvent("viewer-event", { detail: event }));
   if (event.type === "recording_open" && opening !== null) seek(opening);
   if (event.type === "time_update" && (event.timeline ?? TIMELINE) === TIMELINE) {
+    if (target !== null && Number(target) !== event.time && tries > 0) {
+      tries -= 1;
+      move();
+      return;
+    }
+    target = null;
     if (state.time !== null && Number(state.time) === event.time) return;
     state.time = String(BigInt(Math.round(event.time)));
     clearTimeout(settling);
