@@ -309,7 +309,7 @@ def test_messages_that_are_none_are_answered(address: str) -> None:
         assert answer('{"id": 1, "type": "ask", "time": "x"}') == "that message cannot be understood"
         until(lambda: "no frame" not in answer('{"id": 2, "type": "ask", "time": 0, "pick": "truth//999"}'))
         assert "nothing that can be asked" in answer('{"id": 3, "type": "ask", "time": 0, "pick": "car"}')
-        assert "no object 999" in answer('{"id": 4, "type": "ask", "time": 0, "pick": "truth//999"}')
+        assert "of number 999" in answer('{"id": 4, "type": "ask", "time": 0, "pick": "truth//999"}')
         assert "clustering.epps" in answer(
             '{"id": 5, "type": "try", "time": 0, "set": ["clustering.epps=1"]}'
         )
