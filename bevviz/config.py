@@ -591,8 +591,8 @@ def load(
         value = f" (given: {first['input']!r})" if not silent else ""
         about = keys().get(key) or params.get(key, "")
         hint = f"; it is: {about}" if about else ""
-        unit = f", in {_unit(key)}" if _unit(key) and not silent else ""
-        raise UserError(f"{where}: {key} {_lower(first['msg'])}{unit}{value}{hint}") from None
+        stated_unit = f", in {unit(key)}" if unit(key) and not silent else ""
+        raise UserError(f"{where}: {key} {_lower(first['msg'])}{stated_unit}{value}{hint}") from None
 
 
 def _params(stated: Mapping[str, Any], origin: Mapping[str, str]) -> dict[str, str]:
@@ -645,7 +645,7 @@ def dump(config: Config) -> str:
 
 
 def _note(key: str, about: Mapping[str, str]) -> str:
-    text = (f"in {_unit(key)}; " if _unit(key) else "") + about.get(key, "")
+    text = (f"in {unit(key)}; " if unit(key) else "") + about.get(key, "")
     return f"  # {text}" if text else ""
 
 
@@ -672,7 +672,7 @@ def _lower(message: str) -> str:
     return message[0].lower() + message[1:]
 
 
-def _unit(key: str) -> str:
+def unit(key: str) -> str:
     """Name of the unit that the value of a dotted key is in; empty where it has none."""
     section, _, name = key.partition(".")
     model = _model(section)

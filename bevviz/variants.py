@@ -17,10 +17,14 @@ MOTION = "sync.motion_compensation"  # the one thing in how frames are made that
 
 
 class Variants:
-    """Configurations that share frames, networks, and what stages make of the same arrays."""
+    """Configurations that share frames, networks, and what stages make of the same arrays.
 
-    def __init__(self) -> None:
-        self._memo, self._loader = Memo(), StageLoader()
+    Args:
+        loader: that has networks already.
+    """
+
+    def __init__(self, loader: StageLoader | None = None) -> None:
+        self._memo, self._loader = Memo(), loader or StageLoader()
         self._frame: Frame | None = None
         self._still: Frame | None = None
 

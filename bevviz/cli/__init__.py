@@ -7,7 +7,8 @@ import gc
 import logging
 import os
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
+from pathlib import Path
 
 from bevviz import __version__
 from bevviz.cli import (
@@ -24,6 +25,7 @@ from bevviz.cli import (
     sweep,
     tune,
     why,
+    workbench,
 )
 from bevviz.cli.inputs import check_outputs
 from bevviz.cli.options import with_negatives
@@ -33,6 +35,7 @@ _log = logging.getLogger(__name__)
 
 EPILOG = """examples:
   bevviz demo                                 the synthetic drive, in the viewer
+  bevviz drive.mcap --model yolo11n.onnx      the workbench: a page where a click on anything answers why
   bevviz info drive.mcap                      what is in a bag, and what is missing for a full run
   bevviz bag drive.mcap --model yolo11n.onnx  run the pipeline over a bag, in the viewer
   bevviz bag drive.mcap --save drive.rrd      the same, saved to send with a bug report
@@ -61,7 +64,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if arguments is None:
         interrupts.install()
     try:
-        options = _parser().parse_args(with_negatives(sys.argv[1:] if arguments is None else arguments))
+        parser, commands = _parser()
+        given = with_negatives(sys.argv[1:] if arguments is None else arguments)
+        if given and given[0] not in commands and Path(given[0]).exists():
+            given = ["open", *given]
+        options = parser.parse_args(given)
         if options.verbose:
             _log_to_stderr()
         check_outputs(options)
@@ -93,7 +100,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
             interrupts.ignore()
 
 
-def _parser() -> argparse.ArgumentParser:
+def _parser() -> tuple[argparse.ArgumentParser, Collection[str]]:
+    """The parser, and the names of the commands."""
     parser = argparse.ArgumentParser(
         prog="bevviz",
         description="See what a LiDAR-camera perception pipeline saw, made and decided, in Rerun.",
@@ -102,13 +110,27 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=f"bevviz {__version__}")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
-    for command in (bag, batch, info, why, compare, sweep, tune, calib, report, demo, live, config):
+    for command in (
+        workbench,
+        bag,
+        batch,
+        info,
+        why,
+        compare,
+        sweep,
+        tune,
+        calib,
+        report,
+        demo,
+        live,
+        config,
+    ):
         command.add(commands)
     for command_parser in commands.choices.values():
         command_parser.add_argument(
             "--verbose", action="store_true", help="also say on stderr where in the code something failed"
         )
-    return parser
+    return parser, commands.choices
 
 
 def _log_to_stderr() -> None:

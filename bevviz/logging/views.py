@@ -19,6 +19,7 @@ def space(
     *,
     raw: bool = True,
     grid: bool = True,
+    frustums: bool = True,
     why: bool = False,
     name: str = "3D",
     root: str = "",
@@ -32,6 +33,7 @@ def space(
         scene: names of the sensors.
         raw: with every raw point, coloured as ground or obstacle.
         grid: with the occupancy on the ground.
+        frustums: with what each detection sees.
         why: with the chain of what ``bevviz why`` explains.
         name: of the view.
         root: entity that the run is logged under.
@@ -42,6 +44,7 @@ def space(
     hidden += [entities.obstacles(scene.lidar)] if raw else []
     hidden += [] if raw else [entities.points(lidar) for lidar in scene.lidars or (scene.lidar,)]
     hidden += [] if grid else [entities.GRID]
+    hidden += [] if frustums else [entities.FRUSTUMS]
     # The points of what is explained stand out by their colours, which tell another story than the clusters'.
     hidden += [entities.clusters(scene.lidar), entities.FRUSTUMS] if why else []
     return rrb.Spatial3DView(

@@ -1,0 +1,435 @@
+"""The workbench in a real browser, against the real server."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import time
+import urllib.error
+import urllib.request
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+from urllib.parse import parse_qs, urlsplit
+
+import pytest
+
+import bevviz
+from bevviz.cli import main
+from bevviz.errors import UserError
+from bevviz.evaluate import truth_of
+from bevviz.frame import Frame, FrameResult
+from bevviz.logging import entities
+from bevviz.workbench.film import Film
+from bevviz.workbench.missed import finds
+from bevviz.workbench.parameters import controls
+from bevviz.workbench.pick import Pick, pick
+
+if TYPE_CHECKING:
+    from playwright.sync_api import Browser, Page
+
+FRAMES = 6
+POLL = 0.5  # seconds: a page that draws without a graphics card has little time to be asked
+WAIT = 60.0  # seconds: a browser without a graphics card on a machine with other work
+SOFTWARE_GL = [
+    "--no-sandbox",
+    "--use-angle=swiftshader",
+    "--enable-unsafe-swiftshader",
+    "--ignore-gpu-blocklist",
+]
+
+
+@pytest.fixture(scope="module")
+def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("workbench") / "demo.mcap"
+    assert main(["demo", "--frames", str(FRAMES), "--bag", str(path)]) == 0
+    return path
+
+
+@pytest.fixture(scope="module")
+def result() -> Iterator[FrameResult]:
+    with bevviz.simulate(frames=3, set={"clustering.min_cluster_points": 30}) as drive:  # some are set aside
+        yield drive.at(frame=1)
+
+
+@contextmanager
+def serving(*arguments: str) -> Iterator[tuple[str, subprocess.Popen[str]]]:
+    """``bevviz open`` as a user starts it: its address and its process."""
+    command = [sys.executable, "-m", "bevviz.cli", *arguments, "--model", "demo", "--no-browser"]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as server:
+        try:
+            assert server.stderr is not None
+            for line in server.stderr:
+                if found := re.search(r"workbench at (\S+)", line):
+                    yield found[1], server
+                    break
+            else:
+                pytest.fail("the server has said no address")
+        finally:
+            server.send_signal(signal.SIGINT)
+            server.communicate(timeout=60)
+
+
+@pytest.fixture(scope="module")
+def address(bag: Path) -> Iterator[str]:
+    with serving(str(bag)) as (address, _):
+        yield address
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Browser]:
+    executable = (
+        os.environ.get("BEVVIZ_CHROMIUM") or shutil.which("chromium") or shutil.which("google-chrome")
+    )
+    if executable is None:
+        pytest.skip("needs a browser: apt-get install chromium (or BEVVIZ_CHROMIUM=its path)")
+    from playwright.sync_api import sync_playwright
+
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=executable, args=SOFTWARE_GL)
+        yield browser
+        browser.close()
+
+
+@contextmanager
+def opened(browser: Browser, address: str) -> Iterator[Page]:
+    """The page, once the viewer shows a frame."""
+    page = browser.new_page(viewport={"width": 1400, "height": 900})
+    page.add_init_script(
+        "window.seen = []; window.addEventListener('viewer-event', (e) => window.seen.push(e.detail))"
+    )
+    try:
+        page.goto(address)
+        until(lambda: events(page, "time_update") or events(page, "timeline_change"))
+        yield page
+    finally:
+        page.close()
+
+
+def click(page: Page, x: int, y: int) -> None:
+    """Until the viewer says that an entity is selected: without a graphics card it may miss one."""
+    number = len(events(page, "selection_change"))
+
+    def selected() -> bool:
+        page.mouse.move(x - 3, y)
+        page.wait_for_timeout(300)  # it finds what is under the pointer a picture later
+        page.mouse.move(x, y)
+        page.wait_for_timeout(300)
+        page.mouse.click(x, y, delay=60)
+        page.wait_for_timeout(2000)
+        new = [item for event in events(page, "selection_change")[number:] for item in event["items"]]
+        return any(item["type"] == "entity" for item in new)  # rather than the view
+
+    until(selected)
+
+
+def events(page: Page, kind: str) -> list[dict[str, Any]]:
+    """What the viewer has told of a kind."""
+    found: list[dict[str, Any]] = page.evaluate("window.seen")
+    return [event for event in found if event["type"] == kind]
+
+
+def until(done: Callable[[], Any], seconds: float = WAIT) -> Any:
+    """What it gives, once that is something. (The page's own policy forbids Playwright's way to wait.)"""
+    end = time.monotonic() + seconds
+    while not (found := done()):
+        assert time.monotonic() < end, "it has not come about"
+        time.sleep(POLL)
+    return found
+
+
+def verdict(page: Page) -> str:
+    """The newest answer's sentence; empty while it is on its way."""
+    answer = page.locator("#answer")
+    busy = "busy" in (answer.get_attribute("class") or "")
+    return "" if busy else page.inner_text("#verdict")
+
+
+def new_verdict(page: Page, before: str) -> str:
+    """The next one, once it is there."""
+    until(lambda: verdict(page) not in ("", before))
+    return verdict(page)
+
+
+def state(page: Page) -> dict[str, list[str]]:
+    """What the address holds."""
+    return parse_qs(urlsplit(page.url).fragment)
+
+
+# --- the whole way, in a browser ----------------------------------------------------------------
+
+
+def test_a_click_is_answered(browser: Browser, address: str) -> None:
+    """On a camera's image, in space and from above; the answer names what lies there, and has a chain."""
+    with opened(browser, address) as page:
+        before = verdict(page)
+        for x, y in ((880, 270), (300, 420), (760, 690)):
+            click(page, x, y)
+            before = new_verdict(page, before)
+            assert "cannot" not in before.split()[:4]
+            assert page.locator("#chain li").count() > 0
+            assert state(page)["pick"]
+
+
+def test_missed_objects_are_listed_and_sought(browser: Browser, address: str) -> None:
+    """A row of the list moves the viewer to its time and is answered; the address opens the same again."""
+    with opened(browser, address) as page:
+        until(lambda: f"{FRAMES} frames" in page.inner_text("#run"))
+        rows = page.locator("#found button")
+        late = next(
+            row for row in rows.all() if row.locator(".time").inner_text() not in ("0.00 s", "")
+        )  # of another frame than that which is shown
+        assert late.locator(".missed").inner_text() == "missed"
+        shown = len(events(page, "time_update"))
+        late.click()
+        until(lambda: "missed" in (page.locator("#answer").get_attribute("class") or ""))
+        text = until(lambda: verdict(page))
+        assert "was not reported" in text or "shares" in text or "cluster" in text
+        until(lambda: len(events(page, "time_update")) > shown)
+        held, url = state(page), page.url
+        assert held["pick"][0].startswith("truth/")
+        chain = page.inner_text("#chain")
+    with opened(browser, url) as again:
+        until(lambda: again.inner_text("#chain") == chain)
+        assert state(again) == held
+
+
+def test_parameters_are_tried_on_the_shown_frame(browser: Browser, address: str) -> None:
+    """A control changes the picture's counts; undo takes it back; what is wrong is said in a line."""
+    with opened(browser, address) as page:
+        until(lambda: f"{FRAMES} frames" in page.inner_text("#run"))
+        page.keyboard.press("/")
+        page.keyboard.type("min_cluster_points")
+        control = page.locator("[id='control-clustering.min_cluster_points']")
+        assert control.input_value() == "10"
+        control.fill("100000")
+        control.press("Enter")
+        until(lambda: "no object after" in page.inner_text("#effect"))
+        assert state(page)["set"] == ["clustering.min_cluster_points=100000"]
+        assert "F1" in page.inner_text("#effect")
+        page.click("#undo")
+        until(lambda: "0 new, 0 gone" in page.inner_text("#effect"))
+        assert "set" not in state(page)
+        control = page.locator("[id='control-clustering.min_cluster_points']")
+        control.fill("-3")
+        control.press("Enter")
+        until(lambda: "must be greater than or equal to 1" in page.inner_text("#verdict"))
+
+
+def test_a_server_that_is_gone_is_said_and_another_one_not_taken_for_it(bag: Path, browser: Browser) -> None:
+    with serving("open", str(bag)) as (address, server), opened(browser, address) as page:
+        assert page.locator("#gone").is_hidden()
+        server.kill()
+        until(lambda: "The server is gone" in page.inner_text("#gone"))
+        port = str(urlsplit(address).port)
+        server.wait()
+        with serving("open", str(bag), "--port", port):
+            until(lambda: "open the address that it printed" in page.inner_text("#gone"))
+
+
+# --- who is let in ------------------------------------------------------------------------------
+
+
+def answered(url: str, **headers: str) -> int:
+    """Status of the answer."""
+    request = urllib.request.Request(url, headers={k.replace("_", "-"): v for k, v in headers.items()})
+    try:
+        with urllib.request.urlopen(request, timeout=20) as response:
+            return int(response.status)
+    except urllib.error.HTTPError as error:
+        return error.code
+
+
+def test_only_who_has_the_token_is_let_in(address: str) -> None:
+    parts = urlsplit(address)
+    site = f"http://{parts.netloc}"
+    token = parse_qs(parts.query)["token"][0]
+    assert answered(address) == 200
+    assert answered(f"{site}/") == 403
+    assert answered(f"{site}/?token=wrong") == 403
+    assert answered(f"{site}/page/bench.js?token={token}") == 200
+    assert answered(f"{site}/page/bench.js") == 403
+    assert answered(f"{site}/page/..%2fserver.py?token={token}") == 404
+    assert answered(f"{site}/config.yaml?token={token}&set=clustering.eps=0.7") == 200
+    assert answered(f"{site}/config.yaml?token={token}&set=clustering.eps=-1") == 400
+
+
+def test_other_hosts_and_origins_are_refused(address: str) -> None:
+    """A name that somebody else lets lead here, and a page of another site that knows the token."""
+    parts = urlsplit(address)
+    assert answered(address, Host="evil.example") == 403
+    assert answered(address, Host=f"evil.example:{parts.port}") == 403
+    assert answered(address, Origin="http://evil.example") == 403
+    assert answered(address, Origin=f"http://{parts.netloc}") == 200
+
+
+@pytest.mark.parametrize("path", ["/talk", "/film"])
+def test_channels_are_guarded(address: str, path: str) -> None:
+    from websockets.exceptions import InvalidStatus
+    from websockets.sync.client import connect
+    from websockets.typing import Origin
+
+    parts = urlsplit(address)
+    url, own = f"ws://{parts.netloc}{path}?{parts.query}", f"http://{parts.netloc}"
+    with connect(url, origin=Origin(own), max_size=None) as channel:
+        assert channel.recv(timeout=60)
+    for bad in (
+        {"uri": url, "origin": "http://evil.example"},
+        {"uri": url, "origin": None},
+        {"uri": f"ws://{parts.netloc}{path}", "origin": own},
+    ):
+        with pytest.raises(InvalidStatus) as refused:
+            connect(**bad)
+        assert refused.value.response.status_code == 403
+
+
+def test_messages_that_are_none_are_answered(address: str) -> None:
+    from websockets.sync.client import connect
+    from websockets.typing import Origin
+
+    parts = urlsplit(address)
+    url = f"ws://{parts.netloc}/talk?{parts.query}"
+    with connect(url, origin=Origin(f"http://{parts.netloc}"), max_size=None) as channel:
+
+        def answer(message: str) -> str:
+            channel.send(message)
+            while True:
+                found = json.loads(channel.recv(timeout=60))
+                if found["type"] == "error":
+                    return str(found["text"])
+
+        assert answer("{") == "that message cannot be understood"
+        assert answer("[]") == "that message cannot be understood"
+        assert answer('{"id": 1, "type": "ask", "time": "x"}') == "that message cannot be understood"
+        until(lambda: "no frame" not in answer('{"id": 2, "type": "ask", "time": 0, "pick": "truth//999"}'))
+        assert "nothing that can be asked" in answer('{"id": 3, "type": "ask", "time": 0, "pick": "car"}')
+        assert "of number 999" in answer('{"id": 4, "type": "ask", "time": 0, "pick": "truth//999"}')
+        assert "clustering.epps" in answer(
+            '{"id": 5, "type": "try", "time": 0, "set": ["clustering.epps=1"]}'
+        )
+
+
+def test_a_path_alone_opens_it(bag: Path) -> None:
+    with serving(str(bag)) as (address, _):
+        assert answered(address) == 200
+
+
+def test_a_bag_that_is_none_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    broken = tmp_path / "broken.mcap"
+    broken.write_bytes(b"no bag")
+    assert main(["open", str(broken), "--no-browser"]) == 2
+    assert "broken.mcap" in capsys.readouterr().err
+
+
+# --- what a click is on -------------------------------------------------------------------------
+
+
+def test_rows_of_what_is_drawn_are_rows_of_the_result(result: FrameResult) -> None:
+    """The viewer tells the row of what was logged, of which some things are left out."""
+    camera = result.cameras[0]
+    name, found = camera.camera.name, camera.detections
+    assert found is not None
+    assert result.objects is not None
+    assert result.clusters is not None
+    kept = [row for row, is_kept in enumerate(found.kept) if is_kept]
+    weak = [row for row, is_kept in enumerate(found.kept) if not is_kept]
+    aside = [row for row, is_kept in enumerate(result.clusters.kept) if not is_kept]
+    assert kept and weak and aside and len(result.objects)
+    assert pick(result, None, entities.detections(name), len(kept) - 1, ()) == Pick(
+        "detection", kept[-1], name
+    )
+    assert pick(result, None, entities.weak(name), 0, ()) == Pick("detection", weak[0], name)
+    assert pick(result, None, entities.FUSED, 0, (1, 2, 3)) == Pick("object", 0)
+    assert pick(result, None, entities.TRUTH, 2, ()) == Pick("truth", 2)
+    lidar = result.frame.lidar
+    assert pick(result, None, entities.set_aside(lidar), 0, ()) == Pick("cluster", aside[0])
+    assert pick(result, None, entities.image(name), None, (10.5, 20.5)) == Pick(
+        "pixel", camera=name, place=(10.0, 20.0)
+    )
+    assert pick(result, None, entities.BEV, None, (12.7, 3.2)) == Pick("cell", place=(3, 12))
+    point = result.frame.points[5]
+    assert pick(result, None, entities.points(lidar), 5, ()) == Pick("point", place=tuple(map(float, point)))
+    fixed = (result.frame.pose @ [*point, 1])[:3]
+    in_space = pick(result, None, entities.obstacles(lidar), None, tuple(fixed))
+    assert in_space is not None
+    assert in_space.place == pytest.approx(point, abs=1e-4)
+    assert pick(result, None, entities.FUSED, 10_000, ()) is None
+    assert pick(result, None, "/health/time_ms/total", None, ()) is None
+
+
+@pytest.mark.parametrize(
+    "one", [Pick("truth", 3), Pick("detection", 0, "a/b"), Pick("pixel", camera="zed", place=(1.5, 2.0))]
+)
+def test_picks_stand_in_an_address(one: Pick) -> None:
+    assert Pick.parse(str(one)) == one
+
+
+@pytest.mark.parametrize("text", ["", "car", "truth//", "truth//nan", "pixel/zed/1", "point//1,2", "x//1"])
+def test_what_is_no_pick_is_said(text: str) -> None:
+    with pytest.raises(UserError, match="nothing that can be asked"):
+        Pick.parse(text)
+
+
+# --- what is worth a look -----------------------------------------------------------------------
+
+
+def test_what_the_truth_misses_is_what_is_listed(result: FrameResult) -> None:
+    """Every object that has to be found is found by an object of its class within 2 m, or is listed."""
+    frame: Frame = result.frame
+    assert frame.truth is not None
+    assert result.objects is not None
+    truth = truth_of(frame, frame.truth)
+    missed = {find.pick.row for find in finds(result, truth) if find.what == "missed"}
+    assert missed
+    for row, (label, must) in enumerate(zip(truth.labels, truth.must, strict=True)):
+        near = [
+            name.lower() == label.lower()
+            and float(((center[:2] - truth.boxes.center[row, :2]) ** 2).sum()) <= 4
+            for name, center in zip(result.objects.names, result.objects.boxes.center, strict=True)
+        ]
+        if row in missed:
+            assert must
+        elif must:
+            assert any(near)
+
+
+def test_without_truth_it_is_what_nothing_explains(result: FrameResult) -> None:
+    listed = finds(result, None)
+    assert {find.what for find in listed} <= {"unmatched", "unnamed"}
+    assert any(find.what == "unnamed" for find in listed)
+    assert all(not find.distance > 40 for find in listed)
+
+
+# --- parts --------------------------------------------------------------------------------------
+
+
+def test_pieces_come_back_as_they_were() -> None:
+    told = []
+    with Film() as film:
+        end = film.listen(lambda: told.append(len(film)))
+        for piece in (b"one", b"", None, b"two" * 1000):
+            film.add(piece)
+        end()
+        film.add(b"three")
+        assert [film[row] for row in range(len(film))] == [b"one", b"two" * 1000, b"three"]
+        assert told == [1, 2]
+        with pytest.raises(IndexError):
+            film[3]
+
+
+def test_controls_are_made_of_the_fields() -> None:
+    from bevviz.config import load
+
+    made = {control["key"]: control for control in controls(load())}
+    eps = made["clustering.eps"]
+    assert (eps["value"], eps["unit"], eps["low"], eps["high"]) == (0.5, "metres", 0, 20)
+    assert made["clustering.boxes"]["choices"] == ["oriented", "axis_aligned"]
+    assert made["voxel.average"]["kind"] == "switch"
+    assert made["clustering.max_cluster_points"]["kind"] == "whole"
+    assert not any(key.startswith("live.") for key in made)
