@@ -146,13 +146,13 @@ class AnomalyDetector:
             before, self._alone[name] = self._alone.get(name, []), []
             if found is None or fusion is None:
                 continue
-            unmatched = np.isin(fusion.detection_decision, UNMATCHED) & found.kept
-            for d in np.flatnonzero(unmatched).tolist():
-                box, what = found.xyxy[d], found.names[d]
-                earlier = [
-                    frames for other, called, frames in before
-                    if called == what and iou(box[None], other[None])[0, 0] >= SAME_BOX
-                ]  # fmt: skip
+            unmatched = np.flatnonzero(np.isin(fusion.detection_decision, UNMATCHED) & found.kept)
+            boxes = found.xyxy[unmatched]
+            others = np.array([box for box, _, _ in before], np.float32).reshape(-1, 4)
+            same = iou(boxes, others) >= SAME_BOX
+            for d, box, near in zip(unmatched.tolist(), boxes, same, strict=True):
+                what = found.names[d]
+                earlier = [before[i][2] for i in np.flatnonzero(near).tolist() if before[i][1] == what]
                 frames = 1 + max(earlier, default=0)
                 self._alone[name].append((box, what, frames))
                 if frames >= config.alone_frames:
