@@ -50,7 +50,7 @@ def _calib(options: argparse.Namespace) -> int:
         try:
             with open_bag(options, config) as source:
                 scene, total = source.scene, source.total
-            names = _cameras(scene, options.camera)
+                names = _cameras(scene, options.camera, source.roles.no_camera)
             options.every = chosen or max(1, total // FRAMES)
             with open_bag(options, config) as source:
                 bar = tqdm(source, total=source.total, unit="frame", desc="find edges", disable=None)
@@ -76,14 +76,11 @@ def _calib(options: argparse.Namespace) -> int:
     return 0
 
 
-def _cameras(scene: Scene, wanted: str | None) -> tuple[str, ...]:
+def _cameras(scene: Scene, wanted: str | None, why_none: str) -> tuple[str, ...]:
     from bevviz.errors import UserError
 
     if not scene.cameras:
-        raise UserError(
-            f"{scene.name}: no camera to calibrate (no Image topic was found); "
-            "name one with --set source.camera_topics=[/topic]"
-        )
+        raise UserError(f"{scene.name}: no camera to calibrate ({why_none})")
     if wanted is None:
         return scene.cameras
     if wanted not in scene.cameras:
