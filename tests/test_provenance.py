@@ -32,8 +32,11 @@ PACKAGE = Path(bevviz.__file__).parent
 NEUTRAL = {
     "pydantic": "the configuration's types",
     "pydantic_core": "the configuration's types",
+    "annotated-types": "the configuration's types",
     "tqdm": "progress bars",
     "jinja2": "pages about results",
+    "starlette": "the workbench's server",
+    "uvicorn": "the workbench's server",
     "ruamel.yaml": "files of configurations",
     "pyarrow": "containers of what is computed",
     "apsw": "bytes out of SQLite files",
