@@ -255,7 +255,12 @@ def _for_detection(reason: Reason, best: Candidate, config: Config) -> Iterator[
     if reason is Reason.BELOW_THRESHOLD:
         # A threshold that lets any noise pass is no advice.
         if best.score >= 0.05:
-            yield {"detector.conf_threshold": math.floor(100 * best.score) / 100}
+            passes = {"detector.conf_threshold": math.floor(100 * best.score) / 100}
+            yield passes
+            if config.fusion.method == "frustum" and config.fusion.split:
+                # What it rates a match by is in proportion to the score.
+                weak = config.fusion.min_rating * best.score / config.detector.conf_threshold
+                yield from ({**passes, "fusion.min_rating": round(weak * f, 4)} for f in (1.0, 0.5))
     elif reason is Reason.SUPPRESSED:
         yield from ({"detector.iou_threshold": value} for value in (0.6, 0.7, 0.8, 0.9))
     elif reason is Reason.LOW_OVERLAP:
