@@ -7,7 +7,6 @@
 
 from __future__ import annotations
 
-import logging
 import os
 from typing import TYPE_CHECKING, Any
 
@@ -20,8 +19,6 @@ if TYPE_CHECKING:
 
 __version__ = "0.1.0"
 __all__ = ["Config", "Drive", "Frame", "FrameResult", "UserError", "open", "simulate"]
-
-logging.getLogger("bevviz").addHandler(logging.NullHandler())  # silent where nobody listens
 
 # onnxruntime stores a number for this machine when it is imported, unless it is told not to before.
 os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")

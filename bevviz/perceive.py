@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import threading
 import time
 import traceback
@@ -35,6 +34,7 @@ from bevviz.frame import (
     Splits,
     Voxels,
 )
+from bevviz.loggers import logger
 from bevviz.plugins import TOPIC
 from bevviz.stages import foreign, robot
 from bevviz.stages.bev import bev
@@ -51,7 +51,7 @@ Ts = TypeVarTuple("Ts")
 
 Detect = Callable[[Camera], Detections | None]
 
-_log = logging.getLogger(__name__)
+_log = logger(__name__)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import heapq
-import logging
 from array import array
 from collections import Counter
 from collections.abc import Callable, Collection, Container, Iterator, Mapping, Sequence
@@ -28,8 +27,9 @@ from bevviz.bags.reader import (
     public_messages,
 )
 from bevviz.frame import I64
+from bevviz.loggers import logger
 
-logger = logging.getLogger(__name__)
+_log = logger(__name__)
 
 PublicReader = rosbags.rosbag1.Reader | rosbags.rosbag2.Reader
 
@@ -180,7 +180,7 @@ class SoundChunks:
             with as_damage():
                 reader.open()
         except DamageError as error:
-            logger.info("%s: read by its index, for rosbags says: %s", path, error)
+            _log.info("%s: read by its index, for rosbags says: %s", path, error)
         else:
             known = {c.id: c for c in reader.connections}  # with their quality of service
             index.connections = [

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import struct
 from binascii import crc32
 from collections import Counter
@@ -16,8 +15,9 @@ from rosbags.interfaces import Connection, ConnectionExtRosbag2, MessageDefiniti
 from bevviz.bags.chunks import Chunk, Index
 from bevviz.bags.reader import LAST, Bytes, DamageError
 from bevviz.frame import I64
+from bevviz.loggers import logger
 
-logger = logging.getLogger(__name__)
+_log = logger(__name__)
 
 MAGIC = b"\x89MCAP0\r\n"
 HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX, CHUNK_INDEX = range(1, 9)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import os
 import re
 import struct
@@ -23,8 +22,9 @@ from rosbags.interfaces import Connection
 
 from bevviz.errors import first_line
 from bevviz.frame import I64
+from bevviz.loggers import logger
 
-logger = logging.getLogger(__name__)
+_log = logger(__name__)
 
 Message = tuple[Connection, int, bytes | memoryview]
 """Where it was recorded, log time in nanoseconds, and the serialised message."""
@@ -218,7 +218,7 @@ class BagFile:
         sound.close()
 
     def _tell(self, error: DamageError) -> None:
-        logger.info("%s: %s: rescuing what is there", self.path, error, exc_info=error)
+        _log.info("%s: %s: rescuing what is there", self.path, error, exc_info=error)
         self._notes.append(f"{error}: what is there was rescued")
 
 

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import argparse
 import gc
-import logging
 import os
 import sys
 from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from bevviz import __version__
 from bevviz.cli import (
@@ -31,7 +31,8 @@ from bevviz.cli.inputs import check_outputs
 from bevviz.cli.options import with_negatives
 from bevviz.errors import UserError, first_line, interrupt_in
 
-_log = logging.getLogger(__name__)
+if TYPE_CHECKING:
+    from logging import Logger
 
 EPILOG = """examples:
   bevviz demo                                 the synthetic drive, in the viewer
@@ -75,7 +76,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         run: Callable[[argparse.Namespace], int] = options.run
         return run(options)
     except UserError as error:
-        _log.debug("what led to the error", exc_info=error)
+        _log().debug("what led to the error", exc_info=error)
         print(f"bevviz: error: {error}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
@@ -88,7 +89,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if interrupt_in(error) or interrupts.came():
             print("bevviz: interrupted", file=sys.stderr)
             return 130
-        _log.error("an error that nobody foresaw", exc_info=error)
+        _log().error("an error that nobody foresaw", exc_info=error)
         what = f"{type(error).__name__}: {first_line(error)}"
         print(
             f"bevviz: error of bevviz itself: {what}; --verbose shows where, please report it",
@@ -134,7 +135,15 @@ def _parser() -> tuple[argparse.ArgumentParser, Collection[str]]:
     return parser, commands.choices
 
 
+def _log() -> Logger:
+    from bevviz.loggers import logger
+
+    return logger(__name__)
+
+
 def _log_to_stderr() -> None:
+    import logging
+
     handler = logging.StreamHandler()
     handler.setFormatter(logging.Formatter("%(name)s: %(levelname)s: %(message)s"))
     logger = logging.getLogger("bevviz")

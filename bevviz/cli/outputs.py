@@ -7,9 +7,8 @@ import os
 import sys
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from bevviz.cli.interrupts import wait_for_interrupt
 from bevviz.text import printable
@@ -22,8 +21,7 @@ if TYPE_CHECKING:
     from bevviz.logging.sinks import Sinks
 
 
-@dataclass(frozen=True, slots=True)
-class Outputs:
+class Outputs(NamedTuple):
     """What the options of ``add_output`` ask for; several at once."""
 
     save: Path | None = None
@@ -46,7 +44,7 @@ class Outputs:
 
     def or_viewer(self) -> Outputs:
         """Where nothing is asked for, the viewer on this machine, if it can be shown."""
-        return self if self or not has_display() else replace(self, viewer=True)
+        return self if self or not has_display() else self._replace(viewer=True)
 
     def or_file(self, default: Path) -> Outputs:
         """Where nothing is asked for and nothing can be shown, a file."""
@@ -54,7 +52,7 @@ class Outputs:
         if chosen:
             return chosen
         say(f"no display: saving {default} (--serve shows it in a browser)")
-        return replace(chosen, save=default)
+        return chosen._replace(save=default)
 
     @contextmanager
     def opened(self, scene: Scene, config: Config) -> Iterator[Sinks]:

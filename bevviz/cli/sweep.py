@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 from contextlib import ExitStack
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -50,7 +49,7 @@ def _sweep(options: argparse.Namespace) -> int:
     with open_bag(options, config) as source:
         truth = truth_source(source.roles, options.truth, options.kitti_labels, len(source.scans))
         sweep = Sweep(parameters, configs, truth)
-        outputs = replace(Outputs.of(options), blueprint=layout(sweep))
+        outputs = Outputs.of(options)._replace(blueprint=layout(sweep))
         with ExitStack() as stack:
             # Before the run, that may take long: what cannot be opened is told now.
             sinks = stack.enter_context(outputs.opened(source.scene, source.config)) if outputs else None

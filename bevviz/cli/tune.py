@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -49,7 +48,7 @@ def _tune(options: argparse.Namespace) -> int:
     frame, scene, warnings = _frame(options, settings)
     outputs = Outputs.of(options).or_viewer()
     if not outputs:
-        outputs = replace(outputs, serve=free_port(9090))
+        outputs = outputs._replace(serve=free_port(9090))
     one = OneFrame(frame)
     one.check(settings.config)
     last = 0

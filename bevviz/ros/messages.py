@@ -7,7 +7,6 @@ in the message, and none takes more memory than a message of reasonable size ask
 
 from __future__ import annotations
 
-import logging
 import math
 import re
 import struct
@@ -23,9 +22,10 @@ from numpy.typing import NDArray
 from bevviz import geometry
 from bevviz.errors import UserError, first_line
 from bevviz.frame import F32, F64, U8, Boxes3D, Cloud, Image, Intrinsics, LabelledBoxes2D, LabelledBoxes3D
+from bevviz.loggers import logger
 from bevviz.ros.roles import VIDEO
 
-logger = logging.getLogger(__name__)
+_log = logger(__name__)
 
 MOST_POINTS = 100_000_000  # of a cloud
 MOST_FIELDS = 1024  # of a point; each element of a field counts
@@ -50,7 +50,7 @@ def _guarded(decode: Callable[P, R]) -> Callable[P, R]:
             raise
         except Exception as error:
             topic = next((value for value in (*args, *kwargs.values()) if isinstance(value, str)), "message")
-            logger.debug("%s cannot be used", topic, exc_info=True)
+            _log.debug("%s cannot be used", topic, exc_info=True)
             what = f"{type(error).__name__}: {first_line(error)}"
             raise MessageError(f"{topic}: cannot be used ({what})") from None
 

@@ -6,7 +6,6 @@ import asyncio
 import contextlib
 import importlib.util
 import json
-import logging
 import secrets
 import socket
 from collections.abc import Callable
@@ -27,6 +26,7 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from bevviz.config import dump, revised
 from bevviz.errors import UserError, first_line
+from bevviz.loggers import logger
 from bevviz.workbench.bench import Bench, Settings
 from bevviz.workbench.parameters import controls
 from bevviz.workbench.pick import Pick
@@ -42,7 +42,7 @@ POLICY = (
     "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
 )
 
-_log = logging.getLogger(__name__)
+_log = logger(__name__)
 
 
 def serve(bench: Bench, port: int | None, ready: Callable[[str], None]) -> None:
