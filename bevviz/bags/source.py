@@ -76,15 +76,7 @@ class BagSource(Closing):
 
     @property
     def scene(self) -> Scene:
-        names = self.roles.lidar_names
-        return Scene(
-            name=self.recording.name,
-            lidar=names[0] if len(names) == 1 else "lidars",
-            lidars=names,
-            cameras=tuple(camera.name for camera in self.roles.cameras),
-            robot=bool(self.roles.robot_detections_2d or self.roles.robot_detections_3d),
-            truth=bool(self.roles.truth),
-        )
+        return self.roles.scene(self.recording.name)
 
     @property
     def total(self) -> int:

@@ -184,15 +184,7 @@ class LiveSource(Closing):
     @property
     def scene(self) -> Scene:
         """Known after ``wait``; another one when sensors come up later."""
-        names = self.roles.lidar_names
-        return Scene(
-            name="live",
-            lidar=names[0] if len(names) == 1 else "lidars",
-            lidars=names,
-            cameras=tuple(camera.name for camera in self.roles.cameras),
-            robot=bool(self.roles.robot_detections_2d or self.roles.robot_detections_3d),
-            truth=bool(self.roles.truth),
-        )
+        return self.roles.scene("live")
 
     @property
     def total(self) -> None:

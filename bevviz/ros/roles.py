@@ -11,6 +11,7 @@ from types import MappingProxyType
 
 from bevviz.config import SourceConfig
 from bevviz.errors import UserError
+from bevviz.frame import Scene
 from bevviz.logging.entities import RESERVED
 
 
@@ -60,6 +61,18 @@ class Roles:
     no_lidar: str = field(default="", compare=False)  # why there is none, and what would help
     no_camera: str = field(default="", compare=False)  # the same of cameras
     notes: Mapping[str, str] = field(default_factory=dict)
+
+    def scene(self, name: str) -> Scene:
+        """What a source with these topics delivers."""
+        lidars = self.lidar_names
+        return Scene(
+            name=name,
+            lidar=lidars[0] if len(lidars) == 1 else "lidars",
+            lidars=lidars,
+            cameras=tuple(camera.name for camera in self.cameras),
+            robot=bool(self.robot_detections_2d or self.robot_detections_3d),
+            truth=bool(self.truth),
+        )
 
 
 MANY = 12  # topics; more are not listed in a sentence
