@@ -84,22 +84,22 @@ class BagSource(Closing):
 
     @property
     def warnings(self) -> Sequence[str]:
-        damaged = [
+        synced = self._sync.report.warnings() if self._sync else ()
+        blind = blindness(self.config, self.roles, self._sync.report if self._sync else None)
+        return [*self.recording.warnings, *self._damage, *blind, *synced]
+
+    @property
+    def _damage(self) -> Sequence[str]:
+        """Messages that could not be used, a sentence for each topic."""
+        return [
             f"{count} message(s) of {topic} could not be used, the first: {self._first_damage[topic]}"
             for topic, count in self._damaged.items()
         ]
-        synced = self._sync.report.warnings() if self._sync else ()
-        blind = blindness(self.config, self.roles, self._sync.report if self._sync else None)
-        return [*self.recording.warnings, *damaged, *blind, *synced]
 
     @property
     def doubts(self) -> Sequence[str]:
         """What of the frames read so far may make all of them wrong, one sentence each."""
-        damaged = [
-            f"{topic}: {count} message(s) could not be used, the first: {self._first_damage[topic]}"
-            for topic, count in self._damaged.items()
-        ]
-        return [*damaged, *(self._sync.report.doubts() if self._sync else ())]
+        return [*self._damage, *(self._sync.report.doubts() if self._sync else ())]
 
     @property
     def span(self) -> tuple[int, int]:
