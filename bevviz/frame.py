@@ -172,6 +172,16 @@ class LabelledBoxes2D:
 
 
 @dataclass(frozen=True, slots=True)
+class LateResult:
+    """Boxes of the robot's own that came when the frame of their time had gone on: beside a robot alone."""
+
+    boxes: LabelledBoxes2D | LabelledBoxes3D
+    frame_stamp: int  # of the frame that is nearest
+    pose: F64  # (4, 4) world from points, at that frame
+    index: int = 0  # of that frame
+
+
+@dataclass(frozen=True, slots=True)
 class Frame:
     """One LiDAR scan with all that belongs to its time.
 

@@ -21,8 +21,14 @@ import pytest
 from bevviz.config import Config, load
 from bevviz.errors import UserError
 from bevviz.frame import Boxes3D, CameraResult, Detections, Frame, FrameResult, Objects
-from bevviz.ros.encode import encode_camera_info, typestore
-from bevviz.ros.messages import decode_cloud, decode_detections_2d, decode_detections_3d, decode_image
+from bevviz.ros.encode import encode_boxes_3d, encode_camera_info, typestore
+from bevviz.ros.messages import (
+    decode_cloud,
+    decode_detections_2d,
+    decode_detections_3d,
+    decode_image,
+    read_header,
+)
 from bevviz.session import Session
 from bevviz.synthetic import SyntheticSource
 from bevviz.synthetic.bag import TOPICS
@@ -123,6 +129,43 @@ def test_newest_frame_wins(robot: str) -> None:
         frame = next(live)
         assert source.dropped >= frame.index - before - 1 >= 5
         assert time.time_ns() - frame.received < 1e9
+
+
+def test_frames_do_not_wait_for_the_robots_results(robot: str) -> None:
+    """One detector stamps its boxes a little after the scan, another one takes 0.7 s for them."""
+    kind, cloud = "vision_msgs/msg/Detection3DArray", "sensor_msgs/msg/PointCloud2"
+    one = Boxes3D(np.ones((1, 3), np.float32), np.ones((1, 3), np.float32), np.zeros(1, np.float32))
+    scans: list[int] = []
+    said: list[str] = []
+    with Node(name="perception") as robots:
+        node = robots.node
+        soon, slow = (
+            node.create_publisher(typesupport.message_type(kind), topic, 10)
+            for topic in ("/soon/boxes", "/slow/boxes")
+        )
+
+        def perceive(data: bytes) -> None:
+            scans.append(read_header(data, "<", LIDAR_TOPIC)[0])
+            for publisher, stamp in ((soon, scans[-1] + 12_000_000), (slow, scans[-8:][0])):
+                boxes = encode_boxes_3d(stamp, "rslidar", one, [[("car", 0.9)]])
+                publisher.publish(bytes(typestore().serialize_cdr(boxes, kind)))
+
+        node.create_subscription(typesupport.message_type(cloud), LIDAR_TOPIC, perceive, 5, raw=True)
+        robots.start()
+        with LiveSource(load(settings=["sync.max_wait=20"]), tell=said.append) as source:
+            assert source.wait(PATIENCE)
+            until(lambda: {"/soon/boxes", "/slow/boxes"} <= set(source.received), "results")
+            source.overtaken()
+            heard = list(islice(source, 12))  # with such a wait there were one in 20 s, did they wait
+            late = source.overtaken()
+    stamps = {frame.index: frame.stamp for frame in heard}
+    for topic, shift in (("/soon/boxes", 12_000_000), ("/slow/boxes", 0)):
+        mine = [found for found in late if found.boxes.topic == topic and found.index in stamps]
+        taken = sum(box.topic == topic for frame in heard for box in frame.robot_boxes)
+        assert len(mine) + taken > 2
+        assert all(found.boxes.stamp - stamps[found.index] == shift for found in mine)
+    assert sum(found.boxes.topic == "/slow/boxes" for found in late) > 2
+    assert any(text.startswith("/slow/boxes comes when its frame has gone on") for text in said)
 
 
 def test_remap_of_a_stated_topic(robot: str) -> None:

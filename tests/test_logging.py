@@ -45,6 +45,7 @@ from bevviz.frame import (
     Intrinsics,
     LabelledBoxes2D,
     LabelledBoxes3D,
+    LateResult,
     Objects,
     Pairs,
     Scene,
@@ -188,6 +189,29 @@ def test_a_drive_with_gaps_is_a_valid_recording(tmp_path: Path) -> None:
             logger.log(nothing(index, Failure("voxel", "out of memory")) if index % 4 == 3 else make(index))
     verify(path)
     assert Recording(path).blueprints == 1
+
+
+def test_late_results_of_the_robot_are_at_their_own_stamp(tmp_path: Path) -> None:
+    row = np.ones((1, 3), np.float32)
+    three = LabelledBoxes3D(
+        "/late", START + 12_000_000, "map", Boxes3D(row, row, row[:, 0]), ("car",), row[0, :1]
+    )
+    two = LabelledBoxes2D(
+        "/seen", START + 15_000_000, "zed", np.ones((1, 4), np.float32), ("car",), row[0, :1], "zed"
+    )
+    late = [LateResult(boxes, START, np.eye(4), index=0) for boxes in (three, two)]
+    path = tmp_path / "drive.rrd"
+    with open_recording(SCENE, load(), save=path) as sinks:
+        logger = Logger(sinks.recording, load(), SCENE)
+        logger.log_static()
+        for index in range(40):
+            logger.log(make(index), late=late if index == 7 else ())
+    found = Recording(path)
+    for topic, at, kind in (("/late", 12, "Boxes3D"), ("/seen", 15, "Boxes2D")):
+        rows = found.rows[f"/robot{topic}"]
+        (shown,) = (row for row in rows if row.get(f"{kind}:half_sizes"))
+        assert (shown["frame"], shown["stamp"]) == (0, START + at * 1_000_000)
+        assert found.cleared(f"/robot{topic}") == {31}  # three seconds later nobody may think that it is new
 
 
 def test_times(record: Callable[..., Recording]) -> None:

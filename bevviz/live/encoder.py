@@ -15,7 +15,7 @@ import rerun.blueprint as rrb
 
 from bevviz.closing import Closing
 from bevviz.config import Config
-from bevviz.frame import FrameResult, Scene
+from bevviz.frame import FrameResult, LateResult, Scene
 from bevviz.logging import blueprints
 from bevviz.logging.logger import Context, Logger
 from bevviz.logging.sinks import APPLICATION
@@ -93,6 +93,7 @@ class Encoder:
         scene: Scene,
         health: Mapping[str, float],
         notes: Sequence[tuple[str, str]],
+        late: Sequence[LateResult] = (),
     ) -> Packet:
         """One frame, and with it whatever is new in the configuration or the scene."""
         config = result.config
@@ -106,7 +107,7 @@ class Encoder:
         if whole:
             self._whole = now
             self._logger.refresh()
-        self._logger.log(result, health, notes)
+        self._logger.log(result, health, notes, late)
         return Packet(self._stream.read(), whole, self._logger.context, now)
 
     def prelude(self, context: Context, *, blueprint: bool = True) -> bytes:

@@ -16,7 +16,7 @@ import numpy as np
 
 from bevviz.config import Config
 from bevviz.errors import UserError
-from bevviz.frame import Frame, FrameResult, Scene, Source
+from bevviz.frame import Frame, FrameResult, LateResult, Scene, Source
 from bevviz.live.control import Control
 from bevviz.live.encoder import Encoder
 from bevviz.live.files import Indexer, Saver
@@ -221,7 +221,8 @@ class Live:
         """Encode a frame once, for every output."""
         drops = {entities.drops(where): float(count) for where, count in self._drops().items()}
         health = self.health.scalars() | drops
-        packet = self._encoder.encode(result, self._source.scene, health, self.notes.take())
+        late = self._source.overtaken()
+        packet = self._encoder.encode(result, self._source.scene, health, self.notes.take(), late)
         for output in self._outputs:
             output.put(packet)
         self.flight.put(packet)
@@ -370,6 +371,11 @@ class Thinned:
     def dropped(self) -> int:
         """That the source itself has left out."""
         return int(getattr(self._source, "dropped", 0))
+
+    def overtaken(self) -> tuple[LateResult, ...]:
+        """The robot's own results that came too late for their frames, since the last call."""
+        overtaken = getattr(self._source, "overtaken", None)
+        return () if overtaken is None else tuple(overtaken())
 
     def stop(self) -> None:
         stop = getattr(self._source, "stop", None)

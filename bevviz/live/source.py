@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -12,7 +12,7 @@ from typing import Any
 from bevviz.closing import Closing
 from bevviz.config import Config, SourceConfig, stage_topics
 from bevviz.errors import UserError
-from bevviz.frame import Frame, Intrinsics, Scene
+from bevviz.frame import Frame, Intrinsics, LateResult, Scene
 from bevviz.ros.encode import typestore
 from bevviz.ros.graph import PublishedTopic, matched_qos, mismatches, published_topics
 from bevviz.ros.messages import MessageError, read_header
@@ -20,7 +20,7 @@ from bevviz.ros.node import Node
 from bevviz.ros.roles import Roles, Topic, find_roles
 from bevviz.ros.typesupport import message_type
 from bevviz.sync.feed import Handler, make_handlers
-from bevviz.sync.synchronizer import Synchronizer, blindness
+from bevviz.sync.synchronizer import OVERTAKEN, Synchronizer, blindness
 
 LOOK = 0.5  # seconds between two looks at the graph
 TICK = 0.05  # seconds between two looks at the clouds that have waited long enough
@@ -116,6 +116,7 @@ class LiveSource(Closing):
         self._handover = threading.Condition()
         self._frame: Frame | None = None
         self._frames = 0
+        self._numbers: deque[tuple[int, int]] = deque(maxlen=OVERTAKEN)  # stamp and index of the last frames
         self._ended = False
 
         self._node = Node(arguments, on_end=self.stop, name=name)
@@ -205,6 +206,16 @@ class LiveSource(Closing):
             blind = blindness(self.config, self.roles, report) if self._settled.is_set() else []
             return [*self._notes.values(), *lost, *damaged, *blind, *report.warnings()]
 
+    def overtaken(self) -> tuple[LateResult, ...]:
+        """The robot's own results that no frame has taken, since the last call; from any thread."""
+        with self._knowledge:
+            numbers = dict(self._numbers)
+            return tuple(
+                replace(late, index=numbers[late.frame_stamp])
+                for late in self._sync.overtaken()
+                if late.frame_stamp in numbers
+            )
+
     def __iter__(self) -> Iterator[Frame]:
         while True:
             with self._handover:
@@ -268,6 +279,7 @@ class LiveSource(Closing):
             with self._handover:
                 self.dropped += self._frame is not None
                 self._frame = replace(frame, index=self._frames)
+                self._numbers.append((frame.stamp, self._frames))
                 self._frames += 1
                 self._handover.notify()
 
@@ -286,6 +298,10 @@ class LiveSource(Closing):
             self._note(name, gone if topic is None else "", f"{name} is published again")
             unheard = "; ".join(mismatches(topic, subscription.qos)) if topic is not None else ""
             self._note(f"{name} quality", unheard, f"{name}: every publisher is received")
+        for topic in self._sync.report.overtaken:
+            self._note(
+                f"{topic} late", f"{topic} comes when its frame has gone on: shown at its own stamp", ""
+            )
         silent = self._settled.is_set() and time.monotonic() - self._last_cloud > SILENCE
         quiet = f"no cloud for {SILENCE:.0f} s on {', '.join(self.roles.lidars)}"
         self._note("silence", quiet if silent else "", "the clouds are back")
@@ -323,7 +339,8 @@ class LiveSource(Closing):
         self._note("roles", "", "the topics fit the configuration")
         if replace(roles, notes={}) != replace(self.roles, notes={}):
             self._changed = time.monotonic()
-            former, self._sync = self._sync, Synchronizer(roles, self.config)
+            results = {*roles.robot_detections_2d, *roles.robot_detections_3d} - set(stages.values())
+            former, self._sync = self._sync, Synchronizer(roles, self.config, beside=results)
             self._sync.take_over(former)
             self._handlers = make_handlers(self._sync, roles, LiveMessage.decode)
         self.roles = roles

@@ -11,7 +11,7 @@ import rerun as rr
 
 from bevviz.anomalies import Onsets
 from bevviz.config import Config
-from bevviz.frame import CameraResult, Frame, FrameResult, Intrinsics, Scene
+from bevviz.frame import CameraResult, Frame, FrameResult, Intrinsics, LateResult, Scene
 from bevviz.logging import entities
 from bevviz.logging.annotations import log_world
 from bevviz.logging.anomalies import log_anomalies, log_anomalies_looks
@@ -28,13 +28,15 @@ from bevviz.logging.clusters import log_clusters, log_clusters_looks
 from bevviz.logging.decisions import log_decisions
 from bevviz.logging.frustums import log_frustums
 from bevviz.logging.health import log_health
-from bevviz.logging.labelled import log_robot, log_truth, log_truth_looks
+from bevviz.logging.labelled import forget_late, log_late, log_robot, log_truth, log_truth_looks
 from bevviz.logging.objects import log_objects, log_objects_looks
 from bevviz.logging.origin import log_origin
 from bevviz.logging.pieces import transform
 from bevviz.logging.states import COLORS, StateLanes, states_of, track_states
 from bevviz.logging.tracks import Lanes, log_speeds, log_tracks, log_tracks_looks
 from bevviz.logging.writer import Writer
+
+STALE = 3_000_000_000  # nanoseconds that the newest late result of the robot is shown
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,6 +80,7 @@ class Logger(Writer):
         self._state_lanes = StateLanes(COLORS)
         self._onsets = Onsets()
         self._last: Frame | None = None
+        self._late: dict[str, int] = {}  # topic of the robot's results that come late -> stamp of the newest
 
     @property
     def context(self) -> Context:
@@ -125,6 +128,7 @@ class Logger(Writer):
         result: FrameResult,
         health: Mapping[str, float] = MappingProxyType({}),
         notes: Sequence[tuple[str, str]] = (),
+        late: Sequence[LateResult] = (),
     ) -> None:
         """Everything of one frame. What the frame before had and this one has not is cleared.
 
@@ -132,8 +136,12 @@ class Logger(Writer):
             result: the frame and what was made of it.
             health: further scalars, by entity.
             notes: further lines of the log: level and text.
+            late: what the robot has published since and belongs to frames before.
         """
         frame = result.frame
+        for found in late:
+            self._late[found.boxes.topic] = found.boxes.stamp
+            log_late(self, found, self._config.bev)
         self.begin(frame.index, frame.stamp, frame.received)
         self.put(entities.sensor(frame.lidar), transform(frame.pose))
         if not self.root:
@@ -166,6 +174,10 @@ class Logger(Writer):
                 self._log_intrinsics(camera.camera.name, camera.camera.intrinsics)
         log_truth(self, frame, config.bev)
         log_robot(self, frame, config.bev)
+        for topic, stamp in list(self._late.items()):
+            if frame.stamp - stamp > STALE:
+                del self._late[topic]
+                forget_late(self, topic)
 
     def _log_intrinsics(self, name: str, intrinsics: Intrinsics) -> None:
         """Where they are new."""
