@@ -152,6 +152,23 @@ def test_a_queue_hands_out_the_newest_items_and_counts_the_others(moves: list[bo
     assert queue.dropped == sum(moves) - taken - len(waiting)
 
 
+def test_what_comes_together_waits_and_who_is_behind_gets_the_newest() -> None:
+    queue: NewestQueue[int] = NewestQueue(3, catch_up=True)
+    items = iter(queue)
+    for number in range(0, 10, 2):  # pairs, for one who is quick
+        queue.put(number)
+        queue.put(number + 1)
+        assert (next(items), next(items)) == (number, number + 1)
+    assert queue.dropped == 0
+    taken = []
+    for number in range(10, 40):  # three come while one is worked on
+        queue.put(number)
+        if number % 3 == 0:
+            taken.append(next(items))
+    assert taken[1:] == [15, 18, 21, 24, 27, 30, 33, 36, 39]
+    assert queue.dropped == 30 - len(taken) - len(queue)
+
+
 def test_a_slow_pipeline_takes_the_newest_frame(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     whole = Session.perceive
 

@@ -54,6 +54,7 @@ from bevviz.frame import (
 )
 from bevviz.logging.cloud import quantised
 from bevviz.logging.entities import DEPTH_BINS, DEPTH_RANGE, TRACK_COLORS, ClassId
+from bevviz.logging.health import Rates
 from bevviz.logging.logger import Logger
 from bevviz.logging.sinks import open_recording
 from bevviz.logging.tracks import LANES, Lanes
@@ -507,6 +508,22 @@ def test_explanations_in_words_and_as_states(record: Callable[..., Recording]) -
     assert found.at["/explain/states/pipeline"]["StateChange:state"] == {0: ["ok"]}
 
 
+def test_rates_are_counted_over_a_second() -> None:
+    rates = Rates()
+    frame = make().frame
+    found = []
+    for index in range(40):  # two at a time, 60 ns apart, five times a second
+        at = START + index // 2 * 200_000_000 + index % 2 * 60
+        rates.add(dataclasses.replace(frame, stamp=at, received=at))
+        found.append(dict(rates))
+    assert found[1] == {}  # nothing is known of two
+    assert all(9 <= rate <= 12 for rates in found[4:] for rate in rates.values())
+    slow = Rates()
+    for index in range(3):  # every two seconds
+        slow.add(dataclasses.replace(frame, stamp=index * 2_000_000_000, received=0))
+    assert dict(slow) == {"sensor": 0.5}
+
+
 def test_health(record: Callable[..., Recording]) -> None:
     found = record([make(0), make(3)])
     value = {
@@ -740,7 +757,8 @@ def test_a_killed_process_leaves_what_it_had_logged(tmp_path: Path) -> None:
         import os, signal, time
         from pathlib import Path
         from bevviz.config import load
-        from bevviz.logging.logger import Logger
+        from bevviz.logging.health import Rates
+from bevviz.logging.logger import Logger
         from bevviz.logging.sinks import open_recording
         from tests.test_logging import SCENE, make
         with open_recording(SCENE, load(), save=Path({str(path)!r})) as sinks:

@@ -13,12 +13,14 @@ from bevviz.closing import Closing
 from bevviz.config import Config, SourceConfig, stage_topics
 from bevviz.errors import UserError
 from bevviz.frame import Frame, Intrinsics, LateResult, Scene
+from bevviz.queues import NewestQueue
 from bevviz.ros.encode import typestore
 from bevviz.ros.graph import PublishedTopic, matched_qos, mismatches, published_topics
 from bevviz.ros.messages import MessageError, read_header
 from bevviz.ros.node import Node
 from bevviz.ros.roles import Roles, Topic, find_roles
 from bevviz.ros.typesupport import message_type
+from bevviz.run import BURST
 from bevviz.sync.feed import Handler, make_handlers
 from bevviz.sync.synchronizer import OVERTAKEN, Synchronizer, blindness
 
@@ -73,8 +75,8 @@ class _Subscription:
 class LiveSource(Closing):
     """The frames of a robot, as they become complete, until ``stop``.
 
-    Messages are received, decoded and synchronised in a thread of their own. It hands over through a slot
-    for one frame: whoever iterates gets the newest one, and those that nobody came for are counted in
+    Messages are received, decoded and synchronised in a thread of their own. It hands over through a short
+    queue: whoever iterates gets the newest frames, and those that nobody came for are counted in
     ``dropped``. What has to be said meanwhile (a lost publisher, a new calibration) goes to ``tell``.
 
     Args:
@@ -101,7 +103,6 @@ class LiveSource(Closing):
         self.lost: Counter[str] = Counter()  # topic -> messages that the middleware could not deliver
         self.frame_ids: dict[str, str] = {}  # of each sensor topic's first message
         self.topics: dict[str, PublishedTopic] = {}  # all that others publish
-        self.dropped = 0  # frames that were overtaken by a newer one before anybody took them
         self._tell: Callable[[str], None] = tell or (lambda text: None)
         self._damaged: Counter[str] = Counter()
         self._first_damage: dict[str, str] = {}
@@ -113,8 +114,7 @@ class LiveSource(Closing):
         self._changed = self._last_cloud = time.monotonic()
         self._settled = threading.Event()
         self._knowledge = threading.RLock()  # of all that the receiving thread changes piece by piece
-        self._handover = threading.Condition()
-        self._frame: Frame | None = None
+        self._handover: NewestQueue[Frame] = NewestQueue(BURST, catch_up=True)
         self._frames = 0
         self._numbers: deque[tuple[int, int]] = deque(maxlen=OVERTAKEN)  # stamp and index of the last frames
         self._ended = False
@@ -131,9 +131,8 @@ class LiveSource(Closing):
 
     def stop(self) -> None:
         """End the iteration, from any thread."""
-        with self._handover:
-            self._ended = True
-            self._handover.notify_all()
+        self._ended = True
+        self._handover.close()
         self._settled.set()
 
     @property
@@ -148,6 +147,11 @@ class LiveSource(Closing):
     @property
     def middleware(self) -> str:
         return self._node.middleware
+
+    @property
+    def dropped(self) -> int:
+        """Frames that were overtaken by newer ones before anybody took them."""
+        return self._handover.dropped
 
     @property
     def tree(self) -> Mapping[str, str]:
@@ -217,14 +221,11 @@ class LiveSource(Closing):
             )
 
     def __iter__(self) -> Iterator[Frame]:
-        while True:
-            with self._handover:
-                self._handover.wait_for(lambda: self._ended or self._frame is not None)
-                frame, self._frame = self._frame, None
-            self._check()
-            if frame is None:
-                return
+        for frame in self._handover:
+            if self._ended:
+                break
             yield frame
+        self._check()
 
     def _check(self) -> None:
         """Raise here what ended the receiving thread."""
@@ -276,12 +277,9 @@ class LiveSource(Closing):
         for frame in frames:
             if not self._settled.is_set():
                 continue
-            with self._handover:
-                self.dropped += self._frame is not None
-                self._frame = replace(frame, index=self._frames)
-                self._numbers.append((frame.stamp, self._frames))
-                self._frames += 1
-                self._handover.notify()
+            self._numbers.append((frame.stamp, self._frames))
+            self._handover.put(replace(frame, index=self._frames))
+            self._frames += 1
 
     # --- the graph -----------------------------------------------------------------------------
 
@@ -298,10 +296,8 @@ class LiveSource(Closing):
             self._note(name, gone if topic is None else "", f"{name} is published again")
             unheard = "; ".join(mismatches(topic, subscription.qos)) if topic is not None else ""
             self._note(f"{name} quality", unheard, f"{name}: every publisher is received")
-        for topic in self._sync.report.overtaken:
-            self._note(
-                f"{topic} late", f"{topic} comes when its frame has gone on: shown at its own stamp", ""
-            )
+        for name in self._sync.report.overtaken:
+            self._note(f"{name} late", f"{name} comes when its frame has gone on: shown at its own stamp", "")
         silent = self._settled.is_set() and time.monotonic() - self._last_cloud > SILENCE
         quiet = f"no cloud for {SILENCE:.0f} s on {', '.join(self.roles.lidars)}"
         self._note("silence", quiet if silent else "", "the clouds are back")

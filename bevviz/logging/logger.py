@@ -27,7 +27,7 @@ from bevviz.logging.cloud import log_cloud, log_cloud_looks, log_ground, log_obs
 from bevviz.logging.clusters import log_clusters, log_clusters_looks
 from bevviz.logging.decisions import log_decisions
 from bevviz.logging.frustums import log_frustums
-from bevviz.logging.health import log_health
+from bevviz.logging.health import Rates, log_health
 from bevviz.logging.labelled import forget_late, log_late, log_robot, log_truth, log_truth_looks
 from bevviz.logging.objects import log_objects, log_objects_looks
 from bevviz.logging.origin import log_origin
@@ -80,6 +80,7 @@ class Logger(Writer):
         self._state_lanes = StateLanes(COLORS)
         self._onsets = Onsets()
         self._last: Frame | None = None
+        self._rates = Rates()
         self._late: dict[str, int] = {}  # topic of the robot's results that come late -> stamp of the newest
 
     @property
@@ -159,7 +160,8 @@ class Logger(Writer):
         log_decisions(self, result, notes)
         log_anomalies(self, result, self._onsets.of(result.anomalies))
         self._log_states(result)
-        log_health(self, result, self._last, health)
+        self._rates.add(frame)
+        log_health(self, result, self._last, self._rates, health)
         self.end()
         self._last = frame
 
