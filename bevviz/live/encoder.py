@@ -6,9 +6,11 @@ The bytes of consecutive frames, put behind a prelude, are a complete recording.
 from __future__ import annotations
 
 import os
+import threading
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from types import MappingProxyType
 
 import rerun as rr
 import rerun.blueprint as rrb
@@ -59,7 +61,7 @@ class _Stream(Closing):
 
 
 class Encoder:
-    """Turns results into packets. For one thread, but for ``prelude``.
+    """Turns results into packets. From any thread.
 
     Args:
         config: how the results are made.
@@ -77,6 +79,7 @@ class Encoder:
         self._stream = _Stream()
         self._logger = Logger(self._stream.recording, config, scene)
         self._whole = float("-inf")
+        self._lock = threading.Lock()
         self.recording_id: str = self._stream.recording.get_recording_id() or ""
         self.header = self._stream.read()  # behind it, packets alone are readable, without static data
 
@@ -94,8 +97,29 @@ class Encoder:
         health: Mapping[str, float],
         notes: Sequence[tuple[str, str]],
         late: Sequence[LateResult] = (),
+        states: Mapping[str, str] = MappingProxyType({}),
     ) -> Packet:
-        """One frame, and with it whatever is new in the configuration or the scene."""
+        """One frame, and with it whatever is new in the configuration or the scene; see ``Logger.log``."""
+        with self._lock:
+            return self._encode(result, scene, health, notes, late, states)
+
+    def encode_meanwhile(
+        self, seconds: float, notes: Sequence[tuple[str, str]], states: Mapping[str, str]
+    ) -> Packet:
+        """What is to be said while no frame comes; see ``Logger.log_meanwhile``."""
+        with self._lock:
+            self._logger.log_meanwhile(seconds, notes, states)
+            return Packet(self._stream.read(), False, self._logger.context, time.monotonic())
+
+    def _encode(
+        self,
+        result: FrameResult,
+        scene: Scene,
+        health: Mapping[str, float],
+        notes: Sequence[tuple[str, str]],
+        late: Sequence[LateResult],
+        states: Mapping[str, str],
+    ) -> Packet:
         config = result.config
         if (config, scene) != (self._config, self._scene):
             if scene != self._scene:
@@ -107,7 +131,7 @@ class Encoder:
         if whole:
             self._whole = now
             self._logger.refresh()
-        self._logger.log(result, health, notes, late)
+        self._logger.log(result, health, notes, late, states)
         return Packet(self._stream.read(), whole, self._logger.context, now)
 
     def prelude(self, context: Context, *, blueprint: bool = True) -> bytes:

@@ -18,7 +18,7 @@ from bevviz.config import Config
 from bevviz.errors import UserError
 from bevviz.frame import Frame, FrameResult, LateResult, Scene, Source
 from bevviz.live.control import Control
-from bevviz.live.encoder import Encoder
+from bevviz.live.encoder import Encoder, Packet
 from bevviz.live.files import Indexer, Saver
 from bevviz.live.flight import FlightRecorder
 from bevviz.live.health import Health, set_nice
@@ -94,7 +94,8 @@ class Live:
         self._changing = threading.Lock()
         self._over = threading.Event()
         self._asked_to_save = False
-        self._looked = 0.0
+        self._looked = self._logged = 0.0  # seconds, monotonic
+        self._states: dict[str, str] = {}  # of the topics, as logged while no frame came
         live = settings.config.live
 
         self._nice(live.nice)
@@ -206,6 +207,7 @@ class Live:
             self._reload()
         if jump := self.health.clock_jump():
             self.notes.warn(f"the clock of this machine has jumped by {jump:+.1f} s")
+        self._log_meanwhile()
         if self._shown is not self.config:
             self._shown = self.config
             self.on_change(self._shown)
@@ -221,15 +223,31 @@ class Live:
         """Encode a frame once, for every output."""
         drops = {entities.drops(where): float(count) for where, count in self._drops().items()}
         health = self.health.scalars() | drops
-        late = self._source.overtaken()
-        packet = self._encoder.encode(result, self._source.scene, health, self.notes.take(), late)
-        for output in self._outputs:
-            output.put(packet)
-        self.flight.put(packet)
+        late, states = self._source.overtaken(), self._topic_states()
+        notes, scene = self.notes.take(), self._source.scene
+        self._hand_out(self._encoder.encode(result, scene, health, notes, late, states))
+        self._logged = time.monotonic()
         self.health.logged(result.frame.received)
         self.frames += 1
         if reason := self._triggers.check(result):
             self._save_soon(reason)
+
+    def _log_meanwhile(self) -> None:
+        """What is said while no frame comes is in the log and in the lanes all the same."""
+        since, states = time.monotonic() - self._logged, self._topic_states()
+        if not self.frames or since < LOOK:
+            return
+        if (notes := self.notes.take()) or states != self._states:
+            self._states = states
+            self._hand_out(self._encoder.encode_meanwhile(since, notes, states))
+
+    def _hand_out(self, packet: Packet) -> None:
+        for output in self._outputs:
+            output.put(packet)
+        self.flight.put(packet)
+
+    def _topic_states(self) -> dict[str, str]:
+        return {entities.topic_state(topic): state for topic, state in self._source.states.items()}
 
     def _drops(self) -> dict[str, int]:
         drops = {"source": self._source.dropped, **self._dropping.dropped}
@@ -371,6 +389,11 @@ class Thinned:
     def dropped(self) -> int:
         """That the source itself has left out."""
         return int(getattr(self._source, "dropped", 0))
+
+    @property
+    def states(self) -> Mapping[str, str]:
+        """How each topic does, where the source has topics."""
+        return getattr(self._source, "states", {})
 
     def overtaken(self) -> tuple[LateResult, ...]:
         """The robot's own results that came too late for their frames, since the last call."""

@@ -125,6 +125,11 @@ def state(*lane: str) -> str:
     return "/".join((STATES, *lane))
 
 
+def topic_state(topic: str) -> str:
+    """Whether its messages come, and can be used."""
+    return f"{STATES}/topics{_topic(topic)}"
+
+
 def class_state(camera: str, class_name: str) -> str:
     """What became of the best detection of the class."""
     return state(camera, _part(class_name))

@@ -130,6 +130,7 @@ class Logger(Writer):
         health: Mapping[str, float] = MappingProxyType({}),
         notes: Sequence[tuple[str, str]] = (),
         late: Sequence[LateResult] = (),
+        states: Mapping[str, str] = MappingProxyType({}),
     ) -> None:
         """Everything of one frame. What the frame before had and this one has not is cleared.
 
@@ -138,6 +139,7 @@ class Logger(Writer):
             health: further scalars, by entity.
             notes: further lines of the log: level and text.
             late: what the robot has published since and belongs to frames before.
+            states: of further lanes, by entity.
         """
         frame = result.frame
         for found in late:
@@ -159,11 +161,23 @@ class Logger(Writer):
             log_grid(self, result, result.bev)
         log_decisions(self, result, notes)
         log_anomalies(self, result, self._onsets.of(result.anomalies))
-        self._log_states(result)
+        self._log_states(result, states)
         self._rates.add(frame)
         log_health(self, result, self._last, self._rates, health)
         self.end()
         self._last = frame
+
+    def log_meanwhile(
+        self, seconds: float, notes: Sequence[tuple[str, str]], states: Mapping[str, str]
+    ) -> None:
+        """What is to be said while no frame comes, ``seconds`` after the last one was received."""
+        if self._last is None:
+            return
+        later = round(seconds * 1e9)
+        last = self._last
+        self.set_time(last.index, last.stamp + later, last.received + later if last.received else 0)
+        self.lines(entities.EXPLAIN_LOG, notes)
+        self._state_lanes.log(self, {**self._state_lanes.states, **states})
 
     def _log_input(self, result: FrameResult) -> None:
         """What the sensors and the robot brought."""
@@ -207,8 +221,8 @@ class Logger(Writer):
         if self._config.logging.projected_points:
             log_projected_points(self, result)
 
-    def _log_states(self, result: FrameResult) -> None:
-        states = states_of(result)
+    def _log_states(self, result: FrameResult, more: Mapping[str, str]) -> None:
+        states = {**states_of(result), **more}
         rows = self._track_lanes.update(result.tracks)
         if result.tracks is not None:
             log_speeds(self, result.tracks, rows)

@@ -262,6 +262,7 @@ class Synchronizer:
         self._step = math.inf  # nanoseconds between the last two clouds; a gap is much longer
         self._partners: dict[str, _Track[Cloud]] = self._make_tracks(*roles.lidars[1:])
         self._images: dict[str, _Track[_Undecoded]] = self._make_tracks(*(c.topic for c in roles.cameras))
+        self._lidar_frames: dict[str, str] = {}  # cloud topic -> frame
         self._camera_frames: dict[str, str] = {}  # image topic -> optical frame
         self.intrinsics: dict[str, Intrinsics] = {}  # CameraInfo topic -> the newest
         self._infos: dict[str, _Track[Intrinsics]] = {}  # by topic
@@ -301,6 +302,7 @@ class Synchronizer:
             return
         stamp = self._arrived(cloud.topic, cloud.stamp, cloud.received)
         cloud = replace(cloud, stamp=stamp, name=self._lidar_name(cloud))
+        self._lidar_frames[cloud.topic] = cloud.frame_id.lstrip("/")
         self._check_units(cloud)
         self.report.clouds += 1
         if cloud.topic in self._partners:
@@ -450,6 +452,19 @@ class Synchronizer:
         )
         for group in groups:
             yield from group.items()
+
+    def lacking(self) -> Iterator[str]:
+        """What keeps frames from being whole so far, and may still come: calibrations and transforms."""
+        lidar = next(iter(self._lidar_frames.values()), "")
+        for camera in self._roles.cameras:
+            if camera.info_topic and camera.info_topic not in self.intrinsics:
+                yield f"no CameraInfo on {camera.info_topic} yet"
+            frame = self._camera_frames.get(camera.topic, "")
+            if self._roles.tf_static + self._roles.tf and frame and lidar and not self.tf.knows(lidar, frame):
+                yield f"no transform from '{lidar}' to '{frame}' yet"
+        moving = self._roles.tf or self._roles.odometry
+        if moving and lidar and not self._fixed(lidar)[0]:
+            yield f"no transform from '{lidar}' to a frame that stands still yet"
 
     # --- what goes out -------------------------------------------------------------------------
 
