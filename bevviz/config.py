@@ -23,6 +23,8 @@ from pydantic import (
     Field,
     PositiveFloat,
     ValidationError,
+    ValidationInfo,
+    field_validator,
 )
 from pydantic.fields import FieldInfo
 from pydantic_core import PydanticCustomError
@@ -194,6 +196,18 @@ class ClusteringConfig(StageSection):
     min_cluster_points: int = Field(10, ge=1, description="smaller clusters are set aside, with the reason")
     max_cluster_points: int | None = Field(None, ge=1, description="larger ones too; empty: no limit")
     boxes: Literal["oriented", "axis_aligned"] = Field("oriented", description="box used downstream")
+
+    @field_validator("max_cluster_points")
+    @classmethod
+    def _leaves_some(cls, most: int | None, info: ValidationInfo) -> int | None:
+        least = info.data.get("min_cluster_points", 1)
+        if most is not None and most < least:
+            raise PydanticCustomError(
+                "no_room",
+                "must not be below clustering.min_cluster_points, which is {least}",
+                {"least": least},
+            )
+        return most
 
 
 class DetectorConfig(StageSection):

@@ -28,6 +28,7 @@ from bevviz.live.settings import AT_START, Settings
 from bevviz.live.triggers import Triggers
 from bevviz.live.viewers import Viewer, remote, server, window
 from bevviz.logging import entities
+from bevviz.perceive import StageLoader
 from bevviz.run import Dropping, Observer, run
 from bevviz.session import Session
 
@@ -69,6 +70,8 @@ class Live:
         notes: what has to be said.
         observe: leave the pipeline off; only what the robot publishes is logged.
         on_result: called with each result in a thread of its own; when it is too slow the newest wins.
+        loader: has the detector's network already.
+        control: takes orders to save; None: one of its own.
 
     Raises:
         UserError: the detector's model, an output or the blueprint cannot be used.
@@ -83,8 +86,11 @@ class Live:
         *,
         observe: bool = False,
         on_result: Callable[[FrameResult], None] | None = None,
+        loader: StageLoader | None = None,
+        control: Control | None = None,
     ) -> None:
         self.notes = notes
+        self._control = control
         self.on_change: Callable[[Config], None] = lambda config: None  # called in the thread of ``run``
         self.urls: list[str] = []
         self.frames = 0  # logged
@@ -99,7 +105,7 @@ class Live:
         live = settings.config.live
 
         self._nice(live.nice)
-        self._session = Observing(settings.config) if observe else Session(settings.config)
+        self._session = Observing(settings.config) if observe else Session(settings.config, loader=loader)
         self._encoder = Encoder(self.config, source.scene, outputs.blueprint)
         self._indexer = Indexer()
         self._saves = ThreadPoolExecutor(1, "save")
@@ -171,7 +177,8 @@ class Live:
         with ExitStack() as stack:
             stack.callback(_handle, {number: signal.getsignal(number) for number in ENDING})
             stack.callback(self._close)
-            stack.enter_context(Control(self.save, self.notes.warn))
+            if self._control is None:
+                stack.enter_context(Control(self.save, self.notes.warn))
             stack.enter_context(self._signal())
             # A second Ctrl-C must not leave half a file or a viewer behind. Closing takes bounded time.
             stack.callback(_handle, dict.fromkeys(ENDING, signal.SIG_IGN))
@@ -216,6 +223,8 @@ class Live:
         for output in self._outputs:
             output.close()
         self._saves.shutdown()
+        if self._indexer.waiting:
+            self.notes.info("the recording gets its index; it is complete already")
         self._indexer.close()
         self._encoder.close()
 

@@ -49,6 +49,14 @@ class Settings:
         """
         return load(self.file, [*self._settings, *more], self._preset)
 
+    def take(self, more: Sequence[str]) -> None:
+        """More settings, before anything runs with them.
+
+        Raises:
+            UserError: one of them is wrong; nothing is changed.
+        """
+        self.keep(self.read(more), more)
+
     def keep(self, config: Config, more: Sequence[str] = ()) -> None:
         self.config = config
         self._settings += more

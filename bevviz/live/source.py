@@ -358,6 +358,11 @@ class LiveSource(Closing):
         if report.resets > self._clock_resets:
             watch.tell("the stamps of the clouds jumped back: a simulation or a bag that began anew")
             self._clock_resets = report.resets
+        twin = (
+            f"another node is called {self._node.node.get_fully_qualified_name()}: orders for one may reach "
+            f"the other; --ros-args -r __node:=bevviz_2 gives this one another name"
+        )
+        watch.note("name", "" if self._node.is_alone else twin, "no other node has the name of this one now")
         silent = self._complete and time.monotonic() - self._last_cloud > SILENCE
         quiet = f"no cloud for {SILENCE:.0f} s on {', '.join(self.roles.lidars)}"
         watch.note("silence", quiet if silent else "", "the clouds are back")
