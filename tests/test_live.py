@@ -24,9 +24,10 @@ from hypothesis import strategies as st
 from bevviz.anomalies import AnomalyDetector
 from bevviz.config import load
 from bevviz.errors import UserError
+from bevviz.files import lock
 from bevviz.frame import CameraResult, Decision, Detections, Frame, FrameResult, Fusion, Pairs, Scene
 from bevviz.live.encoder import WHOLE, Encoder, Packet
-from bevviz.live.files import Indexer, Saver
+from bevviz.live.files import Indexer, Saver, remove_leftovers
 from bevviz.live.notes import Notes
 from bevviz.live.replay import Replay
 from bevviz.live.runtime import Live, Outputs, thin
@@ -201,6 +202,57 @@ def test_a_slow_log_drops_results_and_holds_nobody_up(run: Run, monkeypatch: pyt
     assert drops["logging"] > 15
     assert outcome.live.frames + drops["logging"] + drops["incoming"] == 40
     assert len(seen) > 30
+
+
+class Stalled:
+    """Plays a replay, then only says how its topics do."""
+
+    def __init__(self, replay: Replay) -> None:
+        self._replay, self._over = replay, threading.Event()
+        self.scene, self.total, self.warnings = replay.scene, None, ()
+        self.states = {"/points": "ok"}
+
+    def stop(self) -> None:
+        self._over.set()
+
+    def __iter__(self) -> Iterator[Frame]:
+        yield from self._replay
+        self._over.wait()
+
+
+def test_what_is_said_while_no_frame_comes_is_logged(
+    run: Run, frames: list[Frame], drive: SyntheticSource
+) -> None:
+    source = Stalled(Replay(frames, drive.scene, rate=20, total=3))
+
+    def stall(live: Live) -> None:
+        wait_for(lambda: live.frames == 3)
+        source.states = {"/points": "silent"}
+        live.notes.warn("no cloud for 2 s on /points")
+        wait_for(lambda: not live.notes._waiting)
+        live.stop()
+
+    run(source=source, during=stall, save=Path("out.rrd"))
+    recording = Recording(Path("out.rrd"))
+    lanes = recording.rows["/explain/states/topics/points"]
+    assert [row["StateChange:state"] for row in lanes] == [["ok"], ["silent"]]
+    (line,) = (
+        row
+        for row in recording.rows["/explain/log"]
+        if row["TextLog:text"] == ["no cloud for 2 s on /points"]
+    )
+    last = recording.rows["/explain"][-1]
+    assert line["frame"] == last["frame"]
+    assert line["stamp"] - last["stamp"] == line["received"] - last["received"] > 900_000_000
+
+
+def test_leftover_indexes_are_removed_and_those_in_work_are_not(tmp_path: Path) -> None:
+    left, work = tmp_path / "a.rrd.part", tmp_path / "b.rrd.part"
+    left.write_bytes(b"half")
+    with work.open("wb") as file:
+        lock(file.fileno(), "taken")
+        remove_leftovers(tmp_path)
+    assert not left.exists() and work.exists()
 
 
 def test_a_steady_run_logs_every_frame_with_its_health(run: Run) -> None:

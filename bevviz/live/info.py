@@ -28,8 +28,15 @@ class LiveInfo(Contents):
     seconds: float  # that were listened for
 
 
-def describe(config: Config, arguments: Sequence[str] = (), seconds: float = LISTEN) -> LiveInfo:
+def describe(
+    config: Config,
+    arguments: Sequence[str] = (),
+    seconds: float = LISTEN,
+    patience: float = PATIENCE,
+) -> LiveInfo:
     """Listen to the graph for ``seconds``, counted from when the topics have their roles. Ctrl-C ends it.
+
+    After ``patience`` seconds what is there by then is shown.
 
     Raises:
         UserError: no working rclpy, or arguments that it refuses.
@@ -37,7 +44,7 @@ def describe(config: Config, arguments: Sequence[str] = (), seconds: float = LIS
     # Under a name of its own: what another bevviz publishes is shown, too.
     with LiveSource(config, arguments=arguments, name="bevviz_info") as source:
         with suppress(KeyboardInterrupt):
-            source.wait(PATIENCE)
+            source.wait(patience)
         before, volume = source.received, source.volume
         start = time.monotonic()
         frame = _last_frame(source, seconds)
