@@ -98,13 +98,12 @@ def _live(options: argparse.Namespace) -> int:
         own_address(options.bind)  # before a robot is waited for
         check_port(options.serve)
     notes = Notes(say)
-    with terminable():
-        if options.synthetic:
-            return _watch(_replay(options.synthetic), settings, options, notes)
-        from bevviz.live.source import LiveSource
+    if options.synthetic:
+        return _watch(_replay(options.synthetic), settings, options, notes)
+    from bevviz.live.source import LiveSource
 
-        with LiveSource(settings.config, arguments=options.ros_args, tell=notes.info) as source:
-            return _watch_robot(source, settings, options, notes)
+    with LiveSource(settings.config, arguments=options.ros_args, tell=notes.info) as source:
+        return _watch_robot(source, settings, options, notes)
 
 
 def _watch_robot(source: LiveSource, settings: Settings, options: argparse.Namespace, notes: Notes) -> int:
@@ -113,12 +112,12 @@ def _watch_robot(source: LiveSource, settings: Settings, options: argparse.Names
     from bevviz.ros.publish import Publisher
 
     shown = ""
-    with suppress(KeyboardInterrupt):
+    with suppress(KeyboardInterrupt), terminable() as ended:
         while not source.wait(1.0):
             if source.missing != shown:
                 shown = source.missing
                 say(f"waiting: {shown}")
-    if not source.wait(0):
+    if ended.is_set():
         return 1
     publisher = Publisher(source.node, settings.config, notes.warn) if options.publish else None
 
@@ -171,7 +170,11 @@ def _watch(
         say(f"viewer at {url}")
     if unsaid and not window:
         say("no display: 'bevviz snap' saves the last seconds, --serve shows them in a browser")
-    with suppress(KeyboardInterrupt), tqdm(unit="frame", desc=source.scene.name, disable=None) as bar:
+    with (
+        suppress(KeyboardInterrupt),
+        terminable(),
+        tqdm(unit="frame", desc=source.scene.name, disable=None) as bar,
+    ):
 
         def show(status: Status) -> None:
             bar.set_postfix_str(f"{1e3 * status.p50:.0f} ms, {sum(status.drops.values())} dropped", False)
