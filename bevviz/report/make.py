@@ -138,7 +138,7 @@ def make(request: ReportRequest) -> WrittenReport:
         info = _info(request, window, written, made_with, bag)
         recording.send_property("report", rr.AnyValues(about=info.dump()))
         recording.log(entities.REPORT, document(facts.markdown()), static=True)
-    save(html, page(facts, summary), "-o")
+    save(html, page(facts, summary, file_hash(rrd)), "-o")
     written.files.insert(1, html)
     return written
 
