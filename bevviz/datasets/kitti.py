@@ -9,7 +9,7 @@ import numpy as np
 
 from bevviz import geometry
 from bevviz.errors import UserError
-from bevviz.frame import F64, Boxes3D, LabelledBoxes3D
+from bevviz.frame import F64, Boxes3D, ImageLabels, LabelledBoxes3D
 
 # What a detector of COCO's classes may rightly call them.
 ACCEPTED = {
@@ -38,23 +38,32 @@ def label_files(path: Path) -> Sequence[Path]:
 def read_labels(file: Path) -> LabelledBoxes3D:
     """The labelled objects in the frame of the LiDAR, with the calibration of the same number beside them.
 
-    The file is ``label_2/NUMBER.txt`` and the calibration ``calib/NUMBER.txt``. ``DontCare`` is left out.
+    The file is ``label_2/NUMBER.txt`` and the calibration ``calib/NUMBER.txt``. Of ``DontCare`` the region
+    in the image is kept.
 
     Raises:
         UserError: a file cannot be read, or is none of KITTI's.
     """
     calibration = file.parent.parent / "calib" / file.name
     lidar_from_camera = geometry.inverse(_camera_from_lidar(calibration))
-    labels, rows = [], []
+    labels, rows, dont_care = [], [], []
     for number, line in enumerate(_read(file).splitlines(), 1):
         kind, *values = line.split()
-        if kind not in ACCEPTED:
+        if kind not in ACCEPTED and kind != "DontCare":
             continue
         if len(values) < 14:
             raise UserError(f"{file}: line {number} has {len(values)} numbers, a KITTI label has 14")
+        try:
+            row = [float(value) for value in values[:14]]
+        except ValueError:
+            raise UserError(f"{file}: line {number} has something that is no number") from None
+        if kind == "DontCare":
+            dont_care.append(row[3:7])
+            continue
         labels.append(kind)
-        rows.append([float(value) for value in values[7:14]])
-    height, width, length, x, y, z, turn = np.array(rows, np.float64).reshape(-1, 7).T
+        rows.append(row)
+    table = np.array(rows, np.float64).reshape(-1, 14)
+    height, width, length, x, y, z, turn = table[:, 7:].T
     # A location is the middle of the bottom, in the reference camera: x right, y down, z forward.
     center = geometry.apply(lidar_from_camera, np.column_stack([x, y - height / 2, z]))
     # The heading is (cos, 0, -sin) there.
@@ -66,7 +75,14 @@ def read_labels(file: Path) -> LabelledBoxes3D:
         np.column_stack([length, width, height]).astype(np.float32),
         np.arctan2(heading[:, 1], heading[:, 0]).astype(np.float32),
     )
-    return LabelledBoxes3D(str(file), 0, "", boxes, tuple(labels), np.ones(len(labels), np.float32))
+    image = ImageLabels(
+        table[:, 3:7].astype(np.float32),
+        table[:, 0].astype(np.float32),
+        table[:, 1].astype(np.int32),
+        np.array(dont_care, np.float32).reshape(-1, 4),
+    )
+    ones = np.ones(len(labels), np.float32)
+    return LabelledBoxes3D(str(file), 0, "", boxes, tuple(labels), ones, image=image)
 
 
 def _camera_from_lidar(calibration: Path) -> F64:
