@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 
@@ -15,9 +16,15 @@ from bevviz.frame import Bool, Boxes3D, Camera, Frame, ImageLabels, LabelledBoxe
 from bevviz.ros.roles import Roles
 from bevviz.stages.robot import in_points_frame
 
+if TYPE_CHECKING:
+    from bevviz.drive import Frames
+
 MIN_HITS = 10  # LiDAR points on an object that must be found
 MAX_DISTANCE = 2.0  # metres between the centres, on the ground plane, of a box and its object
 RANGE = 40.0  # metres
+
+
+Truths: TypeAlias = "Callable[[Frame], Truth | None]"
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,13 +50,11 @@ class Truth:
         uv, _ = geometry.project(seen, self.camera.intrinsics)
         low, high = self.image.dont_care[:, :2], self.image.dont_care[:, 2:]
         with np.errstate(invalid="ignore"):
-            inside: Bool = ((uv[:, None] >= low) & (uv[:, None] <= high)).all(axis=2)
-        return np.asarray(inside.any(axis=1))
+            inside = ((uv[:, None] >= low) & (uv[:, None] <= high)).all(axis=2)
+        return np.asarray(np.any(inside, axis=1), bool)
 
 
-def truth_source(
-    roles: Roles, topic: str | None, kitti: Path | None, scans: int
-) -> Callable[[Frame], Truth | None] | None:
+def truth_source(roles: Roles, topic: str | None, kitti: Path | None, scans: int) -> Truths | None:
     """Where the truth of each frame comes from; None: there is none.
 
     Args:
@@ -70,8 +75,7 @@ def truth_source(
             )
 
         def of_kitti(frame: Frame) -> Truth | None:
-            labelled = read_labels(files[frame.index])
-            return truth_of(frame, labelled, [ACCEPTED[label] for label in labelled.labels])
+            return truth_of(frame, read_labels(files[frame.index]))
 
         return of_kitti
     there = (*roles.robot_detections_3d, *([roles.truth] if roles.truth else []))
@@ -90,9 +94,35 @@ def truth_source(
     return published
 
 
-def truth_of(
-    frame: Frame, labelled: LabelledBoxes3D, accepted: Sequence[frozenset[str]] | None = None
-) -> Truth:
+def truth_in(frames: Frames, topic: str | None = None, kitti: Path | None = None) -> Truths:
+    """Where the truth of a drive's frames comes from.
+
+    Args:
+        frames: a bag, or frames that come with their own truth.
+        topic, kitti: as of ``truth_source``.
+
+    Raises:
+        UserError: as of ``truth_source``, and where there is no truth.
+    """
+    roles: Roles | None = getattr(frames, "roles", None)
+    if roles is None and (topic or kitti):
+        option = f"--truth {topic}" if topic else f"--kitti-labels {kitti}"
+        raise UserError(f"{option}: {frames.scene.name} has its own truth, leave it out")
+    if roles is None:
+        if not frames.scene.truth:
+            raise UserError(f"{frames.scene.name}: there is no ground truth")
+        return lambda frame: None if frame.truth is None else truth_of(frame, frame.truth)
+    found = truth_source(roles, topic, kitti, len(frames.scans))
+    if found is None:
+        there = ", ".join(roles.robot_detections_3d) or "none"
+        raise UserError(
+            f"{frames.scene.name}: no .../ground_truth in it; give --truth TOPIC (Detection3DArray there: "
+            f"{there}) or --kitti-labels"
+        )
+    return found
+
+
+def truth_of(frame: Frame, labelled: LabelledBoxes3D) -> Truth:
     """Labelled boxes as truth for a frame.
 
     An object must be found if its centre lies within 40 m and in the image of some camera, where there is
@@ -100,20 +130,22 @@ def truth_of(
 
     Args:
         frame: the frame.
-        labelled: boxes, in any frame whose pose they come with.
-        accepted: names that are right for each box, in lower case; default: its label alone.
+        labelled: boxes, in any frame whose pose they come with. KITTI's labels accept the names that
+            detectors of COCO's classes have for them, others their own alone.
     """
     boxes = in_points_frame(frame, labelled)
     must = (np.hypot(*boxes.center[:, :2].T) <= RANGE) & _in_view(frame, boxes)
     must[must] = [
         geometry.inside(frame.points, boxes, k).sum() >= MIN_HITS for k in np.flatnonzero(must).tolist()
     ]
-    own = [frozenset((label.lower(),)) for label in labelled.labels]
+    accepted = {label: frozenset((label.lower(),)) for label in labelled.labels}
+    if labelled.image is not None:
+        accepted |= ACCEPTED
     camera = next((camera for camera in frame.cameras if _can_see(camera)), None)
     return Truth(
         boxes,
         labelled.labels,
-        tuple(accepted if accepted is not None else own),
+        tuple(accepted[label] for label in labelled.labels),
         must,
         labelled.ids,
         labelled.image,
