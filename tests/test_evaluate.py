@@ -11,6 +11,7 @@ from xml.etree import ElementTree
 
 import cv2
 import numpy as np
+import pyarrow.parquet as pq
 import pytest
 
 import bevviz
@@ -308,3 +309,28 @@ def test_real_frames(shared: Path, capsys: Capture) -> None:
     said = capsys.readouterr()
     assert "12 frames; 28 objects had to be found" in said.out
     assert "car, moderate" in said.out
+
+
+# --- many bags ---------------------------------------------------------------------------------
+
+
+def test_a_batch_is_held_to_the_truth(
+    drive: Path, evaluated: Evaluation, tmp_path: Path, capsys: Capture
+) -> None:
+    runs, junit = tmp_path / "runs", tmp_path / "ci.xml"
+    command = ["batch", str(drive), "-o", str(runs), "--model", "demo", "--junit", str(junit)]
+    assert main([*command, "--min", "recall=0.1"]) == 2
+    assert "--min, --max and --junit: held to what? Give --truth" in capsys.readouterr().err
+    assert main([*command, "--truth", "--min", "recall=0.1"]) == 0
+    rows = pq.read_table(runs / "summary.parquet").to_pylist()
+    assert sum(row["missed"] for row in rows) == evaluated.metrics["missed"]
+    missed = [text for row in rows for text in row["remarks"] if text.startswith("missed ")]
+    assert len(missed) == evaluated.metrics["missed"]
+    assert f"{evaluated.metrics['recall']:.3f}</td>" in (runs / "summary.html").read_text()
+    assert ElementTree.parse(junit).getroot()[0].get("failures") == "0"
+    # The same results, another limit: nothing is run again.
+    assert main([*command, "--truth", "--min", "recall=0.999"]) == 1
+    said = capsys.readouterr().err
+    assert "1 of 1 bags are complete and up to date" in said
+    assert "drive: not kept: recall is 0." in said
+    assert ElementTree.parse(junit).getroot()[0].get("failures") == "1"

@@ -120,7 +120,7 @@ def _report(evaluation: Evaluation, limits: list[Limit], options: argparse.Names
         gate = [{"limit": str(k.limit), "kept": not k.reason, "reason": k.reason} for k in kept]
         evaluation.write_json(options.json, {"limits": gate})
     if options.junit is not None:
-        write_junit(options.junit, {options.paths[0].stem: kept})
+        write_junit(options.junit, {options.paths[0].resolve().stem: kept})
     for found in kept:
         if found.reason:
             say(f"not kept: {found.reason}")

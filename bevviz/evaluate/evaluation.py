@@ -166,6 +166,11 @@ class Evaluation(Observer[FrameResult]):
         return {f"{c}.{d}" if d else c: number for (c, d), number in labels.items()}
 
     @property
+    def now(self) -> Mapping[str, Any]:
+        """``true``, ``missed`` and ``false`` of the frame that was seen last, in words."""
+        return self._frame(self.judged[-1])
+
+    @property
     def worst(self) -> list[dict[str, Any]]:
         """Frames in which something was missed or false, most of that first."""
         frames = [self._frame(frame) for frame in self.judged]

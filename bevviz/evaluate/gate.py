@@ -82,7 +82,7 @@ def _kept(limit: Limit, metrics: Mapping[str, float]) -> Kept:
     return Kept(limit, value, "" if kept else f"{limit.metric} is {value:.4g}, asked for {limit}")
 
 
-def write_junit(path: Path, suites: Mapping[str, Sequence[Kept] | str]) -> None:
+def write_junit(path: Path, suites: Mapping[str, list[Kept] | str]) -> None:
     """A test suite for each drive, a test case for each limit.
 
     Args:

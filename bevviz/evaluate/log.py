@@ -51,12 +51,8 @@ class EvaluationRecorder(Observer[FrameResult]):
             self._boxes(result, "true", objects.boxes, np.flatnonzero(matches.true).tolist(), objects.names)
             self._boxes(result, "false", objects.boxes, false, objects.names)
         self._boxes(result, "missed", truth.boxes, np.flatnonzero(matches.missed).tolist(), truth.labels)
-        said = self._evaluation.judged[-1]
-        words = {
-            "missed": said.missed,
-            "false": tuple(text for name, text in said.false if name in names),
-            "true": said.true,
-        }
+        said = self._evaluation.now
+        words = {what: said[what] for what in ("missed", "false", "true")}
         for what, texts in words.items():
             writer.scalar(entities.judged_count(what), float(len(texts)))
         writer.put(entities.EVALUATE, document(_page(frame.index, truth, words)))
@@ -82,7 +78,7 @@ class EvaluationRecorder(Observer[FrameResult]):
         self._writer.close()
 
 
-def _page(index: int, truth: Truth, words: dict[str, tuple[str, ...]]) -> str:
+def _page(index: int, truth: Truth, words: dict[str, Sequence[str]]) -> str:
     lines = [f"### Frame {index}", "", f"{int(truth.must.sum())} objects had to be found"]
     for what, texts in words.items():
         if texts:
