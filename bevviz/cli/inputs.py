@@ -15,6 +15,7 @@ WRITTEN = {
     "output": "-o",
     "csv": "--csv",
     "json": "--json",
+    "junit": "--junit",
     "write": "--write",
     "bag": "--bag",
 }
