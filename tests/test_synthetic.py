@@ -176,7 +176,7 @@ def test_the_bag_holds_what_the_source_gives(tmp_path: Path) -> None:
         strict=True,
     ):
         names = [f.name for f in cloud.fields]
-        assert names == ["x", "y", "z", "intensity", "ring", "time"]
+        assert names == ["x", "y", "z", "intensity", "ring", "time", "label"]
         kinds = {4: "<u2", 7: "<f4"}
         layout: dict[str, Any] = {
             "names": names,

@@ -18,6 +18,7 @@ from bevviz.cli import (
     compare,
     config,
     demo,
+    evaluate,
     info,
     interrupts,
     live,
@@ -44,6 +45,7 @@ EPILOG = """examples:
   bevviz report drive.mcap --at 12.5          a bug report that stands on its own
   bevviz compare drive.mcap --model yolo11n.onnx --set-b clustering.eps=0.8   what if?
   bevviz sweep drive.mcap --model yolo11n.onnx --set clustering.eps=0.3:0.9:0.1   which value?
+  bevviz evaluate drive.mcap --model yolo11n.onnx --min recall=0.8                how right? a gate for CI
   bevviz tune drive.mcap --at 12.5 --model yolo11n.onnx --config my.yaml          run at each save
   bevviz batch bags/ -o runs                  many bags, and the worst frames of all of them
   bevviz live --model yolo11n.onnx --serve    the same beside a running robot, in a browser
@@ -119,6 +121,7 @@ def _parser() -> tuple[argparse.ArgumentParser, Collection[str]]:
         info,
         why,
         compare,
+        evaluate,
         sweep,
         tune,
         calib,

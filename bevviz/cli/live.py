@@ -106,13 +106,12 @@ def _live(options: argparse.Namespace) -> int:
     if not options.observe:
         loader.load(settings.config)
     notes = Notes(say)
-    with terminable():
-        if options.synthetic:
-            return _watch(_replay(options.synthetic), settings, options, notes, loader)
-        from bevviz.live.source import LiveSource
+    if options.synthetic:
+        return _watch(_replay(options.synthetic), settings, options, notes, loader)
+    from bevviz.live.source import LiveSource
 
-        with LiveSource(settings.config, arguments=options.ros_args, tell=notes.info) as source:
-            return _watch_robot(source, settings, options, notes, loader)
+    with LiveSource(settings.config, arguments=options.ros_args, tell=notes.info) as source:
+        return _watch_robot(source, settings, options, notes, loader)
 
 
 def _check_outputs(options: argparse.Namespace) -> None:
@@ -159,13 +158,13 @@ def _watch_robot(
         orders = Orders(source.node, settings.config, take, refuse)
         orders.config = settings.config
         shown = ""
-        with suppress(KeyboardInterrupt):
+        with suppress(KeyboardInterrupt), terminable() as ended:
             while not source.wait(1.0):
                 missing = source.missing
                 if missing and missing != shown:
                     shown = missing
                     say(f"waiting: {shown}")
-        if not source.wait(0):
+        if ended.is_set():
             return 1
         publisher = Publisher(source.node, settings.config, notes.warn) if options.publish else None
 
@@ -231,7 +230,11 @@ def _watch(
         say(f"viewer at {url}")
     if unsaid and not window:
         say("no display: 'bevviz snap' saves the last seconds, --serve shows them in a browser")
-    with suppress(KeyboardInterrupt), tqdm(unit="frame", desc=source.scene.name, disable=None) as bar:
+    with (
+        suppress(KeyboardInterrupt),
+        terminable(),
+        tqdm(unit="frame", desc=source.scene.name, disable=None) as bar,
+    ):
 
         def show(status: Status) -> None:
             bar.set_postfix_str(f"{1e3 * status.p50:.0f} ms, {sum(status.drops.values())} dropped", False)

@@ -49,7 +49,7 @@ def _open(options: argparse.Namespace) -> int:
         raise UserError(
             f"the workbench needs further packages ({error.name}): pip install 'bevviz[workbench]'"
         ) from None
-    with terminable(), _bench(options) as bench:
+    with _bench(options) as bench:
         hint(bench.drive.scene, bench.drive.config)
         warn(bench.drive.warnings)
 
@@ -61,7 +61,7 @@ def _open(options: argparse.Namespace) -> int:
                 webbrowser.open(address)
             say("open until Ctrl-C; only this machine can reach it")
 
-        with suppress(KeyboardInterrupt):  # the way to end it
+        with suppress(KeyboardInterrupt), terminable():  # the way to end it
             serve(bench, options.port, ready)
     return 0
 

@@ -33,7 +33,7 @@ from bevviz.run import Dropping, Observer, run
 from bevviz.session import Session
 
 LOOK = 1.0  # seconds between two looks at the configuration file and the clock
-ENDING = (signal.SIGINT, signal.SIGTERM)
+ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 @dataclass(frozen=True, slots=True)

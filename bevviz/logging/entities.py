@@ -49,6 +49,9 @@ COMPARE_ABOUT = "/compare/about"
 COMPARE_LOG = "/compare/log"
 COMPARE_STATES = "/compare/states"
 CALIB = "/calib"
+EVALUATE = "/evaluate"
+EVALUATE_ABOUT = "/evaluate/about"
+EVALUATE_LOG = "/evaluate/log"
 
 # Names that no sensor can have, as they are something else where it has its entities.
 RESERVED = frozenset(
@@ -155,6 +158,15 @@ def difference_count(change: str) -> str:
 
 def difference_state(class_name: str) -> str:
     return f"{COMPARE_STATES}/{_part(class_name)}"
+
+
+def judged(what: str) -> str:
+    """Objects that are true, false or missed."""
+    return f"{EVALUATE}/objects/{what}"
+
+
+def judged_count(what: str) -> str:
+    return f"{EVALUATE}/count/{what}"
 
 
 def sweep(metric: str) -> str:

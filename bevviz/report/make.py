@@ -8,17 +8,19 @@ from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
 from contextlib import ExitStack
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 
 import rerun as rr
 from tqdm import tqdm
 
+from bevviz import remains
 from bevviz.bags.reader import megabytes
 from bevviz.bags.recording import RawMessage
 from bevviz.bags.source import MARGIN, BagSource
 from bevviz.config import Config, changes, load
 from bevviz.errors import UserError
-from bevviz.files import claim, unfinished
+from bevviz.files import claim, save, unfinished
 from bevviz.files import written as write_beside
 from bevviz.frame import Camera, Detections, Frame, FrameResult
 from bevviz.logging import entities
@@ -109,14 +111,20 @@ def make(request: ReportRequest) -> WrittenReport:
         detect = None if found is None else replay(found)
         session = Session(request.config, detect)
         part = _cut(whole, window, topics, bag, redactor)
+        remains.remember(bag, partial(bag.unlink, missing_ok=True))  # alone it is no report
+        stack.callback(remains.forget, bag)
         written.files.append(bag)
         written.warnings += [*whole.recording.warnings, *part.left_out, *(redactor.notes if redactor else ())]
         if model is not None:
-            written.files.append(Path(shutil.copyfile(model, rrd.with_name(model.name))))
+            beside = rrd.with_name(model.name)
+            with write_beside(beside, "model") as given:
+                shutil.copyfile(model, given.path)
+            written.files.append(beside)
 
         public = shareable(request.config)
         source = stack.enter_context(open_window([bag], request.config, window.low, window.high))
         sinks = stack.enter_context(open_recording(whole.scene, public, save=rrd, blueprint="bug_report"))
+        remains.forget(bag)
         recording = sinks.recording
         written.files.insert(0, rrd)
         summary = WindowSummary(window.at, source.total, len(whole.scene.cameras))
@@ -130,11 +138,7 @@ def make(request: ReportRequest) -> WrittenReport:
         info = _info(request, window, written, made_with, bag)
         recording.send_property("report", rr.AnyValues(about=info.dump()))
         recording.log(entities.REPORT, document(facts.markdown()), static=True)
-    with write_beside(html, "page") as given:
-        try:
-            given.path.write_text(page(facts, summary), encoding="utf-8")
-        except OSError as error:
-            raise UserError(f"{html}: cannot write the page: {error.strerror}") from None
+    save(html, page(facts, summary, file_hash(rrd)), "-o")
     written.files.insert(1, html)
     return written
 

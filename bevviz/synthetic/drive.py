@@ -28,7 +28,7 @@ from bevviz.frame import (
 )
 from bevviz.synthetic import faults
 from bevviz.synthetic.mesh import Material
-from bevviz.synthetic.sensors import Caster, Lidar, PinholeCamera, View, optical
+from bevviz.synthetic.sensors import Caster, Lidar, PinholeCamera, Scan, View, optical
 from bevviz.synthetic.world import World, bounds
 
 LIDAR_TOPIC = "/rslidar_points"
@@ -45,6 +45,10 @@ IMAGE_DELAY = 12_000_000  # nanoseconds from a scan to its image
 LATENCY = 8_000_000  # nanoseconds from a stamp to its reception
 TRUTH_RANGE = 80.0  # metres
 GROUND = (Material.ROAD, Material.PAVEMENT, Material.KERB, Material.GRASS)
+# SemanticKITTI's numbers (Behley et al. 2019), in the field 'label' of the points.
+SCENERY_LABELS = {Material.ROAD: 40, Material.PAVEMENT: 48, Material.KERB: 49, Material.GRASS: 72}
+OBJECT_LABELS = {"car": 10, "person": 30, "cyclist": 31}
+OTHER_STRUCTURE, OTHER_OBJECT = 52, 99
 
 
 @dataclass(frozen=True, slots=True)
@@ -193,6 +197,7 @@ class SyntheticSource:
         picture = self._camera.picture(seen, map_from_lens, self.world.light, rng)
 
         fields: dict[str, NDArray[Any]] = {"intensity": scan.intensity, "ring": scan.ring, "time": scan.time}
+        fields["label"] = self._labels(scan)
         cloud = Cloud(stamp, LIDAR_FRAME, scan.xyz, fields, LIDAR_TOPIC, stamp + LATENCY, name=LIDAR_FRAME)
         image = Image(shot, CAMERA_FRAME, picture.bgr, topic=IMAGE_TOPIC, received=shot + LATENCY)
         camera = Camera(
@@ -227,6 +232,15 @@ class SyntheticSource:
         ground = np.isin(scan.material, GROUND)
         return Snapshot(frame, numbers, hits.astype(np.int32), scan.object, ground, picture.object)
 
+    def _labels(self, scan: Scan) -> NDArray[np.uint16]:
+        """(N,) what each point is of."""
+        scenery = np.full(len(Material), OTHER_STRUCTURE, np.uint16)
+        for material, number in SCENERY_LABELS.items():
+            scenery[material] = number
+        kinds = [OBJECT_LABELS.get(actor.label, OTHER_OBJECT) for actor in self.world.actors]
+        of_object = np.array([0, *kinds], np.uint16)
+        return np.where(scan.object > 0, of_object[scan.object], scenery[scan.material])
+
     def _truth(self, stamp: int, time: float, map_from_lidar: F64) -> tuple[LabelledBoxes3D, I32]:
         """Tight boxes, upright in the LiDAR's frame, around every actor in range, hidden or not."""
         lidar_from_map = geometry.inverse(map_from_lidar)
@@ -248,5 +262,6 @@ class SyntheticSource:
             np.ones(len(objects), np.float32),
             map_from_lidar,
             stamp + LATENCY,
+            ids=tuple(str(actor.number) for actor, _, _ in objects),
         )
         return truth, np.array([actor.number for actor, _, _ in objects], np.int32)
