@@ -414,9 +414,9 @@ def test_wrong_input(turned: Path, capsys: Capture) -> None:
         (["loose"], "no frame to calibrate with: no transform from"),
         ([turned, "--camera", "left"], "there is no such camera; there are zed"),
         ([turned, "--write", "fixed.txt"], "ends in .yaml"),
-        ([turned, "--write", "nowhere/fixed.yaml"], "nowhere/fixed.yaml: there is no folder nowhere"),
+        (
             [turned, "--write", "nowhere/fixed.yaml", "--frames", ":1"],
-            "--write nowhere/fixed.yaml: there is no folder nowhere",
+            "nowhere/fixed.yaml: there is no folder nowhere",
         ),
         (["nothing.mcap"], "nothing.mcap"),
     ):
