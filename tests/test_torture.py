@@ -50,7 +50,7 @@ def test_what_counts_as_false_or_unreadable(tmp_path: Path, monkeypatch: pytest.
     assert kill._falsehood(tmp_path, bag, 0, "") == "and not all that it should be"
     assert kill._falsehood(tmp_path, check, 0, f"{kill.SCANS} frames: the same in every bit") == ""
     assert kill._falsehood(tmp_path, check, 0, "1 of 40 frames differ")
-    assert kill._falsehood(tmp_path, check, 130, "1 of 40 frames differ")
+    assert kill._falsehood(tmp_path, check, 130, "1 of 40 frames differ, first frame 3")
     assert kill._falsehood(tmp_path, bag, 3, "") and not kill._falsehood(tmp_path, bag, 130, "")
     assert not kill._falsehood(tmp_path, bag, -signal.SIGINT, "")
     monkeypatch.setattr(kill, "PATIENCE", 0.2)

@@ -61,6 +61,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Returns:
         The exit status: 0 done, 1 nothing made, 2 wrong input, 3 an error of bevviz itself, 130 interrupted.
     """
+    status = _main(arguments)
+    if arguments is None:
+        interrupts.leave(status)
+    return status
+
+
+def _main(arguments: Sequence[str] | None) -> int:
     # Imports and frames make many objects and few cycles: at Python's default of 700 between two looks for
     # cycles these take a tenth of all the time.
     gc.set_threshold(50_000, 10, 10)

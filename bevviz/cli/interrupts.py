@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import signal
+import sys
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from threading import Event
@@ -32,6 +34,18 @@ def ignore() -> None:
     """The command is over: nothing that comes now may spoil its exit status."""
     for number in SIGNALS:
         signal.signal(number, signal.SIG_IGN)
+
+
+def leave(status: int) -> None:
+    """At the end of an interrupted command, by the shortest way where a thread is still in the midst of work.
+
+    One that compiles a stage meanwhile would find half of its compiler gone, and abort.
+    """
+    if came() and any(thread.daemon for thread in threading.enumerate()):
+        for stream in (sys.stdout, sys.stderr):
+            with suppress(OSError, ValueError):
+                stream.flush()
+        os._exit(status)
 
 
 def _interrupt(number: int, stack: object) -> None:
