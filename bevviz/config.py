@@ -379,6 +379,9 @@ class LiveConfig(Section):
     viewer_memory: Megabytes = Field(
         500.0, ge=10, description="recent past kept for a viewer that comes late (--serve)"
     )
+    viewer_rate: float | None = Field(
+        None, ge=1, le=100, description="frames a second that viewers get at most, files get all; empty: all"
+    )
     split_size: Megabytes | None = Field(
         None, ge=1, description="--save: size that a part is closed at; empty: any"
     )

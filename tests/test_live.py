@@ -11,7 +11,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import closing, contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -33,6 +33,7 @@ from bevviz.live.replay import Replay
 from bevviz.live.runtime import Live, Outputs, thin
 from bevviz.live.settings import Settings
 from bevviz.live.triggers import Triggers
+from bevviz.live.viewers import Program, Viewer
 from bevviz.queues import NewestQueue
 from bevviz.session import Session
 from bevviz.synthetic import SyntheticSource
@@ -241,6 +242,32 @@ def test_what_is_said_while_no_frame_comes_is_logged(
     last = recording.rows["/explain"][-1]
     assert line["frame"] == last["frame"]
     assert line["stamp"] - last["stamp"] == line["received"] - last["received"] > 900_000_000
+
+
+def test_viewers_can_be_given_fewer_frames_than_files(frames: list[Frame], drive: SyntheticSource) -> None:
+    taken: list[int] = []
+
+    class Screen(Viewer):
+        def _start(self) -> Any:
+            return subprocess.Popen(["cat"], stdin=subprocess.PIPE, stdout=subprocess.DEVNULL)
+
+        def _take(self, packet: Packet, fresh: bool) -> bool:
+            taken.append(packet.context.clock[0])
+            return super()._take(packet, fresh)
+
+    session = Session(load())
+    with closing(Encoder(load(), drive.scene, "live", whole=0.2)) as encoder:
+        screen = Screen(Program("screen", ["cat"]), 20, encoder, Notes(lambda text: None), sparse=True)
+        packets = []
+        for index in range(12):
+            result = session.run(replace(frames[index % len(frames)], index=index))
+            packets.append(encoder.encode(result, drive.scene, {}, ()))
+            screen.put(packets[-1])
+            time.sleep(0.05)
+        screen.close()
+    whole = [packet.context.clock[0] for packet in packets if packet.whole]
+    assert taken == whole and 1 < len(whole) < 12
+    assert screen.dropped == 0  # they were not wanted
 
 
 def test_leftover_indexes_are_removed_and_those_in_work_are_not(tmp_path: Path) -> None:

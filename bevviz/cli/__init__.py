@@ -10,7 +10,7 @@ from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from bevviz import __version__
+from bevviz import __version__, announce
 from bevviz.cli import (
     bag,
     batch,
@@ -22,6 +22,7 @@ from bevviz.cli import (
     info,
     interrupts,
     live,
+    outputs,
     report,
     sweep,
     tune,
@@ -81,6 +82,7 @@ def _main(arguments: Sequence[str] | None) -> int:
         options = parser.parse_args(given)
         if options.verbose:
             _log_to_stderr()
+        announce.to(outputs.say)
         check_outputs(options)
         run: Callable[[argparse.Namespace], int] = options.run
         return run(options)

@@ -67,13 +67,15 @@ class Encoder:
         config: how the results are made.
         scene: names of the sensors.
         blueprint: name of a layout, or a .py or .rbl file.
+        whole: seconds from one whole packet to the next, at most.
 
     Raises:
         UserError: no such blueprint.
     """
 
-    def __init__(self, config: Config, scene: Scene, blueprint: str) -> None:
+    def __init__(self, config: Config, scene: Scene, blueprint: str, whole: float = WHOLE) -> None:
         self._blueprint = blueprint
+        self._step = whole
         blueprints.load(blueprint, scene)  # what is wrong with it is said at the start
         self._config, self._scene = config, scene
         self._stream = _Stream()
@@ -127,7 +129,7 @@ class Encoder:
             self._config, self._scene = config, scene
             self._logger.reconfigure(config, scene)
         now = time.monotonic()
-        whole = now - self._whole >= WHOLE
+        whole = now - self._whole >= self._step
         if whole:
             self._whole = now
             self._logger.refresh()

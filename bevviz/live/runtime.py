@@ -18,7 +18,7 @@ from bevviz.config import Config
 from bevviz.errors import UserError
 from bevviz.frame import Frame, FrameResult, LateResult, Scene, Source
 from bevviz.live.control import Control
-from bevviz.live.encoder import Encoder, Packet
+from bevviz.live.encoder import WHOLE, Encoder, Packet
 from bevviz.live.files import Indexer, Saver
 from bevviz.live.flight import FlightRecorder
 from bevviz.live.health import Health, set_nice
@@ -106,7 +106,8 @@ class Live:
 
         self._nice(live.nice)
         self._session = Observing(settings.config) if observe else Session(settings.config, loader=loader)
-        self._encoder = Encoder(self.config, source.scene, outputs.blueprint)
+        whole = WHOLE if live.viewer_rate is None else 1 / live.viewer_rate
+        self._encoder = Encoder(self.config, source.scene, outputs.blueprint, whole)
         self._indexer = Indexer()
         self._saves = ThreadPoolExecutor(1, "save")
         self.flight = FlightRecorder(live, self._encoder, self._indexer)
@@ -126,7 +127,10 @@ class Live:
         if outputs.save is not None:
             self.saver = Saver(outputs.save, live, self._encoder, self._indexer, notes)
             self._outputs.append(self.saver)
-        self._outputs += [Viewer(program, live.output_queue, self._encoder, notes) for program in programs]
+        sparse = live.viewer_rate is not None
+        self._outputs += [
+            Viewer(program, live.output_queue, self._encoder, notes, sparse=sparse) for program in programs
+        ]
 
     @property
     def config(self) -> Config:
