@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
@@ -68,7 +68,7 @@ class SyntheticSource:
 
     The scan is one instant (free of motion distortion); the image is taken ``IMAGE_DELAY`` later, so that
     projection needs motion compensation. The same arguments give the same frames, each of them whatever
-    was asked for before.
+    was asked for before and however long the drive is.
 
     Args:
         frames: length of the drive.
@@ -79,7 +79,7 @@ class SyntheticSource:
         image_late: seconds by which the stamps of the images are late.
 
     Raises:
-        UserError: ``frames`` below 1, no such fault, or a drive too short for it.
+        UserError: ``frames`` below 1, ``seed`` below 0, no such fault, or a drive too short for it.
     """
 
     def __init__(
@@ -96,6 +96,8 @@ class SyntheticSource:
     ) -> None:
         if frames < 1:
             raise UserError(f"a synthetic drive needs at least 1 frame, not {frames}")
+        if seed < 0:
+            raise UserError(f"seed {seed}: a seed is 0 or above")
         self.total = frames
         self.seed = seed
         self.faults = faults.find(plant, (frames - 1) * PERIOD * 1e-9)
@@ -126,8 +128,9 @@ class SyntheticSource:
         return World(self.seed, self.total * PERIOD * 1e-9, scenes, weave=self._weave)
 
     @cached_property
-    def _static(self) -> Caster:
-        return Caster(self.world.static)
+    def _static(self) -> Callable[[int], Caster]:
+        """The scenery around a section of the street; a scan and its image may be in two."""
+        return lru_cache(maxsize=2)(lambda section: Caster(self.world.static(section)))
 
     @property
     def intrinsics(self) -> Intrinsics:
@@ -191,9 +194,10 @@ class SyntheticSource:
         at_scan, at_image = ((t - START) * 1e-9 for t in (stamp, taken))
 
         moving = self.world.moving(at_scan, map_from_lidar[:3, 3], self._lidar.reach)
-        scan = self._lidar.scan(View(self._static, moving), map_from_lidar, rng)
+        scan = self._lidar.scan(View(self._static(self.world.section(at_scan)), moving), map_from_lidar, rng)
         ahead = map_from_lens[:3, 3] + 50.0 * map_from_lens[:3, 2]  # what is far behind casts no shadow here
-        seen = View(self._static, self.world.moving(at_image, ahead, 70.0))
+        scenery = self._static(self.world.section(at_image))
+        seen = View(scenery, self.world.moving(at_image, ahead, 70.0))
         picture = self._camera.picture(seen, map_from_lens, self.world.light, rng)
 
         fields: dict[str, NDArray[Any]] = {"intensity": scan.intensity, "ring": scan.ring, "time": scan.time}
@@ -228,7 +232,7 @@ class SyntheticSource:
             truth=truth,
             tf_age=0.0,
         )
-        hits = np.bincount(scan.object, minlength=len(self.world.actors) + 1)[numbers]
+        hits = np.bincount(scan.object, minlength=max(numbers, default=0) + 1)[numbers]
         ground = np.isin(scan.material, GROUND)
         return Snapshot(frame, numbers, hits.astype(np.int32), scan.object, ground, picture.object)
 
