@@ -204,7 +204,7 @@ def measure(seeds: Sequence[int], config: Config, made: Callable[[int], Iterator
             ):
                 window = drive[index - 1 : index + HORIZON]
                 for name, fault in FAULTS.items():
-                    for target in targets(fault, drive[index - 1][0], result, reported):
+                    for target in targets(fault, [shot for shot, _ in window], result, reported):
                         tally.delays[name].append(_delay(session, known, window, fault, target))
             result = run(session, shot.frame, found)
             known = {(a.kind, a.subject, a.since) for a in result.anomalies}
@@ -236,26 +236,43 @@ def _delay(
     return float("inf")
 
 
-def targets(fault: Fault, shot: Snapshot, result: FrameResult, reported: list[set[int]]) -> list[Target]:
+def targets(
+    fault: Fault, window: list[Snapshot], result: FrameResult, reported: list[set[int]]
+) -> list[Target]:
     """What a fault can be planted on now: for each label the nearest object that was seen until now.
 
-    One that was not reported in most of the last frames cannot be missed.
+    One that was not reported in most of the last frames, or that leaves the image or gets hidden while it is
+    watched, is missed by nobody.
     """
     if not fault.labels:
         return [Target(0, "")]
-    truth, objects = shot.frame.truth, result.objects
-    assert truth is not None and objects is not None
+    before = window[0]
+    truth = before.frame.truth
+    assert truth is not None
     chosen = []
     away = np.hypot(*truth.boxes.center[:, :2].T)
     for label in fault.labels:
         for k in np.argsort(away).tolist():
-            number = int(shot.truth_object[k])
+            number = int(before.truth_object[k])
             often = sum(number in seen for seen in reported[-10:])
             if truth.labels[k] != label or away[k] > NEAR or often < SEEN or number not in reported[-1]:
                 continue
-            chosen.append(Target(number, label))
-            break
+            if _stays_in_view(window[: round(IN_TIME * 10) + 2], number):
+                chosen.append(Target(number, label))
+                break
     return chosen
+
+
+def _stays_in_view(window: list[Snapshot], number: int) -> bool:
+    """Whether an object does not touch the border of the image, nor gets hidden by half."""
+    pixels, points = [], []
+    for shot in window:
+        mine = shot.pixel_object == number
+        if mine[[0, -1]].any() or mine[:, [0, -1]].any():
+            return False
+        pixels.append(mine.sum())
+        points.append((shot.point_object == number).sum())
+    return min(pixels) > pixels[0] / 2 and min(points) > points[0] / 2
 
 
 def _reported(shot: Snapshot, result: FrameResult) -> set[int]:

@@ -31,7 +31,7 @@ SPREADS = 6.0  # a jump is so many times what the object's own past spreads
 REACH = 3.0  # metres that an object may have jumped
 LATEST = 0.25  # seconds that a track may be unseen for when it turns up elsewhere
 GROWTH = 0.5  # metres that what is measured may have become longer or shorter in a jump: else it was cut anew
-EMPTY = 3  # obstacle points, at most, where it was
+EMPTY = 3  # obstacle points of other objects, at most, where it was
 UNMATCHED = (Decision.NO_CLUSTER, Decision.TOO_FEW_POINTS, Decision.LOW_OVERLAP, Decision.MISFIT)
 
 
@@ -163,11 +163,20 @@ def _jump(
             tracks.object[other] >= 0
             and tracks.names[other] == tracks.names[row]
             and abs(length - known.length) <= GROWTH
-            and geometry.inside(result.obstacles, sight.boxes, row).sum() <= EMPTY
+            and _others_there(result, tracks, sight, row) <= EMPTY
         ):
             text = f"{who}: {offset[other]:.1f} m from where it was expected, as a new track"
             yield Anomaly("jump", who, text, rank=_rank(sight, row, float(offset[other]) / limit / 3))
             return
+
+
+def _others_there(result: FrameResult, tracks: Tracks, sight: _Sight, row: int) -> int:
+    """Obstacle points where a track should be, of clusters that were tracked before."""
+    assert result.obstacles is not None
+    assert result.clusters is not None
+    old = tracks.cluster[(tracks.hits > 2) & (tracks.cluster >= 0)]
+    there = geometry.inside(result.obstacles, sight.boxes, row)
+    return int(np.isin(result.clusters.labels[there], old).sum()) if len(result.clusters.labels) else 0
 
 
 def _measured(measured: Boxes3D, tracks: Tracks, row: int) -> tuple[float, F32]:
