@@ -334,12 +334,16 @@ class TrackingConfig(Section):
 class AnomaliesConfig(Section):
     """What is worth a look, frame after frame."""
 
-    flicker_frames: int = Field(
-        5, ge=1, le=1000, description="longest gap, in frames, after as many frames with the object"
+    surprise: float = Field(
+        8.0,
+        gt=0,
+        le=100,
+        description="of an object, or a class, that is missed: -ln of its chance, by the object's own past",
     )
-    jump: Metres = Field(
-        1.0, gt=0, le=20, description="of a box from where it was expected, or of its longer side"
+    visible: float = Field(
+        0.7, ge=0, le=1, description="share of an object that nothing may hide, else it is excused"
     )
+    jump: Metres = Field(1.0, gt=0, le=20, description="least of a box from where it was expected")
     alone_frames: int = Field(
         5, ge=1, le=1000, description="frames until what only one sensor sees is an anomaly"
     )

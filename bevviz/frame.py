@@ -606,3 +606,4 @@ class Anomaly:
     text: str
     severity: Literal["WARN", "ERROR"] = "WARN"
     since: int = 0  # stamp of the frame that it began in
+    rank: float = 0.0  # 0 to 1: how bad it is; the worst come first
