@@ -38,6 +38,7 @@ from bevviz.workbench.pick import Pick, pick
 
 KEPT = 6  # results of frames that were looked at
 PATIENCE = 10.0  # seconds that the run may take to end
+FIRST = 6.0  # seconds that the run waits for a page to have drawn the first frame
 
 Settings = tuple[str, ...]
 TruthOf = Callable[[Frame], Truth | None]
@@ -53,7 +54,8 @@ class Bench(Closing):
         first: number of the scan that is shown first.
 
     Attributes:
-        film: what is shown: the whole drive, then what was asked and tried.
+        film: what is shown: the whole drive.
+        desk: what was asked and tried, which is shown with it.
         found: what is worth a look in the frames so far.
         opening: stamp of the frame that a page is to open at; None: not run yet.
     """
@@ -61,7 +63,7 @@ class Bench(Closing):
     def __init__(self, drive: Drive, again: Frames, truth_of: TruthOf | None = None, first: int = 0) -> None:
         self.drive, self.truth_of = drive, truth_of
         self._first = first
-        self.film = Film()
+        self.film, self.desk = Film(), Film()
         self.found: list[Find] = []
         self.opening: int | None = None
         self.done, self.over, self.error = 0, False, ""
@@ -72,7 +74,7 @@ class Bench(Closing):
         self._results: OrderedDict[tuple[int, Settings], FrameResult] = OrderedDict()
         self._variants, self._looking = Variants(drive.session.loader), threading.RLock()
         self._asked: Questioner | None = None
-        self._stop, self._quiet = threading.Event(), threading.Event()
+        self._stop, self._quiet, self._go = threading.Event(), threading.Event(), threading.Event()
         self._quiet.set()
         recording_id = f"bench-{time.time_ns()}"
         self._main, self._film_main = self._stream(recording_id)
@@ -96,9 +98,11 @@ class Bench(Closing):
     def close(self) -> None:
         self._stop.set()
         self._quiet.set()
+        self._go.set()
         if self._thread.is_alive():
             self._thread.join(PATIENCE)
         self.film.close()
+        self.desk.close()
         self.drive.close()
         self._again.close()
 
@@ -122,8 +126,8 @@ class Bench(Closing):
 
     def _run(self) -> None:
         try:
-            if self._first:
-                self._show(self.look(self._first))
+            self._show(self.look(self._first))
+            self._go.wait(FIRST)
             session = self.drive.new_session()
             run(self._again, session, [_Filming(self)], stop=self._stop)
         except Exception as error:
@@ -132,6 +136,10 @@ class Bench(Closing):
             )
         self.over = True
         self._news()
+
+    def go_on(self) -> None:
+        """A page shows the first frame: run the others."""
+        self._go.set()
 
     def see(self, result: FrameResult) -> None:
         """The next frame of the run; while a question is being answered, it waits."""
@@ -257,7 +265,7 @@ class Bench(Closing):
         log_answers(self._desk, frame, answers, len(answers))
         self._desk_logger.set_time(frame.index + 1, frame.stamp + 1, frame.received and frame.received + 1)
         self._desk.log(entities.WHY, rr.Clear(recursive=True))
-        self.film.add(self._film_desk.read())
+        self.desk.add(self._film_desk.read())
 
     # --- other values --------------------------------------------------------------------------
 
@@ -298,7 +306,7 @@ class Bench(Closing):
             self._desk_logger.log(after)
             self._desk_logger.refresh()
         self._desk_logger.flush()
-        self.film.add(self._film_desk.read())
+        self.desk.add(self._film_desk.read())
 
 
 def _f1(result: FrameResult, truth: Truth) -> float | None:

@@ -2,6 +2,7 @@
 
 const $ = (id) => document.getElementById(id);
 const version = $("viewer").dataset.version;
+console.debug = () => {}; // the viewer tells it fifty thousand lines at its start, which takes seconds
 const widget = (await import(`/viewer/${version}/widget.js`)).default;
 
 const TIMELINE = "stamp";
@@ -17,6 +18,8 @@ let current = -1;
 let controls = [];
 let opening = null; // stamp that is shown first
 let asked = 0; // when the newest question was asked, to tell how long the answer took
+let pressed = 0; // when the pointer was last let go: the viewer says what it was on some pictures later
+window.addEventListener("pointerup", () => { pressed = performance.now(); }, true);
 
 // --- the viewer ---------------------------------------------------------------------------------
 // Rerun's notebook widget, which keeps its own wrapper of the viewer up to date; this page is its notebook.
@@ -48,6 +51,7 @@ function seek(stamp) {
   move();
 }
 
+let drawn = false; // whether a frame has been on the screen
 let settling = 0;
 function viewerEvent(event) {
   window.dispatchEvent(new CustomEvent("viewer-event", { detail: event }));
@@ -59,6 +63,10 @@ function viewerEvent(event) {
       return;
     }
     target = null;
+    if (!drawn) {
+      drawn = true;
+      requestAnimationFrame(() => requestAnimationFrame(() => send({ type: "shown" })));
+    }
     if (state.time !== null && Number(state.time) === event.time) return;
     state.time = String(BigInt(Math.round(event.time)));
     clearTimeout(settling);
@@ -80,20 +88,21 @@ function settled() {
 // --- the server ---------------------------------------------------------------------------------
 
 const socketAt = (path) => new WebSocket(`ws://${location.host}${path}`);
-let pieces = 0; // of the film that the viewer has
+const pieces = { film: 0, desk: 0 }; // that the viewer has
 
-function film() {
-  const socket = socketAt(`/film?from=${pieces}`);
+function film(lane) {
+  const socket = socketAt(`/film?lane=${lane}&from=${pieces[lane]}`);
   socket.binaryType = "arraybuffer";
   socket.onmessage = ({ data }) => {
-    pieces += 1;
+    pieces[lane] += 1;
     toViewer({ type: "rrd" }, [new DataView(data)]);
+    if (lane === "film") requestAnimationFrame(() => { if (socket.readyState === WebSocket.OPEN) socket.send(""); });
   };
   return socket;
 }
 
 function connect() {
-  let shown = null;
+  let lanes = [];
   talk = socketAt("/talk");
   talk.onopen = () => { gone(""); };
   talk.onmessage = ({ data }) => {
@@ -101,11 +110,11 @@ function connect() {
     if (message.type === "welcome") {
       if (state.run && state.run !== message.run) { location.reload(); return; }
       welcome(message);
-      viewerReady.then(() => { shown = film(); });
+      viewerReady.then(() => { lanes = ["film", "desk"].map(film); });
     } else receive(message);
   };
   talk.onclose = async () => {
-    shown?.close();
+    for (const lane of lanes) lane.close();
     gone("The server is gone: nothing is answered until it is back. Looking for it ...");
     setTimeout(async () => {
       try {
@@ -133,6 +142,7 @@ function send(message) {
 
 function receive(message) {
   if (message.type === "progress") progress(message);
+  else if (message.type === "failed") gone(message.text);
   else if (message.type === "found") { found = ranked(found.concat(message.found)); list(); }
   else if (message.type === "opening") open(message.stamp);
   else if (message.type === "tried") tried(message);
@@ -155,7 +165,7 @@ function receive(message) {
 let asking = 0;
 function ask(what) {
   if (state.time === null) return;
-  asked = performance.now();
+  asked = "entity" in what ? pressed : performance.now();
   $("answer").classList.add("busy");
   asking = send({ type: "ask", time: Number(state.time), set: state.flipped ? [] : state.set, ...what });
 }
