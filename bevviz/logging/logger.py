@@ -59,7 +59,8 @@ class Logger(Writer):
         scene: names of the sensors.
         root: entity that everything goes under. With one, this is what else was made of frames that
             another logger writes: what the sensors and the robot brought is not written twice.
-        wait: as of ``Writer``.
+        wait, stamps: as of ``Writer``.
+        inputs: write what the sensors and the robot brought; default: without a root.
     """
 
     def __init__(
@@ -69,8 +70,11 @@ class Logger(Writer):
         scene: Scene,
         root: str = "",
         wait: float = 0.0,
+        stamps: Sequence[str] = (entities.STAMP,),
+        inputs: bool | None = None,
     ) -> None:
-        super().__init__(recording, root, wait)
+        super().__init__(recording, root, wait, stamps)
+        self._inputs = not root if inputs is None else inputs
         self._config = config
         self._scene = scene
         self._intrinsics: dict[str, Intrinsics] = {}
@@ -136,7 +140,7 @@ class Logger(Writer):
         frame = result.frame
         self.begin(frame.index, frame.stamp, frame.received)
         self.put(entities.sensor(frame.lidar), transform(frame.pose))
-        if not self.root:
+        if self._inputs:
             self._log_input(result)
         self._log_lidar_results(result)
         for camera in result.cameras:

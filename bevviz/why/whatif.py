@@ -94,7 +94,9 @@ class WhatIf:
             return None
         row = subject.row if subject.kind == "truth" else -1
         settings = tuple(f"{key}={_written(value)}" for key, value in change.items())
-        return Hint(settings, text, effects(self._traces, after, row, own))
+        return Hint(
+            settings, text, effects(self._result.objects, after.result.objects, self._traces.truth, row, own)
+        )
 
     def _run(self, change: Change) -> Traces | None:
         key = tuple(change.items())
