@@ -69,6 +69,7 @@ def _report(options: argparse.Namespace) -> int:
 
 def _make(options: argparse.Namespace) -> int:
     from bevviz.bags.reader import megabytes
+    from bevviz.notes import Notes
     from bevviz.report.make import ReportRequest, make
 
     if options.at is None:
@@ -89,6 +90,7 @@ def _make(options: argparse.Namespace) -> int:
             unredacted=options.unredacted,
             include_model=options.include_model,
             force=options.force,
+            notes=list(Notes(options.paths)),
         )
     )
     for warning in report.warnings:

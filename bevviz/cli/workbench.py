@@ -65,10 +65,14 @@ def _open(options: argparse.Namespace) -> int:
             from bevviz.drive import Drive
             from bevviz.evaluate import truth_source
             from bevviz.workbench.bench import Bench
+            from bevviz.workbench.labelled import Labelled
 
             hint(source.scene, config)
             truth_of = truth_source(source.roles, options.truth, options.kitti_labels, len(source.scans))
-            return Bench(Drive(source, config), again, truth_of, first)
+            if truth_of is None or (options.truth is None and options.kitti_labels is None):
+                return Bench(Drive(source, config), again, options.paths, truth_of, first)
+            mine, others = (Labelled(frames, truth_of) for frames in (source, again))
+            return Bench(Drive(mine, config), others, options.paths, truth_of, first)
 
         def ready(address: str) -> None:
             say(f"workbench at {address}")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from types import MappingProxyType
 
@@ -129,6 +129,7 @@ class Logger(Writer):
         result: FrameResult,
         health: Mapping[str, float] = MappingProxyType({}),
         notes: Sequence[tuple[str, str]] = (),
+        beside: Callable[[], object] | None = None,
     ) -> None:
         """Everything of one frame. What the frame before had and this one has not is cleared.
 
@@ -136,6 +137,7 @@ class Logger(Writer):
             result: the frame and what was made of it.
             health: further scalars, by entity.
             notes: further lines of the log: level and text.
+            beside: puts something more into the frame.
         """
         frame = result.frame
         self.begin(frame.index, frame.stamp, frame.received)
@@ -156,6 +158,8 @@ class Logger(Writer):
         log_anomalies(self, result, self._onsets.of(result.anomalies))
         self._log_states(result)
         log_health(self, result, self._last, health)
+        if beside is not None:
+            beside()
         self.end()
         self._last = frame
 

@@ -22,9 +22,9 @@ from bevviz.workbench.opening import Opening
 from bevviz.workbench.visit import Visit, listening
 
 PAGE = Path(__file__).parent / "page"
-FILES = ("bench.css", "bench.js")
+FILES = ("bench.css", "bench.js", "list.js", "state.js", "talk.js", "viewer.js", "work.js")
 VIEWER = ("widget.js", "widget.css", "re_viewer_bg.wasm")
-KINDS = {".js": "text/javascript", ".css": "text/css", ".wasm": "application/wasm", ".html": "text/html"}
+KINDS = {".js": "text/javascript", ".css": "text/css", ".wasm": "application/wasm"}
 POLICY = (
     "default-src 'none'; script-src 'self' 'wasm-unsafe-eval'; style-src 'self' 'unsafe-inline'; "
     "img-src 'self' data: blob:; font-src 'self' data:; connect-src 'self'; "
@@ -48,6 +48,7 @@ def application(opening: Opening, viewer: Path, version: str, token: str, port: 
         Route("/page/{name}", site.file),
         Route(f"/viewer/{version}/{{name}}", site.viewer),
         Route("/config.yaml", site.config),
+        Route("/report/{number:int}/{name}", site.report),
         WebSocketRoute("/film", site.film),
         WebSocketRoute("/talk", site.talk),
     ]
@@ -92,6 +93,17 @@ class _Site:
             return PlainTextResponse(str(error), 400)
         headers = {"Content-Disposition": 'attachment; filename="bevviz.yaml"'}
         return Response(text, media_type="application/yaml", headers=headers)
+
+    async def report(self, request: Request) -> Response:
+        """A file of a report that was made here."""
+        bench, number = await self._opening.bench(), request.path_params["number"]
+        made = [] if bench is None else bench.reports.made
+        path = made[number].file(request.path_params["name"]) if number < len(made) else None
+        if path is None:
+            return PlainTextResponse("there is no such file\n", 404)
+        if path.suffix == ".html":  # with a policy of its own
+            return _File(path, media_type="text/html")
+        return _File(path, filename=path.name, media_type="application/octet-stream")
 
     # --- what is shown -------------------------------------------------------------------------
 

@@ -5,8 +5,9 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
 from starlette.websockets import WebSocket, WebSocketDisconnect
@@ -15,9 +16,11 @@ from bevviz.errors import UserError, first_line
 from bevviz.loggers import logger
 
 if TYPE_CHECKING:
+    from bevviz.why import Answer
     from bevviz.workbench.bench import Bench, Settings
     from bevviz.workbench.pick import Pick
 
+BESIDE = 6  # further things that are listed
 TOGETHER = 0.05  # seconds that what is new waits for more of it
 
 _log = logger(__name__)
@@ -43,6 +46,11 @@ class Visit:
             "try": self._try,
             "settle": self._settle,
             "shown": self._shown,
+            "drive": self._drive,
+            "cancel": self._cancel,
+            "report": self._report,
+            "note": self._note,
+            "unnote": self._unnote,
         }
 
     async def stay(self) -> None:
@@ -76,15 +84,18 @@ class Visit:
 
     async def _tell(self, more: asyncio.Event) -> None:
         """What is new of the run, whenever there is something."""
-        told, opened, bench = 0, False, self._bench
+        told: dict[int, int] = {}
+        opened, noted, bench = False, -1, self._bench
         while True:
             more.clear()
             if not opened and bench.opening is not None:
                 opened = True
                 await self._send({"type": "opening", "stamp": str(bench.opening)})
-            if new := bench.found[told:]:
-                told += len(new)
-                await self._send({"type": "found", "found": [find.as_dict() for find in new]})
+            for news in bench.entries.news(told):
+                await self._send(news)
+            if noted != bench.notes_changed:
+                noted = bench.notes_changed
+                await self._send(await asyncio.to_thread(_notes, bench))
             await self._send(bench.progress())
             await more.wait()
             await asyncio.sleep(TOGETHER)
@@ -149,7 +160,8 @@ class Visit:
             picked = what()
             if picked is None:
                 return None
-            return {"pick": str(picked), **bench.ask(frame, settings, picked).as_dict()}
+            answer, beside = bench.ask(frame, settings, picked)
+            return {"pick": str(picked), **answer.as_dict(), "beside": list(_briefly(beside))}
 
         answer = await self._at_desk(number, work)
         head = {"id": number, "frame": frame}
@@ -158,7 +170,7 @@ class Visit:
             return
         await self._send({"type": "answer", **head, **answer})
         pick = Pick.parse(answer["pick"])
-        hints = await self._at_desk(number, lambda: bench.ask(frame, settings, pick, hints=True), idle=True)
+        hints = await self._at_desk(number, lambda: bench.hints(frame, settings, pick), idle=True)
         if hints is not None:
             await self._send({"type": "hints", **head, "hints": hints.as_dict()["hints"]})
 
@@ -172,6 +184,32 @@ class Visit:
         frame = self._frame(message)
         await self._at_desk(number, lambda: self._bench.look(frame, _settings(message)), idle=True)
 
+    async def _drive(self, number: int, message: dict[str, Any]) -> None:
+        """Run all of it with other values."""
+        settings = _settings(message)
+        await asyncio.to_thread(self._bench.trials.begin, settings)
+
+    async def _cancel(self, number: int, message: dict[str, Any]) -> None:
+        what = self._bench.reports if message["what"] == "report" else self._bench.trials
+        await asyncio.to_thread(what.end)
+
+    async def _report(self, number: int, message: dict[str, Any]) -> None:
+        frame, text = self._frame(message), str(message["text"])
+        before, after = float(message["before"]), float(message["after"])
+        await self._at_desk(number, lambda: self._bench.reports.begin(frame, before, after, text))
+
+    async def _note(self, number: int, message: dict[str, Any]) -> None:
+        from bevviz.workbench.pick import Pick
+
+        frame, text = self._frame(message), str(message["text"])
+        pick = Pick.parse(str(message["pick"])) if message.get("pick") else None
+        await self._at_desk(number, lambda: self._bench.note(frame, text, pick))
+        await self._send({"type": "noted", "id": number, "file": self._bench.notes.path.name})
+
+    async def _unnote(self, number: int, message: dict[str, Any]) -> None:
+        stamp, text = int(message["stamp"]), str(message["text"])
+        await self._at_desk(number, lambda: self._bench.remove_note(stamp, text))
+
     async def _shown(self, number: int, message: dict[str, Any]) -> None:
         """The page has drawn its first frame: the run may take the machine."""
         self._bench.go_on()
@@ -179,6 +217,30 @@ class Visit:
     def _frame(self, message: dict[str, Any]) -> int:
         """Number of the frame that the page shows."""
         return self._bench.number_at(round(float(message["time"])))
+
+
+def _briefly(answers: Sequence[Answer]) -> Iterator[dict[str, Any]]:
+    """What else is there: the nearest missed first, as the questioner has it."""
+    from bevviz.workbench.answers import pick_of
+
+    for answer in answers[:BESIDE]:
+        if (pick := pick_of(answer)) is not None:
+            verdict = answer.verdict
+            yield {
+                "pick": str(pick),
+                "name": answer.subject.name,
+                "reported": verdict.reported,
+                "reason": verdict.reason.value,
+            }
+
+
+def _notes(bench: Bench) -> dict[str, Any]:
+    try:
+        notes = list(bench.notes)
+    except UserError as error:
+        return {"type": "notes", "notes": [], "error": str(error)}
+    told = [{**asdict(note), "stamp": str(note.stamp), "received": str(note.received)} for note in notes]
+    return {"type": "notes", "notes": told, "error": ""}
 
 
 def _settings(message: dict[str, Any]) -> Settings:
