@@ -86,6 +86,9 @@ class Notes:
             raise UserError(f"{self.path}: holds no notes as bevviz writes them; move it away") from None
 
     def _write(self, notes: Sequence[Note]) -> None:
+        if not notes:
+            self.path.unlink(missing_ok=True)
+            return
         text = json.dumps({"notes": [asdict(note) for note in notes]}, indent=1, ensure_ascii=False)
         with written(self.path, "notes") as given:
             try:

@@ -91,6 +91,7 @@ class Bench(Closing):
         self.done, self.over, self.error = 0, False, ""
         self._listeners: list[Callable[[], None]] = []
         self._stamps: list[tuple[int, int]] = []  # stamp, number of each frame on the film, in order
+        self._rows: dict[int, int] = {}  # on the film, of each stamp
         self._tracks: dict[int, Tracks] = {}
         self._objects: dict[int, Objects | None] = {}
         self._layers: dict[tuple[int, bool], Layer] = {}  # by frame, and whether other values made it
@@ -204,6 +205,7 @@ class Bench(Closing):
         place = bisect.bisect_left(self._stamps, entry)
         if self._stamps[place : place + 1] != [entry]:
             self._stamps.insert(place, entry)
+        self._rows[frame.stamp] = len(self.film)
         self.film.add(self._film_main.read())
         if self.opening is None:
             self.opening = frame.stamp
@@ -251,16 +253,10 @@ class Bench(Closing):
         place = bisect.bisect_right(self._stamps, (stamp + 1000, 2**62)) - 1  # pages count in doubles
         return self._stamps[max(place, 0)][1]
 
-    def stamp_of(self, number: int) -> int:
-        """Sensor time of a frame, in nanoseconds.
-
-        Raises:
-            UserError: it is not on the film yet.
-        """
-        for stamp, index in self._stamps:
-            if index == number:
-                return stamp
-        raise UserError(f"frame {number} has not been run yet")
+    def film_row(self, stamp: int) -> int | None:
+        """Piece of the film that has the frame which a viewer shows at that time."""
+        place = bisect.bisect_right(self._stamps, (stamp + 1000, 2**62)) - 1
+        return self._rows.get(self._stamps[place][0]) if place >= 0 else None
 
     def truth(self, frame: Frame) -> Truth | None:
         """What has to be found in a frame, where that is known."""

@@ -110,8 +110,9 @@ class _Site:
     async def film(self, socket: WebSocket) -> None:
         """Every piece from the one that is asked for on, as they are made.
 
-        Those of the run are sent no faster than the page takes them, which says so by a word for each; those
-        of the desk, answers and what is tried, at once.
+        Those of the run are sent no faster than the page takes them, which says so by a word for each; a
+        time instead of it is that of a frame which is to come next. Those of the desk, answers and what is
+        tried, are sent at once.
         """
         await socket.accept()
         bench = await self._opening.bench()
@@ -121,19 +122,28 @@ class _Site:
         desk = socket.query_params.get("lane") == "desk"
         film, ahead = (bench.desk, None) if desk else (bench.film, AHEAD)
         text = socket.query_params.get("from", "0")
-        row = first = int(text) if text.isdecimal() else 0
+        row, early, count = int(text) if text.isdecimal() else 0, set[int](), 0
+
+        async def put(number: int) -> None:
+            nonlocal count
+            count += 1
+            await socket.send_bytes(await asyncio.to_thread(film.__getitem__, number))
+
         with listening(film.listen) as more, contextlib.suppress(WebSocketDisconnect, RuntimeError):
             async with _heard(socket, more) as heard:
                 while not heard.gone:
                     more.clear()
-                    while (
-                        row < len(film)
-                        and not heard.gone
-                        and (ahead is None or row - first < heard.count + ahead)
-                    ):
-                        await socket.send_bytes(await asyncio.to_thread(film.__getitem__, row))
+                    while heard.wanted:
+                        wanted = bench.film_row(heard.wanted.pop())
+                        if wanted is not None and wanted >= row and wanted not in early:
+                            early.add(wanted)
+                            await put(wanted)
+                    if row < len(film) and (ahead is None or count < heard.count + ahead):
+                        if row not in early:
+                            await put(row)
                         row += 1
-                    await more.wait()
+                    else:
+                        await more.wait()
 
     # --- what is asked -------------------------------------------------------------------------
 
@@ -150,10 +160,11 @@ class _Site:
 
 
 class _Heard:
-    """What the page has said on a socket: a word for each piece that it has."""
+    """What the page has said on a socket: a word for each piece that it has, and times that it wants."""
 
     def __init__(self) -> None:
         self.count, self.gone = 0, False
+        self.wanted: list[int] = []
 
 
 @contextlib.asynccontextmanager
@@ -163,8 +174,11 @@ async def _heard(socket: WebSocket, more: asyncio.Event) -> AsyncIterator[_Heard
     async def listen() -> None:
         with contextlib.suppress(WebSocketDisconnect, RuntimeError):
             while True:
-                await socket.receive_text()
-                heard.count += 1
+                text = await socket.receive_text()
+                if text.isdecimal():
+                    heard.wanted.append(int(text))
+                else:
+                    heard.count += 1
                 more.set()
         heard.gone = True
         more.set()

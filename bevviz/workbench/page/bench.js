@@ -2,7 +2,7 @@
 
 import * as list from "./list.js";
 import { $, asked, element, remember, state, stated } from "./state.js";
-import { connect, newest, on, send } from "./talk.js";
+import { connect, newest, on, send, want } from "./talk.js";
 import { isTried, seek, showSide, tell } from "./viewer.js";
 import * as work from "./work.js";
 
@@ -207,11 +207,13 @@ tell({
   clicked: ask,
   settled: () => {
     remember();
+    want(state.time);
     if (isTried()) attemptThere();
     else send({ type: "settle", time: Number(state.time), set: [] });
     if ($("here").checked) list.draw();
   },
   shown: () => send({ type: "shown" }),
+  sought: want,
 });
 
 function attemptThere() {

@@ -12,9 +12,18 @@ export const on = (more) => Object.assign(handlers, more);
 
 const socketAt = (path) => new WebSocket(`ws://${location.host}${path}`);
 const pieces = { film: 0, desk: 0 }; // that the viewer has
+let early = 0; // of those of the film that may have come before their turn
+let lanes = [];
+
+// The frame of this time next, if the viewer has it not yet.
+export function want(stamp) {
+  if (lanes[0]?.readyState !== WebSocket.OPEN) return;
+  early += 1;
+  lanes[0].send(String(stamp));
+}
 
 function film(lane) {
-  const socket = socketAt(`/film?lane=${lane}&from=${pieces[lane]}`);
+  const socket = socketAt(`/film?lane=${lane}&from=${pieces[lane] - Math.min(pieces[lane], lane === "film" ? early : 0)}`);
   socket.binaryType = "arraybuffer";
   socket.onmessage = ({ data }) => {
     pieces[lane] += 1;
@@ -25,7 +34,6 @@ function film(lane) {
 }
 
 export function connect() {
-  let lanes = [];
   talk = socketAt("/talk");
   talk.onopen = () => { gone(""); };
   talk.onmessage = ({ data }) => {

@@ -16,7 +16,7 @@ const settings = {
   _url: null, _width: "auto", _height: "auto", _theme: "dark", _fallback_token: null,
   _panel_states: { top: "hidden", blueprint: "hidden", selection: "hidden", time: "collapsed" },
 };
-const told = { settled: () => {}, clicked: () => {}, shown: () => {} }; // whom the viewer's events are for
+const told = { settled: () => {}, clicked: () => {}, shown: () => {}, sought: () => {} }; // whom the viewer's events are for
 export const viewerReady = new Promise((ready) => {
   widget.render({
     model: {
@@ -41,6 +41,7 @@ export function seek(stamp) {
   target = String(stamp);
   tries = 3;
   state.time = target;
+  told.sought(target);
   move(target);
 }
 
