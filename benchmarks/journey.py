@@ -30,7 +30,7 @@ DATA = Path(os.environ.get("BEVVIZ_DATA") or Path(__file__).resolve().parents[2]
 FRAMES = 20
 CLICKS, SECONDS = 6, 20.0  # that the journey may take
 FIRST, ANSWER = 3.0, 0.7  # seconds to the first frame, and from a click to its answer for 95 %
-SIZE = {"width": 1400, "height": 900}
+WIDTH, HEIGHT = 1400, 900
 PANEL = 400  # pixels of the page's width that are not the viewer
 SOFTWARE = [
     "--no-sandbox",
@@ -38,7 +38,7 @@ SOFTWARE = [
     "--enable-unsafe-swiftshader",
     "--ignore-gpu-blocklist",
 ]
-LATE = 120.0  # seconds after which something does not come about
+LATE = 400.0  # seconds after which something does not come about
 
 
 @dataclass
@@ -127,7 +127,10 @@ def _go(name: str, arguments: list[str], folder: Path, options: argparse.Namespa
     print(f"\n{name}: bevviz open {' '.join(arguments)}")
     with sync_playwright() as playwright:
         context = playwright.chromium.launch_persistent_context(
-            folder / "profile", executable_path=chromium, args=SOFTWARE, viewport=SIZE
+            folder / "profile",
+            executable_path=chromium,
+            args=SOFTWARE,
+            viewport={"width": WIDTH, "height": HEIGHT},
         )
         context.add_init_script(
             "window.seen = []; window.addEventListener('viewer-event', (e) => window.seen.push(e.detail))"
@@ -137,7 +140,7 @@ def _go(name: str, arguments: list[str], folder: Path, options: argparse.Namespa
             with serving(arguments, folder) as address:
                 page = context.new_page()
                 page.goto(address)
-                until(lambda page=page: events(page, "time_update"), 0.1)
+                _first_frame(page)
                 first = time.monotonic() - start
                 which = "again: the browser has the viewer" if warm else "the first time"
                 print(f"  {first:6.2f} s  from the command to the first frame, {which} (wanted: {FIRST:g} s)")
@@ -179,7 +182,7 @@ def _journey(page: Page, name: str, pictures: Path | None) -> Journey:
     for row in page.locator("#found button", has=page.locator(".missed")).all()[:12]:
         before = page.inner_text("#where")
         row.click()
-        took = waited(lambda before=before: page.inner_text("#where") != before and not busy(page))
+        took = waited(_answered(page, before))
         verdict = page.inner_text("#verdict")
         hints = waited(lambda: not page.inner_text("#hints").startswith("Trying"))
         if page.locator("#hints button").count():
@@ -226,12 +229,12 @@ def _journey(page: Page, name: str, pictures: Path | None) -> Journey:
 
 def _clicks(page: Page, number: int) -> list[float]:
     """Seconds from a click in a view to the verdict, as the page itself counts them."""
-    rng, found = np.random.default_rng(0), []
+    rng, found = np.random.default_rng(0), list[float]()
     for _ in range(4 * number):
         if len(found) == number:
             break
-        x = int(rng.integers(20, SIZE["width"] - PANEL - 20))
-        y = int(rng.integers(40, SIZE["height"] - 60))
+        x = int(rng.integers(20, WIDTH - PANEL - 20))
+        y = int(rng.integers(40, HEIGHT - 60))
         before = page.inner_text("#where")
         page.mouse.move(x, y)
         page.wait_for_timeout(800)  # nobody clicks where the pointer has just come to
@@ -243,6 +246,15 @@ def _clicks(page: Page, number: int) -> list[float]:
                 found.append(float(page.get_attribute("#answer", "data-took") or "nan") / 1000)
                 break
     return found
+
+
+def _first_frame(page: Page) -> None:
+    until(lambda: events(page, "time_update"), 0.1)
+
+
+def _answered(page: Page, before: str) -> Callable[[], bool]:
+    """Whether there is another answer than that one."""
+    return lambda: page.inner_text("#where") != before and not busy(page)
 
 
 def busy(page: Page) -> bool:
