@@ -303,7 +303,7 @@ def helped(talk: Talk) -> tuple[int, str, dict[str, Any]]:
 
 
 def test_one_missed_object_is_one_entry(talk: Talk) -> None:
-    """However many frames it lasts; no frame has it twice, and no two entries have the same object of a frame."""
+    """However many frames it lasts; no two entries have the same object of a frame."""
     missed = talk.of("missed")
     assert any(len(entry["sights"]) > 2 for entry in missed)
     sights = [(frame, pick) for entry in missed for frame, _, _, pick, _ in entry["sights"]]
