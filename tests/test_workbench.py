@@ -30,6 +30,7 @@ from bevviz.workbench.film import Film
 from bevviz.workbench.missed import finds
 from bevviz.workbench.parameters import controls
 from bevviz.workbench.pick import Pick, pick
+from bevviz.workbench.token import kept_token
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser, Page
@@ -224,15 +225,32 @@ def test_parameters_are_tried_on_the_shown_frame(browser: Browser, address: str)
         until(lambda: "must be greater than or equal to 1" in page.inner_text("#verdict"))
 
 
-def test_a_server_that_is_gone_is_said_and_another_one_not_taken_for_it(bag: Path, browser: Browser) -> None:
+def test_two_pages_on_one_drive(browser: Browser, address: str) -> None:
+    """In one browser and in another: each has its own question, both the same list."""
+    with opened(browser, address) as page, opened(browser, address) as other:
+        until(lambda: f"{FRAMES} frames" in page.inner_text("#run") + other.inner_text("#run"))
+        until(lambda: other.locator("#found button .missed").count())
+        page.keyboard.press("n")
+        text = new_verdict(page, verdict(page))
+        assert text not in verdict(other)
+        until(lambda: page.inner_text("#found-title") == other.inner_text("#found-title"))
+
+
+def test_a_server_that_was_killed_is_found_again(bag: Path, browser: Browser) -> None:
+    """The page says that it is gone, finds the next one of the same drive, and shows what it showed."""
     with serving("open", str(bag)) as (address, server), opened(browser, address) as page:
+        until(lambda: page.locator("#found button .missed").count())
+        page.keyboard.press("n")
+        text, held = new_verdict(page, verdict(page)), state(page)
         assert page.locator("#gone").is_hidden()
         server.kill()
         until(lambda: "The server is gone" in page.inner_text("#gone"))
-        port = str(urlsplit(address).port)
         server.wait()
-        with serving("open", str(bag), "--port", port):
-            until(lambda: "open the address that it printed" in page.inner_text("#gone"))
+        with serving("open", str(bag), "--port", str(urlsplit(address).port)) as (again, _):
+            assert again == address
+            until(lambda: verdict(page) == text)
+            assert state(page) == held
+            assert page.locator("#gone").is_hidden()
 
 
 # --- the whole way, as the page talks -----------------------------------------------------------
@@ -331,8 +349,8 @@ def test_empty_ground_and_several_things_are_told(talk: Talk) -> None:
 
 def test_a_hint_does_what_it_says(talk: Talk) -> None:
     """What it was said to do to the frame is what the panel says when it is pressed, name by name."""
-    stamp, _, hint = helped(talk)
-    tried = talk.asked("tried", type="try", time=stamp, set=hint["settings"])
+    stamp, pick, hint = helped(talk)
+    tried = talk.asked("tried", type="try", time=stamp, set=hint["settings"], pick=pick)
     assert tried["effects"] == {key: hint[key] for key in tried["effects"]}
     assert hint["fixed"]
     assert tried["f1"][1] > tried["f1"][0]
@@ -505,9 +523,47 @@ def test_messages_that_are_none_are_answered(address: str) -> None:
         )
 
 
-def test_a_path_alone_opens_it(bag: Path) -> None:
-    with serving(str(bag)) as (address, _):
-        assert answered(address) == 200
+def test_two_drives_at_once(bag: Path, address: str) -> None:
+    """A path alone opens one; each has a port and a token of its own."""
+    with serving(str(bag)) as (other, _):
+        assert answered(other) == 200
+        assert urlsplit(other).port != urlsplit(address).port
+        assert urlsplit(other).query != urlsplit(address).query
+        assert answered(f"{other.split('?')[0]}?{urlsplit(address).query}") == 403
+
+
+def test_a_damaged_bag_is_opened_as_far_as_it_goes(bag: Path, tmp_path: Path) -> None:
+    """What could be read is run and asked about; what was lost is said."""
+    cut = tmp_path / "cut.mcap"
+    cut.write_bytes(bag.read_bytes()[: bag.stat().st_size // 2])
+    with serving("open", str(cut)) as (address, _), Talk(address) as talk:
+        over = talk.until("progress", lambda message: message["over"])
+        assert 0 < over["done"] < FRAMES
+        assert over["warnings"]
+        assert talk.entries
+
+
+def test_a_token_outlives_a_server_that_was_killed_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    with kept_token(1, "drive") as first:
+        (kept,) = tmp_path.glob("bevviz/*")
+        assert kept.stat().st_mode & 0o077 == 0
+        left = kept.read_bytes()
+    assert not kept.exists()
+    kept.write_bytes(left)
+    with kept_token(1, "drive") as readable_by_others:
+        assert readable_by_others != first
+    kept.touch(mode=0o600)
+    kept.chmod(0o600)
+    kept.write_bytes(left)
+    with kept_token(1, "another drive") as other:
+        assert other != first
+    kept.touch(mode=0o600)
+    kept.write_bytes(left)
+    with kept_token(1, "drive") as again:
+        assert again == first
 
 
 def test_a_bag_that_is_none_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

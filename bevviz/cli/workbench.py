@@ -83,7 +83,7 @@ def _open(options: argparse.Namespace) -> int:
             say("open until Ctrl-C; only this machine can reach it")
 
         with suppress(KeyboardInterrupt):  # the way to end it
-            serve(make, options.port, ready)
+            serve(make, "\n".join(str(path.resolve()) for path in options.paths), options.port, ready)
     return 0
 
 

@@ -333,9 +333,11 @@ class Bench(Closing):
         return answer
 
     def _keep(self, number: int, what: Pick, answer: Answer) -> None:
-        """For reports: as the drive was opened."""
-        self._answers[number, str(what)] = self.look(number).frame.received, answer
-        self._answers.move_to_end((number, str(what)))
+        """For reports: as the drive was opened, with its hints once they are known."""
+        key = number, str(what)
+        if answer.hints or key not in self._answers:
+            self._answers[key] = self.look(number).frame.received, answer
+        self._answers.move_to_end(key)
         while len(self._answers) > ASKED:
             self._answers.popitem(last=False)
 
@@ -384,8 +386,13 @@ class Bench(Closing):
 
     # --- other values --------------------------------------------------------------------------
 
-    def attempt(self, number: int, settings: Settings) -> dict[str, Any]:
+    def attempt(self, number: int, settings: Settings, what: Pick | None = None) -> dict[str, Any]:
         """Show the frame as it is with other values, and tell what they do to it.
+
+        Args:
+            number: of the frame.
+            settings: the values.
+            what: they are tried for, which is told first.
 
         Raises:
             UserError: as ``look``.
@@ -395,7 +402,8 @@ class Bench(Closing):
         self.draw_tried(self._tried_logger, after, finds(after, truth))
         self._tried_logger.flush()
         self.desk.add(self._film_desk.read())
-        return attempt(before, after, truth)
+        asked = what.row if what is not None and what.kind == "truth" else -1
+        return attempt(before, after, truth, asked)
 
 
 class _Filming(Observer[FrameResult]):

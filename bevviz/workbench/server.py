@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib.util
-import secrets
 import socket
 from collections.abc import Callable
 from importlib.metadata import version
@@ -16,6 +15,7 @@ from bevviz.errors import UserError
 from bevviz.workbench.guard import HOSTS
 from bevviz.workbench.opening import Opening
 from bevviz.workbench.site import VIEWER, application
+from bevviz.workbench.token import kept_token
 
 if TYPE_CHECKING:
     from bevviz.workbench.bench import Bench
@@ -23,11 +23,12 @@ if TYPE_CHECKING:
 PORT = 9880  # where it is free: browsers keep the viewer, compiled, by the address that they had it from
 
 
-def serve(make: Callable[[], Bench], port: int | None, ready: Callable[[str], None]) -> None:
+def serve(make: Callable[[], Bench], drive: str, port: int | None, ready: Callable[[str], None]) -> None:
     """Serve the page of a drive until an interrupt; it is opened and run behind it.
 
     Args:
         make: makes the bench, while the page's viewer loads.
+        drive: its paths: a page finds a server that was killed again, if that of the same drive comes back.
         port: of the page; None: 9880, else one that is free.
         ready: called with the address when it can be opened.
 
@@ -37,8 +38,7 @@ def serve(make: Callable[[], Bench], port: int | None, ready: Callable[[str], No
     viewer = viewer_folder()
     with _listening(port) as listening:
         port = listening.getsockname()[1]
-        token = secrets.token_urlsafe(16)
-        with Opening(make, lambda: server.end()) as opening:
+        with kept_token(port, drive) as token, Opening(make, lambda: server.end()) as opening:
             config = uvicorn.Config(
                 application(opening, viewer, version("rerun-sdk"), token, port),
                 log_level="warning",

@@ -207,10 +207,10 @@ def difference_entries(
             yield find(what, effect.name, center, Pick("object", effect.before)), False
 
 
-def attempt(before: FrameResult, after: FrameResult, truth: Truth | None) -> dict[str, Any]:
-    """What other values do to one frame, for the page."""
+def attempt(before: FrameResult, after: FrameResult, truth: Truth | None, asked: int = -1) -> dict[str, Any]:
+    """What other values do to one frame, for the page; what was asked about, a row of the truth, first."""
     subjects = truth_subjects(after.frame, _names(before))
-    found = effects(before.objects, after.objects, subjects)
+    found = effects(before.objects, after.objects, subjects, asked)
     told: dict[str, Any] = {
         "changes": {k: str(c) for k, c in changes(before.config, after.config).items()},
         "effects": effects_dict(found),

@@ -175,8 +175,11 @@ class Visit:
             await self._send({"type": "hints", **head, "hints": hints.as_dict()["hints"]})
 
     async def _try(self, number: int, message: dict[str, Any]) -> None:
+        from bevviz.workbench.pick import Pick
+
         settings, frame = _settings(message), self._frame(message)
-        told = await self._at_desk(number, lambda: self._bench.attempt(frame, settings))
+        pick = Pick.parse(str(message["pick"])) if message.get("pick") else None
+        told = await self._at_desk(number, lambda: self._bench.attempt(frame, settings, pick))
         await self._send({"type": "tried", "id": number, "frame": frame, **told})
 
     async def _settle(self, number: int, message: dict[str, Any]) -> None:

@@ -104,7 +104,7 @@ function attempt() {
   showSide();
   if (state.set.length) {
     $("effect").textContent = "Running the stages ...";
-    trying = send({ type: "try", time: Number(state.time), set: state.set });
+    trying = send({ type: "try", time: Number(state.time), set: state.set, pick: state.pick });
   } else $("effect").textContent = "As it was opened.";
   if (state.pick) askAgain();
 }
