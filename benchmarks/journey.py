@@ -176,7 +176,7 @@ def _journey(page: Page, name: str, pictures: Path | None) -> Journey:
         until(done, 0.1)
         return time.monotonic() - start
 
-    until(lambda: "of" not in page.inner_text("#run"), 0.5)  # the drive is loaded
+    until(lambda: page.locator("#bar").is_hidden(), 0.5)  # the drive is loaded
     picture("opened")
     helped = False
     for row in page.locator("#found button", has=page.locator(".missed")).all()[:12]:

@@ -269,7 +269,7 @@ class Talk:
         url, origin = f"ws://{parts.netloc}/talk?{parts.query}", Origin(f"http://{parts.netloc}")
         self._channel = connect(url, origin=origin, max_size=None).__enter__()
         self.say(type="shown")
-        self.until("progress", lambda message: message["over"])
+        self.over = self.until("progress", lambda message: message["over"])
 
     def __enter__(self) -> Talk:
         return self
@@ -337,8 +337,8 @@ def test_empty_ground_and_several_things_are_told(talk: Talk) -> None:
     ground = talk.asked("answer", type="ask", time=int(stamp), set=[], pick="point//6,0,-1.6")
     assert re.search(r"only ground .*: \d+ points, all ground", ground["verdict"])
     answers = [
-        talk.asked("answer", type="ask", time=int(stamp), set=[], pick=f"pixel/zed/{u},185")
-        for u in range(300, 360, 5)
+        talk.asked("answer", type="ask", time=int(stamp), set=[], pick=f"pixel/zed/{u},140")
+        for u in range(100, 640, 60)
     ]
     several = [answer for answer in answers if answer["beside"]]
     assert several
@@ -537,9 +537,8 @@ def test_a_damaged_bag_is_opened_as_far_as_it_goes(bag: Path, tmp_path: Path) ->
     cut = tmp_path / "cut.mcap"
     cut.write_bytes(bag.read_bytes()[: bag.stat().st_size // 2])
     with serving("open", str(cut)) as (address, _), Talk(address) as talk:
-        over = talk.until("progress", lambda message: message["over"])
-        assert 0 < over["done"] < FRAMES
-        assert over["warnings"]
+        assert 0 < talk.over["done"] < FRAMES
+        assert talk.over["warnings"]
         assert talk.entries
 
 
