@@ -61,6 +61,7 @@ def _report(options: argparse.Namespace) -> int:
     if options.check:
         return _check(options)
     from bevviz.bags.reader import megabytes
+    from bevviz.notes import Notes
     from bevviz.report.make import ReportRequest, make
 
     if options.at is None:
@@ -81,6 +82,7 @@ def _report(options: argparse.Namespace) -> int:
             unredacted=options.unredacted,
             include_model=options.include_model,
             force=options.force,
+            notes=list(Notes(options.paths)),
         )
     )
     for warning in report.warnings:

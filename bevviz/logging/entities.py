@@ -10,6 +10,7 @@ from bevviz.frame import AnomalyKind, ClusterState, DetectionState
 # --- timelines ---------------------------------------------------------------------------------
 
 STAMP = "stamp"  # sensor time, from the header of the cloud
+TRIED = "tried"  # the same, of a frame as other values make it, in bevviz open
 FRAME = "frame"  # sequence
 VERSION = "version"  # sequence: of the configuration, in bevviz tune
 RECEIVED = "received"  # when the cloud was received, or logged into the bag
@@ -19,6 +20,9 @@ RECEIVED = "received"  # when the cloud was received, or logged into the bag
 WORLD = "/world"
 FUSED = "/world/fused"
 MEASURED = "/world/fused/measured"
+MISSED = "/world/missed"
+FALSE = "/world/false"
+UNNAMED = "/world/unnamed"
 FRUSTUMS = "/world/frustums"
 GRID = "/world/bev"
 TRUTH = "/world/ground_truth"
@@ -55,7 +59,7 @@ EVALUATE_LOG = "/evaluate/log"
 
 # Names that no sensor can have, as they are something else where it has its entities.
 RESERVED = frozenset(
-    {path.split("/")[2] for path in (FUSED, FRUSTUMS, GRID, TRUTH, TRACKS)}
+    {path.split("/")[2] for path in (FUSED, FRUSTUMS, GRID, TRUTH, TRACKS, MISSED, FALSE, UNNAMED)}
     | {path.split("/")[2] for path in (COMPARE_ABOUT, COMPARE_LOG, COMPARE_STATES)}
     | {"objects", "count"}  # of /compare
     | {"pipeline"}  # of /explain/states

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from types import MappingProxyType
 
@@ -61,7 +61,8 @@ class Logger(Writer):
         scene: names of the sensors.
         root: entity that everything goes under. With one, this is what else was made of frames that
             another logger writes: what the sensors and the robot brought is not written twice.
-        wait: as of ``Writer``.
+        wait, stamps: as of ``Writer``.
+        inputs: write what the sensors and the robot brought; default: without a root.
     """
 
     def __init__(
@@ -71,8 +72,11 @@ class Logger(Writer):
         scene: Scene,
         root: str = "",
         wait: float = 0.0,
+        stamps: Sequence[str] = (entities.STAMP,),
+        inputs: bool | None = None,
     ) -> None:
-        super().__init__(recording, root, wait)
+        super().__init__(recording, root, wait, stamps)
+        self._inputs = not root if inputs is None else inputs
         self._config = config
         self._scene = scene
         self._intrinsics: dict[str, Intrinsics] = {}
@@ -131,6 +135,7 @@ class Logger(Writer):
         notes: Sequence[tuple[str, str]] = (),
         late: Sequence[LateResult] = (),
         states: Mapping[str, str] = MappingProxyType({}),
+        beside: Callable[[], object] | None = None,
     ) -> None:
         """Everything of one frame. What the frame before had and this one has not is cleared.
 
@@ -140,6 +145,7 @@ class Logger(Writer):
             notes: further lines of the log: level and text.
             late: what the robot has published since and belongs to frames before.
             states: of further lanes, by entity.
+            beside: puts something more into the frame.
         """
         frame = result.frame
         for found in late:
@@ -147,7 +153,7 @@ class Logger(Writer):
             log_late(self, found, self._config.bev)
         self.begin(frame.index, frame.stamp, frame.received)
         self.put(entities.sensor(frame.lidar), transform(frame.pose))
-        if not self.root:
+        if self._inputs:
             self._log_input(result)
         self._log_lidar_results(result)
         for camera in result.cameras:
@@ -164,6 +170,8 @@ class Logger(Writer):
         self._log_states(result, states)
         self._rates.add(frame)
         log_health(self, result, self._last, self._rates, health)
+        if beside is not None:
+            beside()
         self.end()
         self._last = frame
 

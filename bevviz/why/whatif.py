@@ -116,7 +116,9 @@ class WhatIf:
             text, own = _outcome(subject, (reason, reported), (new, now_reported), then, after)
             if text:
                 row = subject.row if subject.kind == "truth" else -1
-                found.append(Hint(_settings(change), text, effects(self._traces, after, row, own)))
+                objects, then_objects = self._result.objects, after.result.objects
+                harm = effects(objects, then_objects, self._traces.truth, row, own)
+                found.append(Hint(_settings(change), text, harm))
                 if not found[-1].effects.harm:
                     break
             elif not now_reported and _ORDER[new] > _ORDER[reason]:
