@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from bevviz.config import Config
     from bevviz.frame import FrameResult, Source
     from bevviz.live.notes import Notes
+    from bevviz.live.raw import RawRecorder
     from bevviz.live.replay import Replay
     from bevviz.live.runtime import Live, Status
     from bevviz.live.settings import Settings
@@ -101,13 +102,17 @@ def _live(options: argparse.Namespace) -> int:
     with terminable():
         if options.synthetic:
             return _watch(_replay(options.synthetic), settings, options, notes)
+        from bevviz.live.raw import RawRecorder
         from bevviz.live.source import LiveSource
 
-        with LiveSource(settings.config, arguments=options.ros_args, tell=notes.info) as source:
-            return _watch_robot(source, settings, options, notes)
+        raw = RawRecorder(settings.config.live)
+        with LiveSource(settings.config, arguments=options.ros_args, tell=notes.info, raw=raw) as source:
+            return _watch_robot(source, settings, options, notes, raw)
 
 
-def _watch_robot(source: LiveSource, settings: Settings, options: argparse.Namespace, notes: Notes) -> int:
+def _watch_robot(
+    source: LiveSource, settings: Settings, options: argparse.Namespace, notes: Notes, raw: RawRecorder
+) -> int:
     """Publish back and take orders, as far as that is asked for."""
     from bevviz.ros.orders import Orders
     from bevviz.ros.publish import Publisher
@@ -132,7 +137,7 @@ def _watch_robot(source: LiveSource, settings: Settings, options: argparse.Names
 
         return show
 
-    return _watch(source, settings, options, notes, publisher.publish if publisher else None, follow)
+    return _watch(source, settings, options, notes, publisher.publish if publisher else None, follow, raw)
 
 
 def _replay(frames: int) -> Replay:
@@ -153,6 +158,7 @@ def _watch(
     notes: Notes,
     on_result: Callable[[FrameResult], None] | None = None,
     follow: Callable[[Live], Callable[[Config], None]] | None = None,
+    raw: RawRecorder | None = None,
 ) -> int:
     """The live run, until the source ends or the user ends it."""
     from tqdm import tqdm
@@ -164,7 +170,7 @@ def _watch(
     window = window or (unsaid and has_display())
     connect = [options.connect] if options.connect else []
     outputs = Outputs(options.save, window, options.serve, options.bind, connect, options.blueprint)
-    live = Live(source, settings, outputs, notes, observe=options.observe, on_result=on_result)
+    live = Live(source, settings, outputs, notes, observe=options.observe, on_result=on_result, raw=raw)
     if follow is not None:
         live.on_change = follow(live)
     for url in live.urls:

@@ -6,7 +6,7 @@ import signal
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import Executor, ThreadPoolExecutor
+from concurrent.futures import Executor
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -24,7 +24,9 @@ from bevviz.live.flight import FlightRecorder
 from bevviz.live.health import Health, set_nice
 from bevviz.live.notes import Notes
 from bevviz.live.output import Output
+from bevviz.live.raw import RawRecorder
 from bevviz.live.settings import AT_START, Settings
+from bevviz.live.snapshots import Snapshots
 from bevviz.live.triggers import Triggers
 from bevviz.live.viewers import Viewer, remote, server, window
 from bevviz.logging import entities
@@ -69,6 +71,7 @@ class Live:
         notes: what has to be said.
         observe: leave the pipeline off; only what the robot publishes is logged.
         on_result: called with each result in a thread of its own; when it is too slow the newest wins.
+        raw: the messages that the source makes the frames of.
 
     Raises:
         UserError: the detector's model, an output or the blueprint cannot be used.
@@ -83,6 +86,7 @@ class Live:
         *,
         observe: bool = False,
         on_result: Callable[[FrameResult], None] | None = None,
+        raw: RawRecorder | None = None,
     ) -> None:
         self.notes = notes
         self.on_change: Callable[[Config], None] = lambda config: None  # called in the thread of ``run``
@@ -101,8 +105,9 @@ class Live:
         self._session = Observing(settings.config) if observe else Session(settings.config)
         self._encoder = Encoder(self.config, source.scene, outputs.blueprint)
         self._indexer = Indexer()
-        self._saves = ThreadPoolExecutor(1, "save")
         self.flight = FlightRecorder(live, self._encoder, self._indexer)
+        self._raw = raw
+        self._snapshots = Snapshots(self.flight, raw, notes)
         self._triggers = Triggers(live)
         self.health = Health()
         self._dropping = Dropping()
@@ -142,6 +147,10 @@ class Live:
             self._drops(),
         )
 
+    def save(self, path: Path | None = None) -> Path:
+        """The last seconds, as ``Snapshots.save``; from any thread."""
+        return self._snapshots.save(path)
+
     def stop(self) -> None:
         """End ``run``, from any thread."""
         self._over.set()
@@ -158,7 +167,7 @@ class Live:
         def tick() -> None:
             if self._asked_to_save:
                 self._asked_to_save = False
-                self._save_soon("SIGUSR1")
+                self._snapshots.save_soon("SIGUSR1")
             if time.monotonic() - self._looked >= LOOK:
                 self._looked = time.monotonic()
                 self._look()
@@ -213,14 +222,14 @@ class Live:
     def _close(self) -> None:
         for output in self._outputs:
             output.close()
-        self._saves.shutdown()
+        self._snapshots.close()
         self._indexer.close()
         self._encoder.close()
 
     def log(self, result: FrameResult) -> None:
         """Encode a frame once, for every output."""
         drops = {entities.drops(where): float(count) for where, count in self._drops().items()}
-        health = self.health.scalars() | drops
+        health = self.health.scalars() | drops | self._snapshots.scalars
         packet = self._encoder.encode(result, self._source.scene, health, self.notes.take())
         for output in self._outputs:
             output.put(packet)
@@ -228,32 +237,13 @@ class Live:
         self.health.logged(result.frame.received)
         self.frames += 1
         if reason := self._triggers.check(result):
-            self._save_soon(reason)
+            self._snapshots.save_soon(reason, self.config.live.trigger_after)
 
     def _drops(self) -> dict[str, int]:
         drops = {"source": self._source.dropped, **self._dropping.dropped}
         for output in self._outputs:
             drops[output.name] = drops.get(output.name, 0) + output.dropped
         return drops
-
-    # --- the flight recorder -------------------------------------------------------------------
-
-    def save(self, path: Path | None = None) -> Path:
-        """``FlightRecorder.save``, and say so."""
-        saved = self.flight.save(path)
-        self.notes.info(f"flight recorder saved in {saved}")
-        return saved
-
-    def _save_soon(self, reason: str) -> None:
-        """In a thread of its own: nothing waits for the disk."""
-
-        def save() -> None:
-            try:
-                self.notes.info(f"flight recorder saved in {self.flight.save()} ({reason})")
-            except UserError as error:
-                self.notes.warn(f"flight recorder not saved ({reason}): {error}")
-
-        self._saves.submit(save)
 
     # --- changes -------------------------------------------------------------------------------
 
@@ -279,6 +269,8 @@ class Live:
         changed = self._session.configure(config)
         self._settings.keep(config)
         self.flight.config = self._triggers.config = config.live
+        if self._raw is not None:
+            self._raw.config = config.live
         if config.live.nice != nice:
             self._nice(config.live.nice)
         for key, change in changed.items():

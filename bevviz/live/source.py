@@ -13,6 +13,8 @@ from bevviz.closing import Closing
 from bevviz.config import Config, SourceConfig, stage_topics
 from bevviz.errors import UserError
 from bevviz.frame import Frame, Intrinsics, Scene
+from bevviz.live.raw import RawRecorder
+from bevviz.live.rawtopics import RawTopics
 from bevviz.ros.encode import typestore
 from bevviz.ros.graph import PublishedTopic, matched_qos, mismatches, published_topics
 from bevviz.ros.messages import MessageError, read_header
@@ -82,6 +84,7 @@ class LiveSource(Closing):
         arguments: what follows ``--ros-args``: remaps, namespace, parameters.
         tell: called with one sentence each, from the receiving thread.
         name: of the node.
+        raw: gets every message as it came, and those of further topics (``live.raw_topics``).
 
     Raises:
         UserError: no working rclpy, or arguments that it refuses.
@@ -94,6 +97,7 @@ class LiveSource(Closing):
         arguments: Sequence[str] = (),
         tell: Callable[[str], None] | None = None,
         name: str = "bevviz",
+        raw: RawRecorder | None = None,
     ) -> None:
         self.config = config
         self.roles = Roles()
@@ -119,6 +123,7 @@ class LiveSource(Closing):
         self._ended = False
 
         self._node = Node(arguments, on_end=self.stop, name=name)
+        self._raw = None if raw is None else RawTopics(self._node, raw)
         self._add_timer(LOOK, self._look)
         self._add_timer(TICK, self._tick)
         self._node.start()
@@ -235,6 +240,8 @@ class LiveSource(Closing):
 
     def _receive(self, topic: str, kind: str, data: bytes, info: dict[str, Any]) -> None:
         message = LiveMessage(topic, kind, info["received_timestamp"] or time.time_ns(), data)
+        if self._raw is not None:
+            self._raw.put(self._known[topic], message.received, info, data)
         first = not self.received[topic]
         self.received[topic] += 1
         before = self._sync.intrinsics.get(topic)
@@ -278,6 +285,8 @@ class LiveSource(Closing):
         known = {name: topic for name, topic in self._known.items() if self.received[name]}
         self._known = known | {name: t for name, t in self.topics.items() if t.type in KINDS}
         self._assign()
+        if self._raw is not None:
+            self._raw.look(self.topics, self._subscriptions.keys())
         heard = self._subscriptions.keys() & self.topics.keys()
         self._sync.absent = frozenset(self._handlers.keys() - heard)
         for name, subscription in self._subscriptions.items():
