@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 from bevviz.cli.interrupts import terminable
 from bevviz.cli.options import Commands, add_config, add_output, add_ros_args, positive
 from bevviz.cli.outputs import has_display, say
+from bevviz.errors import UserError
 
 if TYPE_CHECKING:
     from bevviz.config import Config
@@ -51,7 +52,7 @@ def add(commands: Commands) -> None:
         help="instead of a robot N scans of the synthetic drive, forth and back (default: 30)",
     )
     add_config(live)
-    output = add_output(live, blueprint="live")
+    output = add_output(live, blueprint="live", raw=True)
     output.add_argument(
         "--split", type=_split, metavar="SIZE|TIME", help="--save in parts, e.g. 500MB or 10min"
     )
@@ -64,7 +65,8 @@ def add(commands: Commands) -> None:
     snap = commands.add_parser(
         "snap",
         help="save the last seconds of a running 'bevviz live'",
-        description="Have a running 'bevviz live' save its flight recorder. SIGUSR1 does the same.",
+        description="Have a running 'bevviz live' save its flight recorder: FILE.rrd, and beside it "
+        "FILE.mcap, the messages that it was made of. SIGUSR1 does the same.",
     )
     snap.add_argument("path", nargs="?", type=Path, metavar="FILE.rrd", help="default: named by the time")
     snap.add_argument("--pid", type=int, metavar="PID", help="which process, where several run")
@@ -94,6 +96,9 @@ def _live(options: argparse.Namespace) -> int:
     more = [f"{key}={value}" for key, value in given.items() if value is not None]
     if options.split is not None:
         more.append(options.split)
+    _, messages = _files(options.save)  # before a robot is waited for
+    if messages is not None and options.synthetic:
+        raise UserError(f"--save {messages}: the synthetic drive has no messages; 'bevviz demo --bag' does")
     settings = Settings(options.config, [*options.set, *more], options.preset)
     if options.serve is not None:
         own_address(options.bind)  # before a robot is waited for
@@ -166,10 +171,11 @@ def _watch(
     from bevviz.live.runtime import Live, Outputs
 
     window = options.viewer
-    unsaid = options.save is None and options.serve is None and options.connect is None and not window
+    save, messages = _files(options.save)
+    unsaid = not options.save and options.serve is None and options.connect is None and not window
     window = window or (unsaid and has_display())
     connect = [options.connect] if options.connect else []
-    outputs = Outputs(options.save, window, options.serve, options.bind, connect, options.blueprint)
+    outputs = Outputs(save, window, options.serve, options.bind, connect, options.blueprint, messages)
     live = Live(source, settings, outputs, notes, observe=options.observe, on_result=on_result, raw=raw)
     if follow is not None:
         live.on_change = follow(live)
@@ -186,15 +192,31 @@ def _watch(
         live.run(show)
     for warning in source.warnings:
         say(f"warning: {warning}")
-    where = live.saver.paths if live.saver is not None else []
-    target = f" in {where[0]}" + (f" and {len(where) - 1} more" if where[1:] else "") if where else ""
+    written = [saver.paths for saver in (live.saver, live.raw_saver) if saver is not None]
+    targets = [f"{where[0]}" + (f" and {len(where) - 1} more" if where[1:] else "") for where in written]
+    target = f" in {', '.join(targets)}" if targets else ""
     drops = [f"{count} ({place})" for place, count in live.status.drops.items() if count]
     say(f"{live.frames} frames{target}, {' + '.join(drops) or 'none'} dropped")
     return 0 if live.frames else 1
 
 
+def _files(paths: Sequence[Path]) -> tuple[Path | None, Path | None]:
+    """Those of ``--save``: for the recording, and for the messages."""
+    found: dict[str, Path] = {}
+    for path in paths:
+        if path.suffix not in (".rrd", ".mcap"):  # a slip must not overwrite something else
+            raise UserError(f"--save {path}: expected a file name that ends in .rrd or .mcap")
+        if path.suffix in found:
+            raise UserError(f"--save {path}: {found[path.suffix]} is given already; one of each kind")
+        found[path.suffix] = path
+    return found.get(".rrd"), found.get(".mcap")
+
+
 def _snap(options: argparse.Namespace) -> int:
     from bevviz.live.control import snap
 
-    print(snap(options.path, options.pid))
+    saved = snap(options.path, options.pid)
+    print(saved)
+    if saved.with_suffix(".mcap").exists():
+        print(saved.with_suffix(".mcap"))
     return 0

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import subprocess
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from pathlib import Path
@@ -66,6 +67,7 @@ class Saver(Output):
         if path.suffix != ".rrd":  # a slip must not overwrite something else
             raise UserError(f"--save {path}: expected a file name that ends in .rrd")
         self.paths: list[Path] = []
+        self.on_part: Callable[[], None] = lambda: None  # called when a further one begins
         self._path = path
         self._size = config.split_size and config.split_size * MEGABYTE
         self._time = config.split_time
@@ -90,6 +92,7 @@ class Saver(Output):
             if packet.whole and self._is_complete(packet):
                 self._finish()
                 self._open()
+                self.on_part()
             if not self._written:
                 self._started = packet.time
                 self._write(self._encoder.prelude(packet.context))

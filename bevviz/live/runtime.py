@@ -25,6 +25,7 @@ from bevviz.live.health import Health, set_nice
 from bevviz.live.notes import Notes
 from bevviz.live.output import Output
 from bevviz.live.raw import RawRecorder
+from bevviz.live.rawsaver import RawSaver
 from bevviz.live.settings import AT_START, Settings
 from bevviz.live.snapshots import Snapshots
 from bevviz.live.triggers import Triggers
@@ -39,7 +40,7 @@ ENDING = (signal.SIGINT, signal.SIGTERM)
 
 @dataclass(frozen=True, slots=True)
 class Outputs:
-    """Where the results go, any number at once: file, window, web viewer at a port, viewers elsewhere."""
+    """Where the results go, any number at once: files, window, web viewer at a port, viewers elsewhere."""
 
     save: Path | None = None
     window: bool = False
@@ -47,6 +48,7 @@ class Outputs:
     bind: str = "127.0.0.1"
     connect: Sequence[str] = ()
     blueprint: str = "live"
+    raw: Path | None = None  # .mcap file for the messages
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,6 +126,13 @@ class Live:
         if outputs.save is not None:
             self.saver = Saver(outputs.save, live, self._encoder, self._indexer, notes)
             self._outputs.append(self.saver)
+        self.raw_saver: RawSaver | None = None
+        if outputs.raw is not None:
+            if raw is None:
+                raise UserError(f"--save {outputs.raw}: only a robot's messages can be saved")
+            self.raw_saver = RawSaver(outputs.raw, live, raw, notes, follows=self.saver is not None)
+            if self.saver is not None:
+                self.saver.on_part = self.raw_saver.next_part
         self._outputs += [Viewer(program, live.output_queue, self._encoder, notes) for program in programs]
 
     @property
@@ -222,6 +231,8 @@ class Live:
     def _close(self) -> None:
         for output in self._outputs:
             output.close()
+        if self.raw_saver is not None:
+            self.raw_saver.close()
         self._snapshots.close()
         self._indexer.close()
         self._encoder.close()
@@ -243,6 +254,8 @@ class Live:
         drops = {"source": self._source.dropped, **self._dropping.dropped}
         for output in self._outputs:
             drops[output.name] = drops.get(output.name, 0) + output.dropped
+        if self.raw_saver is not None:
+            drops[self.raw_saver.name] = self.raw_saver.dropped
         return drops
 
     # --- changes -------------------------------------------------------------------------------
