@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import random
 import subprocess
 import threading
@@ -11,13 +12,19 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
+from rosbags.interfaces import Connection, ConnectionExtRosbag2, MessageDefinition, MessageDefinitionFormat
 from ruamel.yaml import YAML
 
+from bevviz.bags import mcap_writer
+from bevviz.bags.info import describe
+from bevviz.bags.mcap_writer import McapWriter
 from bevviz.bags.source import BagSource
 from bevviz.config import load
+from bevviz.errors import UserError
 from bevviz.frame import FrameResult
 from bevviz.report.digest import compare, digest
 from bevviz.run import Observer
@@ -32,10 +39,11 @@ from tests.ros_player import Play
 pytest.importorskip("rclpy", reason="needs rclpy: pip install 'bevviz[ros]'")
 
 from bevviz.live.notes import Notes
-from bevviz.live.raw import RawRecorder
+from bevviz.live.raw import Earlier, RawMessage, RawRecorder, children, define
 from bevviz.live.runtime import Live, Outputs
 from bevviz.live.settings import Settings
 from bevviz.live.source import LiveSource
+from bevviz.ros.encode import encode_transforms, typestore
 from bevviz.ros.node import Node
 
 PATIENCE = 60.0
@@ -170,8 +178,69 @@ def test_other_libraries_read_it(flight: Flight) -> None:
     assert counts[LIDAR_TOPIC] >= 10 * SECONDS
 
 
+def test_a_recording_stands_for_the_bag_beside_it(flight: Flight, tmp_path: Path) -> None:
+    info = describe([flight.folder / "snap.rrd"], load())
+    assert info.missing == ("no detector: --model FILE.onnx",) and info.cameras[0].image is not None
+    alone = tmp_path / "snap.rrd"
+    alone.write_bytes((flight.folder / "snap.rrd").read_bytes())
+    with pytest.raises(UserError, match=r"snap\.mcap, which 'bevviz live' saves with it, is not beside it"):
+        describe([alone], load())
+
+
 def test_what_is_held_is_bounded_and_shown(flight: Flight) -> None:
     assert max(seconds for _, seconds in flight.sizes) <= SECONDS + 3.2
     assert max(size for size, _ in flight.sizes) < 500e6
     (saved,) = [text for text in flight.said if text.startswith("flight recorder saved")]
     assert "snap.rrd and snap.mcap, " in saved and "messages of 6 s" in saved
+
+
+def test_a_message_stays_until_another_one_takes_its_place() -> None:
+    def said(topic: str, kind: str, received: int, data: bytes) -> RawMessage:
+        nothing = MessageDefinition(MessageDefinitionFormat.NONE, "")
+        connection = Connection(0, topic, kind, nothing, "", 0, ConnectionExtRosbag2("cdr", []), None)
+        return RawMessage(connection, received, received, data)
+
+    def pose(received: int, *names: str) -> RawMessage:
+        edges = [("a frame", name, np.eye(4)) for name in names]
+        data = typestore().serialize_cdr(encode_transforms(received, edges), "tf2_msgs/msg/TFMessage")
+        return said("/tf", "tf2_msgs/msg/TFMessage", received, bytes(data))
+
+    earlier = Earlier()
+    messages = [
+        said("/map", "nav_msgs/msg/OccupancyGrid", 1, b"old"),
+        pose(2, "odom", "b"),
+        pose(3, "odom"),
+        said("/points", "sensor_msgs/msg/PointCloud2", 4, b"cloud"),
+        said("/map", "nav_msgs/msg/OccupancyGrid", 5, b"new!"),
+        pose(6, "odom"),
+    ]
+    for message in messages:
+        earlier.note(message)
+    kept = earlier.before(1000)
+    assert [(m.sent, m.received) for m in kept] == [(2, 997), (5, 998), (6, 999)]
+    assert earlier.size == sum(len(m.data) for m in kept)
+    assert children(messages[1].data) == (b"odom", b"b") and children(b"\0\1\0\0\5") == ()
+
+
+def test_a_full_disk_leaves_a_bag_that_can_be_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    nothing = MessageDefinition(MessageDefinitionFormat.NONE, "")
+    connection = Connection(0, "/x", "a/msg/X", nothing, "", 0, ConnectionExtRosbag2("cdr", []), None)
+    written, room = mcap_writer.write_all, 12_000_000
+
+    def limited(file: int, data: bytes) -> None:
+        nonlocal room
+        if len(data) > room:
+            written(file, data[:room])
+            raise OSError(errno.ENOSPC, "No space left on device")
+        room -= len(data)
+        written(file, data)
+
+    monkeypatch.setattr(mcap_writer, "write_all", limited)
+    random_bytes = np.random.default_rng(0).bytes
+    with McapWriter(tmp_path / "x.mcap", define) as bag:
+        with pytest.raises(UserError, match="No space left"):
+            for time_ in range(100):
+                bag.write(connection, time_, random_bytes(1_000_000))
+        room = 1_000_000  # of the chunk that did not fit
+    with (tmp_path / "x.mcap").open("rb") as file:
+        assert len(list(make_reader(file, validate_crcs=True).iter_messages())) == 10
