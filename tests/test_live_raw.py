@@ -19,12 +19,12 @@ from rosbags.highlevel import AnyReader
 from rosbags.interfaces import Connection, ConnectionExtRosbag2, MessageDefinition, MessageDefinitionFormat
 from ruamel.yaml import YAML
 
-from bevviz.bags import mcap_writer
 from bevviz.bags.info import describe
 from bevviz.bags.mcap_writer import McapWriter
 from bevviz.bags.source import BagSource
 from bevviz.config import load
 from bevviz.errors import UserError
+from bevviz.files import write_all
 from bevviz.frame import FrameResult
 from bevviz.report.digest import compare, digest
 from bevviz.run import Observer
@@ -225,7 +225,7 @@ def test_a_message_stays_until_another_one_takes_its_place() -> None:
 def test_a_full_disk_leaves_a_bag_that_can_be_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     nothing = MessageDefinition(MessageDefinitionFormat.NONE, "")
     connection = Connection(0, "/x", "a/msg/X", nothing, "", 0, ConnectionExtRosbag2("cdr", []), None)
-    written, room = mcap_writer.write_all, 12_000_000
+    written, room = write_all, 12_000_000
 
     def limited(file: int, data: bytes) -> None:
         nonlocal room
@@ -235,7 +235,7 @@ def test_a_full_disk_leaves_a_bag_that_can_be_read(tmp_path: Path, monkeypatch: 
         room -= len(data)
         written(file, data)
 
-    monkeypatch.setattr(mcap_writer, "write_all", limited)
+    monkeypatch.setattr("bevviz.bags.mcap_writer.write_all", limited)
     random_bytes = np.random.default_rng(0).bytes
     with McapWriter(tmp_path / "x.mcap", define) as bag:
         with pytest.raises(UserError, match="No space left"):
