@@ -88,7 +88,8 @@ class RawSaver(Closing):
 
     def _open(self) -> McapWriter:
         number = f"_{len(self.paths):03d}" if self._numbered else ""
-        part = McapWriter(self._path.with_stem(f"{self._path.stem}{number}"), define)
+        # As `ros2 bag record` does by itself: what is saved must not take the CPU from what it is saved for.
+        part = McapWriter(self._path.with_stem(f"{self._path.stem}{number}"), define, compress=False)
         part.__enter__()
         self.paths.append(self._path.with_stem(f"{self._path.stem}{number}"))
         return part
