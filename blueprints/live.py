@@ -23,6 +23,7 @@ def blueprint(scene: Scene) -> rrb.Blueprint:
                     views.anomalies(),
                     views.states(),
                     views.tracks(),
+                    views.diagnostics(),
                     views.log(),
                 ),
                 row_shares=[*[2] * len(side), 3, 2],

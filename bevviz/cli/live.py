@@ -39,6 +39,11 @@ def add(commands: Commands) -> None:
     choice.add_argument(
         "--publish", action="store_true", help="publish the results, as the nodes of the tutorial do"
     )
+    choice.add_argument(
+        "--diagnostics",
+        action="store_true",
+        help="publish how bevviz does and what is worth a look on /diagnostics; --publish does it, too",
+    )
     choice.add_argument("--every", metavar="N", help="run each N-th scan only")
     choice.add_argument("--max-rate", metavar="HZ", help="frames a second at most")
     choice.add_argument("--points", metavar="N", help="points kept of each scan")
@@ -119,6 +124,7 @@ def _watch_robot(
     source: LiveSource, settings: Settings, options: argparse.Namespace, notes: Notes, raw: RawRecorder
 ) -> int:
     """Publish back and take orders, as far as that is asked for."""
+    from bevviz.ros.diagnostics import Diagnostics
     from bevviz.ros.orders import Orders
     from bevviz.ros.publish import Publisher
 
@@ -131,9 +137,18 @@ def _watch_robot(
     if not source.wait(0):
         return 1
     publisher = Publisher(source.node, settings.config, notes.warn) if options.publish else None
+    diagnostics = Diagnostics(source.node) if options.publish or options.diagnostics else None
+
+    def on_result(result: FrameResult) -> None:
+        if publisher is not None:
+            publisher.publish(result)
+        if diagnostics is not None:
+            diagnostics.see(result)
 
     def follow(live: Live) -> Callable[[Config], None]:
         orders = Orders(source.node, live.config, live.update, live.save)
+        if diagnostics is not None:
+            diagnostics.every_second(lambda: diagnostics.publish(live.numbers, source.warnings))
 
         def show(config: Config) -> None:
             orders.show(config)
@@ -142,7 +157,8 @@ def _watch_robot(
 
         return show
 
-    return _watch(source, settings, options, notes, publisher.publish if publisher else None, follow, raw)
+    wanted = on_result if publisher is not None or diagnostics is not None else None
+    return _watch(source, settings, options, notes, wanted, follow, raw)
 
 
 def _replay(frames: int) -> Replay:

@@ -156,6 +156,20 @@ class Live:
             self._drops(),
         )
 
+    @property
+    def numbers(self) -> dict[str, float]:
+        """How it goes, by name: for a monitor."""
+        status = self.status
+        numbers = {
+            "frames": float(status.frames),
+            "latency p50, ms": 1e3 * status.p50,
+            "latency p99, ms": 1e3 * status.p99,
+            "CPU, percent of a core": status.cpu,
+            "memory, MB": status.memory,
+        }
+        numbers |= {f"dropped: {where}": float(count) for where, count in status.drops.items()}
+        return numbers | {path.rpartition("/")[2]: n for path, n in self._snapshots.scalars.items()}
+
     def save(self, path: Path | None = None) -> Path:
         """The last seconds, as ``Snapshots.save``; from any thread."""
         return self._snapshots.save(path)

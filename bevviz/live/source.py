@@ -15,13 +15,14 @@ from bevviz.errors import UserError
 from bevviz.frame import Frame, Intrinsics, Scene
 from bevviz.live.raw import RawRecorder
 from bevviz.live.rawtopics import RawTopics
+from bevviz.ros import around
 from bevviz.ros.encode import typestore
 from bevviz.ros.graph import PublishedTopic, matched_qos, mismatches, published_topics
 from bevviz.ros.messages import MessageError, read_header
 from bevviz.ros.node import Node
-from bevviz.ros.roles import Roles, Topic, find_roles
+from bevviz.ros.roles import MARK, Roles, Topic, find_roles
 from bevviz.ros.typesupport import message_type
-from bevviz.sync.feed import Handler, make_handlers
+from bevviz.sync.feed import Handler, make_around_handlers, make_handlers
 from bevviz.sync.synchronizer import Synchronizer, blindness
 
 LOOK = 0.5  # seconds between two looks at the graph
@@ -39,6 +40,7 @@ KINDS = {
     "nav_msgs/msg/Odometry",
     "vision_msgs/msg/Detection2DArray",
     "vision_msgs/msg/Detection3DArray",
+    *around.TYPES,
 }
 
 
@@ -124,6 +126,8 @@ class LiveSource(Closing):
 
         self._node = Node(arguments, on_end=self.stop, name=name)
         self._raw = None if raw is None else RawTopics(self._node, raw)
+        mark = self._node.resolve(MARK)  # heard before anybody says something: it may be said once
+        self._mark = PublishedTopic(mark, "std_msgs/msg/String", ())
         self._add_timer(LOOK, self._look)
         self._add_timer(TICK, self._tick)
         self._node.start()
@@ -283,6 +287,7 @@ class LiveSource(Closing):
     def _look(self) -> None:
         self.topics = published_topics(self._node)
         known = {name: topic for name, topic in self._known.items() if self.received[name]}
+        known.setdefault(self._mark.name, self._mark)
         self._known = known | {name: t for name, t in self.topics.items() if t.type in KINDS}
         self._assign()
         if self._raw is not None:
@@ -291,6 +296,8 @@ class LiveSource(Closing):
         self._sync.absent = frozenset(self._handlers.keys() - heard)
         for name, subscription in self._subscriptions.items():
             topic = self.topics.get(name)
+            if topic is None and any(name == shown for shown, _, _ in self.roles.around):
+                continue  # such come and go
             gone = f"{name} has no publisher any more; waiting for it to come back"
             self._note(name, gone if topic is None else "", f"{name} is published again")
             unheard = "; ".join(mismatches(topic, subscription.qos)) if topic is not None else ""
@@ -335,6 +342,10 @@ class LiveSource(Closing):
             former, self._sync = self._sync, Synchronizer(roles, self.config)
             self._sync.take_over(former)
             self._handlers = make_handlers(self._sync, roles, LiveMessage.decode)
+        elif roles.around != self.roles.around:
+            others = self._handlers.keys() - {topic for topic, _, _ in self.roles.around}
+            self._handlers = {topic: self._handlers[topic] for topic in others}
+            self._handlers |= make_around_handlers(self._sync, roles, LiveMessage.decode)
         self.roles = roles
         for name in self._subscriptions.keys() - self._handlers.keys():
             self._node.input.destroy_subscription(self._subscriptions.pop(name).handle)
