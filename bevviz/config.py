@@ -385,6 +385,16 @@ class LiveConfig(Section):
     triggers: tuple[AnomalyKind, ...] = Field(
         (), description="save when such an anomaly begins: " + ", ".join(get_args(AnomalyKind))
     )
+    robot_time: Seconds | None = Field(
+        None,
+        ge=0,
+        description="--robot: save when the robot's objects and ours differ for so long; empty: never",
+    )
+    robot_tolerance: Metres = Field(
+        0.5,
+        ge=0,
+        description="--robot: distance of one object's centres, seen from above, that is the same yet",
+    )
     trigger_after: Seconds = Field(
         2.0, ge=0, le=600, description="that still belong to an automatic save, after its reason"
     )

@@ -19,6 +19,7 @@ from bevviz.frame import Frame, FrameResult
 from bevviz.ros.encode import typestore
 from bevviz.session import Session
 from bevviz.synthetic import SyntheticSource
+from bevviz.synthetic.drive import TRUTH_TOPIC
 from tests.recordings import Recording
 from tests.ros_player import Play
 
@@ -34,6 +35,7 @@ from bevviz.ros.node import Node
 from bevviz.ros.typesupport import message_type
 
 PATIENCE = 60.0
+BOXES = "vision_msgs/msg/Detection3DArray"
 MARK = "the person behind the van"
 
 
@@ -42,6 +44,8 @@ class Flight:
     folder: Path
     frames: list[Frame]
     heard: list[Any]  # what bevviz said on /diagnostics
+    said: list[str]  # on the terminal
+    live: Live
 
 
 def until(condition: Callable[[], object], what: str) -> None:
@@ -90,6 +94,14 @@ class Robot:
         )
         self.say("/diagnostics", TYPE, make(TYPE, header=header(""), status=[status]))
 
+    def objects(self, data: bytes) -> None:
+        """The ground truth as what is ours, and as the robot's own, a metre further."""
+        message: Any = typestore().deserialize_cdr(data, BOXES)
+        self.say("/ours/objects", BOXES, message)
+        for detection in message.detections:
+            detection.bbox.center.position.x += 1.0
+        self.say("/detection/fused_3d", BOXES, message)
+
     def path(self) -> None:
         poses = [
             make("geometry_msgs/msg/PoseStamped", header=header("map"), pose=pose(x)) for x in (0.0, 1.0, 2.0)
@@ -119,7 +131,9 @@ def flight(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Flight]:
 def fly(folder: Path) -> Flight:
     frames: list[Frame] = []
     heard: list[Any] = []
-    settings = Settings(None, ["live.flight_time=20 s"])
+    said: list[str] = []
+    asked = ["objects.method=topic:/ours/objects", "live.robot_time=0.5 s", "live.trigger_after=0"]
+    settings = Settings(None, ["live.flight_time=20 s", *asked])
     Session(settings.config).run(SyntheticSource(frames=1).snapshot(0).frame)  # what is compiled, is
     raw = RawRecorder(settings.config.live)
     with Node(name="robot") as node:
@@ -127,10 +141,11 @@ def fly(folder: Path) -> Flight:
         robot = Robot(node.node)
 
         def hear(data: bytes) -> None:
-            said: Any = typestore().deserialize_cdr(data, TYPE)
-            heard.extend(status for status in said.status if status.name.startswith("bevviz"))
+            told: Any = typestore().deserialize_cdr(data, TYPE)
+            heard.extend(status for status in told.status if status.name.startswith("bevviz"))
 
         node.node.create_subscription(message_type(TYPE), "/diagnostics", hear, 10, raw=True)
+        node.node.create_subscription(message_type(BOXES), TRUTH_TOPIC, robot.objects, 10, raw=True)
         with LiveSource(settings.config, raw=raw) as source:
             assert source.wait(PATIENCE), source.missing
             diagnostics = Diagnostics(source.node)
@@ -139,7 +154,9 @@ def fly(folder: Path) -> Flight:
                 frames.append(result.frame)
                 diagnostics.see(result)
 
-            live = Live(source, settings, Outputs(), Notes(lambda text: None), on_result=on_result, raw=raw)
+            live = Live(
+                source, settings, Outputs(), Notes(said.append), on_result=on_result, raw=raw, robot=""
+            )
             diagnostics.every_second(lambda: diagnostics.publish(live.numbers, ["two LiDARs are one"]))
 
             def latest(condition: Callable[[Any], object]) -> Callable[[], bool]:
@@ -160,12 +177,13 @@ def fly(folder: Path) -> Flight:
                         until(latest(told), text)
                     mark = node.node.create_publisher(message_type("std_msgs/msg/String"), "/bevviz/mark", 10)
                     until(mark.get_subscription_count, "somebody who hears marks")
-                    said = make("std_msgs/msg/String", data=MARK)
-                    mark.publish(bytes(typestore().serialize_cdr(said, "std_msgs/msg/String")))
+                    text = make("std_msgs/msg/String", data=MARK)
+                    mark.publish(bytes(typestore().serialize_cdr(text, "std_msgs/msg/String")))
                     until(lambda: any(f.around and f.around.marks for f in list(frames)), "the mark")
                     until(
                         lambda: {s.name for s in heard} >= {f"bevviz: {p}" for p in PARTS}, "our diagnostics"
                     )
+                    until(lambda: any("robot and ours differ" in text for text in said), "a save for that")
                     count = live.frames
                     until(lambda: live.frames > count + 3, "more frames")
                     live.save(Path("snap.rrd"))
@@ -176,7 +194,7 @@ def fly(folder: Path) -> Flight:
             thread.start()
             live.run()
             thread.join()
-    return Flight(folder, frames, heard)
+    return Flight(folder, frames, heard, said, live)
 
 
 PARTS = ("pipeline", "anomalies", "sources")
@@ -199,6 +217,19 @@ def test_the_robots_diagnostics_have_lanes_and_lines(flight: Flight) -> None:
     assert [value[0] for value in changes] == ["ok", "warning"]
     texts = [text for row in recording.rows["/explain/log"] for text in row["TextLog:text"] or ()]
     assert texts.count("diagnostics: lidar/fan: warning, is slow") == 1
+
+
+def test_ours_against_the_robots(flight: Flight) -> None:
+    against = flight.live.against
+    assert against is not None and against.topic == "/detection/fused_3d"
+    assert against.frames > 3 and against.differing == against.frames
+    recording = Recording(flight.folder / "snap.rrd")
+    moved = [value[0] for value in recording.column("/compare/count/moved", "Scalars:scalars")]
+    (only,) = {value[0] for value in recording.column("/compare/count/only_a", "Scalars:scalars")}
+    assert min(moved) >= 1 and only == 0
+    assert "/compare/objects/moved" in recording.at and recording.static["/compare/about"]
+    (told,) = [text for text in flight.said if "robot and ours differ" in text]
+    assert "1.00 m apart" in told and told.startswith("flight recorder saved in flight_")
 
 
 def test_what_bevviz_says_of_itself(flight: Flight) -> None:

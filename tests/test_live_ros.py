@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from bevviz.config import Config, load
+from bevviz.config import Config, keys, load
 from bevviz.errors import UserError
 from bevviz.frame import Boxes3D, CameraResult, Detections, Frame, FrameResult, Objects
 from bevviz.ros.encode import encode_camera_info, typestore
@@ -410,6 +410,29 @@ def test_parameters_and_the_saving_of_the_recording(pair: tuple[Node, Node]) -> 
     orders.show(load(settings=["voxel_size=0.2"], preset="reference"))
     assert robot.node.get_parameter("voxel_size").value == 0.2
     assert len(ordered) == 3, "what is shown is no order"
+
+    del ordered[:]
+    settings = {
+        "clustering.eps": "60 cm",
+        "live.max_rate": 5,
+        "live.triggers": ["tf", "stage"],
+        "source.lidar_topics": "[/points]",
+        "sync.motion_compensation": True,
+    }
+    assert all(set_to(name, value).successful for name, value in settings.items())
+    orders.show(config)
+    assert (config.clustering.eps, config.live.triggers) == (0.5, ()), "each order is alone in this test"
+    assert set_to("live.max_rate", 5).successful and set_to("live.max_rate", "").successful
+    assert ordered == [
+        "clustering.eps=60 cm",
+        "live.max_rate=5",
+        'live.triggers=["tf", "stage"]',
+        "source.lidar_topics=[/points]",
+        "sync.motion_compensation=true",
+        "live.max_rate=5",
+    ]
+    assert not set_to("live.triggers", ["typhoon"]).successful
+    assert {name for name in keys() if not robot.node.has_parameter(name)} == set()
 
     trigger = operator.node.create_client(Trigger, "/one/save_recording")
     answer = call(operator.node, trigger, Trigger.Request())

@@ -44,6 +44,13 @@ def add(commands: Commands) -> None:
         action="store_true",
         help="publish how bevviz does and what is worth a look on /diagnostics; --publish does it, too",
     )
+    choice.add_argument(
+        "--robot",
+        nargs="?",
+        const="",
+        metavar="TOPIC",
+        help="compare our objects with the robot's (default: its fused Detection3DArray), frame by frame",
+    )
     choice.add_argument("--every", metavar="N", help="run each N-th scan only")
     choice.add_argument("--max-rate", metavar="HZ", help="frames a second at most")
     choice.add_argument("--points", metavar="N", help="points kept of each scan")
@@ -104,6 +111,8 @@ def _live(options: argparse.Namespace) -> int:
     _, messages = _files(options.save)  # before a robot is waited for
     if messages is not None and options.synthetic:
         raise UserError(f"--save {messages}: the synthetic drive has no messages; 'bevviz demo --bag' does")
+    if options.observe and options.robot is not None:
+        raise UserError("--robot compares our objects with the robot's: leave --observe out")
     settings = Settings(options.config, [*options.set, *more], options.preset)
     if options.serve is not None:
         own_address(options.bind)  # before a robot is waited for
@@ -192,7 +201,16 @@ def _watch(
     window = window or (unsaid and has_display())
     connect = [options.connect] if options.connect else []
     outputs = Outputs(save, window, options.serve, options.bind, connect, options.blueprint, messages)
-    live = Live(source, settings, outputs, notes, observe=options.observe, on_result=on_result, raw=raw)
+    live = Live(
+        source,
+        settings,
+        outputs,
+        notes,
+        observe=options.observe,
+        on_result=on_result,
+        raw=raw,
+        robot=options.robot,
+    )
     if follow is not None:
         live.on_change = follow(live)
     for url in live.urls:
@@ -206,6 +224,9 @@ def _watch(
             bar.update(status.frames - bar.n)
 
         live.run(show)
+    if (against := live.against) is not None:
+        text = f"{against.differing} of {against.frames} compared frames differ from {against.names[1]}"
+        say(text if against.frames else f"the robot published nothing on {against.names[1]}")
     for warning in source.warnings:
         say(f"warning: {warning}")
     written = [saver.paths for saver in (live.saver, live.raw_saver) if saver is not None]

@@ -60,6 +60,10 @@ class DifferenceLogger(Writer):
                     rr.SeriesLines(colors=[color], names=[f"{series} {what.upper()}"]),
                 )
 
+    def refresh(self) -> None:
+        super().refresh()
+        self._lanes.states = {}
+
     def log(self, found: FrameDifferences, received: int, world_from_points: F64) -> None:
         """One frame. Times in nanoseconds; ``received`` is 0 where it is not known."""
         self.begin(found.index, found.stamp, received)

@@ -17,6 +17,7 @@ import numpy as np
 from bevviz.config import Config
 from bevviz.errors import UserError
 from bevviz.frame import Frame, FrameResult, Scene, Source
+from bevviz.live.against import AgainstRobot
 from bevviz.live.control import Control
 from bevviz.live.encoder import Encoder
 from bevviz.live.files import Indexer, Saver
@@ -74,6 +75,7 @@ class Live:
         observe: leave the pipeline off; only what the robot publishes is logged.
         on_result: called with each result in a thread of its own; when it is too slow the newest wins.
         raw: the messages that the source makes the frames of.
+        robot: topic of the robot's boxes that ours are compared with, empty: that which is fused; None: none.
 
     Raises:
         UserError: the detector's model, an output or the blueprint cannot be used.
@@ -89,6 +91,7 @@ class Live:
         observe: bool = False,
         on_result: Callable[[FrameResult], None] | None = None,
         raw: RawRecorder | None = None,
+        robot: str | None = None,
     ) -> None:
         self.notes = notes
         self.on_change: Callable[[Config], None] = lambda config: None  # called in the thread of ``run``
@@ -105,7 +108,9 @@ class Live:
 
         self._nice(live.nice)
         self._session = Observing(settings.config) if observe else Session(settings.config)
-        self._encoder = Encoder(self.config, source.scene, outputs.blueprint)
+        self._robot_problem = ""
+        self.against = None if robot is None else AgainstRobot(robot, live)
+        self._encoder = Encoder(self.config, source.scene, outputs.blueprint, self.against)
         self._indexer = Indexer()
         self.flight = FlightRecorder(live, self._encoder, self._indexer)
         self._raw = raw
@@ -255,13 +260,24 @@ class Live:
         """Encode a frame once, for every output."""
         drops = {entities.drops(where): float(count) for where, count in self._drops().items()}
         health = self.health.scalars() | drops | self._snapshots.scalars
-        packet = self._encoder.encode(result, self._source.scene, health, self.notes.take())
+        compared = self.against.see(result) if self.against is not None else ()
+        packet = self._encoder.encode(result, self._source.scene, health, self.notes.take(), compared)
         for output in self._outputs:
             output.put(packet)
         self.flight.put(packet)
         self.health.logged(result.frame.received)
         self.frames += 1
         if reason := self._triggers.check(result):
+            self._snapshots.save_soon(reason, self.config.live.trigger_after)
+        if self.against is not None:
+            self._watch_robot(self.against)
+
+    def _watch_robot(self, against: AgainstRobot) -> None:
+        if against.problem != self._robot_problem:
+            self._robot_problem = against.problem
+            if against.problem:
+                self.notes.warn(against.problem)
+        if reason := against.reason():
             self._snapshots.save_soon(reason, self.config.live.trigger_after)
 
     def _drops(self) -> dict[str, int]:
@@ -298,6 +314,8 @@ class Live:
         self.flight.config = self._triggers.config = config.live
         if self._raw is not None:
             self._raw.config = config.live
+        if self.against is not None:
+            self.against.config = config.live
         if config.live.nice != nice:
             self._nice(config.live.nice)
         for key, change in changed.items():

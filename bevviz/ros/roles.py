@@ -184,7 +184,8 @@ def find_roles(
     for key, topic in staged.items():
         notes[topic.name] = f"the robot's own result, taken for the stage {key.partition('.')[0]}"
     around = [(t.name, kind, t.kind) for t in topics if (kind := kind_of(t.name, t.kind)) is not None]
-    notes.update({name: f"shown: {_AROUND[kind]}" for name, kind, _ in around})
+    helps = {t.name: f"; no LiDAR: {why}" if (why := _foreign(t, "LiDAR")) else "" for t in topics}
+    notes.update({name: f"shown: {_AROUND[kind]}{helps[name]}" for name, kind, _ in around})
     return Roles(
         around=tuple(around),
         lidars=_names(lidars),
