@@ -53,7 +53,8 @@ def decode_shapes(msg: Any, short: str, topic: str) -> list[Shape]:
         angles = msg.angle_min + msg.angle_increment * np.arange(len(ranges))
         within = (ranges >= msg.range_min) & (ranges <= msg.range_max)
         directions = np.stack([np.cos(angles), np.sin(angles), np.zeros(len(ranges))], axis=1)
-        return [Shape(*about, points=(directions * ranges[:, None])[within].astype(np.float32))]
+        points = directions[within] * ranges[within, None]
+        return [Shape(*about, points=points.astype(np.float32))]
     if short == "Path":
         way = np.array([[*_xyz(p.pose.position)] for p in msg.poses], np.float32).reshape(-1, 3)
         return [Shape(*about, strips=(way,))] if len(way) else []
