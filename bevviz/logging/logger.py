@@ -15,6 +15,7 @@ from bevviz.frame import CameraResult, Frame, FrameResult, Intrinsics, LateResul
 from bevviz.logging import entities
 from bevviz.logging.annotations import log_world
 from bevviz.logging.anomalies import log_anomalies, log_anomalies_looks
+from bevviz.logging.around import AroundLog, diagnostic_states, marks
 from bevviz.logging.bev import log_bev, log_grid
 from bevviz.logging.camera import (
     log_camera,
@@ -82,6 +83,7 @@ class Logger(Writer):
         self._intrinsics: dict[str, Intrinsics] = {}
         self._track_lanes = Lanes()
         self._state_lanes = StateLanes(COLORS)
+        self._around = AroundLog()
         self._onsets = Onsets()
         self._last: Frame | None = None
         self._rates = Rates()
@@ -165,7 +167,8 @@ class Logger(Writer):
         if result.bev is not None:
             log_bev(self, result.bev, self._config)
             log_grid(self, result, result.bev)
-        log_decisions(self, result, notes)
+        lines = marks(frame) if self.root else self._around.log(self, frame)
+        log_decisions(self, result, [*notes, *lines])
         log_anomalies(self, result, self._onsets.of(result.anomalies))
         self._log_states(result, states)
         self._rates.add(frame)
@@ -235,4 +238,6 @@ class Logger(Writer):
         if result.tracks is not None:
             log_speeds(self, result.tracks, rows)
             states |= track_states(result.tracks, rows)
+        if not self.root:
+            states |= diagnostic_states(result.frame)
         self._state_lanes.log(self, states)
