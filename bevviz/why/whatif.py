@@ -133,7 +133,7 @@ class WhatIf:
                 found.append(Hint(_settings(change), text, effects(self._traces, after, row, own)))
                 if not found[-1].effects.harm:
                     break
-            elif (stage := _Stage(now_reported, new)) > _Stage(reported, reason):
+            elif not text and (stage := _Stage(now_reported, new)) > _Stage(reported, reason):
                 reached.setdefault(stage, (change, then, after))
         if found or not reached:
             return Search(tuple(sorted(found, key=lambda hint: hint.effects.harm)[:1]), tried)
