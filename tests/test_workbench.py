@@ -26,6 +26,7 @@ from bevviz.errors import UserError
 from bevviz.evaluate import truth_of
 from bevviz.frame import Frame, FrameResult
 from bevviz.logging import entities
+from bevviz.workbench.bench import Bench
 from bevviz.workbench.film import Film
 from bevviz.workbench.missed import finds
 from bevviz.workbench.parameters import controls
@@ -649,6 +650,42 @@ def test_without_truth_it_is_what_nothing_explains(result: FrameResult) -> None:
     assert {find.what for find in listed} <= {"unmatched", "unnamed"}
     assert any(find.what == "unnamed" for find in listed)
     assert all(not find.distance > 40 for find in listed)
+
+
+# --- what is shown with other values ------------------------------------------------------------
+
+
+def test_other_values_are_beside_what_the_drive_makes(bag: Path, tmp_path: Path) -> None:
+    """On a timeline of its own: what was there is as it was, the sensors' data are there on both."""
+    from rerun.chunk import RrdReader
+
+    with bevviz.open(bag, model="demo") as drive, bevviz.open(bag, model="demo") as again:
+        bench = Bench(drive, again.frames, [bag])
+        bench.see(drive.at(frame=0))
+        told = bench.attempt(0, ("clustering.min_cluster_points=100000",))
+        recoloured = bench.attempt(0, ("ground.distance_threshold=0.5",))
+        bench.attempt(0, ("detector.conf_threshold=0.9",))
+        result = drive.at(frame=0)
+        pieces = [film[row] for film in (bench.film, bench.desk) for row in range(len(film))]
+        bench.close()
+    assert result.objects is not None
+    assert len(told["effects"]["lost"]) == len(result.objects)
+    assert recoloured["effects"] != told["effects"]
+    rows: dict[str, list[tuple[set[str], bool]]] = {}
+    for number, piece in enumerate(pieces):  # each is a whole file
+        (path := tmp_path / f"{number}.rrd").write_bytes(piece)
+        for chunk in RrdReader(path).stream():
+            if not chunk.is_static:
+                cleared = any("Clear" in str(name) for name in chunk.to_record_batch().schema.names)
+                rows.setdefault(chunk.entity_path, []).append((set(chunk.timeline_names), cleared))
+    fused = rows[entities.FUSED]
+    assert ({"stamp", "tried", "frame", "received"}, False) in fused
+    assert ({"tried"}, True) in fused, "no object is left"
+    assert not any("stamp" in timelines and cleared for timelines, cleared in fused)
+    lidar, camera = result.frame.lidar, result.cameras[0].camera.name
+    for path_of_input in (entities.points(lidar), entities.image(camera), entities.sensor(camera)):
+        assert not any(cleared for _, cleared in rows[path_of_input])
+    assert sum(timelines == {"tried"} for timelines, _ in rows[entities.points(lidar)]) == 2, "it is put back"
 
 
 # --- parts --------------------------------------------------------------------------------------
