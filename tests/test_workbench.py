@@ -13,7 +13,7 @@ import time
 import urllib.error
 import urllib.request
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import parse_qs, urlsplit
@@ -444,14 +444,28 @@ def test_the_frame_that_is_looked_at_comes_first(address: str) -> None:
     with Talk(address) as talk:
         last = max(int(s[1]) for entry in talk.of("missed", "false") for s in entry["sights"])
     parts = urlsplit(address)
-    url = f"ws://{parts.netloc}/film?{parts.query}&from=1"
-    with connect(url, origin=Origin(f"http://{parts.netloc}"), max_size=None) as channel:
-        channel.send(str(last))
-        pieces = []
-        with pytest.raises(TimeoutError):
-            while True:
-                pieces.append(channel.recv(timeout=2))
-    assert len(pieces) == len(set(pieces)) <= FRAMES + 1
+    url, origin = f"ws://{parts.netloc}/film?{parts.query}", Origin(f"http://{parts.netloc}")
+
+    def pieces(start: int, words: Callable[[], str], first: str = "") -> list[bytes]:
+        found = []
+        with connect(f"{url}&from={start}", origin=origin, max_size=None) as channel:
+            if first:
+                channel.send(first)
+            with suppress(TimeoutError):
+                while True:
+                    found.append(channel.recv(timeout=1.5, decode=False))
+                    if word := words():
+                        channel.send(word)
+        return found
+
+    whole = pieces(0, lambda: "got it")
+    assert len(whole) > FRAMES
+    few = pieces(0, lambda: "")
+    assert whole[: len(few)] == few
+    assert whole[FRAMES] not in few
+    asked = pieces(0, lambda: "", str(last))
+    assert len(set(asked)) == len(asked) == len(few)
+    assert whole[FRAMES] in asked
 
 
 # --- who is let in ------------------------------------------------------------------------------
