@@ -165,11 +165,11 @@ FAULTS = {
     "detector drops a class": Fault(
         frozenset({"flicker", "one_sensor"}), ("person", "car", "cyclist"), _class_dropped
     ),
-    "box jumps by 2 m": Fault(frozenset({"jump"}), ("person", "car", "cyclist"), _jumped),
+    "box jumps by 2 m": Fault(frozenset({"jump", "one_sensor"}), ("person", "car", "cyclist"), _jumped),
     "person unseen by the camera": Fault(
         frozenset({"one_sensor", "flicker"}), ("person",), _unseen_by_camera
     ),
-    "person unseen by the LiDAR": Fault(frozenset({"one_sensor"}), ("person",), _unseen_by_lidar),
+    "person unseen by the LiDAR": Fault(frozenset({"one_sensor", "flicker"}), ("person",), _unseen_by_lidar),
     "image of the scan before": Fault(frozenset({"sync"}), (), _late_image),
     "no image": Fault(frozenset({"sync"}), (), _no_image),
     "transform of the camera lost": Fault(frozenset({"tf"}), (), _camera_lost),
@@ -272,7 +272,7 @@ def _stays_in_view(window: list[Snapshot], number: int) -> bool:
             return False
         pixels.append(mine.sum())
         points.append((shot.point_object == number).sum())
-    return min(pixels) > pixels[0] / 2 and min(points) > points[0] / 2
+    return bool(min(pixels) > pixels[0] / 2 and min(points) > points[0] / 2)
 
 
 def _reported(shot: Snapshot, result: FrameResult) -> set[int]:
