@@ -24,9 +24,11 @@ check: $(VENV)/.tested
 bench: $(VENV)/.installed
 	$(BIN)/python -m benchmarks.performance --write docs/performance.md
 
-accuracy: $(VENV)/.installed
+accuracy: $(VENV)/.tested
 	$(BIN)/python -m benchmarks.accuracy --write docs/accuracy.md
 	$(BIN)/python -m benchmarks.why --write docs/accuracy.md
+	$(BIN)/python -m benchmarks.ground --write docs/accuracy.md
+	$(BIN)/python -m benchmarks.anomalies --write docs/accuracy.md
 
 $(VENV)/.installed: pyproject.toml
 	$(PYTHON) -m venv $(VENV)

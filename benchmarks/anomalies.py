@@ -12,10 +12,12 @@ import itertools
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 
 import numpy as np
 from tqdm import tqdm
 
+from benchmarks.pages import write_section
 from bevviz import geometry
 from bevviz.anomalies import Onsets
 from bevviz.config import Config, load
@@ -24,8 +26,17 @@ from bevviz.perceive import StageLoader
 from bevviz.session import Session
 from bevviz.synthetic import Snapshot, SyntheticSource
 
-CHOSEN_ON = (2000, 2001)  # seeds that rules and limits were looked at on
-SEEDS = (2010, 2011, 2012)  # seeds that figures are of
+CHOSEN_ON = (2000, 2001, 2011)  # seeds that rules and limits were looked at on
+SEEDS = (2010, 2012, 2013)  # seeds that figures are of
+
+INTRO = f"""## Anomalies
+
+Faults planted in the synthetic drives {SEEDS} of 10 s, by `python -m benchmarks.anomalies`; the
+rules and limits were chosen on {CHOSEN_ON}. Each fault is planted every two seconds, those of objects
+on the nearest one of each class that was reported in eight of the last ten frames, is within 25 m and stays
+in view. A box that jumps counts as told if it is called a jump, or its object gone from where it was.
+"""
+
 FRAMES = 100
 EVERY, FIRST = 20, 30  # frames: when faults are planted
 IN_TIME = 0.3  # seconds
@@ -165,11 +176,11 @@ FAULTS = {
     "detector drops a class": Fault(
         frozenset({"flicker", "one_sensor"}), ("person", "car", "cyclist"), _class_dropped
     ),
-    "box jumps by 2 m": Fault(frozenset({"jump"}), ("person", "car", "cyclist"), _jumped),
+    "box jumps by 2 m": Fault(frozenset({"jump", "one_sensor"}), ("person", "car", "cyclist"), _jumped),
     "person unseen by the camera": Fault(
         frozenset({"one_sensor", "flicker"}), ("person",), _unseen_by_camera
     ),
-    "person unseen by the LiDAR": Fault(frozenset({"one_sensor"}), ("person",), _unseen_by_lidar),
+    "person unseen by the LiDAR": Fault(frozenset({"one_sensor", "flicker"}), ("person",), _unseen_by_lidar),
     "image of the scan before": Fault(frozenset({"sync"}), (), _late_image),
     "no image": Fault(frozenset({"sync"}), (), _no_image),
     "transform of the camera lost": Fault(frozenset({"tf"}), (), _camera_lost),
@@ -318,8 +329,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seed", type=int, action="append", help=f"drives (default: {SEEDS})")
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE")
+    parser.add_argument("--write", type=Path, help="page whose section is replaced, instead of printing it")
     options = parser.parse_args(arguments)
-    print(table(measure(options.seed or SEEDS, load(settings=options.set))))
+    found = table(measure(options.seed or SEEDS, load(settings=options.set)))
+    if options.write:
+        write_section(options.write, f"{INTRO}\n{found}\n")
+    else:
+        print(found)
 
 
 if __name__ == "__main__":

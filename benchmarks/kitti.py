@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import argparse
 import os
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -47,6 +47,8 @@ class Label:
     size: np.ndarray  # (3,) length, width, height
     yaw: float
     hits: int  # LiDAR points in its box
+    occluded: int  # 0: seen whole, 1: partly, 2: largely hidden, 3: not known
+    truncated: float  # share outside of the image
 
     @property
     def required(self) -> bool:
@@ -113,7 +115,7 @@ def read(root: Path, name: str) -> Shot:
             [c * offset[:, 0] + s * offset[:, 1], c * offset[:, 1] - s * offset[:, 0], offset[:, 2]]
         )
         hits = int((np.abs(local) <= size / 2).all(axis=1).sum())
-        labels.append(Label(kind, v[3:7], center, size, yaw, hits))
+        labels.append(Label(kind, v[3:7], center, size, yaw, hits, int(v[1]), float(v[0])))
     return Shot(name, frame, tuple(labels), np.array(ignored).reshape(-1, 4))
 
 
@@ -298,6 +300,29 @@ def table(tallies: Mapping[str, Tally]) -> str:
 RINGS = ((0, 15), (15, 25), (25, RANGE))  # metres
 
 
+VISIBILITIES: dict[str, Callable[[Label], bool]] = {
+    "seen whole": lambda label: label.occluded == 0 and label.truncated <= 0.15,
+    "partly hidden, or cut off by the image": lambda label: (
+        label.occluded == 1 or (label.occluded == 0 and label.truncated > 0.15)
+    ),
+    "largely hidden": lambda label: label.occluded >= 2,
+}
+
+
+def by_visibility(tallies: Mapping[str, Tally]) -> str:
+    """The same by how much of an object the labels say is seen in the image."""
+    heads = [f"{name}: found, IoU 0.5" for name in VISIBILITIES]
+    lines = ["| case | " + " | ".join(heads) + " |", "| --- |" + " ---: |" * len(heads)]
+    for case, tally in tallies.items():
+        cells = []
+        for holds in VISIBILITIES.values():
+            there = [v for v in tally.objects if holds(v.label)]
+            found, good = sum(v.distance <= FOUND for v in there), sum(v.iou >= 0.5 for v in there)
+            cells.append(f"{found}, {good} of {len(there)}")
+        lines.append(f"| {case} | " + " | ".join(cells) + " |")
+    return "\n".join(lines)
+
+
 def by_distance(tallies: Mapping[str, Tally]) -> str:
     """Objects found, and of those that have an IoU of 0.5."""
     heads = [f"{low:.0f} to {high:.0f} m: found, IoU 0.5" for low, high in RINGS]
@@ -327,6 +352,8 @@ comes after the detector is judged.
 {table(tallies)}
 
 {by_distance(tallies)}
+
+{by_visibility(tallies)}
 """
 
 

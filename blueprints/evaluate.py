@@ -10,7 +10,11 @@ from bevviz.logging import entities, views
 
 def blueprint(scene: Scene) -> rrb.Blueprint:
     side: list[rrb.Container | rrb.View] = [views.cameras(scene)] if scene.cameras else []
-    judged = (entities.judged("**"), f"- {entities.FUSED}/**")  # the same boxes, in other colours
+    judged = (
+        f"{entities.ROBOT}/**",
+        entities.judged("**"),
+        f"- {entities.FUSED}/**",  # the same boxes, in other colours
+    )
     words = rrb.Tabs(
         rrb.TextDocumentView(name="Frame", origin=entities.EVALUATE, contents=["$origin"]),
         rrb.TextDocumentView(name="Evaluation", origin=entities.EVALUATE_ABOUT),

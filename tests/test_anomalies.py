@@ -178,7 +178,7 @@ def test_an_object_that_the_lidar_no_longer_sees() -> None:
     drive.person(12)
     for _ in range(6):
         drive.frame(alone=(("person", 8, 0, 0.8),))
-    text = "person #0: detected, in plain view, and without a cluster for 4 frames"
+    text = "person #0: detected where the LiDAR sees nothing, and nothing that hides it, for 4 frames"
     assert (15, "one_sensor", text) in drive.said
 
 

@@ -9,6 +9,7 @@ import pytest
 
 from benchmarks.bags import repeat
 from benchmarks.measure import interleaved, run
+from benchmarks.pages import write_section
 from benchmarks.runs import counted, logged_points
 from benchmarks.stages import same_clusters, side_by_side
 from benchmarks.truth import Rule, scene_of
@@ -127,3 +128,12 @@ def test_the_rule_knows_the_planted_faults_and_a_wrong_answer_counts_as_wrong(
     bench.frame(at("flat_car"), scene_of(drive(), at("flat_car")), "frame")
     noise, all_ = bench.tally.of([Reason.NOISE]), bench.tally.of([*Reason])
     assert noise["right"] == noise["asked"] == all_["right"] and len(bench.tally.wrong) > 50
+
+
+def test_a_section_takes_the_place_of_its_older_self_alone(tmp_path: Path) -> None:
+    page = tmp_path / "page.md"
+    page.write_text("# Title\n\n## One\n\nold\n\n## Two\n\nkept\n")
+    write_section(page, "## One\n\nnew\n")
+    assert page.read_text() == "# Title\n\n## One\n\nnew\n\n## Two\n\nkept\n"
+    write_section(page, "## Three\n\nlast\n")
+    assert page.read_text().endswith("kept\n\n## Three\n\nlast\n")

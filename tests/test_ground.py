@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from bevviz.config import GroundConfig
-from bevviz.frame import F32, F64, Bool
+from bevviz.frame import F32, F64, Bool, Ground
 from bevviz.o3d import load
 from bevviz.stages.clustering import dbscan
 from bevviz.stages.ground import RING_COUNT, RING_SCALE, _place, segment_ground
@@ -248,6 +248,38 @@ def test_road_is_ground(shared: Path) -> None:
     ground = segment_ground(points, GroundConfig())
     assert road.sum() > 8000
     assert ground.mask[road].mean() > 0.99
+
+
+@pytest.mark.parametrize("angle", [15, 20, 25])
+def test_a_bank_beside_the_road_is_ground(angle: float) -> None:
+    """From 8 m to the left on, 3 m high, with grass on it; 30 m of it alongside."""
+    ground, bank = _beside(angle, 30.0)
+    assert ground.mask[bank].mean() > 0.9
+
+
+def test_a_short_slope_is_an_obstacle() -> None:
+    """As a car's bonnet: what is as steep and a car's width alongside stays above the ground."""
+    ground, bank = _beside(30, 1.8)
+    assert ground.mask[bank].mean() < 0.4
+
+
+def _beside(angle: float, length: float) -> tuple[Ground, Bool]:
+    rng = np.random.default_rng(0)
+    road = np.column_stack([rng.uniform(-20, 20, 60_000), rng.uniform(-8, 8, 60_000), np.full(60_000, -1.7)])
+    wide = min(3.0 / np.tan(np.radians(angle)), 2.0 if length < 5 else 12.0)
+    count = int(length * wide * 80)
+    across = rng.uniform(0, wide, count)
+    rising = np.column_stack(
+        [
+            rng.uniform(-length / 2, length / 2, count),
+            8 + across,
+            -1.7 + np.tan(np.radians(angle)) * across + 0.03 * rng.standard_normal(count),
+        ]
+    )
+    points = np.vstack([road, rising]).astype(np.float32)
+    bank = np.arange(len(points)) >= len(road)
+    bank[bank] = points[bank, 2] > -1.4  # above where its foot would be called ground anyway
+    return segment_ground(points, GroundConfig()), bank
 
 
 # --- the reference's plane ---------------------------------------------------------------------

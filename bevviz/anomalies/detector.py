@@ -13,12 +13,13 @@ from typing import get_args
 import numpy as np
 
 from bevviz import geometry
-from bevviz.anomalies.objects import UNMATCHED, ObjectWatch
+from bevviz.anomalies.objects import ObjectWatch
 from bevviz.config import AnomaliesConfig
-from bevviz.frame import F32, Anomaly, AnomalyKind, CameraResult, FrameResult
+from bevviz.frame import F32, Anomaly, AnomalyKind, CameraResult, Decision, FrameResult
 from bevviz.geometry import iou
 
 KINDS: tuple[AnomalyKind, ...] = get_args(AnomalyKind)
+UNMATCHED = (Decision.NO_CLUSTER, Decision.TOO_FEW_POINTS, Decision.LOW_OVERLAP, Decision.MISFIT)
 SAME_BOX = 0.3  # IoU of the image boxes of one object in consecutive frames
 STRONG = 0.5  # score of a detection that the LiDAR has to have something for
 NEAR = 25.0  # metres, by the usual height of its class, that such a thing may be away

@@ -18,7 +18,7 @@ import numpy as np
 
 from bevviz import geometry
 from bevviz.config import AnomaliesConfig
-from bevviz.frame import F32, Anomaly, Bool, Boxes3D, CameraResult, Decision, FrameResult, Tracks
+from bevviz.frame import F32, Anomaly, Bool, Boxes3D, CameraResult, FrameResult, Tracks
 from bevviz.stages.fusion import in_view
 from bevviz.stages.visibility import range_image, visible
 
@@ -31,8 +31,7 @@ SPREADS = 6.0  # a jump is so many times what the object's own past spreads
 REACH = 3.0  # metres that an object may have jumped
 LATEST = 0.25  # seconds that a track may be unseen for when it turns up elsewhere
 GROWTH = 0.5  # metres that what is measured may have become longer or shorter in a jump: else it was cut anew
-EMPTY = 3  # obstacle points of other objects, at most, where it was
-UNMATCHED = (Decision.NO_CLUSTER, Decision.TOO_FEW_POINTS, Decision.LOW_OVERLAP, Decision.MISFIT)
+EMPTY = 3  # obstacle points, at most, where nothing is
 
 
 @dataclass(slots=True)
@@ -80,8 +79,7 @@ class _Sight:
     boxes: Boxes3D  # in the frame of the points
     open: F32  # (T,) share that nothing nearer hides
     whole: Bool  # (T,) in the image of some camera, not cut off by its border
-    strong: Bool  # (T,) a kept detection is there, of its class and without a cluster
-    weak: Bool  # (T,) some detection of its class is, however weak
+    detected: Bool  # (T,) a kept detection is there, or one of its class, however weak
 
 
 class ObjectWatch:
@@ -109,13 +107,13 @@ class ObjectWatch:
             if has_name:
                 named.add(tracks.names[row])
                 known.camera.add(True)
-            elif clustered and looked_at[row] and plain and sight.whole[row] and not sight.weak[row]:
+            elif clustered and looked_at[row] and plain and sight.whole[row] and not sight.detected[row]:
                 known.camera.add(False)
                 if tracks.confirmed[row]:
                     missing[tracks.names[row]].append((row, known.camera))
             if clustered:
                 known.lidar.add(True)
-            elif plain and sight.strong[row] and tracks.confirmed[row]:
+            elif tracks.confirmed[row] and plain and sight.whole[row] and _empty(result, tracks, sight, row):
                 known.lidar.add(False)
                 if known.lidar.surprise >= config.surprise and known.lidar.missed >= 2:
                     yield _lost(tracks, sight, row, known.lidar)
@@ -160,8 +158,7 @@ def _jump(
     for other in np.flatnonzero((tracks.hits <= 2) & (offset > limit) & (offset <= REACH)).tolist():
         length, _ = _measured(measured, tracks, other)
         if (
-            tracks.object[other] >= 0
-            and tracks.names[other] == tracks.names[row]
+            tracks.names[other] in ("", tracks.names[row])
             and abs(length - known.length) <= GROWTH
             and _others_there(result, tracks, sight, row) <= EMPTY
         ):
@@ -221,9 +218,20 @@ def _missing(
 
 
 def _lost(tracks: Tracks, sight: _Sight, row: int, past: Past) -> Anomaly:
-    who = label(tracks, row)
-    text = f"{who}: detected, in plain view, and without a cluster for {_frames(past.missed)}"
-    return Anomaly("one_sensor", who, text, rank=_rank(sight, row, past.surprise / 20))
+    who, frames = label(tracks, row), _frames(past.missed)
+    if sight.detected[row]:
+        text = f"{who}: detected where the LiDAR sees nothing, and nothing that hides it, for {frames}"
+        return Anomaly("one_sensor", who, text, rank=_rank(sight, row, past.surprise / 20))
+    text = f"{who}: gone for {frames} from where nothing hides it"
+    return Anomaly("flicker", who, text, rank=_rank(sight, row, past.surprise / 20))
+
+
+def _empty(result: FrameResult, tracks: Tracks, sight: _Sight, row: int) -> bool:
+    """Whether nothing is where a track should be, nor another track that has taken its object over."""
+    if result.obstacles is None or geometry.inside(result.obstacles, sight.boxes, row).sum() > EMPTY:
+        return False
+    others = np.flatnonzero(tracks.cluster >= 0)
+    return not geometry.bev_iou(sight.boxes.chosen([row]), sight.boxes.chosen(others)).any()
 
 
 def _rank(sight: _Sight, row: int, strange: float) -> float:
@@ -243,7 +251,7 @@ def _sight(result: FrameResult, tracks: Tracks) -> _Sight:
         boxes = Boxes3D(geometry.apply(back, boxes.center), boxes.size, boxes.yaw + turn)
     n = len(boxes)
     open_, whole = np.ones(n, np.float32), np.zeros(n, bool)
-    strong, weak = np.zeros(n, bool), np.zeros(n, bool)
+    detected = np.zeros(n, bool)
     asked = np.flatnonzero(tracks.confirmed)
     if len(asked):
         open_[asked] = visible(range_image(result.frame.points), boxes.chosen(asked))
@@ -257,12 +265,8 @@ def _sight(result: FrameResult, tracks: Tracks) -> _Sight:
         near = geometry.iou(xyxy, found.xyxy) >= SAME
         same = np.array([[name == tracks.names[t] for name in found.names] for t in asked], bool)
         same = same.reshape(len(asked), len(found))
-        alone = found.kept
-        if camera.fusion is not None:
-            alone = alone & np.isin(camera.fusion.detection_decision, UNMATCHED)
-        strong[asked] |= (near & same & alone).any(axis=1)
-        weak[asked] |= (near & (same | found.kept)).any(axis=1)
-    return _Sight(boxes, open_, whole, strong, weak)
+        detected[asked] |= (near & (same | found.kept)).any(axis=1)
+    return _Sight(boxes, open_, whole, detected)
 
 
 def _in_image(camera: CameraResult, boxes: Boxes3D) -> tuple[F32, F32] | None:

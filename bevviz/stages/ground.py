@@ -18,6 +18,10 @@ RING_COUNT = 25.0
 NEAR = 20.0  # metres around the sensor in which the first plane is sought
 TALL = 2.0  # metres: what is higher may hang over the ground, a crown or a bridge
 MEMORY = 5.0  # metres over which the slope of the ground is remembered
+BANK = 0.7  # metres up for each one outwards: the steepest bank, 35 degrees
+ACROSS = 0.5  # share of a bin that a bank must be seen across: a vehicle's side is not
+ROUGH = 0.1  # metres of grass on it
+WIDE = 4.0  # metres that it goes on for to the side: a car's bonnet does not
 
 
 def segment_ground(points: F32, config: GroundConfig) -> Ground:
@@ -257,7 +261,7 @@ def _heights(
 ) -> tuple[F32, Bool]:
     """(N,) height above the ground, and whether it is below the threshold."""
     rise = _above(points, plane) / np.float32(plane[2])
-    surface = _follow(rise, order, start, radius, sectors, max_step, steepest)
+    surface = _follow(rise, ring, order, start, radius, sectors, max_step, steepest)
     _settle(surface, rise, order, start, threshold / 2)
     height = _height(rise, ring, sector, surface)
     return height, height < threshold
@@ -282,14 +286,21 @@ def _lowest(points: F32, order: I32, start: I32) -> I32:
 
 @kernel
 def _follow(
-    rise: F32, order: I32, start: I32, radius: F64, sectors: int, max_step: float, steepest: float
+    rise: F32,
+    ring: F32,
+    order: I32,
+    start: I32,
+    radius: F64,
+    sectors: int,
+    max_step: float,
+    steepest: float,
 ) -> F64:
     """(R, S) height of the ground above the first plane, ring by ring outwards."""
     surface = np.zeros((len(radius), sectors))
     level = np.zeros(sectors)
     slope = np.zeros(sectors)
     unseen = np.full(sectors, -NEAR)  # metres since the last offer; the first plane is good for NEAR
-    offer = np.empty(sectors)
+    offer, banked = np.empty(sectors), np.empty(sectors)
     for r in range(len(radius)):
         step = radius[r] - radius[r - 1] if r > 0 else radius[0]
         keep = math.exp(-step / MEMORY)
@@ -297,16 +308,25 @@ def _follow(
             level[s] += slope[s] * step
             # The longer the ground was hidden, the less is known of where it comes up again.
             gate = max_step * (1 + max(unseen[s], 0.0) / MEMORY)
-            offer[s] = np.inf
-            standing = False
+            offer[s] = banked[s] = np.inf
+            lowest, top, near, far = np.inf, -np.inf, np.inf, -np.inf
             for k in range(start[r * sectors + s], start[r * sectors + s + 1]):
                 above = rise[order[k]] - level[s]
                 if abs(above) <= gate:
                     offer[s] = min(offer[s], rise[order[k]])
-                standing |= gate < above < TALL
-            # The lowest point of something that stands there need not be its foot.
-            if standing and offer[s] > level[s]:
+                if -gate <= above < TALL:
+                    lowest, top = min(lowest, above), max(top, above)
+                    near, far = min(near, ring[order[k]]), max(far, ring[order[k]])
+            if top <= gate:
+                continue
+            # What rises no steeper than a bank over most of the bin is one; what rises at once stands there,
+            # and the lowest point of it need not be its foot.
+            across = (far - near) * step
+            bank = across >= ACROSS * step and top - lowest <= BANK * across + ROUGH
+            banked[s] = level[s] + lowest if bank and lowest <= gate + BANK * step else np.inf
+            if offer[s] > level[s]:
                 offer[s] = np.inf
+        _widen(offer, banked, WIDE * sectors / (2 * math.pi * radius[r]))
         # Offers of sectors within a metre to each side.
         reach = min(max(2, math.ceil(sectors / (2 * math.pi * radius[r]))), 8)
         around = np.empty(2 * reach + 1)
@@ -332,6 +352,21 @@ def _follow(
                 unseen[s] += step
             surface[r, s] = level[s]
     return surface
+
+
+@kernel
+def _widen(offer: F64, banked: F64, least: float) -> None:
+    """Take the offers of banks where at least so many sectors beside each other have one."""
+    sectors = len(offer)
+    run = 0
+    for place in range(2 * sectors):  # around twice: a run may go over the first sector
+        if banked[place % sectors] < np.inf:
+            run += 1
+            continue
+        if run >= least:
+            for back in range(1, min(run, sectors) + 1):
+                offer[(place - back) % sectors] = banked[(place - back) % sectors]
+        run = 0
 
 
 @kernel
