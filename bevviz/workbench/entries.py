@@ -29,6 +29,7 @@ class Sight:
         distance: metres; NaN where it is not known.
         pick: that asks about it; empty: nothing to ask.
         tried: whether it is to be seen with what was changed, rather than as the drive was opened.
+        text: why it is so in this frame.
     """
 
     frame: int
@@ -36,11 +37,12 @@ class Sight:
     distance: float
     pick: str
     tried: bool = False
+    text: str = ""
 
     def as_list(self) -> list[Any]:
         """For the page, which counts in doubles."""
         away = None if math.isnan(self.distance) else round(self.distance, 1)
-        return [self.frame, str(self.stamp), away, self.pick, self.tried]
+        return [self.frame, str(self.stamp), away, self.pick, self.tried, self.text]
 
 
 @dataclass(slots=True)
@@ -50,7 +52,6 @@ class Entry:
     number: int
     what: str
     name: str
-    text: str
     sights: list[Sight] = field(default_factory=list)
     place: Place | None = None  # where it was last
     box: F32 | None = None
@@ -70,10 +71,11 @@ class Entries:
         with self._lock:
             taken: set[int] = set()
             for find in found:
-                entry = self._same(find, taken) or self._new(find.what, find.name, find.reason)
+                entry = self._same(find, taken) or self._new(find.what, find.name)
                 taken.add(entry.number)
                 entry.place, entry.box = find.place, find.box
-                entry.sights.append(Sight(find.frame, find.stamp, find.distance, str(find.pick), tried))
+                pick = str(find.pick)
+                entry.sights.append(Sight(find.frame, find.stamp, find.distance, pick, tried, find.reason))
 
     def _same(self, find: Find, taken: set[int]) -> Entry | None:
         entries = self._open.get((find.what, find.name), [])
@@ -82,9 +84,9 @@ class Entries:
         best, number = min(near, default=(math.inf, -1))
         return self._entries[number] if best <= 1 else None
 
-    def _new(self, what: str, name: str, text: str) -> Entry:
+    def _new(self, what: str, name: str) -> Entry:
         self._number += 1
-        entry = Entry(self._number, what, name, text)
+        entry = Entry(self._number, what, name)
         self._entries[entry.number] = entry
         self._open.setdefault((what, name), []).append(entry)
         return entry
@@ -94,8 +96,8 @@ class Entries:
         with self._lock:
             for anomaly in new:
                 kind = anomaly.kind.replace("_", " ")
-                entry = self._new("anomaly", kind, anomaly.text)
-                entry.sights.append(Sight(frame, stamp, math.nan, ""))
+                sight = Sight(frame, stamp, math.nan, "", text=anomaly.text)
+                self._new("anomaly", kind).sights.append(sight)
 
     def replace(self, whats: Sequence[str]) -> None:
         """Drop all of these kinds: others are to come."""
@@ -115,7 +117,6 @@ class Entries:
                     "number": entry.number,
                     "what": entry.what,
                     "name": entry.name,
-                    "text": entry.text,
                     "sights": [sight.as_list() for sight in entry.sights[told.get(entry.number, 0) :]],
                 }
                 for entry in new

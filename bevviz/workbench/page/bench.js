@@ -14,6 +14,7 @@ let asking = 0;
 function ask(what) {
   if (state.time === null) return;
   asked.at = "entity" in what ? asked.released : performance.now();
+  asked.sent = performance.now();
   $("answer").classList.add("busy");
   asking = send({ type: "ask", time: Number(state.time), set: isTried() ? state.set : [], ...what });
 }
@@ -29,6 +30,7 @@ function answer(message) {
   remember();
   $("answer").className = message.reported ? "reported" : "missed";
   $("answer").dataset.took = took.toFixed(0);
+  $("answer").dataset.server = (performance.now() - asked.sent).toFixed(0); // of it, what is not the viewer's
   $("verdict").textContent = message.verdict;
   const parts = [message.name, `frame ${message.frame}`];
   if (message.distance !== null) parts.push(`${message.distance} m away`);

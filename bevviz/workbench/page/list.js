@@ -45,8 +45,8 @@ export function notes(message) {
   for (const key of [...entries.keys()]) if (typeof key === "string") entries.delete(key);
   for (const one of message.notes) {
     const key = `${one.stamp} ${one.text}`;
-    const sights = [[null, one.stamp, null, one.pick, false]];
-    entries.set(key, { key, what: "note", name: one.about || "frame", text: one.text, sights, note: one });
+    const sights = [[null, one.stamp, null, one.pick, false, one.text]];
+    entries.set(key, { key, what: "note", name: one.about || "frame", sights, note: one });
   }
   $("note-error").textContent = message.error;
   draw();
@@ -104,7 +104,7 @@ function frames(entry) {
 function drawn(entry) {
   const one = entry.sights[entry.best];
   const where = one[2] === null ? "" : ` at ${one[2]} m`;
-  const text = `${entry.name}${where}${entry.text ? `: ${entry.text}` : ""}`;
+  const text = `${entry.name}${where}${one[5] ? `: ${one[5]}` : ""}`;
   const button = element("button", "", "", element("span", "time", seconds(one[1])),
     element("span", entry.what.replace(" ", "-"), entry.what), element("span", "", text),
     element("span", "faint", frames(entry)));

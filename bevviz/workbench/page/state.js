@@ -7,7 +7,8 @@ export const state = {
   opening: null, // stamp that is shown first
   first: 0, // stamp that times count from
 };
-export const asked = { released: 0, at: 0 }; // when the pointer was let go, and when the newest question was asked
+// When the pointer was let go, when the newest question began for whoever clicked, and when it was sent.
+export const asked = { released: 0, at: 0, sent: 0 };
 export const stated = new URLSearchParams(location.hash.slice(1));
 
 export function remember() {
