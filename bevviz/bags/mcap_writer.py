@@ -7,6 +7,7 @@ import struct
 from binascii import crc32
 from collections import Counter, defaultdict
 from collections.abc import Callable
+from functools import partial
 from io import BytesIO
 from pathlib import Path
 from types import TracebackType
@@ -23,7 +24,7 @@ from rosbags.interfaces import (
 )
 from ruamel.yaml import YAML
 
-from bevviz import __version__
+from bevviz import __version__, remains
 from bevviz.bags.mcap import (
     CHANNEL,
     CHUNK,
@@ -89,10 +90,12 @@ class McapWriter:
 
     def __enter__(self) -> Self:
         self._lock = claim(self._path, "bag")
+        remains.remember(self, partial(self._part.unlink, missing_ok=True))
         try:
             self._file = os.open(self._part, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, 0o666)
             self._put(MAGIC + _record(HEADER, _text(self._profile) + _text(f"bevviz {__version__}")))
         except OSError as error:
+            remains.forget(self)
             os.close(self._lock)
             raise UserError(f"{self._path}: cannot write the bag: {error.strerror}") from None
         return self
@@ -110,6 +113,7 @@ class McapWriter:
         finally:
             os.close(self._file)
             self._part.unlink(missing_ok=True)
+            remains.forget(self)
             os.close(self._lock)
 
     @property

@@ -17,12 +17,14 @@ from bevviz.errors import UserError
 if TYPE_CHECKING:
     from bevviz.config import Config
     from bevviz.frame import FrameResult, Source
+    from bevviz.live.control import Control
     from bevviz.live.notes import Notes
     from bevviz.live.raw import RawRecorder
     from bevviz.live.replay import Replay
     from bevviz.live.runtime import Live, Status
     from bevviz.live.settings import Settings
     from bevviz.live.source import LiveSource
+    from bevviz.perceive import StageLoader
 
 
 def add(commands: Commands) -> None:
@@ -95,7 +97,7 @@ def _live(options: argparse.Namespace) -> int:
     os.environ.setdefault("RUST_LOG", "warn,re_log_encoding=error")
     from bevviz.live.notes import Notes
     from bevviz.live.settings import Settings
-    from bevviz.logging.ports import check_port, own_address
+    from bevviz.perceive import StageLoader
 
     given = {
         "detector.model": options.model,
@@ -108,66 +110,109 @@ def _live(options: argparse.Namespace) -> int:
     more = [f"{key}={value}" for key, value in given.items() if value is not None]
     if options.split is not None:
         more.append(options.split)
-    _, messages = _files(options.save)  # before a robot is waited for
+    _, messages = _files(options.save)
+    if options.split is not None and not options.save:
+        raise UserError("--split divides what --save writes: give --save FILE.rrd, too")
+    if options.observe and options.publish:
+        raise UserError("--observe makes no results that --publish could send: leave one of them out")
     if messages is not None and options.synthetic:
         raise UserError(f"--save {messages}: the synthetic drive has no messages; 'bevviz demo --bag' does")
     if options.observe and options.robot is not None:
         raise UserError("--robot compares our objects with the robot's: leave --observe out")
     settings = Settings(options.config, [*options.set, *more], options.preset)
-    if options.serve is not None:
-        own_address(options.bind)  # before a robot is waited for
-        check_port(options.serve)
+    _check_outputs(options)
+    loader = StageLoader()
+    if not options.observe:
+        loader.load(settings.config)
     notes = Notes(say)
-    with terminable():
-        if options.synthetic:
-            return _watch(_replay(options.synthetic), settings, options, notes)
-        from bevviz.live.raw import RawRecorder
-        from bevviz.live.source import LiveSource
+    if options.synthetic:
+        return _watch(_replay(options.synthetic), settings, options, notes, loader)
+    from bevviz.live.raw import RawRecorder
+    from bevviz.live.source import LiveSource
 
-        raw = RawRecorder(settings.config.live)
-        with LiveSource(settings.config, arguments=options.ros_args, tell=notes.info, raw=raw) as source:
-            return _watch_robot(source, settings, options, notes, raw)
+    raw = RawRecorder(settings.config.live)
+    with LiveSource(settings.config, arguments=options.ros_args, tell=notes.info, raw=raw) as source:
+        return _watch_robot(source, settings, options, notes, loader, raw)
+
+
+def _check_outputs(options: argparse.Namespace) -> None:
+    """What cannot work is said before a robot is waited for."""
+    from bevviz.frame import Scene
+    from bevviz.live.files import check_name
+    from bevviz.logging import blueprints
+    from bevviz.logging.ports import check_port, own_address
+    from bevviz.logging.sinks import check_viewer
+
+    if options.serve is not None:
+        own_address(options.bind)
+        check_port(options.serve)
+    if options.connect is not None:
+        check_viewer(options.connect)
+    for path in options.save:
+        check_name(path)
+    blueprints.load(options.blueprint, Scene("live", "lidar", ("lidar",)))
 
 
 def _watch_robot(
-    source: LiveSource, settings: Settings, options: argparse.Namespace, notes: Notes, raw: RawRecorder
+    source: LiveSource,
+    settings: Settings,
+    options: argparse.Namespace,
+    notes: Notes,
+    loader: StageLoader,
+    raw: RawRecorder,
 ) -> int:
     """Publish back and take orders, as far as that is asked for."""
+    from bevviz.live.control import Control, unasked
     from bevviz.ros.diagnostics import Diagnostics
     from bevviz.ros.orders import Orders
     from bevviz.ros.publish import Publisher
 
-    shown = ""
-    with suppress(KeyboardInterrupt):
-        while not source.wait(1.0):
-            if source.missing != shown:
-                shown = source.missing
-                say(f"waiting: {shown}")
-    if not source.wait(0):
-        return 1
-    publisher = Publisher(source.node, settings.config, notes.warn) if options.publish else None
-    diagnostics = Diagnostics(source.node) if options.publish or options.diagnostics else None
+    def refuse(path: Path | None = None) -> Path:
+        raise UserError(f"there is nothing to save yet; waiting: {source.missing}")
 
-    def on_result(result: FrameResult) -> None:
-        if publisher is not None:
-            publisher.publish(result)
-        if diagnostics is not None:
-            diagnostics.see(result)
+    with Control(refuse, notes.warn) as control, unasked(lambda: notes.warn("there is nothing to save yet")):
 
-    def follow(live: Live) -> Callable[[Config], None]:
-        orders = Orders(source.node, live.config, live.update, live.save)
-        if diagnostics is not None:
-            diagnostics.every_second(lambda: diagnostics.publish(live.numbers, source.warnings))
+        def take(more: list[str]) -> None:
+            settings.take(more)
+            if orders is not None:
+                orders.config = settings.config
 
-        def show(config: Config) -> None:
-            orders.show(config)
+        orders: Orders | None = None
+        orders = Orders(source.node, settings.config, take, refuse)
+        orders.config = settings.config
+        shown = ""
+        with suppress(KeyboardInterrupt), terminable() as ended:
+            while not source.wait(1.0):
+                missing = source.missing
+                if missing and missing != shown:
+                    shown = missing
+                    say(f"waiting: {shown}")
+        if ended.is_set():
+            return 1
+        publisher = Publisher(source.node, settings.config, notes.warn) if options.publish else None
+        diagnostics = Diagnostics(source.node) if options.publish or options.diagnostics else None
+
+        def on_result(result: FrameResult) -> None:
             if publisher is not None:
-                publisher.configure(config)
+                publisher.publish(result)
+            if diagnostics is not None:
+                diagnostics.see(result)
 
-        return show
+        def follow(live: Live, orders: Orders = orders) -> Callable[[Config], None]:
+            control.save = orders.save = live.save
+            orders.change = live.update
+            if diagnostics is not None:
+                diagnostics.every_second(lambda: diagnostics.publish(live.numbers, source.warnings))
 
-    wanted = on_result if publisher is not None or diagnostics is not None else None
-    return _watch(source, settings, options, notes, wanted, follow, raw)
+            def show(config: Config) -> None:
+                orders.show(config)
+                if publisher is not None:
+                    publisher.configure(config)
+
+            return show
+
+        wanted = on_result if publisher is not None or diagnostics is not None else None
+        return _watch(source, settings, options, notes, loader, wanted, follow, control, raw)
 
 
 def _replay(frames: int) -> Replay:
@@ -186,8 +231,10 @@ def _watch(
     settings: Settings,
     options: argparse.Namespace,
     notes: Notes,
+    loader: StageLoader,
     on_result: Callable[[FrameResult], None] | None = None,
     follow: Callable[[Live], Callable[[Config], None]] | None = None,
+    control: Control | None = None,
     raw: RawRecorder | None = None,
 ) -> int:
     """The live run, until the source ends or the user ends it."""
@@ -208,6 +255,8 @@ def _watch(
         notes,
         observe=options.observe,
         on_result=on_result,
+        loader=loader,
+        control=control,
         raw=raw,
         robot=options.robot,
     )
@@ -217,7 +266,11 @@ def _watch(
         say(f"viewer at {url}")
     if unsaid and not window:
         say("no display: 'bevviz snap' saves the last seconds, --serve shows them in a browser")
-    with suppress(KeyboardInterrupt), tqdm(unit="frame", desc=source.scene.name, disable=None) as bar:
+    with (
+        suppress(KeyboardInterrupt),
+        terminable(),
+        tqdm(unit="frame", desc=source.scene.name, disable=None) as bar,
+    ):
 
         def show(status: Status) -> None:
             bar.set_postfix_str(f"{1e3 * status.p50:.0f} ms, {sum(status.drops.values())} dropped", False)

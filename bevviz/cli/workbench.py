@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import argparse
-from contextlib import suppress
+import sys
+from contextlib import ExitStack, suppress
 from typing import TYPE_CHECKING
 
 from bevviz.cli.interrupts import terminable
@@ -35,7 +36,9 @@ def add(commands: Commands) -> None:
     add_truth(command)
     add_config(command)
     page = command.add_argument_group("page")
-    page.add_argument("--port", type=port, metavar="N", help="of the page (default: one that is free)")
+    page.add_argument(
+        "--port", type=port, metavar="N", help="of the page (default: 9880, else one that is free)"
+    )
     page.add_argument(
         "--no-browser", dest="browser", action="store_false", help="print the address, open nothing"
     )
@@ -49,9 +52,27 @@ def _open(options: argparse.Namespace) -> int:
         raise UserError(
             f"the workbench needs further packages ({error.name}): pip install 'bevviz[workbench]'"
         ) from None
-    with terminable(), _bench(options) as bench:
-        hint(bench.drive.scene, bench.drive.config)
-        warn(bench.drive.warnings)
+    config = load_config(options)
+    with ExitStack() as stack:
+        from bevviz.bags.source import BagSource
+
+        source, again = (stack.enter_context(BagSource(options.paths, config)) for _ in range(2))
+        first = source.number_at(options.at) if options.at is not None else 0
+        warn(source.warnings)
+
+        def make() -> Bench:
+            _arrow_without_pandas()
+            from bevviz.drive import Drive
+            from bevviz.evaluate import truth_source
+            from bevviz.workbench.bench import Bench
+            from bevviz.workbench.labelled import Labelled
+
+            hint(source.scene, config)
+            truth_of = truth_source(source.roles, options.truth, options.kitti_labels, len(source.scans))
+            if truth_of is None or (options.truth is None and options.kitti_labels is None):
+                return Bench(Drive(source, config), again, options.paths, truth_of, first)
+            mine, others = (Labelled(frames, truth_of) for frames in (source, again))
+            return Bench(Drive(mine, config), others, options.paths, truth_of, first)
 
         def ready(address: str) -> None:
             say(f"workbench at {address}")
@@ -61,25 +82,30 @@ def _open(options: argparse.Namespace) -> int:
                 webbrowser.open(address)
             say("open until Ctrl-C; only this machine can reach it")
 
-        with suppress(KeyboardInterrupt):  # the way to end it
-            serve(bench, options.port, ready)
+        with suppress(KeyboardInterrupt), terminable():  # the way to end it
+            serve(make, "\n".join(str(path.resolve()) for path in options.paths), options.port, ready)
     return 0
 
 
-def _bench(options: argparse.Namespace) -> Bench:
-    from contextlib import ExitStack
+def _arrow_without_pandas() -> None:
+    """pyarrow looks for pandas at the first array that it makes: half a second, for nothing used here.
 
-    from bevviz.bags.source import BagSource
-    from bevviz.drive import Drive
-    from bevviz.evaluate import truth_source
-    from bevviz.workbench.bench import Bench
+    Where its own pandas functions are called it looks again.
+    """
+    if "pandas" in sys.modules:
+        return
+    finder = _NoPandas()
+    sys.meta_path.insert(0, finder)
+    try:
+        import pyarrow
 
-    config = load_config(options)
-    with ExitStack() as stack:
-        source = stack.enter_context(BagSource(options.paths, config))
-        again = stack.enter_context(BagSource(options.paths, config))
-        truth_of = truth_source(source.roles, options.truth, options.kitti_labels, len(source.scans))
-        first = source.number_at(options.at) if options.at is not None else 0
-        bench = Bench(Drive(source, config), again, truth_of, first)
-        stack.pop_all()  # the bench closes them
-    return bench
+        pyarrow.array([True])
+    finally:
+        sys.meta_path.remove(finder)
+
+
+class _NoPandas:
+    @staticmethod
+    def find_spec(name: str, *_: object) -> None:
+        if name == "pandas":
+            raise ModuleNotFoundError(name)

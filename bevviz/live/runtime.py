@@ -16,10 +16,10 @@ import numpy as np
 
 from bevviz.config import Config
 from bevviz.errors import UserError
-from bevviz.frame import Frame, FrameResult, Scene, Source
+from bevviz.frame import Frame, FrameResult, LabelledBoxes3D, LateResult, Scene, Source
 from bevviz.live.against import AgainstRobot
 from bevviz.live.control import Control
-from bevviz.live.encoder import Encoder
+from bevviz.live.encoder import WHOLE, Encoder, Packet
 from bevviz.live.files import Indexer, Saver
 from bevviz.live.flight import FlightRecorder
 from bevviz.live.health import Health, set_nice
@@ -32,11 +32,12 @@ from bevviz.live.snapshots import Snapshots
 from bevviz.live.triggers import Triggers
 from bevviz.live.viewers import Viewer, remote, server, window
 from bevviz.logging import entities
+from bevviz.perceive import StageLoader
 from bevviz.run import Dropping, Observer, run
 from bevviz.session import Session
 
 LOOK = 1.0  # seconds between two looks at the configuration file and the clock
-ENDING = (signal.SIGINT, signal.SIGTERM)
+ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,6 +75,8 @@ class Live:
         notes: what has to be said.
         observe: leave the pipeline off; only what the robot publishes is logged.
         on_result: called with each result in a thread of its own; when it is too slow the newest wins.
+        loader: has the detector's network already.
+        control: takes orders to save; None: one of its own.
         raw: the messages that the source makes the frames of.
         robot: topic of the robot's boxes that ours are compared with, empty: that which is fused; None: none.
 
@@ -90,10 +93,13 @@ class Live:
         *,
         observe: bool = False,
         on_result: Callable[[FrameResult], None] | None = None,
+        loader: StageLoader | None = None,
+        control: Control | None = None,
         raw: RawRecorder | None = None,
         robot: str | None = None,
     ) -> None:
         self.notes = notes
+        self._control = control
         self.on_change: Callable[[Config], None] = lambda config: None  # called in the thread of ``run``
         self.urls: list[str] = []
         self.frames = 0  # logged
@@ -103,14 +109,16 @@ class Live:
         self._changing = threading.Lock()
         self._over = threading.Event()
         self._asked_to_save = False
-        self._looked = 0.0
+        self._looked = self._logged = 0.0  # seconds, monotonic
+        self._states: dict[str, str] = {}  # of the topics, as logged while no frame came
         live = settings.config.live
 
         self._nice(live.nice)
-        self._session = Observing(settings.config) if observe else Session(settings.config)
+        self._session = Observing(settings.config) if observe else Session(settings.config, loader=loader)
         self._robot_problem = ""
         self.against = None if robot is None else AgainstRobot(robot, live)
-        self._encoder = Encoder(self.config, source.scene, outputs.blueprint, self.against)
+        whole = WHOLE if live.viewer_rate is None else 1 / live.viewer_rate
+        self._encoder = Encoder(self.config, source.scene, outputs.blueprint, whole, self.against)
         self._indexer = Indexer()
         self.flight = FlightRecorder(live, self._encoder, self._indexer)
         self._raw = raw
@@ -138,7 +146,10 @@ class Live:
             self.raw_saver = RawSaver(outputs.raw, live, raw, notes, follows=self.saver is not None)
             if self.saver is not None:
                 self.saver.on_part = self.raw_saver.next_part
-        self._outputs += [Viewer(program, live.output_queue, self._encoder, notes) for program in programs]
+        sparse = live.viewer_rate is not None
+        self._outputs += [
+            Viewer(program, live.output_queue, self._encoder, notes, sparse=sparse) for program in programs
+        ]
 
     @property
     def config(self) -> Config:
@@ -207,7 +218,8 @@ class Live:
         with ExitStack() as stack:
             stack.callback(_handle, {number: signal.getsignal(number) for number in ENDING})
             stack.callback(self._close)
-            stack.enter_context(Control(self.save, self.notes.warn))
+            if self._control is None:
+                stack.enter_context(Control(self.save, self.notes.warn))
             stack.enter_context(self._signal())
             # A second Ctrl-C must not leave half a file or a viewer behind. Closing takes bounded time.
             stack.callback(_handle, dict.fromkeys(ENDING, signal.SIG_IGN))
@@ -243,6 +255,7 @@ class Live:
             self._reload()
         if jump := self.health.clock_jump():
             self.notes.warn(f"the clock of this machine has jumped by {jump:+.1f} s")
+        self._log_meanwhile()
         if self._shown is not self.config:
             self._shown = self.config
             self.on_change(self._shown)
@@ -253,6 +266,8 @@ class Live:
         if self.raw_saver is not None:
             self.raw_saver.close()
         self._snapshots.close()
+        if self._indexer.waiting:
+            self.notes.info("the recording gets its index; it is complete already")
         self._indexer.close()
         self._encoder.close()
 
@@ -260,11 +275,12 @@ class Live:
         """Encode a frame once, for every output."""
         drops = {entities.drops(where): float(count) for where, count in self._drops().items()}
         health = self.health.scalars() | drops | self._snapshots.scalars
-        compared = self.against.see(result) if self.against is not None else ()
-        packet = self._encoder.encode(result, self._source.scene, health, self.notes.take(), compared)
-        for output in self._outputs:
-            output.put(packet)
-        self.flight.put(packet)
+        late, states = self._source.overtaken(), self._topic_states()
+        boxes = [(one.frame_stamp, one.boxes) for one in late if isinstance(one.boxes, LabelledBoxes3D)]
+        compared = self.against.see(result, boxes) if self.against is not None else ()
+        notes, scene = self.notes.take(), self._source.scene
+        self._hand_out(self._encoder.encode(result, scene, health, notes, late, states, compared))
+        self._logged = time.monotonic()
         self.health.logged(result.frame.received)
         self.frames += 1
         if reason := self._triggers.check(result):
@@ -279,6 +295,23 @@ class Live:
                 self.notes.warn(against.problem)
         if reason := against.reason():
             self._snapshots.save_soon(reason, self.config.live.trigger_after)
+
+    def _log_meanwhile(self) -> None:
+        """What is said while no frame comes is in the log and in the lanes all the same."""
+        since, states = time.monotonic() - self._logged, self._topic_states()
+        if not self.frames or since < LOOK:
+            return
+        if (notes := self.notes.take()) or states != self._states:
+            self._states = states
+            self._hand_out(self._encoder.encode_meanwhile(since, notes, states))
+
+    def _hand_out(self, packet: Packet) -> None:
+        for output in self._outputs:
+            output.put(packet)
+        self.flight.put(packet)
+
+    def _topic_states(self) -> dict[str, str]:
+        return {entities.topic_state(topic): state for topic, state in self._source.states.items()}
 
     def _drops(self) -> dict[str, int]:
         drops = {"source": self._source.dropped, **self._dropping.dropped}
@@ -407,6 +440,16 @@ class Thinned:
     def dropped(self) -> int:
         """That the source itself has left out."""
         return int(getattr(self._source, "dropped", 0))
+
+    @property
+    def states(self) -> Mapping[str, str]:
+        """How each topic does, where the source has topics."""
+        return getattr(self._source, "states", {})
+
+    def overtaken(self) -> tuple[LateResult, ...]:
+        """The robot's own results that came too late for their frames, since the last call."""
+        overtaken = getattr(self._source, "overtaken", None)
+        return () if overtaken is None else tuple(overtaken())
 
     def stop(self) -> None:
         stop = getattr(self._source, "stop", None)

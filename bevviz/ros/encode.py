@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import colorsys
-import itertools
 from collections.abc import Iterable, Sequence
 from functools import cache
 from typing import Any
@@ -105,7 +104,7 @@ def encode_boxes_3d(
     boxes: Boxes3D,
     results: Iterable[Hypotheses],
     pose: F64 | None = None,
-    ids: Iterable[str] | None = None,
+    ids: Sequence[str] = (),
 ) -> Any:
     """A vision_msgs/Detection3DArray.
 
@@ -114,14 +113,14 @@ def encode_boxes_3d(
         boxes: in a frame of theirs.
         results: the hypotheses of each box.
         pose: (4, 4) frame_id from the frame of the boxes; None: it is the same.
-        ids: of each box; None: they have none.
+        ids: of each box; (): they have none.
     """
     turn = np.eye(4) if pose is None else pose
     about = _header(stamp, frame_id)
     detections = []
-    named = itertools.repeat("", len(boxes)) if ids is None else ids
+    names = ids or [""] * len(boxes)
     for center, size, yaw, hypotheses, name in zip(
-        boxes.center, boxes.size, boxes.yaw, results, named, strict=True
+        boxes.center, boxes.size, boxes.yaw, results, names, strict=True
     ):
         half = float(yaw) / 2
         place = _pose(turn @ geometry.transform(center, np.array([0, 0, np.sin(half), np.cos(half)])))

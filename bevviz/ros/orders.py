@@ -17,7 +17,8 @@ class Orders:
     """Every key of the configuration as a parameter (``clustering.eps``), the tutorial's names (``range_x``,
     ``voxel_size`` ...) beside them, and the service ``~/save_recording``.
 
-    Values given with ``--ros-args -p`` are ordered before the constructor returns.
+    Values given with ``--ros-args -p`` are ordered before the constructor returns. ``config``, ``change`` and
+    ``save`` may be replaced later.
 
     Args:
         node: an rclpy node that somebody spins.
@@ -37,9 +38,9 @@ class Orders:
         save: Callable[[], Path] | None = None,
     ) -> None:
         self._node = node
-        self._config = config
-        self._change = change
-        self._save = save
+        self.config = config
+        self.change = change
+        self.save = save
         self._keys = {**{key: key for key in keys(config)}, **TUTORIAL_NAMES}  # by name of the parameter
         about = keys(config)
         given = [
@@ -58,7 +59,7 @@ class Orders:
         """Let the parameters say what holds now, wherever it was changed."""
         from rclpy.parameter import Parameter
 
-        self._config = config
+        self.config = config
         current = {name: _value(config, name, key) for name, key in self._keys.items()}
         self._node.set_parameters(
             [Parameter(n, value=v) for n, v in current.items() if self._node.get_parameter(n).value != v]
@@ -66,12 +67,12 @@ class Orders:
 
     def _settings(self, parameters: Sequence[Any]) -> list[str]:
         """What differs from the configuration, in its words."""
-        current = values(self._config)
+        current = values(self.config)
         ordered = []
         for parameter in parameters:
             name, value = parameter.name, parameter.value
             key = self._keys.get(name)
-            if key is None or value == _value(self._config, name, key):
+            if key is None or value == _value(self.config, name, key):
                 continue
             empty = value == NO_LIMIT if name == "max_cluster_size" else value in ("", None)
             none = empty and not isinstance(current[key], str)
@@ -83,15 +84,15 @@ class Orders:
 
         try:
             if settings := self._settings(parameters):
-                self._change(settings)
+                self.change(settings)
         except UserError as error:
             return SetParametersResult(successful=False, reason=str(error))
         return SetParametersResult(successful=True)
 
     def _trigger(self, request: Any, response: Any) -> Any:
-        assert self._save is not None
+        assert self.save is not None
         try:
-            response.success, response.message = True, str(self._save())
+            response.success, response.message = True, str(self.save())
         except UserError as error:
             response.success, response.message = False, str(error)
         return response
