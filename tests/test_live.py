@@ -404,6 +404,15 @@ def test_nothing_to_save(run: Run) -> None:
     run(["live.flight_time=0"], total=10, during=during)
 
 
+def test_nothing_to_write_is_no_bytes(frames: list[Frame], drive: SyntheticSource) -> None:
+    config = load()
+    with closing(Encoder(config, drive.scene, "live")) as encoder:
+        first = encoder.encode(FrameResult.unprocessed(frames[0], config), drive.scene, {}, [])
+        assert encoder._stream.read() == b"" == encoder._stream.read()
+        second = encoder.encode(FrameResult.unprocessed(frames[1], config), drive.scene, {}, [])
+        assert len(first.data) > 1000 < len(second.data) and second.data.strip(b"\0")
+
+
 def test_a_recording_may_start_at_any_whole_packet(
     frames: list[Frame], drive: SyntheticSource, tmp_path: Path
 ) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import random
+import re
 import subprocess
 import threading
 import time
@@ -48,7 +49,7 @@ from bevviz.ros.encode import encode_transforms, typestore
 from bevviz.ros.node import Node
 
 PATIENCE = 60.0
-WAIT = "sync.max_wait=10 s"  # on a busy machine a message may come late; then it is waited for
+WAIT = ["sync.max_wait=10 s", "sync.queue=100"]  # on a busy machine messages come late: they are waited for
 SECONDS = 3.0  # that the flight recorder holds: less than the run takes
 
 
@@ -89,7 +90,7 @@ def fly(folder: Path) -> Flight:
     said: list[str] = []
     results: dict[int, Any] = {}
     sizes: list[tuple[int, float]] = []
-    settings = Settings(None, [f"live.flight_time={SECONDS} s", WAIT])
+    settings = Settings(None, [f"live.flight_time={SECONDS} s", *WAIT])
     Session(settings.config).run(SyntheticSource(frames=1).snapshot(0).frame)  # what is compiled, is
     raw = RawRecorder(settings.config.live)
     with Node(name="robot") as robot:
@@ -141,7 +142,7 @@ class Digests(Observer[FrameResult]):
 
 @pytest.mark.parametrize("bag", ["snap.mcap", "all.mcap"])
 def test_the_messages_give_the_same_results_in_every_bit(flight: Flight, bag: str) -> None:
-    config = load(settings=[WAIT])
+    config = load(settings=WAIT)
     again = Digests()
     with BagSource([flight.folder / bag], config) as source:
         run_frames(source, Session(config), [again])
@@ -200,7 +201,8 @@ def test_what_is_held_is_bounded_and_shown(flight: Flight) -> None:
     assert max(seconds for _, seconds in flight.sizes) <= SECONDS + 3.2
     assert max(size for size, _ in flight.sizes) < 500e6
     (saved,) = [text for text in flight.said if text.startswith("flight recorder saved")]
-    assert "snap.rrd and snap.mcap, " in saved and "messages of 6 s" in saved
+    told = re.search(r"snap\.rrd and snap\.mcap, (\d+) messages of (\d+) s", saved)
+    assert told is not None and int(told[1]) > 300 and SECONDS <= int(told[2]) <= 4 * SECONDS
     (left_out,) = [text for text in flight.said if text.startswith("not in snap.mcap")]
     assert "/depth/image (it plays no role and is no small one)" in left_out
     assert "/heightmap (it plays no role and has " in left_out

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import threading
-from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 
@@ -18,6 +18,7 @@ from bevviz.errors import UserError
 from bevviz.frame import F64, Boxes3D, FrameResult, LabelledBoxes3D
 
 SECOND = 1_000_000_000
+T = TypeVar("T")
 WAITING = 50  # frames that the robot may still say something of
 
 
@@ -58,7 +59,8 @@ class AgainstRobot:
         self.problem = ""  # why nothing is compared
         self._asked = asked
         self._topics: set[str] = set()
-        self._waiting: deque[Ours] = deque(maxlen=WAITING)
+        self._waiting: dict[int, Ours] = {}  # by stamp: frames that the robot has said nothing of yet
+        self._late: dict[int, LabelledBoxes3D] = {}  # by stamp of their frame, whose result is yet to come
         self._since: int | None = None  # stamp from which on both differ in every frame
         self._fired = False
         self._reason = ""
@@ -82,19 +84,17 @@ class AgainstRobot:
         frame = result.frame
         for labelled in (*frame.robot_boxes, *(boxes for _, boxes in late)):
             self._choose(labelled.topic)
-        ours = Ours(frame.index, frame.stamp, frame.received, frame.pose, seen(result))
+        self._waiting[frame.stamp] = Ours(frame.index, frame.stamp, frame.received, frame.pose, seen(result))
+        self._late |= {stamp: boxes for stamp, boxes in late if boxes.topic == self.topic}
         compared = []
-        for stamp, boxes in late:
-            former = next((o for o in self._waiting if o.stamp == stamp), None)
-            if former is not None and boxes.topic == self.topic:
-                self._waiting.remove(former)
-                compared.append(self._compare(former, _placed(boxes, former.world_from_points)))
-        theirs = published(frame, self.topic, result.config) if self.topic else None
-        if theirs is None:
-            self._waiting.append(ours)
-        else:
-            compared.append(self._compare(ours, seen(theirs)))
-        return compared
+        if self.topic and (theirs := published(frame, self.topic, result.config)) is not None:
+            compared.append(self._compare(self._waiting.pop(frame.stamp), seen(theirs)))
+        for stamp in sorted(self._late.keys() & self._waiting.keys()):
+            ours, boxes = self._waiting.pop(stamp), self._late.pop(stamp)
+            compared.append(self._compare(ours, _placed(boxes, ours.world_from_points)))
+        _forget(self._waiting)
+        _forget(self._late)
+        return sorted(compared, key=lambda one: one.found.stamp)
 
     def reason(self) -> str | None:
         """Why the flight recorder should save: both have differed for ``live.robot_time``; once each time."""
@@ -134,6 +134,11 @@ class AgainstRobot:
         if difference.change is Change.MOVED:
             return difference.distance > self.config.robot_tolerance
         return difference.change is not Change.SAME
+
+
+def _forget(waiting: dict[int, T]) -> None:
+    while len(waiting) > WAITING:
+        del waiting[next(iter(waiting))]
 
 
 def _words(difference: Difference) -> str:

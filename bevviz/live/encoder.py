@@ -56,8 +56,11 @@ class _Stream(Closing):
     def read(self) -> bytes:
         """What was logged since the last call. Its memory is given back: the file only looks long."""
         self.recording.flush()
-        start, self._end = self._end, os.fstat(self._file).st_size
-        data = os.pread(self._file, self._end - start, start)
+        start, end = self._end, os.fstat(self._file).st_size
+        if end <= start:  # the file was cut last time, and nothing came since
+            return b""
+        self._end = end
+        data = os.pread(self._file, end - start, start)
         os.ftruncate(self._file, 0)
         return data
 

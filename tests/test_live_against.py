@@ -1,0 +1,93 @@
+"""Ours against the robot's, frame by frame, whenever the robot's boxes come."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from bevviz.compare.differences import Change
+from bevviz.config import load
+from bevviz.frame import Boxes3D, Frame, FrameResult, LabelledBoxes3D, Objects
+from bevviz.live.against import WAITING, AgainstRobot
+from bevviz.synthetic import SyntheticSource
+from bevviz.synthetic.sensors import Lidar, PinholeCamera
+
+TOPIC = "/detection/fused_3d"
+CONFIG = load(settings=["live.robot_time=0.3 s"])
+
+
+@pytest.fixture(scope="module")
+def first() -> Frame:
+    source = SyntheticSource(
+        frames=1, lidar=Lidar(beams=8, azimuths=90), camera=PinholeCamera(width=64, height=36, focal=44.0)
+    )
+    return source.snapshot(0).frame
+
+
+def boxes(x: float) -> Boxes3D:
+    center = np.array([[x, 0, 0]], np.float32)
+    return Boxes3D(center, np.full((1, 3), 2, np.float32), np.zeros(1, np.float32))
+
+
+def theirs(frame: Frame, x: float, topic: str = TOPIC) -> LabelledBoxes3D:
+    """In the world, as they come."""
+    return LabelledBoxes3D(
+        stamp=frame.stamp,
+        frame_id="map",
+        topic=topic,
+        boxes=boxes(x),
+        labels=("car",),
+        scores=np.ones(1, np.float32),
+        world_from_boxes=frame.pose,
+    )
+
+
+def result(first: Frame, index: int, robot: float | None = None, x: float = 10.0) -> FrameResult:
+    frame = replace(first, index=index, stamp=first.stamp + index * 100_000_000)
+    if robot is not None:
+        frame = replace(frame, robot_boxes=(theirs(frame, robot),))
+    none = np.full(1, -1, np.int32)
+    objects = Objects(boxes(x), ("car",), np.ones(1, np.float32), none, ("",), none)
+    return replace(FrameResult.unprocessed(frame, CONFIG), objects=objects)
+
+
+def test_boxes_may_come_with_their_frame_after_it_or_before_its_result(first: Frame) -> None:
+    against = AgainstRobot("", CONFIG.live)
+    (with_it,) = against.see(result(first, 0, robot=10.1))
+    assert [d.change for d in with_it.found.objects] == [Change.SAME] and against.topic == TOPIC
+    assert against.see(result(first, 1)) == []
+    early = result(first, 3)  # the robot has said so before our result is there
+    late = [(result(first, 1).frame.stamp, theirs(first, 11.0)), (early.frame.stamp, theirs(first, 10.4))]
+    (after,) = against.see(result(first, 2), late)
+    assert after.found.index == 1 and after.found.objects[0].change is Change.MOVED
+    assert after.found.objects[0].distance == pytest.approx(1.0, abs=1e-4)
+    (before,) = against.see(early)
+    assert before.found.index == 3 and (against.frames, against.differing) == (
+        3,
+        1,
+    )  # 0.4 m is no difference yet
+
+
+def test_a_difference_that_lasts_is_a_reason_once(first: Frame) -> None:
+    against = AgainstRobot("", CONFIG.live)
+    reasons = []
+    for index in range(12):
+        against.see(result(first, index, robot=10.0 if index in (0, 7) else 11.0))
+        reasons.append(against.reason())
+    assert [bool(reason) for reason in reasons] == [index in (4, 11) for index in range(12)]
+    assert reasons[4] is not None and reasons[4].startswith(
+        "robot and ours differ for 0.3 s: car 1.00 m apart"
+    )
+
+
+def test_several_topics_are_told_and_nothing_grows(first: Frame) -> None:
+    against = AgainstRobot("", CONFIG.live)
+    both = result(first, 0)
+    frame = both.frame
+    both = replace(both, frame=replace(frame, robot_boxes=(theirs(frame, 1, "/a"), theirs(frame, 1, "/b"))))
+    assert against.see(both) == [] and "which of its topics" in against.problem
+    for index in range(1, 3 * WAITING):
+        against.see(result(first, index), [(index, theirs(first, 1, "/a"))])
+    assert len(against._waiting) == WAITING and len(against._late) <= WAITING
