@@ -62,6 +62,7 @@ class Drive(Closing):
     Args:
         frames: where they come from.
         config: how they are run.
+        notes: what is to be said of them beforehand, one sentence each.
 
     Attributes:
         frames: the source.
@@ -71,8 +72,9 @@ class Drive(Closing):
         UserError: the detector's model or somebody's function cannot be used.
     """
 
-    def __init__(self, frames: Frames, config: Config) -> None:
+    def __init__(self, frames: Frames, config: Config, notes: Sequence[str] = ()) -> None:
         self.frames, self.session = frames, Session(config)
+        self._notes = list(notes)
         self._results: OrderedDict[tuple[int, int], FrameResult] = OrderedDict()
         self._questioner: Questioner | None = None
 
@@ -98,7 +100,7 @@ class Drive(Closing):
     @property
     def warnings(self) -> list[str]:
         """What was lost or looked wrong so far, one sentence each."""
-        return list(self.frames.warnings)
+        return [*self._notes, *self.frames.warnings]
 
     @property
     def times(self) -> F64:
@@ -318,17 +320,20 @@ def open_drive(
     end: str | float | None = None,
     every: int = 1,
     frames: tuple[int | None, int | None] | None = None,
+    bag: str | PathLike[str] | None = None,
 ) -> Drive:
     """Open a recorded drive.
 
     Args:
-        path: bag file or folder (MCAP, sqlite3, ROS 1); several are one drive.
+        path: bag file or folder (MCAP, sqlite3, ROS 1); several are one drive. A recording (.rrd) stands
+            for the bag that it was made from and for its configuration.
         model: detector, as ``detector.model``.
         set: parameters: ``{"clustering.eps": 0.6}``, or ``["clustering.eps=60 cm"]`` as after ``--set``.
         config: YAML file, as ``bevviz config`` prints it.
         preset: ``default``, or ``reference``: as the ROS 2 tutorial pipeline.
         start, end, every, frames: which scans a run over the whole drive takes, as the options of
             ``bevviz bag``; any scan can be asked for one by one.
+        bag: of a recording, where it is not found by itself.
 
     Raises:
         UserError: no bag, nothing in it, an unknown parameter, or a model that cannot be used.
@@ -343,12 +348,22 @@ def open_drive(
     """
     from bevviz.bags.source import BagSource
 
-    paths = [path] if isinstance(path, str | PathLike) else path
-    loaded = _load(model, set, config, preset)
+    paths = [Path(p) for p in ([path] if isinstance(path, str | PathLike) else path)]
+    settings, notes = _given(model, set), tuple[str, ...]()
+    if len(paths) == 1 and paths[0].suffix == ".rrd":
+        from bevviz.recorded import follow
+
+        recorded = follow(paths[0], [] if bag is None else [Path(bag)], settings)
+        paths, notes = list(recorded.paths), recorded.warnings
+        loaded = recorded.load(_file(config), settings, preset)
+    elif bag is not None:
+        raise UserError(f"bag={bag}: is where the bag of a recording lies, and {paths[0]} is none")
+    else:
+        loaded = load(_file(config), settings, preset)
     times = {"start": None if start is None else str(start), "end": None if end is None else str(end)}
-    source = BagSource([Path(p) for p in paths], loaded, every=every, frames=frames, **times)
+    source = BagSource(paths, loaded, every=every, frames=frames, **times)
     try:
-        return Drive(source, loaded)
+        return Drive(source, loaded, notes)
     except BaseException:
         source.close()
         raise
@@ -377,15 +392,17 @@ def simulate(
     """
     from bevviz.synthetic import SyntheticSource
 
-    return Drive(SyntheticSource(frames, seed, plant=plant), _load(model, set, config, preset))
+    return Drive(SyntheticSource(frames, seed, plant=plant), load(_file(config), _given(model, set), preset))
 
 
-def _load(
-    model: str | PathLike[str], settings: Settings, config: str | PathLike[str] | None, preset: Preset | None
-) -> Config:
+def _given(model: str | PathLike[str], settings: Settings) -> list[str]:
+    """``key=value`` each."""
     given = _settings(settings) if isinstance(settings, Mapping) else list(settings)
-    named = [f"detector.model={model}"] if model else []
-    return load(None if config is None else Path(config), [*named, *given], preset)
+    return [*([f"detector.model={model}"] if model else []), *given]
+
+
+def _file(config: str | PathLike[str] | None) -> Path | None:
+    return None if config is None else Path(config)
 
 
 def _settings(tree: Mapping[str, Any]) -> list[str]:

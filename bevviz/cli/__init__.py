@@ -28,7 +28,7 @@ from bevviz.cli import (
     workbench,
 )
 from bevviz.cli.inputs import check_outputs
-from bevviz.cli.options import with_negatives
+from bevviz.cli.options import follow_recording, with_negatives
 from bevviz.errors import UserError, first_line, interrupt_in
 
 if TYPE_CHECKING:
@@ -72,6 +72,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         options = parser.parse_args(given)
         if options.verbose:
             _log_to_stderr()
+        follow_recording(options)
         check_outputs(options)
         run: Callable[[argparse.Namespace], int] = options.run
         return run(options)

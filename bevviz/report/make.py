@@ -7,7 +7,7 @@ import shutil
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
 from contextlib import ExitStack
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import rerun as rr
@@ -27,6 +27,7 @@ from bevviz.logging.recorder import DiskWatch, Recorder
 from bevviz.logging.sinks import open_recording
 from bevviz.progress import Progress
 from bevviz.provenance import Provenance, file_hash, model_path, names_path, provenance, versions
+from bevviz.recorded import Origin
 from bevviz.report.digest import digest, pack
 from bevviz.report.facts import Facts, commands, file_lines, traceback_texts, window_text
 from bevviz.report.origin import ReportInfo, shareable
@@ -116,7 +117,11 @@ def make(request: ReportRequest) -> WrittenReport:
 
         public = shareable(request.config)
         source = stack.enter_context(open_window([bag], request.config, window.low, window.high))
-        sinks = stack.enter_context(open_recording(whole.scene, public, save=rrd, blueprint="bug_report"))
+        origin = Origin.of(source.scene, request.config, rrd, folders=False, redacted=request.redact)
+        scene = replace(whole.scene, bag=())  # where that lies is nobody's concern
+        sinks = stack.enter_context(
+            open_recording(scene, public, save=rrd, blueprint="bug_report", origin=origin)
+        )
         recording = sinks.recording
         written.files.insert(0, rrd)
         summary = WindowSummary(window.at, source.total, len(whole.scene.cameras))
