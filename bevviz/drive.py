@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import ExitStack
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol, overload
@@ -22,6 +21,7 @@ if TYPE_CHECKING:
     from pandas import DataFrame
     from rerun.blueprint import Blueprint
 
+    from bevviz.notebook import NotebookViewer, Selected
     from bevviz.why import Answer, Questioner
 
 Settings = Mapping[str, Any] | Sequence[str]
@@ -77,6 +77,7 @@ class Drive(Closing):
         self._notes = list(notes)
         self._results: OrderedDict[tuple[int, int], FrameResult] = OrderedDict()
         self._questioner: Questioner | None = None
+        self._shown: NotebookViewer | None = None
 
     def close(self) -> None:
         self.frames.close()
@@ -169,7 +170,8 @@ class Drive(Closing):
         """Why objects of a frame were reported, or were not: what ``bevviz why`` answers.
 
         Args:
-            time, frame: which scan, as for ``at``.
+            time, frame: which scan, as for ``at``; neither: the one that the notebook's viewer shows, and
+                with no selection what was clicked there last.
             cls: all of that class; with no selection at all: whatever went wrong.
             box: what is at the pixel u, v, or in the image box u0, v0, u1, v1.
             point: what is at x, y, z, in metres of the points' frame.
@@ -198,7 +200,27 @@ class Drive(Closing):
             detection=detection,
             camera=camera,
         )
-        return self.questioner(time, frame=frame).explain(selection, hints, everything=everything)
+        viewer = self._shown
+        if time is None and frame is None and viewer is not None:
+            frame = viewer.frame
+            if not (selection.one or selection.label) and (clicked := self.selected) is not None:
+                frame, selection = clicked.frame, clicked.selection(self.config == viewer.config)
+        questioner = self.questioner(time, frame=frame)
+        answers = questioner.explain(selection, hints, everything=everything)
+        if viewer is not None:
+            viewer.mark(questioner.traces.result, answers)
+        return answers
+
+    @property
+    def selected(self) -> Selected | None:
+        """What was clicked last in the notebook's viewer, see ``show``; None: nothing."""
+        viewer = self._shown
+        if viewer is None or viewer.clicked is None:
+            return None
+        if viewer.config == self.config:
+            return viewer.selected(self.at(frame=viewer.clicked))
+        as_shown = Session(viewer.config, loader=self.session.loader)
+        return viewer.selected(as_shown.alone(self.raw(viewer.clicked)))
 
     def questioner(self, time: str | float | None = None, *, frame: int | None = None) -> Questioner:
         """Answers any number of questions about one scan; what they have in common is worked out once.
@@ -241,7 +263,7 @@ class Drive(Closing):
 
     def _number(self, time: str | float | None, frame: int | None) -> int:
         if (time is None) == (frame is None):
-            raise UserError("which scan? Give a time, or frame=NUMBER")
+            raise UserError("which scan? Give a time, or frame=NUMBER; or show() it in a notebook, and click")
         if time is not None:
             return self.frames.number_at(time)
         assert frame is not None
@@ -278,28 +300,28 @@ class Drive(Closing):
                 raise KeyboardInterrupt
         return target
 
-    def show(self, blueprint: str | Blueprint = "debug") -> Any:
+    def show(self, blueprint: str | Blueprint | None = None) -> None:
         """Run the whole drive into a viewer: in a notebook into the cell, else into a window.
 
-        Returns:
-            The notebook's viewer; None where a window was opened.
+        What is clicked in a notebook's viewer is ``selected`` in the cells that are run next, and what
+        ``why()`` answers about; that is then marked in the viewer.
+
+        Args:
+            blueprint: layout; None: ``workbench`` in a notebook, else ``debug``.
 
         Raises:
             UserError: no viewer can be shown.
         """
         from bevviz.logging.recorder import Recorder
         from bevviz.logging.sinks import open_recording
-        from bevviz.notebook import in_notebook, notebook_viewer
+        from bevviz.notebook import NotebookViewer, in_notebook
 
-        with ExitStack() as stack:
-            viewer = None
-            if in_notebook():
-                viewer, recording = notebook_viewer(self.scene, blueprint)
-            else:
-                sinks = open_recording(self.scene, self.config, spawn=True, blueprint=blueprint)
-                recording = stack.enter_context(sinks).recording
-            self.run([Recorder(recording, self.config)])
-        return viewer
+        if in_notebook():
+            self._shown = NotebookViewer(self.scene, self.config, blueprint or "workbench")
+            self.run([self._shown])
+            return
+        with open_recording(self.scene, self.config, spawn=True, blueprint=blueprint or "debug") as sinks:
+            self.run([Recorder(sinks.recording, self.config)])
 
     def to_pandas(self) -> DataFrame:
         """Run the whole drive into a table: a row a frame, with counts, times and what went wrong."""

@@ -12,6 +12,7 @@ from bevviz.frame import F32, Camera, Frame
 from bevviz.logging import entities
 from bevviz.logging.camera import over_image
 from bevviz.logging.pieces import boxes2d, document, edges, transform
+from bevviz.logging.writer import Writer
 from bevviz.why.answer import Answer
 from bevviz.why.subject import projected
 from bevviz.why.text import page
@@ -64,6 +65,21 @@ def log_answers(recording: rr.RecordingStream, frame: Frame, answers: Sequence[A
         recording.log(entities.why("place"), pose, place)
     for camera in frame.cameras:
         _log_image(recording, camera, drawn)
+
+
+def mark_answers(to: Writer, frame: Frame, answers: Sequence[Answer]) -> None:
+    """The answers over the frame, and nothing of those before; gone again at the next frame.
+
+    Args:
+        to: a writer of its own, whose clock is set.
+        frame: what was explained.
+        answers: all are drawn.
+    """
+    to.set_time(frame.index, frame.stamp, frame.received)
+    to.recording.log(entities.WHY, rr.Clear(recursive=True))
+    log_answers(to.recording, frame, answers, len(answers))
+    to.set_time(frame.index + 1, frame.stamp + 1, frame.received and frame.received + 1)
+    to.recording.log(entities.WHY, rr.Clear(recursive=True))
 
 
 def _frustums(camera: Camera, answers: Sequence[Answer]) -> Iterator[tuple[F32, str]]:
