@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from contextlib import suppress
+from contextlib import AbstractContextManager, nullcontext, suppress
 from typing import TYPE_CHECKING
 
 from bevviz.cli.interrupts import terminable
@@ -13,6 +13,7 @@ from bevviz.errors import UserError
 
 if TYPE_CHECKING:
     from bevviz.workbench.bench import Bench
+    from bevviz.workbench.native import NativeViewer
 
 EXAMPLES = """examples:
   bevviz drive.mcap                                     the same as bevviz open drive.mcap
@@ -39,6 +40,12 @@ def add(commands: Commands) -> None:
     page.add_argument(
         "--no-browser", dest="browser", action="store_false", help="print the address, open nothing"
     )
+    page.add_argument(
+        "--viewer", action="store_true", help="Rerun's viewer in a window, the page is the panel alone"
+    )
+    page.add_argument(
+        "--connect", metavar="URL", help="the same with a viewer that runs: rerun+http://127.0.0.1:9876/proxy"
+    )
     command.set_defaults(run=_open)
 
 
@@ -61,9 +68,20 @@ def _open(options: argparse.Namespace) -> int:
                 webbrowser.open(address)
             say("open until Ctrl-C; only this machine can reach it")
 
-        with suppress(KeyboardInterrupt):  # the way to end it
-            serve(bench, options.port, ready)
+        with suppress(KeyboardInterrupt), _native(options, bench) as native:  # the way to end it
+            serve(bench, options.port, ready, native)
     return 0
+
+
+def _native(options: argparse.Namespace, bench: Bench) -> AbstractContextManager[NativeViewer | None]:
+    """The viewer beside the page, where one is asked for."""
+    from bevviz.workbench.native import NativeViewer
+
+    if options.connect is None and not options.viewer:
+        return nullcontext()
+    if options.connect is None and not has_display():
+        raise UserError("--viewer: no display; without it the page has a viewer of its own")
+    return NativeViewer(bench.film, bench.recording_id, options.connect)
 
 
 def _bench(options: argparse.Namespace) -> Bench:

@@ -54,6 +54,7 @@ class Bench(Closing):
 
     Attributes:
         film: what is shown: the whole drive, then what was asked and tried.
+        recording_id: of the film.
         found: what is worth a look in the frames so far.
         opening: stamp of the frame that a page is to open at; None: not run yet.
     """
@@ -74,7 +75,7 @@ class Bench(Closing):
         self._asked: Questioner | None = None
         self._stop, self._quiet = threading.Event(), threading.Event()
         self._quiet.set()
-        recording_id = f"bench-{time.time_ns()}"
+        self.recording_id = recording_id = f"bench-{time.time_ns()}"
         self._main, self._film_main = self._stream(recording_id)
         self._desk, self._film_desk = self._stream(recording_id)
         self._main.send_blueprint(blueprints.load("workbench", drive.scene), make_active=True)

@@ -28,11 +28,12 @@ from bevviz.config import dump, revised
 from bevviz.errors import UserError, first_line
 from bevviz.loggers import logger
 from bevviz.workbench.bench import Bench, Settings
+from bevviz.workbench.native import NativeViewer
 from bevviz.workbench.parameters import controls
 from bevviz.workbench.pick import Pick
 
 PAGE = Path(__file__).parent / "page"
-FILES = ("bench.css", "bench.js")
+FILES = ("bench.css", "bench.js", "native.js")
 VIEWER = ("widget.js", "widget.css", "re_viewer_bg.wasm")
 KINDS = {".js": "text/javascript", ".css": "text/css", ".wasm": "application/wasm"}
 HOSTS = ("127.0.0.1", "localhost")
@@ -45,13 +46,16 @@ POLICY = (
 _log = logger(__name__)
 
 
-def serve(bench: Bench, port: int | None, ready: Callable[[str], None]) -> None:
+def serve(
+    bench: Bench, port: int | None, ready: Callable[[str], None], native: NativeViewer | None = None
+) -> None:
     """Run the drive and serve its page until an interrupt.
 
     Args:
         bench: the drive.
         port: of the page; None: one that is free.
         ready: called with the address when it can be opened.
+        native: the viewer beside which the page is the panel alone; None: the page has one of its own.
 
     Raises:
         UserError: the port is in use, or the viewer is not installed.
@@ -65,7 +69,7 @@ def serve(bench: Bench, port: int | None, ready: Callable[[str], None]) -> None:
             raise UserError(f"--port {port}: {error.strerror}; without --port a free one is taken") from None
         port = listening.getsockname()[1]
         token = secrets.token_urlsafe(16)
-        app = application(bench, viewer, token, port)
+        app = application(bench, viewer, token, port, native)
         config = uvicorn.Config(
             app,
             log_level="warning",
@@ -110,9 +114,11 @@ def viewer_folder() -> Path:
     return folder
 
 
-def application(bench: Bench, viewer: Path, token: str, port: int) -> ASGIApp:
+def application(
+    bench: Bench, viewer: Path, token: str, port: int, native: NativeViewer | None = None
+) -> ASGIApp:
     """Everything that the page asks for, behind its guard."""
-    site = _Site(bench, viewer, token, port)
+    site = _Site(bench, viewer, token, port, native is not None)
     routes = [
         Route("/", site.page),
         Route("/page/{name}", site.file),
@@ -121,6 +127,8 @@ def application(bench: Bench, viewer: Path, token: str, port: int) -> ASGIApp:
         WebSocketRoute("/film", site.film),
         WebSocketRoute("/talk", site.talk),
     ]
+    if native is not None:
+        routes.append(WebSocketRoute("/native", native.talk))
     return _Guard(Starlette(routes=routes), token, port)
 
 
@@ -176,8 +184,9 @@ def _cookie(asked: HTTPConnection, name: str) -> str:
 
 
 class _Site:
-    def __init__(self, bench: Bench, viewer: Path, token: str, port: int) -> None:
+    def __init__(self, bench: Bench, viewer: Path, token: str, port: int, native: bool) -> None:
         self._bench, self._viewer, self._token, self._port = bench, viewer, token, port
+        self._native = native
         self._run = secrets.token_hex(4)  # a page that finds another one starts anew
         self._desk = ThreadPoolExecutor(1, "desk")  # answers one question after the other
 
@@ -185,6 +194,7 @@ class _Site:
 
     async def page(self, request: Request) -> Response:
         text = (PAGE / "index.html").read_text().replace("VIEWER_VERSION", rr.__version__)
+        text = text.replace("NATIVE_VIEWER", str(self._native).lower())
         response = Response(text, media_type="text/html", headers={"Content-Security-Policy": POLICY})
         response.headers["Cache-Control"] = "no-store"
         response.headers["Referrer-Policy"] = "no-referrer"

@@ -2,7 +2,8 @@
 
 const $ = (id) => document.getElementById(id);
 const version = $("viewer").dataset.version;
-const widget = (await import(`/viewer/${version}/widget.js`)).default;
+const native = $("viewer").dataset.native === "true"; // Rerun's viewer is a window of its own
+const widget = (await import(native ? "/page/native.js" : `/viewer/${version}/widget.js`)).default;
 
 const TIMELINE = "stamp";
 const SETTLED = 150; // ms without a change after which a frame is taken for one that is looked at
@@ -101,7 +102,7 @@ function connect() {
     if (message.type === "welcome") {
       if (state.run && state.run !== message.run) { location.reload(); return; }
       welcome(message);
-      viewerReady.then(() => { shown = film(); });
+      viewerReady.then(() => { if (!native) shown = film(); });
     } else receive(message);
   };
   talk.onclose = async () => {
