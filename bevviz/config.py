@@ -371,6 +371,9 @@ class LiveConfig(Section):
     split_time: Seconds | None = Field(
         None, ge=1, description="--save: time that a part is closed after; empty: any"
     )
+    held: int = Field(
+        20, ge=1, le=1000, description="newest frames that can be asked about (--workbench), 5 to 20 MB each"
+    )
     flight_time: Seconds = Field(30.0, ge=0, le=3600, description="flight recorder: the last seconds; 0: off")
     flight_size: Megabytes = Field(500.0, ge=1, description="flight recorder: memory at most")
     flight_folder: str = Field("", description="where its recordings go; empty: the working directory")

@@ -99,15 +99,16 @@ class Live:
 
         self._nice(live.nice)
         self._session = Observing(settings.config) if observe else Session(settings.config)
-        self._encoder = Encoder(self.config, source.scene, outputs.blueprint)
+        self.encoder = Encoder(self.config, source.scene, outputs.blueprint)
         self._indexer = Indexer()
+        self._watchers: list[Callable[[FrameResult], None]] = []
         self._saves = ThreadPoolExecutor(1, "save")
-        self.flight = FlightRecorder(live, self._encoder, self._indexer)
+        self.flight = FlightRecorder(live, self.encoder, self._indexer)
         self._triggers = Triggers(live)
         self.health = Health()
         self._dropping = Dropping()
 
-        programs = [remote(url, self._encoder.recording_id) for url in outputs.connect]
+        programs = [remote(url, self.encoder.recording_id) for url in outputs.connect]
         if outputs.serve is not None:
             program, address = server(outputs.serve, outputs.bind, live.viewer_memory)
             programs.append(program)
@@ -117,9 +118,9 @@ class Live:
         self.saver: Saver | None = None
         self._outputs: list[Output] = []
         if outputs.save is not None:
-            self.saver = Saver(outputs.save, live, self._encoder, self._indexer, notes)
+            self.saver = Saver(outputs.save, live, self.encoder, self._indexer, notes)
             self._outputs.append(self.saver)
-        self._outputs += [Viewer(program, live.output_queue, self._encoder, notes) for program in programs]
+        self._outputs += [Viewer(program, live.output_queue, self.encoder, notes) for program in programs]
 
     @property
     def config(self) -> Config:
@@ -141,6 +142,26 @@ class Live:
             health.memory,
             self._drops(),
         )
+
+    @property
+    def session(self) -> Session:
+        """That every frame is run in."""
+        return self._session
+
+    @property
+    def scene(self) -> Scene:
+        """Names of the sensors."""
+        return self._source.scene
+
+    def attach(self, output: Output, watcher: Callable[[FrameResult], None]) -> None:
+        """One more output, before the run; it is closed at its end.
+
+        Args:
+            output: takes the packets.
+            watcher: called with each result that was logged, in the thread that logs.
+        """
+        self._outputs.append(output)
+        self._watchers.append(watcher)
 
     def stop(self) -> None:
         """End ``run``, from any thread."""
@@ -215,16 +236,18 @@ class Live:
             output.close()
         self._saves.shutdown()
         self._indexer.close()
-        self._encoder.close()
+        self.encoder.close()
 
     def log(self, result: FrameResult) -> None:
         """Encode a frame once, for every output."""
         drops = {entities.drops(where): float(count) for where, count in self._drops().items()}
         health = self.health.scalars() | drops
-        packet = self._encoder.encode(result, self._source.scene, health, self.notes.take())
+        packet = self.encoder.encode(result, self._source.scene, health, self.notes.take())
         for output in self._outputs:
             output.put(packet)
         self.flight.put(packet)
+        for watcher in self._watchers:
+            watcher(result)
         self.health.logged(result.frame.received)
         self.frames += 1
         if reason := self._triggers.check(result):

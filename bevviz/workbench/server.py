@@ -20,7 +20,7 @@ import uvicorn
 from starlette.applications import Starlette
 from starlette.requests import HTTPConnection, Request
 from starlette.responses import FileResponse, PlainTextResponse, Response
-from starlette.routing import Route, WebSocketRoute
+from starlette.routing import BaseRoute, Route, WebSocketRoute
 from starlette.types import ASGIApp, Receive, Scope, Send
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
@@ -33,7 +33,7 @@ from bevviz.workbench.parameters import controls
 from bevviz.workbench.pick import Pick
 
 PAGE = Path(__file__).parent / "page"
-FILES = ("bench.css", "bench.js", "native.js")
+FILES = ("bench.css", "bench.js", "native.js", "live.js")
 VIEWER = ("widget.js", "widget.css", "re_viewer_bg.wasm")
 KINDS = {".js": "text/javascript", ".css": "text/css", ".wasm": "application/wasm"}
 HOSTS = ("127.0.0.1", "localhost")
@@ -42,6 +42,13 @@ POLICY = (
     "img-src 'self' data: blob:; font-src 'self' data:; connect-src 'self'; "
     "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
 )
+
+SERVER: dict[str, Any] = {
+    "log_level": "warning",
+    "lifespan": "off",
+    "ws_per_message_deflate": False,
+    "timeout_graceful_shutdown": 1,
+}
 
 _log = logger(__name__)
 
@@ -61,25 +68,31 @@ def serve(
         UserError: the port is in use, or the viewer is not installed.
     """
     viewer = viewer_folder()
-    with socket.socket() as listening:
-        listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        try:
-            listening.bind((HOSTS[0], port or 0))
-        except OSError as error:
-            raise UserError(f"--port {port}: {error.strerror}; without --port a free one is taken") from None
+    with bound(port) as listening:
         port = listening.getsockname()[1]
         token = secrets.token_urlsafe(16)
         app = application(bench, viewer, token, port, native)
-        config = uvicorn.Config(
-            app,
-            log_level="warning",
-            lifespan="off",
-            ws_per_message_deflate=False,
-            timeout_graceful_shutdown=1,
+        server = _Server(
+            uvicorn.Config(app, **SERVER), lambda: ready(f"http://{HOSTS[0]}:{port}/?token={token}")
         )
-        server = _Server(config, lambda: ready(f"http://{HOSTS[0]}:{port}/?token={token}"))
         bench.start()
         server.run(sockets=[listening])
+
+
+def bound(port: int | None) -> socket.socket:
+    """A socket of this machine alone; None: at a port that is free.
+
+    Raises:
+        UserError: the port is in use.
+    """
+    found = socket.socket()
+    found.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    try:
+        found.bind((HOSTS[0], port or 0))
+    except OSError as error:
+        found.close()
+        raise UserError(f"port {port}: {error.strerror}; without a number a free one is taken") from None
+    return found
 
 
 class _Server(uvicorn.Server):
@@ -119,7 +132,14 @@ def application(
 ) -> ASGIApp:
     """Everything that the page asks for, behind its guard."""
     site = _Site(bench, viewer, token, port, native is not None)
-    routes = [
+    routes = _routes(site)
+    if native is not None:
+        routes.append(WebSocketRoute("/native", native.talk))
+    return _Guard(Starlette(routes=routes), token, port)
+
+
+def _routes(site: _Site) -> list[BaseRoute]:
+    return [
         Route("/", site.page),
         Route("/page/{name}", site.file),
         Route(f"/viewer/{rr.__version__}/{{name}}", site.viewer),
@@ -127,9 +147,6 @@ def application(
         WebSocketRoute("/film", site.film),
         WebSocketRoute("/talk", site.talk),
     ]
-    if native is not None:
-        routes.append(WebSocketRoute("/native", native.talk))
-    return _Guard(Starlette(routes=routes), token, port)
 
 
 class _Guard:
@@ -381,8 +398,9 @@ class _Visit:
 
     async def _settle(self, number: int, message: dict[str, Any]) -> None:
         """The page shows this frame for a while: questions about it are to come."""
-        frame = self._bench.number_at(round(float(message["time"])))
-        await self._at_desk(number, lambda: self._bench.look(frame, _settings(message)), idle=True)
+        with contextlib.suppress(UserError):  # nobody has asked yet
+            frame = self._bench.number_at(round(float(message["time"])))
+            await self._at_desk(number, lambda: self._bench.look(frame, _settings(message)), idle=True)
 
 
 def _settings(message: dict[str, Any]) -> Settings:

@@ -38,6 +38,7 @@ const viewerReady = new Promise((ready) => {
   });
 });
 const toViewer = (message, buffers) => listeners["msg:custom"](message, buffers);
+window.addEventListener("to-viewer", ({ detail }) => toViewer(detail));
 const move = () => toViewer({ type: "time_ctrl", timeline: TIMELINE, timestamp_nanos: target, play: false });
 
 // A viewer that has just opened a recording goes to its beginning of itself, and takes no time before that.
