@@ -188,6 +188,7 @@ class LiveBench(Closing):
         self.found: list[Find] = []
         self._newest: deque[FrameResult] = deque(maxlen=live.config.live.held)
         self._kept: OrderedDict[int, FrameResult] = OrderedDict()
+        self._lock = threading.Lock()  # of the two
         self._tried: OrderedDict[tuple[int, Settings], FrameResult] = OrderedDict()
         self._before = values(live.config)
         self._set: Settings = ()
@@ -226,7 +227,8 @@ class LiveBench(Closing):
         }
 
     def _see(self, result: FrameResult) -> None:
-        self._newest.append(result)
+        with self._lock:
+            self._newest.append(result)
         if result.frame.truth is not None and self.truth_of is None:
             self.truth_of = _own_truth
         for listener in tuple(self._listeners):
@@ -252,7 +254,8 @@ class LiveBench(Closing):
         return there[-1]
 
     def _held(self) -> list[FrameResult]:
-        return [*self._kept.values(), *self._newest]
+        with self._lock:
+            return [*self._kept.values(), *self._newest]
 
     def hold(self, stamp: int) -> FrameResult:
         """Keep the frame that a viewer shows, to ask about it for as long as one likes; a few at most.
@@ -268,13 +271,15 @@ class LiveBench(Closing):
             raise UserError("no frame has come yet")
         result = self.look(shown[-1] if shown else frames[0][1])
         index = result.frame.index
-        if index not in self._kept:
+        with self._lock:
+            new = index not in self._kept
             self._kept[index] = result
+            self._kept.move_to_end(index)
+            while len(self._kept) > KEPT:
+                self._kept.popitem(last=False)
+        if new:
             truth = self.truth_of(result.frame) if self.truth_of is not None else None
             self.found += finds(result, truth)[: FOUND - len(self.found)]
-        self._kept.move_to_end(index)
-        while len(self._kept) > KEPT:
-            self._kept.popitem(last=False)
         for listener in tuple(self._listeners):
             listener()
         return result
