@@ -95,8 +95,9 @@ def truth_of(source: SyntheticSource, shot: Snapshot, must: Bool) -> Truth:
     stated, time = shot.frame.truth, (shot.frame.stamp - START) * 1e-9
     assert stated is not None and stated.world_from_boxes is not None
     world, step = source.world, 0.05
+    actors = {actor.number: actor for actor in world.actors}
     places = [
-        [world.actors[number - 1].pose(world.street, time + sign * step)[:3, 3] for sign in (-1, 1)]
+        [actors[number].pose(world.street, time + sign * step)[:3, 3] for sign in (-1, 1)]
         for number in shot.truth_object.tolist()
     ]
     ends = np.array(places).reshape(-1, 2, 3)

@@ -122,7 +122,7 @@ class Bench:
 
     def _hint(self, known: Questioner, answer: Answer, again: _Again, row: int, about: str) -> None:
         start = time.perf_counter()
-        hints = known.hints(answer)
+        hints = known.search(answer).hints
         self.tally.hint_seconds.append(time.perf_counter() - start)
         if not hints:
             self.tally.hints.update(none=1)

@@ -5,12 +5,13 @@
 >>> drive.at(12.5).objects.to_pandas()
 """
 
-from __future__ import annotations
-
 import os
-from typing import TYPE_CHECKING, Any
 
+# Neither ``typing`` nor ``__future__``: to an interrupt among these imports Python gives a traceback.
+TYPE_CHECKING = False
 if TYPE_CHECKING:
+    from typing import Any
+
     from bevviz.config import Config
     from bevviz.drive import Drive, simulate
     from bevviz.drive import open_drive as open  # bevviz.open
@@ -34,7 +35,7 @@ _HOMES = {
 }
 
 
-def __getattr__(name: str) -> Any:
+def __getattr__(name: str) -> "Any":
     """Imported when it is asked for, so that ``bevviz --help`` is instant."""
     if name not in _HOMES:
         raise AttributeError(f"module 'bevviz' has no attribute '{name}'")

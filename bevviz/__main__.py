@@ -1,14 +1,14 @@
 """The command ``bevviz``, and ``python -m bevviz``."""
 
-from __future__ import annotations
-
-import signal
+import _signal  # type: ignore[import-not-found]
 import sys
 
-# Among the imports an interrupt just ends the process, as SIGTERM does; ``main`` has its own way then.
-signal.signal(signal.SIGINT, signal.SIG_DFL)
+# Until ``main`` has its own way an interrupt just ends the process, as SIGTERM does, and does so before
+# anything is imported that takes time, as ``signal`` itself: Python's own answer is a traceback.
+if _signal.getsignal(_signal.SIGINT) != _signal.SIG_IGN:
+    _signal.signal(_signal.SIGINT, _signal.SIG_DFL)
 
-from bevviz.cli import main  # noqa: E402
+from bevviz.cli import main
 
 if __name__ == "__main__":
     sys.exit(main())

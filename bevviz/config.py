@@ -23,6 +23,8 @@ from pydantic import (
     Field,
     PositiveFloat,
     ValidationError,
+    ValidationInfo,
+    field_validator,
 )
 from pydantic.fields import FieldInfo
 from pydantic_core import PydanticCustomError
@@ -195,6 +197,18 @@ class ClusteringConfig(StageSection):
     max_cluster_points: int | None = Field(None, ge=1, description="larger ones too; empty: no limit")
     boxes: Literal["oriented", "axis_aligned"] = Field("oriented", description="box used downstream")
 
+    @field_validator("max_cluster_points")
+    @classmethod
+    def _leaves_some(cls, most: int | None, info: ValidationInfo) -> int | None:
+        least = info.data.get("min_cluster_points", 1)
+        if most is not None and most < least:
+            raise PydanticCustomError(
+                "no_room",
+                "must not be below clustering.min_cluster_points, which is {least}",
+                {"least": least},
+            )
+        return most
+
 
 class DetectorConfig(StageSection):
     model: str = Field(
@@ -320,12 +334,16 @@ class TrackingConfig(Section):
 class AnomaliesConfig(Section):
     """What is worth a look, frame after frame."""
 
-    flicker_frames: int = Field(
-        5, ge=1, le=1000, description="longest gap, in frames, after as many frames with the object"
+    surprise: float = Field(
+        8.0,
+        gt=0,
+        le=100,
+        description="of an object, or a class, that is missed: -ln of its chance, by the object's own past",
     )
-    jump: Metres = Field(
-        1.0, gt=0, le=20, description="of a box from where it was expected, or of its longer side"
+    visible: float = Field(
+        0.7, ge=0, le=1, description="share of an object that nothing may hide, else it is excused"
     )
+    jump: Metres = Field(1.0, gt=0, le=20, description="least of a box from where it was expected")
     alone_frames: int = Field(
         5, ge=1, le=1000, description="frames until what only one sensor sees is an anomaly"
     )
@@ -364,6 +382,9 @@ class LiveConfig(Section):
     output_queue: int = Field(20, ge=1, le=1000, description="frames that may wait for a slow disk or viewer")
     viewer_memory: Megabytes = Field(
         500.0, ge=10, description="recent past kept for a viewer that comes late (--serve)"
+    )
+    viewer_rate: float | None = Field(
+        None, ge=1, le=100, description="frames a second that viewers get at most, files get all; empty: all"
     )
     split_size: Megabytes | None = Field(
         None, ge=1, description="--save: size that a part is closed at; empty: any"

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from pandas import DataFrame
     from rerun.blueprint import Blueprint
 
+    from bevviz.evaluate.evaluation import Evaluation
     from bevviz.notebook import NotebookViewer, Selected
     from bevviz.why import Answer, Questioner
 
@@ -283,6 +284,29 @@ class Drive(Closing):
         """Show every frame in order to the observers, see ``bevviz.run.run``."""
         return run(self.frames, self.new_session(), observers)
 
+    def evaluate(
+        self, *, truth: str | None = None, kitti_labels: str | PathLike[str] | None = None
+    ) -> Evaluation:
+        """Run the whole drive and hold every frame to what is really there.
+
+        Args:
+            truth: a Detection3DArray topic that states it; default: the one called ground truth.
+            kitti_labels: or a folder of KITTI's labels, one file for each scan.
+
+        Raises:
+            UserError: there is no truth.
+
+        Example:
+            >>> drive.evaluate().metrics["recall.person@0-10"]
+        """
+        from bevviz.evaluate.evaluation import Evaluation
+        from bevviz.evaluate.truth import truth_in
+
+        labels = None if kitti_labels is None else Path(kitti_labels)
+        evaluation = Evaluation(truth_in(self.frames, truth, labels))
+        self.run([evaluation])
+        return evaluation
+
     def save(self, path: str | PathLike[str], blueprint: str | Blueprint = "debug") -> Path:
         """Run the whole drive into a Rerun recording.
 
@@ -347,8 +371,9 @@ def open_drive(
     """Open a recorded drive.
 
     Args:
-        path: bag file or folder (MCAP, sqlite3, ROS 1); several are one drive. A recording (.rrd) stands
-            for the bag that it was made from and for its configuration.
+        path: bag file or folder (MCAP, sqlite3, ROS 1); several are one drive. Or a folder of the KITTI
+            object benchmark (velodyne, image_2, calib, label_2): single frames, without times. Or a
+            recording (.rrd), which stands for the bag that it was made from and for its configuration.
         model: detector, as ``detector.model``.
         set: parameters: ``{"clustering.eps": 0.6}``, or ``["clustering.eps=60 cm"]`` as after ``--set``.
         config: YAML file, as ``bevviz config`` prints it.
@@ -369,6 +394,7 @@ def open_drive(
         ...     print(answer.verdict.text)
     """
     from bevviz.bags.source import BagSource
+    from bevviz.datasets.kitti import KittiFrames, is_kitti
 
     paths = [Path(p) for p in ([path] if isinstance(path, str | PathLike) else path)]
     settings, notes = _given(model, set), tuple[str, ...]()
@@ -383,7 +409,11 @@ def open_drive(
     else:
         loaded = load(_file(config), settings, preset)
     times = {"start": None if start is None else str(start), "end": None if end is None else str(end)}
-    source = BagSource(paths, loaded, every=every, frames=frames, **times)
+    source: Frames
+    if len(paths) == 1 and is_kitti(paths[0]):
+        source = KittiFrames(paths[0], every=every, frames=frames)
+    else:
+        source = BagSource(paths, loaded, every=every, frames=frames, **times)
     try:
         return Drive(source, loaded, notes)
     except BaseException:

@@ -11,8 +11,10 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
+from bevviz import remains
 from bevviz.errors import UserError
 
 YOUNG = 60.0  # seconds that a temporary folder may be without its lock: it is being made
@@ -48,24 +50,43 @@ def written(target: Path, what: str) -> Iterator[Unfinished]:
     """
     target = target.resolve()
     path = unfinished(target)
-    handle = claim(target, what)
-    try:
-        leftover = os.fstat(handle).st_size > 0
-        os.ftruncate(handle, 0)
+    with remains.unfinished():
+        handle = claim(target, what)
         try:
-            yield Unfinished(path, leftover)
-        except KeyboardInterrupt:
+            leftover = os.fstat(handle).st_size > 0
+            os.ftruncate(handle, 0)
+            try:
+                yield Unfinished(path, leftover)
+            except KeyboardInterrupt:
+                _finish(path, target, what)
+                raise
+            except BaseException as error:
+                if not os.fstat(handle).st_size:
+                    path.unlink(missing_ok=True)
+                elif isinstance(error, UserError):
+                    raise UserError(f"{error}; what was made until then is in {path.name}") from error
+                raise
             _finish(path, target, what)
-            raise
-        except BaseException as error:
-            if not os.fstat(handle).st_size:
-                path.unlink(missing_ok=True)
-            elif isinstance(error, UserError):
-                raise UserError(f"{error}; what was made until then is in {path.name}") from error
-            raise
-        _finish(path, target, what)
-    finally:
-        os.close(handle)  # and with it the lock
+        finally:
+            os.close(handle)  # and with it the lock
+
+
+def save(target: Path, text: str, option: str) -> None:
+    """Write a text file, whole or not at all; a pipe, or what is in /dev (stdout), as it is.
+
+    Raises:
+        UserError: it cannot be written; ``option`` named it.
+    """
+    try:
+        if target.absolute().is_relative_to("/dev") or (target.exists() and not target.is_file()):
+            target.write_text(text, encoding="utf-8", newline="")
+            return
+        with written(target, "file") as file:
+            file.path.write_text(text, encoding="utf-8", newline="")
+    except OSError as error:
+        raise UserError(f"{option} {target}: cannot write the file: {error.strerror}") from None
+    except UserError as error:
+        raise UserError(f"{option} {error}") from None
 
 
 def claim(target: Path, what: str) -> int:
@@ -154,6 +175,7 @@ class Scratch:
             if self._folder is None:
                 self._sweep()
                 self._folder = Path(tempfile.mkdtemp(prefix=self.PREFIX))
+                remains.remember(self, partial(shutil.rmtree, self._folder, ignore_errors=True))
                 self._lock = os.open(self._folder, os.O_RDONLY | os.O_CLOEXEC)
                 with suppress(OSError):
                     fcntl.flock(self._lock, fcntl.LOCK_SH | fcntl.LOCK_NB)
@@ -169,6 +191,7 @@ class Scratch:
             shutil.rmtree(self._folder, ignore_errors=True)
             os.close(self._lock)
             self._folder = None
+            remains.forget(self)
 
     def _sweep(self) -> None:
         """Of this user, and nobody has it open: its lock ends with the process that held it."""

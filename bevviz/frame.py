@@ -156,6 +156,18 @@ class LabelledBoxes3D:
     scores: F32  # (K,), 1 where not given
     world_from_boxes: F64 | None = None
     received: int = 0
+    ids: tuple[str, ...] = ()  # of each, the same from frame to frame; (): none are stated
+    image: ImageLabels | None = None  # of a labelled data set
+
+
+@dataclass(frozen=True, slots=True)
+class ImageLabels:
+    """What was labelled in the image, beside boxes in 3D. KITTI's terms."""
+
+    xyxy: F32  # (K, 4) of each box
+    truncated: F32  # (K,) share outside of the image, 0 to 1
+    occluded: I32  # (K,) 0 seen whole, 1 partly, 2 largely hidden, 3 not known
+    dont_care: F32  # (R, 4) regions in which nothing was labelled
 
 
 @dataclass(frozen=True, slots=True)
@@ -170,6 +182,16 @@ class LabelledBoxes2D:
     scores: F32  # (K,)
     camera: str = ""  # name of the camera they belong to, where known
     received: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class LateResult:
+    """Boxes of the robot's own that came when the frame of their time had gone on: beside a robot alone."""
+
+    boxes: LabelledBoxes2D | LabelledBoxes3D
+    frame_stamp: int  # of the frame that is nearest
+    pose: F64  # (4, 4) world from points, at that frame
+    index: int = 0  # of that frame
 
 
 @dataclass(frozen=True, slots=True)
@@ -587,3 +609,4 @@ class Anomaly:
     text: str
     severity: Literal["WARN", "ERROR"] = "WARN"
     since: int = 0  # stamp of the frame that it began in
+    rank: float = 0.0  # 0 to 1: how bad it is; the worst come first

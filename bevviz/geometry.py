@@ -247,15 +247,43 @@ def inside(points: F32, boxes: Boxes3D, k: int) -> Bool:
 
 def bev_iou(a: Boxes3D, b: Boxes3D) -> F32:
     """(A, B) intersection over union, seen from above, of A and B upright boxes however they are turned."""
-    ratio = np.zeros((len(a), len(b)), np.float32)
+    shared = _shared_area(a, b)
+    return _ratio(shared, _product(a.size[:, :2])[:, None] + _product(b.size[:, :2])[None] - shared)
+
+
+def box_iou(a: Boxes3D, b: Boxes3D) -> tuple[F32, F32]:
+    """(A, B) intersection over union of A and B upright boxes, seen from above and as volumes."""
+    area = _shared_area(a, b)
+    (low_a, high_a), (low_b, high_b) = (
+        (boxes.center[:, 2] - boxes.size[:, 2] / 2, boxes.center[:, 2] + boxes.size[:, 2] / 2)
+        for boxes in (a, b)
+    )
+    height = np.minimum(high_a[:, None], high_b[None]) - np.maximum(low_a[:, None], low_b[None])
+    volume = area * np.clip(height, 0, None)
+    return (
+        _ratio(area, _product(a.size[:, :2])[:, None] + _product(b.size[:, :2])[None] - area),
+        _ratio(volume, _product(a.size)[:, None] + _product(b.size)[None] - volume),
+    )
+
+
+def _shared_area(a: Boxes3D, b: Boxes3D) -> F64:
+    """(A, B) square metres that both cover, seen from above."""
+    shared = np.zeros((len(a), len(b)))
     reach_a, reach_b = (np.hypot(boxes.size[:, 0], boxes.size[:, 1]) / 2 for boxes in (a, b))
     away = np.linalg.norm(a.center[:, None, :2] - b.center[None, :, :2], axis=2)
     outlines_a, outlines_b = (np.asarray(corners(boxes)[:, :4, :2], np.float64) for boxes in (a, b))
     for i, j in np.argwhere(away < reach_a[:, None] + reach_b[None, :]):
-        shared = _area(_clip(outlines_a[i], outlines_b[j]))
-        whole = float(np.prod(a.size[i, :2]) + np.prod(b.size[j, :2])) - shared
-        ratio[i, j] = shared / whole if whole > 0 else 0.0
-    return ratio
+        shared[i, j] = _area(_clip(outlines_a[i], outlines_b[j]))
+    return shared
+
+
+def _product(sides: F32) -> F64:
+    return np.asarray(np.prod(sides, axis=1, dtype=np.float64))
+
+
+def _ratio(part: F64, whole: F64) -> F32:
+    """Zero where the whole is nothing."""
+    return np.divide(part, whole, out=np.zeros(part.shape), where=whole > 0).astype(np.float32)
 
 
 def _clip(polygon: F64, window: F64) -> F64:

@@ -10,6 +10,8 @@ from functools import lru_cache
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
+from bevviz.text import printable
+
 
 def render(template: str, **values: object) -> str:
     """The page.
@@ -30,10 +32,18 @@ def environment() -> Environment:
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
+        finalize=_visible,
     )
     found.filters["base64"] = _base64
     found.filters["words"] = _words
     return found
+
+
+def _visible(value: object) -> object:
+    """What no reader would see, and might be misled by, is told as Python would."""
+    if type(value) is not str or value.isprintable():  # markup has a type of its own
+        return value
+    return "\n".join(printable(line) for line in value.split("\n"))
 
 
 def _base64(data: bytes) -> str:

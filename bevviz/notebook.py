@@ -171,7 +171,7 @@ class NotebookViewer(Recorder):
         frame = result.frame
         if frame.index not in self._frames.numbers:
             return
-        mark_answers(self._marker, frame, answers[:MARKED])
+        mark_answers(self._marker, frame, answers[:MARKED], result.config.bev)
         self.recording.flush()
         if frame.index != self.frame:
             when = np.datetime64(frame.stamp, "ns")

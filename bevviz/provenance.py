@@ -15,7 +15,6 @@ from dataclasses import dataclass, field
 from functools import lru_cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any
 
 from bevviz import __version__
 from bevviz.config import STAGES, Config, plugin_of
@@ -53,12 +52,6 @@ class Provenance:
 
     dependencies: Mapping[str, Dependency]
     machine: Mapping[str, str] = field(default_factory=dict)
-
-    @staticmethod
-    def load(values: Mapping[str, Any]) -> Provenance:
-        """From what ``dataclasses.asdict`` made of one. Raises KeyError or TypeError for anything else."""
-        dependencies = {name: Dependency(**part) for name, part in dict(values["dependencies"]).items()}
-        return Provenance(dependencies, dict(values["machine"]))
 
 
 def provenance(config: Config, network: str = "") -> Provenance:

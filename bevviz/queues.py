@@ -14,10 +14,16 @@ class NewestQueue(Generic[T]):
     """Holds up to ``size`` items; a further one pushes the oldest out, which is counted.
 
     Putting never blocks. Iteration takes items, oldest first, and ends after ``close``.
+
+    Args:
+        size: items that wait at most.
+        catch_up: items wait only where they came together. Who finds more than one waiting time and again
+            is too slow, and gets the newest alone.
     """
 
-    def __init__(self, size: int = 1) -> None:
+    def __init__(self, size: int = 1, *, catch_up: bool = False) -> None:
         self.dropped = 0
+        self._catch_up = catch_up
         self._size = size
         self._items: deque[T] = deque()
         self._closed = False
@@ -43,10 +49,16 @@ class NewestQueue(Generic[T]):
             self._changed.notify_all()
 
     def __iter__(self) -> Iterator[T]:
+        behind = False
         while True:
             with self._changed:
                 self._changed.wait_for(lambda: self._items or self._closed)
                 if not self._items:
                     return
+                several = len(self._items) > 1
+                if self._catch_up and behind and several:
+                    self.dropped += len(self._items) - 1
+                    self._items = deque([self._items[-1]])
+                behind = several
                 item = self._items.popleft()
             yield item

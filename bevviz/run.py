@@ -22,6 +22,7 @@ R = TypeVar("R")
 R_contra = TypeVar("R_contra", contravariant=True)
 
 DEPTH = 2  # frames that are drawn ahead of what is observed
+BURST = 3  # frames that may come together without one being lost
 TICK = 0.2  # seconds between two looks at whether it is over
 PATIENCE = 10.0  # seconds that an observer of its own thread may take to end
 
@@ -79,11 +80,11 @@ class Dropping:
     """Whoever is too slow gets the newest. For what cannot wait: a robot.
 
     Args:
-        incoming: frames that may wait for the stages.
+        incoming: frames that may wait for the stages, where they came together.
         results: results that may wait for the observers.
     """
 
-    def __init__(self, incoming: int = 1, results: int = 2) -> None:
+    def __init__(self, incoming: int = BURST, results: int = 2) -> None:
         self.incoming_size, self.results_size = incoming, results
         self._queues: dict[str, NewestQueue[Any]] = {}
 
@@ -97,9 +98,9 @@ class Dropping:
         for queue in self._queues.values():
             queue.close()
 
-    def queue(self, place: str, size: int) -> NewestQueue[T]:
+    def queue(self, place: str, size: int, *, catch_up: bool = False) -> NewestQueue[T]:
         """One whose drops are counted."""
-        queue: NewestQueue[T] = NewestQueue(size)
+        queue: NewestQueue[T] = NewestQueue(size, catch_up=catch_up)
         self._queues[place] = queue
         return queue
 
@@ -307,7 +308,7 @@ def _newest(
     items: Iterable[T], work: Callable[[T], R], dropping: Dropping, stop: threading.Event
 ) -> Generator[R, None, None]:
     """Yield what is made of the newest items: drawing, work and the caller each in a thread of its own."""
-    incoming: NewestQueue[T] = dropping.queue("incoming", dropping.incoming_size)
+    incoming: NewestQueue[T] = dropping.queue("incoming", dropping.incoming_size, catch_up=True)
     done: NewestQueue[R] = dropping.queue("results", dropping.results_size)
     errors: list[BaseException] = []
 

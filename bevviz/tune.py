@@ -15,6 +15,7 @@ from bevviz.compare.differences import DIFFERENT, Change, FrameDifferences, diff
 from bevviz.compare.log import DifferenceLogger
 from bevviz.config import Config, ParameterChange, changes
 from bevviz.errors import UserError
+from bevviz.files import save
 from bevviz.frame import Frame, FrameResult, Scene
 from bevviz.live.settings import Settings
 from bevviz.logging import entities
@@ -194,11 +195,7 @@ def create(file: Path, text: str) -> bool:
     Raises:
         UserError: it cannot be written.
     """
-    try:
-        with file.open("x") as new:
-            new.write(text)
-    except FileExistsError:
+    if file.exists():
         return False
-    except OSError as error:
-        raise UserError(f"--config {file}: cannot be written: {error.strerror}") from None
+    save(file, text, "--config")
     return True

@@ -397,7 +397,10 @@ def detection(messages: bags.Messages, stamp: int, label: str) -> Any:
         (["drive", "--set-b", "sync.tolerance=0.05"], "A and B differ in sync.tolerance"),
         (["drive", "--b", "none.yaml"], "none.yaml: cannot read the configuration"),
         (["drive", "--set-a", "clustering.epsilon=1"], "unknown key 'clustering.epsilon'"),
-        (["drive", "--json", "none/c.json", "--save", "c.rrd"], "--json none/c.json: cannot be written"),
+        (
+            ["drive", "--json", "none/c.json", "--save", "c.rrd"],
+            "--json none/c.json: there is no folder none",
+        ),
     ],
 )
 def test_wrong_calls(arguments: list[str], message: str, capsys: Capture) -> None:

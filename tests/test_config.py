@@ -103,3 +103,15 @@ def test_a_wrong_file_is_one_clear_line(tmp_path: Path) -> None:
         assert said in str(caught.value)
     with pytest.raises(UserError, match="No such file"):
         config.load(tmp_path / "absent.yaml")
+
+
+def test_clusters_that_could_have_no_size_are_refused() -> None:
+    said = r"clustering\.max_cluster_points must not be below .* is 20 \(given: 10\)"
+    for settings in (
+        ["clustering.min_cluster_points=20", "clustering.max_cluster_points=10"],
+        ["min_cluster_size=5", "clustering.min_cluster_points=20", "max_cluster_size=10"],
+    ):
+        with pytest.raises(UserError, match=said):
+            config.load(settings=settings)
+    least = config.load(settings=["clustering.max_cluster_points=10"]).clustering
+    assert (least.min_cluster_points, least.max_cluster_points) == (10, 10)

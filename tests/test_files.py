@@ -14,7 +14,7 @@ import pytest
 
 from bevviz.cli import main
 from bevviz.errors import UserError
-from bevviz.files import Scratch, unfinished, written
+from bevviz.files import Scratch, save, unfinished, written
 from tests import bags
 from tests.recordings import Recording, verify
 from tests.test_cli import Capture, environment, error_of
@@ -92,6 +92,69 @@ def test_a_link_and_what_is_no_file() -> None:
         pass
 
 
+def test_a_text_is_whole_or_the_old_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    target = Path("a.csv")
+    save(target, "old\r\n", "--csv")
+    assert target.read_bytes() == b"old\r\n"
+
+    def full(self: Path, text: str, **_: object) -> int:
+        with self.open("w") as file:
+            file.write(text[:2])
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "write_text", full)
+        with pytest.raises(UserError, match=r"^--csv a\.csv: cannot write the file: No space left"):
+            save(target, "new", "--csv")
+    assert target.read_bytes() == b"old\r\n"
+    save(target, "new", "--csv")
+    assert [path.name for path in Path().iterdir()] == ["a.csv"]
+    with pytest.raises(UserError, match=r"^--csv .*none/a\.csv: cannot write the file: No such file"):
+        save(Path("none/a.csv"), "x", "--csv")
+    Path("folder").mkdir()
+    with pytest.raises(UserError, match="--csv folder: cannot write the file: Is a directory"):
+        save(Path("folder"), "x", "--csv")
+
+
+def test_a_text_goes_into_a_pipe(capfd: Capture) -> None:
+    save(Path("/dev/stdout"), "a,b\n", "--csv")
+    assert capfd.readouterr().out == "a,b\n"
+
+
+@pytest.mark.parametrize(
+    ("command", "options"),
+    [
+        ("compare", ["--csv", "a.csv", "--json", "b.json", "--save", "c.rrd", "--set-b", "voxel.size=0.3"]),
+        ("sweep", ["--csv", "a.csv", "--save", "c.rrd", "--set", "voxel.size=0.2,0.3"]),
+        ("calib", ["--write", "a.yaml", "--save", "c.rrd"]),
+        ("report", ["--at", "0", "-o", "c.rrd", "--force"]),
+    ],
+)
+def test_every_output_of_a_command_gets_its_name_when_it_is_whole(
+    command: str, options: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Nothing is opened for writing under the name that it has in the end."""
+    bags.write(Path("drive"), bags.small_items(scans=2))
+    here = f"{Path.cwd()}{os.sep}"
+    opened: set[str] = set()
+
+    def watch(event: str, given: tuple[object, ...]) -> None:
+        if event == "open" and isinstance(given[0], str | Path) and watching:
+            path, flags = Path(given[0]).absolute(), given[2]
+            if isinstance(flags, int) and flags & (os.O_WRONLY | os.O_RDWR) and str(path).startswith(here):
+                opened.add(path.name)
+
+    watching = True
+    sys.addaudithook(watch)
+    try:
+        assert main([command, "drive", *options]) == 0
+    finally:
+        watching = False
+    whole = {path.name for path in Path().rglob("*") if path.is_file()}
+    assert len(whole) > 1 and opened
+    assert not opened & whole
+
+
 # --- never over what is read -------------------------------------------------------------------
 
 
@@ -109,6 +172,9 @@ def test_no_output_is_an_input(capsys: Capture) -> None:
         capsys, "calib", "drive", "--config", "my.yaml", "--write", "my.yaml"
     )
     assert "is what is read" in error_of(capsys, "compare", "drive", "--json", bag)
+    assert "there is no folder no" in error_of(capsys, "compare", "drive", "--csv", "no/same.txt")
+    both = ("--csv", "same.txt", "--json", "same.txt")
+    assert "--json same.txt: --csv writes that file" in error_of(capsys, "compare", "drive", *both)
     assert bag.read_bytes() == before and Path("my.yaml").read_text().startswith("voxel")
 
 

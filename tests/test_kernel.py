@@ -1,9 +1,17 @@
-"""Compiled loops where there is no place to keep them."""
+"""Compiled loops: where there is no place to keep them, and what time they count as."""
 
 from __future__ import annotations
 
 import subprocess
 import sys
+import threading
+import time
+from types import SimpleNamespace
+
+import numba
+
+from bevviz import announce
+from bevviz.stages.kernel import _Announcing, clock, common_clock
 
 NOWHERE = """
 from numba.core.caching import CacheImpl
@@ -20,3 +28,45 @@ print(dbscan(points, 0.5, 2).tolist())
 def test_without_a_place_they_are_compiled_anew() -> None:
     done = subprocess.run([sys.executable, "-c", NOWHERE], capture_output=True, text=True, check=False)
     assert (done.returncode, done.stdout.strip()) == (0, "[0, 0, -1]"), done.stderr
+
+
+def test_the_clock_of_the_stages_stands_still_while_they_are_compiled() -> None:
+    def twice(x: float) -> float:
+        return 2 * x
+
+    compiled = numba.njit(twice)
+    wall, own, common = time.perf_counter(), clock(), common_clock()
+    assert compiled(1.5) == 3.0
+    wall, own, common = time.perf_counter() - wall, clock() - own, common_clock() - common
+    assert wall > 0.02  # it was compiled
+    assert own < wall / 2 and common < wall / 2
+    start = clock()
+    time.sleep(0.05)
+    assert clock() - start >= 0.05
+
+
+def test_other_threads_compile_on_their_own_time() -> None:
+    def thrice(x: float) -> float:
+        return 3 * x
+
+    compiled = numba.njit(thrice)
+    start, common = clock(), common_clock()
+    wall = time.perf_counter()
+    thread = threading.Thread(target=compiled, args=(1.0,))
+    thread.start()
+    thread.join()
+    wall = time.perf_counter() - wall
+    assert clock() - start >= wall > common_clock() - common
+
+
+def test_that_stages_are_compiled_is_said_once() -> None:
+    said: list[str] = []
+    announce.to(said.append)
+    try:
+        listener = _Announcing()
+        for module in ("somebody.else", "bevviz.stages.voxel", "bevviz.stages.ground"):
+            listener.on_start(SimpleNamespace(data={"dispatcher": SimpleNamespace(__module__=module)}))
+    finally:
+        announce.to(lambda text: None)
+    (line,) = said
+    assert line.startswith("compiling the stages for this machine")

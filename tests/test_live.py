@@ -11,7 +11,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import closing, contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -24,14 +24,16 @@ from hypothesis import strategies as st
 from bevviz.anomalies import AnomalyDetector
 from bevviz.config import load
 from bevviz.errors import UserError
+from bevviz.files import lock
 from bevviz.frame import CameraResult, Decision, Detections, Frame, FrameResult, Fusion, Pairs, Scene
 from bevviz.live.encoder import WHOLE, Encoder, Packet
-from bevviz.live.files import Indexer, Saver
+from bevviz.live.files import Indexer, Saver, remove_leftovers
 from bevviz.live.notes import Notes
 from bevviz.live.replay import Replay
 from bevviz.live.runtime import Live, Outputs, thin
 from bevviz.live.settings import Settings
 from bevviz.live.triggers import Triggers
+from bevviz.live.viewers import Program, Viewer
 from bevviz.queues import NewestQueue
 from bevviz.session import Session
 from bevviz.synthetic import SyntheticSource
@@ -152,6 +154,23 @@ def test_a_queue_hands_out_the_newest_items_and_counts_the_others(moves: list[bo
     assert queue.dropped == sum(moves) - taken - len(waiting)
 
 
+def test_what_comes_together_waits_and_who_is_behind_gets_the_newest() -> None:
+    queue: NewestQueue[int] = NewestQueue(3, catch_up=True)
+    items = iter(queue)
+    for number in range(0, 10, 2):  # pairs, for one who is quick
+        queue.put(number)
+        queue.put(number + 1)
+        assert (next(items), next(items)) == (number, number + 1)
+    assert queue.dropped == 0
+    taken = []
+    for number in range(10, 40):  # three come while one is worked on
+        queue.put(number)
+        if number % 3 == 0:
+            taken.append(next(items))
+    assert taken[1:] == [15, 18, 21, 24, 27, 30, 33, 36, 39]
+    assert queue.dropped == 30 - len(taken) - len(queue)
+
+
 def test_a_slow_pipeline_takes_the_newest_frame(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     whole = Session.perceive
 
@@ -184,6 +203,80 @@ def test_a_slow_log_drops_results_and_holds_nobody_up(run: Run, monkeypatch: pyt
     assert drops["logging"] > 15
     assert outcome.live.frames + drops["logging"] + drops["incoming"] == 40
     assert len(seen) > 30
+
+
+class Stalled:
+    """Plays a replay, then only says how its topics do."""
+
+    def __init__(self, replay: Replay) -> None:
+        self._replay, self._over = replay, threading.Event()
+        self.scene, self.total, self.warnings = replay.scene, None, ()
+        self.states = {"/points": "ok"}
+
+    def stop(self) -> None:
+        self._over.set()
+
+    def __iter__(self) -> Iterator[Frame]:
+        yield from self._replay
+        self._over.wait()
+
+
+def test_what_is_said_while_no_frame_comes_is_logged(
+    run: Run, frames: list[Frame], drive: SyntheticSource
+) -> None:
+    source = Stalled(Replay(frames, drive.scene, rate=20, total=3))
+
+    def stall(live: Live) -> None:
+        wait_for(lambda: live.frames == 3)
+        source.states = {"/points": "silent"}
+        live.notes.warn("no cloud for 2 s on /points")
+        wait_for(lambda: not live.notes._waiting)
+        live.stop()
+
+    run(source=source, during=stall, save=Path("out.rrd"))
+    recording = Recording(Path("out.rrd"))
+    lanes = recording.rows["/explain/states/topics/points"]
+    assert list(dict.fromkeys(row["StateChange:state"][0] for row in lanes)) == ["ok", "silent"]
+    said = ["no cloud for 2 s on /points"]
+    (line,) = (row for row in recording.rows["/explain/log"] if row["TextLog:text"] == said)
+    last = recording.rows["/explain"][-1]
+    assert line["frame"] == last["frame"]
+    assert line["stamp"] - last["stamp"] == line["received"] - last["received"] > 900_000_000
+
+
+def test_viewers_can_be_given_fewer_frames_than_files(frames: list[Frame], drive: SyntheticSource) -> None:
+    taken: list[int] = []
+
+    class Screen(Viewer):
+        def _start(self) -> Any:
+            return subprocess.Popen(["cat"], stdin=subprocess.PIPE, stdout=subprocess.DEVNULL)
+
+        def _take(self, packet: Packet, fresh: bool) -> bool:
+            taken.append(packet.context.clock[0])
+            return super()._take(packet, fresh)
+
+    session = Session(load())
+    with closing(Encoder(load(), drive.scene, "live", whole=0.2)) as encoder:
+        screen = Screen(Program("screen", ["cat"]), 20, encoder, Notes(lambda text: None), sparse=True)
+        packets = []
+        for index in range(12):
+            result = session.run(replace(frames[index % len(frames)], index=index))
+            packets.append(encoder.encode(result, drive.scene, {}, ()))
+            screen.put(packets[-1])
+            time.sleep(0.05)
+        screen.close()
+    whole = [packet.context.clock[0] for packet in packets if packet.whole]
+    assert taken == whole and 1 < len(whole) < 12
+    assert screen.dropped == 0  # they were not wanted
+
+
+def test_leftover_indexes_are_removed_and_those_in_work_are_not(tmp_path: Path) -> None:
+    left, work = tmp_path / "a.rrd.part", tmp_path / "b.rrd.part"
+    left.write_bytes(b"half")
+    with work.open("wb") as file:
+        lock(file.fileno(), "taken")
+        remove_leftovers(tmp_path)
+    assert not left.exists() and work.exists()
 
 
 def test_a_steady_run_logs_every_frame_with_its_health(run: Run) -> None:

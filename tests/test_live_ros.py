@@ -21,12 +21,18 @@ import pytest
 from bevviz.config import Config, load
 from bevviz.errors import UserError
 from bevviz.frame import Boxes3D, CameraResult, Detections, Frame, FrameResult, Objects
-from bevviz.ros.encode import encode_camera_info, typestore
-from bevviz.ros.messages import decode_cloud, decode_detections_2d, decode_detections_3d, decode_image
+from bevviz.ros.encode import encode_boxes_3d, encode_camera_info, encode_cloud, typestore
+from bevviz.ros.messages import (
+    decode_cloud,
+    decode_detections_2d,
+    decode_detections_3d,
+    decode_image,
+    read_header,
+)
 from bevviz.session import Session
 from bevviz.synthetic import SyntheticSource
 from bevviz.synthetic.bag import TOPICS
-from bevviz.synthetic.drive import LIDAR_TOPIC, TRUTH_TOPIC
+from bevviz.synthetic.drive import CAMERA_INFO_TOPIC, LIDAR_TOPIC, TRUTH_TOPIC
 from tests.recordings import Recording, verify
 from tests.ros_player import Play
 
@@ -125,6 +131,43 @@ def test_newest_frame_wins(robot: str) -> None:
         assert time.time_ns() - frame.received < 1e9
 
 
+def test_frames_do_not_wait_for_the_robots_results(robot: str) -> None:
+    """One detector stamps its boxes a little after the scan, another one takes 0.7 s for them."""
+    kind, cloud = "vision_msgs/msg/Detection3DArray", "sensor_msgs/msg/PointCloud2"
+    one = Boxes3D(np.ones((1, 3), np.float32), np.ones((1, 3), np.float32), np.zeros(1, np.float32))
+    scans: list[int] = []
+    said: list[str] = []
+    with Node(name="perception") as robots:
+        node = robots.node
+        soon, slow = (
+            node.create_publisher(typesupport.message_type(kind), topic, 10)
+            for topic in ("/soon/boxes", "/slow/boxes")
+        )
+
+        def perceive(data: bytes) -> None:
+            scans.append(read_header(data, "<", LIDAR_TOPIC)[0])
+            for publisher, stamp in ((soon, scans[-1] + 12_000_000), (slow, scans[-8:][0])):
+                boxes = encode_boxes_3d(stamp, "rslidar", one, [[("car", 0.9)]])
+                publisher.publish(bytes(typestore().serialize_cdr(boxes, kind)))
+
+        node.create_subscription(typesupport.message_type(cloud), LIDAR_TOPIC, perceive, 5, raw=True)
+        robots.start()
+        with LiveSource(load(settings=["sync.max_wait=20"]), tell=said.append) as source:
+            assert source.wait(PATIENCE)
+            until(lambda: {"/soon/boxes", "/slow/boxes"} <= set(source.received), "results")
+            source.overtaken()
+            heard = list(islice(source, 12))  # with such a wait there were one in 20 s, did they wait
+            late = source.overtaken()
+    stamps = {frame.index: frame.stamp for frame in heard}
+    for topic, shift in (("/soon/boxes", 12_000_000), ("/slow/boxes", 0)):
+        mine = [found for found in late if found.boxes.topic == topic and found.index in stamps]
+        taken = sum(box.topic == topic for frame in heard for box in frame.robot_boxes)
+        assert len(mine) + taken > 2
+        assert all(found.boxes.stamp - stamps[found.index] == shift for found in mine)
+    assert sum(found.boxes.topic == "/slow/boxes" for found in late) > 2
+    assert any(text.startswith("/slow/boxes comes when its frame has gone on") for text in said)
+
+
 def test_remap_of_a_stated_topic(robot: str) -> None:
     config = load(settings=["source.lidar_topics=[/points]"])
     with LiveSource(config, arguments=["-r", f"/points:={LIDAR_TOPIC}"]) as source:
@@ -133,9 +176,92 @@ def test_remap_of_a_stated_topic(robot: str) -> None:
 
 
 def test_stated_topic_is_waited_for(robot: str) -> None:
-    with LiveSource(load(settings=["source.lidar_topics=[/elsewhere]"])) as source:
-        assert not source.wait(2.5)
-        assert "nobody publishes /elsewhere" in source.missing
+    said: list[str] = []
+    settings = ["source.lidar_topics=[/rosout]", "source.camera_topics=[/elsewhere]"]
+    with LiveSource(load(settings=settings), tell=said.append) as source:
+        assert not source.wait(3.5)
+        absent = "nobody publishes /elsewhere, which source.camera_topics states"
+        wrong = "/rosout is a rcl_interfaces/msg/Log, but source.lidar_topics takes PointCloud2"
+        assert source.missing == f"{wrong}; {absent}"
+        assert {absent, wrong} <= set(said)
+
+
+def test_info_says_what_is_missing() -> None:
+    """The first command that a user runs: no LiDAR yet, then one without messages."""
+    with Node(name="half_a_robot") as robots:
+        robots.start()
+        made = info.describe(load(settings=["source.lidar_topics=[/points]"]), seconds=1.0, patience=2.0)
+        assert made.missing[0] == "nobody publishes /points, which source.lidar_topics states"
+        cloud = typesupport.message_type("sensor_msgs/msg/PointCloud2")
+        robots.node.create_publisher(cloud, "/points", 5)
+        made = info.describe(load(), seconds=1.0, patience=3.0)
+        assert made.missing == ("no message on /points yet", "no detector: --model FILE.onnx")
+
+
+def test_what_stops_or_cannot_be_used_is_told_at_once_and_when_it_is_over() -> None:
+    said: list[str] = []
+    kind = "sensor_msgs/msg/PointCloud2"
+    with Node(name="driver") as driver, LiveSource(load(), tell=said.append) as source:
+        driver.start()
+        points = driver.node.create_publisher(typesupport.message_type(kind), "/points", 5)
+        whole = encode_cloud(SyntheticSource(frames=1).snapshot(0).frame.clouds[0])
+        flat = replace(whole, fields=[field for field in whole.fields if field.name != "z"])
+
+        def publish(message: Any) -> bool:
+            now = time.time_ns()
+            stamp = replace(message.header.stamp, sec=now // 10**9, nanosec=now % 10**9)
+            header = replace(message.header, stamp=stamp)
+            points.publish(bytes(typestore().serialize_cdr(replace(message, header=header), kind)))
+            return True
+
+        def until_told(text: str, message: Any = None) -> None:
+            def told() -> bool:
+                if message is not None:
+                    publish(message)
+                return any(text in line for line in said)
+
+            until(told, text)
+
+        until_told("/points", flat)  # at the very first message
+        assert source.states == {"/points": "unusable"}
+        assert any("z" in line for line in said)
+        until_told("/points: its messages can be used again", whole)
+        until(lambda: publish(whole) and source.wait(0), "a scene")
+        for _ in range(6):
+            publish(whole)
+            time.sleep(0.05)
+        until_told("no cloud for 2 s on /points")
+        assert source.states == {"/points": "silent"}
+        until_told("the clouds are back", whole)
+        with Node(name="second_driver") as second:
+            second.start()
+            second.node.create_publisher(typesupport.message_type(kind), "/points", 5)
+            until_told("/points has several publishers, taken for one sensor: /", whole)
+        with Node(name="bevviz") as twin:
+            twin.start()
+            until_told("another node is called /bevviz")
+
+
+def test_the_first_frame_waits_for_its_calibration(monkeypatch: pytest.MonkeyPatch) -> None:
+    """CameraInfo and transforms of a robot that starts: the frames begin with them."""
+    monkeypatch.setattr("bevviz.live.source.PATIENCE", PATIENCE)
+    said: list[str] = []
+    late = ("/tf_static", CAMERA_INFO_TOPIC)
+    only = tuple(TOPICS.keys() - {CAMERA_INFO_TOPIC})
+    static = tuple(TOPICS.keys() - {"/tf_static"})
+    with playing(replace(LIGHT, without=late)), LiveSource(load(), tell=said.append) as source:
+        until(lambda: source.received[LIDAR_TOPIC] > 3, "clouds")
+        assert not source.wait(1.5)
+        assert source.missing.startswith(
+            "no transform from 'rslidar' to 'zed2_left_camera_optical_frame' yet"
+        )
+        info, transforms = (
+            Play(frames=1, name=name, without=w) for name, w in (("info", only), ("tf", static))
+        )
+        with playing(info), playing(transforms):
+            frame = next(frames(source))
+        (camera,) = frame.cameras
+        assert camera.intrinsics is not None and camera.camera_from_points is not None, said
 
 
 def test_info_shows_the_graph(robot: str) -> None:
@@ -473,6 +599,43 @@ def test_the_command_beside_a_robot(robot: str, tmp_path: Path) -> None:
         assert len(recording.rows["/bev"]) > 1
         configs = recording.static["/config"] or recording.rows["/config"]
         assert "range_x" in str(configs)
+
+
+def test_orders_while_a_robot_is_waited_for(tmp_path: Path) -> None:
+    """SIGUSR1 and snap are answered, parameters are taken, and a wrong one ends the command at once."""
+    environment = dict(os.environ) | {"XDG_RUNTIME_DIR": str(tmp_path)}
+    command = [sys.executable, "-m", "bevviz.cli", "live", "--observe"]
+    wrong = [*command, "--ros-args", "-p", "voxel_size:=-1"]
+    refused = subprocess.run(wrong, capture_output=True, text=True, timeout=PATIENCE, check=False)
+    assert refused.returncode == 2 and "voxel.size must be greater than or equal to 0" in refused.stderr
+    run = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, cwd=tmp_path, env=environment)
+    assert run.stderr is not None
+    try:
+        assert run.stderr.readline().startswith("bevviz: waiting: nothing is published")
+        run.send_signal(signal.SIGUSR1)
+        assert "there is nothing to save yet" in run.stderr.readline()
+        snap = [sys.executable, "-m", "bevviz.cli", "snap"]
+        asked = subprocess.run(
+            snap, capture_output=True, text=True, env=environment, timeout=PATIENCE, check=False
+        )
+        assert asked.returncode == 2
+        assert "there is nothing to save yet; waiting: nothing is published" in asked.stderr
+    finally:
+        run.send_signal(signal.SIGTERM)
+        _, said = run.communicate(timeout=PATIENCE)
+    assert run.returncode == 1 and said == ""
+
+
+def test_another_middleware_is_refused_and_not_aborted() -> None:
+    command = [sys.executable, "-m", "bevviz.cli", "info", "--live"]
+    environment = dict(os.environ) | {"RMW_IMPLEMENTATION": "rmw_cyclonedds_cpp"}
+    done = subprocess.run(
+        command, capture_output=True, text=True, env=environment, timeout=PATIENCE, check=False
+    )
+    if done.returncode == 0:
+        pytest.skip("rmw_cyclonedds_cpp is installed here")
+    assert done.returncode == 2
+    assert "RMW_IMPLEMENTATION=rmw_cyclonedds_cpp is not installed for this Python" in done.stderr
 
 
 def test_parameters_of_the_command_line() -> None:

@@ -45,6 +45,7 @@ from bevviz.frame import (
     Intrinsics,
     LabelledBoxes2D,
     LabelledBoxes3D,
+    LateResult,
     Objects,
     Pairs,
     Scene,
@@ -53,6 +54,7 @@ from bevviz.frame import (
 )
 from bevviz.logging.cloud import quantised
 from bevviz.logging.entities import DEPTH_BINS, DEPTH_RANGE, TRACK_COLORS, ClassId
+from bevviz.logging.health import Rates
 from bevviz.logging.logger import Logger
 from bevviz.logging.sinks import open_recording
 from bevviz.logging.tracks import LANES, Lanes
@@ -188,6 +190,29 @@ def test_a_drive_with_gaps_is_a_valid_recording(tmp_path: Path) -> None:
             logger.log(nothing(index, Failure("voxel", "out of memory")) if index % 4 == 3 else make(index))
     verify(path)
     assert Recording(path).blueprints == 1
+
+
+def test_late_results_of_the_robot_are_at_their_own_stamp(tmp_path: Path) -> None:
+    row = np.ones((1, 3), np.float32)
+    three = LabelledBoxes3D(
+        "/late", START + 12_000_000, "map", Boxes3D(row, row, row[:, 0]), ("car",), row[0, :1]
+    )
+    two = LabelledBoxes2D(
+        "/seen", START + 15_000_000, "zed", np.ones((1, 4), np.float32), ("car",), row[0, :1], "zed"
+    )
+    late = [LateResult(boxes, START, np.eye(4), index=0) for boxes in (three, two)]
+    path = tmp_path / "drive.rrd"
+    with open_recording(SCENE, load(), save=path) as sinks:
+        logger = Logger(sinks.recording, load(), SCENE)
+        logger.log_static()
+        for index in range(40):
+            logger.log(make(index), late=late if index == 7 else ())
+    found = Recording(path)
+    for topic, at, kind in (("/late", 12, "Boxes3D"), ("/seen", 15, "Boxes2D")):
+        rows = found.rows[f"/robot{topic}"]
+        (shown,) = (row for row in rows if row.get(f"{kind}:half_sizes"))
+        assert (shown["frame"], shown["stamp"]) == (0, START + at * 1_000_000)
+        assert found.cleared(f"/robot{topic}") == {31}  # three seconds later nobody may think that it is new
 
 
 def test_times(record: Callable[..., Recording]) -> None:
@@ -483,6 +508,22 @@ def test_explanations_in_words_and_as_states(record: Callable[..., Recording]) -
     assert found.at["/explain/states/pipeline"]["StateChange:state"] == {0: ["ok"]}
 
 
+def test_rates_are_counted_over_a_second() -> None:
+    rates = Rates()
+    frame = make().frame
+    found = []
+    for index in range(40):  # two at a time, 60 ns apart, five times a second
+        at = START + index // 2 * 200_000_000 + index % 2 * 60
+        rates.add(dataclasses.replace(frame, stamp=at, received=at))
+        found.append(dict(rates))
+    assert found[1] == {}  # nothing is known of two
+    assert all(9 <= rate <= 12 for rates in found[4:] for rate in rates.values())
+    slow = Rates()
+    for index in range(3):  # every two seconds
+        slow.add(dataclasses.replace(frame, stamp=index * 2_000_000_000, received=0))
+    assert dict(slow) == {"sensor": 0.5}
+
+
 def test_health(record: Callable[..., Recording]) -> None:
     found = record([make(0), make(3)])
     value = {
@@ -716,7 +757,8 @@ def test_a_killed_process_leaves_what_it_had_logged(tmp_path: Path) -> None:
         import os, signal, time
         from pathlib import Path
         from bevviz.config import load
-        from bevviz.logging.logger import Logger
+        from bevviz.logging.health import Rates
+from bevviz.logging.logger import Logger
         from bevviz.logging.sinks import open_recording
         from tests.test_logging import SCENE, make
         with open_recording(SCENE, load(), save=Path({str(path)!r})) as sinks:

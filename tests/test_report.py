@@ -344,7 +344,7 @@ def test_an_interrupted_run_is_a_shorter_report(
     def interrupted(self: Session, result: FrameResult) -> FrameResult:
         done.append(result)
         if len(done) == 4:
-            os.kill(os.getpid(), signal.SIGTERM)
+            os.kill(os.getpid(), signal.SIGINT)
             time.sleep(1)  # it is the main thread's to see it
         return finish(self, result)
 

@@ -326,7 +326,7 @@ def test_an_interrupted_sweep_tells_what_it_has(
             "--truth /none: no such Detection3DArray topic",
         ),
         (["--set", "clustering.eps=1,2", "--kitti-labels", "none"], "--kitti-labels none: no label file"),
-        (["--set", "clustering.eps=1,2", "--csv", "none/s.csv"], "--csv none/s.csv: cannot be written"),
+        (["--set", "clustering.eps=1,2", "--csv", "none/s.csv"], "--csv none/s.csv: there is no folder none"),
     ],
 )
 def test_wrong_calls(arguments: list[str], message: str, drive: str, capsys: Capture) -> None:

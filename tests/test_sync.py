@@ -574,6 +574,34 @@ def test_results_of_the_robot_go_to_the_one_nearest_frame() -> None:
     np.testing.assert_allclose(frames[1].truth.world_from_boxes, turning(0.12), atol=1e-9)  # type: ignore[arg-type]
 
 
+def test_beside_a_robot_no_frame_waits_for_its_results() -> None:
+    topic = "/detection/fused_3d"
+    roles = replace(ONE, cameras=(), robot_detections_3d=(topic,))
+    sync = Synchronizer(roles, load(), beside=[topic])
+    sync.add_transform(edge("odom", "rslidar", pose(1.0)), static=True)
+    frames: list[Frame] = []
+    for t in (0.0, 0.1, 0.2):
+        sync.add_cloud(cloud(t))
+        frames += sync.ready()
+        assert frames[-1].stamp == ns(t)
+        sync.add_boxes(boxes(t + 0.012))  # after every scan, as from a detector that is a little late
+    assert not any(frame.robot_boxes for frame in frames)
+    first, second, third = sync.overtaken()
+    assert [late.boxes.stamp for late in (first, second, third)] == [ns(0.012), ns(0.112), ns(0.212)]
+    assert [late.frame_stamp for late in (first, second, third)] == [ns(0.0), ns(0.1), ns(0.2)]
+    np.testing.assert_array_equal(first.boxes.world_from_boxes, pose(1.0))  # type: ignore[union-attr]
+    assert sync.overtaken() == ()
+
+    sync.add_boxes(boxes(0.3))  # one that is there before its scan goes with it
+    sync.add_boxes(boxes(0.31))  # a second one of the same time does not
+    sync.add_cloud(cloud(0.3))
+    (frame,) = sync.ready()
+    assert [b.stamp for b in frame.robot_boxes] == [ns(0.3)]
+    assert [late.boxes.stamp for late in sync.overtaken()] == [ns(0.31)]
+    (said,) = (text for text in sync.report.warnings() if topic in text)
+    assert said.startswith(f"{topic}: 4 results came when the frame of that time had gone on")
+
+
 def test_detections_of_the_robot_know_their_camera() -> None:
     feed = Feed()
     feed.calibration()

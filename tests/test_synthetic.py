@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import errno
+from collections.abc import Mapping
+from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import Any
 
@@ -13,13 +15,15 @@ from rosbags.highlevel import AnyReader
 from bevviz import geometry
 from bevviz.bags.mcap_writer import McapWriter
 from bevviz.bags.source import BagSource
-from bevviz.config import Config, DetectorConfig
+from bevviz.config import Config, DetectorConfig, load
 from bevviz.errors import UserError
 from bevviz.frame import DetectionState, Source
+from bevviz.session import Session
 from bevviz.stages.detector import Detector
 from bevviz.synthetic import BagWriter, Snapshot, SyntheticSource, write_bag
 from bevviz.synthetic.bag import TOPICS
 from bevviz.synthetic.drive import PERIOD, START
+from bevviz.synthetic.world import SECTION
 
 
 @pytest.fixture(scope="module")
@@ -53,6 +57,58 @@ def test_the_seed_decides_everything(snapshot: Snapshot) -> None:
     assert image is not None and image_again is not None and image_other is not None
     assert np.array_equal(image_again.bgr, image.bgr)
     assert not np.array_equal(image_other.bgr, image.bgr)
+
+
+def same(one: Any, other: Any) -> bool:
+    """Bit for bit, down to the last field of whatever is in there."""
+    if is_dataclass(one):
+        return type(one) is type(other) and all(
+            same(getattr(one, f.name), getattr(other, f.name)) for f in fields(one) if f.name != "timings"
+        )
+    if isinstance(one, np.ndarray):
+        return (one.dtype, one.shape, one.tobytes()) == (other.dtype, other.shape, other.tobytes())
+    if isinstance(one, Mapping):
+        return list(one) == list(other) and all(same(one[key], other[key]) for key in one)
+    if isinstance(one, (tuple, list)):
+        return len(one) == len(other) and all(map(same, one, other))
+    return bool(one == other)
+
+
+def test_a_frame_depends_on_nothing_but_what_came_before_it() -> None:
+    """Not on how long the drive will be: neither what the sensors give nor what is made of it."""
+    short, long = SyntheticSource(frames=6), SyntheticSource(frames=700)
+    sessions = [Session(load(settings=["detector.model=demo"])) for _ in range(2)]
+    anomalies = 0
+    for index in range(6):
+        shots = [source.snapshot(index) for source in (short, long)]
+        assert same(*shots), f"snapshot {index}"
+        results = [session.run(shot.frame) for session, shot in zip(sessions, shots, strict=True)]
+        assert same(*results), f"result of frame {index}"
+        detections, objects = results[0].cameras[0].detections, results[0].objects
+        assert detections is not None and len(detections) and objects is not None and len(objects)
+        anomalies += len(results[0].anomalies)
+    assert anomalies, "none to compare"
+
+
+@pytest.mark.parametrize("more", [{}, {"weave": True}, {"plant": ["merged_people"]}])
+def test_nor_does_the_last_frame(more: dict[str, Any]) -> None:
+    """Where the street of a short drive ends, that of a longer one goes on: nobody sees as far."""
+    short, long = SyntheticSource(60, 4, **more), SyntheticSource(150, 4, **more)
+    for index in (0, 59):
+        assert same(short.snapshot(index), long.snapshot(index))
+    assert not same(short.snapshot(58), long.snapshot(59)), "it would be told"
+
+
+def test_the_scenery_goes_on_from_section_to_section() -> None:
+    """What is seen around the border between two is in both."""
+    world = SyntheticSource(frames=100).world
+    border = world.street.point(SECTION, 0.0)
+    corners = []
+    for section in (0, 1):
+        mesh = world.static(section)
+        near = np.linalg.norm(mesh.vertices - border, axis=1) < 120
+        corners.append({tuple(vertex) for vertex in mesh.vertices[near].tolist()})
+    assert corners[0] == corners[1] and len(corners[0]) > 10_000
 
 
 def test_a_scan_is_that_of_a_64_beam_lidar(snapshot: Snapshot) -> None:
@@ -176,7 +232,7 @@ def test_the_bag_holds_what_the_source_gives(tmp_path: Path) -> None:
         strict=True,
     ):
         names = [f.name for f in cloud.fields]
-        assert names == ["x", "y", "z", "intensity", "ring", "time"]
+        assert names == ["x", "y", "z", "intensity", "ring", "time", "label"]
         kinds = {4: "<u2", 7: "<f4"}
         layout: dict[str, Any] = {
             "names": names,
@@ -255,9 +311,11 @@ def test_a_wrong_path_is_one_clear_line(tmp_path: Path, name: str, words: str) -
         write_bag(SyntheticSource(frames=1), tmp_path / name)
 
 
-def test_a_drive_needs_a_frame() -> None:
+def test_a_drive_needs_a_frame_and_a_seed() -> None:
     with pytest.raises(UserError, match="at least 1 frame"):
         SyntheticSource(frames=0)
+    with pytest.raises(UserError, match="seed -1: "):
+        SyntheticSource(seed=-1)
 
 
 def test_the_network_finds_what_is_clearly_in_view() -> None:

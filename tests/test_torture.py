@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import argparse
+import signal
+import subprocess
 from collections import Counter
 from pathlib import Path
 
@@ -38,16 +40,26 @@ def test_fuzzed_messages() -> None:
 
 
 def test_signals_at_any_time() -> None:
-    for _, tally in kill.run(seed=1, count=8, names=("bag", "report --check")):
-        assert tally.signals == 4
+    for _, tally in kill.run(seed=1, count=9, names=("bag", "report --check", "batch")):
+        assert tally.signals == 3
         assert tally.well, tally.examples
 
 
-def test_what_counts_as_false_or_unreadable(tmp_path: Path) -> None:
-    assert kill._falsehood(tmp_path, "bag", 0, "") == "and not all frames"
-    assert kill._falsehood(tmp_path, "report --check", 0, f"{kill.SCANS} frames: the same in every bit") == ""
-    assert kill._falsehood(tmp_path, "report --check", 0, "1 of 40 frames differ")
-    assert kill._falsehood(tmp_path, "bag", 3, "") and not kill._falsehood(tmp_path, "bag", 130, "")
+def test_what_counts_as_false_or_unreadable(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    bag, check = kill.COMMANDS["bag"], kill.COMMANDS["report --check"]
+    assert kill._falsehood(tmp_path, bag, 0, "") == "and not all that it should be"
+    assert kill._falsehood(tmp_path, check, 0, f"{kill.SCANS} frames: the same in every bit") == ""
+    assert kill._falsehood(tmp_path, check, 0, "1 of 40 frames differ")
+    assert kill._falsehood(tmp_path, check, 130, "1 of 40 frames differ, first frame 3")
+    assert kill._falsehood(tmp_path, bag, 3, "") and not kill._falsehood(tmp_path, bag, 130, "")
+    assert not kill._falsehood(tmp_path, bag, -signal.SIGINT, "")
+    monkeypatch.setattr(kill, "PATIENCE", 0.2)
+    (tmp_path / "half.txt").write_text("of something")
+    (tmp_path / "out.partial.rrd").write_text("half")
+    assert kill._left(tmp_path, 2**31 - 1, set(), ["out.rrd"], killed=False) == "left: half.txt"
+    assert kill._left(tmp_path, 2**31 - 1, {"half.txt"}, ["out.rrd"], killed=False) == ""
+    with subprocess.Popen(["sleep", "60"], start_new_session=True) as left:
+        assert "sleep 60" in kill._left(tmp_path, left.pid, {"half.txt"}, ["out.rrd"], killed=True)
     (tmp_path / "cut.rrd").write_bytes(b"RRF2\0\0")
     assert kill._unreadable(tmp_path / "cut.rrd")
 

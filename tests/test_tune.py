@@ -156,7 +156,7 @@ def test_a_file_is_made_once(tmp_path: Path) -> None:
     assert load(file) == config
     assert not create(file, "")
     assert load(file) == config
-    with pytest.raises(UserError, match="cannot be written"):
+    with pytest.raises(UserError, match="cannot write the file"):
         create(tmp_path / "none" / "my.yaml", "")
 
 
@@ -201,7 +201,7 @@ def test_wrong_calls(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: An
     bags.write(tmp_path / "drive", bags.small_items(messages, scans=2), messages)
     for arguments, message in (
         (["drive", "--at", "100"], "100 is outside the recording"),
-        (["drive", "--config", "none/my.yaml"], "--config none/my.yaml: cannot be written"),
+        (["drive", "--config", "none/my.yaml"], "my.yaml: cannot write the file: No such file"),
         (["drive", "--model", "none.onnx"], "detector.model none.onnx: no such file"),
     ):
         assert main(["tune", *arguments]) == 2

@@ -104,7 +104,7 @@ def test_a_hint_may_be_a_parameter_of_somebodys_function(here: Path) -> None:
     """Of ours only those that still have a say."""
     result = Session(load(settings=["detector.model=demo", "clustering.method=somebody:cells"])).run(frame())
     questioner = Questioner(result, classes=CLASSES)
-    hints = [hint for a in questioner.ask(Selection())[:25] for hint in questioner.hints(a)]
+    hints = [hint for a in questioner.ask(Selection())[:25] for hint in questioner.search(a).hints]
     keys = {setting.partition("=")[0] for hint in hints for setting in hint.settings}
     assert "clustering.params.cell" in keys
     assert not keys & {"clustering.eps", "clustering.min_points"}

@@ -30,6 +30,7 @@ from bevviz.workbench.film import Film
 from bevviz.workbench.missed import finds
 from bevviz.workbench.parameters import controls
 from bevviz.workbench.pick import Pick, pick
+from bevviz.workbench.token import kept_token
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser, Page
@@ -59,10 +60,11 @@ def result() -> Iterator[FrameResult]:
 
 
 @contextmanager
-def serving(*arguments: str) -> Iterator[tuple[str, subprocess.Popen[str]]]:
-    """``bevviz open`` as a user starts it: its address and its process."""
-    command = [sys.executable, "-m", "bevviz.cli", *arguments, "--model", "demo", "--no-browser"]
-    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as server:
+def serving(*arguments: str, model: str = "demo") -> Iterator[tuple[str, subprocess.Popen[str]]]:
+    """``bevviz open`` as a user starts it, in the folder of the bag: its address and its process."""
+    command = [sys.executable, "-m", "bevviz.cli", *arguments, "--model", model, "--no-browser"]
+    folder = next(Path(argument).parent for argument in arguments if argument.endswith(("mcap", "bag")))
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True, cwd=folder) as server:
         try:
             assert server.stderr is not None
             for line in server.stderr:
@@ -210,11 +212,12 @@ def test_parameters_are_tried_on_the_shown_frame(browser: Browser, address: str)
         assert control.input_value() == "10"
         control.fill("100000")
         control.press("Enter")
-        until(lambda: "no object after" in page.inner_text("#effect"))
+        until(lambda: "loses" in page.inner_text("#effect"))
         assert state(page)["set"] == ["clustering.min_cluster_points=100000"]
         assert "F1" in page.inner_text("#effect")
+        page.keyboard.press("Escape")
         page.click("#undo")
-        until(lambda: "0 new, 0 gone" in page.inner_text("#effect"))
+        until(lambda: "As it was opened" in page.inner_text("#effect"))
         assert "set" not in state(page)
         control = page.locator("[id='control-clustering.min_cluster_points']")
         control.fill("-3")
@@ -222,15 +225,220 @@ def test_parameters_are_tried_on_the_shown_frame(browser: Browser, address: str)
         until(lambda: "must be greater than or equal to 1" in page.inner_text("#verdict"))
 
 
-def test_a_server_that_is_gone_is_said_and_another_one_not_taken_for_it(bag: Path, browser: Browser) -> None:
+def test_two_pages_on_one_drive(browser: Browser, address: str) -> None:
+    """In one browser and in another: each has its own question, both the same list."""
+    with opened(browser, address) as page, opened(browser, address) as other:
+        until(lambda: f"{FRAMES} frames" in page.inner_text("#run") + other.inner_text("#run"))
+        until(lambda: other.locator("#found button .missed").count())
+        page.keyboard.press("n")
+        text = new_verdict(page, verdict(page))
+        assert text not in verdict(other)
+        until(lambda: page.inner_text("#found-title") == other.inner_text("#found-title"))
+
+
+def test_a_server_that_was_killed_is_found_again(bag: Path, browser: Browser) -> None:
+    """The page says that it is gone, finds the next one of the same drive, and shows what it showed."""
     with serving("open", str(bag)) as (address, server), opened(browser, address) as page:
+        until(lambda: page.locator("#found button .missed").count())
+        page.keyboard.press("n")
+        text, held = new_verdict(page, verdict(page)), state(page)
         assert page.locator("#gone").is_hidden()
         server.kill()
         until(lambda: "The server is gone" in page.inner_text("#gone"))
-        port = str(urlsplit(address).port)
         server.wait()
-        with serving("open", str(bag), "--port", port):
-            until(lambda: "open the address that it printed" in page.inner_text("#gone"))
+        with serving("open", str(bag), "--port", str(urlsplit(address).port)) as (again, _):
+            assert again == address
+            until(lambda: verdict(page) == text)
+            assert state(page) == held
+            assert page.locator("#gone").is_hidden()
+
+
+# --- the whole way, as the page talks -----------------------------------------------------------
+
+
+class Talk:
+    """A page without a browser."""
+
+    def __init__(self, address: str) -> None:
+        from websockets.sync.client import connect
+        from websockets.typing import Origin
+
+        parts = urlsplit(address)
+        self.entries: dict[int, dict[str, Any]] = {}
+        self._number = 0
+        url, origin = f"ws://{parts.netloc}/talk?{parts.query}", Origin(f"http://{parts.netloc}")
+        self._channel = connect(url, origin=origin, max_size=None).__enter__()
+        self.say(type="shown")
+        self.over = self.until("progress", lambda message: message["over"])
+
+    def __enter__(self) -> Talk:
+        return self
+
+    def __exit__(self, *error: Any) -> None:
+        self._channel.__exit__(*error)
+
+    def say(self, **message: Any) -> None:
+        self._number += 1
+        self._channel.send(json.dumps({"id": self._number, **message}))
+
+    def asked(self, kind: str, **message: Any) -> dict[str, Any]:
+        """The answer of a kind to a message, or its error."""
+        self.say(**message)
+        return self.until(kind, lambda answer: answer.get("id") == self._number)
+
+    def until(self, kind: str, wanted: Callable[[dict[str, Any]], Any] = bool) -> dict[str, Any]:
+        """The next message of a kind that is so, or the next error."""
+        while True:
+            message: dict[str, Any] = json.loads(self._channel.recv(timeout=WAIT))
+            if message["type"] == "entries":
+                for number in message["gone"]:
+                    del self.entries[number]
+                for entry in message["entries"]:
+                    known = self.entries.setdefault(entry["number"], {**entry, "sights": []})
+                    known["sights"] += entry["sights"]
+            if message["type"] == "error" or (message["type"] == kind and wanted(message)):
+                return message
+
+    def of(self, *whats: str) -> list[dict[str, Any]]:
+        return [entry for entry in self.entries.values() if entry["what"] in whats]
+
+
+@pytest.fixture
+def talk(address: str) -> Iterator[Talk]:
+    with Talk(address) as talk:
+        yield talk
+
+
+def helped(talk: Talk) -> tuple[int, str, dict[str, Any]]:
+    """Time and pick of a missed object, and a hint that helps it."""
+    for entry in talk.of("missed"):
+        _, stamp, _, pick, _ = entry["sights"][0]
+        talk.say(type="ask", time=int(stamp), set=[], pick=pick)
+        hints = talk.until("hints")["hints"]
+        if hints:
+            return int(stamp), pick, hints[0]
+    pytest.fail("no change helps any missed object")
+
+
+def test_one_missed_object_is_one_entry(talk: Talk) -> None:
+    """However many frames it lasts; no two entries have the same object of a frame."""
+    missed = talk.of("missed")
+    assert any(len(entry["sights"]) > 2 for entry in missed)
+    sights = [(frame, pick) for entry in missed for frame, _, _, pick, _ in entry["sights"]]
+    assert len(sights) == len(set(sights))
+    for entry in missed:
+        numbers = [frame for frame, *_ in entry["sights"]]
+        assert numbers == sorted(set(numbers))
+        assert entry["text"], "its reason"
+
+
+def test_empty_ground_and_several_things_are_told(talk: Talk) -> None:
+    stamp = next(iter(talk.of("missed")))["sights"][0][1]
+    ground = talk.asked("answer", type="ask", time=int(stamp), set=[], pick="point//6,0,-1.6")
+    assert re.search(r"only ground .*: \d+ points, all ground", ground["verdict"])
+    answers = [
+        talk.asked("answer", type="ask", time=int(stamp), set=[], pick=f"pixel/zed/{u},140")
+        for u in range(100, 640, 60)
+    ]
+    several = [answer for answer in answers if answer["beside"]]
+    assert several
+    other = several[0]["beside"][0]
+    again = talk.asked("answer", type="ask", time=int(stamp), set=[], pick=other["pick"])
+    assert again["name"] == other["name"]
+
+
+def test_a_hint_does_what_it_says(talk: Talk) -> None:
+    """What it was said to do to the frame is what the panel says when it is pressed, name by name."""
+    stamp, pick, hint = helped(talk)
+    tried = talk.asked("tried", type="try", time=stamp, set=hint["settings"], pick=pick)
+    assert tried["effects"] == {key: hint[key] for key in tried["effects"]}
+    assert hint["fixed"]
+    assert tried["f1"][1] > tried["f1"][0]
+
+
+def test_the_drive_is_run_with_other_values(talk: Talk, address: str) -> None:
+    """Every frame, with what it makes better and worse; another page is told the same; it can be ended."""
+    stamp, pick, hint = helped(talk)
+    with Talk(address) as other:
+        talk.say(type="drive", set=hint["settings"])
+        trials = [
+            one.until("progress", lambda m: m["trial"] and m["trial"]["state"] == "over")["trial"]
+            for one in (talk, other)
+        ]
+        assert trials[0] == trials[1]
+    trial = trials[0]
+    assert trial["done"] == trial["total"] == len(trial["strip"]) == FRAMES
+    assert trial["f1"][0] != trial["f1"][1]
+    fixed = [(int(s[1]), s[3]) for entry in talk.of("fixed") for s in entry["sights"]]
+    assert (stamp, pick) in fixed
+    assert len(fixed) == trial["counts"]["fixed"]
+    good = sum(len(e["sights"]) for e in talk.of("fixed", "false gone"))
+    assert sum(frame[1] for frame in trial["strip"]) == good
+    talk.say(type="drive", set=["clustering.eps=0.7"])
+    talk.say(type="cancel", what="drive")
+    ended = talk.until("progress", lambda m: m["trial"]["settings"] == ["clustering.eps=0.7"])["trial"]
+    while ended["state"] in ("waiting", "running"):
+        ended = talk.until("progress")["trial"]
+    assert ended["state"] in ("cancelled", "over")
+    assert "nothing is changed" in talk.asked("never", type="drive", set=[])["text"]
+    assert "clustering.epps" in talk.asked("never", type="drive", set=["clustering.epps=1"])["text"]
+
+
+def test_notes_are_kept_beside_the_bag(talk: Talk, bag: Path) -> None:
+    from bevviz.notes import Notes
+
+    _, stamp, _, pick, _ = talk.of("missed")[0]["sights"][0]
+    talk.say(type="note", time=int(stamp), pick=pick, text=" look here ")
+    (note,) = talk.until("notes", lambda message: message["notes"])["notes"]
+    assert (note["stamp"], note["pick"], note["text"]) == (stamp, pick, "look here")
+    assert [str(one) for one in Notes([bag])] == [f"{note['about']}: look here"]
+    assert "characters" in talk.asked("noted", type="note", time=int(stamp), pick="", text="  ")["text"]
+    talk.say(type="unnote", stamp=stamp, text="look here")
+    talk.until("notes", lambda message: not message["notes"])
+    assert not Notes([bag]).path.exists()
+
+
+def test_a_report_has_what_was_asked_and_noted(talk: Talk, address: str) -> None:
+    """Its files are there for who has the token, and nobody else."""
+    stamp, pick, hint = helped(talk)
+    talk.say(type="note", time=stamp, pick=pick, text="a note of mine")
+    talk.until("noted")
+    talk.say(type="report", time=stamp, before=0.2, after=0.1, text="it is plainly there")
+    made = talk.until("progress", lambda m: m["reports"] and m["reports"][-1]["state"] != "running")[
+        "reports"
+    ][-1]
+    assert made["state"] == "over", made["error"]
+    assert made["done"] == made["total"] > 0
+    site, token = address.split("/?")
+    (page,) = [file["name"] for file in made["files"] if file["name"].endswith(".html")]
+    link = f"{site}/report/{made['number']}/{page}"
+    assert answered(link) == 403
+    assert answered(f"{site}/report/{made['number']}/..%2f..%2fetc%2fpasswd?{token}") == 404
+    with urllib.request.urlopen(f"{link}?{token}", timeout=20) as response:
+        text = response.read().decode()
+    assert "it is plainly there" in text
+    assert "a note of mine" in text
+    assert f"change {hint['settings'][0]}" in text
+    talk.say(type="unnote", stamp=str(stamp), text="a note of mine")
+    assert "up to 600" in talk.asked("never", type="report", time=stamp, before=1e9, after=0, text="")["text"]
+
+
+def test_the_frame_that_is_looked_at_comes_first(address: str) -> None:
+    """Of a film that nobody acknowledges a few pieces come, and the one that is asked for."""
+    from websockets.sync.client import connect
+    from websockets.typing import Origin
+
+    with Talk(address) as talk:
+        last = max(int(s[1]) for entry in talk.of("missed", "false") for s in entry["sights"])
+    parts = urlsplit(address)
+    url = f"ws://{parts.netloc}/film?{parts.query}&from=1"
+    with connect(url, origin=Origin(f"http://{parts.netloc}"), max_size=None) as channel:
+        channel.send(str(last))
+        pieces = []
+        with pytest.raises(TimeoutError):
+            while True:
+                pieces.append(channel.recv(timeout=2))
+    assert len(pieces) == len(set(pieces)) <= FRAMES + 1
 
 
 # --- who is let in ------------------------------------------------------------------------------
@@ -315,9 +523,46 @@ def test_messages_that_are_none_are_answered(address: str) -> None:
         )
 
 
-def test_a_path_alone_opens_it(bag: Path) -> None:
-    with serving(str(bag)) as (address, _):
-        assert answered(address) == 200
+def test_two_drives_at_once(bag: Path, address: str) -> None:
+    """A path alone opens one; each has a port and a token of its own."""
+    with serving(str(bag)) as (other, _):
+        assert answered(other) == 200
+        assert urlsplit(other).port != urlsplit(address).port
+        assert urlsplit(other).query != urlsplit(address).query
+        assert answered(f"{other.split('?')[0]}?{urlsplit(address).query}") == 403
+
+
+def test_a_damaged_bag_is_opened_as_far_as_it_goes(bag: Path, tmp_path: Path) -> None:
+    """What could be read is run and asked about; what was lost is said."""
+    cut = tmp_path / "cut.mcap"
+    cut.write_bytes(bag.read_bytes()[: bag.stat().st_size // 2])
+    with serving("open", str(cut)) as (address, _), Talk(address) as talk:
+        assert 0 < talk.over["done"] < FRAMES
+        assert talk.over["warnings"]
+        assert talk.entries
+
+
+def test_a_token_outlives_a_server_that_was_killed_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    with kept_token(1, "drive") as first:
+        (kept,) = tmp_path.glob("bevviz/*")
+        assert kept.stat().st_mode & 0o077 == 0
+        left = kept.read_bytes()
+    assert not kept.exists()
+    kept.write_bytes(left)
+    with kept_token(1, "drive") as readable_by_others:
+        assert readable_by_others != first
+    kept.touch(mode=0o600)
+    kept.chmod(0o600)
+    kept.write_bytes(left)
+    with kept_token(1, "another drive") as other:
+        assert other != first
+    kept.touch(mode=0o600)
+    kept.write_bytes(left)
+    with kept_token(1, "drive") as again:
+        assert again == first
 
 
 def test_a_bag_that_is_none_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -20,6 +20,7 @@ import time
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
+from functools import lru_cache
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -34,7 +35,7 @@ from torch.nn import functional as F  # noqa: N812
 from bevviz import geometry
 from bevviz.frame import F32, I32, U8
 from bevviz.synthetic.sensors import Caster, PinholeCamera, View, optical
-from bevviz.synthetic.world import World
+from bevviz.synthetic.world import SECTION, World
 
 NAMES = ("person", "car", "cyclist")
 WIDTH, HEIGHT = 640, 384  # of the exported input
@@ -57,14 +58,15 @@ def street_images(seed: int) -> list[tuple[U8, Labels]]:
     """Images from random places of one street, the camera turned and shifted at random."""
     rng = np.random.default_rng((seed, 1))
     camera, world = PinholeCamera(), World(seed, DURATION)
-    static = Caster(world.static)
+    static = lru_cache(lambda section: Caster(world.static(section)))
     found = []
     for _ in range(PER_SEED):
         t, s = rng.uniform(0, DURATION), rng.uniform(0, world.length)
         base = world.street.pose(s, rng.normal(-1.7, 0.7), turn=rng.normal(0, 0.12), upright=False)
         pose = base @ optical((0.7, 0.06, rng.normal(1.55, 0.08)), np.radians(rng.normal(3.0, 1.0)))
         centre = pose[:3, 3]
-        picture = camera.picture(View(static, world.moving(t, centre, 120.0)), pose, world.light, rng)
+        view = View(static(int(s // SECTION)), world.moving(t, centre, 120.0))
+        picture = camera.picture(view, pose, world.light, rng)
         boxes, kinds = [], []
         for actor, mesh, _ in world.objects(t, centre, 120.0):
             v, u = np.nonzero(picture.object == actor.number)

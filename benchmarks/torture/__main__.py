@@ -2,7 +2,7 @@
 
 Prints a table for each part and what went wrong in it, and ends with status 1 where anything did: a
 traceback, a hang, a loss without a word, fewer messages than 99.5 % of what the best other reader gives, a
-false result after a signal, or a file that cannot be read after a kill.
+false result after a signal, a process or a file that is left, or one that cannot be read after a kill.
 """
 
 from __future__ import annotations
@@ -45,7 +45,10 @@ def fuzzed_messages(options: argparse.Namespace) -> bool:
 def killed_processes(options: argparse.Namespace) -> bool:
     print(f"\nSignals at any time, seed {options.seed}\n\n{kill.HEAD}")
     well, examples = True, list[str]()
-    for name, tally in kill.run(options.seed, options.signals):
+    wanted = (options.commands or ",".join(kill.COMMANDS)).split(",")
+    if unknown := set(wanted) - set(kill.COMMANDS):
+        raise SystemExit(f"--commands {', '.join(sorted(unknown))}: none of {', '.join(kill.COMMANDS)}")
+    for name, tally in kill.run(options.seed, options.signals, wanted):
         print(kill.row(name, tally), flush=True)
         well &= tally.well
         examples += tally.examples
@@ -74,7 +77,12 @@ def main() -> int:
     parser.add_argument("--bags", type=int, default=900, help="damaged bags (default: 900)")
     parser.add_argument("--format", metavar="NAME", help="only the formats whose name has this in it")
     parser.add_argument("--messages", type=int, default=2000, help="fuzzed messages (default: 2000)")
-    parser.add_argument("--signals", type=int, default=240, help="signals sent to commands (default: 240)")
+    parser.add_argument(
+        "--signals", type=int, default=280, help="signals, shared among the commands (default: 280)"
+    )
+    parser.add_argument(
+        "--commands", metavar="NAME,...", help=f"that are sent signals: {', '.join(kill.COMMANDS)}"
+    )
     options = parser.parse_args()
     if unknown := set(options.parts) - set(PARTS):
         parser.error(f"{', '.join(sorted(unknown))}: no such part; there are {', '.join(PARTS)}")

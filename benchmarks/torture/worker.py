@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import faulthandler
 import multiprocessing
 import traceback
 from dataclasses import dataclass, field
@@ -112,7 +113,9 @@ def _serve(pipe: Connection) -> None:
         except (EOFError, KeyboardInterrupt):
             return
         before = _reset_peak()
+        faulthandler.dump_traceback_later(0.9 * LIMIT)  # what hangs says where
         outcome = tasks[task](argument)
+        faulthandler.cancel_dump_traceback_later()
         outcome.memory = max(0.0, _peak() - before)
         pipe.send(outcome)
 

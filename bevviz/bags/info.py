@@ -32,9 +32,11 @@ class TopicInfo:
     count: int | None  # None: not listened to
     frame_id: str
     rate: float | None  # Hz, between the first and the last message
-    pause: float | None  # longest time between two messages, seconds of log time
-    pause_at: float | None  # when it begins, seconds from the start
     role: str
+    pause: float | None = None  # longest time between two messages, seconds of log time
+    pause_at: float | None = None  # when it begins, seconds from the start
+    size: float | None = None  # bytes of a message, on average
+    delay: float | None = None  # seconds from the stamp to the receipt
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -220,19 +222,23 @@ def _item(text: str) -> Iterator[str]:
 
 
 def _topic_table(topics: Sequence[TopicInfo]) -> Iterator[str]:
-    head = ("topic", "type", "count", "Hz", "longest gap", "frame_id")
-    rows = [
-        (
-            t.name,
-            t.type.rpartition("/")[2],
-            "" if t.count is None else str(t.count),
-            "" if t.rate is None else f"{t.rate:.1f}",
-            "" if t.pause is None else f"{t.pause:.2f} s at {t.pause_at:.1f} s",
-            t.frame_id,
-        )
-        for t in topics
+    """What is not known of any topic has no column."""
+    columns: list[tuple[str, str, list[str]]] = [
+        ("topic", "l", [t.name for t in topics]),
+        ("type", "l", [t.type.rpartition("/")[2] for t in topics]),
+        ("count", "r", ["" if t.count is None else str(t.count) for t in topics]),
+        ("Hz", "r", ["" if t.rate is None else f"{t.rate:.1f}" for t in topics]),
     ]
-    return table.lines([head, *rows], "llrrll")
+    if any(t.size is not None for t in topics):
+        columns.append(("kB", "r", ["" if t.size is None else f"{t.size / 1e3:.1f}" for t in topics]))
+    if any(t.delay is not None for t in topics):
+        columns.append(("delay", "r", ["" if t.delay is None else f"{1e3 * t.delay:.0f} ms" for t in topics]))
+    if any(t.pause is not None for t in topics):
+        pauses = ["" if t.pause is None else f"{t.pause:.2f} s at {t.pause_at:.1f} s" for t in topics]
+        columns.append(("longest gap", "l", pauses))
+    columns.append(("frame_id", "l", [t.frame_id for t in topics]))
+    heads, sides, cells = zip(*columns, strict=True)
+    return table.lines([heads, *zip(*cells, strict=True)], "".join(sides))
 
 
 def _camera(camera: Camera) -> str:

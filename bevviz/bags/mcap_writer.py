@@ -7,6 +7,7 @@ import struct
 from binascii import crc32
 from collections import Counter, defaultdict
 from collections.abc import Callable
+from functools import partial
 from io import BytesIO
 from pathlib import Path
 from types import TracebackType
@@ -23,7 +24,7 @@ from rosbags.interfaces import (
 )
 from ruamel.yaml import YAML
 
-from bevviz import __version__
+from bevviz import __version__, remains
 from bevviz.bags.mcap import (
     CHANNEL,
     CHUNK,
@@ -86,6 +87,7 @@ class McapWriter:
 
     def __enter__(self) -> Self:
         self._lock = claim(self._path, "bag")
+        remains.remember(self, partial(self._part.unlink, missing_ok=True))
         self._file: IO[bytes] = self._part.open("wb")
         self._file.write(MAGIC + _record(HEADER, _text(self._profile) + _text(f"bevviz {__version__}")))
         return self
@@ -103,6 +105,7 @@ class McapWriter:
             raise UserError(f"{self._path}: cannot write the bag: {failure.strerror}") from None
         finally:
             self._part.unlink(missing_ok=True)
+            remains.forget(self)
             os.close(self._lock)
 
     def write(self, connection: Connection, time: int, data: bytes | memoryview) -> None:

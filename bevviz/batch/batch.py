@@ -7,8 +7,10 @@ import os
 import shutil
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 
+from bevviz import remains
 from bevviz.batch.jobs import PARTIAL, Job
 from bevviz.errors import UserError
 
@@ -32,11 +34,14 @@ def claimed(folder: Path) -> Iterator[None]:
             raise UserError(f"-o {folder}: another batch is running in it") from None
         except OSError:
             pass  # a network file system without locks on folders
-        shutil.rmtree(folder / PARTIAL, ignore_errors=True)
+        remove = partial(shutil.rmtree, folder / PARTIAL, ignore_errors=True)
+        remove()
+        remains.remember(folder, remove)
         try:
             yield
         finally:
-            shutil.rmtree(folder / PARTIAL, ignore_errors=True)
+            remove()
+            remains.forget(folder)
     finally:
         os.close(handle)
 

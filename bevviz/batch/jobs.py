@@ -11,6 +11,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 from bevviz.bags.recording import METADATA
 from bevviz.batch.table import RunInfo, read_info
@@ -43,6 +44,7 @@ class Job:
     config: Config
     selection: FrameSelection
     blueprint: str
+    truth: str | None = None  # topic that results are held to, "" the bag's own; None: they are not
 
     @property
     def recording(self) -> Path:
@@ -62,7 +64,7 @@ class Job:
     def key(self) -> str:
         """Another one for another bag, selection, configuration, model, layout or version."""
         files = {"detector": {"model", "names"}}  # they count by their content, below
-        content = {
+        content: dict[str, Any] = {
             "bag": [
                 [path_text(file.name), file.stat().st_size, file.stat().st_mtime_ns]
                 for file in _files(self.bag)
@@ -72,6 +74,8 @@ class Job:
             "blueprint": file_hash(Path(self.blueprint)) if _is_file(self.blueprint) else self.blueprint,
             "dependencies": {name: [d.version, d.sha256] for name, d in dependencies_of(self.config).items()},
         }
+        if self.truth is not None:
+            content["truth"] = self.truth
         return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
     @property
@@ -88,9 +92,14 @@ class Job:
 
 
 def make_jobs(
-    paths: Sequence[Path], folder: Path, config: Config, selection: FrameSelection, blueprint: str
+    paths: Sequence[Path],
+    folder: Path,
+    config: Config,
+    selection: FrameSelection,
+    blueprint: str,
+    truth: str | None = None,
 ) -> list[Job]:
-    """A job for each bag that the paths name.
+    """A job for each bag that the paths name; the arguments are those of ``Job``.
 
     Raises:
         UserError: a path that does not exist, or no bag at all.
@@ -105,7 +114,7 @@ def make_jobs(
     blueprint = _absolute(blueprint)
     owners = {info.bag: table.stem for table, info in tables(folder)}
     names = name_bags(bags, owners)
-    return [Job(names[bag], bag, folder, config, selection, blueprint) for bag in bags]
+    return [Job(names[bag], bag, folder, config, selection, blueprint, truth) for bag in bags]
 
 
 def tables(folder: Path) -> Iterator[tuple[Path, RunInfo]]:

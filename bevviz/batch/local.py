@@ -16,6 +16,8 @@ from bevviz.batch.work import JobResult, JobResults
 
 # concurrent.futures is of no use here: a worker that dies breaks the pool and every job that was on its way.
 
+SIGNALS = {signal.SIGINT, signal.SIGTERM, signal.SIGHUP}
+
 
 @dataclass
 class _Worker:
@@ -91,11 +93,13 @@ def _start(job: Job, threads: int) -> _Worker:
     context = get_context("spawn")  # a fork would copy threads of Rerun and onnxruntime in the midst of work
     ours, theirs = context.Pipe()
     process = context.Process(target=_work, args=(theirs, threads), name="bevviz batch", daemon=True)
-    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # inherited: Ctrl-C is for the batch alone,
-    try:  # which ends its workers
+    # Inherited: signals of the terminal are for the batch alone, which ends its workers. It must not be
+    # interrupted itself between a worker's start and its name.
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)
+    try:
         process.start()
     finally:
-        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
     theirs.close()  # so that its end is seen as soon as the process has gone
     ours.send(job)
     return _Worker(process, ours, job)
@@ -124,6 +128,7 @@ def _end(worker: _Worker) -> None:
 
 def _work(pipe: Connection, threads: int) -> None:
     """The process: one job after another, until the other end of the pipe is closed."""
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGTERM})
     os.environ["OMP_NUM_THREADS"] = str(threads)  # before Open3D is loaded
     import cv2
 

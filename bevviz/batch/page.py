@@ -69,6 +69,7 @@ def page(
         "batch.html",
         title=title,
         bags=bags,
+        evaluated=any(bag.info.metrics is not None for bag in bags),
         frames=sum(bag.info.frames for bag in bags),
         minutes=sum(bag.duration for bag in bags) / 60,
         bad=sum(bag.bad for bag in bags),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -13,6 +12,7 @@ import pyarrow.parquet as pq
 
 from bevviz.batch.page import BagTotals, page
 from bevviz.batch.table import SCHEMA, RunInfo
+from bevviz.files import save, written
 
 NAME = "summary"
 
@@ -84,16 +84,7 @@ def write_summary(
     frames, bags = collect(results, link)
     path = folder / f"{NAME}.html"
     text = page(folder.resolve().name, bags, head(frames, top), failed, viewer)
-    _write_whole(folder / f"{NAME}.parquet", lambda unfinished: pq.write_table(frames, unfinished))
-    _write_whole(path, lambda unfinished: unfinished.write_text(text, encoding="utf-8"))
+    with written(folder / f"{NAME}.parquet", "summary") as file:
+        pq.write_table(frames, file.path)
+    save(path, text, "-o")
     return path
-
-
-def _write_whole(path: Path, write: Callable[[Path], object]) -> None:
-    """Have a file written that is there either as a whole or not at all."""
-    unfinished = path.with_name(f".{path.name}.{os.getpid()}")
-    try:
-        write(unfinished)
-        unfinished.replace(path)
-    finally:
-        unfinished.unlink(missing_ok=True)

@@ -24,7 +24,7 @@ STAGES = (
     "total",
 )
 
-FAILURE, PROBLEM, ANOMALY = 10.0, 3.0, 0.5
+FAILURE, PROBLEM, ANOMALY, WRONG = 10.0, 3.0, 0.5, 1.0
 UNMATCHED = {
     "no_cluster": 2.0,
     "too_few_points": 1.5,
@@ -52,6 +52,8 @@ SCHEMA = pa.schema(
         ("unmatched", pa.list_(pa.string())),
         ("remarks", pa.list_(pa.string())),
         ("badness", pa.float64()),
+        ("missed", pa.int64()),
+        ("false", pa.int64()),
     ]
 )
 
@@ -67,6 +69,7 @@ class RunInfo:
     seconds: float  # that the run took
     scene: Scene
     warnings: tuple[str, ...] = ()
+    metrics: dict[str, float | None] | None = None  # None: it was not held to the truth
 
 
 _INFO = TypeAdapter(RunInfo)
@@ -123,6 +126,18 @@ def row(result: FrameResult, config: Config) -> dict[str, Any]:
         "unmatched": unmatched,
         "remarks": [text for _, text in remarks(result)] + [anomaly.text for anomaly in result.anomalies],
         "badness": round(badness, 6),
+    }
+
+
+def judged(row: Mapping[str, Any], missed: Sequence[str], false: Sequence[str]) -> dict[str, Any]:
+    """The row of a frame that was held to the truth; ``missed`` and ``false``: its objects, in words."""
+    wrong = [*(f"missed {text}" for text in missed), *(f"false {text}" for text in false)]
+    return {
+        **row,
+        "missed": len(missed),
+        "false": len(false),
+        "remarks": [*wrong, *row["remarks"]],
+        "badness": row["badness"] + WRONG * len(wrong),
     }
 
 

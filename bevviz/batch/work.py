@@ -12,8 +12,11 @@ from uuid import uuid4
 
 from bevviz.bags.source import BagSource
 from bevviz.batch.jobs import PARTIAL, Job
-from bevviz.batch.table import RunInfo, row, write
+from bevviz.batch.table import RunInfo, judged, row, write
 from bevviz.errors import UserError
+from bevviz.evaluate.evaluation import Evaluation
+from bevviz.evaluate.log import EvaluationRecorder
+from bevviz.evaluate.truth import truth_in
 from bevviz.files import unfinished
 from bevviz.frame import FrameResult
 from bevviz.logging.recorder import DiskWatch, Recorder
@@ -86,12 +89,13 @@ def run(job: Job, threads: int, on_frame: Callable[[], None] = lambda: None) -> 
                 place=job.recording,
             ) as sinks:
                 assert sinks.file is not None
-                table_rows = _Rows(job, sinks.file, on_frame)
-                observers: list[Observer[FrameResult]] = [
-                    Recorder(sinks.recording, config),
-                    table_rows,
-                    DiskWatch(sinks),
-                ]
+                evaluation = None
+                observers: list[Observer[FrameResult]] = [Recorder(sinks.recording, config)]
+                if job.truth is not None:
+                    evaluation = Evaluation(truth_in(source, job.truth or None))
+                    observers += [evaluation, EvaluationRecorder(sinks.recording, evaluation)]
+                table_rows = _Rows(job, sinks.file, on_frame, evaluation)
+                observers += [table_rows, DiskWatch(sinks)]
                 if run_frames(source, session, observers).interrupted:
                     raise KeyboardInterrupt
             rows = table_rows.rows
@@ -99,7 +103,16 @@ def run(job: Job, threads: int, on_frame: Callable[[], None] = lambda: None) -> 
         if not rows:
             raise UserError("; ".join([f"{job.bag.name}: no frame in it", *warnings]))
         seconds = time.perf_counter() - start
-        info = RunInfo(job.key, path_text(job.bag), job.recording_id, len(rows), seconds, scene, warnings)
+        info = RunInfo(
+            job.key,
+            path_text(job.bag),
+            job.recording_id,
+            len(rows),
+            seconds,
+            scene,
+            warnings,
+            None if evaluation is None else evaluation.as_tree()["metrics"],
+        )
         write(table, rows, info)
         job.table.unlink(missing_ok=True)  # of an older result: it must not vouch for the new recording
         recording.replace(job.recording)
@@ -115,14 +128,19 @@ def run(job: Job, threads: int, on_frame: Callable[[], None] = lambda: None) -> 
 class _Rows(Observer[FrameResult]):
     """A row of the table for each frame; ends the run where its recording was removed."""
 
-    def __init__(self, job: Job, recording: Path, on_frame: Callable[[], None]) -> None:
+    def __init__(
+        self, job: Job, recording: Path, on_frame: Callable[[], None], evaluation: Evaluation | None
+    ) -> None:
         self.rows: list[dict[str, Any]] = []
         self._job, self._recording, self._on_frame = job, recording, on_frame
+        self._evaluation = evaluation
 
     def see(self, result: FrameResult) -> None:
-        self.rows.append(
-            {**row(result, result.config), "bag": path_text(self._job.bag), "recording": self._job.name}
-        )
+        found = row(result, result.config)
+        if self._evaluation is not None and self._evaluation.last is not None:
+            wrong = self._evaluation.now
+            found = judged(found, wrong["missed"], wrong["false"])
+        self.rows.append({**found, "bag": path_text(self._job.bag), "recording": self._job.name})
         self._on_frame()
         if not self._recording.exists():
             raise WithdrawnError

@@ -10,7 +10,7 @@ from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from bevviz import __version__
+from bevviz import __version__, announce
 from bevviz.cli import (
     bag,
     batch,
@@ -18,9 +18,11 @@ from bevviz.cli import (
     compare,
     config,
     demo,
+    evaluate,
     info,
     interrupts,
     live,
+    outputs,
     report,
     sweep,
     tune,
@@ -44,6 +46,7 @@ EPILOG = """examples:
   bevviz report drive.mcap --at 12.5          a bug report that stands on its own
   bevviz compare drive.mcap --model yolo11n.onnx --set-b clustering.eps=0.8   what if?
   bevviz sweep drive.mcap --model yolo11n.onnx --set clustering.eps=0.3:0.9:0.1   which value?
+  bevviz evaluate drive.mcap --model yolo11n.onnx --min recall=0.8                how right? a gate for CI
   bevviz tune drive.mcap --at 12.5 --model yolo11n.onnx --config my.yaml          run at each save
   bevviz batch bags/ -o runs                  many bags, and the worst frames of all of them
   bevviz live --model yolo11n.onnx --serve    the same beside a running robot, in a browser
@@ -59,6 +62,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Returns:
         The exit status: 0 done, 1 nothing made, 2 wrong input, 3 an error of bevviz itself, 130 interrupted.
     """
+    status = _main(arguments)
+    if arguments is None:
+        interrupts.leave(status)
+    return status
+
+
+def _main(arguments: Sequence[str] | None) -> int:
     # Imports and frames make many objects and few cycles: at Python's default of 700 between two looks for
     # cycles these take a tenth of all the time.
     gc.set_threshold(50_000, 10, 10)
@@ -72,6 +82,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         options = parser.parse_args(given)
         if options.verbose:
             _log_to_stderr()
+        announce.to(outputs.say)
         follow_recording(options)
         check_outputs(options)
         run: Callable[[argparse.Namespace], int] = options.run
@@ -120,6 +131,7 @@ def _parser() -> tuple[argparse.ArgumentParser, Collection[str]]:
         info,
         why,
         compare,
+        evaluate,
         sweep,
         tune,
         calib,

@@ -16,6 +16,7 @@ from bevviz.cli.options import (
     Commands,
     add_bind,
     add_config,
+    add_limits,
     add_selection,
     load_config,
     port,
@@ -28,6 +29,7 @@ if TYPE_CHECKING:
     from bevviz.batch.jobs import Job
     from bevviz.batch.table import RunInfo
     from bevviz.batch.work import JobResults
+    from bevviz.evaluate.gate import Limit
 
 
 def add(commands: Commands) -> None:
@@ -72,6 +74,15 @@ def add(commands: Commands) -> None:
     )
     add_bind(results, "--serve-catalog")
     results.add_argument("--dataset", metavar="NAME", help="in the catalog (default: name of DIR)")
+    truth = batch.add_argument_group("ground truth")
+    truth.add_argument(
+        "--truth",
+        nargs="?",
+        const="",
+        metavar="TOPIC",
+        help="evaluate: against the bag's own .../ground_truth, or this Detection3DArray",
+    )
+    add_limits(batch)
     add_config(batch)
     batch.set_defaults(run=_batch)
 
@@ -80,6 +91,7 @@ def _batch(options: argparse.Namespace) -> int:
     from bevviz.batch.batch import claimed
     from bevviz.batch.jobs import tables
 
+    limits = _limits(options)
     if options.catalog and options.serve_catalog:
         raise UserError("--catalog and --serve-catalog: give one of them")
     failed: list[tuple[str, str]] = []
@@ -92,7 +104,16 @@ def _batch(options: argparse.Namespace) -> int:
             interrupted = False
             found = tables(options.output.resolve())
             complete = [(table, info) for table, info in found if table.with_suffix(".rrd").is_file()]
-        return _sum_up(complete, failed, options, interrupted)
+        return _sum_up(complete, failed, limits, options, interrupted)
+
+
+def _limits(options: argparse.Namespace) -> list[Limit]:
+    from bevviz.evaluate.gate import parse_limits
+
+    limits = parse_limits(options.min, options.max)
+    if (limits or options.junit) and options.paths and options.truth is None:
+        raise UserError("--min, --max and --junit: held to what? Give --truth, or --truth TOPIC")
+    return limits
 
 
 def _jobs(options: argparse.Namespace) -> list[Job]:
@@ -103,7 +124,7 @@ def _jobs(options: argparse.Namespace) -> list[Job]:
 
     config = load_config(options)
     selection = FrameSelection(options.start, options.end, options.every, options.frames)
-    jobs = make_jobs(options.paths, options.output, config, selection, options.blueprint)
+    jobs = make_jobs(options.paths, options.output, config, selection, options.blueprint, options.truth)
     # What is wrong for every bag is told once.
     blueprints.load(options.blueprint, Scene("", "lidar"))
     if config.detector.model:
@@ -161,6 +182,7 @@ def _execute(todo: list[Job], options: argparse.Namespace, on_frame: Callable[[]
 def _sum_up(
     complete: list[tuple[Path, RunInfo]],
     failed: list[tuple[str, str]],
+    limits: list[Limit],
     options: argparse.Namespace,
     interrupted: bool,
 ) -> int:
@@ -187,9 +209,37 @@ def _sum_up(
         if interrupted:
             say(f"interrupted; {len(complete)} bags are complete, the same command goes on. Summary: {page}")
             return 130
+        kept = _gate(complete, failed, limits, options.junit)
         frames = sum(info.frames for _, info in complete)
         say(f"{len(complete)} bags complete, {len(failed)} failed, {frames} frames. Summary: {page}")
         if viewer:
             say(f"catalog at {url}, viewer at {viewer}; serving until Ctrl-C")
             wait_for_interrupt()
-    return 1 if failed or not complete else 0
+    return 1 if failed or not complete or not kept else 0
+
+
+def _gate(
+    complete: list[tuple[Path, RunInfo]],
+    failed: list[tuple[str, str]],
+    limits: list[Limit],
+    junit: Path | None,
+) -> bool:
+    """Whether every bag keeps every limit."""
+    from bevviz.evaluate.gate import Kept, check, write_junit
+
+    suites: dict[str, list[Kept] | str] = dict(failed)
+    for table, info in complete:
+        metrics = {name: value for name, value in (info.metrics or {}).items() if value is not None}
+        suites[table.stem] = check(limits, metrics)
+    broken = [
+        (name, kept.reason)
+        for name, found in suites.items()
+        if not isinstance(found, str)
+        for kept in found
+        if kept.reason
+    ]
+    for name, reason in broken:
+        say(f"{name}: not kept: {reason}")
+    if junit is not None:
+        write_junit(junit, suites)
+    return not broken

@@ -6,7 +6,6 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from bevviz.cli.interrupts import terminable
 from bevviz.cli.options import Commands, add_bag, add_config, add_output, add_selection, load_config, open_bag
 from bevviz.cli.outputs import Outputs, say, warn
 
@@ -46,29 +45,24 @@ def _calib(options: argparse.Namespace) -> int:
         raise UserError(f"--write {options.write}: expected a file name that ends in .yaml")
     chosen = options.every
     options.every = chosen or 1
-    with terminable():
-        try:
-            with open_bag(options, config) as source:
-                scene, total = source.scene, source.total
-                names = _cameras(scene, options.camera, source.roles.no_camera)
-            options.every = chosen or max(1, total // FRAMES)
-            with open_bag(options, config) as source:
-                bar = tqdm(source, total=source.total, unit="frame", desc="find edges", disable=None)
-                shots = gather(bar, names, source.pose)
-                warn(source.warnings)
-            results = []
-            for name in names:
-                form = "{desc}: {percentage:3.0f}%|{bar}| {elapsed}{postfix}"
-                with tqdm(total=100, desc=f"align {name}", bar_format=form, disable=None) as steps:
+    with open_bag(options, config) as source:
+        scene, total = source.scene, source.total
+        names = _cameras(scene, options.camera, source.roles.no_camera)
+    options.every = chosen or max(1, total // FRAMES)
+    with open_bag(options, config) as source:
+        bar = tqdm(source, total=source.total, unit="frame", desc="find edges", disable=None)
+        shots = gather(bar, names, source.pose)
+        warn(source.warnings)
+    results = []
+    for name in names:
+        form = "{desc}: {percentage:3.0f}%|{bar}| {elapsed}{postfix}"
+        with tqdm(total=100, desc=f"align {name}", bar_format=form, disable=None) as steps:
 
-                    def show(done: float, what: str, steps: tqdm = steps) -> None:
-                        steps.set_postfix_str(what, refresh=False)
-                        steps.update(round(100 * done) - steps.n)
+            def show(done: float, what: str, steps: tqdm = steps) -> None:
+                steps.set_postfix_str(what, refresh=False)
+                steps.update(round(100 * done) - steps.n)
 
-                    results.append(calibrate(shots[name], show, config.sync.offsets))
-        except KeyboardInterrupt:
-            say("interrupted: nothing was found yet")
-            return 130
+            results.append(calibrate(shots[name], show, config.sync.offsets))
     _print(results, options.json)
     if options.write is not None:
         _write(results, options.write)
@@ -106,12 +100,9 @@ def _print(results: list[Calibration], as_json: bool) -> None:
 
 def _write(results: list[Calibration], path: Path) -> None:
     from bevviz.calib.result import configuration
-    from bevviz.errors import UserError
+    from bevviz.files import save
 
-    try:
-        path.write_text(configuration(results))
-    except OSError as error:
-        raise UserError(f"--write {path}: {error.strerror}") from None
+    save(path, configuration(results), "--write")
     say(f"configuration in {path}{'' if any(r.moved for r in results) else ': all as it is stated'}")
 
 

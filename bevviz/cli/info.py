@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from bevviz.cli.options import Commands, add_config, add_ros_args, load_config
+from bevviz.cli.options import Commands, add_config, add_ros_args, load_config, positive
 from bevviz.errors import UserError
 
 
@@ -17,6 +17,13 @@ def add(commands: Commands) -> None:
     )
     info.add_argument("paths", nargs="*", type=Path, metavar="PATH", help="bag file or folder")
     info.add_argument("--live", action="store_true", help="a running robot's topics instead of a bag's")
+    info.add_argument(
+        "--for",
+        dest="seconds",
+        type=positive,
+        metavar="SECONDS",
+        help="--live: how long to listen, for rates, sizes and delays (default: 3); Ctrl-C ends it earlier",
+    )
     add_config(info)
     add_ros_args(info)
     info.set_defaults(run=_info)
@@ -28,8 +35,11 @@ def _info(options: argparse.Namespace) -> int:
     if options.live:
         from bevviz.live import info
 
-        print(info.render(info.describe(load_config(options), options.ros_args)))
+        seconds = options.seconds or info.LISTEN
+        print(info.render(info.describe(load_config(options), options.ros_args, seconds)))
         return 0
+    if options.seconds is not None:
+        raise UserError("bevviz info: --for is for --live; a bag is read as a whole")
     if not options.paths:
         raise UserError("bevviz info: which bag? Give its path, or --live for a running robot")
     print(render(describe(options.paths, load_config(options))))

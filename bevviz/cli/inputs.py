@@ -1,4 +1,4 @@
-"""What is read must not be written over."""
+"""What is read must not be written over, nor anything written twice."""
 
 from __future__ import annotations
 
@@ -15,20 +15,33 @@ WRITTEN = {
     "output": "-o",
     "csv": "--csv",
     "json": "--json",
+    "junit": "--junit",
     "write": "--write",
     "bag": "--bag",
 }
+TEXTS = ("csv", "json", "write")  # that are written at the end, where nothing looks at their place before
 
 
 def check_outputs(options: argparse.Namespace) -> None:
-    """Raises UserError where an option's output is one of the command's inputs, by whatever name or link."""
+    """Before an hour's work.
+
+    Raises:
+        UserError: an option's output is one of the command's inputs, by whatever name or link, or another
+            option's output, or there is no folder for it.
+    """
     if getattr(options, "check", False):  # it writes nothing
         return
     inputs = {identity: path for path in _inputs(options) for identity in _identities(path)}
+    outputs: dict[Path, str] = {}
     for name, option in WRITTEN.items():
         target = getattr(options, name, None)
         if not isinstance(target, Path) or target.is_dir():
             continue
+        other = outputs.setdefault(target.resolve(), option)
+        if other != option and (target.is_file() or not target.exists()):
+            raise UserError(f"{option} {target}: {other} writes that file; give another name")
+        if name in TEXTS and not target.parent.is_dir():
+            raise UserError(f"{option} {target}: there is no folder {target.parent}")
         for identity in _identities(target):
             if identity in inputs:
                 same = "" if inputs[identity] == target else f" ({inputs[identity]})"

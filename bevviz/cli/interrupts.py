@@ -1,14 +1,18 @@
-"""Ctrl-C and SIGTERM: both end a command, with what was made until then complete."""
+"""Ctrl-C, SIGTERM and SIGHUP end a command, with what was made until then complete."""
 
 from __future__ import annotations
 
+import os
 import signal
+import sys
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from threading import Event
-from typing import NoReturn
 
-SIGNALS = (signal.SIGINT, signal.SIGTERM)
+from bevviz import remains
+
+SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 _came = Event()  # a signal, whatever became of its exception
@@ -20,9 +24,10 @@ def came() -> bool:
 
 
 def install() -> None:
-    """For the whole process, before anything else: a signal among the imports is an interrupt, too."""
+    """For the whole process, before anything else. What ``nohup`` or a shell ignores stays ignored."""
     for number in SIGNALS:
-        signal.signal(number, _interrupt)
+        if signal.getsignal(number) != signal.SIG_IGN:
+            signal.signal(number, _interrupt)
 
 
 def ignore() -> None:
@@ -31,7 +36,24 @@ def ignore() -> None:
         signal.signal(number, signal.SIG_IGN)
 
 
-def _interrupt(number: int, stack: object) -> NoReturn:
+def leave(status: int) -> None:
+    """At the end of an interrupted command, by the shortest way where a thread is still in the midst of work.
+
+    One that compiles a stage meanwhile would find half of its compiler gone, and abort.
+    """
+    if came() and any(thread.daemon for thread in threading.enumerate()):
+        for stream in (sys.stdout, sys.stderr):
+            with suppress(OSError, ValueError):
+                stream.flush()
+        os._exit(status)
+
+
+def _interrupt(number: int, stack: object) -> None:
+    """An exception only where a file needs its end: imports and libraries may swallow one."""
+    if not remains.any_unfinished():
+        remains.remove()
+        signal.signal(number, signal.SIG_DFL)
+        os.kill(os.getpid(), number)
     _came.set()
     raise KeyboardInterrupt
 
@@ -45,13 +67,17 @@ def terminable() -> Iterator[Event]:
     """
     ended = Event()
 
-    def interrupt(number: int, stack: object) -> NoReturn:
+    def interrupt(number: int, stack: object) -> None:
         ended.set()
-        if before[signal.SIGINT] is _interrupt:  # of a process that is a command
+        if _interrupt in before.values():  # of a process that is a command
             _came.set()
         raise KeyboardInterrupt
 
-    before = {number: signal.signal(number, interrupt) for number in SIGNALS}
+    before = {
+        number: handler for number in SIGNALS if (handler := signal.getsignal(number)) != signal.SIG_IGN
+    }
+    for number in before:
+        signal.signal(number, interrupt)
     try:
         yield ended
     finally:

@@ -17,11 +17,13 @@ from bevviz.errors import UserError
 if TYPE_CHECKING:
     from bevviz.config import Config
     from bevviz.frame import FrameResult, Source
+    from bevviz.live.control import Control
     from bevviz.live.notes import Notes
     from bevviz.live.replay import Replay
     from bevviz.live.runtime import Live, Status
     from bevviz.live.settings import Settings
     from bevviz.live.source import LiveSource
+    from bevviz.perceive import StageLoader
 
 
 def add(commands: Commands) -> None:
@@ -89,7 +91,7 @@ def _live(options: argparse.Namespace) -> int:
     os.environ.setdefault("RUST_LOG", "warn,re_log_encoding=error")
     from bevviz.live.notes import Notes
     from bevviz.live.settings import Settings
-    from bevviz.logging.ports import check_port, own_address
+    from bevviz.perceive import StageLoader
 
     given = {
         "detector.model": options.model,
@@ -102,46 +104,91 @@ def _live(options: argparse.Namespace) -> int:
     more = [f"{key}={value}" for key, value in given.items() if value is not None]
     if options.split is not None:
         more.append(options.split)
+    if options.split is not None and options.save is None:
+        raise UserError("--split divides what --save writes: give --save FILE.rrd, too")
+    if options.observe and options.publish:
+        raise UserError("--observe makes no results that --publish could send: leave one of them out")
     settings = Settings(options.config, [*options.set, *more], options.preset)
-    if options.serve is not None:
-        own_address(options.bind)  # before a robot is waited for
-        check_port(options.serve)
+    _check_outputs(options)
+    loader = StageLoader()
+    if not options.observe:
+        loader.load(settings.config)
     notes = Notes(say)
-    with terminable():
-        if options.synthetic:
-            return _watch(_replay(options.synthetic), settings, options, notes)
-        from bevviz.live.source import LiveSource
+    if options.synthetic:
+        return _watch(_replay(options.synthetic), settings, options, notes, loader)
+    from bevviz.live.source import LiveSource
 
-        with LiveSource(settings.config, arguments=options.ros_args, tell=notes.info) as source:
-            return _watch_robot(source, settings, options, notes)
+    with LiveSource(settings.config, arguments=options.ros_args, tell=notes.info) as source:
+        return _watch_robot(source, settings, options, notes, loader)
 
 
-def _watch_robot(source: LiveSource, settings: Settings, options: argparse.Namespace, notes: Notes) -> int:
+def _check_outputs(options: argparse.Namespace) -> None:
+    """What cannot work is said before a robot is waited for."""
+    from bevviz.frame import Scene
+    from bevviz.live.files import check_name
+    from bevviz.logging import blueprints
+    from bevviz.logging.ports import check_port, own_address
+    from bevviz.logging.sinks import check_viewer
+
+    if options.serve is not None:
+        own_address(options.bind)
+        check_port(options.serve)
+    if options.connect is not None:
+        check_viewer(options.connect)
+    if options.save is not None:
+        check_name(options.save)
+    blueprints.load(options.blueprint, Scene("live", "lidar", ("lidar",)))
+
+
+def _watch_robot(
+    source: LiveSource,
+    settings: Settings,
+    options: argparse.Namespace,
+    notes: Notes,
+    loader: StageLoader,
+) -> int:
     """Publish back and take orders, as far as that is asked for."""
+    from bevviz.live.control import Control, unasked
     from bevviz.ros.orders import Orders
     from bevviz.ros.publish import Publisher
 
-    shown = ""
-    with suppress(KeyboardInterrupt):
-        while not source.wait(1.0):
-            if source.missing != shown:
-                shown = source.missing
-                say(f"waiting: {shown}")
-    if not source.wait(0):
-        return 1
-    publisher = Publisher(source.node, settings.config, notes.warn) if options.publish else None
+    def refuse(path: Path | None = None) -> Path:
+        raise UserError(f"there is nothing to save yet; waiting: {source.missing}")
 
-    def follow(live: Live) -> Callable[[Config], None]:
-        orders = Orders(source.node, live.config, live.update, live.save)
+    with Control(refuse, notes.warn) as control, unasked(lambda: notes.warn("there is nothing to save yet")):
 
-        def show(config: Config) -> None:
-            orders.show(config)
-            if publisher is not None:
-                publisher.configure(config)
+        def take(more: list[str]) -> None:
+            settings.take(more)
+            if orders is not None:
+                orders.config = settings.config
 
-        return show
+        orders: Orders | None = None
+        orders = Orders(source.node, settings.config, take, refuse)
+        orders.config = settings.config
+        shown = ""
+        with suppress(KeyboardInterrupt), terminable() as ended:
+            while not source.wait(1.0):
+                missing = source.missing
+                if missing and missing != shown:
+                    shown = missing
+                    say(f"waiting: {shown}")
+        if ended.is_set():
+            return 1
+        publisher = Publisher(source.node, settings.config, notes.warn) if options.publish else None
 
-    return _watch(source, settings, options, notes, publisher.publish if publisher else None, follow)
+        def follow(live: Live, orders: Orders = orders) -> Callable[[Config], None]:
+            control.save = orders.save = live.save
+            orders.change = live.update
+
+            def show(config: Config) -> None:
+                orders.show(config)
+                if publisher is not None:
+                    publisher.configure(config)
+
+            return show
+
+        publish = publisher.publish if publisher else None
+        return _watch(source, settings, options, notes, loader, publish, follow, control)
 
 
 def _replay(frames: int) -> Replay:
@@ -160,8 +207,10 @@ def _watch(
     settings: Settings,
     options: argparse.Namespace,
     notes: Notes,
+    loader: StageLoader,
     on_result: Callable[[FrameResult], None] | None = None,
     follow: Callable[[Live], Callable[[Config], None]] | None = None,
+    control: Control | None = None,
 ) -> int:
     """The live run, until the source ends or the user ends it."""
     from tqdm import tqdm
@@ -174,7 +223,16 @@ def _watch(
     window = window or (unsaid and has_display())
     connect = [options.connect] if options.connect else []
     outputs = Outputs(options.save, window, options.serve, options.bind, connect, options.blueprint)
-    live = Live(source, settings, outputs, notes, observe=options.observe, on_result=on_result)
+    live = Live(
+        source,
+        settings,
+        outputs,
+        notes,
+        observe=options.observe,
+        on_result=on_result,
+        loader=loader,
+        control=control,
+    )
     if follow is not None:
         live.on_change = follow(live)
     for url in live.urls:
@@ -183,6 +241,7 @@ def _watch(
         say("no display: 'bevviz snap' saves the last seconds, --serve shows them in a browser")
     with (
         suppress(KeyboardInterrupt),
+        terminable(),
         _page(options, live),
         tqdm(unit="frame", desc=source.scene.name, disable=None) as bar,
     ):

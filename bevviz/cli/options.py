@@ -61,6 +61,21 @@ def add_truth(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def add_limits(parser: argparse.ArgumentParser) -> None:
+    gate = parser.add_argument_group(
+        "gate", "METRIC[.CLASS][@RANGE]: recall=0.8, recall.person@0-10=0.9, ap_3d_0.7.car.moderate=0.5."
+    )
+    for side, what in (("min", "at least"), ("max", "at most")):
+        gate.add_argument(
+            f"--{side}",
+            action="append",
+            default=[],
+            metavar="METRIC=NUMBER",
+            help=f"{what} that",
+        )
+    gate.add_argument("--junit", type=Path, metavar="FILE.xml", help="whether each limit is kept, for a CI")
+
+
 def add_selection(group: argparse._ArgumentGroup) -> None:
     """Which of its frames."""
     group.add_argument("--start", metavar="TIME", help="skip what is before this time")

@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from bevviz.cli.interrupts import terminable
 from bevviz.cli.options import Commands, add_bag, add_config, load_config
 from bevviz.cli.outputs import say
 from bevviz.errors import UserError
@@ -59,16 +58,10 @@ def add(commands: Commands) -> None:
 
 
 def _report(options: argparse.Namespace) -> int:
-    with terminable():
-        try:
-            return _check(options) if options.check else _make(options)
-        except KeyboardInterrupt:
-            say("interrupted: nothing was written" if not options.check else "interrupted")
-            return 130
-
-
-def _make(options: argparse.Namespace) -> int:
+    if options.check:
+        return _check(options)
     from bevviz.bags.reader import megabytes
+    from bevviz.notes import Notes
     from bevviz.report.make import ReportRequest, make
 
     if options.at is None:
@@ -89,6 +82,7 @@ def _make(options: argparse.Namespace) -> int:
             unredacted=options.unredacted,
             include_model=options.include_model,
             force=options.force,
+            notes=list(Notes(options.paths)),
         )
     )
     for warning in report.warnings:

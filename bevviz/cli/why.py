@@ -6,7 +6,6 @@ import argparse
 from collections.abc import Callable, Iterable, Sequence
 from typing import TYPE_CHECKING
 
-from bevviz.cli.interrupts import terminable
 from bevviz.cli.options import Commands, add_bag, add_config, add_output, load_config, positive
 from bevviz.cli.outputs import Outputs, say, warn
 from bevviz.errors import UserError
@@ -113,7 +112,7 @@ def _why(options: argparse.Namespace) -> int:
     from bevviz.why.text import plain
 
     config, selection = load_config(options), _selection(options)
-    with terminable(), BagSource(options.paths, config, at=options.at) as source:
+    with BagSource(options.paths, config, at=options.at) as source:
         loader = StageLoader()
         session = Session(config, loader=loader)
         number = options.at_frame

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import argparse
-from contextlib import AbstractContextManager, nullcontext, suppress
+import sys
+from contextlib import ExitStack, suppress
 from typing import TYPE_CHECKING
 
 from bevviz.cli.interrupts import terminable
@@ -13,7 +14,6 @@ from bevviz.errors import UserError
 
 if TYPE_CHECKING:
     from bevviz.workbench.bench import Bench
-    from bevviz.workbench.native import NativeViewer
 
 EXAMPLES = """examples:
   bevviz drive.mcap                                     the same as bevviz open drive.mcap
@@ -36,7 +36,9 @@ def add(commands: Commands) -> None:
     add_truth(command)
     add_config(command)
     page = command.add_argument_group("page")
-    page.add_argument("--port", type=port, metavar="N", help="of the page (default: one that is free)")
+    page.add_argument(
+        "--port", type=port, metavar="N", help="of the page (default: 9880, else one that is free)"
+    )
     page.add_argument(
         "--no-browser", dest="browser", action="store_false", help="print the address, open nothing"
     )
@@ -56,9 +58,35 @@ def _open(options: argparse.Namespace) -> int:
         raise UserError(
             f"the workbench needs further packages ({error.name}): pip install 'bevviz[workbench]'"
         ) from None
-    with terminable(), _bench(options) as bench:
-        hint(bench.drive.scene, bench.drive.config)
-        warn(bench.drive.warnings)
+    config, beside = load_config(options), _beside(options)
+    with ExitStack() as stack:
+        from bevviz.bags.source import BagSource
+
+        source, again = (stack.enter_context(BagSource(options.paths, config)) for _ in range(2))
+        first = source.number_at(options.at) if options.at is not None else 0
+        warn(source.warnings)
+
+        def make() -> Bench:
+            _arrow_without_pandas()
+            hint(source.scene, config)
+            bench = made()
+            if beside:
+                from bevviz.workbench.native import NativeViewer
+
+                bench.native = NativeViewer((bench.film, bench.desk), bench.recording_id, options.connect)
+            return bench
+
+        def made() -> Bench:
+            from bevviz.drive import Drive
+            from bevviz.evaluate import truth_source
+            from bevviz.workbench.bench import Bench
+            from bevviz.workbench.labelled import Labelled
+
+            truth_of = truth_source(source.roles, options.truth, options.kitti_labels, len(source.scans))
+            if truth_of is None or (options.truth is None and options.kitti_labels is None):
+                return Bench(Drive(source, config), again, options.paths, truth_of, first)
+            mine, others = (Labelled(frames, truth_of) for frames in (source, again))
+            return Bench(Drive(mine, config), others, options.paths, truth_of, first)
 
         def ready(address: str) -> None:
             say(f"workbench at {address}")
@@ -68,36 +96,42 @@ def _open(options: argparse.Namespace) -> int:
                 webbrowser.open(address)
             say("open until Ctrl-C; only this machine can reach it")
 
-        with suppress(KeyboardInterrupt), _native(options, bench) as native:  # the way to end it
-            serve(bench, options.port, ready, native)
+        with suppress(KeyboardInterrupt), terminable():  # the way to end it
+            drive = "\n".join(str(path.resolve()) for path in options.paths)
+            serve(make, drive, options.port, ready, "native" if beside else "page")
     return 0
 
 
-def _native(options: argparse.Namespace, bench: Bench) -> AbstractContextManager[NativeViewer | None]:
-    """The viewer beside the page, where one is asked for."""
-    from bevviz.workbench.native import NativeViewer
+def _beside(options: argparse.Namespace) -> bool:
+    """Whether Rerun's own viewer is shown beside the page; what stands against it is told now."""
+    if options.connect is not None:
+        from bevviz.logging.sinks import check_viewer
 
-    if options.connect is None and not options.viewer:
-        return nullcontext()
-    if options.connect is None and not has_display():
+        check_viewer(options.connect)
+    elif options.viewer and not has_display():
         raise UserError("--viewer: no display; without it the page has a viewer of its own")
-    return NativeViewer(bench.film, bench.recording_id, options.connect)
+    return options.viewer or options.connect is not None
 
 
-def _bench(options: argparse.Namespace) -> Bench:
-    from contextlib import ExitStack
+def _arrow_without_pandas() -> None:
+    """pyarrow looks for pandas at the first array that it makes: half a second, for nothing used here.
 
-    from bevviz.bags.source import BagSource
-    from bevviz.drive import Drive
-    from bevviz.evaluate import truth_source
-    from bevviz.workbench.bench import Bench
+    Where its own pandas functions are called it looks again.
+    """
+    if "pandas" in sys.modules:
+        return
+    finder = _NoPandas()
+    sys.meta_path.insert(0, finder)
+    try:
+        import pyarrow
 
-    config = load_config(options)
-    with ExitStack() as stack:
-        source = stack.enter_context(BagSource(options.paths, config))
-        again = stack.enter_context(BagSource(options.paths, config))
-        truth_of = truth_source(source.roles, options.truth, options.kitti_labels, len(source.scans))
-        first = source.number_at(options.at) if options.at is not None else 0
-        bench = Bench(Drive(source, config), again, truth_of, first)
-        stack.pop_all()  # the bench closes them
-    return bench
+        pyarrow.array([True])
+    finally:
+        sys.meta_path.remove(finder)
+
+
+class _NoPandas:
+    @staticmethod
+    def find_spec(name: str, *_: object) -> None:
+        if name == "pandas":
+            raise ModuleNotFoundError(name)

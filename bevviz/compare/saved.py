@@ -23,6 +23,7 @@ from bevviz.frame import F64, Boxes3D, Scene
 from bevviz.logging import entities
 from bevviz.logging.camera import log_shared_image
 from bevviz.logging.pieces import CORNER
+from bevviz.logging.reading import readable
 from bevviz.logging.writer import Writer
 from bevviz.run import Items, Observer
 
@@ -66,11 +67,11 @@ class SavedRun:
         self.path = path
         self.frames: dict[int, SavedFrame] = {}  # by stamp
         self._property: Row = {}
-        try:
+        if not path.is_file():
+            raise UserError(f"{path}: {'it is no file' if path.exists() else 'no such file'}")
+        with readable(path):
             for chunk in self.stream():
                 self._read(chunk)
-        except (OSError, RuntimeError, ValueError) as error:
-            raise UserError(f"{path}: cannot be read: {str(error).splitlines()[0]}") from None
         if not self._property:
             raise UserError(f"{path}: no recording of bevviz: it does not say how it was made")
         self.frames = {stamp: frame for stamp, frame in self.frames.items() if frame.index >= 0}

@@ -6,6 +6,7 @@ import csv
 import json
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Mapping, Sequence
+from io import StringIO
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -16,7 +17,7 @@ from bevviz.compare.differences import DIFFERENT, WORST_FIRST, Change, Differenc
 from bevviz.compare.log import place
 from bevviz.compare.truth import Judged
 from bevviz.config import ParameterChange
-from bevviz.errors import UserError
+from bevviz.files import save
 from bevviz.run import Observer
 from bevviz.text import fenced, printable
 
@@ -216,10 +217,7 @@ class ComparisonSummary(Observer[Compared]):
             "truth": self.truth,
             "frames": self.frames,
         }
-        try:
-            path.write_text(json.dumps(tree, indent=1))
-        except OSError as error:
-            raise UserError(f"--json {path}: cannot be written: {error.strerror}") from None
+        save(path, json.dumps(tree, indent=1), "--json")
 
     def write_csv(self, path: Path) -> None:
         """A row for each object that differs.
@@ -228,14 +226,12 @@ class ComparisonSummary(Observer[Compared]):
             UserError: the file cannot be written.
         """
         header = ("frame", "stamp", "change", "class_a", "class_b", "x", "y", "z", "distance", "iou")
-        try:
-            with path.open("w", newline="") as file:
-                writer = csv.DictWriter(file, header, extrasaction="ignore")
-                writer.writeheader()
-                for frame in self.frames:
-                    writer.writerows({**frame, **row} for row in frame["objects"])
-        except OSError as error:
-            raise UserError(f"--csv {path}: cannot be written: {error.strerror}") from None
+        file = StringIO()
+        writer = csv.DictWriter(file, header, extrasaction="ignore")
+        writer.writeheader()
+        for frame in self.frames:
+            writer.writerows({**frame, **row} for row in frame["objects"])
+        save(path, file.getvalue(), "--csv")
 
 
 def parameters(config: Mapping[str, str]) -> Iterator[str]:

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bevviz.evaluate import Truth, match
+from bevviz.evaluate import Truth
+from bevviz.evaluate import judge as judge_objects
 from bevviz.frame import Bool, FrameResult, Objects
 
 
@@ -57,9 +58,7 @@ def judge(a: FrameResult, b: FrameResult, truth: Truth) -> Judged:
 
 def _side(objects: Objects | None, truth: Truth) -> tuple[Bool, tuple[str, ...]]:
     """(K,) which boxes of the truth are found, and the names of the objects that are none of them."""
-    found = np.zeros(len(truth.labels), bool)
     if objects is None:
-        return found, ()
-    partner, _ = match(objects, truth)
-    found[partner[partner >= 0]] = True
-    return found, tuple(objects.names[j].lower() for j in np.flatnonzero(partner < 0))
+        return np.zeros(len(truth.labels), bool), ()
+    matches = judge_objects(objects, truth)
+    return ~matches.missed, tuple(objects.names[j].lower() for j in np.flatnonzero(matches.false))

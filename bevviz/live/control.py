@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import json
 import os
+import signal
 import socket
 import stat
 import struct
 import tempfile
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import BinaryIO
 
@@ -35,7 +36,7 @@ class Control(Closing):
     """
 
     def __init__(self, save: Callable[[Path | None], Path], warn: Callable[[str], None]) -> None:
-        self._save = save
+        self.save = save  # may be another one later
         self._path: Path | None = None
         self._thread = threading.Thread(target=self._serve, name="control", daemon=True)
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
@@ -95,12 +96,22 @@ class Control(Closing):
         if not isinstance(path, str | None):
             return {"error": "the request was not understood"}
         try:
-            saved = self._save(Path(path) if path else None)
+            saved = self.save(Path(path) if path else None)
             return {"saved": str(saved.absolute())}
         except UserError as error:
             return {"error": str(error)}
         except Exception as error:  # it must not end the thread that answers the next one
             return {"error": f"{type(error).__name__}: {error}"}
+
+
+@contextmanager
+def unasked(say: Callable[[], None]) -> Iterator[None]:
+    """Until somebody takes SIGUSR1 for an order, it is only answered: it would end the process."""
+    before = signal.signal(signal.SIGUSR1, lambda number, stack: say())
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGUSR1, before)
 
 
 def snap(path: Path | None = None, pid: int | None = None) -> Path:

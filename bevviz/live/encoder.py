@@ -6,16 +6,18 @@ The bytes of consecutive frames, put behind a prelude, are a complete recording.
 from __future__ import annotations
 
 import os
+import threading
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from types import MappingProxyType
 
 import rerun as rr
 import rerun.blueprint as rrb
 
 from bevviz.closing import Closing
 from bevviz.config import Config
-from bevviz.frame import FrameResult, Scene
+from bevviz.frame import FrameResult, LateResult, Scene
 from bevviz.logging import blueprints
 from bevviz.logging.logger import Context, Logger
 from bevviz.logging.sinks import APPLICATION
@@ -59,24 +61,27 @@ class _Stream(Closing):
 
 
 class Encoder:
-    """Turns results into packets. For one thread, but for ``prelude``.
+    """Turns results into packets. From any thread.
 
     Args:
         config: how the results are made.
         scene: names of the sensors.
         blueprint: name of a layout, or a .py or .rbl file.
+        whole: seconds from one whole packet to the next, at most.
 
     Raises:
         UserError: no such blueprint.
     """
 
-    def __init__(self, config: Config, scene: Scene, blueprint: str) -> None:
+    def __init__(self, config: Config, scene: Scene, blueprint: str, whole: float = WHOLE) -> None:
         self._blueprint = blueprint
+        self._step = whole
         blueprints.load(blueprint, scene)  # what is wrong with it is said at the start
         self._config, self._scene = config, scene
         self._stream = _Stream()
         self._logger = Logger(self._stream.recording, config, scene)
         self._whole = float("-inf")
+        self._lock = threading.Lock()
         self.recording_id: str = self._stream.recording.get_recording_id() or ""
         self.header = self._stream.read()  # behind it, packets alone are readable, without static data
 
@@ -93,8 +98,30 @@ class Encoder:
         scene: Scene,
         health: Mapping[str, float],
         notes: Sequence[tuple[str, str]],
+        late: Sequence[LateResult] = (),
+        states: Mapping[str, str] = MappingProxyType({}),
     ) -> Packet:
-        """One frame, and with it whatever is new in the configuration or the scene."""
+        """One frame, and with it whatever is new in the configuration or the scene; see ``Logger.log``."""
+        with self._lock:
+            return self._encode(result, scene, health, notes, late, states)
+
+    def encode_meanwhile(
+        self, seconds: float, notes: Sequence[tuple[str, str]], states: Mapping[str, str]
+    ) -> Packet:
+        """What is to be said while no frame comes; see ``Logger.log_meanwhile``."""
+        with self._lock:
+            self._logger.log_meanwhile(seconds, notes, states)
+            return Packet(self._stream.read(), False, self._logger.context, time.monotonic())
+
+    def _encode(
+        self,
+        result: FrameResult,
+        scene: Scene,
+        health: Mapping[str, float],
+        notes: Sequence[tuple[str, str]],
+        late: Sequence[LateResult],
+        states: Mapping[str, str],
+    ) -> Packet:
         config = result.config
         if (config, scene) != (self._config, self._scene):
             if scene != self._scene:
@@ -102,11 +129,11 @@ class Encoder:
             self._config, self._scene = config, scene
             self._logger.reconfigure(config, scene)
         now = time.monotonic()
-        whole = now - self._whole >= WHOLE
+        whole = now - self._whole >= self._step
         if whole:
             self._whole = now
             self._logger.refresh()
-        self._logger.log(result, health, notes)
+        self._logger.log(result, health, notes, late, states)
         return Packet(self._stream.read(), whole, self._logger.context, now)
 
     def prelude(self, context: Context, *, blueprint: bool = True) -> bytes:

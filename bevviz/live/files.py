@@ -17,37 +17,77 @@ from bevviz.live.output import Output
 from bevviz.logging import rerun_cli
 
 MEGABYTE = 1_000_000
+PART = ".rrd.part"  # suffix of a file while its index is made
 INDEXED = 1000 * MEGABYTE  # the index is made in memory; a larger file stays without
 
 
 class Indexer:
     """Gives finished recordings their index and merges their many small chunks, in the background.
 
-    Without it they open as well, but slowly. Where it cannot be done, the file stays as it is.
+    Without it they open as well, but slowly. Where it cannot be done, the file stays as it is. The work ends
+    with this process; what one that was killed has left is removed by the next one beside it.
     """
 
     def __init__(self) -> None:
         self._worker = ThreadPoolExecutor(1, "index")
+        self._waiting = 0
+
+    @property
+    def waiting(self) -> int:
+        """Files that are not done."""
+        return self._waiting
 
     def add(self, path: Path) -> None:
         if path.stat().st_size <= INDEXED:
             with suppress(RuntimeError):  # closed already: it stays as it is
                 self._worker.submit(self._index, path)
+                self._waiting += 1
 
     def close(self) -> None:
         """Finish what is waiting."""
         self._worker.shutdown()
 
     def _index(self, path: Path) -> None:
-        indexed = path.with_suffix(".rrd.part")
-        command = ["nice", "-n", "19", rerun_cli.program(), "rrd", "optimize", str(path), "-o", str(indexed)]
-        done = subprocess.run(
-            command, capture_output=True, check=False, env=rerun_cli.environment(), start_new_session=True
-        )
-        if done.returncode == 0 and indexed.exists():
-            indexed.replace(path)
-        else:
-            indexed.unlink(missing_ok=True)
+        indexed = path.with_suffix(PART)
+        optimize = ["nice", "-n", "19", rerun_cli.program(), "rrd", "optimize", str(path), "-o", str(indexed)]
+        handle = os.open(indexed, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
+        try:
+            lock(handle, f"{indexed}: another process is writing it")
+            os.ftruncate(handle, 0)
+            done = subprocess.run(
+                rerun_cli.tied(optimize),
+                capture_output=True,
+                check=False,
+                env=rerun_cli.environment(),
+                start_new_session=True,
+            )
+            if done.returncode == 0 and indexed.stat().st_size:
+                indexed.replace(path)
+            else:
+                indexed.unlink(missing_ok=True)
+        finally:
+            os.close(handle)
+            self._waiting -= 1
+
+
+def check_name(path: Path) -> None:
+    """Raises UserError where a recording is not to be written: a slip must not overwrite something else."""
+    if path.suffix != ".rrd":
+        raise UserError(f"--save {path}: expected a file name that ends in .rrd")
+    if not path.absolute().parent.is_dir():
+        raise UserError(f"--save {path}: there is no folder {path.parent}")
+
+
+def remove_leftovers(folder: Path) -> None:
+    """Indexes that nobody is making any more."""
+    for path in folder.glob(f"*{PART}"):
+        with suppress(OSError, UserError):
+            handle = os.open(path, os.O_RDWR | os.O_NOFOLLOW | os.O_CLOEXEC)
+            try:
+                lock(handle, "")
+                path.unlink()
+            finally:
+                os.close(handle)
 
 
 class Saver(Output):
@@ -63,8 +103,8 @@ class Saver(Output):
         self, path: Path, config: LiveConfig, encoder: Encoder, indexer: Indexer, notes: Notes
     ) -> None:
         super().__init__("file", config.output_queue)
-        if path.suffix != ".rrd":  # a slip must not overwrite something else
-            raise UserError(f"--save {path}: expected a file name that ends in .rrd")
+        check_name(path)
+        remove_leftovers(path.parent)
         self.paths: list[Path] = []
         self._path = path
         self._size = config.split_size and config.split_size * MEGABYTE

@@ -12,7 +12,7 @@ from bevviz.config import LiveConfig
 from bevviz.errors import UserError
 from bevviz.files import write_all
 from bevviz.live.encoder import Encoder, Packet
-from bevviz.live.files import MEGABYTE, Indexer
+from bevviz.live.files import MEGABYTE, Indexer, remove_leftovers
 
 
 class FlightRecorder:
@@ -74,6 +74,7 @@ class FlightRecorder:
                 raise UserError(f"{target}: is already there") from None
             except OSError as error:
                 raise UserError(f"{target}: cannot be saved: {error.strerror}") from None
+        remove_leftovers(target.parent)
         self._indexer.add(target)
         return target
 

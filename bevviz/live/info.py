@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import threading
 import time
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 
 from bevviz.bags.info import Contents, TopicInfo, find_missing, render_contents
@@ -14,6 +15,7 @@ from bevviz.frame import Frame
 from bevviz.live.source import LiveSource
 from bevviz.ros.graph import PublishedTopic, describe_qos
 
+LISTEN = 3.0  # seconds
 PATIENCE = 10.0  # seconds until what is there so far is shown
 
 
@@ -26,21 +28,30 @@ class LiveInfo(Contents):
     seconds: float  # that were listened for
 
 
-def describe(config: Config, arguments: Sequence[str] = (), seconds: float = 3.0) -> LiveInfo:
-    """Listen to the graph for ``seconds``, counted from when the topics have their roles.
+def describe(
+    config: Config,
+    arguments: Sequence[str] = (),
+    seconds: float = LISTEN,
+    patience: float = PATIENCE,
+) -> LiveInfo:
+    """Listen to the graph for ``seconds``, counted from when the topics have their roles. Ctrl-C ends it.
+
+    After ``patience`` seconds what is there by then is shown.
 
     Raises:
         UserError: no working rclpy, or arguments that it refuses.
     """
     # Under a name of its own: what another bevviz publishes is shown, too.
     with LiveSource(config, arguments=arguments, name="bevviz_info") as source:
-        settled = source.wait(PATIENCE)
-        before = Counter(source.received)
+        with suppress(KeyboardInterrupt):
+            source.wait(patience)
+        before, volume = source.received, source.volume
         start = time.monotonic()
         frame = _last_frame(source, seconds)
         seconds = time.monotonic() - start
-        counts = source.received - before
-        missing = find_missing(source.roles, frame, config) if settled else [source.missing]
+        counts, volume = source.received - before, source.volume - volume
+        lacking = source.missing
+        missing = [lacking] if lacking else find_missing(source.roles, frame, config)
         if not config.detector.model:
             missing.append("no detector: --model FILE.onnx")
         return LiveInfo(
@@ -48,7 +59,7 @@ def describe(config: Config, arguments: Sequence[str] = (), seconds: float = 3.0
             middleware=source.middleware,
             seconds=seconds,
             topics=tuple(
-                _topic(topic, source, counts, seconds)
+                _topic(topic, source, counts[topic.name], volume[topic.name], seconds)
                 for topic in sorted(source.topics.values(), key=lambda t: t.name)
             ),
             lidars=source.roles.lidar_names,
@@ -64,22 +75,28 @@ def describe(config: Config, arguments: Sequence[str] = (), seconds: float = 3.0
 def _last_frame(source: LiveSource, seconds: float) -> Frame | None:
     timer = threading.Timer(seconds, source.stop)
     timer.start()
-    last = deque(source, maxlen=1)
+    last: deque[Frame] = deque(maxlen=1)
+    try:
+        last.extend(source)
+    except KeyboardInterrupt:
+        source.stop()
+    timer.cancel()
     timer.join()
     return last[0] if last else None
 
 
-def _topic(topic: PublishedTopic, source: LiveSource, counts: Counter[str], seconds: float) -> TopicInfo:
+def _topic(topic: PublishedTopic, source: LiveSource, count: int, volume: int, seconds: float) -> TopicInfo:
     heard = topic.name in source.received
+    stream = heard and topic.name not in source.roles.tf_static
     role = source.roles.notes.get(topic.name, "")
     return TopicInfo(
         name=topic.name,
         type=topic.type,
-        count=counts[topic.name] if heard else None,
+        count=count if heard else None,
         frame_id=source.frame_ids.get(topic.name, ""),
-        rate=counts[topic.name] / seconds if heard and topic.name not in source.roles.tf_static else None,
-        pause=None,
-        pause_at=None,
+        rate=count / seconds if stream else None,
+        size=volume / count if count else None,
+        delay=source.delay(topic.name) if stream else None,
         role=f"{role}; {describe_qos(topic)}" if role else "",
     )
 

@@ -16,9 +16,9 @@ import numpy as np
 
 from bevviz.config import Config
 from bevviz.errors import UserError
-from bevviz.frame import Frame, FrameResult, Scene, Source
+from bevviz.frame import Frame, FrameResult, LateResult, Scene, Source
 from bevviz.live.control import Control
-from bevviz.live.encoder import Encoder
+from bevviz.live.encoder import WHOLE, Encoder, Packet
 from bevviz.live.files import Indexer, Saver
 from bevviz.live.flight import FlightRecorder
 from bevviz.live.health import Health, set_nice
@@ -28,11 +28,12 @@ from bevviz.live.settings import AT_START, Settings
 from bevviz.live.triggers import Triggers
 from bevviz.live.viewers import Viewer, remote, server, window
 from bevviz.logging import entities
+from bevviz.perceive import StageLoader
 from bevviz.run import Dropping, Observer, run
 from bevviz.session import Session
 
 LOOK = 1.0  # seconds between two looks at the configuration file and the clock
-ENDING = (signal.SIGINT, signal.SIGTERM)
+ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,6 +70,8 @@ class Live:
         notes: what has to be said.
         observe: leave the pipeline off; only what the robot publishes is logged.
         on_result: called with each result in a thread of its own; when it is too slow the newest wins.
+        loader: has the detector's network already.
+        control: takes orders to save; None: one of its own.
 
     Raises:
         UserError: the detector's model, an output or the blueprint cannot be used.
@@ -83,8 +86,11 @@ class Live:
         *,
         observe: bool = False,
         on_result: Callable[[FrameResult], None] | None = None,
+        loader: StageLoader | None = None,
+        control: Control | None = None,
     ) -> None:
         self.notes = notes
+        self._control = control
         self.on_change: Callable[[Config], None] = lambda config: None  # called in the thread of ``run``
         self.urls: list[str] = []
         self.frames = 0  # logged
@@ -94,12 +100,14 @@ class Live:
         self._changing = threading.Lock()
         self._over = threading.Event()
         self._asked_to_save = False
-        self._looked = 0.0
+        self._looked = self._logged = 0.0  # seconds, monotonic
+        self._states: dict[str, str] = {}  # of the topics, as logged while no frame came
         live = settings.config.live
 
         self._nice(live.nice)
-        self._session = Observing(settings.config) if observe else Session(settings.config)
-        self.encoder = Encoder(self.config, source.scene, outputs.blueprint)
+        self._session = Observing(settings.config) if observe else Session(settings.config, loader=loader)
+        whole = WHOLE if live.viewer_rate is None else 1 / live.viewer_rate
+        self.encoder = Encoder(self.config, source.scene, outputs.blueprint, whole)
         self._indexer = Indexer()
         self._watchers: list[Callable[[FrameResult], None]] = []
         self._saves = ThreadPoolExecutor(1, "save")
@@ -120,7 +128,10 @@ class Live:
         if outputs.save is not None:
             self.saver = Saver(outputs.save, live, self.encoder, self._indexer, notes)
             self._outputs.append(self.saver)
-        self._outputs += [Viewer(program, live.output_queue, self.encoder, notes) for program in programs]
+        sparse = live.viewer_rate is not None
+        self._outputs += [
+            Viewer(program, live.output_queue, self.encoder, notes, sparse=sparse) for program in programs
+        ]
 
     @property
     def config(self) -> Config:
@@ -191,7 +202,8 @@ class Live:
         with ExitStack() as stack:
             stack.callback(_handle, {number: signal.getsignal(number) for number in ENDING})
             stack.callback(self._close)
-            stack.enter_context(Control(self.save, self.notes.warn))
+            if self._control is None:
+                stack.enter_context(Control(self.save, self.notes.warn))
             stack.enter_context(self._signal())
             # A second Ctrl-C must not leave half a file or a viewer behind. Closing takes bounded time.
             stack.callback(_handle, dict.fromkeys(ENDING, signal.SIG_IGN))
@@ -227,6 +239,7 @@ class Live:
             self._reload()
         if jump := self.health.clock_jump():
             self.notes.warn(f"the clock of this machine has jumped by {jump:+.1f} s")
+        self._log_meanwhile()
         if self._shown is not self.config:
             self._shown = self.config
             self.on_change(self._shown)
@@ -235,6 +248,8 @@ class Live:
         for output in self._outputs:
             output.close()
         self._saves.shutdown()
+        if self._indexer.waiting:
+            self.notes.info("the recording gets its index; it is complete already")
         self._indexer.close()
         self.encoder.close()
 
@@ -242,16 +257,33 @@ class Live:
         """Encode a frame once, for every output."""
         drops = {entities.drops(where): float(count) for where, count in self._drops().items()}
         health = self.health.scalars() | drops
-        packet = self.encoder.encode(result, self._source.scene, health, self.notes.take())
-        for output in self._outputs:
-            output.put(packet)
-        self.flight.put(packet)
+        late, states = self._source.overtaken(), self._topic_states()
+        notes, scene = self.notes.take(), self._source.scene
+        self._hand_out(self.encoder.encode(result, scene, health, notes, late, states))
         for watcher in self._watchers:
             watcher(result)
+        self._logged = time.monotonic()
         self.health.logged(result.frame.received)
         self.frames += 1
         if reason := self._triggers.check(result):
             self._save_soon(reason)
+
+    def _log_meanwhile(self) -> None:
+        """What is said while no frame comes is in the log and in the lanes all the same."""
+        since, states = time.monotonic() - self._logged, self._topic_states()
+        if not self.frames or since < LOOK:
+            return
+        if (notes := self.notes.take()) or states != self._states:
+            self._states = states
+            self._hand_out(self.encoder.encode_meanwhile(since, notes, states))
+
+    def _hand_out(self, packet: Packet) -> None:
+        for output in self._outputs:
+            output.put(packet)
+        self.flight.put(packet)
+
+    def _topic_states(self) -> dict[str, str]:
+        return {entities.topic_state(topic): state for topic, state in self._source.states.items()}
 
     def _drops(self) -> dict[str, int]:
         drops = {"source": self._source.dropped, **self._dropping.dropped}
@@ -393,6 +425,16 @@ class Thinned:
     def dropped(self) -> int:
         """That the source itself has left out."""
         return int(getattr(self._source, "dropped", 0))
+
+    @property
+    def states(self) -> Mapping[str, str]:
+        """How each topic does, where the source has topics."""
+        return getattr(self._source, "states", {})
+
+    def overtaken(self) -> tuple[LateResult, ...]:
+        """The robot's own results that came too late for their frames, since the last call."""
+        overtaken = getattr(self._source, "overtaken", None)
+        return () if overtaken is None else tuple(overtaken())
 
     def stop(self) -> None:
         stop = getattr(self._source, "stop", None)

@@ -13,7 +13,7 @@ AT_START = (
     "live.log_queue",
     "live.output_queue",
     "live.held",
-    "live.viewer_memory",
+    "live.viewer_",
     "live.split_",
 )  # fixed once it runs
 
@@ -49,6 +49,14 @@ class Settings:
             UserError: as ``bevviz.config.load``.
         """
         return load(self.file, [*self._settings, *more], self._preset)
+
+    def take(self, more: Sequence[str]) -> None:
+        """More settings, before anything runs with them.
+
+        Raises:
+            UserError: one of them is wrong; nothing is changed.
+        """
+        self.keep(self.read(more), more)
 
     def keep(self, config: Config, more: Sequence[str] = ()) -> None:
         self.config = config

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -12,21 +12,26 @@ from typing import Any
 from bevviz.closing import Closing
 from bevviz.config import Config, SourceConfig, stage_topics
 from bevviz.errors import UserError
-from bevviz.frame import Frame, Intrinsics, Scene
+from bevviz.frame import Frame, Intrinsics, LateResult, Scene
+from bevviz.live.watch import SILENCE, Watch
+from bevviz.queues import NewestQueue
 from bevviz.ros.encode import typestore
-from bevviz.ros.graph import PublishedTopic, matched_qos, mismatches, published_topics
+from bevviz.ros.graph import PublishedTopic, full_name, matched_qos, mismatches, published_topics
 from bevviz.ros.messages import MessageError, read_header
 from bevviz.ros.node import Node
-from bevviz.ros.roles import Roles, Topic, find_roles
+from bevviz.ros.roles import STAGE_KINDS, Roles, Topic, find_roles, foreign
 from bevviz.ros.typesupport import message_type
+from bevviz.run import BURST
 from bevviz.sync.feed import Handler, make_handlers
-from bevviz.sync.synchronizer import Synchronizer, blindness
+from bevviz.sync.synchronizer import OVERTAKEN, Synchronizer, blindness
 
 LOOK = 0.5  # seconds between two looks at the graph
 TICK = 0.05  # seconds between two looks at the clouds that have waited long enough
 SETTLE = 1.0  # seconds without a change of roles after which the scene is taken as complete
-PATIENCE = 3.0  # seconds that a topic without messages may delay the scene
-SILENCE = 2.0  # seconds without a cloud that are told
+PATIENCE = 3.0  # seconds that what is lacking may delay the scene
+FIRST = 1.0  # seconds of a subscription in which messages are lost as publishers are met
+CHANGING = "the topics are still changing"
+REMEDY = "a larger segment of the publisher's helps, see 'Clouds were lost on the way' in docs/live.md"
 
 KINDS = {
     "sensor_msgs/msg/PointCloud2",
@@ -35,6 +40,7 @@ KINDS = {
     "sensor_msgs/msg/CameraInfo",
     "tf2_msgs/msg/TFMessage",
     "nav_msgs/msg/Odometry",
+    "sensor_msgs/msg/Imu",
     "vision_msgs/msg/Detection2DArray",
     "vision_msgs/msg/Detection3DArray",
 }
@@ -73,8 +79,8 @@ class _Subscription:
 class LiveSource(Closing):
     """The frames of a robot, as they become complete, until ``stop``.
 
-    Messages are received, decoded and synchronised in a thread of their own. It hands over through a slot
-    for one frame: whoever iterates gets the newest one, and those that nobody came for are counted in
+    Messages are received, decoded and synchronised in a thread of their own. It hands over through a short
+    queue: whoever iterates gets the newest frames, and those that nobody came for are counted in
     ``dropped``. What has to be said meanwhile (a lost publisher, a new calibration) goes to ``tell``.
 
     Args:
@@ -97,25 +103,22 @@ class LiveSource(Closing):
     ) -> None:
         self.config = config
         self.roles = Roles()
-        self.received: Counter[str] = Counter()  # topic -> messages
         self.lost: Counter[str] = Counter()  # topic -> messages that the middleware could not deliver
         self.frame_ids: dict[str, str] = {}  # of each sensor topic's first message
         self.topics: dict[str, PublishedTopic] = {}  # all that others publish
-        self.dropped = 0  # frames that were overtaken by a newer one before anybody took them
-        self._tell: Callable[[str], None] = tell or (lambda text: None)
-        self._damaged: Counter[str] = Counter()
-        self._first_damage: dict[str, str] = {}
-        self._notes: dict[str, str] = {}  # what a sentence is about -> the sentence, while it holds
+        self._watch = Watch(tell or (lambda text: None))
+        self._clock_resets = 0  # that were told
         self._known: dict[str, PublishedTopic] = {}  # that could play a role, or have
         self._subscriptions: dict[str, _Subscription] = {}
         self._handlers: dict[str, Handler[LiveMessage]] = {}
         self._sync = Synchronizer(self.roles, config)
-        self._changed = self._last_cloud = time.monotonic()
+        self._begun = self._changed = self._last_cloud = time.monotonic()
         self._settled = threading.Event()
+        self._complete = False  # the scene is known
         self._knowledge = threading.RLock()  # of all that the receiving thread changes piece by piece
-        self._handover = threading.Condition()
-        self._frame: Frame | None = None
+        self._handover: NewestQueue[Frame] = NewestQueue(BURST, catch_up=True)
         self._frames = 0
+        self._numbers: deque[tuple[int, int]] = deque(maxlen=OVERTAKEN)  # stamp and index of the last frames
         self._ended = False
 
         self._node = Node(arguments, on_end=self.stop, name=name)
@@ -130,9 +133,8 @@ class LiveSource(Closing):
 
     def stop(self) -> None:
         """End the iteration, from any thread."""
-        with self._handover:
-            self._ended = True
-            self._handover.notify_all()
+        self._ended = True
+        self._handover.close()
         self._settled.set()
 
     @property
@@ -147,6 +149,11 @@ class LiveSource(Closing):
     @property
     def middleware(self) -> str:
         return self._node.middleware
+
+    @property
+    def dropped(self) -> int:
+        """Frames that were overtaken by newer ones before anybody took them."""
+        return self._handover.dropped
 
     @property
     def tree(self) -> Mapping[str, str]:
@@ -165,21 +172,34 @@ class LiveSource(Closing):
     @property
     def missing(self) -> str:
         """What ``wait`` waits for, in one sentence; empty once the scene is known."""
-        if self._settled.is_set():
-            return ""
-        present = self.topics
-        if not present:
-            return (
+        with self._knowledge:
+            return "" if self._complete else "; ".join(self._lacking())
+
+    def _lacking(self) -> list[str]:
+        """What a first frame would lack, the worst first."""
+        if not self.topics:
+            return [
                 f"nothing is published on ROS domain {self._node.domain}: is the robot running, with this "
                 f"ROS_DOMAIN_ID, and not limited to its own machine (ROS_AUTOMATIC_DISCOVERY_RANGE)?"
-            )
-        stated = {self._node.resolve(topic) for topic in self.config.source.lidar_topics}
-        if absent := stated - present.keys():
-            return f"nobody publishes {', '.join(sorted(absent))}, which source.lidar_topics states"
+            ]
+        misstated = list(self._misstated().values())
         if not self.roles.lidars:
-            return self.roles.no_lidar or "the topics are still changing"
-        silent = [topic for topic in self.roles.lidars if not self.received[topic]]
-        return f"no message on {', '.join(silent)} yet" if silent else "the topics are still changing"
+            return misstated or [self.roles.no_lidar or "no LiDAR yet"]
+        used = [*self.roles.lidars, *(camera.topic for camera in self.roles.cameras)]
+        silent = [topic for topic in used if not self.received[topic]]
+        none = [f"no message on {', '.join(silent)} yet"] if silent else []
+        return [*misstated, *none, *self._sync.lacking()] or [CHANGING]
+
+    def _misstated(self) -> dict[str, str]:
+        """Topics that the configuration states and that nobody publishes, or with another type."""
+        found = {}
+        for name, (key, kinds) in _stated(self.config, self._node.resolve).items():
+            topic = self.topics.get(name)
+            if topic is None:
+                found[name] = f"nobody publishes {name}, which {key} states"
+            elif topic.type.rpartition("/")[2] not in kinds:
+                found[name] = f"{name} is a {topic.type}, but {key} takes {' or '.join(kinds)}"
+        return found
 
     @property
     def scene(self) -> Scene:
@@ -193,27 +213,51 @@ class LiveSource(Closing):
     @property
     def warnings(self) -> Sequence[str]:
         with self._knowledge:
-            damaged = [
-                f"{count} message(s) of {topic} could not be used, the first: {self._first_damage[topic]}"
-                for topic, count in self._damaged.items()
-            ]
             lost = [
                 f"{count} message(s) of {topic} were lost on the way, see docs/live.md"
                 for topic, count in self.lost.items()
             ]
             report = self._sync.report
-            blind = blindness(self.config, self.roles, report) if self._settled.is_set() else []
-            return [*self._notes.values(), *lost, *damaged, *blind, *report.warnings()]
+            blind = blindness(self.config, self.roles, report) if self._complete else []
+            return [*self._watch.warnings, *lost, *blind, *report.warnings()]
+
+    @property
+    def received(self) -> Counter[str]:
+        """Messages so far, by topic."""
+        return self._watch.received
+
+    @property
+    def volume(self) -> Counter[str]:
+        """Bytes so far, by topic."""
+        return self._watch.volume
+
+    def delay(self, topic: str) -> float | None:
+        """Seconds from a stamp to its receipt, the median of the last ones; None: not known."""
+        with self._knowledge:
+            return self._sync.clocks.lag(topic)
+
+    @property
+    def states(self) -> Mapping[str, str]:
+        """How each topic that plays a role does."""
+        with self._knowledge:
+            return self._watch.states({name: name in self.topics for name in self._subscriptions})
+
+    def overtaken(self) -> tuple[LateResult, ...]:
+        """The robot's own results that no frame has taken, since the last call; from any thread."""
+        with self._knowledge:
+            numbers = dict(self._numbers)
+            return tuple(
+                replace(late, index=numbers[late.frame_stamp])
+                for late in self._sync.overtaken()
+                if late.frame_stamp in numbers
+            )
 
     def __iter__(self) -> Iterator[Frame]:
-        while True:
-            with self._handover:
-                self._handover.wait_for(lambda: self._ended or self._frame is not None)
-                frame, self._frame = self._frame, None
-            self._check()
-            if frame is None:
-                return
+        for frame in self._handover:
+            if self._ended:
+                break
             yield frame
+        self._check()
 
     def _check(self) -> None:
         """Raise here what ended the receiving thread."""
@@ -235,8 +279,7 @@ class LiveSource(Closing):
 
     def _receive(self, topic: str, kind: str, data: bytes, info: dict[str, Any]) -> None:
         message = LiveMessage(topic, kind, info["received_timestamp"] or time.time_ns(), data)
-        first = not self.received[topic]
-        self.received[topic] += 1
+        first = self._watch.add(topic, len(data))
         before = self._sync.intrinsics.get(topic)
         try:
             if first and kind.endswith(("PointCloud2", "Image")):
@@ -244,9 +287,9 @@ class LiveSource(Closing):
                 self._assign()
             if (handler := self._handlers.get(topic)) is not None:
                 handler(message)
+            self._watch.usable(topic)
         except MessageError as error:
-            self._damaged[topic] += 1
-            self._first_damage.setdefault(topic, str(error))
+            self._watch.unusable(topic, str(error))
         if before is not None:
             self._compare(topic, before, self._sync.intrinsics[topic])
         if topic in self.roles.lidars:
@@ -256,56 +299,87 @@ class LiveSource(Closing):
     def _compare(self, topic: str, before: Intrinsics, after: Intrinsics) -> None:
         if (before.K != after.K).any() or before.D.tolist() != after.D.tolist():
             old, new = before.K[0, 0], after.K[0, 0]
-            self._tell(f"the calibration on {topic} has changed: fx {old:.1f} -> {new:.1f}")
+            self._watch.tell(f"the calibration on {topic} has changed: fx {old:.1f} -> {new:.1f}")
 
     def _tick(self) -> None:
         self._deliver(self._sync.ready(time.time_ns()))
 
     def _deliver(self, frames: Iterable[Frame]) -> None:
         for frame in frames:
-            if not self._settled.is_set():
+            if not self._complete:
                 continue
-            with self._handover:
-                self.dropped += self._frame is not None
-                self._frame = replace(frame, index=self._frames)
-                self._frames += 1
-                self._handover.notify()
+            self._numbers.append((frame.stamp, self._frames))
+            self._handover.put(replace(frame, index=self._frames))
+            self._frames += 1
 
     # --- the graph -----------------------------------------------------------------------------
 
     def _look(self) -> None:
         self.topics = published_topics(self._node)
         known = {name: topic for name, topic in self._known.items() if self.received[name]}
-        self._known = known | {name: t for name, t in self.topics.items() if t.type in KINDS}
+        self._known = known | {name: topic for name, topic in self.topics.items() if _concerns(topic)}
         self._assign()
         heard = self._subscriptions.keys() & self.topics.keys()
         self._sync.absent = frozenset(self._handlers.keys() - heard)
         for name, subscription in self._subscriptions.items():
-            topic = self.topics.get(name)
-            gone = f"{name} has no publisher any more; waiting for it to come back"
-            self._note(name, gone if topic is None else "", f"{name} is published again")
-            unheard = "; ".join(mismatches(topic, subscription.qos)) if topic is not None else ""
-            self._note(f"{name} quality", unheard, f"{name}: every publisher is received")
-        silent = self._settled.is_set() and time.monotonic() - self._last_cloud > SILENCE
-        quiet = f"no cloud for {SILENCE:.0f} s on {', '.join(self.roles.lidars)}"
-        self._note("silence", quiet if silent else "", "the clouds are back")
-        if not self._settled.is_set() and self._is_settled():
+            self._look_at(name, subscription)
+        self._look_at_frames()
+        if not self._complete and self._is_settled():
+            self._complete = True
             self._settled.set()
 
-    def _note(self, about: str, text: str, over: str) -> None:
-        """Tell ``text`` when it begins to hold, and ``over`` when it is empty again."""
-        before = self._notes.pop(about, "")
-        if text:
-            self._notes[about] = text
-        if text != before:
-            self._tell(text or over)
+    def _look_at(self, name: str, subscription: _Subscription) -> None:
+        """At a topic that plays a role."""
+        topic, watch = self.topics.get(name), self._watch
+        gone = f"{name} has no publisher any more; waiting for it to come back"
+        watch.note(f"{name} gone", gone if topic is None else "", f"{name} is published again")
+        unheard = "; ".join(mismatches(topic, subscription.qos)) if topic is not None else ""
+        watch.note(f"{name} quality", unheard, f"{name}: every publisher is received")
+        silent = topic is not None and name not in self.roles.lidars and watch.silent_for(name) > 0
+        quiet = f"no message on {name} for {SILENCE:.0f} s, though it has a publisher"
+        watch.note(f"{name} silence", quiet if silent else "", f"{name} is back")
+        sensors = {*self.roles.lidars, *(camera.topic for camera in self.roles.cameras)}
+        several = topic is not None and name in sensors and len(topic.publishers) > 1
+        names = ", ".join(map(full_name, topic.publishers)) if topic is not None else ""
+        mixed = f"{name} has several publishers, taken for one sensor: {names}; remap all but one"
+        watch.note(f"{name} publishers", mixed if several else "", f"{name} has one publisher")
+        if self.lost[name]:
+            watch.once(f"messages of {name} are lost on the way: {REMEDY}")
+
+    def _look_at_frames(self) -> None:
+        """At what the synchroniser found odd."""
+        watch, report = self._watch, self._sync.report
+        for name in report.overtaken:
+            watch.once(f"{name} comes when its frame has gone on: shown at its own stamp")
+        for name in report.unstamped:
+            watch.once(f"{name}: no stamp in the header, time of receipt is used instead")
+        for camera, reason in report.first_undecodable.items():
+            watch.once(f"camera '{camera}': an image could not be decoded: {reason}")
+        if report.resets > self._clock_resets:
+            watch.tell("the stamps of the clouds jumped back: a simulation or a bag that began anew")
+            self._clock_resets = report.resets
+        twin = (
+            f"another node is called {self._node.node.get_fully_qualified_name()}: orders for one may reach "
+            f"the other; --ros-args -r __node:=bevviz_2 gives this one another name"
+        )
+        watch.note("name", "" if self._node.is_alone else twin, "no other node has the name of this one now")
+        silent = self._complete and time.monotonic() - self._last_cloud > SILENCE
+        quiet = f"no cloud for {SILENCE:.0f} s on {', '.join(self.roles.lidars)}"
+        watch.note("silence", quiet if silent else "", "the clouds are back")
+        misstated = self._misstated() if time.monotonic() - self._begun > SETTLE + LOOK else {}
+        for name in _stated(self.config, self._node.resolve):
+            watch.note(
+                f"{name} stated", misstated.get(name, ""), f"{name} is there, as the configuration states"
+            )
 
     def _is_settled(self) -> bool:
         calm = time.monotonic() - self._changed
-        used = [*self.roles.lidars, *(camera.topic for camera in self.roles.cameras)]
-        complete = all(self.received[topic] for topic in used)
-        driven = any(self.received[topic] for topic in self.roles.lidars)
-        return driven and calm > (SETTLE if complete else PATIENCE)
+        if calm < SETTLE or not any(self.received[topic] for topic in self.roles.lidars):
+            return False
+        lacking = [text for text in self._lacking() if text != CHANGING]
+        if lacking and calm > PATIENCE:
+            self._watch.tell(f"not waited for any longer: {'; '.join(lacking)}")
+        return not lacking or calm > PATIENCE
 
     def _assign(self) -> None:
         """Give the topics their roles, and listen to those that play one."""
@@ -318,12 +392,13 @@ class LiveSource(Closing):
         try:
             roles = find_roles(*_without_absent(topics, stated), stages)
         except UserError as error:
-            self._note("roles", str(error), "")
+            self._watch.note("roles", str(error))
             return
-        self._note("roles", "", "the topics fit the configuration")
+        self._watch.note("roles", "", "the topics fit the configuration")
         if replace(roles, notes={}) != replace(self.roles, notes={}):
             self._changed = time.monotonic()
-            former, self._sync = self._sync, Synchronizer(roles, self.config)
+            results = {*roles.robot_detections_2d, *roles.robot_detections_3d} - set(stages.values())
+            former, self._sync = self._sync, Synchronizer(roles, self.config, beside=results)
             self._sync.take_over(former)
             self._handlers = make_handlers(self._sync, roles, LiveMessage.decode)
         self.roles = roles
@@ -339,7 +414,7 @@ class LiveSource(Closing):
         try:
             kind = message_type(topic.type)
         except UserError as error:
-            self._note(f"{topic.name} type", f"{topic.name} is not received: {error}", "")
+            self._watch.note(f"{topic.name} type", f"{topic.name} is not received: {error}")
             return
         qos = matched_qos(topic.publishers, topic.type.rpartition("/")[2])
         former = self._subscriptions.get(topic.name)
@@ -352,7 +427,11 @@ class LiveSource(Closing):
             with self._knowledge:
                 self._receive(topic.name, topic.type, data, info)
 
+        since = time.monotonic()
+
         def count_lost(event: Any) -> None:
+            if time.monotonic() - since < FIRST:
+                return
             with self._knowledge:
                 self.lost[topic.name] += event.total_count_change
 
@@ -365,6 +444,27 @@ class LiveSource(Closing):
             kind, topic.name, receive, qos, event_callbacks=events, raw=True
         )
         self._subscriptions[topic.name] = _Subscription(handle, topic.type, qos)
+
+
+def _concerns(topic: PublishedTopic) -> bool:
+    """Whether a topic can play a role, or holds what could, in a form that nothing here reads."""
+    return topic.type in KINDS or bool(foreign(Topic(topic.name, topic.type, None, "")))
+
+
+def _stated(config: Config, resolve: Callable[[str], str]) -> dict[str, tuple[str, tuple[str, ...]]]:
+    """The topics that the configuration names: where, and which types they may have."""
+    source, images = _resolved(config.source, resolve), ("Image", "CompressedImage")
+    found: dict[str, tuple[str, tuple[str, ...]]] = {}
+    for key, names, kinds in (
+        ("source.lidar_topics", source.lidar_topics, ("PointCloud2",)),
+        ("source.camera_topics", source.camera_topics, images),
+        ("source.camera_info_topics", source.camera_info_topics, images),
+        ("source.camera_info_topics", source.camera_info_topics.values(), ("CameraInfo",)),
+        ("source.odometry_topic", filter(None, [source.odometry_topic]), ("Odometry",)),
+    ):
+        found |= dict.fromkeys(names, (key, kinds))
+    stages = stage_topics(config)
+    return found | {resolve(name): (key, (STAGE_KINDS[key],)) for key, name in stages.items()}
 
 
 def _resolved(config: SourceConfig, resolve: Callable[[str], str]) -> SourceConfig:

@@ -61,7 +61,7 @@ def server(port: int, bind: str, memory: float) -> tuple[Program, str]:
     check_port(port)
     data_port = free_port(FIRST_DATA_PORT, but=port)
     command = [rerun_cli.program(), "-", "--serve-web", "--bind", address, "--port", str(data_port)]
-    command += ["--web-viewer-port", str(port), "--server-memory-limit", f"{memory:.0f}MB"]
+    command += ["--web-viewer-port", str(port), "--server-memory-limit", f"{memory:.0f}MB", "--newest-first"]
     for origin in origins(address, port):
         command += ["--cors-allow-origin", origin]
     return Program("web", rerun_cli.tied(command)), viewer_address(host_for(address), port, data_port)
@@ -79,14 +79,24 @@ def remote(url: str, recording_id: str) -> Program:
 
 
 class Viewer(Output):
-    """Feeds one program."""
+    """Feeds one program.
 
-    def __init__(self, program: Program, queue: int, encoder: Encoder, notes: Notes) -> None:
+    ``sparse``: with whole packets alone, for whoever is too slow for all of them.
+    """
+
+    def __init__(
+        self, program: Program, queue: int, encoder: Encoder, notes: Notes, *, sparse: bool = False
+    ) -> None:
         super().__init__(program.name, queue)
+        self._sparse = sparse
         self._program = program
         self._encoder, self._notes = encoder, notes
         self._process = self._start()
         self._thread.start()
+
+    def put(self, packet: Packet) -> None:
+        if packet.whole or not self._sparse:
+            super().put(packet)
 
     def close(self, patience: float = 2.0) -> None:
         """Hand over what waits, if that is soon done. A window stays open, for the user to close."""

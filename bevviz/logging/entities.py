@@ -10,6 +10,7 @@ from bevviz.frame import AnomalyKind, ClusterState, DetectionState
 # --- timelines ---------------------------------------------------------------------------------
 
 STAMP = "stamp"  # sensor time, from the header of the cloud
+TRIED = "tried"  # the same, of a frame as other values make it, in bevviz open
 FRAME = "frame"  # sequence
 VERSION = "version"  # sequence: of the configuration, in bevviz tune
 RECEIVED = "received"  # when the cloud was received, or logged into the bag
@@ -19,6 +20,9 @@ RECEIVED = "received"  # when the cloud was received, or logged into the bag
 WORLD = "/world"
 FUSED = "/world/fused"
 MEASURED = "/world/fused/measured"
+MISSED = "/world/missed"
+FALSE = "/world/false"
+UNNAMED = "/world/unnamed"
 FRUSTUMS = "/world/frustums"
 GRID = "/world/bev"
 TRUTH = "/world/ground_truth"
@@ -50,10 +54,13 @@ COMPARE_ABOUT = "/compare/about"
 COMPARE_LOG = "/compare/log"
 COMPARE_STATES = "/compare/states"
 CALIB = "/calib"
+EVALUATE = "/evaluate"
+EVALUATE_ABOUT = "/evaluate/about"
+EVALUATE_LOG = "/evaluate/log"
 
 # Names that no sensor can have, as they are something else where it has its entities.
 RESERVED = frozenset(
-    {path.split("/")[2] for path in (FUSED, FRUSTUMS, GRID, TRUTH, TRACKS)}
+    {path.split("/")[2] for path in (FUSED, FRUSTUMS, GRID, TRUTH, TRACKS, MISSED, FALSE, UNNAMED)}
     | {path.split("/")[2] for path in (COMPARE_ABOUT, COMPARE_LOG, COMPARE_STATES)}
     | {"objects", "count"}  # of /compare
     | {"pipeline"}  # of /explain/states
@@ -126,6 +133,11 @@ def state(*lane: str) -> str:
     return "/".join((STATES, *lane))
 
 
+def topic_state(topic: str) -> str:
+    """Whether its messages come, and can be used."""
+    return f"{STATES}/topics{_topic(topic)}"
+
+
 def class_state(camera: str, class_name: str) -> str:
     """What became of the best detection of the class."""
     return state(camera, _part(class_name))
@@ -151,6 +163,15 @@ def difference_count(change: str) -> str:
 
 def difference_state(class_name: str) -> str:
     return f"{COMPARE_STATES}/{_part(class_name)}"
+
+
+def judged(what: str) -> str:
+    """Objects that are true, false or missed."""
+    return f"{EVALUATE}/objects/{what}"
+
+
+def judged_count(what: str) -> str:
+    return f"{EVALUATE}/count/{what}"
 
 
 def sweep(metric: str) -> str:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import rerun as rr
 
 from bevviz import geometry
 from bevviz.config import BevConfig
-from bevviz.frame import F64, Frame, LabelledBoxes2D, LabelledBoxes3D
+from bevviz.frame import F64, Frame, LabelledBoxes2D, LabelledBoxes3D, LateResult
 from bevviz.logging import entities
 from bevviz.logging.bev import footprints, seen_from_above
 from bevviz.logging.camera import over_image
@@ -15,6 +17,7 @@ from bevviz.logging.pieces import OUTLINE, boxes2d, boxes3d, scored, transform
 from bevviz.logging.writer import Writer
 
 Color = tuple[int, int, int]
+Put = Callable[..., None]  # of a Writer: ``put`` or ``write``
 
 _TRUTH_COLOR = (215, 215, 215)
 _ROBOT_COLOR = (255, 210, 0)
@@ -34,23 +37,44 @@ def log_truth_looks(to: Writer) -> None:
 
 def log_truth(to: Writer, frame: Frame, config: BevConfig) -> None:
     if frame.truth is not None and len(frame.truth.boxes):
-        _log_boxes(to, entities.TRUTH, frame.truth, None)
-        _log_outlines(to, entities.overlay("ground_truth"), frame, frame.truth, config, _TRUTH_COLOR)
+        _log_boxes(to.put, entities.TRUTH, frame.truth, None)
+        path = entities.overlay("ground_truth")
+        _log_outlines(to.put, path, frame.pose, frame.truth, config, _TRUTH_COLOR)
 
 
 def log_robot(to: Writer, frame: Frame, config: BevConfig) -> None:
     """Under the names of its topics."""
     for labelled in frame.robot_boxes:
         if len(labelled.boxes):
-            _log_boxes(to, entities.robot(labelled.topic), labelled, _ROBOT_COLOR)
-            _log_outlines(to, entities.robot_overlay(labelled.topic), frame, labelled, config, _ROBOT_COLOR)
+            _log_boxes(to.put, entities.robot(labelled.topic), labelled, _ROBOT_COLOR)
+            path = entities.robot_overlay(labelled.topic)
+            _log_outlines(to.put, path, frame.pose, labelled, config, _ROBOT_COLOR)
     for found in frame.robot_detections:
         if len(found.xyxy):
-            _log_image_boxes(to, found)
+            _log_image_boxes(to.put, found)
 
 
-def _log_boxes(to: Writer, path: str, labelled: LabelledBoxes3D, color: Color | None) -> None:
-    to.put(
+def log_late(to: Writer, late: LateResult, config: BevConfig) -> None:
+    """What came too late for its frame, at its own stamp, until there is more or ``forget_late``."""
+    boxes = late.boxes
+    to.set_time(late.index, boxes.stamp, boxes.received)
+    if isinstance(boxes, LabelledBoxes2D):
+        _log_image_boxes(to.write, boxes)
+        return
+    _log_boxes(to.write, entities.robot(boxes.topic), boxes, _ROBOT_COLOR)
+    path = entities.robot_overlay(boxes.topic)
+    if not _log_outlines(to.write, path, late.pose, boxes, config, _ROBOT_COLOR):
+        to.write(path, rr.Clear(recursive=False))
+
+
+def forget_late(to: Writer, topic: str) -> None:
+    """Nothing of this topic came for a long time."""
+    for path in (entities.robot(topic), entities.robot_overlay(topic)):
+        to.write(path, rr.Clear(recursive=False))
+
+
+def _log_boxes(put: Put, path: str, labelled: LabelledBoxes3D, color: Color | None) -> None:
+    put(
         path,
         transform(_pose(labelled)),
         boxes3d(
@@ -62,9 +86,9 @@ def _log_boxes(to: Writer, path: str, labelled: LabelledBoxes3D, color: Color | 
     )
 
 
-def _log_image_boxes(to: Writer, found: LabelledBoxes2D) -> None:
+def _log_image_boxes(put: Put, found: LabelledBoxes2D) -> None:
     """Under /robot, but in the space of the camera's image, so that it can be shown over it."""
-    to.put(
+    put(
         entities.robot(found.topic),
         *([over_image(found.camera)] if found.camera else []),
         boxes2d(found.xyxy, scored(found.labels, found.scores), colors=[_ROBOT_COLOR], draw_order=25.0),
@@ -72,16 +96,16 @@ def _log_image_boxes(to: Writer, found: LabelledBoxes2D) -> None:
 
 
 def _log_outlines(
-    to: Writer, path: str, frame: Frame, labelled: LabelledBoxes3D, config: BevConfig, color: Color
-) -> None:
-    """Boxes seen from above, over the bird's-eye image; only those whose centre is in it."""
-    points_from_boxes = geometry.inverse(frame.pose) @ _pose(labelled)
+    put: Put, path: str, pose: F64, labelled: LabelledBoxes3D, config: BevConfig, color: Color
+) -> bool:
+    """Boxes seen from above, over the bird's-eye image; only those whose centre is in it. False: none is."""
+    points_from_boxes = geometry.inverse(pose) @ _pose(labelled)
     reach = np.array([config.range_x, config.range_y], np.float32)
     inside = (np.abs(geometry.apply(points_from_boxes, labelled.boxes.center)[:, :2]) < reach).all(axis=1)
     if not inside.any():
-        return
+        return False
     outlines = footprints(geometry.corners(labelled.boxes)[inside])
-    to.put(
+    put(
         path,
         rr.LineStrips2D(
             seen_from_above(config, points_from_boxes, outlines),
@@ -92,6 +116,7 @@ def _log_outlines(
             draw_order=10.0,
         ),
     )
+    return True
 
 
 def _pose(labelled: LabelledBoxes3D) -> F64:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from types import MappingProxyType
 
@@ -11,7 +11,7 @@ import rerun as rr
 
 from bevviz.anomalies import Onsets
 from bevviz.config import Config
-from bevviz.frame import CameraResult, Frame, FrameResult, Intrinsics, Scene
+from bevviz.frame import CameraResult, Frame, FrameResult, Intrinsics, LateResult, Scene
 from bevviz.logging import entities
 from bevviz.logging.annotations import log_world
 from bevviz.logging.anomalies import log_anomalies, log_anomalies_looks
@@ -27,14 +27,16 @@ from bevviz.logging.cloud import log_cloud, log_cloud_looks, log_ground, log_obs
 from bevviz.logging.clusters import log_clusters, log_clusters_looks
 from bevviz.logging.decisions import log_decisions
 from bevviz.logging.frustums import log_frustums
-from bevviz.logging.health import log_health
-from bevviz.logging.labelled import log_robot, log_truth, log_truth_looks
+from bevviz.logging.health import Rates, log_health
+from bevviz.logging.labelled import forget_late, log_late, log_robot, log_truth, log_truth_looks
 from bevviz.logging.objects import log_objects, log_objects_looks
 from bevviz.logging.origin import log_origin
 from bevviz.logging.pieces import transform
 from bevviz.logging.states import COLORS, StateLanes, states_of, track_states
 from bevviz.logging.tracks import Lanes, log_speeds, log_tracks, log_tracks_looks
 from bevviz.logging.writer import Writer
+
+STALE = 3_000_000_000  # nanoseconds that the newest late result of the robot is shown
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,7 +61,8 @@ class Logger(Writer):
         scene: names of the sensors.
         root: entity that everything goes under. With one, this is what else was made of frames that
             another logger writes: what the sensors and the robot brought is not written twice.
-        wait: as of ``Writer``.
+        wait, stamps: as of ``Writer``.
+        inputs: write what the sensors and the robot brought; default: without a root.
     """
 
     def __init__(
@@ -69,8 +72,11 @@ class Logger(Writer):
         scene: Scene,
         root: str = "",
         wait: float = 0.0,
+        stamps: Sequence[str] = (entities.STAMP,),
+        inputs: bool | None = None,
     ) -> None:
-        super().__init__(recording, root, wait)
+        super().__init__(recording, root, wait, stamps)
+        self._inputs = not root if inputs is None else inputs
         self._config = config
         self._scene = scene
         self._intrinsics: dict[str, Intrinsics] = {}
@@ -78,6 +84,8 @@ class Logger(Writer):
         self._state_lanes = StateLanes(COLORS)
         self._onsets = Onsets()
         self._last: Frame | None = None
+        self._rates = Rates()
+        self._late: dict[str, int] = {}  # topic of the robot's results that come late -> stamp of the newest
 
     @property
     def context(self) -> Context:
@@ -125,6 +133,9 @@ class Logger(Writer):
         result: FrameResult,
         health: Mapping[str, float] = MappingProxyType({}),
         notes: Sequence[tuple[str, str]] = (),
+        late: Sequence[LateResult] = (),
+        states: Mapping[str, str] = MappingProxyType({}),
+        beside: Callable[[], object] | None = None,
     ) -> None:
         """Everything of one frame. What the frame before had and this one has not is cleared.
 
@@ -132,11 +143,17 @@ class Logger(Writer):
             result: the frame and what was made of it.
             health: further scalars, by entity.
             notes: further lines of the log: level and text.
+            late: what the robot has published since and belongs to frames before.
+            states: of further lanes, by entity.
+            beside: puts something more into the frame.
         """
         frame = result.frame
+        for found in late:
+            self._late[found.boxes.topic] = found.boxes.stamp
+            log_late(self, found, self._config.bev)
         self.begin(frame.index, frame.stamp, frame.received)
         self.put(entities.sensor(frame.lidar), transform(frame.pose))
-        if not self.root:
+        if self._inputs:
             self._log_input(result)
         self._log_lidar_results(result)
         for camera in result.cameras:
@@ -150,10 +167,25 @@ class Logger(Writer):
             log_grid(self, result, result.bev)
         log_decisions(self, result, notes)
         log_anomalies(self, result, self._onsets.of(result.anomalies))
-        self._log_states(result)
-        log_health(self, result, self._last, health)
+        self._log_states(result, states)
+        self._rates.add(frame)
+        log_health(self, result, self._last, self._rates, health)
+        if beside is not None:
+            beside()
         self.end()
         self._last = frame
+
+    def log_meanwhile(
+        self, seconds: float, notes: Sequence[tuple[str, str]], states: Mapping[str, str]
+    ) -> None:
+        """What is to be said while no frame comes, ``seconds`` after the last one was received."""
+        if self._last is None:
+            return
+        later = round(seconds * 1e9)
+        last = self._last
+        self.set_time(last.index, last.stamp + later, last.received + later if last.received else 0)
+        self.lines(entities.EXPLAIN_LOG, notes)
+        self._state_lanes.log(self, {**self._state_lanes.states, **states})
 
     def _log_input(self, result: FrameResult) -> None:
         """What the sensors and the robot brought."""
@@ -166,6 +198,10 @@ class Logger(Writer):
                 self._log_intrinsics(camera.camera.name, camera.camera.intrinsics)
         log_truth(self, frame, config.bev)
         log_robot(self, frame, config.bev)
+        for topic, stamp in list(self._late.items()):
+            if frame.stamp - stamp > STALE:
+                del self._late[topic]
+                forget_late(self, topic)
 
     def _log_intrinsics(self, name: str, intrinsics: Intrinsics) -> None:
         """Where they are new."""
@@ -193,8 +229,8 @@ class Logger(Writer):
         if self._config.logging.projected_points:
             log_projected_points(self, result)
 
-    def _log_states(self, result: FrameResult) -> None:
-        states = states_of(result)
+    def _log_states(self, result: FrameResult, more: Mapping[str, str]) -> None:
+        states = {**states_of(result), **more}
         rows = self._track_lanes.update(result.tracks)
         if result.tracks is not None:
             log_speeds(self, result.tracks, rows)

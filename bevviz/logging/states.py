@@ -28,6 +28,9 @@ COLORS: Mapping[str, Color] = {
     "taken": (150, 120, 220),
     "too far": (110, 130, 160),
     "not fused": (110, 110, 120),
+    "silent": (210, 70, 70),
+    "unusable": (210, 70, 70),
+    "no publisher": (210, 70, 70),
 }
 
 

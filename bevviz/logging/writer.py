@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping, Sequence, Set
 
 import numpy as np
 import rerun as rr
@@ -12,7 +12,7 @@ import rerun as rr
 from bevviz.closing import Closing
 from bevviz.logging import entities
 
-STAMPS = (entities.STAMP, entities.RECEIVED)  # timelines in nanoseconds; the others count
+STAMPS = (entities.STAMP, entities.TRIED, entities.RECEIVED)  # timelines in nanoseconds; the others count
 WAIT = 1.0  # seconds, for a recording rather than for a robot's operator
 
 
@@ -26,13 +26,20 @@ class Writer(Closing):
         root: entity that everything goes under; empty: paths are as they are.
         wait: seconds that numbers to plot may wait for those of the next frames: sent together, as columns,
             they take a fraction of the time. Then close it, which sends the last of them.
+        stamps: timelines of the sensor time. Without ``stamp`` among them, there are no others.
     """
 
-    def __init__(self, recording: rr.RecordingStream, root: str = "", wait: float = 0.0) -> None:
+    def __init__(
+        self,
+        recording: rr.RecordingStream,
+        root: str = "",
+        wait: float = 0.0,
+        stamps: Sequence[str] = (entities.STAMP,),
+    ) -> None:
         self.recording = recording
         self.root = root
         self.sequences: Mapping[str, int] = {}  # further timelines, and where on them what comes next is
-        self._wait = wait
+        self._wait, self._stamps = wait, stamps
         self._clock: dict[str, int] = {}  # timeline -> where on it this frame is
         self._scalars: dict[str, list[tuple[dict[str, int], float]]] = defaultdict(list)
         self._sent = time.monotonic()
@@ -58,10 +65,19 @@ class Writer(Closing):
         if time.monotonic() - self._sent >= self._wait:
             self.flush()
 
-    def refresh(self) -> None:
-        """Make the next frame whole without those before: what it lacks is cleared, nothing is kept."""
-        self._shown = set(self._known)
+    def refresh(self, known: Set[str] = frozenset()) -> None:
+        """Make the next frame whole without those before: what it lacks is cleared, nothing is kept.
+
+        Args:
+            known: further entities that may be there.
+        """
+        self._shown = self._known | known
         self._versions.clear()
+
+    @property
+    def known(self) -> frozenset[str]:
+        """Entities that any frame had."""
+        return frozenset(self._known)
 
     def flush(self) -> None:
         """Send what waits for more of its kind."""
@@ -114,9 +130,11 @@ class Writer(Closing):
 
     def set_time(self, index: int, stamp: int, received: int) -> None:
         """Where on the timelines what comes next is, without a frame; see ``begin``."""
-        self._clock = {entities.FRAME: index, entities.STAMP: stamp}
-        if received:
-            self._clock[entities.RECEIVED] = received
+        self._clock = dict.fromkeys(self._stamps, stamp)
+        if entities.STAMP in self._stamps:
+            self._clock[entities.FRAME] = index
+            if received:
+                self._clock[entities.RECEIVED] = received
         self._clock |= self.sequences
         self.recording.reset_time()
         for name, number in self._clock.items():

@@ -14,10 +14,11 @@ import numpy as np
 from rerun.chunk import RrdReader
 
 from bevviz.config import Config, changes, flat_yaml, load
-from bevviz.errors import UserError, first_line
+from bevviz.errors import UserError
 from bevviz.files import Scratch
 from bevviz.frame import FrameResult
 from bevviz.logging import entities
+from bevviz.logging.reading import readable
 from bevviz.progress import Progress
 from bevviz.provenance import differences, file_hash, model_path, provenance
 from bevviz.recorded import check_functions
@@ -32,10 +33,13 @@ from bevviz.report.digest import (
 )
 from bevviz.report.make import replay
 from bevviz.report.origin import ReportInfo
+from bevviz.report.seal import check_seal
 from bevviz.report.window import open_window
 from bevviz.run import Observer, run
 from bevviz.session import Session
 from bevviz.stages.detector import DEMO_MODEL
+
+UNREADABLE = "cannot be read as a report"
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,10 +62,13 @@ class CheckResult:
     first: tuple[int, DigestDifference] | None = None  # frame and what differs
     changed: list[str] = field(default_factory=list)
     redacted: bool = False
+    sound: bool = True  # the bag is, byte for byte, the one that the report was made with
+    sealed: bool = True  # and the recording that which its page tells of
 
     @property
     def same(self) -> bool:
-        return self.frames > 0 and not self.differing
+        """Bag and every frame."""
+        return self.frames > 0 and not self.differing and self.sound
 
     def add(self, number: int, difference: DigestDifference | None) -> None:
         """Count one frame."""
@@ -91,10 +98,15 @@ class CheckResult:
                 f"{self.frames} frames: the same; {self.exact} in every bit, the others to "
                 f"{self.rounding:.1g} of their numbers (rounding, up to {ROUNDING:g})"
             )
-        if self.same:
+        if self.frames and not self.differing:
             yield (
                 "compared: what the stages make of each frame of the bag; not compared: how the recording "
                 "and the page show it, their texts, times and tracks"
+            )
+            yield (
+                "the recording is, byte for byte, the file that the page beside it tells of"
+                if self.sealed
+                else "the recording itself may have been changed: there is no page beside it that tells of it"
             )
         if self.redacted:
             yield "the images are redacted: detections are taken from the report, all else was computed again"
@@ -114,23 +126,29 @@ def check(rrd: Path, *, model: Path | None = None, settings: Sequence[str] = ())
     Raises:
         UserError: no report, no bag, or no model.
     """
+    if not rrd.is_file():
+        raise UserError(f"{rrd}: {'it is no file' if rrd.exists() else 'no such file'}")
+    sealed = check_seal(rrd)
     stored = read(rrd)
     info, bag = stored.info, rrd.with_suffix(".mcap")
-    if not bag.exists():
+    if not bag.is_file():
         raise UserError(f"{bag}: the bag of the report is not there; it has the name of the recording")
     with closing(Scratch()) as scratch:
         then, now = _configs(rrd, stored, model, settings, scratch.new())
-        result = CheckResult(redacted=info.redacted)
-        detections = {
-            key: value for stages in stored.frames.values() for key, value in detections_of(stages).items()
-        }
+        result = CheckResult(redacted=info.redacted, sealed=sealed, sound=file_hash(bag) == info.bag_sha256)
+        with readable(rrd, UNREADABLE):
+            frames = stored.frames.values()
+            detections = {key: value for stages in frames for key, value in detections_of(stages).items()}
         session = Session(now, replay(detections) if info.redacted else None)
         network = session.stages.provider
         result.changed = [*_changed_input(info, bag, then, now), *_changed_provenance(info, now, network)]
         comparer = _Comparer(stored, result)
-        with open_window([bag], now, info.low, info.high) as source:
-            if run(source, session, [comparer, Progress("check")], stop=comparer.complete).interrupted:
-                raise KeyboardInterrupt
+        try:
+            with open_window([bag], now, info.low, info.high) as source:
+                if run(source, session, [comparer, Progress("check")], stop=comparer.complete).interrupted:
+                    raise KeyboardInterrupt
+        except UserError as error:
+            raise error if result.sound else UserError(f"{error}; {_other(bag)}") from None
     for number in sorted(comparer.left):
         result.add(number, DigestDifference("cloud", "this run makes no such frame", inf))
     return result
@@ -159,9 +177,7 @@ def read(rrd: Path) -> StoredReport:
     """
     info = config = None
     frames: dict[int, tuple[StageDigest, ...]] = {}
-    if not rrd.is_file():
-        raise UserError(f"{rrd}: no such file")
-    try:
+    with readable(rrd, UNREADABLE):
         for chunk in RrdReader(rrd).stream():
             if chunk.entity_path == "/__properties/report":
                 info = _column(chunk, "about")[-1][0]
@@ -171,13 +187,11 @@ def read(rrd: Path) -> StoredReport:
                 numbers = _column(chunk, entities.FRAME)
                 rows = zip(numbers, _column(chunk, "stages"), _column(chunk, "arrays"), strict=True)
                 frames |= {n: unpack(lines, np.array(block, np.uint8)) for n, lines, block in rows}
-    except (ValueError, KeyError, TypeError, RuntimeError) as error:
-        raise UserError(f"{rrd}: cannot be read as a report: {first_line(error)}") from None
     if info is None or config is None:
         raise UserError(f"{rrd}: a recording, but not one of 'bevviz report' (or one that was not finished)")
     try:
         return StoredReport(ReportInfo.load(info), config, frames)
-    except (ValueError, KeyError, TypeError):
+    except ValueError:
         raise UserError(
             f"{rrd}: a report of another version of bevviz: check it with that version; /config names it"
         ) from None
@@ -210,10 +224,14 @@ def _configs(
     return then, load(file, [*here, *settings])
 
 
+def _other(bag: Path) -> str:
+    return f"{bag.name} is not the file that the report was made with (SHA-256)"
+
+
 def _changed_input(info: ReportInfo, bag: Path, then: Config, now: Config) -> Iterator[str]:
     """The bag and the configuration, but for the files that this names, which are dependencies."""
     if file_hash(bag) != info.bag_sha256:
-        yield f"{bag.name} is not the file that the report was made with (SHA-256)"
+        yield _other(bag)
     for key, change in changes(then, now).items():
         if key not in ("detector.model", "detector.names"):
             yield f"{key} was {change.before}, is {change.after}"

@@ -21,12 +21,23 @@ TRACEBACKS = 5  # that are told
 _FOLDERS = re.compile(r'(?<=File ").*?([^/\\"]+[/\\][^/\\"]+)(?=")')
 
 
+@dataclass(frozen=True, slots=True)
+class Asked:
+    """What was asked about, and why it is as it is: the verdict, and stage by stage."""
+
+    verdict: str
+    reported: bool
+    chain: Sequence[tuple[str, str]]
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Facts:
     """What a page states beside the results. All of it is text, and escaped where it is written."""
 
     title: str
     note: str
+    notes: Mapping[str, str]  # of the drive, in the window, by their time
+    asked: Sequence[Asked]
     where: str  # the bag, its window, and the place in it
     start: int  # log time of the recording's start: seconds count from here
     config: str  # preset in a sentence
@@ -42,6 +53,10 @@ class Facts:
         """The same for the recording, without what it holds already."""
         lines = [f"# {markdown(self.title)}", "", markdown(self.where), ""]
         lines += [f"> {markdown(line)}" for line in self.note.splitlines()]
+        lines += [f"- {markdown(when)}: {markdown(text)}" for when, text in self.notes.items()]
+        for one in self.asked:
+            lines += ["", f"**{markdown(one.verdict)}**", ""]
+            lines += [f"- *{stage}*: {markdown(text)}" for stage, text in one.chain]
         for title, items in (("Files", self.files), ("Warnings", self.warnings), ("Hardware", self.hardware)):
             lines += ["", f"## {title}", "", *(f"- {markdown(item)}" for item in items)] if items else []
         for title, traceback in self.tracebacks.items():

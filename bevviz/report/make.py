@@ -4,32 +4,37 @@ from __future__ import annotations
 
 import os
 import shutil
+import threading
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import rerun as rr
 from tqdm import tqdm
 
+from bevviz import remains
 from bevviz.bags.reader import megabytes
 from bevviz.bags.recording import RawMessage
-from bevviz.bags.source import MARGIN, BagSource
+from bevviz.bags.source import MARGIN, SECOND, BagSource
 from bevviz.config import Config, changes, load
 from bevviz.errors import UserError
-from bevviz.files import claim, unfinished
+from bevviz.files import claim, save, unfinished
 from bevviz.files import written as write_beside
 from bevviz.frame import Camera, Detections, Frame, FrameResult
 from bevviz.logging import entities
 from bevviz.logging.pieces import document
 from bevviz.logging.recorder import DiskWatch, Recorder
 from bevviz.logging.sinks import open_recording
+from bevviz.notes import Note
 from bevviz.progress import Progress
 from bevviz.provenance import Provenance, file_hash, model_path, names_path, provenance, versions
 from bevviz.recorded import Origin
 from bevviz.report.digest import digest, pack
-from bevviz.report.facts import Facts, commands, file_lines, traceback_texts, window_text
+from bevviz.report.facts import Asked, Facts, commands, file_lines, traceback_texts, window_text
 from bevviz.report.origin import ReportInfo, shareable
 from bevviz.report.page import page
 from bevviz.report.redact import Redactor
@@ -38,6 +43,9 @@ from bevviz.report.window import Cut, Window, choose_topics, cut, find_window, f
 from bevviz.run import Observer, run
 from bevviz.session import Session
 from bevviz.stages.detector import Detector
+
+if TYPE_CHECKING:
+    from bevviz.why import Answer
 
 Found = Mapping[tuple[str, int], Detections]  # by camera and stamp of the image
 
@@ -48,7 +56,8 @@ class ReportRequest:
 
     ``before`` and ``after`` are in seconds; ``topics``: patterns of those that go into the bag beside the
     ones that the pipeline reads, None: all; ``redact``: hide people and vehicles; ``unredacted``: patterns of
-    topics that are kept even so where nobody can tell what they show; ``force``: overwrite.
+    topics that are kept even so where nobody can tell what they show; ``force``: overwrite; ``asked``: the
+    answers that go in; ``notes``: of the whole drive.
     """
 
     paths: Sequence[Path]
@@ -63,6 +72,8 @@ class ReportRequest:
     unredacted: Sequence[str] = ()
     include_model: bool = False
     force: bool = False
+    asked: Sequence[Answer] = ()
+    notes: Sequence[Note] = ()
 
 
 @dataclass(slots=True)
@@ -75,8 +86,17 @@ class WrittenReport:
     warnings: list[str] = field(default_factory=list)
 
 
-def make(request: ReportRequest) -> WrittenReport:
+def make(
+    request: ReportRequest,
+    observers: Sequence[Observer[FrameResult]] = (),
+    stop: threading.Event | None = None,
+) -> WrittenReport:
     """Write the report. Interrupted while it runs, it is a report of the frames until then.
+
+    Args:
+        request: what is asked for.
+        observers: that see its frames, too.
+        stop: ends the run when it is set, as an interrupt does.
 
     The pipeline runs on the bag that was cut out, not on the whole one: so does whoever runs it again. With
     ``redact`` that bag's images are no longer those that the network should see; its detections, made on
@@ -110,11 +130,17 @@ def make(request: ReportRequest) -> WrittenReport:
         detect = None if found is None else replay(found)
         session = Session(request.config, detect)
         part = _cut(whole, window, topics, bag, redactor)
+        remains.remember(bag, partial(bag.unlink, missing_ok=True))  # alone it is no report
+        stack.callback(remains.forget, bag)
         written.files.append(bag)
         written.warnings += [*whole.recording.warnings, *part.left_out, *(redactor.notes if redactor else ())]
         if model is not None:
-            written.files.append(Path(shutil.copyfile(model, rrd.with_name(model.name))))
+            beside = rrd.with_name(model.name)
+            with write_beside(beside, "model") as given:
+                shutil.copyfile(model, given.path)
+            written.files.append(beside)
 
+        notes = [note for note in request.notes if window.low <= note.received < window.high]
         public = shareable(request.config)
         source = stack.enter_context(open_window([bag], request.config, window.low, window.high))
         origin = Origin.of(source.scene, request.config, rrd, folders=False, redacted=request.redact)
@@ -122,24 +148,23 @@ def make(request: ReportRequest) -> WrittenReport:
         sinks = stack.enter_context(
             open_recording(scene, public, save=rrd, blueprint="bug_report", origin=origin)
         )
+        remains.forget(bag)
         recording = sinks.recording
         written.files.insert(0, rrd)
         summary = WindowSummary(window.at, source.total, len(whole.scene.cameras))
-        recorder = _ReportRecorder(recording, public, summary, window.at, request.note)
-        written.interrupted = run(source, session, [recorder, DiskWatch(sinks), Progress("run")]).interrupted
+        recorder = _ReportRecorder(recording, public, summary, window.at, request.note, notes)
+        watchers = [recorder, DiskWatch(sinks), Progress("run"), *observers]
+        ended = run(source, session, watchers, stop=stop)
+        written.interrupted = ended.interrupted or (stop is not None and stop.is_set())
         written.frames = len(summary.frames)
         written.warnings += [w for w in source.warnings if w not in written.warnings]
         written.warnings = [_without_folders(w, [*request.paths, bag]) for w in written.warnings]
         made_with = provenance(request.config, session.stages.provider)
-        facts = _facts(request, public, window, part, written, made_with, summary, whole.scene.name)
+        facts = _facts(request, public, window, part, written, made_with, summary, whole.scene.name, notes)
         info = _info(request, window, written, made_with, bag)
         recording.send_property("report", rr.AnyValues(about=info.dump()))
         recording.log(entities.REPORT, document(facts.markdown()), static=True)
-    with write_beside(html, "page") as given:
-        try:
-            given.path.write_text(page(facts, summary), encoding="utf-8")
-        except OSError as error:
-            raise UserError(f"{html}: cannot write the page: {error.strerror}") from None
+    save(html, page(facts, summary, file_hash(rrd)), "-o")
     written.files.insert(1, html)
     return written
 
@@ -148,14 +173,23 @@ class _ReportRecorder(Recorder):
     """Logs each frame with its fingerprints and the note, and gathers what the page tells."""
 
     def __init__(
-        self, recording: rr.RecordingStream, config: Config, summary: WindowSummary, at: int, note: str
+        self,
+        recording: rr.RecordingStream,
+        config: Config,
+        summary: WindowSummary,
+        at: int,
+        note: str,
+        notes: Sequence[Note],
     ) -> None:
         super().__init__(recording, config)
-        self._summary, self._at, self._note = summary, at, note
+        self._summary, self._at, self._note, self._notes = summary, at, note, notes
 
     def see(self, result: FrameResult) -> None:
-        noted = self._note and result.frame.received == self._at
-        self.logger.log(result, notes=[("INFO", f"note: {self._note}")] if noted else ())
+        received = result.frame.received
+        lines = [f"note: {note}" for note in self._notes if note.received == received]
+        if self._note and received == self._at:
+            lines.insert(0, f"note: {self._note}")
+        self.logger.log(result, notes=[("INFO", line) for line in lines])
         lines, block = pack(digest(result))
         self.recording.log(entities.DIGEST, rr.AnyValues(stages=lines, arrays=block))
         self._summary.add(result)
@@ -257,6 +291,7 @@ def _facts(
     made_with: Provenance,
     summary: WindowSummary,
     name: str,
+    notes: Sequence[Note],
 ) -> Facts:
     sizes = {
         path.name: f"{what}, {megabytes(path.stat().st_size)}"
@@ -277,6 +312,11 @@ def _facts(
     return Facts(
         title=f"{stem}: {request.note.splitlines()[0]}" if request.note else stem,
         note=request.note,
+        notes={f"{(note.received - window.start) / SECOND:.3f} s": str(note) for note in notes},
+        asked=[
+            Asked(answer.verdict.text, answer.verdict.reported, [(s.stage, s.text) for s in answer.steps])
+            for answer in request.asked
+        ],
         where=where,
         start=window.start,
         config=f"Preset {public.preset}, {differs}.",

@@ -7,6 +7,8 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
+from pydantic import TypeAdapter
+
 from bevviz.config import Config
 from bevviz.provenance import Provenance, model_path
 
@@ -31,9 +33,11 @@ class ReportInfo:
 
     @staticmethod
     def load(text: str) -> ReportInfo:
-        """Raises ValueError, TypeError or KeyError where ``text`` is not what ``dump`` makes."""
-        values = json.loads(text)
-        return ReportInfo(provenance=Provenance.load(values.pop("provenance")), **values)
+        """Raises ValueError where ``text`` is not what ``dump`` makes."""
+        return _INFO.validate_json(text, strict=True)
+
+
+_INFO = TypeAdapter(ReportInfo)
 
 
 def shareable(config: Config) -> Config:

@@ -58,14 +58,15 @@ class DecisionTotal:
     frames: str
 
 
-def page(facts: Facts, summary: WindowSummary) -> str:
-    """The whole file."""
+def page(facts: Facts, summary: WindowSummary, seal: str) -> str:
+    """The whole file. ``seal``: SHA-256 of the recording."""
     bad = [frame for frame in summary.frames if frame.problems]
     common = Counter(problem for frame in bad for problem in frame.problems).most_common(COMMON)
     return render(
         "report.html",
         title=facts.title,
         facts=facts,
+        seal=seal,
         frame=None if summary.result is None else _frame(summary.result, facts),
         frames=len(summary.frames),
         bad_frames=len(bad),

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from bevviz.frame import Frame, FrameResult
-from bevviz.logging.health import health
+from bevviz.logging.health import Rates, health
 from bevviz.report.pictures import camera_picture, jpeg, shrink
 
 STRIP_PICTURES = 48  # of all cameras and the bird's-eye view together
@@ -44,6 +44,7 @@ class WindowSummary:
     result: FrameResult | None = None  # of the scan nearest to ``at``
     tracebacks: Counter[tuple[str, str]] = field(default_factory=Counter)  # stage and traceback
     _last: Frame | None = None
+    _rates: Rates = field(default_factory=Rates)
 
     def add(self, result: FrameResult) -> FrameSummary:
         """Take in the next frame."""
@@ -58,7 +59,8 @@ class WindowSummary:
         problems = [f"{f.stage}: {f.reason}" for f in result.failures]
         problems += frame.problems
         problems += [f"{c.camera.name}: {p}" for c in result.cameras for p in c.camera.problems]
-        measured = dict(health(result, self._last))
+        self._rates.add(frame)
+        measured = dict(health(result, self._last, self._rates))
         moment = FrameSummary(frame.index, frame.stamp, frame.received, measured, states, tuple(problems))
         if self._is_for_strip(len(self.frames)):
             self.strip.append((moment, strip_pictures(result)))

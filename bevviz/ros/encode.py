@@ -98,7 +98,12 @@ def encode_camera_info(image: Image, intrinsics: Intrinsics) -> Any:
 
 
 def encode_boxes_3d(
-    stamp: int, frame_id: str, boxes: Boxes3D, results: Iterable[Hypotheses], pose: F64 | None = None
+    stamp: int,
+    frame_id: str,
+    boxes: Boxes3D,
+    results: Iterable[Hypotheses],
+    pose: F64 | None = None,
+    ids: Sequence[str] = (),
 ) -> Any:
     """A vision_msgs/Detection3DArray.
 
@@ -107,11 +112,15 @@ def encode_boxes_3d(
         boxes: in a frame of theirs.
         results: the hypotheses of each box.
         pose: (4, 4) frame_id from the frame of the boxes; None: it is the same.
+        ids: of each box; (): they have none.
     """
     turn = np.eye(4) if pose is None else pose
     about = _header(stamp, frame_id)
     detections = []
-    for center, size, yaw, hypotheses in zip(boxes.center, boxes.size, boxes.yaw, results, strict=True):
+    names = ids or [""] * len(boxes)
+    for center, size, yaw, hypotheses, name in zip(
+        boxes.center, boxes.size, boxes.yaw, results, names, strict=True
+    ):
         half = float(yaw) / 2
         place = _pose(turn @ geometry.transform(center, np.array([0, 0, np.sin(half), np.cos(half)])))
         box = _make("vision_msgs/msg/BoundingBox3D", center=place, size=_vector("Vector3", size))
@@ -121,7 +130,7 @@ def encode_boxes_3d(
                 header=about,
                 results=_results(hypotheses, place),
                 bbox=box,
-                id="",
+                id=name,
             )
         )
     return _make("vision_msgs/msg/Detection3DArray", header=about, detections=detections)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import importlib
 import os
+import sys
+from pathlib import Path
 from types import ModuleType
 
 import numpy as np
@@ -14,6 +16,11 @@ WHEELS = "pip install 'bevviz[ros]' (Python 3.11 or 3.12, Linux) brings one that
 UNSOURCED = (
     "start bevviz in a shell without `source /opt/ros/.../setup.bash`, in an environment with "
     "pip install 'bevviz[ros]' or in RoboStack: it meets the robot's nodes over DDS all the same"
+)
+
+MEETING = (
+    "Fast DDS and Cyclone DDS meet on the wire, a robot on rmw_zenoh_cpp is met by none of them: bevviz must "
+    "run in an environment that has that middleware"
 )
 
 # Set by the wheels when they have restarted the interpreter with their library path; a child process of
@@ -31,6 +38,7 @@ def load_rclpy() -> ModuleType:
     if int(np.__version__.partition(".")[0]) < 2:
         whose = f"the sourced ROS in {sourced}" if sourced else "this environment"
         raise UserError(f"numpy {np.__version__} of {whose} is too old for the viewer's SDK; {UNSOURCED}")
+    _check_middleware()
     try:
         rclpy = importlib.import_module("rclpy")
         for name in ("rclpy.executors", "rcl_interfaces.msg", "sensor_msgs.msg"):
@@ -42,6 +50,37 @@ def load_rclpy() -> ModuleType:
     except (ImportError, AttributeError) as error:  # numpy's own words for an extension of another ABI
         raise UserError(_explain(error, sourced)) from None
     return rclpy
+
+
+def _check_middleware() -> None:
+    """A middleware whose library is missing ends the process from within rclpy, without an exception.
+
+    Raises:
+        UserError: RMW_IMPLEMENTATION names one that is not installed.
+    """
+    asked = os.environ.get("RMW_IMPLEMENTATION", "")
+    if not asked:
+        return
+    there = middlewares()
+    if there and asked not in there:
+        raise UserError(
+            f"RMW_IMPLEMENTATION={asked} is not installed for this Python, there is "
+            f"{', '.join(sorted(there))}: unset RMW_IMPLEMENTATION where the robot speaks DDS; {MEETING}"
+        )
+
+
+def middlewares() -> set[str]:
+    """The middlewares whose libraries are installed, by the names that RMW_IMPLEMENTATION takes."""
+    folders = [Path(sys.prefix, "lib"), *(Path(p, "lib") for p in _paths("AMENT_PREFIX_PATH"))]
+    folders += map(Path, _paths("LD_LIBRARY_PATH"))
+    names = {path.name[3:-3] for folder in folders for path in folder.glob("librmw_*_cpp.so")}
+    return {
+        name for name in names if not name.endswith(("_shared_cpp", "_typesupport_cpp", "_fastrtps_cpp__"))
+    }
+
+
+def _paths(variable: str) -> list[str]:
+    return [path for path in os.environ.get(variable, "").split(os.pathsep) if path]
 
 
 def _explain(error: Exception, sourced: str) -> str:

@@ -64,11 +64,12 @@ def describe_qos(topic: PublishedTopic) -> str:
         words = ["reliable" if qos.reliability == ReliabilityPolicy.RELIABLE else "best effort"]
         if qos.durability == DurabilityPolicy.TRANSIENT_LOCAL:
             words.append("latched")
-        lines.append(f"{_full_name(publisher)} ({', '.join(words)})")
+        lines.append(f"{full_name(publisher)} ({', '.join(words)})")
     return f"from {', '.join(lines)}"
 
 
-def _full_name(publisher: Any) -> str:
+def full_name(publisher: Any) -> str:
+    """Of the node that a publisher belongs to."""
     if publisher.node_name == UNKNOWN:
         return "a node that does not say its name"
     return f"{publisher.node_namespace.rstrip('/')}/{publisher.node_name}"
@@ -81,6 +82,6 @@ def mismatches(topic: PublishedTopic, qos: Any) -> Iterable[str]:
     for publisher in topic.publishers:
         compatible, reason = qos_check_compatible(publisher.qos_profile, qos)
         if compatible == QoSCompatibility.ERROR:
-            who = _full_name(publisher)
+            who = full_name(publisher)
             text = reason.removeprefix("ERROR: ").rstrip(".;")
             yield f"{topic.name}: {who} is not heard, its quality of service does not fit ({text})"

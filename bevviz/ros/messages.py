@@ -570,7 +570,7 @@ def decode_detections_2d(msg: Any, topic: str, received: int) -> LabelledBoxes2D
         position = getattr(center, "position", center)  # flat up to ROS 2 Galactic
         return position.x, position.y, center.theta, box.size_x, box.size_y
 
-    values, labels, scores = _rows(msg, row, 5, topic)
+    values, labels, scores, _ = _rows(msg, row, 5, topic)
     x, y, theta, w, h = values.T
     cos, sin = np.abs(np.cos(theta)), np.abs(np.sin(theta))
     dx, dy = (w * cos + h * sin) / 2, (w * sin + h * cos) / 2
@@ -601,7 +601,7 @@ def decode_detections_3d(msg: Any, topic: str, received: int) -> LabelledBoxes3D
         p, q = center.position, center.orientation
         return p.x, p.y, p.z, size.x, size.y, size.z, q.x, q.y, q.z, q.w
 
-    values, labels, scores = _rows(msg, row, 10, topic)
+    values, labels, scores, ids = _rows(msg, row, 10, topic)
     x, y, z, w = values[:, 6:].T
     yaw = np.arctan2(2 * (w * z + x * y), w * w + x * x - y * y - z * z)  # holds at any length, zero too
     center, size = values[:, :3].astype(np.float32), values[:, 3:6].astype(np.float32)
@@ -613,20 +613,22 @@ def decode_detections_3d(msg: Any, topic: str, received: int) -> LabelledBoxes3D
         labels=labels,
         scores=scores,
         received=received,
+        ids=ids if all(ids) else (),
     )
 
 
 def _rows(
     msg: Any, row: Callable[[Any], tuple[float, ...]], width: int, topic: str
-) -> tuple[F64, tuple[str, ...], F32]:
-    """(K, width) numbers, labels and scores of the detections whose numbers are all finite."""
+) -> tuple[F64, tuple[str, ...], F32, tuple[str, ...]]:
+    """(K, width) numbers, labels, scores and ids of the detections whose numbers are all finite."""
     try:
-        rows = [(row(d), *_hypothesis(d.results)) for d in msg.detections]
+        rows = [(row(d), *_hypothesis(d.results), str(getattr(d, "id", ""))) for d in msg.detections]
     except AttributeError as error:
         raise MessageError(f"{topic}: unknown version of vision_msgs: {error}") from None
     rows = [r for r in rows if all(map(math.isfinite, r[0]))]
     values = np.array([r[0] for r in rows], np.float64).reshape(-1, width)
-    return values, tuple(r[1] for r in rows), np.nan_to_num(np.array([r[2] for r in rows], np.float32))
+    scores = np.nan_to_num(np.array([r[2] for r in rows], np.float32))
+    return values, tuple(r[1] for r in rows), scores, tuple(r[3] for r in rows)
 
 
 def _hypothesis(results: Iterable[Any]) -> tuple[str, float]:

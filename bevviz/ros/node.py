@@ -91,6 +91,12 @@ class Node(Closing):
         whose = (endpoint.node_name, endpoint.node_namespace)
         return any(whose == (node.get_name(), node.get_namespace()) for node in (self.node, self.input))
 
+    @property
+    def is_alone(self) -> bool:
+        """Whether no other node that is known by now has the same name."""
+        me = (self.node.get_name(), self.node.get_namespace())
+        return list(self.input.get_node_names_and_namespaces()).count(me) <= 1
+
     def start(self) -> None:
         for thread in self._threads:
             thread.start()

@@ -15,7 +15,8 @@ NO_LIMIT = 0  # a parameter cannot be empty
 class Orders:
     """The tutorial's parameters (``range_x``, ``voxel_size`` ...) and the service ``~/save_recording``.
 
-    Values given with ``--ros-args -p`` are ordered before the constructor returns.
+    Values given with ``--ros-args -p`` are ordered before the constructor returns. ``config``, ``change`` and
+    ``save`` may be replaced later.
 
     Args:
         node: an rclpy node that somebody spins.
@@ -35,9 +36,9 @@ class Orders:
         save: Callable[[], Path] | None = None,
     ) -> None:
         self._node = node
-        self._config = config
-        self._change = change
-        self._save = save
+        self.config = config
+        self.change = change
+        self.save = save
         given = [
             node.declare_parameter(name, _value(config, key), _descriptor(key))
             for name, key in TUTORIAL_NAMES.items()
@@ -54,7 +55,7 @@ class Orders:
         """Let the parameters say what holds now, wherever it was changed."""
         from rclpy.parameter import Parameter
 
-        self._config = config
+        self.config = config
         current = {name: _value(config, key) for name, key in TUTORIAL_NAMES.items()}
         self._node.set_parameters(
             [Parameter(n, value=v) for n, v in current.items() if self._node.get_parameter(n).value != v]
@@ -63,22 +64,22 @@ class Orders:
     def _settings(self, parameters: Sequence[Any]) -> list[str]:
         """What differs from the configuration, in its words."""
         keyed = [(TUTORIAL_NAMES[p.name], p.value) for p in parameters if p.name in TUTORIAL_NAMES]
-        return [f"{key}={_text(key, value)}" for key, value in keyed if value != _value(self._config, key)]
+        return [f"{key}={_text(key, value)}" for key, value in keyed if value != _value(self.config, key)]
 
     def _set(self, parameters: Sequence[Any]) -> Any:
         from rcl_interfaces.msg import SetParametersResult
 
         try:
             if settings := self._settings(parameters):
-                self._change(settings)
+                self.change(settings)
         except UserError as error:
             return SetParametersResult(successful=False, reason=str(error))
         return SetParametersResult(successful=True)
 
     def _trigger(self, request: Any, response: Any) -> Any:
-        assert self._save is not None
+        assert self.save is not None
         try:
-            response.success, response.message = True, str(self._save())
+            response.success, response.message = True, str(self.save())
         except UserError as error:
             response.success, response.message = False, str(error)
         return response

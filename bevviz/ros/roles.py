@@ -117,7 +117,7 @@ _FOREIGN = (  # what holds points or pixels in a form that nothing here reads, a
 )
 
 
-def _foreign(topic: Topic, sensor: str = "") -> str:
+def foreign(topic: Topic, sensor: str = "") -> str:
     """What a topic that nothing here reads holds and what would help; empty where it is not known."""
     return next((why for of, kind, why in _FOREIGN if sensor in ("", of) and kind.search(topic.type)), "")
 
@@ -148,7 +148,7 @@ def find_roles(
         UserError: a stated topic does not exist, or is of another type.
     """
     topics = sorted(topics, key=lambda t: t.name)  # the order of a bag's or a graph's topics is chance
-    notes = {t.name: f"not used: {_foreign(t) or f'nothing here reads {t.type}'}" for t in topics}
+    notes = {t.name: f"not used: {foreign(t) or f'nothing here reads {t.type}'}" for t in topics}
     staged = {key: _stated(name, topics, key, STAGE_KINDS[key]) for key, name in stages.items()}
     obstacles = [topic for key, topic in staged.items() if key == "ground.method"]
     lidars = _find_lidars([t for t in topics if t not in obstacles], config, notes)
@@ -203,7 +203,7 @@ def find_roles(
 
 def _no_lidar(topics: Sequence[Topic]) -> str:
     said = f"no LiDAR: none of {len(topics)} topics is a sensor_msgs/PointCloud2"
-    if held := [f"{t.name} holds {why}" for t in topics if (why := _foreign(t, "LiDAR"))]:
+    if held := [f"{t.name} holds {why}" for t in topics if (why := foreign(t, "LiDAR"))]:
         return f"{said}; {'; '.join(held)}"
     if taken := _names(_of(topics, "PointCloud2")):
         return f"no LiDAR: {', '.join(taken)} is the result of a stage"
@@ -214,7 +214,7 @@ def _no_lidar(topics: Sequence[Topic]) -> str:
 
 def _no_camera(topics: Sequence[Topic]) -> str:
     images = _of(topics, *_IMAGES)
-    if held := [f"{t.name} holds {why}" for t in topics if (why := _foreign(t, "camera"))]:
+    if held := [f"{t.name} holds {why}" for t in topics if (why := foreign(t, "camera"))]:
         return f"no camera that can be read: {'; '.join(held)}"
     if with_messages := _names(t for t in images if t.count != 0):
         return f"no camera among the images: --set source.camera_topics=[{with_messages[0]}]"
@@ -242,7 +242,7 @@ def _stated(name: str, topics: Sequence[Topic], key: str, *kinds: str) -> Topic:
         if topic.name == name:
             if topic in fitting:
                 return topic
-            why = _foreign(topic)
+            why = foreign(topic)
             helps = f"; it holds {why}" if why else ""
             raise UserError(f"{key}: {name} is a {topic.type}, but must be {' or '.join(kinds)}{helps}")
     near = difflib.get_close_matches(name, _names(fitting), n=3, cutoff=0.4) or _names(fitting)

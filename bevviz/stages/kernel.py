@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import threading
+import time
 from collections.abc import Callable
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numba
+from numba.core import event
+
+from bevviz import announce
 
 F = TypeVar("F", bound=Callable[..., object])
 
@@ -20,6 +25,63 @@ def _has_place() -> bool:
 
 
 CACHED = _has_place()  # False: each run compiles anew
+
+
+class _Compiling(event.Listener):  # type: ignore[misc]
+    """How long was compiled, or fetched what was compiled before: by whom, and by all threads."""
+
+    def __init__(self) -> None:
+        self._local = threading.local()
+        self.everywhere = 0.0
+
+    @property
+    def here(self) -> float:
+        """Seconds, by this thread."""
+        return getattr(self._local, "seconds", 0.0)
+
+    def on_start(self, event: Any) -> None:
+        depth = getattr(self._local, "depth", 0)
+        if not depth:
+            self._local.start = time.perf_counter()
+        self._local.depth = depth + 1
+
+    def on_end(self, event: Any) -> None:
+        self._local.depth -= 1
+        if not self._local.depth:
+            seconds = time.perf_counter() - self._local.start
+            self._local.seconds = self.here + seconds
+            self.everywhere += seconds
+
+
+class _Announcing(event.Listener):  # type: ignore[misc]
+    """Says once that stages are compiled: the first frame after an installation takes a while."""
+
+    def __init__(self) -> None:
+        self._said = False
+
+    def on_start(self, event: Any) -> None:
+        if not self._said and event.data["dispatcher"].__module__.startswith("bevviz."):
+            self._said = True
+            kept = "once" if CACHED else "for this run, as there is no folder to keep it in"
+            announce.say(f"compiling the stages for this machine, {kept}: about 15 s")
+
+    def on_end(self, event: Any) -> None:
+        pass
+
+
+_compiling = _Compiling()
+event.register("numba:compiler_lock", _compiling)
+event.register("numba:compile", _Announcing())
+
+
+def clock() -> float:
+    """Seconds, as ``time.perf_counter``, that stand still while this thread compiles."""
+    return time.perf_counter() - _compiling.here
+
+
+def common_clock() -> float:
+    """Seconds that stand still while any thread compiles, twice where two wait for one another."""
+    return time.perf_counter() - _compiling.everywhere
 
 
 def kernel(function: F) -> F:

@@ -8,6 +8,7 @@ from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, field
+from io import StringIO
 from pathlib import Path
 
 import numpy as np
@@ -15,8 +16,8 @@ import numpy as np
 from bevviz import table
 from bevviz.config import Config
 from bevviz.counts import counts_of
-from bevviz.errors import UserError
 from bevviz.evaluate import Score, Truth
+from bevviz.files import save
 from bevviz.frame import Frame, FrameResult
 from bevviz.sweep.parameters import Parameter, Values
 from bevviz.text import printable
@@ -143,17 +144,15 @@ class Sweep:
         kinds = ("tp", "fp", "fn")
         header = [p.key for p in self.parameters] + ["frames", *names]
         header += [f"{name} {kind}" for name in classes for kind in kinds]
-        try:
-            with path.open("w", newline="") as file:
-                writer = csv.writer(file)
-                writer.writerow(header)
-                for values, outcome in self.outcomes.items():
-                    metrics = outcome.metrics
-                    by_class = [outcome.score.classes[name][kind] for name in classes for kind in kinds]
-                    rounded = (f"{metrics.get(name, math.nan):.6g}" for name in names)
-                    writer.writerow([*values, outcome.frames, *rounded, *by_class])
-        except OSError as error:
-            raise UserError(f"--csv {path}: cannot be written: {error.strerror}") from None
+        file = StringIO()
+        writer = csv.writer(file)
+        writer.writerow(header)
+        for values, outcome in self.outcomes.items():
+            metrics = outcome.metrics
+            by_class = [outcome.score.classes[name][kind] for name in classes for kind in kinds]
+            rounded = (f"{metrics.get(name, math.nan):.6g}" for name in names)
+            writer.writerow([*values, outcome.frames, *rounded, *by_class])
+        save(path, file.getvalue(), "--csv")
 
 
 def _number(name: str, value: float) -> str:

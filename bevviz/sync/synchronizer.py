@@ -6,7 +6,7 @@ import math
 import re
 from bisect import bisect_left
 from collections import Counter, deque
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, Generic, TypeVar
 
@@ -16,7 +16,18 @@ from numpy.typing import NDArray
 from bevviz import geometry
 from bevviz.config import Config
 from bevviz.errors import UserError
-from bevviz.frame import F32, F64, Camera, Cloud, Frame, Image, Intrinsics, LabelledBoxes2D, LabelledBoxes3D
+from bevviz.frame import (
+    F32,
+    F64,
+    Camera,
+    Cloud,
+    Frame,
+    Image,
+    Intrinsics,
+    LabelledBoxes2D,
+    LabelledBoxes3D,
+    LateResult,
+)
 from bevviz.plugins import TOPIC
 from bevviz.ros.messages import StampedTransform
 from bevviz.ros.roles import CameraRole, Roles, entity_name
@@ -31,6 +42,7 @@ JUMP = SECOND  # a stamp that is this much older than its topic's newest means t
 LATENCY = 2 * SECOND  # the longest a cloud is expected to arrive after an image of the same stamp
 FIXED_FRAMES = {"map", "odom", "world", "earth", "global", "utm", "enu", "ned", "mocap", "vicon", "init"}
 FAR = 500.0  # metres that no LiDAR has half of its points beyond
+OVERTAKEN = 64  # results and frames that late results are placed by
 GLOBE_FRAMES = {"earth", "ecef", "utm"}  # coordinates too large for the float32 of a viewer
 TUTORIAL_K = np.array([[267.0, 0.0, 320.0], [0.0, 267.0, 180.0], [0.0, 0.0, 1.0]])
 
@@ -60,6 +72,8 @@ class SyncReport:
     clocks: Clocks = field(default_factory=lambda: Clocks({}, "stamp"))
     clocked: tuple[str, ...] = ()  # topics whose clocks must be one
     oddities: dict[str, str] = field(default_factory=dict)  # topic -> what its messages should not say
+    overtaken: Counter[str] = field(default_factory=Counter)  # topic -> results whose frame had gone on
+    slowest: dict[str, float] = field(default_factory=dict)  # topic -> seconds after its stamp, at worst
 
     def doubts(self) -> tuple[str, ...]:
         """One sentence for whatever may make every frame wrong: clocks, units, which way is up."""
@@ -89,6 +103,11 @@ class SyncReport:
             )
         for topic, n in self.unstamped.items():
             found.append(f"{topic}: no stamp in the header {_times(n)}, time of receipt used instead")
+        for topic, n in self.overtaken.items():
+            found.append(
+                f"{topic}: {n} result{'' if n == 1 else 's'} came when the frame of that time had gone on, "
+                f"at worst {self.slowest[topic]:.2f} s after the stamp: shown at that stamp, and not compared"
+            )
         for camera, n in self.without_image.items():
             found.append(f"{n} of {self.frames} frames have no image of camera '{camera}'")
         for camera, n in self.undecodable.items():
@@ -170,6 +189,13 @@ class _Track(Generic[T]):
         del self._stamps[best]
         return self._items.pop(best)
 
+    def shed(self, last: int) -> list[T]:
+        """Remove and return what has that stamp or an earlier one."""
+        end = bisect_left(self._stamps, last + 1)
+        gone, self._items = self._items[:end], self._items[end:]
+        del self._stamps[:end]
+        return gone
+
     def forget(self, before: int) -> None:
         """Drop what is older, but for the last of it, which may be the nearest to the next cloud."""
         first = max(0, bisect_left(self._stamps, before) - 1)
@@ -207,9 +233,15 @@ class Synchronizer:
     A cloud waits until each camera has an image of its stamp or later and the transforms reach as far,
     at most ``sync.max_wait`` seconds of received time, and in a queue of ``sync.queue``. Clouds out of
     order within the queue are put back in order; later ones are dropped, and all of it is counted.
+
+    Args:
+        roles: which topic is what.
+        config: tolerances and queues.
+        beside: topics of the robot's boxes that no frame waits for: what comes too late for its frame is to
+            be had from ``overtaken``.
     """
 
-    def __init__(self, roles: Roles, config: Config) -> None:
+    def __init__(self, roles: Roles, config: Config, beside: Collection[str] = ()) -> None:
         self.report = SyncReport()
         self.absent: frozenset[str] = frozenset()  # topics that nobody publishes now: not waited for
         self.tf = self.report.tf
@@ -230,6 +262,7 @@ class Synchronizer:
         self._step = math.inf  # nanoseconds between the last two clouds; a gap is much longer
         self._partners: dict[str, _Track[Cloud]] = self._make_tracks(*roles.lidars[1:])
         self._images: dict[str, _Track[_Undecoded]] = self._make_tracks(*(c.topic for c in roles.cameras))
+        self._lidar_frames: dict[str, str] = {}  # cloud topic -> frame
         self._camera_frames: dict[str, str] = {}  # image topic -> optical frame
         self.intrinsics: dict[str, Intrinsics] = {}  # CameraInfo topic -> the newest
         self._infos: dict[str, _Track[Intrinsics]] = {}  # by topic
@@ -240,6 +273,11 @@ class Synchronizer:
         self._detections: dict[str, _Track[LabelledBoxes2D]] = self._make_tracks(*roles.robot_detections_2d)
         self._robot_clouds: dict[str, _Track[Cloud]] = self._make_tracks(*roles.robot_clouds)
         self._truth: dict[str, _Track[LabelledBoxes3D]] = self._make_tracks(*filter(None, [roles.truth]))
+        self._beside = frozenset(beside)
+        self._overtaken: deque[LateResult] = deque(maxlen=OVERTAKEN)
+        self._places: deque[tuple[_Place, F64]] = deque(
+            maxlen=OVERTAKEN
+        )  # of the last frames, and their poses
         for names, pose in config.source.extrinsics.items():
             self.tf.add(_extrinsic(names, pose), static=True, origin=Origin.CONFIG)
 
@@ -254,6 +292,7 @@ class Synchronizer:
         self.tf, self.upright, self.clocks = former.tf, former.upright, former.clocks
         self.intrinsics, self._infos = former.intrinsics, former._infos
         self._odometry_frames = former._odometry_frames
+        self._overtaken, self._places = former._overtaken, former._places
 
     # --- what comes in -------------------------------------------------------------------------
 
@@ -263,6 +302,7 @@ class Synchronizer:
             return
         stamp = self._arrived(cloud.topic, cloud.stamp, cloud.received)
         cloud = replace(cloud, stamp=stamp, name=self._lidar_name(cloud))
+        self._lidar_frames[cloud.topic] = cloud.frame_id.lstrip("/")
         self._check_units(cloud)
         self.report.clouds += 1
         if cloud.topic in self._partners:
@@ -326,8 +366,39 @@ class Synchronizer:
 
     def _add_result(self, tracks: dict[str, _Track[Any]], result: LabelledBoxes2D | LabelledBoxes3D) -> None:
         stamp = self._arrived(result.topic, result.stamp, result.received)
-        track = tracks.setdefault(result.topic, _Track(self._horizon))
-        track.add(stamp, replace(result, stamp=stamp))
+        result = replace(result, stamp=stamp)
+        if result.topic in self._beside and self._is_past(stamp):
+            self._overtake(result)
+        else:
+            tracks.setdefault(result.topic, _Track(self._horizon)).add(stamp, result)
+
+    def _is_past(self, stamp: int) -> bool:
+        """Whether the frame that is nearest to a stamp has gone on."""
+        if self._last is None:
+            return False
+        after = self._clouds[0].stamp if self._clouds else self._last + self._step
+        return stamp <= min(self._last + self._tolerance, (self._last + after) / 2)
+
+    def _overtake(self, result: LabelledBoxes2D | LabelledBoxes3D) -> None:
+        """Place a result of the robot's where no frame takes it."""
+        self.report.overtaken[result.topic] += 1
+        late = (result.received - result.stamp) * 1e-9
+        self.report.slowest[result.topic] = max(self.report.slowest.get(result.topic, late), late)
+        if not self._places:
+            return
+        place, pose = min(self._places, key=lambda at: abs(at[0].stamp - result.stamp))
+        if isinstance(result, LabelledBoxes3D):
+            result = self._placed(result, place, [])
+        elif not result.camera:
+            names = {self._camera_frames.get(role.topic): role.name for role in self._roles.cameras}
+            result = replace(result, camera=names.get(result.frame_id, ""))
+        self._overtaken.append(LateResult(result, place.stamp, pose))
+
+    def overtaken(self) -> tuple[LateResult, ...]:
+        """The robot's results that no frame has taken, since the last call."""
+        found = tuple(self._overtaken)
+        self._overtaken.clear()
+        return found
 
     def _arrived(self, topic: str, stamp: int, received: int) -> int:
         """The stamp to go by."""
@@ -382,6 +453,19 @@ class Synchronizer:
         for group in groups:
             yield from group.items()
 
+    def lacking(self) -> Iterator[str]:
+        """What keeps frames from being whole so far, and may still come: calibrations and transforms."""
+        lidar = next(iter(self._lidar_frames.values()), "")
+        for camera in self._roles.cameras:
+            if camera.info_topic and camera.info_topic not in self.intrinsics:
+                yield f"no CameraInfo on {camera.info_topic} yet"
+            frame = self._camera_frames.get(camera.topic, "")
+            if self._roles.tf_static + self._roles.tf and frame and lidar and not self.tf.knows(lidar, frame):
+                yield f"no transform from '{lidar}' to '{frame}' yet"
+        moving = self._roles.tf or self._roles.odometry
+        if moving and lidar and not self._fixed(lidar)[0]:
+            yield f"no transform from '{lidar}' to a frame that stands still yet"
+
     # --- what goes out -------------------------------------------------------------------------
 
     def ready(self, now: int | None = None) -> Iterator[Frame]:
@@ -417,15 +501,17 @@ class Synchronizer:
     def _complete(self) -> bool:
         """Whether nothing that may still come could change the oldest cloud's frame."""
         stamp = self._clouds[0].stamp
-        waited = [track for topic, track in self._tracks() if topic not in self.absent]
+        beside = self.absent | self._beside
+        waited = [track for topic, track in self._tracks() if topic not in beside]
         if any(track.newest is None or track.newest < stamp for track in waited):
             return False
-        results: list[_Track[Any]] = [
-            *self._boxes.values(),
-            *self._detections.values(),
-            *self._robot_clouds.values(),
-            *self._truth.values(),
-        ]
+        groups: tuple[Mapping[str, _Track[Any]], ...] = (
+            self._boxes,
+            self._detections,
+            self._robot_clouds,
+            self._truth,
+        )
+        results = [track for group in groups for topic, track in group.items() if topic not in self._beside]
         if len(self._clouds) == 1 and any(self._may_be_of_next(track, stamp) for track in results):
             return False
         infos = {camera.info_topic for camera in self._roles.cameras} - {""}
@@ -508,6 +594,12 @@ class Synchronizer:
         self._index += 1
         self._last = cloud.stamp
         self.report.frames += 1
+        self._places.append((place, frame.pose))
+        unused: tuple[Mapping[str, _Track[Any]], ...] = (self._boxes, self._detections)
+        for group in unused:
+            for topic in self._beside & group.keys():
+                for result in group[topic].shed(last):
+                    self._overtake(result)
         for _, track in self._tracks():
             track.forget(cloud.stamp - self._tolerance)
         return frame

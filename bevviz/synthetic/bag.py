@@ -106,7 +106,7 @@ def messages(source: SyntheticSource, frame: Frame) -> list[tuple[str, int, Any]
         found += _poses(source, stamp)
     if truth is not None:
         results = [[pair] for pair in zip(truth.labels, truth.scores.tolist(), strict=True)]
-        boxes = encode_boxes_3d(truth.stamp, truth.frame_id, truth.boxes, results)
+        boxes = encode_boxes_3d(truth.stamp, truth.frame_id, truth.boxes, results, ids=truth.ids)
         found.append((drive.TRUTH_TOPIC, truth.received, boxes))
     if camera.image is not None and camera.intrinsics is not None:
         received, info = camera.image.received, encode_camera_info(camera.image, camera.intrinsics)

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
@@ -28,7 +28,7 @@ from bevviz.frame import (
 )
 from bevviz.synthetic import faults
 from bevviz.synthetic.mesh import Material
-from bevviz.synthetic.sensors import Caster, Lidar, PinholeCamera, View, optical
+from bevviz.synthetic.sensors import Caster, Lidar, PinholeCamera, Scan, View, optical
 from bevviz.synthetic.world import World, bounds
 
 LIDAR_TOPIC = "/rslidar_points"
@@ -45,6 +45,10 @@ IMAGE_DELAY = 12_000_000  # nanoseconds from a scan to its image
 LATENCY = 8_000_000  # nanoseconds from a stamp to its reception
 TRUTH_RANGE = 80.0  # metres
 GROUND = (Material.ROAD, Material.PAVEMENT, Material.KERB, Material.GRASS)
+# SemanticKITTI's numbers (Behley et al. 2019), in the field 'label' of the points.
+SCENERY_LABELS = {Material.ROAD: 40, Material.PAVEMENT: 48, Material.KERB: 49, Material.GRASS: 72}
+OBJECT_LABELS = {"car": 10, "person": 30, "cyclist": 31}
+OTHER_STRUCTURE, OTHER_OBJECT = 52, 99
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,7 +68,7 @@ class SyntheticSource:
 
     The scan is one instant (free of motion distortion); the image is taken ``IMAGE_DELAY`` later, so that
     projection needs motion compensation. The same arguments give the same frames, each of them whatever
-    was asked for before.
+    was asked for before and however long the drive is.
 
     Args:
         frames: length of the drive.
@@ -75,7 +79,7 @@ class SyntheticSource:
         image_late: seconds by which the stamps of the images are late.
 
     Raises:
-        UserError: ``frames`` below 1, no such fault, or a drive too short for it.
+        UserError: ``frames`` below 1, ``seed`` below 0, no such fault, or a drive too short for it.
     """
 
     def __init__(
@@ -92,6 +96,8 @@ class SyntheticSource:
     ) -> None:
         if frames < 1:
             raise UserError(f"a synthetic drive needs at least 1 frame, not {frames}")
+        if seed < 0:
+            raise UserError(f"seed {seed}: a seed is 0 or above")
         self.total = frames
         self.seed = seed
         self.faults = faults.find(plant, (frames - 1) * PERIOD * 1e-9)
@@ -122,8 +128,9 @@ class SyntheticSource:
         return World(self.seed, self.total * PERIOD * 1e-9, scenes, weave=self._weave)
 
     @cached_property
-    def _static(self) -> Caster:
-        return Caster(self.world.static)
+    def _static(self) -> Callable[[int], Caster]:
+        """The scenery around a section of the street; a scan and its image may be in two."""
+        return lru_cache(maxsize=2)(lambda section: Caster(self.world.static(section)))
 
     @property
     def intrinsics(self) -> Intrinsics:
@@ -187,12 +194,14 @@ class SyntheticSource:
         at_scan, at_image = ((t - START) * 1e-9 for t in (stamp, taken))
 
         moving = self.world.moving(at_scan, map_from_lidar[:3, 3], self._lidar.reach)
-        scan = self._lidar.scan(View(self._static, moving), map_from_lidar, rng)
+        scan = self._lidar.scan(View(self._static(self.world.section(at_scan)), moving), map_from_lidar, rng)
         ahead = map_from_lens[:3, 3] + 50.0 * map_from_lens[:3, 2]  # what is far behind casts no shadow here
-        seen = View(self._static, self.world.moving(at_image, ahead, 70.0))
+        scenery = self._static(self.world.section(at_image))
+        seen = View(scenery, self.world.moving(at_image, ahead, 70.0))
         picture = self._camera.picture(seen, map_from_lens, self.world.light, rng)
 
         fields: dict[str, NDArray[Any]] = {"intensity": scan.intensity, "ring": scan.ring, "time": scan.time}
+        fields["label"] = self._labels(scan)
         cloud = Cloud(stamp, LIDAR_FRAME, scan.xyz, fields, LIDAR_TOPIC, stamp + LATENCY, name=LIDAR_FRAME)
         image = Image(shot, CAMERA_FRAME, picture.bgr, topic=IMAGE_TOPIC, received=shot + LATENCY)
         camera = Camera(
@@ -223,9 +232,18 @@ class SyntheticSource:
             truth=truth,
             tf_age=0.0,
         )
-        hits = np.bincount(scan.object, minlength=len(self.world.actors) + 1)[numbers]
+        hits = np.bincount(scan.object, minlength=max(numbers, default=0) + 1)[numbers]
         ground = np.isin(scan.material, GROUND)
         return Snapshot(frame, numbers, hits.astype(np.int32), scan.object, ground, picture.object)
+
+    def _labels(self, scan: Scan) -> NDArray[np.uint16]:
+        """(N,) what each point is of."""
+        scenery = np.full(len(Material), OTHER_STRUCTURE, np.uint16)
+        for material, number in SCENERY_LABELS.items():
+            scenery[material] = number
+        kinds = [OBJECT_LABELS.get(actor.label, OTHER_OBJECT) for actor in self.world.actors]
+        of_object = np.array([0, *kinds], np.uint16)
+        return np.where(scan.object > 0, of_object[scan.object], scenery[scan.material])
 
     def _truth(self, stamp: int, time: float, map_from_lidar: F64) -> tuple[LabelledBoxes3D, I32]:
         """Tight boxes, upright in the LiDAR's frame, around every actor in range, hidden or not."""
@@ -248,5 +266,6 @@ class SyntheticSource:
             np.ones(len(objects), np.float32),
             map_from_lidar,
             stamp + LATENCY,
+            ids=tuple(str(actor.number) for actor, _, _ in objects),
         )
         return truth, np.array([actor.number for actor, _, _ in objects], np.int32)

@@ -21,6 +21,7 @@ _SURFACE: Mapping[Material, tuple[float, float]] = {
     Material.CLOTH: (0.33, 0.08), Material.SKIN: (0.45, 0.0), Material.METAL: (0.55, 0.0),
     Material.FOLIAGE: (0.45, 0.7), Material.BARK: (0.25, 0.4), Material.SIGN: (1.0, 0.0),
 }  # fmt: skip
+SIGHT = 130.0  # metres that a camera sees through the haze: less than there is of the street
 REFLECTANCE, TEXTURE = np.array([_SURFACE[m] for m in Material], np.float32).T
 
 
@@ -210,7 +211,7 @@ class PinholeCamera:
         import cv2
 
         rays = _rays(map_from_camera, self._directions)
-        hits = view.cast(rays)
+        hits = view.cast(rays, SIGHT)
         image = _sky(rays[:, 3:], light)
         direction = rays[hits.ray, 3:]
         point = rays[hits.ray, :3] + direction * hits.distance[:, None]
@@ -227,7 +228,9 @@ class PinholeCamera:
         shade = albedo * (sky_seen * light.ambient + lit[:, None] * light.direct)
         _reflect(shade, hits, direction, light)
         haze = np.exp(-hits.distance / 350.0)[:, None]
-        image[hits.ray] = shade * haze + light.horizon * (1 - haze)
+        clear = np.clip((SIGHT - hits.distance) / (0.4 * SIGHT), 0, 1)[:, None]
+        hazy = shade * haze + light.horizon * (1 - haze)
+        image[hits.ray] = hazy * clear + image[hits.ray] * (1 - clear)
         image = cv2.GaussianBlur(image.reshape(self.height, self.width, 3), (3, 3), 0.55)
         image += rng.standard_normal(image.shape, np.float32) * 2.0
         number = np.full(len(rays), -1, np.int32)

@@ -1,9 +1,16 @@
-"""The street, who is in it, and where everything is at a given time."""
+"""The street, who is in it, and where everything is at a given time.
+
+What is seen at a time depends on the seed alone, not on how long the drive is: every row of things along the
+street has its own random numbers and is drawn from its beginning on, so that a longer drive only adds to it;
+and the scenery is cut into sections, each of which is all that can be seen from it.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import zlib
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import chain
 
 import numpy as np
 
@@ -13,7 +20,8 @@ from bevviz.synthetic import models
 from bevviz.synthetic.mesh import Material, Mesh, grid, merge
 
 SPEED = 8.0  # metres per second, the ego vehicle's mean
-MARGIN = 140.0  # metres of street before the start and beyond the end: more than the LiDAR's range
+MARGIN = 140.0  # metres of street before and beyond a section: more than any sensor's range
+SECTION = 60.0  # metres along the street that are driven with the same scenery around
 ROAD, PAVEMENT, KERB = (
     6.4,
     9.4,
@@ -24,11 +32,17 @@ _PACE = 2 * np.pi / 8.0  # radians per second at which a weaving vehicle brakes 
 
 
 class Street:
-    """A centre line that turns, climbs and falls. ``s`` is the way along it, ``lateral`` to its left."""
+    """A centre line that turns, climbs and falls. ``s`` is the way along it, ``lateral`` to its left.
+
+    Args:
+        rng: for its curves and grades.
+        length: metres that are driven from ``s`` = 0; there is more before and beyond.
+    """
 
     def __init__(self, rng: np.random.Generator, length: float) -> None:
-        self.start, self.end = -MARGIN, length + MARGIN
-        self.s = np.arange(self.start, self.end + 0.5, 0.5)
+        self.start, self.end = -MARGIN, (length // SECTION + 1) * SECTION + MARGIN
+        beyond = 30.0  # the last house begins before the end
+        self.s = np.arange(self.start, self.end + beyond, 0.5)
         wave, phase = rng.uniform((200, 150, 90), (300, 200, 120)), rng.uniform(0, 2 * np.pi, 3)
         grade = rng.uniform(0.035, 0.055) * np.sin(2 * np.pi * self.s / wave[1] + phase[1])
         grade += 0.015 * np.sin(2 * np.pi * self.s / wave[2] + phase[2])
@@ -67,7 +81,7 @@ class Street:
 class Actor:
     """A road user: where it is at time 0, and how it goes along the street."""
 
-    number: int  # 1, 2, ...: the object in meshes and images
+    number: int  # from 1, with gaps: the object in meshes and images
     label: str
     model: models.Model
     s: float
@@ -112,25 +126,44 @@ class World:
         *,
         weave: bool = False,
     ) -> None:
-        rng = np.random.default_rng(seed)
         self.length = SPEED * duration + 10.0
         self._weave = weave
-        self.street = Street(rng, self.length)
-        self.light = _light(rng)
-        self._sway = rng.uniform(0, 2 * np.pi, 2)
-        actors = _Cast(rng, self.street, duration).actors
+        self.street = Street(_stream(seed, "street"), self.length)
+        self.light = _light(_stream(seed, "light"))
+        self._sway = _stream(seed, "sway").uniform(0, 2 * np.pi, 2)
         stages = [
             Stage(self.street, self._way(time), time, np.random.default_rng(seed)) for time, _ in scenes
         ]
         for (_, scene), stage in zip(scenes, stages, strict=True):
             scene(stage)
-            actors = [actor for actor in actors if stage.is_clear_of(actor)]
-        actors += [actor for stage in stages for actor in stage.actors]
-        self.actors = [replace(actor, number=i + 1) for i, actor in enumerate(actors)]
+        rows: list[list[Actor]] = [list(row) for row in _population(seed, self.street, duration)]
+        rows.append([actor for stage in stages for actor in stage.actors])
+        self.actors = [
+            # Who it is does not change with how many others there are.
+            replace(actor, number=1 + i + k * len(rows))
+            for i, row in enumerate(rows)
+            for k, actor in enumerate(row)
+            if row is rows[-1] or all(stage.is_clear_of(actor) for stage in stages)
+        ]
         self._parked = {a.number: a.mesh(self.street, 0.0) for a in self.actors if a.speed == 0}
-        scenery = [_ground(self.street), *_houses(rng, self.street), *_furniture(rng, self.street)]
-        scenery += [mesh for stage in stages for mesh in stage.placed]
-        self.static = merge([*scenery, *self._parked.values()])
+        self._scenery: list[Placed] = [
+            *chain.from_iterable(_houses(_stream(seed, "houses", side), self.street, side) for side in SIDES),
+            *chain.from_iterable(
+                _furniture(_stream(seed, "furniture", side), self.street, side) for side in SIDES
+            ),
+            *chain.from_iterable(stage.placed for stage in stages),
+            *((a.s, self._parked[a.number]) for a in self.actors if a.speed == 0),
+        ]
+
+    def section(self, time: float) -> int:
+        """Which section of the street the ego vehicle is in."""
+        return int(self._way(time) // SECTION)
+
+    def static(self, section: int) -> Mesh:
+        """All that does not move, within ``MARGIN`` metres of a section."""
+        start = max(section * SECTION - MARGIN, self.street.start)
+        end = (section + 1) * SECTION + MARGIN
+        return merge([_ground(self.street, start, end), *(m for s, m in self._scenery if start <= s < end)])
 
     def ego(self, time: float) -> F64:
         """(4, 4) map_from_base_link: on the road below the middle of the vehicle."""
@@ -196,7 +229,7 @@ class Stage:
     def __init__(self, street: Street, way: float, time: float, rng: np.random.Generator) -> None:
         self.rng, self._street, self._way, self._time = rng, street, way, time
         self.actors: list[Actor] = []
-        self.placed: list[Mesh] = []
+        self.placed: list[Placed] = []
 
     def add(self, label: str, model: models.Model, ahead: float, lateral: float, turn: float = 0.0) -> None:
         """Somebody who stands ``ahead`` metres in front of the ego vehicle, on the road."""
@@ -205,7 +238,8 @@ class Stage:
 
     def place(self, mesh: Mesh, ahead: float, lateral: float) -> None:
         """Something that nobody looks for."""
-        self.placed.append(mesh.moved(self._street.pose(self._way + ahead, lateral)))
+        s = self._way + ahead
+        self.placed.append((s, mesh.moved(self._street.pose(s, lateral))))
 
     def is_clear_of(self, actor: Actor) -> bool:
         """Whether an actor of the street is elsewhere at that time; the others are not let on."""
@@ -215,80 +249,94 @@ class Stage:
 
 # --- population --------------------------------------------------------------------------------
 
+SIDES = (-1, 1)
+Placed = tuple[float, Mesh]  # metres along the street, and what begins there
+_TOWN = 1  # chosen so that each planted fault on the street of seed 0 fools those that it is said to fool
 
-class _Cast:
-    """Draws the actors. Those of a lane share one speed, so that none drives through another."""
 
-    def __init__(self, rng: np.random.Generator, street: Street, duration: float) -> None:
-        self.rng, self.actors = rng, list[Actor]()
-        extra = 10.0 * duration  # ground that oncoming traffic covers meanwhile
-        for side in (-1, 1):
-            self._park(street, side)
-        self._drive(-1.7, SPEED, (-22.0, 21.0, *self._spaced(55.0, street.end, 20, 60)))
-        self._drive(1.7, -9.0, self._spaced(20.0, street.end + extra, 20, 60))
-        self._ride(-3.7, 4.6, self._spaced(9.0, street.end, 18, 45))
-        self._ride(3.7, -4.8, self._spaced(14.0, street.end + extra, 18, 55))
-        for side in (-1, 1):
-            self._walk(side * 8.0, rng.uniform(1.15, 1.3), self._spaced(street.start, street.end, 5, 26))
-            self._walk(side * 8.8, -rng.uniform(1.15, 1.3), self._spaced(street.start, street.end, 5, 26))
-            for s in self._spaced(street.start, street.end, 12, 50):
-                self._add(
-                    "person",
-                    models.person(rng, walking=False),
-                    s,
-                    side * 7.3,
-                    KERB,
-                    rng.uniform(0, 2 * np.pi),
-                )
+def _stream(seed: int, kind: str, side: int = 0) -> np.random.Generator:
+    """Random numbers of one kind of things alone: what is drawn for others does not change them."""
+    return np.random.default_rng((_TOWN, seed, zlib.crc32(kind.encode()), side + 1))
 
-    def _spaced(self, start: float, end: float, least: float, most: float) -> list[float]:
-        steps = self.rng.uniform(least, most, int((end - start) / least) + 1)
-        places = start + np.cumsum(steps) - least
-        return [float(s) for s in places[places < end - 8]]
 
-    def _add(
-        self,
-        label: str,
-        model: models.Model,
-        s: float,
-        lateral: float,
-        height: float,
-        turn: float,
-        speed: float = 0.0,
-    ) -> None:
-        upright = label == "person"
-        self.actors.append(
-            Actor(len(self.actors) + 1, label, model, s, lateral, height, turn, speed, upright)
-        )
+def _population(seed: int, street: Street, duration: float) -> Iterator[Iterator[Actor]]:
+    """Rows of actors, each in order along the street. Those of a lane share one speed, so that none drives
+    through another; who comes towards the ego vehicle starts from beyond the street's end."""
 
-    def _park(self, street: Street, side: int) -> None:
-        rng, s = self.rng, street.start + 8
-        while s < street.end - 12:
-            if rng.random() < 0.48:
-                turn = rng.normal(0, 0.02) + (np.pi if (side > 0) ^ (rng.random() < 0.15) else 0)
-                self._add("car", models.car(rng), s, side * (5.3 + rng.normal(0, 0.05)), 0.0, turn)
-            elif rng.random() < 0.4:
-                self._add("person", models.person(rng, False), s, side * 4.9, 0.0, -side * np.pi / 2)
-            s += rng.uniform(5.9, 7.5)
+    def until(speed: float) -> float:
+        return street.end + max(0.0, -speed) * duration
 
-    def _drive(self, lateral: float, speed: float, places: tuple[float, ...] | list[float]) -> None:
-        for s in places:
-            self._add("car", models.car(self.rng), s, lateral, 0.0, 0.0 if speed > 0 else np.pi, speed)
+    for side in SIDES:
+        yield _parked(_stream(seed, "parked", side), street, side)
+    yield _cars(_stream(seed, "traffic"), -1.7, SPEED, (-22.0, 21.0), 55.0, until(SPEED))
+    yield _cars(_stream(seed, "oncoming"), 1.7, -9.0, (), 20.0, until(-9.0))
+    yield _cyclists(_stream(seed, "cyclists", -1), -3.7, 4.6, 9.0, 45.0, until(4.6))
+    yield _cyclists(_stream(seed, "cyclists", 1), 3.7, -4.8, 14.0, 55.0, until(-4.8))
+    for side in SIDES:
+        for lateral, way in ((8.0, 1), (8.8, -1)):
+            rng = _stream(seed, f"walkers at {lateral}", side)
+            speed = way * rng.uniform(1.15, 1.3)
+            yield _walkers(rng, side * lateral, speed, street.start, until(1.03 * speed))
+        yield _standing(_stream(seed, "standing", side), street, side)
 
-    def _ride(self, lateral: float, speed: float, places: list[float]) -> None:
-        for s in places:
-            self._add(
-                "cyclist", models.cyclist(self.rng), s, lateral, 0.0, 0.0 if speed > 0 else np.pi, speed
-            )
 
-    def _walk(self, lateral: float, speed: float, places: list[float]) -> None:
-        for s in places:
-            turn = 0.0 if speed > 0 else np.pi
-            offsets = (0.0, 0.6) if self.rng.random() < 0.25 else (self.rng.normal(0, 0.1),)
-            for offset in offsets:
-                model = models.person(self.rng)
-                pace = speed * (1.0 if len(offsets) == 2 else self.rng.uniform(0.97, 1.03))
-                self._add("person", model, s, lateral - np.sign(lateral) * offset, KERB, turn, pace)
+def _spaced(rng: np.random.Generator, start: float, end: float, least: float, most: float) -> Iterator[float]:
+    s = start + rng.uniform(0.0, most - least)
+    while s < end:
+        yield s
+        s += rng.uniform(least, most)
+
+
+def _actor(
+    label: str, model: models.Model, s: float, lateral: float, height: float, turn: float, speed: float = 0.0
+) -> Actor:
+    return Actor(0, label, model, s, lateral, height, turn, speed, upright=label == "person")
+
+
+def _parked(rng: np.random.Generator, street: Street, side: int) -> Iterator[Actor]:
+    for s in _spaced(rng, street.start + 8, street.end, 5.9, 7.5):
+        if rng.random() < 0.48:
+            turn = rng.normal(0, 0.02) + (np.pi if (side > 0) ^ (rng.random() < 0.15) else 0)
+            yield _actor("car", models.car(rng), s, side * (5.3 + rng.normal(0, 0.05)), 0.0, turn)
+        elif rng.random() < 0.4:
+            yield _actor("person", models.person(rng, False), s, side * 4.9, 0.0, -side * np.pi / 2)
+
+
+def _cars(
+    rng: np.random.Generator,
+    lateral: float,
+    speed: float,
+    first: tuple[float, ...],
+    start: float,
+    end: float,
+) -> Iterator[Actor]:
+    for s in chain(first, _spaced(rng, start, end, 20, 60)):
+        yield _actor("car", models.car(rng), s, lateral, 0.0, 0.0 if speed > 0 else np.pi, speed)
+
+
+def _cyclists(
+    rng: np.random.Generator, lateral: float, speed: float, start: float, most: float, end: float
+) -> Iterator[Actor]:
+    for s in _spaced(rng, start, end, 18, most):
+        yield _actor("cyclist", models.cyclist(rng), s, lateral, 0.0, 0.0 if speed > 0 else np.pi, speed)
+
+
+def _walkers(
+    rng: np.random.Generator, lateral: float, speed: float, start: float, end: float
+) -> Iterator[Actor]:
+    for s in _spaced(rng, start, end, 5, 26):
+        turn = 0.0 if speed > 0 else np.pi
+        offsets = (0.0, 0.6) if rng.random() < 0.25 else (rng.normal(0, 0.1),)
+        for offset in offsets:
+            model = models.person(rng)
+            pace = speed * (1.0 if len(offsets) == 2 else rng.uniform(0.97, 1.03))
+            yield _actor("person", model, s, lateral - np.sign(lateral) * offset, KERB, turn, pace)
+
+
+def _standing(rng: np.random.Generator, street: Street, side: int) -> Iterator[Actor]:
+    for s in _spaced(rng, street.start, street.end, 12, 50):
+        turn = rng.uniform(0, 2 * np.pi)
+        yield _actor("person", models.person(rng, walking=False), s, side * 7.3, KERB, turn)
 
 
 # --- scenery -----------------------------------------------------------------------------------
@@ -305,8 +353,8 @@ def _light(rng: np.random.Generator) -> Light:
     return Light(*(v.astype(np.float32) for v in (sun, direct, ambient, zenith, horizon)))
 
 
-def _ground(street: Street) -> Mesh:
-    s = np.append(np.arange(street.start, street.end, 2.0), street.end)
+def _ground(street: Street, start: float, end: float) -> Mesh:
+    s = np.arange(start, end + 1.0, 2.0)
     strips = (
         ((-60, -25, -PAVEMENT), KERB, (60, 115, 95), Material.GRASS),
         ((-PAVEMENT, -8, -ROAD), KERB, (140, 146, 150), Material.PAVEMENT),
@@ -325,49 +373,34 @@ def _ground(street: Street) -> Mesh:
     return merge(parts)
 
 
-def _houses(rng: np.random.Generator, street: Street) -> list[Mesh]:
-    parts = []
-    for side in (-1, 1):
-        s = street.start
-        while s < street.end - 20:
-            length = rng.uniform(8, 18)
-            if rng.random() < 0.2:
-                parts.append(models.hedge(rng, length).moved(street.pose(s + length / 2, side * 9.9, KERB)))
-                for at in np.arange(s + 2, s + length, 5.0):
-                    parts.append(models.tree(rng).moved(street.pose(at, side * rng.uniform(11.5, 18), KERB)))  # noqa: PERF401
-            else:
-                mesh = models.house(rng, length, rng.uniform(8, 12), rng.uniform(6, 14))
-                front = side * (PAVEMENT + 0.25 + max(0.0, rng.normal(0, 0.5)))
-                parts.append(
-                    mesh.moved(street.pose(s + length / 2, front, KERB, turn=0 if side > 0 else np.pi))
-                )
-            s += length
-        for end, way in ((street.start, -1), (street.end, 1)):  # a house across each end closes the view
-            across = models.house(rng, 70.0, 10.0, 12.0)
-            parts.append(across.moved(street.pose(end, 0.0, turn=-way * np.pi / 2)))
-    return parts
+def _houses(rng: np.random.Generator, street: Street, side: int) -> Iterator[Placed]:
+    s = street.start
+    while s < street.end:
+        length = rng.uniform(8, 18)
+        if rng.random() < 0.2:
+            yield s, models.hedge(rng, length).moved(street.pose(s + length / 2, side * 9.9, KERB))
+            for at in np.arange(s + 2, s + length, 5.0):
+                yield at, models.tree(rng).moved(street.pose(at, side * rng.uniform(11.5, 18), KERB))
+        else:
+            mesh = models.house(rng, length, rng.uniform(8, 12), rng.uniform(6, 14))
+            front = side * (PAVEMENT + 0.25 + max(0.0, rng.normal(0, 0.5)))
+            turn = 0 if side > 0 else np.pi
+            yield s, mesh.moved(street.pose(s + length / 2, front, KERB, turn=turn))
+        s += length
 
 
-def _furniture(rng: np.random.Generator, street: Street) -> list[Mesh]:
-    parts = []
-    for side in (-1, 1):
-        s = street.start + rng.uniform(2, 12)
-        while s < street.end - 5:
-            kind = rng.choice(["lamp", "tree", "sign", "bin"], p=[0.35, 0.35, 0.18, 0.12])
-            if kind == "lamp":
-                parts.append(
-                    models.lamp_post().moved(street.pose(s, side * 6.75, KERB, turn=0 if side < 0 else np.pi))
-                )
-            elif kind == "tree":
-                parts.append(models.tree(rng).moved(street.pose(s, side * 6.9, KERB)))
-            elif kind == "sign":
-                parts.append(
-                    models.sign(rng).moved(street.pose(s, side * 6.8, KERB, turn=0 if side < 0 else np.pi))
-                )
-            else:
-                parts.append(models.litter_bin(rng).moved(street.pose(s, side * 6.85, KERB)))
-            s += rng.uniform(7, 15)
-    return parts
+def _furniture(rng: np.random.Generator, street: Street, side: int) -> Iterator[Placed]:
+    turn = 0 if side < 0 else np.pi
+    for s in _spaced(rng, street.start + 2, street.end, 7, 15):
+        kind = rng.choice(["lamp", "tree", "sign", "bin"], p=[0.35, 0.35, 0.18, 0.12])
+        if kind == "lamp":
+            yield s, models.lamp_post().moved(street.pose(s, side * 6.75, KERB, turn=turn))
+        elif kind == "tree":
+            yield s, models.tree(rng).moved(street.pose(s, side * 6.9, KERB))
+        elif kind == "sign":
+            yield s, models.sign(rng).moved(street.pose(s, side * 6.8, KERB, turn=turn))
+        else:
+            yield s, models.litter_bin(rng).moved(street.pose(s, side * 6.85, KERB))
 
 
 def bounds(mesh: Mesh, frame_from_map: F64, heading: float) -> tuple[F32, F32]:

@@ -19,7 +19,7 @@ from bevviz.why.sentences import verdict_of
 from bevviz.why.subject import Selection, Subject
 from bevviz.why.traces import Traces
 from bevviz.why.verdict import HOPELESS, Reason, Verdict, find_reason
-from bevviz.why.whatif import Hint, WhatIf
+from bevviz.why.whatif import Hint, Search, WhatIf
 
 
 @dataclass(frozen=True, slots=True)
@@ -175,17 +175,21 @@ class Questioner:
         answers = [a for a in self.ask(Selection()) if a.near and not a.verdict.reported and not a.folded]
         return sorted(answers, key=_far)
 
-    def hints(self, answer: Answer) -> tuple[Hint, ...]:
+    def search(self, answer: Answer) -> Search:
         """What would change an answer: other configurations are run, which takes a while."""
         verdict = answer.verdict
-        return self._what_if.hints(answer.subject, answer.evidence, verdict.reason, verdict.reported)
+        return self._what_if.search(answer.subject, answer.evidence, verdict.reason, verdict.reported)
 
     def with_hints(self, answer: Answer) -> Answer:
-        """The answer with its hints, and the sentence that names the first."""
-        hints = self.hints(answer)
+        """The answer with its hints, and the sentence that names the first, or says that there is none."""
+        search, verdict = self.search(answer), answer.verdict
+        hints = search.hints
         if not hints:
-            return answer
-        hint, verdict = hints[0], answer.verdict
+            if verdict.reason is Reason.REPORTED or answer.folded or not search.tried:
+                return answer
+            text = f"{verdict.text.removesuffix('.')}; {_in_vain(search)}."
+            return replace(answer, verdict=replace(verdict, text=text))
+        hint = hints[0]
         also = f" (in this frame it {hint.effects.text})" if hint.effects.text else ""
         settings = ", ".join(hint.settings)
         text = f"{verdict.text.removesuffix('.')}; change {settings}: {hint.text}{also}."
@@ -215,6 +219,14 @@ def why(
 ) -> list[Answer]:
     """One question about a result: see ``Questioner.explain``."""
     return Questioner(result, loader, classes).explain(selection, hints, everything=everything)
+
+
+def _in_vain(search: Search) -> str:
+    count = "the change" if search.tried == 1 else f"none of the {search.tried} changes"
+    helps = "that was tried does not help" if search.tried == 1 else "that were tried helps"
+    if search.then is None:
+        return f"{count} {helps}"
+    return f"{count} {helps}: with {', '.join(search.furthest)} it is lost as '{search.then.value}'"
 
 
 def _rank(answer: Answer) -> tuple[bool, bool, bool, bool, bool, float]:

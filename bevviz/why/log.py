@@ -8,8 +8,10 @@ import numpy as np
 import rerun as rr
 
 from bevviz import geometry
-from bevviz.frame import F32, Camera, Frame
+from bevviz.config import BevConfig
+from bevviz.frame import F32, U8, Camera, Frame
 from bevviz.logging import entities
+from bevviz.logging.bev import footprints, seen_from_above
 from bevviz.logging.camera import over_image
 from bevviz.logging.pieces import boxes2d, document, edges, transform
 from bevviz.logging.writer import Writer
@@ -30,7 +32,19 @@ _SUBJECT = (255, 60, 200)
 _DEPTH = 20.0  # metres that a frustum is drawn to where the distance is unknown
 
 
-def log_answers(recording: rr.RecordingStream, frame: Frame, answers: Sequence[Answer], shown: int) -> None:
+def clear_answers(recording: rr.RecordingStream) -> None:
+    """Nothing is explained from the recording's current time on."""
+    for path in (entities.WHY, entities.overlay("why")):
+        recording.log(path, rr.Clear(recursive=True))
+
+
+def log_answers(
+    recording: rr.RecordingStream,
+    frame: Frame,
+    answers: Sequence[Answer],
+    shown: int,
+    above: BevConfig | None = None,
+) -> None:
     """The first answers over the frame, at the recording's current time; the words of all.
 
     Args:
@@ -38,6 +52,7 @@ def log_answers(recording: rr.RecordingStream, frame: Frame, answers: Sequence[A
         frame: what was explained.
         answers: worst first.
         shown: how many of them are drawn.
+        above: of the bird's-eye view, to draw them there, too.
     """
     recording.log(entities.WHY, document(page(answers, shown)))
     pose = transform(frame.pose)
@@ -65,21 +80,46 @@ def log_answers(recording: rr.RecordingStream, frame: Frame, answers: Sequence[A
         recording.log(entities.why("place"), pose, place)
     for camera in frame.cameras:
         _log_image(recording, camera, drawn)
+    if above is not None:
+        _log_above(recording, frame, drawn, above, fate)
 
 
-def mark_answers(to: Writer, frame: Frame, answers: Sequence[Answer]) -> None:
+def _log_above(
+    recording: rr.RecordingStream, frame: Frame, answers: Sequence[Answer], config: BevConfig, fate: U8
+) -> None:
+    """Outlines, or the points where there is no box, as far as they are in the bird's-eye view."""
+    reach = np.array([config.range_x, config.range_y], np.float32)
+    boxes = [a.subject.box for a in answers if a.subject.box is not None]
+    inside = [box for box in boxes if (np.abs(box.center[0, :2]) < reach).all()]
+    points = frame.points[fate > 0]
+    points = points[(np.abs(points[:, :2]) < reach).all(axis=1)]
+    marks: rr.LineStrips2D | rr.Points2D
+    if inside:
+        outlines = np.concatenate([footprints(geometry.corners(box)) for box in inside])
+        strips, radii = seen_from_above(config, np.eye(4), outlines), rr.Radius.ui_points(2.5)
+        marks = rr.LineStrips2D(strips, radii=radii, colors=[_SUBJECT], draw_order=40.0)
+    elif len(points) and not boxes:
+        dots, radii = seen_from_above(config, np.eye(4), points), rr.Radius.ui_points(2.0)
+        marks = rr.Points2D(dots, radii=radii, colors=[_SUBJECT], draw_order=40.0)
+    else:
+        return
+    recording.log(entities.overlay("why"), marks)
+
+
+def mark_answers(to: Writer, frame: Frame, answers: Sequence[Answer], above: BevConfig | None = None) -> None:
     """The answers over the frame, and nothing of those before; gone again at the next frame.
 
     Args:
-        to: a writer of its own, whose clock is set.
+        to: a writer of its own.
         frame: what was explained.
         answers: all are drawn.
+        above: as of ``log_answers``.
     """
     to.set_time(frame.index, frame.stamp, frame.received)
-    to.recording.log(entities.WHY, rr.Clear(recursive=True))
-    log_answers(to.recording, frame, answers, len(answers))
+    clear_answers(to.recording)
+    log_answers(to.recording, frame, answers, len(answers), above)
     to.set_time(frame.index + 1, frame.stamp + 1, frame.received and frame.received + 1)
-    to.recording.log(entities.WHY, rr.Clear(recursive=True))
+    clear_answers(to.recording)
 
 
 def _frustums(camera: Camera, answers: Sequence[Answer]) -> Iterator[tuple[F32, str]]:

@@ -20,6 +20,7 @@ from bevviz.frame import (
     CameraResult,
     Decision,
     Detections,
+    Frame,
     FrameResult,
 )
 from bevviz.stages.robot import in_points_frame
@@ -215,22 +216,7 @@ class Traces:
     @cached_property
     def truth(self) -> tuple[Subject, ...]:
         """Its objects, in order of their rows."""
-        stated = self.result.frame.truth
-        if stated is None:
-            return ()
-        boxes = in_points_frame(self.result.frame, stated)
-        away = np.hypot(*boxes.center[:, :2].T)
-        return tuple(
-            Subject(
-                "truth",
-                f"the {label.lower()} at {away[row]:.1f} m",
-                label,
-                accepted_names(label, self.classes),
-                row,
-                box=one_of(boxes, row),
-            )
-            for row, label in enumerate(stated.labels)
-        )
+        return truth_subjects(self.result.frame, self.classes)
 
     @cached_property
     def of_truth(self) -> Bool:
@@ -340,6 +326,31 @@ class Traces:
                 kept = camera.detections.kept & (self.owners(camera) < 0)
                 found += [detection_subject(camera, d) for d in np.flatnonzero(kept).tolist()]
         return tuple(found)
+
+
+def truth_subjects(frame: Frame, classes: Sequence[str] = ()) -> tuple[Subject, ...]:
+    """The objects of a frame's ground truth, in order of their rows.
+
+    Args:
+        frame: the frame.
+        classes: names that the detector knows.
+    """
+    stated = frame.truth
+    if stated is None:
+        return ()
+    boxes = in_points_frame(frame, stated)
+    away = np.hypot(*boxes.center[:, :2].T)
+    return tuple(
+        Subject(
+            "truth",
+            f"the {label.lower()} at {away[row]:.1f} m",
+            label,
+            accepted_names(label, classes),
+            row,
+            box=one_of(boxes, row),
+        )
+        for row, label in enumerate(stated.labels)
+    )
 
 
 def _same_boxes(a: Detections, b: Detections) -> bool:

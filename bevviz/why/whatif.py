@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
+from itertools import islice
 from typing import Any
 
 import numpy as np
@@ -22,6 +23,7 @@ from bevviz.why.traces import Traces
 from bevviz.why.verdict import FLAWED, Reason, find_reason
 
 TRIES = 10  # configurations that are run for one subject
+FURTHER = 10  # more of them, that go on from where the first have brought it
 RESULTS = 20  # of other configurations that are kept, for further subjects of the frame
 
 Change = Mapping[str, Any]  # dotted key -> value
@@ -41,6 +43,9 @@ _SECTION = {  # whose parameters may help, by the reason
 }
 
 
+_ORDER = {reason: place for place, reason in enumerate(Reason)}  # along the stages
+
+
 @dataclass(frozen=True, slots=True)
 class Hint:
     """Settings that change the verdict when the stages are run again, and what happens then.
@@ -56,6 +61,23 @@ class Hint:
     effects: Effects
 
 
+@dataclass(frozen=True, slots=True)
+class Search:
+    """What was tried for a subject.
+
+    Attributes:
+        hints: the best that changes the verdict; empty: none of those that were tried does.
+        tried: configurations that were run.
+        furthest: settings that bring it to a later stage, where none helps; empty: none does.
+        then: why it is not reported with these.
+    """
+
+    hints: tuple[Hint, ...]
+    tried: int
+    furthest: tuple[str, ...] = ()
+    then: Reason | None = None
+
+
 class WhatIf:
     """Runs a frame with other configurations, each once.
 
@@ -69,32 +91,42 @@ class WhatIf:
         self._loader, self._memo = loader or StageLoader(), Memo()
         self._runs: dict[tuple[tuple[str, Any], ...], Traces | None] = {}
 
-    def hints(self, subject: Subject, evidence: Evidence, reason: Reason, reported: bool) -> tuple[Hint, ...]:
+    def search(self, subject: Subject, evidence: Evidence, reason: Reason, reported: bool) -> Search:
         """The best change of those that the reason suggests: the mildest that makes nothing worse.
 
-        Where each that helps makes something worse, the one that does the least harm.
+        Where each that helps makes something worse, the one that does the least harm. Where none helps, those
+        that bring it to a later stage are joined with what the reason there suggests.
         """
         found: list[Hint] = []
-        for number, change in enumerate(_changes(evidence, reason, self._traces)):
-            if number == TRIES:
-                break
-            after = self._run(change)
-            hint = None if after is None else self._tried(subject, change, reason, reported, after)
-            if hint is not None:
-                found.append(hint)
-                if not hint.effects.harm:
-                    break
-        return tuple(sorted(found, key=lambda hint: hint.effects.harm)[:1])
+        reached: dict[Reason, tuple[Change, Evidence, Traces]] = {}  # later reasons, by the mildest change
+        tried = 0
 
-    def _tried(
-        self, subject: Subject, change: Change, reason: Reason, reported: bool, after: Traces
-    ) -> Hint | None:
-        text, own = _outcome(subject, reason, reported, after)
-        if not text:
-            return None
-        row = subject.row if subject.kind == "truth" else -1
-        settings = tuple(f"{key}={_written(value)}" for key, value in change.items())
-        return Hint(settings, text, effects(self._traces, after, row, own))
+        def ways() -> Iterator[Change]:
+            yield from islice(_changes(evidence, reason, self._traces), TRIES)
+            if not found:
+                yield from islice(_further(reached), FURTHER)
+
+        for change in ways():
+            after = self._run(change)
+            if after is None:
+                continue
+            tried += 1
+            then = gather(subject, after)
+            new, now_reported = find_reason(subject, then, after)
+            text, own = _outcome(subject, (reason, reported), (new, now_reported), then, after)
+            if text:
+                row = subject.row if subject.kind == "truth" else -1
+                objects, then_objects = self._result.objects, after.result.objects
+                harm = effects(objects, then_objects, self._traces.truth, row, own)
+                found.append(Hint(_settings(change), text, harm))
+                if not found[-1].effects.harm:
+                    break
+            elif not now_reported and _ORDER[new] > _ORDER[reason]:
+                reached.setdefault(new, (change, then, after))
+        if found or not reached:
+            return Search(tuple(sorted(found, key=lambda hint: hint.effects.harm)[:1]), tried)
+        last = max(reached, key=_ORDER.__getitem__)
+        return Search((), tried, _settings(reached[last][0]), last)
 
     def _run(self, change: Change) -> Traces | None:
         key = tuple(change.items())
@@ -146,11 +178,11 @@ def changed(config: Config, change: Change) -> Config:
     return Config.model_validate(tree)
 
 
-def _outcome(subject: Subject, reason: Reason, reported: bool, after: Traces) -> tuple[str, int]:
+def _outcome(
+    subject: Subject, was: tuple[Reason, bool], now: tuple[Reason, bool], e: Evidence, after: Traces
+) -> tuple[str, int]:
     """What has become of the subject, empty where it is no better off, and its object's row."""
-    evidence = gather(subject, after)
-    new, now_reported = find_reason(subject, evidence, after)
-    named = evidence.named
+    (reason, reported), (new, now_reported), named = was, now, e.named
     if reason is Reason.BORROWED and subject.kind != "truth":
         return ("" if named is not None else "it is not named any more"), -1
     better = now_reported and (not reported or reason in FLAWED | {Reason.BORROWED})
@@ -159,6 +191,21 @@ def _outcome(subject: Subject, reason: Reason, reported: bool, after: Traces) ->
     if named.cluster < 0 or not after.origin("objects").ours:
         return f"{after.origin('objects').name} has {named.name} there then", named.row
     return f"it is cluster {named.cluster} then, named {named.name}", named.row
+
+
+def _settings(change: Change) -> tuple[str, ...]:
+    return tuple(f"{key}={_written(value)}" for key, value in change.items())
+
+
+def _further(reached: Mapping[Reason, tuple[Change, Evidence, Traces]]) -> Iterator[Change]:
+    """What might help in addition; ``reached`` may grow meanwhile. What came the farthest goes first."""
+    done: set[Reason] = set()
+    while left := reached.keys() - done:
+        reason = max(left, key=_ORDER.__getitem__)
+        done.add(reason)
+        change, evidence, after = reached[reason]
+        for more in _changes(evidence, reason, after):
+            yield {**change, **more}
 
 
 # --- what to try -------------------------------------------------------------------------------

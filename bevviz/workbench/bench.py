@@ -5,88 +5,125 @@ from __future__ import annotations
 import bisect
 import threading
 import time
-from collections import Counter, OrderedDict
+from collections import OrderedDict
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
-from typing import Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import rerun as rr
 
+from bevviz.anomalies import Onsets
 from bevviz.closing import Closing
-from bevviz.compare.differences import Change, differences, seen
-from bevviz.compare.truth import judge
-from bevviz.config import changes, revised
+from bevviz.config import revised
 from bevviz.drive import Drive, Frames
 from bevviz.errors import UserError, first_line
-from bevviz.evaluate import Score, Truth
-from bevviz.frame import Frame, FrameResult, Tracks
+from bevviz.evaluate import Truth
+from bevviz.frame import Frame, FrameResult, Objects, Tracks
 from bevviz.logging import blueprints, entities
 from bevviz.logging.logger import Logger
 from bevviz.logging.sinks import APPLICATION
 from bevviz.logging.writer import WAIT
+from bevviz.notes import Note, Notes
 from bevviz.perceive import describe
 from bevviz.run import Items, Observer, run
 from bevviz.variants import Variants, check_same_frames
 from bevviz.why import Answer, Questioner
-from bevviz.why.log import log_answers
-from bevviz.workbench.answers import selection
+from bevviz.why.log import mark_answers
+from bevviz.workbench.answers import selection, surroundings
+from bevviz.workbench.entries import Entries
 from bevviz.workbench.film import Film
-from bevviz.workbench.missed import Find, finds
+from bevviz.workbench.labelled import TruthOf
+from bevviz.workbench.layer import Layer, log_layer
+from bevviz.workbench.missed import Find, finds, with_reasons
 from bevviz.workbench.pick import Pick, pick
+from bevviz.workbench.reports import Reports
+from bevviz.workbench.trial import Trials, attempt, tried_logger
+
+if TYPE_CHECKING:
+    from bevviz.workbench.native import NativeViewer
 
 KEPT = 6  # results of frames that were looked at
 PATIENCE = 10.0  # seconds that the run may take to end
+FIRST = 6.0  # seconds that the run waits for a page to have drawn the first frame
+ASKED = 8  # answers that are kept for reports
+BOTH = (entities.STAMP, entities.TRIED)
 
 Settings = tuple[str, ...]
-TruthOf = Callable[[Frame], Truth | None]
 
 
 class Bench(Closing):
     """One drive on the bench. Questions are to be asked from one thread; whoever listens is told from any.
 
+    What the run makes of a frame is on the timeline ``stamp`` and, where nothing else was tried on it, on
+    ``tried``; what other values make of it is on ``tried`` alone. To see either is to choose the timeline.
+
     Args:
         drive: that is asked about.
         again: the same frames once more, to be run through while others are asked for.
-        truth_of: what is known to be there.
+        paths: of the bag.
+        truth_of: what is known to be there, which the frames of both have, too.
         first: number of the scan that is shown first.
 
     Attributes:
-        film: what is shown: the whole drive, then what was asked and tried.
-        recording_id: of the film.
-        found: what is worth a look in the frames so far.
+        film: what is shown: the whole drive.
+        desk: what was asked and tried, which is shown with it.
+        recording_id: of both.
+        native: the viewer beside the page, where there is one.
+        entries: what is worth a look.
+        trials: runs over the drive with other values.
+        reports: of what was found, in the folder that this was started in.
+        notes: of the user, beside the bag.
         opening: stamp of the frame that a page is to open at; None: not run yet.
+        over: whether the run over the drive has ended.
     """
 
-    def __init__(self, drive: Drive, again: Frames, truth_of: TruthOf | None = None, first: int = 0) -> None:
-        self.drive, self.truth_of = drive, truth_of
+    def __init__(
+        self,
+        drive: Drive,
+        again: Frames,
+        paths: Sequence[Path],
+        truth_of: TruthOf | None = None,
+        first: int = 0,
+    ) -> None:
+        self.drive, self.again, self.paths, self.truth_of = drive, again, paths, truth_of
         self._first = first
-        self.film = Film()
-        self.found: list[Find] = []
+        self.film, self.desk = Film(), Film()
+        self.entries = Entries()
         self.opening: int | None = None
         self.done, self.over, self.error = 0, False, ""
-        self._again = again
         self._listeners: list[Callable[[], None]] = []
         self._stamps: list[tuple[int, int]] = []  # stamp, number of each frame on the film, in order
+        self._rows: dict[int, int] = {}  # on the film, of each stamp
         self._tracks: dict[int, Tracks] = {}
+        self._objects: dict[int, Objects | None] = {}
+        self._layers: dict[tuple[int, bool], Layer] = {}  # by frame, and whether other values made it
+        self._onsets = Onsets()
         self._results: OrderedDict[tuple[int, Settings], FrameResult] = OrderedDict()
         self._variants, self._looking = Variants(drive.session.loader), threading.RLock()
         self._asked: Questioner | None = None
-        self._stop, self._quiet = threading.Event(), threading.Event()
+        self._stop, self._quiet, self._go = threading.Event(), threading.Event(), threading.Event()
         self._quiet.set()
-        self.recording_id = recording_id = f"bench-{time.time_ns()}"
-        self._main, self._film_main = self._stream(recording_id)
-        self._desk, self._film_desk = self._stream(recording_id)
+        self.native: NativeViewer | None = None
+        self.recording_id = f"bench-{time.time_ns()}"
+        self._main, self._film_main = self.stream()
+        self._desk, self._film_desk = self.stream()
         self._main.send_blueprint(blueprints.load("workbench", drive.scene), make_active=True)
-        self._logger = Logger(self._main, drive.config, drive.scene, wait=WAIT)
+        self._logger = Logger(self._main, drive.config, drive.scene, wait=WAIT, stamps=BOTH)
         self._logger.log_static()
-        self._desk_logger = Logger(self._desk, drive.config, drive.scene)
+        self._desk_logger = Logger(self._desk, drive.config, drive.scene, stamps=BOTH)
+        self._tried_logger = tried_logger(self._desk, drive.session, self)
+        self.trials, self.reports = Trials(self, self.tell), Reports(self, self.tell, Path.cwd())
+        self.notes = Notes(paths)
+        self.notes_changed = 0
+        self._answers: OrderedDict[tuple[int, str], tuple[int, Answer]] = OrderedDict()
         self._thread = threading.Thread(target=self._run, name="drive", daemon=True)
 
-    @staticmethod
-    def _stream(recording_id: str) -> tuple[rr.RecordingStream, rr.BinaryStream]:
-        recording = rr.RecordingStream(APPLICATION, recording_id=recording_id)
+    def stream(self) -> tuple[rr.RecordingStream, rr.BinaryStream]:
+        """The recording, for a further thread that writes to it."""
+        recording = rr.RecordingStream(APPLICATION, recording_id=self.recording_id)
         recording.set_log_time_enabled(False)
         return recording, rr.binary_stream(recording)
 
@@ -97,11 +134,17 @@ class Bench(Closing):
     def close(self) -> None:
         self._stop.set()
         self._quiet.set()
+        self._go.set()
+        self.trials.end()
+        self.reports.end()
         if self._thread.is_alive():
             self._thread.join(PATIENCE)
+        if self.native is not None:
+            self.native.close()
         self.film.close()
+        self.desk.close()
         self.drive.close()
-        self._again.close()
+        self.again.close()
 
     # --- the run behind it ---------------------------------------------------------------------
 
@@ -115,56 +158,84 @@ class Bench(Closing):
         return {
             "type": "progress",
             "done": self.done,
-            "total": self._again.total,
+            "total": self.again.total,
             "over": self.over,
             "error": self.error,
-            "warnings": list(self._again.warnings) if self.over else [],
+            "reports": [report.as_dict() for report in self.reports.made],
+            "trial": None if self.trials.trial is None else self.trials.trial.as_dict(),
+            "warnings": list(self.again.warnings) if self.over else [],
         }
 
     def _run(self) -> None:
         try:
-            if self._first:
-                self._show(self.look(self._first))
+            first = self.look(self._first)
+            self._show(first, finds(first, self.truth(first.frame)))
+            self._go.wait(FIRST)
             session = self.drive.new_session()
-            run(self._again, session, [_Filming(self)], stop=self._stop)
+            run(self.again, session, [_Filming(self)], stop=self._stop)
         except Exception as error:
             self.error = (
                 str(error) if isinstance(error, UserError) else f"the run failed: {first_line(error)}"
             )
         self.over = True
-        self._news()
+        self.tell()
+
+    def go_on(self) -> None:
+        """A page shows the first frame: run the others."""
+        self._go.set()
 
     def see(self, result: FrameResult) -> None:
         """The next frame of the run; while a question is being answered, it waits."""
-        self._show(result)
         frame = result.frame
+        found = finds(result, self.truth(frame))
+        if any(find.what == "missed" for find in found):
+            names = self.drive.session.stages.class_names
+            found = with_reasons(found, result, Questioner(result, self.drive.session.loader, names))
+        self._show(result, found)
         if result.tracks is not None:
             bare = np.zeros((len(result.tracks), 0, 3), np.float32)
             self._tracks[frame.index] = replace(result.tracks, trail=bare)
-        new = finds(result, self.truth_of(frame) if self.truth_of is not None else None)
-        self.found += new
+        self._objects[frame.index] = result.objects
+        self.entries.add(found)
+        self.entries.add_anomalies(frame.index, frame.stamp, self._onsets.of(result.anomalies))
         self.done += 1
-        self._news()
+        self.tell()
+        self.wait_for_quiet()
+
+    def wait_for_quiet(self) -> None:
+        """Until no question is being answered."""
         self._quiet.wait()
 
-    def _show(self, result: FrameResult) -> None:
+    def _show(self, result: FrameResult, found: Sequence[Find]) -> None:
         frame = result.frame
-        self._logger.log(result)
+        self._draw(self._logger, result, found, tried=False)
         entry = (frame.stamp, frame.index)
         place = bisect.bisect_left(self._stamps, entry)
         if self._stamps[place : place + 1] != [entry]:
             self._stamps.insert(place, entry)
+        self._rows[frame.stamp] = len(self.film)
         self.film.add(self._film_main.read())
         if self.opening is None:
             self.opening = frame.stamp
-            self._news()
+            self.tell()
+
+    def _draw(self, logger: Logger, result: FrameResult, found: Sequence[Find], *, tried: bool) -> None:
+        layers: list[Layer] = []
+        logger.log(result, beside=lambda: layers.append(log_layer(logger, result, found)))
+        self._layers[result.frame.index, tried] = layers[0]
+
+    def draw_tried(self, logger: Logger, result: FrameResult, found: Sequence[Find]) -> None:
+        """A frame as other values make it, beside what the run has made of it."""
+        logger.refresh(self._logger.known)
+        self._draw(logger, result, found, tried=True)
 
     def end(self) -> None:
         """The run's last numbers."""
         self._logger.flush()
         self.film.add(self._film_main.read())
 
-    def _news(self) -> None:
+    def tell(self) -> None:
+        """There is something new."""
         for listener in tuple(self._listeners):
             listener()
 
@@ -190,16 +261,18 @@ class Bench(Closing):
         place = bisect.bisect_right(self._stamps, (stamp + 1000, 2**62)) - 1  # pages count in doubles
         return self._stamps[max(place, 0)][1]
 
-    def stamp_of(self, number: int) -> int:
-        """Sensor time of a frame, in nanoseconds.
+    def film_row(self, stamp: int) -> int | None:
+        """Piece of the film that has the frame which a viewer shows at that time."""
+        place = bisect.bisect_right(self._stamps, (stamp + 1000, 2**62)) - 1
+        return self._rows.get(self._stamps[place][0]) if place >= 0 else None
 
-        Raises:
-            UserError: it is not on the film yet.
-        """
-        for stamp, index in self._stamps:
-            if index == number:
-                return stamp
-        raise UserError(f"frame {number} has not been run yet")
+    def truth(self, frame: Frame) -> Truth | None:
+        """What has to be found in a frame, where that is known."""
+        return None if self.truth_of is None else self.truth_of(frame)
+
+    def objects(self, number: int) -> Objects | None:
+        """That the run has found in a frame."""
+        return self._objects.get(number)
 
     def look(self, number: int, settings: Settings = ()) -> FrameResult:
         """What the stages make of a frame, with other values; with those in force the tracks of the run.
@@ -227,22 +300,81 @@ class Bench(Closing):
         self, number: int, settings: Settings, path: str, instance: int | None, position: Sequence[float]
     ) -> Pick | None:
         """What a click in the frame is on, see ``pick``."""
+        layer = self._layers.get((number, bool(settings)), {})
+        if instance is not None and 0 <= instance < len(rows := layer.get(path, ())):
+            return rows[instance].pick
         return pick(self.look(number, settings), self._tracks.get(number), path, instance, position)
 
-    def ask(self, number: int, settings: Settings, what: Pick, hints: bool = False) -> Answer:
-        """Why it was reported, or was not; what is asked about is shown in every view.
+    def ask(self, number: int, settings: Settings, what: Pick) -> tuple[Answer, list[Answer]]:
+        """Why it was reported, or was not, and what else is there; it is shown in every view.
 
         Raises:
             UserError: there is no such thing in the frame.
         """
         questioner = self._questioner(self.look(number, settings))
-        found = questioner.ask(selection(what))
+        wanted = selection(what)
+        there = questioner.candidates(wanted) if what.is_place else []
+        found = there or questioner.ask(wanted)
         if not found:
             raise UserError(f"there is nothing to say about {what}")
-        if hints:
-            return questioner.with_hints(found[0])
-        self._mark(questioner.traces.result, found[:1])
-        return found[0]
+        answer = found[0]
+        if not there and (around := surroundings(what, answer)) is not None:
+            there = questioner.candidates(around)
+        beside = [other for other in there if other.subject.key != answer.subject.key]
+        self._mark(questioner.traces.result, answer)
+        if not settings:
+            self._keep(number, what, answer)
+        return answer, beside
+
+    def hints(self, number: int, settings: Settings, what: Pick) -> Answer:
+        """The same with what would change it, which takes longer.
+
+        Raises:
+            UserError: as ``ask``.
+        """
+        questioner = self._questioner(self.look(number, settings))
+        wanted = selection(what)
+        there = questioner.candidates(wanted) if what.is_place else []
+        answer = questioner.with_hints((there or questioner.ask(wanted))[0])
+        if not settings:
+            self._keep(number, what, answer)
+        return answer
+
+    def _keep(self, number: int, what: Pick, answer: Answer) -> None:
+        """For reports: as the drive was opened, with its hints once they are known."""
+        key = number, str(what)
+        if answer.hints or key not in self._answers:
+            self._answers[key] = self.look(number).frame.received, answer
+        self._answers.move_to_end(key)
+        while len(self._answers) > ASKED:
+            self._answers.popitem(last=False)
+
+    def asked_within(self, low: int, high: int) -> list[Answer]:
+        """What was asked about frames of these log times, the newest first."""
+        return [answer for at, answer in reversed(self._answers.values()) if low <= at <= high]
+
+    # --- notes ---------------------------------------------------------------------------------
+
+    def note(self, number: int, text: str, what: Pick | None) -> None:
+        """Keep a note of a frame, or of a thing in it.
+
+        Raises:
+            UserError: it cannot be written, or there is no such thing.
+        """
+        frame = self.look(number).frame
+        about = "" if what is None else self.ask(number, (), what)[0].subject.name
+        pick = "" if what is None else str(what)
+        self.notes.add(Note(frame.stamp, frame.received, text.strip(), about.removeprefix("the "), pick))
+        self.notes_changed += 1
+        self.tell()
+
+    def remove_note(self, stamp: int, text: str) -> None:
+        """Raises UserError where the file cannot be written."""
+        for note in list(self.notes):
+            if (note.stamp, note.text) == (stamp, text):
+                self.notes.remove(note)
+        self.notes_changed += 1
+        self.tell()
 
     def _questioner(self, result: FrameResult) -> Questioner:
         """What questions about one result have in common is worked out once."""
@@ -251,63 +383,30 @@ class Bench(Closing):
             self._asked = Questioner(result, session.loader, session.stages.class_names)
         return self._asked
 
-    def _mark(self, result: FrameResult, answers: Sequence[Answer]) -> None:
-        frame = result.frame
-        self._desk_logger.set_time(frame.index, frame.stamp, frame.received)
-        self._desk.log(entities.WHY, rr.Clear(recursive=True))
-        log_answers(self._desk, frame, answers, len(answers))
-        self._desk_logger.set_time(frame.index + 1, frame.stamp + 1, frame.received and frame.received + 1)
-        self._desk.log(entities.WHY, rr.Clear(recursive=True))
-        self.film.add(self._film_desk.read())
+    def _mark(self, result: FrameResult, answer: Answer) -> None:
+        mark_answers(self._desk_logger, result.frame, [answer], result.config.bev)
+        self.desk.add(self._film_desk.read())
 
     # --- other values --------------------------------------------------------------------------
 
-    def attempt(self, number: int, settings: Settings) -> dict[str, Any]:
+    def attempt(self, number: int, settings: Settings, what: Pick | None = None) -> dict[str, Any]:
         """Show the frame as it is with other values, and tell what they do to it.
+
+        Args:
+            number: of the frame.
+            settings: the values.
+            what: they are tried for, which is told first.
 
         Raises:
             UserError: as ``look``.
         """
         before, after = self.look(number), self.look(number, settings)
-        self._redraw(before, after)
-        frame = after.frame
-        found = differences(frame.index, frame.stamp, seen(before), seen(after))
-        counts = found.counts
-        names = (before.objects.names if before.objects else (), after.objects.names if after.objects else ())
-        told: dict[str, Any] = {
-            "changes": {k: str(c) for k, c in changes(self.drive.config, after.config).items()},
-            "before": Counter(names[0]),
-            "after": Counter(names[1]),
-            "gone": counts[Change.ONLY_A],
-            "new": counts[Change.ONLY_B],
-            "changed": counts[Change.MOVED] + counts[Change.CLASS],
-            "failures": [f"{failure.stage}: {failure.reason}" for failure in after.failures],
-        }
-        truth = self.truth_of(frame) if self.truth_of is not None else None
-        if truth is not None:
-            judged = judge(before, after, truth)
-            told["fixed"] = [judged.text(row) for row in judged.fixed]
-            told["broken"] = [judged.text(row) for row in judged.broken]
-            told["f1"] = [_f1(before, truth), _f1(after, truth)]
-        return told
-
-    def _redraw(self, before: FrameResult, after: FrameResult) -> None:
-        """Over what the run has drawn, which the desk's logger has to know in order to clear it."""
-        self._desk_logger.log(before)
-        self._desk_logger.refresh()
-        if after is not before:
-            self._desk_logger.log(after)
-            self._desk_logger.refresh()
-        self._desk_logger.flush()
-        self.film.add(self._film_desk.read())
-
-
-def _f1(result: FrameResult, truth: Truth) -> float | None:
-    score = Score()
-    if result.objects is None:
-        return None
-    score.add(result.objects, truth)
-    return None if np.isnan(score.f1) else round(score.f1, 3)
+        truth = self.truth(after.frame)
+        self.draw_tried(self._tried_logger, after, finds(after, truth))
+        self._tried_logger.flush()
+        self.desk.add(self._film_desk.read())
+        asked = what.row if what is not None and what.kind == "truth" else -1
+        return attempt(before, after, truth, asked)
 
 
 class _Filming(Observer[FrameResult]):

@@ -7,15 +7,16 @@ import contextlib
 import json
 import secrets
 import threading
-from collections import Counter, OrderedDict, deque
+from collections import OrderedDict, deque
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
+from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
 import rerun as rr
-import uvicorn
 from starlette.applications import Starlette
 from starlette.requests import Request
 from starlette.responses import Response
@@ -23,8 +24,7 @@ from starlette.routing import WebSocketRoute
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from bevviz.closing import Closing
-from bevviz.compare.differences import Change, differences, seen
-from bevviz.config import Config, changes, revised, values
+from bevviz.config import Config, revised, values
 from bevviz.errors import UserError
 from bevviz.evaluate import Truth, truth_of
 from bevviz.frame import FrameResult, Scene
@@ -39,30 +39,25 @@ from bevviz.session import Session
 from bevviz.variants import Variants
 from bevviz.why import Answer, Questioner
 from bevviz.why.log import mark_answers
-from bevviz.workbench.answers import selection
-from bevviz.workbench.missed import Find, finds
+from bevviz.workbench.answers import selection, surroundings
+from bevviz.workbench.entries import Entries
+from bevviz.workbench.guard import HOSTS, Guard
+from bevviz.workbench.missed import finds, with_reasons
 from bevviz.workbench.pick import Pick, pick
-from bevviz.workbench.server import (
-    HOSTS,
-    SERVER,
-    _Guard,
-    _listening,
-    _routes,
-    _Server,
-    _Site,
-    _until_gone,
-    bound,
-    viewer_folder,
-)
+from bevviz.workbench.server import Server, bound, viewer_folder
+from bevviz.workbench.site import Site, heard_on, routes_of
+from bevviz.workbench.trial import attempt
+from bevviz.workbench.visit import Visit, listening
 
 if TYPE_CHECKING:
     from bevviz.workbench.bench import Bench
+    from bevviz.workbench.opening import Opening
 
 WHOLE = 3  # packets that need none before them, from the oldest of which on all are kept for pages
 KEPT = 4  # frames that pages may hold at once
 TRIED = 2  # results of held frames with other values
 PATIENCE = 3.0  # seconds that the page's threads may take to end
-FOUND = 2000  # things worth a look of frames that were held
+LISTED = ("missed", "false", "unmatched", "unnamed")
 
 Settings = tuple[str, ...]
 
@@ -177,7 +172,7 @@ class LiveBench(Closing):
         live: before its run.
 
     Attributes:
-        found: what is worth a look in frames that were held.
+        entries: what is worth a look in the frame that was held last.
     """
 
     def __init__(self, live: Live) -> None:
@@ -185,7 +180,7 @@ class LiveBench(Closing):
         self.film = LiveFilm(live, live.config.live.output_queue)
         self.truth_of: Callable[..., Truth | None] | None = None
         self.opening: int | None = None  # the page is at the newest frame
-        self.found: list[Find] = []
+        self.entries, self.notes_changed = Entries(), -1
         self._newest: deque[FrameResult] = deque(maxlen=live.config.live.held)
         self._kept: OrderedDict[int, FrameResult] = OrderedDict()
         self._lock = threading.Lock()  # of the two
@@ -223,6 +218,8 @@ class LiveBench(Closing):
             "total": None,
             "over": True,
             "error": "",
+            "reports": [],
+            "trial": None,
             "warnings": [f"{1e3 * status.p50:.0f} ms", f"dropped: {drops or 'none'}"],
         }
 
@@ -272,14 +269,13 @@ class LiveBench(Closing):
         result = self.look(shown[-1] if shown else frames[0][1])
         index = result.frame.index
         with self._lock:
-            new = index not in self._kept
             self._kept[index] = result
             self._kept.move_to_end(index)
             while len(self._kept) > KEPT:
                 self._kept.popitem(last=False)
-        if new:
-            truth = self.truth_of(result.frame) if self.truth_of is not None else None
-            self.found += finds(result, truth)[: FOUND - len(self.found)]
+        found = finds(result, None if self.truth_of is None else self.truth_of(result.frame))
+        self.entries.replace(LISTED)
+        self.entries.add(with_reasons(found, result, self._new_questioner(result)))
         for listener in tuple(self._listeners):
             listener()
         return result
@@ -313,50 +309,77 @@ class LiveBench(Closing):
         """What a click in the frame is on, see ``pick``."""
         return pick(self.look(number), self.look(number).tracks, path, instance, position)
 
-    def ask(self, number: int, settings: Settings, what: Pick, hints: bool = False) -> Answer:
-        """Why it was reported, or was not; what is asked about is shown in every view.
+    def ask(self, number: int, settings: Settings, what: Pick) -> tuple[Answer, list[Answer]]:
+        """Why it was reported, or was not, and what else is there; it is shown in every view.
 
         Raises:
             UserError: there is no such thing in the frame.
         """
         result = self.look(number, settings)
-        if self._asked is None or self._asked.traces.result is not result:
-            session = self.live.session
-            self._asked = Questioner(result, session.loader, session.stages.class_names)
-        found = self._asked.ask(selection(what))
+        questioner, there = self._candidates(result, what)
+        found = there or questioner.ask(selection(what))
         if not found:
             raise UserError(f"there is nothing to say about {what}")
-        if hints:
-            return self._asked.with_hints(found[0])
-        mark_answers(self._marker, result.frame, found[:1])
+        answer = found[0]
+        if not there and (around := surroundings(what, answer)) is not None:
+            there = questioner.candidates(around)
+        mark_answers(self._marker, result.frame, [answer], result.config.bev)
         self.film.add(self._marks.read())
-        return found[0]
+        return answer, [other for other in there if other.subject.key != answer.subject.key]
+
+    def hints(self, number: int, settings: Settings, what: Pick) -> Answer:
+        """The same with what would change it, which takes longer.
+
+        Raises:
+            UserError: as ``ask``.
+        """
+        questioner, there = self._candidates(self.look(number, settings), what)
+        return questioner.with_hints((there or questioner.ask(selection(what)))[0])
+
+    def _candidates(self, result: FrameResult, what: Pick) -> tuple[Questioner, list[Answer]]:
+        if self._asked is None or self._asked.traces.result is not result:
+            self._asked = self._new_questioner(result)
+        return self._asked, list(self._asked.candidates(selection(what))) if what.is_place else []
+
+    def _new_questioner(self, result: FrameResult) -> Questioner:
+        session = self.live.session
+        return Questioner(result, session.loader, session.stages.class_names)
+
+    def go_on(self) -> None:
+        """A robot has not waited."""
 
     # --- orders --------------------------------------------------------------------------------
 
-    def attempt(self, number: int, settings: Settings) -> dict[str, Any]:
+    @property
+    def settings(self) -> Settings:
+        """That pages have changed."""
+        return self._set
+
+    def attempt(self, number: int, settings: Settings, what: Pick | None = None) -> dict[str, Any]:
         """Change parameters of the running session for good, and tell what they do to a frame.
+
+        Raises:
+            UserError: an unknown parameter, or a wrong value; nothing is changed.
+        """
+        before = self.look(number)
+        self.change(settings)
+        after = describe(self._variants.perceive(before.frame, self.live.config))
+        asked = what.row if what is not None and what.kind == "truth" else -1
+        truth = None if self.truth_of is None else self.truth_of(before.frame)
+        return attempt(before, after, truth, asked)
+
+    def change(self, settings: Settings) -> None:
+        """Change parameters of the running session; those of before that are none of these are as at first.
 
         Raises:
             UserError: an unknown parameter, or a wrong value; nothing is changed.
         """
         own = {setting.partition("=")[0] for setting in settings}
         undone = [key for key in (one.partition("=")[0] for one in self._set) if key not in own]
-        before = self.look(number)
-        self.live.update([*(f"{key}={json.dumps(self._before[key])}" for key in undone), *settings])
+        back = [f"{key}={json.dumps(self._before[key])}" for key in undone]
+        if back or settings != self._set:
+            self.live.update([*back, *settings])
         self._set = settings
-        after = describe(self._variants.perceive(before.frame, self.live.config))
-        found = differences(number, before.frame.stamp, seen(before), seen(after))
-        counts = found.counts
-        return {
-            "changes": {key: str(c) for key, c in changes(before.config, after.config).items()},
-            "before": Counter(before.objects.names if before.objects else ()),
-            "after": Counter(after.objects.names if after.objects else ()),
-            "gone": counts[Change.ONLY_A],
-            "new": counts[Change.ONLY_B],
-            "changed": counts[Change.MOVED] + counts[Change.CLASS],
-            "failures": [f"{failure.stage}: {failure.reason}" for failure in after.failures],
-        }
 
     def snap(self) -> str:
         """Save the flight recorder. Returns what to say.
@@ -393,12 +416,11 @@ class LivePage(Closing):
         viewer, token = viewer_folder(), secrets.token_urlsafe(16)
         listening = bound(port)
         port = listening.getsockname()[1]
-        site = LiveSite(bench, viewer, token, port)
-        routes = [*_routes(site), WebSocketRoute("/live", site.orders)]
-        app = _Guard(Starlette(routes=routes), token, port)
+        site = LiveSite(bench, viewer, version("rerun-sdk"), token, port)
+        routes = [*routes_of(site), WebSocketRoute("/live", site.orders)]
         self.address = f"http://{HOSTS[0]}:{port}/?token={token}"
         ready = threading.Event()
-        self._server = _Server(uvicorn.Config(app, **SERVER), ready.set)
+        self._server = Server(Guard(Starlette(routes=routes), token, port), ready.set)
         self._listening = listening
         self._thread = threading.Thread(
             target=lambda: self._server.run(sockets=[listening]), name="page", daemon=True
@@ -407,51 +429,83 @@ class LivePage(Closing):
         ready.wait(PATIENCE)
 
     def close(self) -> None:
-        self._server.should_exit = True
+        self._server.end()
         self._thread.join(PATIENCE)
         self._listening.close()
         self._bench.close()
+
+
+class _Open:
+    """A bench that is there from the beginning."""
+
+    error = None
+
+    def __init__(self, bench: LiveBench) -> None:
+        self._bench = bench
+
+    async def bench(self) -> LiveBench:
+        return self._bench
 
 
 def _own_truth(frame: Any) -> Truth | None:
     return None if frame.truth is None else truth_of(frame, frame.truth)
 
 
-class LiveSite(_Site):
+class LiveVisit(Visit):
+    """A page of a running robot."""
+
+    def __init__(self, bench: LiveBench, socket: WebSocket, desk: ThreadPoolExecutor, run: str) -> None:
+        super().__init__(cast("Bench", bench), socket, desk, run)  # as far as it is asked below
+        self._live = bench
+        for name in ("drive", "cancel", "report", "note", "unnote"):
+            self._handlers[name] = self._refuse
+
+    async def _refuse(self, number: int, message: dict[str, Any]) -> None:
+        raise UserError("that is for a drive that is over: save what was seen, and open the recording's bag")
+
+    async def _ask(self, number: int, message: dict[str, Any]) -> None:
+        """A click is on what is shown; what is asked about again is so with the values of now."""
+        again = list(self._live.settings) if "pick" in message else []
+        await super()._ask(number, {**message, "set": again})
+
+    async def _settle(self, number: int, message: dict[str, Any]) -> None:
+        """Nothing is made ready: the next frame comes at once."""
+
+
+class LiveSite(Site):
     """The page of a running robot."""
 
-    def __init__(self, bench: LiveBench, viewer: Path, token: str, port: int) -> None:
-        super().__init__(cast("Bench", bench), viewer, token, port, native=False)  # as far as a page asks
+    def __init__(self, bench: LiveBench, viewer: Path, version: str, token: str, port: int) -> None:
+        super().__init__(cast("Opening", _Open(bench)), viewer, version, token, port, "live")
         self._live = bench
+
+    def _visit(self, bench: Bench, socket: WebSocket) -> Visit:
+        return LiveVisit(self._live, socket, self._desk, self._run)
 
     async def page(self, request: Request) -> Response:
         response = await super().page(request)
-        text = (
-            bytes(response.body)
-            .decode()
-            .replace("</body>", '<script type="module" src="/page/live.js"></script>\n</body>')
-        )
-        own = {name: value for name, value in response.headers.items() if name != "content-length"}
-        return Response(text, headers=own)
+        script = b'<script type="module" src="/page/live.js"></script>\n</body>'
+        response.body = bytes(response.body).replace(b"</body>", script)
+        response.headers["Content-Length"] = str(len(response.body))
+        return response
 
     async def film(self, socket: WebSocket) -> None:
-        """The newest pieces, as they are made."""
+        """The newest pieces, as they are made; what was asked is among them."""
         await socket.accept()
         film, number = self._live.film, None
-        with _listening(film.listen) as more, contextlib.suppress(WebSocketDisconnect, RuntimeError):
-            gone = asyncio.ensure_future(_until_gone(socket))
-            try:
-                while not gone.done():
+        if socket.query_params.get("lane") == "desk":
+            with contextlib.suppress(WebSocketDisconnect, RuntimeError):
+                await socket.receive_text()
+            return
+        with listening(film.listen) as more, contextlib.suppress(WebSocketDisconnect, RuntimeError):
+            async with heard_on(socket, more) as heard:
+                while not heard.gone:
                     more.clear()
                     pieces, following = await asyncio.to_thread(film.since, number)
                     number = None if following < 0 else following
                     for piece in pieces:
                         await socket.send_bytes(piece)
-                    waiting = asyncio.ensure_future(more.wait())
-                    await asyncio.wait({waiting, gone}, return_when=asyncio.FIRST_COMPLETED)
-                    waiting.cancel()
-            finally:
-                gone.cancel()
+                    await more.wait()
 
     async def orders(self, socket: WebSocket) -> None:
         """Hold, snap and mark."""

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from bevviz import geometry
 from bevviz.evaluate import RANGE, Truth, match
-from bevviz.frame import Decision, FrameResult
+from bevviz.frame import F32, F64, Decision, FrameResult
+from bevviz.why import Questioner, Selection
 from bevviz.workbench.pick import Pick
 
 FEW = 30  # points, below which a cluster that no detection names is no object that one would miss
+
+Place = tuple[float, float, float]
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,7 +29,9 @@ class Find:
         name: of its class, or of the cluster.
         distance: horizontal metres; NaN where it is not known.
         pick: that asks about it.
-        reason: what the fusion says, where it says something.
+        reason: why, in brief.
+        place: in the fixed frame, where it is known.
+        box: (4,) in the image of a camera, of a detection that has no place.
     """
 
     frame: int
@@ -36,52 +41,51 @@ class Find:
     distance: float
     pick: Pick
     reason: str = ""
-
-    def as_dict(self) -> dict[str, Any]:
-        """For the page."""
-        away = None if np.isnan(self.distance) else round(self.distance, 1)
-        return {
-            "frame": self.frame,
-            "stamp": str(self.stamp),  # pages count in doubles
-            "what": self.what,
-            "name": self.name,
-            "distance": away,
-            "pick": str(self.pick),
-            "reason": self.reason,
-        }
+    place: Place | None = None
+    box: F32 | None = None
 
 
 def finds(result: FrameResult, truth: Truth | None) -> list[Find]:
     """Those of a frame within 40 m, the nearest first.
 
-    With the truth what had to be found and was not, and objects that are none; without it kept detections
-    that have no cluster, and clusters in view that no detection names.
+    With the truth, which the frame has, too, what had to be found and was not, and objects that are none;
+    without it kept detections that have no cluster, and clusters in view that no detection names.
     """
     found = list(_judged(result, truth) if truth is not None else _unexplained(result))
     near = [find for find in found if not find.distance > RANGE]
     return sorted(near, key=lambda find: (find.what == "false", np.nan_to_num(find.distance, nan=RANGE)))
 
 
+def with_reasons(found: Sequence[Find], result: FrameResult, questioner: Questioner) -> list[Find]:
+    """The missed objects with the reason of the verdict."""
+    reasons = {}
+    for find in found:
+        if find.what == "missed":
+            answers = questioner.ask(Selection(truth=find.pick.row))
+            reasons[find.pick] = answers[0].verdict.reason.value if answers else ""
+    return [replace(find, reason=reasons.get(find.pick, find.reason)) for find in found]
+
+
 def _judged(result: FrameResult, truth: Truth) -> Iterator[Find]:
-    when, objects = (result.frame.index, result.frame.stamp), result.objects
+    when, objects, pose = (result.frame.index, result.frame.stamp), result.objects, result.frame.pose
     free = truth.must.copy()
     if objects is not None and len(objects):
         partner, _ = match(objects, truth)
         free[partner[partner >= 0]] = False
         judged = frozenset().union(*truth.accepted)
         for row in np.flatnonzero(partner < 0).tolist():
-            name, away = objects.names[row], float(np.hypot(*objects.boxes.center[row, :2]))
+            name, center = objects.names[row], objects.boxes.center[row]
             if name.lower() in judged:
-                yield Find(*when, "false", name, away, Pick("object", row))
-    own = result.frame.truth is not None
+                away = float(np.hypot(*center[:2]))
+                yield Find(*when, "false", name, away, Pick("object", row), place=fixed_place(pose, center))
     for row in np.flatnonzero(free).tolist():
         center = truth.boxes.center[row]
-        place = Pick("truth", row) if own else Pick("point", place=tuple(map(float, center)))
-        yield Find(*when, "missed", truth.labels[row].lower(), float(np.hypot(*center[:2])), place)
+        name, away = truth.labels[row].lower(), float(np.hypot(*center[:2]))
+        yield Find(*when, "missed", name, away, Pick("truth", row), place=fixed_place(pose, center))
 
 
 def _unexplained(result: FrameResult) -> Iterator[Find]:
-    when, clusters = (result.frame.index, result.frame.stamp), result.clusters
+    when, clusters, pose = (result.frame.index, result.frame.stamp), result.clusters, result.frame.pose
     named = np.zeros(0 if clusters is None else len(clusters), bool)
     seen = named.copy()
     for camera in result.cameras:
@@ -92,14 +96,21 @@ def _unexplained(result: FrameResult) -> Iterator[Find]:
         seen |= fusion.cluster_decision == Decision.NO_DETECTION
         for row in np.flatnonzero(detections.kept & (fusion.detection_decision != Decision.MATCHED)).tolist():
             reason = Decision(int(fusion.detection_decision[row])).name.lower().replace("_", " ")
-            away = float("nan")
+            away, name, place = float("nan"), detections.names[row], None
             if (cluster := int(fusion.detection_cluster[row])) >= 0 and clusters is not None:
                 away = float(np.hypot(*clusters.centroid[cluster, :2]))
-            place = Pick("detection", row, camera.camera.name)
-            yield Find(*when, "unmatched", detections.names[row], away, place, reason)
+                place = fixed_place(pose, clusters.centroid[cluster])
+            pick = Pick("detection", row, camera.camera.name)
+            yield Find(*when, "unmatched", name, away, pick, reason, place, detections.xyxy[row])
     if clusters is None:
         return
     for row in np.flatnonzero(seen & ~named & clusters.kept & (clusters.count >= FEW)).tolist():
-        away = float(np.hypot(*clusters.centroid[row, :2]))
-        name = f"cluster of {clusters.count[row]} points"
-        yield Find(*when, "unnamed", name, away, Pick("cluster", row), "no detection")
+        center = clusters.centroid[row]
+        away, reason = float(np.hypot(*center[:2])), f"{clusters.count[row]} points, no detection"
+        yield Find(*when, "unnamed", "cluster", away, Pick("cluster", row), reason, fixed_place(pose, center))
+
+
+def fixed_place(pose: F64, center: F32) -> Place:
+    """In the fixed frame."""
+    x, y, z = geometry.apply(pose, np.asarray(center, np.float32)[None])[0].tolist()
+    return x, y, z

@@ -11,7 +11,7 @@ import json
 import subprocess
 import sys
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -26,6 +26,7 @@ from bevviz.logging.sinks import check_viewer
 from bevviz.workbench.film import Film
 
 LOOK = 0.2  # seconds between two looks at the viewer's time
+TIMELINES = (entities.STAMP, entities.TRIED)  # that pages count in
 MAGIC = 4  # bytes that tell a recording
 
 Event = dict[str, Any]  # as the web viewer's events
@@ -35,20 +36,20 @@ class NativeViewer(Closing):
     """A viewer that is started, or runs already; a thread each for what it is shown and for its time.
 
     Args:
-        film: what it is shown.
-        recording_id: of the film.
+        films: what it is shown, the one with the layout first.
+        recording_id: of all of them.
         url: of a viewer that runs; None: one is started on this machine.
 
     Raises:
         UserError: it cannot be started or reached, or is too old to be asked for its time.
     """
 
-    def __init__(self, film: Film, recording_id: str, url: str | None = None) -> None:
-        self._film, self._recording_id = film, recording_id
+    def __init__(self, films: Sequence[Film], recording_id: str, url: str | None = None) -> None:
+        self._films, self._recording_id = films, recording_id
         self._given = url
         self._listeners: list[Callable[[Event], None]] = []
         self._ended, self._wake = threading.Event(), threading.Event()
-        self._wanted: int | None = None  # stamp to be shown
+        self._wanted: tuple[str, int] | None = None  # timeline and stamp to be shown
         self._last: dict[str, Event] = {}  # of each type, for a page that comes later
         self._started = threading.Lock()
         self._relay = self._open()
@@ -102,30 +103,33 @@ class NativeViewer(Closing):
 
     def _feed(self, relay: rerun_cli.Process) -> None:
         more = threading.Event()
-        end = self._film.listen(more.set)
-        row = 0
+        ends = [film.listen(more.set) for film in self._films]
+        rows, begun = [0] * len(self._films), False
         assert relay.stdin is not None
         try:
             while not self._ended.is_set() and relay.poll() is None:
-                while row < len(self._film) and not self._ended.is_set():
-                    piece = self._film[row]
-                    for part in (piece[:MAGIC], piece) if row == 0 else (piece,):
-                        relay.stdin.write(len(part).to_bytes(8, "little"))
-                        relay.stdin.write(part)
-                    relay.stdin.flush()
-                    row += 1
+                for place, film in enumerate(self._films):
+                    while rows[place] < len(film) and not self._ended.is_set() and (begun or place == 0):
+                        piece = film[rows[place]]
+                        for part in (piece,) if begun else (piece[:MAGIC], piece):
+                            relay.stdin.write(len(part).to_bytes(8, "little"))
+                            relay.stdin.write(part)
+                        relay.stdin.flush()
+                        rows[place] += 1
+                        begun = True
                 more.wait(LOOK)
                 more.clear()
         except (OSError, ValueError):
             pass  # the viewer is gone, which is told where its time is watched
         finally:
-            end()
+            for end in ends:
+                end()
 
     # --- its time ------------------------------------------------------------------------------
 
-    def seek(self, stamp: int) -> None:
+    def seek(self, timeline: str, stamp: int) -> None:
         """Have it show that sensor time; from any thread."""
-        self._wanted = stamp
+        self._wanted = timeline, stamp
         self._wake.set()
 
     def _watch(self, relay: rerun_cli.Process, client: ViewerClient) -> None:
@@ -149,20 +153,20 @@ class NativeViewer(Closing):
                 wanted = self._wanted
                 if wanted is not None:
                     client.set_time(
-                        entities.STAMP,
-                        timestamp=np.datetime64(wanted, "ns"),
+                        wanted[0],
+                        timestamp=np.datetime64(wanted[1], "ns"),
                         play_state="paused",
                         recording=mine[0].store_id,
                     )
                     if self._wanted == wanted:  # else there is a newer one already
                         self._wanted = None
-                    shown = entities.STAMP, wanted
-                    self._tell({"type": "time_update", "timeline": entities.STAMP, "time": wanted})
+                    shown = wanted
+                    self._tell({"type": "time_update", "timeline": wanted[0], "time": wanted[1]})
                     continue
             except (RuntimeError, TimeoutError, ValueError, ConnectionError):
                 continue  # it is busy, and is asked again; when it is gone the relay ends
             now = mine[0].current_timeline, mine[0].current_time
-            if now != shown:
+            if now != shown and now[0] in TIMELINES:
                 shown = now
                 self._tell({"type": "time_update", "timeline": now[0], "time": now[1]})
 
@@ -209,7 +213,8 @@ class NativeViewer(Closing):
 
     async def _take(self, message: Event, told: Callable[[Event], None]) -> None:
         if message.get("type") == "time_ctrl" and str(message.get("timestamp_nanos", "")).isdecimal():
-            self.seek(int(message["timestamp_nanos"]))
+            timeline = message.get("timeline")
+            self.seek(timeline if timeline in TIMELINES else entities.STAMP, int(message["timestamp_nanos"]))
         elif message.get("type") == "reopen":
             try:
                 await asyncio.to_thread(self.reopen)

@@ -34,6 +34,11 @@ class Pick:
     camera: str = ""
     place: tuple[float, ...] = ()
 
+    @property
+    def is_place(self) -> bool:
+        """Whether it is a place, where any number of things may be."""
+        return self.kind in ("pixel", "point", "cell")
+
     def __str__(self) -> str:
         """As it stands in the page's address: ``detection/front/3``, ``point//1.5,2,0``."""
         what = ",".join(f"{v:.4g}" for v in self.place) if self.place else str(self.row)

@@ -9,6 +9,8 @@ panel.innerHTML = `<h2>The robot</h2><p id="said" class="faint" role="status">At
 <p class="buttons"><input id="mark-text" placeholder="a note" aria-label="a note" size="24">
 <button id="mark" title="M">mark this frame</button></p>`;
 document.querySelector("aside header").after(panel);
+for (const id of ["drive", "flip"]) document.getElementById(id).hidden = true; // of a drive that is over
+document.getElementById("words").closest("section").hidden = true;
 const $ = (id) => document.getElementById(id);
 
 let time = null; // of the viewer

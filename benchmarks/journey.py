@@ -1,0 +1,281 @@
+"""The way from a missed object to a filed report in the workbench, in a real browser against the real server.
+
+``python -m benchmarks.journey`` goes it on the synthetic drive and on KITTI's labelled frames, prints its
+steps, its clicks and the seconds that somebody waits, and clicks 40 times in the views.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from playwright.sync_api import Page
+
+DATA = Path(os.environ.get("BEVVIZ_DATA") or Path(__file__).resolve().parents[2] / "shared/data")
+FRAMES = 20
+CLICKS, SECONDS = 6, 20.0  # that the journey may take
+FIRST, ANSWER = 3.0, 0.7  # seconds to the first frame, and from a click to its answer for 95 %
+WIDTH, HEIGHT = 1400, 900
+PANEL = 400  # pixels of the page's width that are not the viewer
+SOFTWARE = [
+    "--no-sandbox",
+    "--use-angle=swiftshader",
+    "--enable-unsafe-swiftshader",
+    "--ignore-gpu-blocklist",
+]
+LATE = 400.0  # seconds after which something does not come about
+
+
+@dataclass
+class Journey:
+    """What was done, and how long it took."""
+
+    steps: list[tuple[str, float]] = field(default_factory=list)
+    clicks: int = 0
+    waited: float = 0.0
+
+    def step(self, what: str, seconds: float, *, click: bool = True) -> None:
+        self.steps.append((what, seconds))
+        self.clicks += click
+        self.waited += seconds
+        print(f"  {seconds:6.2f} s  {what}")
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--frames", type=int, default=FRAMES, help=f"of the synthetic drive (default: {FRAMES})"
+    )
+    parser.add_argument("--only", choices=("demo", "kitti"), help="one of the two")
+    parser.add_argument("--clicks", type=int, default=40, help="in the views, timed one by one (default: 40)")
+    parser.add_argument("--once", action="store_true", help="do not start it a first time, for the browser")
+    parser.add_argument("--pictures", type=Path, help="folder for a picture of each step")
+    options = parser.parse_args()
+    print(f"load of the machine: {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores")
+    good = True
+    with tempfile.TemporaryDirectory() as temporary:
+        folder = Path(temporary)
+        if options.only != "kitti":
+            good &= _go("the synthetic drive", _demo(folder, options.frames), folder, options)
+        if options.only != "demo":
+            if not DATA.is_dir():
+                print(f"no KITTI: {DATA} is not there")
+            else:
+                good &= _go("KITTI", _kitti(folder), folder, options)
+    return 0 if good else 1
+
+
+def _demo(folder: Path, frames: int) -> list[str]:
+    bag = folder / "demo.mcap"
+    subprocess.run(
+        [sys.executable, "-m", "bevviz.cli", "demo", "--frames", str(frames), "--bag", str(bag)], check=True
+    )
+    return [str(bag), "--model", "demo"]
+
+
+def _kitti(folder: Path) -> list[str]:
+    """Its labelled frames as a bag, and the labels."""
+    from tests import bags
+
+    names = [f"{number:06}" for number in range(12)]
+    bag = bags.write(folder / "kitti", bags.kitti_items(DATA.parent / "data", names=names))
+    model = DATA / "models/yolox_nano.onnx"
+    return [str(bag), "--model", str(model), "--kitti-labels", str(DATA / "kitti/label_2")]
+
+
+@contextmanager
+def serving(arguments: Sequence[str], folder: Path) -> Iterator[str]:
+    """``bevviz open`` as a user starts it: its address."""
+    command = [sys.executable, "-m", "bevviz.cli", "open", *arguments, "--no-browser"]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True, cwd=folder) as server:
+        try:
+            assert server.stderr is not None
+            for line in server.stderr:
+                if found := re.search(r"workbench at (\S+)", line):
+                    yield found[1]
+                    break
+            else:
+                raise SystemExit("the server has said no address")
+        finally:
+            server.send_signal(signal.SIGINT)
+            server.communicate(timeout=60)
+
+
+def _go(name: str, arguments: list[str], folder: Path, options: argparse.Namespace) -> bool:
+    from playwright.sync_api import sync_playwright
+
+    chromium = os.environ.get("BEVVIZ_CHROMIUM") or shutil.which("chromium")
+    if chromium is None:
+        raise SystemExit("needs a browser: apt-get install chromium (or BEVVIZ_CHROMIUM=its path)")
+    print(f"\n{name}: bevviz open {' '.join(arguments)}")
+    with sync_playwright() as playwright:
+        context = playwright.chromium.launch_persistent_context(
+            folder / "profile",
+            executable_path=chromium,
+            args=SOFTWARE,
+            viewport={"width": WIDTH, "height": HEIGHT},
+        )
+        context.add_init_script(
+            "window.seen = []; window.addEventListener('viewer-event', (e) => window.seen.push(e.detail))"
+        )
+        for warm in (True,) if options.once else (False, True):  # the second time the browser has the viewer
+            start = time.monotonic()
+            with serving(arguments, folder) as address:
+                page = context.new_page()
+                page.goto(address)
+                _first_frame(page)
+                first = time.monotonic() - start
+                which = "again: the browser has the viewer" if warm else "the first time"
+                print(f"  {first:6.2f} s  from the command to the first frame, {which} (wanted: {FIRST:g} s)")
+                if warm:
+                    journey = _journey(page, name, options.pictures)
+                    latencies = _clicks(page, options.clicks)
+                page.close()
+        context.close()
+    print(
+        f"  {journey.clicks} clicks (at most {CLICKS}), "
+        f"{journey.waited:.1f} s of waiting (at most {SECONDS:g})"
+    )
+    if latencies:
+        p50, p95 = np.percentile(latencies, [50, 95])
+        print(
+            f"  {len(latencies)} clicks in the views: {p50:.2f} s (median), {p95:.2f} s (95 %) "
+            f"from the click to the verdict (wanted: {ANSWER:g} s)"
+        )
+    return journey.clicks <= CLICKS and journey.waited <= SECONDS
+
+
+def _journey(page: Page, name: str, pictures: Path | None) -> Journey:
+    journey = Journey()
+
+    def picture(what: str) -> None:
+        if pictures is not None:
+            pictures.mkdir(parents=True, exist_ok=True)
+            page.wait_for_timeout(3000)  # a browser without a graphics card draws late
+            page.screenshot(path=pictures / f"{name.split()[-1].lower()}-{what}.png")
+
+    def waited(done: Callable[[], Any]) -> float:
+        start = time.monotonic()
+        until(done, 0.1)
+        return time.monotonic() - start
+
+    until(lambda: page.locator("#bar").is_hidden(), 0.5)  # the drive is loaded
+    picture("opened")
+    helped = False
+    for row in page.locator("#found button", has=page.locator(".missed")).all()[:12]:
+        before = page.inner_text("#where")
+        row.click()
+        took = waited(_answered(page, before))
+        verdict = page.inner_text("#verdict")
+        hints = waited(lambda: not page.inner_text("#hints").startswith("Trying"))
+        if page.locator("#hints button").count():
+            journey.step(f"click a missed object: {verdict}", took)
+            journey.step("read the verdict; meanwhile changes are tried", hints, click=False)
+            helped = True
+            break
+    if not helped:
+        print("  no missed object that a change would help")
+        return journey
+    picture("missed")
+    hint = page.locator("#hints button").first
+    what = hint.inner_text().splitlines()[0]
+    hint.click()
+    took = waited(
+        lambda: (
+            "reported" in (page.get_attribute("#answer", "class") or "")
+            and not busy(page)
+            and not page.inner_text("#effect").startswith("Running")
+        )
+    )
+    journey.step(f"press its hint ({what}): {page.inner_text('#effect')}", took)
+    picture("found")
+    page.click("#drive")
+    took = waited(lambda: page.locator("#trial").is_visible() and page.locator("#drive-cancel").is_hidden())
+    journey.step(f"run the drive: {page.inner_text('#trial-text')}", took)
+    picture("drive")
+    page.fill("#words", "missed, although it is plainly there")
+    page.click("#report")
+    took = waited(lambda: page.locator("#reports a").count() >= 2)
+    journey.step(f"write the report: {page.inner_text('#reports')}", took)
+    start = time.monotonic()
+    with page.context.expect_page() as opened:
+        page.locator("#reports a", has_text=".html").click()
+    report = opened.value
+    report.wait_for_load_state()
+    journey.step(f"open the report: {report.title()}", time.monotonic() - start)
+    assert "was not reported" in report.inner_text("body") or "was reported, but" in report.inner_text("body")
+    if pictures is not None:
+        report.screenshot(path=pictures / f"{name.split()[-1].lower()}-report.png")
+    report.close()
+    return journey
+
+
+def _clicks(page: Page, number: int) -> list[float]:
+    """Seconds from a click in a view to the verdict, as the page itself counts them."""
+    rng, found = np.random.default_rng(0), list[float]()
+    for _ in range(4 * number):
+        if len(found) == number:
+            break
+        x = int(rng.integers(20, WIDTH - PANEL - 20))
+        y = int(rng.integers(40, HEIGHT - 60))
+        before = page.inner_text("#where")
+        page.mouse.move(x, y)
+        page.wait_for_timeout(800)  # nobody clicks where the pointer has just come to
+        page.mouse.click(x, y, delay=50)
+        end = time.monotonic() + 6
+        while time.monotonic() < end:
+            page.wait_for_timeout(150)
+            if not busy(page) and page.inner_text("#where") != before:
+                found.append(float(page.get_attribute("#answer", "data-took") or "nan") / 1000)
+                break
+    return found
+
+
+def _first_frame(page: Page) -> None:
+    until(lambda: events(page, "time_update"), 0.1)
+
+
+def _answered(page: Page, before: str) -> Callable[[], bool]:
+    """Whether there is another answer than that one."""
+    return lambda: page.inner_text("#where") != before and not busy(page)
+
+
+def busy(page: Page) -> bool:
+    """Whether an answer is on its way."""
+    return "busy" in (page.get_attribute("#answer", "class") or "")
+
+
+def events(page: Page, kind: str) -> list[dict[str, Any]]:
+    """What the viewer has told of a kind."""
+    found: list[dict[str, Any]] = page.evaluate("window.seen")
+    return [event for event in found if event["type"] == kind]
+
+
+def until(done: Callable[[], Any], pause: float) -> None:
+    """Wait for something."""
+    end = time.monotonic() + LATE
+    while not done():
+        if time.monotonic() > end:
+            raise SystemExit("it has not come about")
+        time.sleep(pause)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,7 @@
+"""What is worth a look in a drive."""
+
+from bevviz.anomalies.detector import KINDS, AnomalyDetector
+from bevviz.anomalies.objects import label
+from bevviz.anomalies.summary import AnomalySummary, FailureSummary, Onsets
+
+__all__ = ["KINDS", "AnomalyDetector", "AnomalySummary", "FailureSummary", "Onsets", "label"]

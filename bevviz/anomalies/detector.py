@@ -1,0 +1,143 @@
+"""What is worth a look in a drive: strange objects, what one sensor alone sees, clocks, transforms.
+
+Plain rules over the results of consecutive frames, each of which knows only those before it; their limits
+are the section ``anomalies``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import get_args
+
+import numpy as np
+
+from bevviz import geometry
+from bevviz.anomalies.objects import UNMATCHED, ObjectWatch
+from bevviz.config import AnomaliesConfig
+from bevviz.frame import F32, Anomaly, AnomalyKind, CameraResult, FrameResult
+from bevviz.geometry import iou
+
+KINDS: tuple[AnomalyKind, ...] = get_args(AnomalyKind)
+SAME_BOX = 0.3  # IoU of the image boxes of one object in consecutive frames
+STRONG = 0.5  # score of a detection that the LiDAR has to have something for
+NEAR = 25.0  # metres, by the usual height of its class, that such a thing may be away
+THROUGH = 0.7  # share of the points in its box that must lie far behind it
+BEHIND = 1.3  # times as far
+
+
+class AnomalyDetector:
+    """Looks at the results of consecutive frames. What lasts is one anomaly, with the stamp it began at."""
+
+    def __init__(self) -> None:
+        self._active: dict[tuple[str, str], tuple[Anomaly, int]] = {}  # with the stamp it was last true at
+        self._objects = ObjectWatch()
+        self._alone: dict[str, list[tuple[F32, str, int]]] = {}  # camera -> box, class, frames
+        self._placed: set[str] = set()  # sensors whose transforms were there
+        self._imaged: set[str] = set()  # cameras that had an image
+        self._stamp = 0
+
+    def update(self, result: FrameResult, config: AnomaliesConfig) -> tuple[Anomaly, ...]:
+        """Those of this frame, and those that ended within ``anomalies.hold``, worst first."""
+        stamp = result.frame.stamp
+        if stamp < self._stamp:
+            self._active.clear()
+            self._alone.clear()
+            self._objects.clear()
+        self._stamp = stamp
+        for anomaly in self._found(result, config):
+            key = anomaly.kind, anomaly.subject
+            since = self._active[key][0].since if key in self._active else stamp
+            self._active[key] = replace(anomaly, since=since), stamp
+        self._active = {
+            key: (anomaly, last)
+            for key, (anomaly, last) in self._active.items()
+            if stamp - last <= config.hold * 1e9
+        }
+        return tuple(sorted((anomaly for anomaly, _ in self._active.values()), key=lambda a: -a.rank))
+
+    def _found(self, result: FrameResult, config: AnomaliesConfig) -> Iterator[Anomaly]:
+        if result.tracks is not None:
+            yield from self._objects.update(result, result.tracks, config)
+        yield from self._detections(result, config)
+        yield from self._clocks(result, config)
+        yield from self._transforms(result, config)
+        yield from _stages(result, config)
+
+    def _detections(self, result: FrameResult, config: AnomaliesConfig) -> Iterator[Anomaly]:
+        """What a camera alone sees, followed from frame to frame by the overlap of its boxes."""
+        texts = {(e.camera, e.row): e.text for e in result.explanations if e.subject == "detection"}
+        for camera in result.cameras:
+            name, found, fusion = camera.camera.name, camera.detections, camera.fusion
+            before, self._alone[name] = self._alone.get(name, []), []
+            if found is None or fusion is None:
+                continue
+            alone = np.isin(fusion.detection_decision, UNMATCHED) & found.kept & (found.score >= STRONG)
+            unmatched = np.flatnonzero(alone)
+            boxes = found.xyxy[unmatched]
+            others = np.array([box for box, _, _ in before], np.float32).reshape(-1, 4)
+            same = iou(boxes, others) >= SAME_BOX
+            for d, box, near in zip(unmatched.tolist(), boxes, same, strict=True):
+                what = found.names[d]
+                earlier = [before[i][2] for i in np.flatnonzero(near).tolist() if before[i][1] == what]
+                frames = 1 + max(earlier, default=0)
+                self._alone[name].append((box, what, frames))
+                if frames >= config.alone_frames and _seen_through(result, camera, d):
+                    text = texts.get((name, d), f"{what} {found.score[d]:.2f}")
+                    subject = f"{what} in {name}"
+                    yield Anomaly("one_sensor", subject, f"{name}: {text}, for {frames} frames", rank=0.4)
+
+    # --- sensors and stages --------------------------------------------------------------------
+
+    def _clocks(self, result: FrameResult, config: AnomaliesConfig) -> Iterator[Anomaly]:
+        for camera in result.frame.cameras:
+            if abs(camera.sync_error) > config.sync_error:
+                text = f"{camera.name} is {1e3 * camera.sync_error:+.0f} ms off the cloud"
+                yield Anomaly("sync", camera.name, text, rank=0.8)
+            elif camera.image is None and camera.name in self._imaged:
+                text = f"{camera.name} has no image at the time of the cloud"
+                yield Anomaly("sync", camera.name, text, rank=0.9)
+        self._imaged |= {camera.name for camera in result.frame.cameras if camera.image is not None}
+
+    def _transforms(self, result: FrameResult, config: AnomaliesConfig) -> Iterator[Anomaly]:
+        frame = result.frame
+        ages = {frame.lidar: frame.tf_age} | {camera.name: camera.tf_age for camera in frame.cameras}
+        for sensor, age in ages.items():
+            if age > config.tf_age:
+                yield Anomaly("tf", sensor, f"the transform of {sensor} is {1e3 * age:.0f} ms old", rank=0.7)
+        placed = {c.name for c in frame.cameras if c.camera_from_points is not None}
+        if frame.world_from_points is not None:
+            placed.add(frame.lidar)
+        for sensor in sorted(self._placed - placed):
+            yield Anomaly("tf", sensor, f"the transform of {sensor} is lost", "ERROR", rank=1.0)
+        self._placed |= placed
+
+
+def _seen_through(result: FrameResult, camera: CameraResult, row: int) -> bool:
+    """Whether the LiDAR sees what is behind a detection, if its class is as near as it looks."""
+    found, about = camera.detections, camera.camera
+    assert found is not None
+    size = result.config.objects.sizes.get(found.names[row].lower())
+    if size is None or about.intrinsics is None or about.camera_from_points is None:
+        return False
+    x0, y0, x1, y1 = found.xyxy[row].tolist()
+    away = float(about.intrinsics.K[1, 1]) * size[2] / max(y1 - y0, 1.0)
+    if away > NEAR or min(x0, y0) < 1 or x1 > about.intrinsics.width - 1 or y1 > about.intrinsics.height - 1:
+        return False
+    uv, depth = geometry.project(
+        geometry.apply(about.camera_from_points, result.frame.points), about.intrinsics
+    )
+    low = np.array([x0 + (x1 - x0) / 4, y0 + (y1 - y0) / 5])
+    high = np.array([x1 - (x1 - x0) / 4, y1 - (y1 - y0) / 5])
+    with np.errstate(invalid="ignore"):
+        there = depth[((uv >= low) & (uv <= high)).all(axis=1)]
+    return bool(len(there) >= 3 and (there > BEHIND * away).mean() >= THROUGH)
+
+
+def _stages(result: FrameResult, config: AnomaliesConfig) -> Iterator[Anomaly]:
+    for failure in result.failures:
+        yield Anomaly("stage", failure.stage, f"{failure.stage}: {failure.reason}", "ERROR", rank=1.0)
+    failed = {failure.stage for failure in result.failures}
+    for stage, seconds in result.timings.items():
+        if config.stage_time is not None and seconds > config.stage_time and stage not in failed:
+            yield Anomaly("stage", stage, f"{stage} took {1e3 * seconds:.0f} ms", rank=0.5)

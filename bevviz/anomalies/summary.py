@@ -1,0 +1,67 @@
+"""What is new in the anomalies of each frame, and how many a drive had."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+
+from bevviz.frame import Anomaly, FrameResult
+from bevviz.run import Observer
+
+
+class Onsets:
+    """Tells what is new in the anomalies of each frame, even where frames are left out."""
+
+    def __init__(self) -> None:
+        self._known: set[tuple[str, str, int]] = set()
+
+    def of(self, anomalies: Sequence[Anomaly]) -> list[Anomaly]:
+        known, self._known = self._known, {(a.kind, a.subject, a.since) for a in anomalies}
+        return [a for a in anomalies if (a.kind, a.subject, a.since) not in known]
+
+
+class AnomalySummary(Observer[FrameResult]):
+    """How many anomalies of each kind a drive had, and when the first began."""
+
+    def __init__(self) -> None:
+        self._onsets = Onsets()
+        self._start: int | None = None
+        self._count: Counter[str] = Counter()
+        self._first: dict[str, int] = {}
+
+    def see(self, result: FrameResult) -> None:
+        self._start = result.frame.stamp if self._start is None else self._start
+        for anomaly in self._onsets.of(result.anomalies):
+            self._count[anomaly.kind] += 1
+            self._first.setdefault(anomaly.kind, anomaly.since - self._start)
+
+    def __str__(self) -> str:
+        """One line, most frequent first; times in seconds from the first frame."""
+        kinds = [
+            f"{count} {kind.replace('_', ' ')} (first at {self._first[kind] * 1e-9:.1f} s)"
+            for kind, count in self._count.most_common()
+        ]
+        return ", ".join(kinds) or "none"
+
+
+class FailureSummary(Observer[FrameResult]):
+    """Which stages failed, how often, and the reason that each gave first."""
+
+    def __init__(self) -> None:
+        self._frames = 0
+        self._count: Counter[str] = Counter()
+        self._first: dict[str, str] = {}
+
+    def see(self, result: FrameResult) -> None:
+        self._frames += 1
+        for failure in result.failures:
+            self._count[failure.stage] += 1
+            self._first.setdefault(failure.stage, failure.reason)
+
+    @property
+    def warnings(self) -> list[str]:
+        """One sentence for each stage."""
+        return [
+            f"{stage} failed in {count} of {self._frames} frames, first: {self._first[stage]}"
+            for stage, count in self._count.items()
+        ]

@@ -1,0 +1,129 @@
+"""``bevviz evaluate``."""
+
+from __future__ import annotations
+
+import argparse
+from contextlib import closing
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from bevviz.cli.options import (
+    Commands,
+    add_bag,
+    add_config,
+    add_limits,
+    add_output,
+    add_selection,
+    add_truth,
+    load_config,
+    open_bag,
+)
+from bevviz.cli.outputs import Outputs, hint, say, warn
+from bevviz.cli.run import logged, through
+from bevviz.errors import UserError
+
+if TYPE_CHECKING:
+    from rerun import RecordingStream
+
+    from bevviz.config import Config
+    from bevviz.drive import Frames
+    from bevviz.evaluate.evaluation import Evaluation
+    from bevviz.evaluate.gate import Limit
+    from bevviz.frame import FrameResult
+    from bevviz.run import Observer
+
+DESCRIPTION = """Hold the results to what is really there: precision and recall by class and range, average
+precision as KITTI defines it, tracks (HOTA, MOTA, IDF1), image boxes, ground. PATH is a bag, or a folder of
+the KITTI object benchmark (with velodyne, image_2, calib and label_2 in it). With --min and --max it is a
+gate: the exit status is 1 where a limit is not kept."""
+
+EPILOG = """examples:
+  bevviz evaluate drive.mcap --model yolo11n.onnx
+  bevviz evaluate training --model yolox_nano.onnx --frames :100 --save training.rrd
+  bevviz evaluate drive.mcap --model yolo11n.onnx --min recall.person=0.8 --max false=2 --junit ci.xml"""
+
+
+def add(commands: Commands) -> None:
+    evaluate = commands.add_parser(
+        "evaluate",
+        help="how right it is, where the truth is known; a gate for CI",
+        description=DESCRIPTION,
+        epilog=EPILOG,
+    )
+    group = add_bag(evaluate)
+    add_selection(group)
+    add_truth(evaluate)
+    add_limits(evaluate)
+    add_config(evaluate)
+    output = add_output(evaluate, blueprint="evaluate")
+    output.description = "None, but the table. Several can be given at once."
+    output.add_argument("--json", type=Path, metavar="FILE", help="every metric, and the frames, worst first")
+    evaluate.set_defaults(run=_evaluate)
+
+
+def _evaluate(options: argparse.Namespace) -> int:
+    from bevviz.evaluate.evaluation import Evaluation
+    from bevviz.evaluate.gate import parse_limits
+    from bevviz.evaluate.truth import truth_in
+
+    limits = parse_limits(options.min, options.max)
+    config = load_config(options)
+    with closing(_frames(options, config)) as frames:
+        evaluation = Evaluation(truth_in(frames, options.truth, options.kitti_labels))
+        status = _run(frames, config, evaluation, Outputs.of(options))
+        if not evaluation.judged:
+            raise UserError(f"{options.paths[0]}: there is truth for none of the {evaluation.without} frames")
+        return _report(evaluation, limits, options) or status
+
+
+def _frames(options: argparse.Namespace, config: Config) -> Frames:
+    from bevviz.datasets.kitti import KittiFrames, is_kitti
+
+    if len(options.paths) != 1 or not is_kitti(options.paths[0]):
+        return open_bag(options, config)
+    if options.start or options.end:
+        raise UserError(f"{options.paths[0]}: single frames have no times; choose with --frames and --every")
+    return KittiFrames(options.paths[0], every=options.every, frames=options.frames)
+
+
+def _run(frames: Frames, config: Config, evaluation: Evaluation, outputs: Outputs) -> int:
+    """The exit status of the run."""
+    from bevviz.session import Session
+
+    session = Session(config)
+    if not outputs:
+        hint(frames.scene, config)
+        end = through(frames, session, [evaluation])
+        warn(frames.warnings)
+        if end.interrupted:
+            say(f"interrupted after {end.frames} frames; the table is of these")
+            return 130
+        return 0 if end.frames else 1
+    from bevviz.evaluate.log import EvaluationRecorder
+    from bevviz.logging.recorder import Recorder
+
+    def observers(recording: RecordingStream) -> list[Observer[FrameResult]]:
+        hint(frames.scene, config)
+        return [Recorder(recording, config), evaluation, EvaluationRecorder(recording, evaluation)]
+
+    return logged(frames, session, config, outputs, observers, lambda: print(evaluation.table(), flush=True))
+
+
+def _report(evaluation: Evaluation, limits: list[Limit], options: argparse.Namespace) -> int:
+    """The exit status of the gate."""
+    from bevviz.evaluate.gate import check, write_junit
+
+    if not Outputs.of(options):
+        print(evaluation.table())
+    kept = check(limits, evaluation.metrics)
+    if options.json is not None:
+        gate = [{"limit": str(k.limit), "kept": not k.reason, "reason": k.reason} for k in kept]
+        evaluation.write_json(options.json, {"limits": gate})
+    if options.junit is not None:
+        write_junit(options.junit, {options.paths[0].resolve().stem: kept})
+    for found in kept:
+        if found.reason:
+            say(f"not kept: {found.reason}")
+    if kept and not any(found.reason for found in kept):
+        say(f"all {len(kept)} limits are kept" if len(kept) > 1 else f"kept: {kept[0].limit}")
+    return int(any(found.reason for found in kept))

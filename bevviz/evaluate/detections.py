@@ -1,0 +1,69 @@
+"""Detections in an image against what is there."""
+
+from __future__ import annotations
+
+from collections import Counter
+
+import numpy as np
+
+from bevviz import geometry
+from bevviz.evaluate.score import accepts, pair_in_order
+from bevviz.evaluate.truth import Truth
+from bevviz.frame import F32, Bool, CameraResult
+
+DETECTION_OVERLAP = 0.5  # least IoU in the image of a detection and what it is
+
+
+def count_detections(counts: dict[str, Counter[str]], result: CameraResult, truth: Truth) -> None:
+    """One camera's detections against the image boxes of the truth, best score first."""
+    found, camera = result.detections, result.camera
+    if found is None or camera.intrinsics is None or camera.camera_from_points is None:
+        return
+    boxes = _image_boxes(truth, result)
+    kept = np.flatnonzero(found.kept)
+    kept = kept[np.argsort(-found.score[kept], kind="stable")]
+    names = [found.names[d].lower() for d in kept]
+    overlap = geometry.iou(found.xyxy[kept], boxes)
+    cost = np.where(accepts(truth, names) & (overlap >= DETECTION_OVERLAP), 1 - overlap, np.inf)
+    partner, free = pair_in_order(cost, 1.0)
+    judged = frozenset().union(*truth.accepted)
+    excused = _in_regions(found.xyxy[kept], truth)
+    here = truth.must & np.isfinite(boxes).all(axis=1)
+    for name, k, out in zip(names, partner.tolist(), excused.tolist(), strict=True):
+        if k >= 0 and here[k]:
+            counts[truth.labels[k].lower()]["true"] += 1
+        elif k < 0 and not out and name in judged:
+            counts[name]["false"] += 1
+    for row in np.flatnonzero(free & here).tolist():
+        counts[truth.labels[row].lower()]["missed"] += 1
+
+
+def _image_boxes(truth: Truth, result: CameraResult) -> F32:
+    """(K, 4) as labelled, or around what is in the image of each projected box; NaN where nothing is."""
+    camera = result.camera
+    if truth.image is not None and truth.camera is not None and truth.camera.name == camera.name:
+        return truth.image.xyxy
+    assert camera.intrinsics is not None
+    assert camera.camera_from_points is not None
+    seen = geometry.apply(camera.camera_from_points, geometry.corners(truth.boxes).reshape(-1, 3))
+    uv, depth = geometry.project(seen, camera.intrinsics)
+    uv, ahead = uv.reshape(-1, 8, 2), depth.reshape(-1, 8).min(axis=1) > geometry.MIN_DEPTH
+    boxes = np.full((len(ahead), 4), np.nan, np.float32)
+    size = np.array([camera.intrinsics.width, camera.intrinsics.height], np.float32)
+    inside = np.clip(uv[ahead], -0.5, size - 0.5)
+    boxes[ahead] = np.hstack([inside.min(axis=1), inside.max(axis=1)])
+    boxes[(boxes[:, 2:] <= boxes[:, :2]).any(axis=1)] = np.nan
+    return boxes
+
+
+def _in_regions(xyxy: F32, truth: Truth) -> Bool:
+    """(D,) which image boxes lie for the most part where nothing was labelled."""
+    none = np.zeros(len(xyxy), bool)
+    if truth.image is None or len(truth.image.dont_care) == 0 or len(xyxy) == 0:
+        return none
+    regions = truth.image.dont_care
+    low = np.maximum(xyxy[:, None, :2], regions[None, :, :2])
+    high = np.minimum(xyxy[:, None, 2:], regions[None, :, 2:])
+    shared = np.prod(np.clip(high - low, 0, None), axis=2)
+    area = np.prod(xyxy[:, 2:] - xyxy[:, :2], axis=1)
+    return np.asarray(shared.max(axis=1) > DETECTION_OVERLAP * area, bool)

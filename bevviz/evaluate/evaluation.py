@@ -1,0 +1,270 @@
+"""Every metric of a drive: objects by class and range, average precision, tracks, detections, ground."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections import Counter, defaultdict
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from bevviz.errors import UserError
+from bevviz.evaluate.detections import count_detections
+from bevviz.evaluate.ground import count_ground
+from bevviz.evaluate.identity import TrackScore
+from bevviz.evaluate.names import base_of, ranges
+from bevviz.evaluate.precision import AveragePrecision, found_objects
+from bevviz.evaluate.score import Matches, Score, share
+from bevviz.evaluate.truth import Truth, Truths
+from bevviz.frame import Boxes3D, Frame, FrameResult, Objects
+from bevviz.run import Observer
+
+if TYPE_CHECKING:
+    from pandas import DataFrame
+
+
+@dataclass(frozen=True, slots=True)
+class JudgedFrame:
+    """One frame against its truth. Rows of the truth, and of the objects."""
+
+    index: int
+    stamp: int
+    true: tuple[str, ...]  # in words, as ``person at 12.3 m, 4 degrees left``
+    missed: tuple[str, ...]
+    false: tuple[tuple[str, str], ...]  # name and words: a name that no label accepts is not judged
+
+
+class Evaluation(Observer[FrameResult]):
+    """Holds every frame of a run against the truth.
+
+    Args:
+        truth: what is really there in a frame; None where that is not known.
+
+    Attributes:
+        last: of the frame that was seen last: its truth, and what each object is.
+
+    Example:
+        >>> evaluation = drive.evaluate()
+        >>> evaluation.metrics["recall.person"]
+    """
+
+    def __init__(self, truth: Truths) -> None:
+        self._truth = truth
+        self.judged: list[JudgedFrame] = []
+        self.without = 0  # frames without truth
+        self.last: tuple[FrameResult, Truth, Matches] | None = None
+        self._score = Score()
+        self._rows: list[tuple[str, str, float]] = []  # what became of it, class, metres away
+        self._precision = AveragePrecision()
+        self._tracks = TrackScore()
+        self._detections: dict[str, Counter[str]] = defaultdict(Counter)
+        self._ground: Counter[str] = Counter()
+        self._errors: dict[str, list[float]] = defaultdict(list)
+        self._metrics: dict[str, float] | None = None
+
+    def see(self, result: FrameResult) -> None:
+        truth = self._truth(result.frame)
+        self._metrics, self.last = None, None
+        if truth is None:
+            self.without += 1
+            return
+        objects = result.objects if result.objects is not None else _nothing()
+        matches = self._score.add(objects, truth)
+        self.last = result, truth, matches
+        self.judged.append(_words(result.frame, objects, truth, matches))
+        self._place(objects, truth, matches)
+        if result.objects is not None:
+            self._precision.add(found_objects(result, truth), truth)
+        self._tracks.add(result, truth)
+        for camera in result.cameras:
+            count_detections(self._detections, camera, truth)
+        count_ground(self._ground, result)
+
+    def _place(self, objects: Objects, truth: Truth, matches: Matches) -> None:
+        """Class and range of what is true, false and missed."""
+        for j in np.flatnonzero(matches.true).tolist():
+            k = int(matches.partner[j])
+            label = truth.labels[k].lower()
+            self._rows.append(("true", label, _away(truth.boxes, k)))
+            self._errors[label].append(float(matches.distance[j]))
+        for row in np.flatnonzero(matches.missed).tolist():
+            self._rows.append(("missed", truth.labels[row].lower(), _away(truth.boxes, row)))
+        for j in np.flatnonzero(matches.false).tolist():
+            self._rows.append(("false", objects.names[j].lower(), _away(objects.boxes, j)))
+
+    # --- numbers -------------------------------------------------------------------------------
+
+    @property
+    def names(self) -> set[str]:
+        """Names that are judged: those that labels accept, in lower case."""
+        return self._score.names
+
+    @property
+    def metrics(self) -> Mapping[str, float]:
+        """Every number by its name, ``METRIC[.CLASS][@RANGE]``, where it could be measured."""
+        if self._metrics is None:
+            self._metrics = dict(self._all_metrics())
+        return self._metrics
+
+    def _all_metrics(self) -> Iterator[tuple[str, float]]:
+        frames = max(len(self.judged), 1)
+        for cls in ("", *self.classes):
+            counts = self.counts(cls)
+            if not counts.total():
+                continue
+            yield from _rates(counts, f".{cls}" if cls else "")
+            errors = self._errors[cls] if cls else self._score.errors
+            if errors:
+                tail = f".{cls}" if cls else ""
+                yield f"error_m{tail}", float(np.median(errors))
+                yield f"error_90_m{tail}", float(np.quantile(errors, 0.9))
+            for low, high in ranges():
+                there = self.counts(cls, low, high)
+                if there.total():
+                    yield from _rates(there, (f".{cls}" if cls else "") + f"@{low}-{high}")
+        total = self.counts()
+        yield "missed_per_frame", total["missed"] / frames
+        yield "false_per_frame", total["false"] / frames
+        for (view, overlap, cls, difficulty), value in self._precision.results().items():
+            yield f"ap_{view}_{overlap}.{cls}" + (f".{difficulty}" if difficulty else ""), value
+        for cls, found in self._tracks.results().items():
+            for name, value in found.items():
+                yield (f"{name}.{cls}" if cls else name), value
+        for cls in ("", *sorted(self._detections)):
+            counts = self._detections[cls] if cls else sum(self._detections.values(), Counter())
+            if counts.total():
+                tail = f".{cls}" if cls else ""
+                yield f"detection_recall{tail}", share(counts["true"], counts["missed"])
+                yield f"detection_precision{tail}", share(counts["true"], counts["false"])
+        if ground := self._ground:
+            yield "ground_precision", share(ground["true"], ground["false"])
+            yield "ground_recall", share(ground["true"], ground["missed"])
+            yield "ground_iou", share(ground["true"], ground["false"] + ground["missed"])
+            yield "object_points_kept", share(ground["kept"], ground["lost"])
+
+    @property
+    def classes(self) -> list[str]:
+        """That labels have, or a false object that is judged."""
+        return sorted({cls for what, cls, _ in self._rows if what != "false" or cls in self.names})
+
+    def counts(self, cls: str = "", low: float = 0.0, high: float = math.inf) -> Counter[str]:
+        """``true``, ``false`` and ``missed``, of a class or of all, between two distances in metres."""
+        return Counter(
+            what
+            for what, name, away in self._rows
+            if (not cls or name == cls) and low <= away < high and (what != "false" or name in self.names)
+        )
+
+    @property
+    def labels(self) -> Mapping[str, int]:
+        """Labels that an average precision is of, by ``CLASS`` or ``CLASS.DIFFICULTY``."""
+        labels = self._precision.labels
+        return {f"{c}.{d}" if d else c: number for (c, d), number in labels.items()}
+
+    @property
+    def now(self) -> Mapping[str, Any]:
+        """``true``, ``missed`` and ``false`` of the frame that was seen last, in words."""
+        return self._frame(self.judged[-1])
+
+    @property
+    def worst(self) -> list[dict[str, Any]]:
+        """Frames in which something was missed or false, most of that first."""
+        frames = [self._frame(frame) for frame in self.judged]
+        wrong = [frame for frame in frames if frame["missed"] or frame["false"]]
+        return sorted(wrong, key=lambda f: (-len(f["missed"]) - len(f["false"]), f["frame"]))
+
+    def _frame(self, frame: JudgedFrame) -> dict[str, Any]:
+        return {
+            "frame": frame.index,
+            "stamp": frame.stamp,
+            "true": list(frame.true),
+            "missed": list(frame.missed),
+            "false": [words for name, words in frame.false if name in self.names],
+        }
+
+    # --- how it is shown -----------------------------------------------------------------------
+
+    def table(self) -> str:
+        """For the terminal."""
+        from bevviz.evaluate.tables import text
+
+        return text(self)
+
+    def as_tree(self) -> dict[str, Any]:
+        """For JSON: every metric, and the frames, worst first."""
+        return {
+            "frames": len(self.judged),
+            "frames_without_truth": self.without,
+            "metrics": {name: _plain(value) for name, value in self.metrics.items()},
+            "worst": self.worst,
+        }
+
+    def write_json(self, path: Path, more: Mapping[str, Any] | None = None) -> None:
+        """Raises UserError where the file cannot be written."""
+        try:
+            path.write_text(json.dumps({**self.as_tree(), **(more or {})}, indent=1))
+        except OSError as error:
+            raise UserError(f"--json {path}: cannot be written: {error.strerror}") from None
+
+    def to_pandas(self) -> DataFrame:
+        """A row for each metric: its name, class, range and value."""
+        from bevviz.frame import data_frame
+
+        rows = []
+        for name, value in self.metrics.items():
+            base = base_of(name) or name
+            cls, _, where = name.removeprefix(base).removeprefix(".").partition("@")
+            rows.append({"metric": base, "class": cls, "range": where, "value": value})
+        return data_frame(rows)
+
+
+def _rates(counts: Counter[str], tail: str) -> Iterator[tuple[str, float]]:
+    yield f"recall{tail}", share(counts["true"], counts["missed"])
+    yield f"precision{tail}", share(counts["true"], counts["false"])
+    yield f"f1{tail}", share(2 * counts["true"], counts["missed"] + counts["false"])
+    yield f"missed{tail}", float(counts["missed"])
+    yield f"false{tail}", float(counts["false"])
+
+
+def _plain(value: float) -> float | None:
+    """JSON has no NaN."""
+    return None if math.isnan(value) else round(value, 6)
+
+
+# --- words -------------------------------------------------------------------------------------
+
+
+def _words(frame: Frame, objects: Objects, truth: Truth, matches: Matches) -> JudgedFrame:
+    def labelled(k: int) -> str:
+        return f"{truth.labels[k].lower()} {place(truth.boxes, k)}"
+
+    return JudgedFrame(
+        frame.index,
+        frame.stamp,
+        tuple(labelled(int(matches.partner[j])) for j in np.flatnonzero(matches.true)),
+        tuple(labelled(k) for k in np.flatnonzero(matches.missed).tolist()),
+        tuple(
+            (objects.names[j].lower(), f"{objects.names[j].lower()} {place(objects.boxes, j)}")
+            for j in np.flatnonzero(matches.false).tolist()
+        ),
+    )
+
+
+def place(boxes: Boxes3D, row: int) -> str:
+    """``at 12.3 m, 4° left``, from the origin of the points."""
+    x, y = boxes.center[row, :2].tolist()
+    angle = math.degrees(math.atan2(y, x))
+    return f"at {math.hypot(x, y):.1f} m, {abs(angle):.0f}° {'left' if angle >= 0 else 'right'}"
+
+
+def _away(boxes: Boxes3D, row: int) -> float:
+    return float(np.hypot(*boxes.center[row, :2]))
+
+
+def _nothing() -> Objects:
+    none = np.zeros(0, np.int32)
+    return Objects(Boxes3D.empty(), (), np.zeros(0, np.float32), none, (), none)

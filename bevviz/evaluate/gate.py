@@ -1,0 +1,118 @@
+"""Limits that an evaluation is held to, and JUnit XML that says whether it keeps them."""
+
+from __future__ import annotations
+
+import difflib
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+from xml.etree import ElementTree
+
+from bevviz.errors import UserError
+from bevviz.evaluate.names import METRICS, base_of
+
+
+@dataclass(frozen=True, slots=True)
+class Limit:
+    """``--min recall.person=0.8``"""
+
+    metric: str
+    side: Literal["min", "max"]
+    value: float
+
+    def __str__(self) -> str:
+        return f"{self.metric} {'>=' if self.side == 'min' else '<='} {self.value:g}"
+
+
+@dataclass(frozen=True, slots=True)
+class Kept:
+    """Whether a limit is kept, and why it is not; empty where it is."""
+
+    limit: Limit
+    measured: float  # NaN: it could not be measured
+    reason: str
+
+
+def parse_limits(least: Sequence[str], most: Sequence[str]) -> list[Limit]:
+    """Of ``--min`` and ``--max``.
+
+    Raises:
+        UserError: no NAME=NUMBER, or no metric of that name.
+    """
+    asked: list[tuple[Literal["min", "max"], str]] = [("min", text) for text in least]
+    asked += [("max", text) for text in most]
+    return [_limit(side, text) for side, text in asked]
+
+
+def _limit(side: Literal["min", "max"], text: str) -> Limit:
+    name, equals, number = text.partition("=")
+    name = name.strip()
+    if base_of(name) is None:
+        base = name.partition("@")[0]
+        near = difflib.get_close_matches(base.partition(".")[0], METRICS, 1)
+        hint = f"did you mean '{near[0]}'? " if near else ""
+        known = ", ".join(METRICS)
+        raise UserError(
+            f"--{side} {text}: no metric '{base}'; {hint}There are {known}; each may have .CLASS and @RANGE"
+        )
+    try:
+        value = float(number)
+    except ValueError:
+        value = math.nan
+    if not equals or math.isnan(value):
+        raise UserError(f"--{side} {text}: expected METRIC=NUMBER, for example --{side} {name}=0.8")
+    return Limit(name, side, value)
+
+
+def check(limits: Sequence[Limit], metrics: Mapping[str, float]) -> list[Kept]:
+    """Whether each is kept. What could not be measured is not."""
+    return [_kept(limit, metrics) for limit in limits]
+
+
+def _kept(limit: Limit, metrics: Mapping[str, float]) -> Kept:
+    value = metrics.get(limit.metric, math.nan)
+    if math.isnan(value):
+        base, ranged = base_of(limit.metric), "@" in limit.metric
+        there = [name for name in metrics if base_of(name) == base and (ranged or "@" not in name)]
+        why = f"measured were {', '.join(there)}" if there else f"nothing there has a {base}"
+        return Kept(limit, value, f"{limit.metric} could not be measured: {why}")
+    kept = value >= limit.value if limit.side == "min" else value <= limit.value
+    return Kept(limit, value, "" if kept else f"{limit.metric} is {value:.4g}, asked for {limit}")
+
+
+def write_junit(path: Path, suites: Mapping[str, list[Kept] | str]) -> None:
+    """A test suite for each drive, a test case for each limit.
+
+    Args:
+        path: the file.
+        suites: name of the drive -> its limits, or why it could not be run at all.
+
+    Raises:
+        UserError: the file cannot be written.
+    """
+    root = ElementTree.Element("testsuites", name="bevviz evaluate")
+    for drive, found in suites.items():
+        suite = ElementTree.SubElement(root, "testsuite", name=_plain(drive))
+        if isinstance(found, str):
+            case = ElementTree.SubElement(suite, "testcase", classname=_plain(drive), name="run")
+            ElementTree.SubElement(case, "error", message=_plain(found))
+            suite.attrib |= {"tests": "1", "failures": "0", "errors": "1"}
+            continue
+        broken = sum(bool(kept.reason) for kept in found)
+        suite.attrib |= {"tests": str(len(found)), "failures": str(broken), "errors": "0"}
+        for kept in found:
+            case = ElementTree.SubElement(suite, "testcase", classname=_plain(drive), name=str(kept.limit))
+            if kept.reason:
+                ElementTree.SubElement(case, "failure", message=_plain(kept.reason))
+    ElementTree.indent(root)
+    try:
+        ElementTree.ElementTree(root).write(path, encoding="utf-8", xml_declaration=True)
+    except OSError as error:
+        raise UserError(f"--junit {path}: cannot be written: {error.strerror}") from None
+
+
+def _plain(text: str) -> str:
+    """Without the characters that XML cannot have."""
+    return "".join(c if c.isprintable() else "?" for c in text)

@@ -1,0 +1,242 @@
+"""Average precision as the KITTI object benchmark defines it, in the image, from above and in 3D.
+
+Geiger, Lenz and Urtasun 2012, with the 40 recall points of Simonelli et al. 2019. What follows is the rule of
+the benchmark's own development kit: which labels and detections count, which are only not held against
+anybody, and at which scores the curve is sampled.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bevviz import geometry
+from bevviz.evaluate.score import accepts
+from bevviz.evaluate.truth import Truth
+from bevviz.frame import F32, Bool, FrameResult
+from bevviz.stages.kernel import kernel
+
+RECALL_POINTS = 40
+COUNTS, IGNORED, OTHER = 0, 1, -1  # what a label or a detection is to a class and difficulty
+
+Roles = NDArray[np.int8]  # of these
+
+
+class Difficulty(NamedTuple):
+    height: float  # pixels that an object is high, at least
+    occluded: int  # at most
+    truncated: float  # at most
+
+
+DIFFICULTIES = {
+    "easy": Difficulty(40, 0, 0.15),
+    "moderate": Difficulty(25, 1, 0.3),
+    "hard": Difficulty(25, 2, 0.5),
+}
+OVERLAPS = (0.5, 0.7)
+VIEWS = ("bev", "3d")
+KITTI_CLASSES = {  # label -> labels that are neither right nor wrong, names that detectors give it
+    "Car": (("Van",), ("car",)),
+    "Pedestrian": (("Person_sitting",), ("pedestrian", "person")),
+    "Cyclist": ((), ("cyclist", "bicycle")),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Found:
+    """Objects of a frame, or detections in its image, against its truth."""
+
+    names: tuple[str, ...]  # (D,) in lower case
+    score: F32  # (D,)
+    height: F32  # (D,) pixels; inf where there is no image box
+    overlaps: dict[str, F32]  # (D, K) IoU with each label, by view
+    excused: dict[str, F32]  # (D,) largest share in a region where nothing is labelled, by view
+
+
+def found_objects(result: FrameResult, truth: Truth) -> Found:
+    """The fused objects of a frame."""
+    objects = result.objects
+    assert objects is not None
+    above, volume = geometry.box_iou(objects.boxes, truth.boxes)
+    detections = {camera.camera.name: camera.detections for camera in result.cameras}
+    height = np.full(len(objects), np.inf, np.float32)
+    for j, (camera, row) in enumerate(zip(objects.camera, objects.detection.tolist(), strict=True)):
+        if row >= 0 and (found := detections.get(camera)) is not None:
+            height[j] = found.xyxy[row, 3] - found.xyxy[row, 1]
+    names = tuple(name.lower() for name in objects.names)
+    return Found(names, objects.score, height, {"bev": above, "3d": volume}, {})
+
+
+@dataclass
+class Curve:
+    """One class, at one difficulty: frame after frame, then ``average``."""
+
+    view: str
+    min_overlap: float
+
+    def __post_init__(self) -> None:
+        self._frames: list[tuple[F32, F32, Roles, Roles, Bool]] = []
+
+    def add(self, found: Found, det: Roles, label: Roles) -> None:
+        """``det`` (D,) and ``label`` (K,): COUNTS, IGNORED or OTHER."""
+        rows, columns = np.flatnonzero(det != OTHER), np.flatnonzero(label != OTHER)
+        if len(rows) == 0 and not (label == COUNTS).any():
+            return
+        excused = found.excused.get(self.view, np.zeros(len(det), np.float32)) > self.min_overlap
+        self._frames.append(
+            (
+                np.ascontiguousarray(found.overlaps[self.view][np.ix_(rows, columns)]),
+                np.ascontiguousarray(found.score[rows]),
+                det[rows],
+                label[columns],
+                excused[rows],
+            )
+        )
+
+    @property
+    def labels(self) -> int:
+        """That have to be found."""
+        return sum(int((frame[3] == COUNTS).sum()) for frame in self._frames)
+
+    def average(self) -> float:
+        """Mean precision over the recall points; NaN where nothing has to be found."""
+        total = self.labels
+        if not total:
+            return float("nan")
+        found = [_matched(*frame, self.min_overlap, -np.inf, False)[2] for frame in self._frames]
+        precision = np.zeros(RECALL_POINTS + 1)
+        for i, threshold in enumerate(_thresholds(np.concatenate(found), total)):
+            counts = [_matched(*frame, self.min_overlap, threshold, True)[:2] for frame in self._frames]
+            right, wrong = np.sum(counts, axis=0)
+            precision[i] = right / (right + wrong) if right + wrong else 0.0
+        precision = np.maximum.accumulate(precision[::-1])[::-1]
+        return float(precision[1:].mean())
+
+
+def _thresholds(scores: F32, total: int) -> Iterable[float]:
+    """Scores of right ones at which recall comes nearest to each of its points."""
+    scores = np.sort(scores)[::-1]
+    recall = 0.0
+    chosen = []
+    for i, score in enumerate(scores.tolist()):
+        left = (i + 1) / total
+        last = i == len(scores) - 1
+        right = left if last else (i + 2) / total
+        if right - recall < recall - left and not last:
+            continue
+        chosen.append(score)
+        recall += 1 / RECALL_POINTS
+    return chosen
+
+
+@kernel
+def _matched(
+    overlap: F32,
+    score: F32,
+    det: Roles,
+    label: Roles,
+    excused: Bool,
+    min_overlap: float,
+    threshold: float,
+    count_false: bool,
+) -> tuple[int, int, F32]:
+    """Right ones, false ones, and the scores of the right ones.
+
+    Each label in turn takes of what is left the best overlap or, where scores are sampled, the best score.
+    """
+    taken = np.zeros(len(score), np.bool_)
+    scores = np.empty(len(label), np.float32)
+    right = 0
+    for k in range(len(label)):
+        best, value, ignored = -1, 0.0, False
+        for d in range(len(score)):
+            if taken[d] or score[d] < threshold or overlap[d, k] <= min_overlap:
+                continue
+            if not count_false:
+                if best < 0 or score[d] > value:
+                    best, value = d, score[d]
+            elif det[d] == 0:
+                if best < 0 or ignored or overlap[d, k] > value:
+                    best, value, ignored = d, overlap[d, k], False
+            elif best < 0:
+                best, ignored = d, True
+        if best < 0:
+            continue
+        taken[best] = True
+        if label[k] == 0 and det[best] == 0:
+            scores[right] = score[best]
+            right += 1
+    false = 0
+    if count_false:
+        for d in range(len(score)):
+            false += not (taken[d] or det[d] != 0 or score[d] < threshold or excused[d])
+    return right, false, scores[:right]
+
+
+class AveragePrecision:
+    """Of all classes of a drive: for KITTI's labels by its difficulties, else of what must be found."""
+
+    def __init__(self, views: Sequence[str] = VIEWS) -> None:
+        self._views = views
+        self._curves: dict[tuple[str, float, str, str], Curve] = {}
+
+    def add(self, found: Found, truth: Truth) -> None:
+        """One frame."""
+        labels = np.array(truth.labels, object)
+        if truth.image is None:
+            for name in sorted({label.lower() for label in truth.labels} | set(self._classes())):
+                of_class = np.array([label.lower() == name for label in truth.labels], bool)
+                label = _roles(of_class & truth.must, of_class)
+                mine = accepts_name(truth, found.names, name)
+                self._add(name, "", found, _roles(mine, mine), label)
+            return
+        size = truth.image.xyxy[:, 3] - truth.image.xyxy[:, 1]
+        for kind, (neighbours, names) in KITTI_CLASSES.items():
+            own, near = labels == kind, np.isin(labels.astype(str), neighbours)
+            mine = np.isin(np.array(found.names, str), names)
+            for name, limit in DIFFICULTIES.items():
+                within = (truth.image.occluded <= limit.occluded) & (truth.image.truncated <= limit.truncated)
+                counts = own & within & (size > limit.height)
+                label = _roles(counts, own | near)
+                small = found.height < limit.height
+                det = _roles(mine & ~small, mine | small)
+                self._add(kind.lower(), name, found, det, label)
+
+    def _classes(self) -> set[str]:
+        return {key[2] for key in self._curves}
+
+    def _add(self, name: str, difficulty: str, found: Found, det: Roles, label: Roles) -> None:
+        for view in self._views:
+            for overlap in OVERLAPS:
+                key = view, overlap, name, difficulty
+                curve = self._curves.setdefault(key, Curve(view, overlap))
+                curve.add(found, det, label)
+
+    @property
+    def labels(self) -> dict[tuple[str, str], int]:
+        """(class, difficulty) -> labels that had to be found."""
+        return {key[2:]: curve.labels for key, curve in self._curves.items() if curve.labels}
+
+    def results(self) -> dict[tuple[str, float, str, str], float]:
+        """(view, overlap, class, difficulty) -> average precision; only where there was something to find.
+
+        The kit takes one score for each right object at most: with 40 labels or fewer it has fewer than 40
+        points, and the average is (labels - 1) / 40 at best.
+        """
+        return {key: curve.average() for key, curve in self._curves.items() if curve.labels}
+
+
+def _roles(counts: Bool, ignored: Bool) -> Roles:
+    return np.where(counts, COUNTS, np.where(ignored, IGNORED, OTHER)).astype(np.int8)
+
+
+def accepts_name(truth: Truth, names: Sequence[str], label: str) -> Bool:
+    """(D,) which names are right for that label."""
+    rows = [k for k, own in enumerate(truth.labels) if own.lower() == label]
+    if rows:
+        return np.asarray(accepts(truth, list(names))[:, rows[0]])
+    return np.array([name == label for name in names], bool)

@@ -1,0 +1,135 @@
+"""How right fused objects are: held against the truth, by class and place."""
+
+from __future__ import annotations
+
+from collections import Counter, defaultdict
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from bevviz.evaluate.truth import MAX_DISTANCE, Truth
+from bevviz.frame import F32, F64, I32, Bool, Objects
+
+
+@dataclass(frozen=True, slots=True)
+class Matches:
+    """A frame's objects against its truth.
+
+    An object is true if it is something that had to be found, false if it is nothing. What is something that
+    need not be found, or lies where nothing was labelled, is neither.
+    """
+
+    partner: I32  # (J,) row of the truth that each object is, else -1
+    distance: F64  # (J,) metres on the ground plane between the centres, NaN where it is none
+    true: Bool  # (J,)
+    false: Bool  # (J,) whatever its name: one that no label accepts is for the caller to leave out
+    missed: Bool  # (K,) had to be found, and was not
+
+
+@dataclass
+class Score:
+    """Counts over frames. A name that no label accepts in any frame is not judged."""
+
+    classes: dict[str, Counter[str]] = field(default_factory=lambda: defaultdict(Counter))
+    names: set[str] = field(default_factory=set)  # that labels accept
+    errors: list[float] = field(default_factory=list)  # metres, of the right ones
+
+    def add(self, found: Objects, truth: Truth) -> Matches:
+        """Pair one frame's objects with the truth, best score first, and count."""
+        self.names.update(*truth.accepted)
+        matches = judge(found, truth)
+        for j in np.flatnonzero(matches.false):
+            self.classes[found.names[j].lower()]["fp"] += 1
+        best_first = np.argsort(-found.score, kind="stable")
+        for j in best_first[matches.true[best_first]]:
+            self.classes[truth.labels[matches.partner[j]].lower()]["tp"] += 1
+            self.errors.append(float(matches.distance[j]))
+        for k in np.flatnonzero(matches.missed):
+            self.classes[truth.labels[k].lower()]["fn"] += 1
+        return matches
+
+    @property
+    def total(self) -> Counter[str]:
+        """Right ones (tp), false ones of the names that are judged (fp), missed ones (fn)."""
+        total: Counter[str] = Counter()
+        for name, counts in self.classes.items():
+            total.update({k: n for k, n in counts.items() if k != "fp" or name in self.names})
+        return total
+
+    @property
+    def precision(self) -> float:
+        """NaN where nothing was found."""
+        return share(self.total["tp"], self.total["fp"])
+
+    @property
+    def recall(self) -> float:
+        """NaN where nothing had to be found."""
+        return share(self.total["tp"], self.total["fn"])
+
+    @property
+    def f1(self) -> float:
+        """Harmonic mean of the two."""
+        total = self.total
+        return share(2 * total["tp"], total["fp"] + total["fn"])
+
+
+def share(right: int, wrong: int) -> float:
+    """NaN where there is neither."""
+    return right / (right + wrong) if right + wrong else float("nan")
+
+
+def judge(found: Objects, truth: Truth) -> Matches:
+    """What each object of a frame is, and what was missed."""
+    partner, distance = match(found, truth)
+    paired = partner >= 0
+    missed = truth.must.copy()
+    missed[partner[paired]] = False
+    true = paired.copy()
+    true[paired] = truth.must[partner[paired]]
+    return Matches(partner, distance, true, ~paired & ~truth.unlabelled(found.boxes), missed)
+
+
+def match(found: Objects, truth: Truth) -> tuple[I32, F64]:
+    """Which box of the truth each object is: of the same class, the nearest within 2 m, best score first.
+
+    Returns:
+        partner: (J,) row of the truth, else -1.
+        distance: (J,) metres on the ground plane to that one, else NaN.
+    """
+    best_first = np.argsort(-found.score, kind="stable")
+    right = accepts(truth, [found.names[j] for j in best_first])
+    away = found.boxes.center[best_first][:, None, :2] - truth.boxes.center[None, :, :2]
+    distance = np.where(right, np.linalg.norm(away, axis=2), np.inf)
+    partners, _ = pair_in_order(distance, MAX_DISTANCE)
+    partner, error = np.full(len(distance), -1, np.int32), np.full(len(distance), np.nan)
+    partner[best_first] = partners
+    paired = np.flatnonzero(partners >= 0)
+    error[best_first[paired]] = distance[paired, partners[paired]]
+    return partner, error
+
+
+def accepts(truth: Truth, names: list[str]) -> Bool:
+    """(J, K) which names are right for which box of the truth."""
+    right = np.array([[name.lower() in accepted for accepted in truth.accepted] for name in names], bool)
+    return right.reshape(len(names), len(truth.accepted))
+
+
+def pair_in_order(distance: F32, limit: float) -> tuple[np.ndarray[tuple[int], np.dtype[np.int32]], Bool]:
+    """Each row in turn takes the nearest column within ``limit`` that is still free.
+
+    Args:
+        distance: (N, M).
+        limit: largest distance of a pair.
+
+    Returns:
+        partner: (N,) column of each row, else -1.
+        free: (M,) columns that nobody took.
+    """
+    free = np.ones(distance.shape[1], bool)
+    partner = np.full(len(distance), -1, np.int32)
+    for row, values in enumerate(distance):
+        candidates = np.flatnonzero(free & (values <= limit))
+        if len(candidates):
+            partner[row] = candidates[values[candidates].argmin()]
+            free[partner[row]] = False
+    return partner, free

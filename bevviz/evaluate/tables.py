@@ -1,0 +1,113 @@
+"""An evaluation as tables, for a terminal and for a page."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from typing import TYPE_CHECKING
+
+from bevviz import table
+from bevviz.evaluate.identity import HINT
+from bevviz.evaluate.names import base_of, ranges
+from bevviz.evaluate.precision import OVERLAPS, VIEWS
+from bevviz.text import printable
+
+if TYPE_CHECKING:
+    from bevviz.evaluate.evaluation import Evaluation
+
+WORST = 10  # frames in the table
+EXAMPLES = 3  # objects of each
+
+Row = tuple[str, ...]
+
+
+def text(found: Evaluation) -> str:
+    """For the terminal."""
+    return "\n".join(map(printable, _lines(found, table.lines)))
+
+
+def page(found: Evaluation) -> str:
+    """In Markdown."""
+    return "\n".join(_lines(found, lambda rows: [table.markdown(rows)], "- "))
+
+
+def _lines(
+    found: Evaluation, laid_out: Callable[[list[Row]], Iterable[str]], bullet: str = "  "
+) -> Iterator[str]:
+    there = found.counts()
+    without = f", {found.without} without truth left out" if found.without else ""
+    yield f"{len(found.judged)} frames{without}; {there['true'] + there['missed']} objects had to be found"
+    for rows in tables(found):
+        yield ""
+        yield from laid_out(rows)
+    if "hota" in found.metrics and "mota" not in found.metrics:
+        yield f"({HINT})"
+    worst = found.worst
+    yield ""
+    if not worst:
+        yield "nothing missed, nothing false"
+        return
+    yield f"{len(worst)} of {len(found.judged)} frames have something missed or false; the worst:"
+    for frame in worst[:WORST]:
+        wrong = [f"{kind} {what}" for kind in ("missed", "false") for what in frame[kind]]
+        more = "; ..." if wrong[EXAMPLES:] else ""
+        counts = ", ".join(f"{len(frame[k])} {k}" for k in ("missed", "false") if frame[k])
+        yield f"{bullet}frame {frame['frame']}: {counts} ({'; '.join(wrong[:EXAMPLES])}{more})"
+
+
+def tables(found: Evaluation) -> Iterator[list[Row]]:
+    """Rows of each table, the first the heading; only those that have something in them."""
+    heads: Row = ("objects", "there", "found", "missed", "false", "precision", "recall", "error m", "90 % m")
+    yield [heads, *(_row(found, name or "all", f".{name}" if name else "") for name in (*found.classes, ""))]
+    by_range = (_row(found, f"{low} to {high} m", f"@{low}-{high}")[:7] for low, high in ranges())
+    yield [("range", *heads[1:7]), *by_range]
+    m = found.metrics
+    if labels := found.labels:
+        columns = [f"ap_{view}_{overlap}" for view in VIEWS for overlap in OVERLAPS]
+        rows = [
+            (n.replace(".", ", "), str(labels[n]), *(_number(m, f"{c}.{n}") for c in columns))
+            for n in sorted(labels, key=_by_difficulty)
+        ]
+        yield [("average precision", "labels", *(f"{v.upper()} {o}" for v in VIEWS for o in OVERLAPS)), *rows]
+    tracked = ("hota", "deta", "assa", "mota", "motp_m", "idf1", "id_switches")
+    if "hota" in m:
+        heads = ("tracks", "HOTA", "DetA", "AssA", "MOTA", "MOTP m", "IDF1", "id switches")
+        yield [heads, *_by_class(m, tracked)]
+    detected = ("detection_precision", "detection_recall")
+    if "detection_recall" in m:
+        yield [("image boxes, IoU 0.5", "precision", "recall"), *_by_class(m, detected)]
+    if "ground_iou" in m:
+        ground = ("ground_precision", "ground_recall", "ground_iou", "object_points_kept")
+        heads = ("points", "precision", "recall", "IoU", "object points kept")
+        yield [heads, ("ground", *(_number(m, name) for name in ground))]
+
+
+def _row(found: Evaluation, title: str, tail: str) -> Row:
+    cls, _, where = tail.removeprefix(".").partition("@")
+    low, _, high = where.partition("-")
+    counts = found.counts(cls, float(low or 0), float(high or "inf"))
+    numbers = (counts["true"] + counts["missed"], counts["true"], counts["missed"], counts["false"])
+    rates = (_number(found.metrics, f"{n}{tail}") for n in ("precision", "recall", "error_m", "error_90_m"))
+    return (title, *map(str, numbers), *rates)
+
+
+def _by_class(metrics: Mapping[str, float], names: tuple[str, ...]) -> Iterator[Row]:
+    """A row for each class that has the first of them, all of them together last."""
+    classes = [name.partition(".")[2] for name in metrics if name.partition(".")[0] == names[0]]
+    for cls in sorted(classes, key=lambda cls: (not cls, cls)):
+        yield (cls or "all", *(_number(metrics, f"{name}.{cls}" if cls else name) for name in names))
+
+
+def _by_difficulty(name: str) -> tuple[str, int]:
+    order = ("easy", "moderate", "hard")
+    cls, _, difficulty = name.partition(".")
+    return cls, order.index(difficulty) if difficulty in order else -1
+
+
+def _number(metrics: Mapping[str, float], name: str) -> str:
+    value = metrics.get(name, math.nan)
+    if math.isnan(value):
+        return "-"
+    base = base_of(name)
+    digits = 0 if base in ("id_switches", "fragmentations") else 2 if (base or "").endswith("_m") else 3
+    return f"{value:.{digits}f}"

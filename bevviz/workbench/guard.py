@@ -1,0 +1,64 @@
+"""Who is let in: whoever has the token, and was not sent by another site."""
+
+from __future__ import annotations
+
+import secrets
+from http.cookies import CookieError, SimpleCookie
+from urllib.parse import parse_qs
+
+from starlette.requests import HTTPConnection
+from starlette.responses import PlainTextResponse
+from starlette.types import ASGIApp, Receive, Scope, Send
+
+HOSTS = ("127.0.0.1", "localhost")
+
+
+class Guard:
+    """Lets nobody in who has not the token, or whom another site sent.
+
+    The host has to be this machine's own name: another one that leads here is a trick. The origin, where the
+    browser states one, has to be the page's.
+    """
+
+    def __init__(self, app: ASGIApp, token: str, port: int) -> None:
+        self._app, self._token, self._port = app, token, port
+        self._hosts = {f"{host}:{port}" for host in HOSTS}
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] in ("http", "websocket"):
+            refusal = self._refusal(HTTPConnection(scope))
+            if refusal and scope["type"] == "websocket":
+                await receive()
+                await send({"type": "websocket.close", "code": 1008, "reason": refusal})  # before accept: 403
+                return
+            if refusal:
+                await PlainTextResponse(f"bevviz: {refusal}\n", 403)(scope, receive, send)
+                return
+        await self._app(scope, receive, send)
+
+    def _refusal(self, asked: HTTPConnection) -> str:
+        """Why nothing is answered; empty: it is."""
+        host, origin = asked.headers.get("host", ""), asked.headers.get("origin")
+        if host not in self._hosts:
+            return "this page is at 127.0.0.1 alone"
+        if origin is not None and origin != f"http://{host}":
+            return "another site's page may not ask here"
+        if asked.scope["type"] == "websocket" and origin is None:
+            return "only the page itself may ask here"
+        given = (*parse_qs(asked.url.query).get("token", ()), _cookie(asked, cookie_name(self._port)))
+        if not any(secrets.compare_digest(one.encode(), self._token.encode()) for one in given):
+            return "wrong or no token: open the address that was printed"
+        return ""
+
+
+def cookie_name(port: int) -> str:
+    """Cookies know no ports: each server has its own."""
+    return f"bevviz_{port}"
+
+
+def _cookie(asked: HTTPConnection, name: str) -> str:
+    try:
+        found = SimpleCookie(asked.headers.get("cookie", "")).get(name)
+    except CookieError:
+        return ""
+    return found.value if found is not None else ""

@@ -1,0 +1,72 @@
+// The server: what is said to it, what it says, and that it may be gone.
+
+import { $, state } from "./state.js";
+import { kind, toViewer, viewerReady } from "./viewer.js";
+
+const RETRY = 1500; // ms between two tries to find the server again
+
+let talk = null;
+let question = 0; // number of the newest one
+const handlers = {};
+export const on = (more) => Object.assign(handlers, more);
+
+const socketAt = (path) => new WebSocket(`ws://${location.host}${path}`);
+const pieces = { film: 0, desk: 0 }; // that the viewer has
+let early = 0; // of those of the film that may have come before their turn
+let lanes = [];
+
+// The frame of this time next, if the viewer has it not yet.
+export function want(stamp) {
+  if (lanes[0]?.readyState !== WebSocket.OPEN) return;
+  early += 1;
+  lanes[0].send(String(stamp));
+}
+
+function film(lane) {
+  const socket = socketAt(`/film?lane=${lane}&from=${pieces[lane] - Math.min(pieces[lane], lane === "film" ? early : 0)}`);
+  socket.binaryType = "arraybuffer";
+  socket.onmessage = ({ data }) => {
+    pieces[lane] += 1;
+    toViewer({ type: "rrd" }, [new DataView(data)]);
+    if (lane === "film") requestAnimationFrame(() => { if (socket.readyState === WebSocket.OPEN) socket.send(""); });
+  };
+  return socket;
+}
+
+export function connect() {
+  talk = socketAt("/talk");
+  talk.onopen = () => { gone(""); };
+  talk.onmessage = ({ data }) => {
+    const message = JSON.parse(data);
+    if (message.type === "welcome") {
+      if (state.run && state.run !== message.run) { location.reload(); return; }
+      handlers.welcome(message);
+      if (kind !== "native") viewerReady.then(() => { lanes = ["film", "desk"].map(film); });
+    } else if (message.type === "failed") gone(message.text);
+    else handlers[message.type]?.(message);
+  };
+  talk.onclose = () => {
+    for (const lane of lanes) lane.close();
+    if (!$("gone").textContent) gone("The server is gone: nothing is answered until it is back. Looking for it ...");
+    setTimeout(async () => {
+      try {
+        const answer = await fetch("/page/bench.js", { method: "HEAD", cache: "no-store" });
+        if (answer.status === 403) gone("Another server is there now: open the address that it printed.");
+      } catch { /* still gone */ }
+      connect();
+    }, RETRY);
+  };
+}
+
+function gone(text) {
+  $("gone").textContent = text;
+  $("gone").hidden = !text;
+}
+
+export function send(message) {
+  question += 1;
+  if (talk.readyState === WebSocket.OPEN) talk.send(JSON.stringify({ id: question, ...message }));
+  return question;
+}
+
+export const newest = () => question;

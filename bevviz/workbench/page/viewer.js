@@ -1,0 +1,85 @@
+// Rerun's viewer: its notebook widget, which keeps its own wrapper of the viewer up to date; this page is its notebook.
+
+import { $, asked, state } from "./state.js";
+
+console.debug = () => {}; // the viewer tells it fifty thousand lines at its start, which takes seconds
+const version = $("viewer").dataset.version;
+export const kind = $("viewer").dataset.kind; // page; native: a window of its own; live: of a robot
+const widget = (await import(kind === "native" ? "/page/native.js" : `/viewer/${version}/widget.js`)).default;
+
+// What the run made of a frame, and what other values make of it, are on two timelines of the same recording.
+const OPENED = "stamp";
+const TRIED = "tried";
+const SETTLED = 150; // ms without a change after which a frame is taken for one that is looked at
+
+const listeners = {};
+const settings = {
+  _url: null, _width: "auto", _height: "auto", _theme: "dark", _fallback_token: null,
+  _panel_states: { top: "hidden", blueprint: "hidden", selection: "hidden", time: "collapsed" },
+};
+const told = { settled: () => {}, clicked: () => {}, shown: () => {}, sought: () => {} }; // whom the viewer's events are for
+export const viewerReady = new Promise((ready) => {
+  widget.render({
+    model: {
+      get: (name) => settings[name],
+      on: (name, listener) => { listeners[name] = listener; },
+      send: (message) => (message === "ready" ? ready() : viewerEvent(JSON.parse(message))),
+    },
+    el: $("viewer"),
+  });
+});
+export const toViewer = (message, buffers) => listeners["msg:custom"](message, buffers);
+export const tell = (whom) => Object.assign(told, whom);
+
+window.addEventListener("to-viewer", ({ detail }) => toViewer(detail));
+
+export const isTried = () => kind !== "live" && state.set.length > 0 && !state.flipped; // a robot has one side
+const timeline = () => (isTried() ? TRIED : OPENED);
+const move = (stamp) => toViewer({ type: "time_ctrl", timeline: timeline(), timestamp_nanos: stamp, play: false });
+
+// A viewer that has just opened a recording goes to its beginning of itself, and takes no time before that.
+let target = null; // stamp that the viewer is on its way to
+let tries = 0;
+export function seek(stamp) {
+  target = String(stamp);
+  tries = 3;
+  state.time = target;
+  told.sought(target);
+  move(target);
+}
+
+// The same time with the other values, or without.
+export const showSide = () => { if (kind !== "live" && state.time !== null) seek(state.time); };
+
+window.addEventListener("pointerup", () => { asked.released = performance.now(); }, true);
+
+let drawn = false; // whether a frame has been on the screen
+let settling = 0;
+function viewerEvent(event) {
+  window.dispatchEvent(new CustomEvent("viewer-event", { detail: event }));
+  if (event.type === "recording_open" && state.opening !== null) seek(state.opening);
+  if (event.type === "time_update" || event.type === "timeline_change") moved(event);
+  if (event.type === "selection_change") {
+    const item = event.items.find((one) => one.type === "entity");
+    if (item) {
+      told.clicked({ entity: item.entity_path, instance: item.instance_id ?? null, position: item.position ?? null });
+    }
+  }
+}
+
+function moved(event) {
+  if (event.type === "time_update" && target !== null && Number(target) !== event.time && tries > 0) {
+    tries -= 1;
+    move(target);
+    return;
+  }
+  if (event.type === "time_update") target = null;
+  if (!drawn) {
+    drawn = true;
+    requestAnimationFrame(() => requestAnimationFrame(told.shown));
+  }
+  if (event.type !== "time_update" || (state.time !== null && Number(state.time) === event.time)) return;
+  state.time = String(BigInt(Math.round(event.time)));
+  clearTimeout(settling);
+  settling = setTimeout(told.settled, SETTLED);
+}

@@ -1,0 +1,111 @@
+// What is made behind the page: the drive with other values, reports; and the user's own words.
+
+import { $, element, seconds, state } from "./state.js";
+import { seek } from "./viewer.js";
+import { send } from "./talk.js";
+
+let trial = null; // the newest, as the server tells it
+
+export const settings = () => trial?.settings ?? null;
+
+export function start() {
+  $("drive").onclick = () => send({ type: "drive", set: state.set });
+  $("drive-cancel").onclick = () => send({ type: "cancel", what: "drive" });
+  $("report").onclick = () => {
+    const number = (id) => Number($(id).value) || 0;
+    const range = { before: number("before"), after: number("after") };
+    send({ type: "report", time: Number(state.time), text: $("words").value, ...range });
+  };
+  $("note").onclick = () => send({ type: "note", time: Number(state.time), pick: state.pick, text: $("words").value });
+  $("strip").onclick = (event) => {
+    if (!trial?.strip.length) return;
+    const row = Math.floor((event.offsetX / $("strip").clientWidth) * trial.strip.length);
+    seek(trial.strip[Math.min(row, trial.strip.length - 1)][0]);
+  };
+}
+
+export const noted = () => { $("words").value = ""; };
+
+export function progress(message) {
+  $("bar").max = message.total || 1;
+  $("bar").value = message.done;
+  $("bar").hidden = message.over;
+  const text = message.over ? `${message.done} frames` : `${message.done} of ${message.total} frames run`;
+  $("run").textContent = [text, message.error, ...message.warnings].filter(Boolean).join(" · ");
+  $("run").className = message.error ? "alarm" : "faint";
+  drive(message.trial);
+  $("reports").replaceChildren(...message.reports.map(report));
+}
+
+// --- the drive with other values ----------------------------------------------------------------
+
+function drive(told) {
+  trial = told;
+  $("trial").hidden = told === null;
+  if (told === null) return;
+  const going = told.state === "waiting" || told.state === "running";
+  $("trial-bar").max = told.total || 1;
+  $("trial-bar").value = told.done;
+  $("trial-bar").hidden = !going;
+  $("drive-cancel").hidden = !going;
+  $("trial-text").textContent = { waiting: "Waiting for the first run ...", failed: told.error }[told.state] ?? summary(told);
+  $("trial-text").className = told.state === "failed" ? "alarm" : "";
+  $("trial-set").textContent = told.settings.join(", ");
+  $("strip").hidden = going || !told.strip.length;
+  if (!$("strip").hidden) strip(told.strip);
+}
+
+function summary(told) {
+  const parts = [];
+  if (told.f1) parts.push(`F1 ${told.f1.map((one) => one ?? "–").join(" → ")}`);
+  const frames = told.state === "running" ? `${told.done} of ${told.total} frames` : `${told.done} frames`;
+  parts.push(told.f1 ? `${frames}: ${told.better} better, ${told.worse} worse` : frames);
+  for (const [what, number] of Object.entries(told.counts)) parts.push(`${number} ${what}`);
+  if (told.state === "cancelled") parts.push("cancelled");
+  return parts.join("; ");
+}
+
+// A bar a frame: what is better upwards, what is worse downwards.
+function strip(frames) {
+  const canvas = $("strip");
+  const [width, height] = [canvas.clientWidth || 360, 36];
+  canvas.width = width;
+  canvas.height = height;
+  const draw = canvas.getContext("2d");
+  const most = Math.max(1, ...frames.map(([, good, bad]) => Math.max(good, bad)));
+  const each = width / frames.length;
+  const style = getComputedStyle(document.documentElement);
+  for (const [row, [, good, bad]] of frames.entries()) {
+    const side = (number) => (number / most) * (height / 2 - 1);
+    draw.fillStyle = style.getPropertyValue("--good");
+    draw.fillRect(row * each, height / 2 - side(good), Math.max(1, each - 1), side(good));
+    draw.fillStyle = style.getPropertyValue("--mark");
+    draw.fillRect(row * each, height / 2, Math.max(1, each - 1), side(bad));
+  }
+  draw.fillStyle = style.getPropertyValue("--line");
+  draw.fillRect(0, height / 2, width, 1);
+  const worst = frames.reduce((a, b) => (b[2] - b[1] > a[2] - a[1] ? b : a));
+  canvas.title = `each frame: better upwards, worse downwards; the worst is at ${seconds(worst[0])}`;
+}
+
+// --- reports ------------------------------------------------------------------------------------
+
+function report(one) {
+  const item = element("li", one.state === "failed" ? "alarm" : "", "");
+  if (one.state === "failed") item.textContent = `${one.name}: ${one.error}`;
+  else if (one.state === "running") {
+    const cancel = element("button", "", "cancel");
+    cancel.onclick = () => send({ type: "cancel", what: "report" });
+    item.append(`${one.name}: ${one.total ? `${one.done} of ${one.total} frames` : "being cut out"} `, cancel);
+  } else {
+    const links = one.files.map((file) => {
+      const link = element("a", "", `${file.name.slice(file.name.lastIndexOf("."))} ${file.megabytes.toFixed(1)} MB`);
+      link.href = `/report/${one.number}/${encodeURIComponent(file.name)}`;
+      link.target = "_blank";
+      return link;
+    });
+    item.append(element("b", "", one.name), ...links.flatMap((link) => [" ", link]),
+      element("span", "faint", ` in ${one.folder}${one.state === "cancelled" ? "; cancelled" : ""}`));
+  }
+  return item;
+}

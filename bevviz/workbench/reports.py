@@ -1,0 +1,154 @@
+"""Reports of what was found, made behind the page."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from bevviz.bags.source import iso
+from bevviz.errors import UserError, first_line
+from bevviz.frame import FrameResult
+from bevviz.run import Items, Observer
+
+if TYPE_CHECKING:
+    from bevviz.workbench.bench import Bench
+
+LONGEST = 600.0  # seconds on either side
+
+
+@dataclass(slots=True)
+class Report:
+    """One that is being made, or was.
+
+    Attributes:
+        number: of it, in its address.
+        state: running, over, cancelled or failed.
+        files: that it has.
+    """
+
+    number: int
+    name: str
+    state: str = "running"
+    error: str = ""
+    done: int = 0
+    total: int = 0
+    files: list[Path] = field(default_factory=list)
+    stop: threading.Event = field(default_factory=threading.Event)
+
+    def as_dict(self) -> dict[str, Any]:
+        """For the page."""
+        return {
+            "number": self.number,
+            "name": self.name,
+            "state": self.state,
+            "error": self.error,
+            "done": self.done,
+            "total": self.total,
+            "files": [{"name": path.name, "megabytes": path.stat().st_size / 1e6} for path in self._there()],
+            "folder": str(self.files[0].parent) if self.files else "",
+        }
+
+    def _there(self) -> Sequence[Path]:
+        return [path for path in self.files if path.is_file()]
+
+    def file(self, name: str) -> Path | None:
+        """One of its files."""
+        return next((path for path in self._there() if path.name == name), None)
+
+
+class Reports:
+    """Those of a bench, one at a time.
+
+    Args:
+        bench: whose drive they are of.
+        news: called when there is something to tell.
+        folder: where they go.
+    """
+
+    def __init__(self, bench: Bench, news: Callable[[], None], folder: Path) -> None:
+        self._bench, self._news, self._folder = bench, news, folder
+        self._thread: threading.Thread | None = None
+        self.made: list[Report] = []
+
+    def begin(self, number: int, before: float, after: float, note: str) -> Report:
+        """Make one, of the configuration that the drive was opened with.
+
+        Args:
+            number: of the frame that it is about.
+            before, after: seconds on either side.
+            note: what went wrong, in the user's words.
+
+        Raises:
+            UserError: one is being made, no such frame, or no such time.
+        """
+        from bevviz.report.make import ReportRequest
+
+        if self.made and self.made[-1].state == "running":
+            raise UserError("a report is being made: wait for it, or cancel it")
+        if not (0 <= before <= LONGEST and 0 <= after <= LONGEST):
+            raise UserError(f"a report is of up to {LONGEST:g} seconds before and after")
+        bench = self._bench
+        received = bench.look(number).frame.received
+        seconds = (received - int(bench.drive.frames.scans[0])) / 1e9
+        output = _free(self._folder, f"{bench.paths[0].resolve().stem}-{seconds:.1f}s")
+        request = ReportRequest(
+            paths=bench.paths,
+            config=bench.drive.config,
+            at=iso(received),
+            before=before,
+            after=after,
+            output=output,
+            note=note.strip(),
+            asked=bench.asked_within(received - round(before * 1e9), received + round(after * 1e9)),
+            notes=list(bench.notes),
+        )
+        report = Report(len(self.made), output.stem)
+        self.made.append(report)
+        self._thread = threading.Thread(target=self._make, args=(report, request), name="report", daemon=True)
+        self._thread.start()
+        self._news()
+        return report
+
+    def end(self) -> None:
+        """Cancel what is being made: it is a report of the frames until then."""
+        if self.made:
+            self.made[-1].stop.set()
+        if self._thread is not None:
+            self._thread.join()
+
+    def _make(self, report: Report, request: Any) -> None:
+        from bevviz.report.make import make
+
+        try:
+            written = make(request, [_Counting(report, self._news)], report.stop)
+            report.files = written.files
+            report.state = "cancelled" if written.interrupted else "over"
+        except Exception as error:
+            report.error = str(error) if isinstance(error, UserError) else first_line(error)
+            report.state = "failed"
+        self._news()
+
+
+class _Counting(Observer[FrameResult]):
+    def __init__(self, report: Report, news: Callable[[], None]) -> None:
+        self._report, self._news = report, news
+
+    def begin(self, items: Items[object]) -> None:
+        self._report.total = items.total or 0
+
+    def see(self, result: FrameResult) -> None:
+        self._report.done += 1
+        self._news()
+
+
+def _free(folder: Path, stem: str) -> Path:
+    """A name that no report has."""
+    number = 1
+    while True:
+        path = folder / f"{stem}{f'-{number}' if number > 1 else ''}.rrd"
+        if not any(path.with_suffix(suffix).exists() for suffix in (".rrd", ".html", ".mcap")):
+            return path
+        number += 1

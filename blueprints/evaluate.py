@@ -1,0 +1,36 @@
+"""Right and wrong: true, false and missed objects, how many there were, and the worst frames."""
+
+from __future__ import annotations
+
+import rerun.blueprint as rrb
+
+from bevviz.frame import Scene
+from bevviz.logging import entities, views
+
+
+def blueprint(scene: Scene) -> rrb.Blueprint:
+    side: list[rrb.Container | rrb.View] = [views.cameras(scene)] if scene.cameras else []
+    judged = (entities.judged("**"), f"- {entities.FUSED}/**")  # the same boxes, in other colours
+    words = rrb.Tabs(
+        rrb.TextDocumentView(name="Frame", origin=entities.EVALUATE, contents=["$origin"]),
+        rrb.TextDocumentView(name="Evaluation", origin=entities.EVALUATE_ABOUT),
+        views.explain(),
+    )
+    counts = [entities.judged_count(what) for what in ("true", "missed", "false")]
+    return rrb.Blueprint(
+        rrb.Vertical(
+            rrb.Horizontal(
+                views.space(scene, raw=False, grid=False, beside=judged),
+                rrb.Vertical(*side, views.birds_eye(), row_shares=[*[2] * len(side), 3]),
+                words,
+                column_shares=[5, 4, 3],
+            ),
+            rrb.Horizontal(
+                views.plot("True, missed, false", entities.EVALUATE, counts),
+                rrb.TextLogView(name="Missed and false", origin=entities.EVALUATE_LOG),
+            ),
+            row_shares=[4, 1],
+        ),
+        views.time_panel(),
+        *views.panels(),
+    )

@@ -1,0 +1,105 @@
+"""Signals before a command has anything to lose, and what of its files is there when one has ended it."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from bevviz import remains
+from tests.test_cli import environment
+
+SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+
+
+def python(script: str, folder: Path) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-c", script],
+        cwd=folder,
+        env=environment(),
+        capture_output=True,
+        text=True,
+        timeout=60,
+        # A shell without job control starts what is in the background deaf to Ctrl-C.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
+    )
+
+
+def test_nothing_is_imported_before_an_interrupt_just_ends_the_process(tmp_path: Path) -> None:
+    """Among imports Python answers one with a traceback."""
+    script = (
+        "import sys, _signal\n"
+        "before = set(sys.modules)\n"
+        "def ask(number, handler, real=_signal.signal):\n"
+        "    print(*sorted(set(sys.modules) - before)); real(number, handler); raise SystemExit\n"
+        "_signal.signal = ask\n"
+        "import bevviz.__main__\n"
+    )
+    done = python(script, tmp_path)
+    assert done.stdout.split() == ["bevviz", "bevviz.__main__"], done.stderr
+
+
+@pytest.mark.parametrize("number", SIGNALS)
+def test_a_signal_ends_what_has_nothing_to_end(tmp_path: Path, number: signal.Signals) -> None:
+    """At once, by the signal, whatever would have become of an exception; temporary folders go."""
+    script = (
+        "import os, tempfile; tempfile.tempdir = os.getcwd()\n"
+        "from bevviz.cli import interrupts\n"
+        "from bevviz.files import Scratch\n"
+        "interrupts.install(); Scratch().new()\n"
+        "assert os.listdir()\n"
+        "try:\n"
+        f"    os.kill(os.getpid(), {number})\n"
+        "except BaseException: print('swallowed')\n"
+        "print('went on')\n"
+    )
+    done = python(script, tmp_path)
+    assert (done.returncode, done.stdout, done.stderr) == (-number, "", "")
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("number", SIGNALS)
+def test_a_file_that_is_being_written_gets_its_end(tmp_path: Path, number: signal.Signals) -> None:
+    script = (
+        "import os; from pathlib import Path\n"
+        "from bevviz.cli import interrupts\n"
+        "from bevviz.files import written\n"
+        "interrupts.install()\n"
+        "try:\n"
+        "    with written(Path('a.txt'), 'file') as given:\n"
+        f"        given.path.write_text('half'); os.kill(os.getpid(), {number})\n"
+        "except KeyboardInterrupt: print(interrupts.came())\n"
+    )
+    assert python(script, tmp_path).stdout == "True\n"
+    assert [path.name for path in tmp_path.iterdir()] == ["a.txt"]
+
+
+@pytest.mark.parametrize("number", SIGNALS)
+def test_what_is_ignored_from_the_start_stays_ignored(tmp_path: Path, number: signal.Signals) -> None:
+    """As ``nohup`` does it with SIGHUP, and a shell with Ctrl-C for what is in the background."""
+    script = (
+        "import os, signal\n"
+        f"signal.signal({number}, signal.SIG_IGN)\n"
+        "import bevviz.__main__; from bevviz.cli import interrupts\n"
+        "interrupts.install()\n"
+        "with interrupts.terminable() as ended:\n"
+        f"    os.kill(os.getpid(), {number})\n"
+        f"os.kill(os.getpid(), {number}); print(ended.is_set())\n"
+    )
+    assert python(script, tmp_path).stdout == "False\n"
+
+
+def test_what_remains_is_forgotten_in_time() -> None:
+    removed: list[str] = []
+    remains.remember("mine", lambda: removed.append("mine"))
+    remains.remember("other", lambda: removed.append("other"))
+    remains.forget("mine")
+    remains.remove()
+    remains.forget("other")
+    assert removed == ["other"]
+    with remains.unfinished(), remains.unfinished():
+        assert remains.any_unfinished()
+    assert not remains.any_unfinished()

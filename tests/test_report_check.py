@@ -1,0 +1,182 @@
+"""``report --check`` on reports that are damaged, or that somebody made to do harm: one clear line each."""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import shutil
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import rerun as rr
+
+from bevviz.cli import main
+from bevviz.config import Config, dump
+from bevviz.logging import entities
+from tests import bags
+from tests.recordings import Recording
+from tests.test_cli import Capture, error_of
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A report of three scans. Not to be changed."""
+    folder = tmp_path_factory.mktemp("report")
+    drive = bags.write(folder / "drive", bags.small_items(scans=3))
+    call = ["report", str(drive), "--at", "0.1", "--before", "0", "--after", "0.1", "--model", "demo"]
+    assert main([*call, "-o", str(folder / "bug.rrd")]) == 0
+    return folder
+
+
+@pytest.fixture(autouse=True)
+def report(made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """A copy in the working directory."""
+    monkeypatch.chdir(tmp_path)
+    for name in ("bug.rrd", "bug.mcap", "bug.html"):
+        shutil.copy(made / name, name)
+    yield
+
+
+def about(made: Path) -> dict[str, Any]:
+    found: dict[str, Any] = json.loads(Recording(made / "bug.rrd").static["/__properties/report"]["about"][0])
+    return found
+
+
+def forge(info: str, config: str, stages: Any = None, arrays: Any = None) -> None:
+    """A recording that says so of itself, in the place of the report's."""
+    with rr.RecordingStream("bevviz") as recording:
+        recording.save("bug.rrd")
+        recording.send_property(entities.PROPERTY, rr.AnyValues(config=config))
+        recording.send_property("report", rr.AnyValues(about=info))
+        if stages is not None:
+            recording.set_time(entities.FRAME, sequence=0)
+            recording.log(entities.DIGEST, rr.AnyValues(stages=stages, arrays=arrays))
+    Path("bug.html").unlink()
+
+
+def instead(name: str, make: Callable[[str], object]) -> None:
+    Path(name).unlink()
+    make(name)
+
+
+def test_a_sound_one(capsys: Capture) -> None:
+    assert main(["report", "--check", "bug.rrd"]) == 0
+    assert "the recording is, byte for byte, the file" in capsys.readouterr().out
+    Path("bug.html").unlink()
+    assert main(["report", "--check", "bug.rrd"]) == 0
+    assert "there is no page beside it" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("name", ["bug.rrd", "bug.mcap"])
+def test_no_byte_of_what_it_vouches_for_can_be_changed(name: str, capsys: Capture) -> None:
+    sound, rng = Path(name).read_bytes(), random.Random(0)
+    for at in [0, len(sound) - 1, *(rng.randrange(len(sound)) for _ in range(4))]:
+        changed = bytearray(sound)
+        changed[at] ^= 1 << rng.randrange(8)
+        Path(name).write_bytes(changed)
+        assert main(["report", "--check", "bug.rrd"]) in (1, 2), at
+        out, said = capsys.readouterr()
+        told = "not the file that" in out + said or "cannot be read" in said or "no bag" in said
+        assert told and "Traceback" not in said and "bevviz itself" not in said, (at, out, said)
+
+
+def test_damage_that_no_page_tells_of(capsys: Capture) -> None:
+    """Among 600 kB some bytes are only shown: what is compared is found, and nothing breaks."""
+    Path("bug.html").unlink()
+    sound, rng = Path("bug.rrd").read_bytes(), random.Random(1)
+    for _ in range(12):
+        changed = bytearray(sound)
+        for _ in range(3):
+            changed[rng.randrange(len(sound))] ^= 1 << rng.randrange(8)
+        Path("bug.rrd").write_bytes(changed)
+        status = main(["report", "--check", "bug.rrd"])
+        out, said = capsys.readouterr()
+        assert status in (0, 1, 2) and "bevviz itself" not in said, said
+        assert status == 2 or "may have been changed" in out or "differ" in out
+
+
+ZIP = np.frombuffer(b"PK\x03\x04 this is no archive", np.uint8)
+
+FORGED: dict[str, tuple[Callable[[Path], object], str]] = {
+    "deep YAML": (lambda made: forge(json.dumps(about(made)), "voxel: " + "[" * 3000), "too deep"),
+    "a count of .inf": (
+        lambda made: forge(json.dumps(about(made)), "clustering: {min_points: .inf}"),
+        "clustering.min_points must be a finite number",
+    ),
+    "YAML that is none": (lambda made: forge(json.dumps(about(made)), "a: ]["), "bug.rrd"),
+    "deep JSON": (lambda made: forge("[" * 100_000, dump(Config())), "another version"),
+    "a time that is infinite": (
+        lambda made: forge(json.dumps({**about(made), "low": float("inf")}), dump(Config())),
+        "another version",
+    ),
+    "names that are no text": (
+        lambda made: forge(json.dumps({**about(made), "names": [1]}), dump(Config())),
+        "another version",
+    ),
+    "versions that are none": (
+        lambda made: forge(json.dumps({**about(made), "provenance": 5}), dump(Config())),
+        "another version",
+    ),
+    "fingerprints that are no archive": (
+        lambda made: forge(json.dumps(about(made)), dump(Config()), ["00 cloud"], ZIP),
+        "cannot be read as a report",
+    ),
+    "fingerprints that are numbers": (
+        lambda made: forge(json.dumps(about(made)), dump(Config()), [1, 2], np.zeros(3, np.uint8)),
+        "cannot be read as a report",
+    ),
+    "no bag": (lambda made: Path("bug.mcap").unlink(), "bug.mcap: the bag of the report is not there"),
+    "a folder for a bag": (
+        lambda made: instead("bug.mcap", os.mkdir),
+        "bug.mcap: the bag of the report is not there",
+    ),
+    "a pipe for a bag": (
+        lambda made: instead("bug.mcap", os.mkfifo),
+        "bug.mcap: the bag of the report is not there",
+    ),
+    "a pipe for a recording": (
+        lambda made: instead("bug.rrd", os.mkfifo),
+        "bug.rrd: it is no file",
+    ),
+    "an empty bag": (
+        lambda made: Path("bug.mcap").write_bytes(b""),
+        "bug.mcap is not the file that the report was made with",
+    ),
+    "half a recording": (
+        lambda made: Path("bug.rrd").write_bytes(Path("bug.rrd").read_bytes()[:9000]),
+        "changed or damaged",
+    ),
+    "an empty recording": (lambda made: Path("bug.rrd").write_bytes(b""), "changed or damaged"),
+    "another page": (
+        lambda made: (
+            Path("bug.html").write_text(f'<p id="seal">SHA-256 of the recording: {"0" * 64}</p>') and None
+        ),
+        "changed or damaged",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", FORGED)
+def test_one_clear_line(name: str, made: Path, capsys: Capture) -> None:
+    make, said = FORGED[name]
+    make(made)
+    assert said in error_of(capsys, "report", "--check", "bug.rrd")
+
+
+def test_no_frames_are_no_proof(made: Path, capsys: Capture) -> None:
+    info = about(made)
+    forge(json.dumps({**info, "interrupted": True}), dump(Config()))
+    assert main(["report", "--check", "bug.rrd"]) == 1
+    assert "the same" not in capsys.readouterr().out
+
+
+def test_two_recordings_that_are_compared(capsys: Capture) -> None:
+    shutil.copy("bug.rrd", "old.rrd")
+    Path("new.rrd").write_bytes(Path("bug.rrd").read_bytes()[:9000])
+    assert "new.rrd: " in error_of(capsys, "compare", "old.rrd", "new.rrd", "--save", "c.rrd")
+    os.mkfifo("pipe.rrd")
+    assert "it is no file" in error_of(capsys, "compare", "old.rrd", "pipe.rrd", "--save", "c.rrd")
