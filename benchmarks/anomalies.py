@@ -272,7 +272,7 @@ def _stays_in_view(window: list[Snapshot], number: int) -> bool:
             return False
         pixels.append(mine.sum())
         points.append((shot.point_object == number).sum())
-    return min(pixels) > pixels[0] / 2 and min(points) > points[0] / 2
+    return bool(min(pixels) > pixels[0] / 2 and min(points) > points[0] / 2)
 
 
 def _reported(shot: Snapshot, result: FrameResult) -> set[int]:

@@ -397,9 +397,30 @@ class LiveConfig(Section):
     )
     flight_time: Seconds = Field(30.0, ge=0, le=3600, description="flight recorder: the last seconds; 0: off")
     flight_size: Megabytes = Field(500.0, ge=1, description="flight recorder: memory at most")
+    raw_size: Megabytes = Field(
+        500.0, ge=0, description="flight recorder: memory for the messages as they came, at most; 0: none"
+    )
+    raw_topics: Literal["roles", "small", "all"] = Field(
+        "small",
+        description="messages that are kept, of --save FILE.mcap too: of topics that play a role, of small "
+        "ones beside them (no clouds or images, below 1 MB/s), of all",
+    )
     flight_folder: str = Field("", description="where its recordings go; empty: the working directory")
     triggers: tuple[AnomalyKind, ...] = Field(
         (), description="save when such an anomaly begins: " + ", ".join(get_args(AnomalyKind))
+    )
+    robot_time: Seconds | None = Field(
+        None,
+        ge=0,
+        description="--robot: save when the robot's objects and ours differ for so long; empty: never",
+    )
+    robot_tolerance: Metres = Field(
+        0.5,
+        ge=0,
+        description="--robot: distance of one object's centres, seen from above, that is the same yet",
+    )
+    trigger_after: Seconds = Field(
+        2.0, ge=0, le=600, description="that still belong to an automatic save, after its reason"
     )
     trigger_pause: Seconds = Field(60.0, ge=0, description="least time from one automatic save to the next")
 

@@ -184,6 +184,64 @@ class LabelledBoxes2D:
     received: int = 0
 
 
+# --- around perception -------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class Status:
+    """What the robot's diagnostics say of one of its parts."""
+
+    name: str
+    level: Literal["ok", "warning", "error", "stale"]
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class Grid:
+    """A map: cells from 0 (free) to 100 (occupied), -1 where nothing is known."""
+
+    cells: NDArray[np.int8]  # (rows, columns)
+    resolution: float  # metres
+    pose: F64  # (4, 4) frame of the map from its first cell's corner, rows along y, columns along x
+
+
+@dataclass(frozen=True, slots=True)
+class Solids:
+    """Boxes, or ellipsoids in them."""
+
+    center: F32  # (N, 3)
+    half: F32  # (N, 3) metres
+    quaternion: F32  # (N, 4) x, y, z, w
+    round: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Shape:
+    """What has a place in the world, in the coordinates of ``frame_id``."""
+
+    topic: str  # with a marker's namespace and id
+    frame_id: str
+    stamp: int
+    points: F32 | None = None  # (N, 3)
+    strips: tuple[F32, ...] = ()  # (N, 3) each
+    solids: Solids | None = None
+    axes: F64 | None = None  # (4, 4) frame_id from a pose
+    grid: Grid | None = None
+    fix: tuple[float, float] | None = None  # degrees of latitude and longitude
+    color: U8 | None = None  # red, green, blue, alpha
+    text: str = ""
+    world_from_shape: F64 | None = None  # (4, 4); None: not connected with the points
+
+
+@dataclass(frozen=True, slots=True)
+class Around:
+    """What the robot says around its perception, at the time of a frame."""
+
+    marks: tuple[str, ...] = ()  # set by people, at this frame
+    statuses: tuple[Status, ...] = ()
+    shapes: tuple[Shape, ...] = ()
+
+
 @dataclass(frozen=True, slots=True)
 class LateResult:
     """Boxes of the robot's own that came when the frame of their time had gone on: beside a robot alone."""
@@ -222,6 +280,7 @@ class Frame:
     truth: LabelledBoxes3D | None = None
     tf_age: float = float("nan")
     problems: tuple[str, ...] = ()  # one clear sentence each
+    around: Around | None = None
 
     @property
     def pose(self) -> F64:

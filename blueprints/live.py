@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import rerun.blueprint as rrb
 
+from bevviz.compare import views as compare
 from bevviz.frame import Scene
 from bevviz.logging import views
 
@@ -23,6 +24,8 @@ def blueprint(scene: Scene) -> rrb.Blueprint:
                     views.anomalies(),
                     views.states(),
                     views.tracks(),
+                    views.diagnostics(),
+                    *([compare.difference_counts(), compare.difference_states()] if scene.robot else []),
                     views.log(),
                 ),
                 row_shares=[*[2] * len(side), 3, 2],

@@ -25,10 +25,12 @@ from bevviz.compare.differences import (
     seen,
 )
 from bevviz.compare.sides import published, robot_topic
+from bevviz.compare.views import side_space
 from bevviz.config import load
 from bevviz.errors import UserError
 from bevviz.frame import Boxes3D, Frame, FrameResult, LabelledBoxes3D
 from bevviz.geometry import transform
+from bevviz.logging import entities
 from bevviz.perceive import Memo, describe
 from bevviz.session import Session
 from bevviz.stages import detector
@@ -456,3 +458,21 @@ def test_without_a_detector_it_is_not_said_that_nothing_differs(demo: str, capsy
     said = capsys.readouterr().out
     assert "no difference" not in said.replace("parameters: no difference", "")
     assert "no detector (--model FILE.onnx), so no objects; the number of clusters differs in 3 of 3" in said
+
+
+def test_both_views_follow_the_robot(demo: str) -> None:
+    """The eye of each is fixed to its own LiDAR, and both LiDARs go the same way."""
+    scene = SyntheticSource(frames=1).scene
+    one, other = side_space(scene, ""), side_space(scene, entities.B)
+    origins = [str(view.origin) for view in (one, other)]
+    assert origins == ["/world/rslidar", "/b/world/rslidar"]
+    eyes = [
+        [batch.as_arrow_array() for batch in view.properties["EyeControls3D"].as_component_batches()]
+        for view in (one, other)
+    ]
+    assert len(eyes[0]) >= 4 and eyes[0] == eyes[1]
+    assert main(["compare", demo, "--save", "c.rrd"]) == 0
+    recording = Recording(Path("c.rrd"))
+    ways = [recording.column(origin, "Transform3D:translation") for origin in origins]
+    assert len(ways[0]) == 3 and len({tuple(np.ravel(place)) for place in ways[0]}) == 3
+    assert ways[0] == ways[1]

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from bevviz.config import Config, load
+from bevviz.config import Config, keys, load
 from bevviz.errors import UserError
 from bevviz.frame import Boxes3D, CameraResult, Detections, Frame, FrameResult, Objects
 from bevviz.ros.encode import encode_boxes_3d, encode_camera_info, encode_cloud, typestore
@@ -43,7 +43,17 @@ from bevviz.live.source import LiveSource
 from bevviz.ros import typesupport
 from bevviz.ros.node import Node
 from bevviz.ros.orders import Orders
-from bevviz.ros.publish import BEV, CLUSTERS, DETECTIONS, FUSED, OBSTACLES, Publisher
+from bevviz.ros.publish import (
+    BEV,
+    CLUSTERS,
+    DETECTIONS,
+    FUSED,
+    MARKERS,
+    OBSTACLES,
+    SPEED,
+    TRACKS,
+    Publisher,
+)
 from bevviz.ros.publish import TOPICS as TOPICS_PUBLISHED
 
 PATIENCE = 60.0  # seconds for what takes one or two on an idle machine
@@ -429,18 +439,26 @@ def result() -> FrameResult:
     boxes = Boxes3D(row.center[:1], row.size[:1], row.yaw[:1])
     objects = Objects(boxes, ("car",), one * 0.75, zero, ("zed",), zero)
     camera = CameraResult(made.cameras[0].camera, car, None)
-    return replace(made, cameras=(camera,), objects=objects)
+    assert made.tracks is not None
+    tracks = replace(
+        made.tracks,
+        names=("car", *made.tracks.names[1:]),
+        confirmed=np.arange(len(made.tracks)) == 0,
+        velocity=np.full_like(made.tracks.velocity, 1.5),
+    )
+    return replace(made, cameras=(camera,), objects=objects, tracks=tracks)
 
 
 def test_results_are_published_for_others_but_not_for_us(result: FrameResult) -> None:
     heard: dict[str, Any] = {}
     kinds = {BEV: "Image", OBSTACLES: "PointCloud2", CLUSTERS: "Detection3DArray", FUSED: "Detection3DArray"}
-    kinds[DETECTIONS] = "Detection2DArray"
+    kinds |= {DETECTIONS: "Detection2DArray", TRACKS: "Detection3DArray", MARKERS: "MarkerArray"}
     with LiveSource(load()) as source, Node(name="rviz") as rviz:
         publisher = Publisher(source.node, load())
         publisher.publish(result)  # for nobody
         for topic, short in kinds.items():
-            kind = f"{'sensor' if short in ('Image', 'PointCloud2') else 'vision'}_msgs/msg/{short}"
+            kind = TOPICS_PUBLISHED[topic]
+            assert kind.endswith(f"/{short}")
 
             def receive(data: bytes, topic: str = topic, kind: str = kind) -> None:
                 heard[topic] = typestore().deserialize_cdr(data, kind)
@@ -474,6 +492,18 @@ def test_results_are_published_for_others_but_not_for_us(result: FrameResult) ->
     fused = heard[FUSED].detections[0]
     assert [h.hypothesis.class_id for h in fused.results] == ["cluster_0", "car"]
     assert [h.hypothesis.score for h in fused.results] == [1.0, 0.75]
+    assert result.tracks is not None
+    (track,) = heard[TRACKS].detections
+    assert track.header.frame_id == result.tracks.frame_id and track.id == str(result.tracks.id[0])
+    speed = result.tracks.speed[0]
+    assert [h.hypothesis.class_id for h in track.results] == ["car", SPEED]
+    assert track.results[1].hypothesis.score == pytest.approx(float(speed))
+    markers = {marker.ns: marker for marker in heard[MARKERS].markers}
+    assert markers["names"].text == f"car #{track.id} {speed:.1f} m/s"
+    scale = markers["boxes"].scale
+    np.testing.assert_allclose([scale.x, scale.y, scale.z], result.tracks.boxes.size[0], rtol=1e-6)
+    ends = [(point.x, point.y, point.z) for point in markers["ways"].points]
+    np.testing.assert_allclose(np.subtract(ends[1], ends[0]), result.tracks.velocity[0], atol=1e-5)
     seen = decode_detections_2d(heard[DETECTIONS], DETECTIONS, 0)
     assert (seen.stamp, seen.frame_id, seen.labels) == (image.stamp, image.frame_id, ("car",))
     np.testing.assert_allclose(seen.xyxy, [[10, 20, 110, 70]])
@@ -536,6 +566,31 @@ def test_parameters_and_the_saving_of_the_recording(pair: tuple[Node, Node]) -> 
     orders.show(load(settings=["voxel_size=0.2"], preset="reference"))
     assert robot.node.get_parameter("voxel_size").value == 0.2
     assert len(ordered) == 3, "what is shown is no order"
+
+    del ordered[:]
+    settings = {
+        "clustering.eps": "60 cm",
+        "live.max_rate": 5,
+        "live.triggers": ["tf", "stage"],
+        "source.lidar_topics": "[/points]",
+        "sync.motion_compensation": True,
+    }
+    assert all(set_to(name, value).successful for name, value in settings.items())
+    orders.show(config)
+    assert (config.clustering.eps, config.live.triggers) == (0.5, ()), "each order is alone in this test"
+    assert set_to("live.max_rate", 5).successful and set_to("live.max_rate", "").successful
+    assert ordered == [
+        "clustering.eps=60 cm",
+        "live.max_rate=5",
+        'live.triggers=["tf", "stage"]',
+        "source.lidar_topics=[/points]",
+        "sync.motion_compensation=true",
+        "live.max_rate=5",
+    ]
+    orders.show(load(settings=["live.max_rate=5"], preset="reference"))
+    assert set_to("live.max_rate", "").successful and ordered[-1] == "live.max_rate=null"
+    assert not set_to("live.triggers", ["typhoon"]).successful
+    assert {name for name in keys() if not robot.node.has_parameter(name)} == set()
 
     trigger = operator.node.create_client(Trigger, "/one/save_recording")
     answer = call(operator.node, trigger, Trigger.Request())

@@ -26,6 +26,7 @@ from bevviz.errors import UserError
 from bevviz.evaluate import truth_of
 from bevviz.frame import Frame, FrameResult
 from bevviz.logging import entities
+from bevviz.workbench.bench import Bench
 from bevviz.workbench.film import Film
 from bevviz.workbench.missed import finds
 from bevviz.workbench.parameters import controls
@@ -215,14 +216,13 @@ def test_parameters_are_tried_on_the_shown_frame(browser: Browser, address: str)
         until(lambda: "loses" in page.inner_text("#effect"))
         assert state(page)["set"] == ["clustering.min_cluster_points=100000"]
         assert "F1" in page.inner_text("#effect")
-        page.keyboard.press("Escape")
         page.click("#undo")
         until(lambda: "As it was opened" in page.inner_text("#effect"))
         assert "set" not in state(page)
         control = page.locator("[id='control-clustering.min_cluster_points']")
         control.fill("-3")
         control.press("Enter")
-        until(lambda: "must be greater than or equal to 1" in page.inner_text("#verdict"))
+        until(lambda: "must be greater than or equal to 1" in page.inner_text("#effect"))
 
 
 def test_two_pages_on_one_drive(browser: Browser, address: str) -> None:
@@ -248,9 +248,8 @@ def test_a_server_that_was_killed_is_found_again(bag: Path, browser: Browser) ->
         server.wait()
         with serving("open", str(bag), "--port", str(urlsplit(address).port)) as (again, _):
             assert again == address
-            until(lambda: verdict(page) == text)
+            until(lambda: page.locator("#gone").is_hidden() and verdict(page) == text)
             assert state(page) == held
-            assert page.locator("#gone").is_hidden()
 
 
 # --- the whole way, as the page talks -----------------------------------------------------------
@@ -649,6 +648,42 @@ def test_without_truth_it_is_what_nothing_explains(result: FrameResult) -> None:
     assert {find.what for find in listed} <= {"unmatched", "unnamed"}
     assert any(find.what == "unnamed" for find in listed)
     assert all(not find.distance > 40 for find in listed)
+
+
+# --- what is shown with other values ------------------------------------------------------------
+
+
+def test_other_values_are_beside_what_the_drive_makes(bag: Path, tmp_path: Path) -> None:
+    """On a timeline of its own: what was there is as it was, the sensors' data are there on both."""
+    from rerun.chunk import RrdReader
+
+    with bevviz.open(bag, model="demo") as drive, bevviz.open(bag, model="demo") as again:
+        bench = Bench(drive, again.frames, [bag])
+        bench.see(drive.at(frame=0))
+        told = bench.attempt(0, ("clustering.min_cluster_points=100000",))
+        recoloured = bench.attempt(0, ("ground.distance_threshold=0.5",))
+        bench.attempt(0, ("detector.conf_threshold=0.9",))
+        result = drive.at(frame=0)
+        pieces = [film[row] for film in (bench.film, bench.desk) for row in range(len(film))]
+        bench.close()
+    assert result.objects is not None
+    assert len(told["effects"]["lost"]) == len(result.objects)
+    assert recoloured["effects"] != told["effects"]
+    rows: dict[str, list[tuple[set[str], bool]]] = {}
+    for number, piece in enumerate(pieces):  # each is a whole file
+        (path := tmp_path / f"{number}.rrd").write_bytes(piece)
+        for chunk in RrdReader(path).stream():
+            if not chunk.is_static:
+                cleared = any("Clear" in str(name) for name in chunk.to_record_batch().schema.names)
+                rows.setdefault(chunk.entity_path, []).append((set(chunk.timeline_names), cleared))
+    fused = rows[entities.FUSED]
+    assert ({"stamp", "tried", "frame", "received"}, False) in fused
+    assert ({"tried"}, True) in fused, "no object is left"
+    assert not any("stamp" in timelines and cleared for timelines, cleared in fused)
+    lidar, camera = result.frame.lidar, result.cameras[0].camera.name
+    for path_of_input in (entities.points(lidar), entities.image(camera), entities.sensor(camera)):
+        assert not any(cleared for _, cleared in rows[path_of_input])
+    assert sum(timelines == {"tried"} for timelines, _ in rows[entities.points(lidar)]) == 2, "it is put back"
 
 
 # --- parts --------------------------------------------------------------------------------------

@@ -11,7 +11,7 @@ from functools import partial
 from io import BytesIO
 from pathlib import Path
 from types import TracebackType
-from typing import IO, Self
+from typing import Self
 
 from backports import zstd
 from rosbags.interfaces import (
@@ -39,7 +39,7 @@ from bevviz.bags.mcap import (
     SCHEMA,
 )
 from bevviz.errors import UserError
-from bevviz.files import claim, unfinished
+from bevviz.files import claim, unfinished, write_all
 
 HEADER, CHUNK_INDEX, STATISTICS = 1, 8, 0x0B
 CHUNK_SIZE = 1 << 22  # bytes that a chunk is closed at
@@ -48,7 +48,9 @@ CHUNK_SIZE = 1 << 22  # bytes that a chunk is closed at
 class McapWriter:
     """Context manager: ``write`` messages in order of log time. The file appears when all went well.
 
-    Until then it is NAME.partial.mcap, which a process that is killed leaves, and which can be read.
+    Until then it is NAME.partial.mcap, which a process that is killed leaves, and which can be read. Where
+    ``write`` finds the disk full, what was written until then becomes a complete file if the context is left
+    without an error.
 
     The messages of ROS 1 stay what they are: with the encoding ``ros1``, which MCAP has beside ``cdr``.
 
@@ -84,12 +86,18 @@ class McapWriter:
         self._chunk_count = 0
         self._counts: Counter[int] = Counter()
         self._span = (2**63 - 1, 0)
+        self._end = 0
 
     def __enter__(self) -> Self:
         self._lock = claim(self._path, "bag")
         remains.remember(self, partial(self._part.unlink, missing_ok=True))
-        self._file: IO[bytes] = self._part.open("wb")
-        self._file.write(MAGIC + _record(HEADER, _text(self._profile) + _text(f"bevviz {__version__}")))
+        try:
+            self._file = os.open(self._part, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, 0o666)
+            self._put(MAGIC + _record(HEADER, _text(self._profile) + _text(f"bevviz {__version__}")))
+        except OSError as error:
+            remains.forget(self)
+            os.close(self._lock)
+            raise UserError(f"{self._path}: cannot write the bag: {error.strerror}") from None
         return self
 
     def __exit__(
@@ -98,23 +106,34 @@ class McapWriter:
         try:
             if kind is None:
                 self._finish()
-            self._file.close()
             if kind is None:
                 self._part.replace(self._path)
         except OSError as failure:
             raise UserError(f"{self._path}: cannot write the bag: {failure.strerror}") from None
         finally:
+            os.close(self._file)
             self._part.unlink(missing_ok=True)
             remains.forget(self)
             os.close(self._lock)
 
-    def write(self, connection: Connection, time: int, data: bytes | memoryview) -> None:
+    @property
+    def size(self) -> int:
+        """Bytes so far, as far as they are in the file."""
+        return self._end
+
+    def write(
+        self, connection: Connection, time: int, data: bytes | memoryview, sent: int | None = None
+    ) -> None:
         """Append a message.
 
         Args:
             connection: where it was recorded: its topic, type, encoding and quality of service are kept.
             time: log time, nanoseconds.
             data: the serialised message.
+            sent: time of publication, nanoseconds; None: not known, the log time.
+
+        Raises:
+            UserError: the disk is full.
         """
         key = connection.topic, connection.msgtype, connection.msgdef
         channel = self._channels.get(key)
@@ -124,13 +143,19 @@ class McapWriter:
         count = self._counts[channel]
         self._counts[channel] += 1
         self._chunk.write(RECORD.pack(MESSAGE, MESSAGE_HEAD.size + len(data)))
-        self._chunk.write(MESSAGE_HEAD.pack(channel, count & 0xFFFFFFFF, time, time))
+        self._chunk.write(
+            MESSAGE_HEAD.pack(channel, count & 0xFFFFFFFF, time, time if sent is None else sent)
+        )
         self._chunk.write(data)
         if self._chunk.tell() > CHUNK_SIZE:
             try:
                 self._close_chunk()
             except OSError as error:
                 raise UserError(f"{self._path}: cannot write the bag: {error.strerror}") from None
+
+    def _put(self, data: bytes) -> None:
+        write_all(self._file, data)
+        self._end += len(data)
 
     def _add_channel(self, connection: Connection, number: int) -> int:
         extra, definition = connection.ext, self._define(connection)
@@ -144,6 +169,8 @@ class McapWriter:
             profiles = BytesIO()
             YAML(typ="safe", pure=True).dump([_profile(qos) for qos in extra.offered_qos_profiles], profiles)
             metadata = _text("offered_qos_profiles") + _text(profiles.getvalue().decode())
+        if connection.digest.startswith("RIHS"):
+            metadata += _text("topic_type_hash") + _text(connection.digest)
         self._declare(
             CHANNEL,
             struct.pack("<HH", number, schema)
@@ -170,32 +197,41 @@ class McapWriter:
         self._declared.write(record)
 
     def _close_chunk(self) -> None:
-        data, start = self._chunk.getvalue(), self._file.tell()
+        data, start = self._chunk.getvalue(), self._end
+        index, self._chunk, self._index = self._index, BytesIO(), defaultdict(list)
         packed = zstd.compress(data) if self._compression else data
-        times = [time for entries in self._index.values() for time, _ in entries]
+        times = [time for entries in index.values() for time, _ in entries]
         first, last = min(times, default=0), max(times, default=0)
         head = CHUNK_HEAD.pack(first, last, len(data), crc32(data), len(self._compression))
-        head += self._compression.encode()
-        self._file.write(_record(CHUNK, head + struct.pack("<Q", len(packed)) + packed))
-        index_start = self._file.tell()
-        offsets = b""
-        for channel, entries in self._index.items():
-            offsets += struct.pack("<HQ", channel, self._file.tell())
-            listed = b"".join(struct.pack("<QQ", *entry) for entry in entries)
-            self._file.write(_record(MESSAGE_INDEX, struct.pack("<H", channel) + _bytes(listed)))
+        head += self._compression.encode() + struct.pack("<Q", len(packed))
+        listed, offsets = b"", b""
+        index_start = start + RECORD.size + len(head) + len(packed)
+        for channel, entries in index.items():
+            offsets += struct.pack("<HQ", channel, index_start + len(listed))
+            pairs = b"".join(struct.pack("<QQ", *entry) for entry in entries)
+            listed += _record(MESSAGE_INDEX, struct.pack("<H", channel) + _bytes(pairs))
+        try:
+            self._put(RECORD.pack(CHUNK, len(head) + len(packed)) + head)
+            self._put(packed)
+            self._put(listed)
+        except OSError:  # whole chunks are left, and place for the summary of them
+            os.ftruncate(self._file, start)
+            os.lseek(self._file, start, os.SEEK_SET)
+            self._end = start
+            self._counts -= Counter({channel: len(entries) for channel, entries in index.items()})
+            raise
         about = struct.pack("<QQQQ", first, last, start, index_start - start) + _bytes(offsets)
-        about += struct.pack("<Q", self._file.tell() - index_start) + _text(self._compression)
+        about += struct.pack("<Q", len(listed)) + _text(self._compression)
         self._chunks.write(_record(CHUNK_INDEX, about + struct.pack("<QQ", len(packed), len(data))))
         self._chunk_count += 1
         if times:
             self._span = min(first, self._span[0]), max(last, self._span[1])
-        self._chunk, self._index = BytesIO(), defaultdict(list)
 
     def _finish(self) -> None:
         if self._chunk.tell():
             self._close_chunk()
-        self._file.write(_record(DATA_END, struct.pack("<I", 0)))
-        summary = self._file.tell()
+        self._put(_record(DATA_END, struct.pack("<I", 0)))
+        summary = self._end
         counts = b"".join(struct.pack("<HQ", *pair) for pair in sorted(self._counts.items()))
         about = struct.pack(
             "<QHIIIIQQ",
@@ -207,9 +243,9 @@ class McapWriter:
             self._chunk_count,
             *(self._span if self._counts else (0, 0)),
         )
-        self._file.write(self._declared.getvalue() + _record(STATISTICS, about + _bytes(counts)))
-        self._file.write(self._chunks.getvalue())
-        self._file.write(_record(FOOTER, struct.pack("<QQI", summary, 0, 0)) + MAGIC)
+        self._put(self._declared.getvalue() + _record(STATISTICS, about + _bytes(counts)))
+        self._put(self._chunks.getvalue())
+        self._put(_record(FOOTER, struct.pack("<QQI", summary, 0, 0)) + MAGIC)
 
 
 def _profile(qos: Qos) -> dict[str, object]:

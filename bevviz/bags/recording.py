@@ -25,6 +25,7 @@ from rosbags.typesys.store import Typestore
 from tqdm import tqdm
 
 from bevviz.bags import mcap, mcap_scan, ros1, sqlite
+from bevviz.bags.beside import bag_beside
 from bevviz.bags.chunks import Form, SoundChunks, rescue
 from bevviz.bags.reader import (
     LONGEST,
@@ -308,6 +309,7 @@ class Recording(Closing):
             return ""
 
     def _open(self, path: Path) -> None:
+        path = bag_beside(path)
         try:
             if path.name == METADATA:
                 path = path.parent

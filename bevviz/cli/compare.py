@@ -71,7 +71,7 @@ def add(commands: Commands) -> None:
 
 def _compare(options: argparse.Namespace) -> int:
     saved = [path.suffix == ".rrd" for path in options.paths]
-    if any(saved):
+    if any(saved) and not (options.robot is not None and len(saved) == 1):
         if not all(saved) or len(saved) != 2:
             raise UserError(
                 "compare: expected a bag, a recording, or two of these: bevviz compare OLD.rrd NEW.rrd"

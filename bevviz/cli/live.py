@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from bevviz.frame import FrameResult, Source
     from bevviz.live.control import Control
     from bevviz.live.notes import Notes
+    from bevviz.live.raw import RawRecorder
     from bevviz.live.replay import Replay
     from bevviz.live.runtime import Live, Status
     from bevviz.live.settings import Settings
@@ -40,6 +41,18 @@ def add(commands: Commands) -> None:
     choice.add_argument(
         "--publish", action="store_true", help="publish the results, as the nodes of the tutorial do"
     )
+    choice.add_argument(
+        "--diagnostics",
+        action="store_true",
+        help="publish how bevviz does and what is worth a look on /diagnostics; --publish does it, too",
+    )
+    choice.add_argument(
+        "--robot",
+        nargs="?",
+        const="",
+        metavar="TOPIC",
+        help="compare our objects with the robot's (default: its fused Detection3DArray), frame by frame",
+    )
     choice.add_argument("--every", metavar="N", help="run each N-th scan only")
     choice.add_argument("--max-rate", metavar="HZ", help="frames a second at most")
     choice.add_argument("--points", metavar="N", help="points kept of each scan")
@@ -53,7 +66,7 @@ def add(commands: Commands) -> None:
         help="instead of a robot N scans of the synthetic drive, forth and back (default: 30)",
     )
     add_config(live)
-    output = add_output(live, blueprint="live")
+    output = add_output(live, blueprint="live", raw=True)
     output.add_argument(
         "--split", type=_split, metavar="SIZE|TIME", help="--save in parts, e.g. 500MB or 10min"
     )
@@ -74,7 +87,8 @@ def add(commands: Commands) -> None:
     snap = commands.add_parser(
         "snap",
         help="save the last seconds of a running 'bevviz live'",
-        description="Have a running 'bevviz live' save its flight recorder. SIGUSR1 does the same.",
+        description="Have a running 'bevviz live' save its flight recorder: FILE.rrd, and beside it "
+        "FILE.mcap, the messages that it was made of. SIGUSR1 does the same.",
     )
     snap.add_argument("path", nargs="?", type=Path, metavar="FILE.rrd", help="default: named by the time")
     snap.add_argument("--pid", type=int, metavar="PID", help="which process, where several run")
@@ -104,10 +118,15 @@ def _live(options: argparse.Namespace) -> int:
     more = [f"{key}={value}" for key, value in given.items() if value is not None]
     if options.split is not None:
         more.append(options.split)
-    if options.split is not None and options.save is None:
+    _, messages = _files(options.save)
+    if options.split is not None and not options.save:
         raise UserError("--split divides what --save writes: give --save FILE.rrd, too")
     if options.observe and options.publish:
         raise UserError("--observe makes no results that --publish could send: leave one of them out")
+    if messages is not None and options.synthetic:
+        raise UserError(f"--save {messages}: the synthetic drive has no messages; 'bevviz demo --bag' does")
+    if options.observe and options.robot is not None:
+        raise UserError("--robot compares our objects with the robot's: leave --observe out")
     settings = Settings(options.config, [*options.set, *more], options.preset)
     _check_outputs(options)
     loader = StageLoader()
@@ -116,10 +135,12 @@ def _live(options: argparse.Namespace) -> int:
     notes = Notes(say)
     if options.synthetic:
         return _watch(_replay(options.synthetic), settings, options, notes, loader)
+    from bevviz.live.raw import RawRecorder
     from bevviz.live.source import LiveSource
 
-    with LiveSource(settings.config, arguments=options.ros_args, tell=notes.info) as source:
-        return _watch_robot(source, settings, options, notes, loader)
+    raw = RawRecorder(settings.config.live)
+    with LiveSource(settings.config, arguments=options.ros_args, tell=notes.info, raw=raw) as source:
+        return _watch_robot(source, settings, options, notes, loader, raw)
 
 
 def _check_outputs(options: argparse.Namespace) -> None:
@@ -135,8 +156,8 @@ def _check_outputs(options: argparse.Namespace) -> None:
         check_port(options.serve)
     if options.connect is not None:
         check_viewer(options.connect)
-    if options.save is not None:
-        check_name(options.save)
+    for path in options.save:
+        check_name(path)
     blueprints.load(options.blueprint, Scene("live", "lidar", ("lidar",)))
 
 
@@ -146,9 +167,11 @@ def _watch_robot(
     options: argparse.Namespace,
     notes: Notes,
     loader: StageLoader,
+    raw: RawRecorder,
 ) -> int:
     """Publish back and take orders, as far as that is asked for."""
     from bevviz.live.control import Control, unasked
+    from bevviz.ros.diagnostics import Diagnostics
     from bevviz.ros.orders import Orders
     from bevviz.ros.publish import Publisher
 
@@ -175,10 +198,19 @@ def _watch_robot(
         if ended.is_set():
             return 1
         publisher = Publisher(source.node, settings.config, notes.warn) if options.publish else None
+        diagnostics = Diagnostics(source.node) if options.publish or options.diagnostics else None
+
+        def on_result(result: FrameResult) -> None:
+            if publisher is not None:
+                publisher.publish(result)
+            if diagnostics is not None:
+                diagnostics.see(result)
 
         def follow(live: Live, orders: Orders = orders) -> Callable[[Config], None]:
             control.save = orders.save = live.save
             orders.change = live.update
+            if diagnostics is not None:
+                diagnostics.every_second(lambda: diagnostics.publish(live.numbers, source.warnings))
 
             def show(config: Config) -> None:
                 orders.show(config)
@@ -187,8 +219,8 @@ def _watch_robot(
 
             return show
 
-        publish = publisher.publish if publisher else None
-        return _watch(source, settings, options, notes, loader, publish, follow, control)
+        wanted = on_result if publisher is not None or diagnostics is not None else None
+        return _watch(source, settings, options, notes, loader, wanted, follow, control, raw)
 
 
 def _replay(frames: int) -> Replay:
@@ -211,6 +243,7 @@ def _watch(
     on_result: Callable[[FrameResult], None] | None = None,
     follow: Callable[[Live], Callable[[Config], None]] | None = None,
     control: Control | None = None,
+    raw: RawRecorder | None = None,
 ) -> int:
     """The live run, until the source ends or the user ends it."""
     from tqdm import tqdm
@@ -218,11 +251,12 @@ def _watch(
     from bevviz.live.runtime import Live, Outputs
 
     window = options.viewer
-    places = options.save, options.serve, options.connect, options.workbench
-    unsaid = all(place is None for place in places) and not window
+    save, messages = _files(options.save)
+    places = options.serve, options.connect, options.workbench
+    unsaid = not options.save and all(place is None for place in places) and not window
     window = window or (unsaid and has_display())
     connect = [options.connect] if options.connect else []
-    outputs = Outputs(options.save, window, options.serve, options.bind, connect, options.blueprint)
+    outputs = Outputs(save, window, options.serve, options.bind, connect, options.blueprint, messages)
     live = Live(
         source,
         settings,
@@ -232,6 +266,8 @@ def _watch(
         on_result=on_result,
         loader=loader,
         control=control,
+        raw=raw,
+        robot=options.robot,
     )
     if follow is not None:
         live.on_change = follow(live)
@@ -251,10 +287,14 @@ def _watch(
             bar.update(status.frames - bar.n)
 
         live.run(show)
+    if (against := live.against) is not None:
+        text = f"{against.differing} of {against.frames} compared frames differ from {against.names[1]}"
+        say(text if against.frames else f"the robot published nothing on {against.names[1]}")
     for warning in source.warnings:
         say(f"warning: {warning}")
-    where = live.saver.paths if live.saver is not None else []
-    target = f" in {where[0]}" + (f" and {len(where) - 1} more" if where[1:] else "") if where else ""
+    written = [saver.paths for saver in (live.saver, live.raw_saver) if saver is not None]
+    targets = [f"{where[0]}" + (f" and {len(where) - 1} more" if where[1:] else "") for where in written]
+    target = f" in {', '.join(targets)}" if targets else ""
     drops = [f"{count} ({place})" for place, count in live.status.drops.items() if count]
     say(f"{live.frames} frames{target}, {' + '.join(drops) or 'none'} dropped")
     return 0 if live.frames else 1
@@ -275,8 +315,23 @@ def _page(options: argparse.Namespace, live: Live) -> AbstractContextManager[obj
     return page
 
 
+def _files(paths: Sequence[Path]) -> tuple[Path | None, Path | None]:
+    """Those of ``--save``: for the recording, and for the messages."""
+    found: dict[str, Path] = {}
+    for path in paths:
+        if path.suffix not in (".rrd", ".mcap"):  # a slip must not overwrite something else
+            raise UserError(f"--save {path}: expected a file name that ends in .rrd or .mcap")
+        if path.suffix in found:
+            raise UserError(f"--save {path}: {found[path.suffix]} is given already; one of each kind")
+        found[path.suffix] = path
+    return found.get(".rrd"), found.get(".mcap")
+
+
 def _snap(options: argparse.Namespace) -> int:
     from bevviz.live.control import snap
 
-    print(snap(options.path, options.pid))
+    saved = snap(options.path, options.pid)
+    print(saved)
+    if saved.with_suffix(".mcap").exists():
+        print(saved.with_suffix(".mcap"))
     return 0

@@ -113,12 +113,26 @@ def add_config(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def add_output(parser: argparse.ArgumentParser, blueprint: str | None = "debug") -> argparse._ArgumentGroup:
-    """Where to, and in which layout; None: the command has one of its own."""
+def add_output(
+    parser: argparse.ArgumentParser, blueprint: str | None = "debug", *, raw: bool = False
+) -> argparse._ArgumentGroup:
+    """Where to, and in which layout; None: the command has one of its own. ``raw``: messages, too."""
     group = parser.add_argument_group(
         "output", "The viewer, where there is a display. Several can be given at once."
     )
-    group.add_argument("--save", type=Path, metavar="FILE.rrd", help="save the recording, blueprint included")
+    if raw:
+        group.add_argument(
+            "--save",
+            type=Path,
+            action="append",
+            default=[],
+            metavar="FILE.rrd|FILE.mcap",
+            help="save the recording, blueprint included; the messages as they come; both, given twice",
+        )
+    else:
+        group.add_argument(
+            "--save", type=Path, metavar="FILE.rrd", help="save the recording, blueprint included"
+        )
     group.add_argument(
         "--serve",
         nargs="?",

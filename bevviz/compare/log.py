@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Set
 
 import numpy as np
 import rerun as rr
@@ -59,6 +59,10 @@ class DifferenceLogger(Writer):
                     entities.difference_count(f"{series}_{what}"),
                     rr.SeriesLines(colors=[color], names=[f"{series} {what.upper()}"]),
                 )
+
+    def refresh(self, known: Set[str] = frozenset()) -> None:
+        super().refresh(known)
+        self._lanes.states = {}
 
     def log(self, found: FrameDifferences, received: int, world_from_points: F64) -> None:
         """One frame. Times in nanoseconds; ``received`` is 0 where it is not known."""

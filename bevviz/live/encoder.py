@@ -16,8 +16,10 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from bevviz.closing import Closing
+from bevviz.compare.log import DifferenceLogger
 from bevviz.config import Config
 from bevviz.frame import FrameResult, LateResult, Scene
+from bevviz.live.against import AgainstRobot, Compared
 from bevviz.logging import blueprints
 from bevviz.logging.logger import Context, Logger
 from bevviz.logging.sinks import APPLICATION
@@ -68,12 +70,22 @@ class Encoder:
         scene: names of the sensors.
         blueprint: name of a layout, or a .py or .rbl file.
         whole: seconds from one whole packet to the next, at most.
+        against: compares with the robot; None: nobody does.
 
     Raises:
         UserError: no such blueprint.
     """
 
-    def __init__(self, config: Config, scene: Scene, blueprint: str, whole: float = WHOLE) -> None:
+    def __init__(
+        self,
+        config: Config,
+        scene: Scene,
+        blueprint: str,
+        whole: float = WHOLE,
+        against: AgainstRobot | None = None,
+    ) -> None:
+        self._against = against
+        self._differences: DifferenceLogger | None = None
         self._blueprint = blueprint
         self._step = whole
         blueprints.load(blueprint, scene)  # what is wrong with it is said at the start
@@ -100,10 +112,14 @@ class Encoder:
         notes: Sequence[tuple[str, str]],
         late: Sequence[LateResult] = (),
         states: Mapping[str, str] = MappingProxyType({}),
+        compared: Sequence[Compared] = (),
     ) -> Packet:
-        """One frame, and with it whatever is new in the configuration or the scene; see ``Logger.log``."""
+        """One frame, and with it whatever is new in the configuration or the scene; see ``Logger.log``.
+
+        ``compared``: how frames so far differ from what the robot made of them.
+        """
         with self._lock:
-            return self._encode(result, scene, health, notes, late, states)
+            return self._encode(result, scene, health, notes, late, states, compared)
 
     def encode_meanwhile(
         self, seconds: float, notes: Sequence[tuple[str, str]], states: Mapping[str, str]
@@ -121,6 +137,7 @@ class Encoder:
         notes: Sequence[tuple[str, str]],
         late: Sequence[LateResult],
         states: Mapping[str, str],
+        compared: Sequence[Compared],
     ) -> Packet:
         config = result.config
         if (config, scene) != (self._config, self._scene):
@@ -134,11 +151,24 @@ class Encoder:
             self._whole = now
             self._logger.refresh()
         self._logger.log(result, health, notes, late, states)
+        self._log_differences(compared, whole)
         return Packet(self._stream.read(), whole, self._logger.context, now)
+
+    def _log_differences(self, compared: Sequence[Compared], whole: bool) -> None:
+        if self._against is None or not (compared or self._differences):
+            return
+        if self._differences is None:
+            self._differences = DifferenceLogger(self._stream.recording, self._against.names, "")
+        if whole:
+            self._differences.refresh()
+        for one in compared:
+            self._differences.log(one.found, one.received, one.world_from_points)
 
     def prelude(self, context: Context, *, blueprint: bool = True) -> bytes:
         """The beginning of a recording whose first packet has this context. From any thread."""
         layout = blueprints.load(self._blueprint, context.scene) if blueprint else None
         with _Stream(self.recording_id, layout) as stream:
             Logger(stream.recording, context.config, context.scene).log_context(context)
+            if self._against is not None:
+                DifferenceLogger(stream.recording, self._against.names, "")
             return stream.read()

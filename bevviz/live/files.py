@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import subprocess
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from pathlib import Path
@@ -71,9 +72,9 @@ class Indexer:
 
 
 def check_name(path: Path) -> None:
-    """Raises UserError where a recording is not to be written: a slip must not overwrite something else."""
-    if path.suffix != ".rrd":
-        raise UserError(f"--save {path}: expected a file name that ends in .rrd")
+    """Raises UserError where nothing is to be written: a slip must not overwrite something else."""
+    if path.suffix not in (".rrd", ".mcap"):
+        raise UserError(f"--save {path}: expected a file name that ends in .rrd or .mcap")
     if not path.absolute().parent.is_dir():
         raise UserError(f"--save {path}: there is no folder {path.parent}")
 
@@ -106,6 +107,7 @@ class Saver(Output):
         check_name(path)
         remove_leftovers(path.parent)
         self.paths: list[Path] = []
+        self.on_part: Callable[[], None] = lambda: None  # called when a further one begins
         self._path = path
         self._size = config.split_size and config.split_size * MEGABYTE
         self._time = config.split_time
@@ -130,6 +132,7 @@ class Saver(Output):
             if packet.whole and self._is_complete(packet):
                 self._finish()
                 self._open()
+                self.on_part()
             if not self._written:
                 self._started = packet.time
                 self._write(self._encoder.prelude(packet.context))

@@ -50,17 +50,22 @@ class FlightRecorder:
         ):
             self._size -= len(self._packets.popleft().data)
 
-    def save(self, path: Path | None = None) -> Path:
+    def held(self) -> list[Packet]:
+        """The packets, oldest first."""
+        with self._held:
+            return list(self._packets)
+
+    def save(self, path: Path | None = None, packets: list[Packet] | None = None) -> Path:
         """Write what is held as a complete recording; from any thread.
 
         Args:
             path: .rrd file, not overwritten; None: named by the time, in ``live.flight_folder``.
+            packets: that ``held`` gave earlier; None: now.
 
         Raises:
             UserError: nothing is held yet, or the file cannot be written.
         """
-        with self._held:
-            packets = list(self._packets)
+        packets = self.held() if packets is None else packets
         if not packets:
             off = "; it is off (live.flight_time is 0)" if self.config.flight_time == 0 else " yet"
             raise UserError(f"the flight recorder holds no frame{off}")
@@ -95,4 +100,4 @@ def _unused(folder: Path) -> Path:
     """Named by the time; with a number where that is taken."""
     stem = time.strftime("flight_%Y%m%dT%H%M%S")
     names = (folder / f"{stem}{suffix}.rrd" for suffix in ("", *(f"_{n}" for n in range(1, 1000))))
-    return next(path for path in names if not path.exists())
+    return next(path for path in names if not (path.exists() or path.with_suffix(".mcap").exists()))

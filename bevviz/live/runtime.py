@@ -6,7 +6,7 @@ import signal
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import Executor, ThreadPoolExecutor
+from concurrent.futures import Executor
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -16,7 +16,8 @@ import numpy as np
 
 from bevviz.config import Config
 from bevviz.errors import UserError
-from bevviz.frame import Frame, FrameResult, LateResult, Scene, Source
+from bevviz.frame import Frame, FrameResult, LabelledBoxes3D, LateResult, Scene, Source
+from bevviz.live.against import AgainstRobot
 from bevviz.live.control import Control
 from bevviz.live.encoder import WHOLE, Encoder, Packet
 from bevviz.live.files import Indexer, Saver
@@ -24,7 +25,10 @@ from bevviz.live.flight import FlightRecorder
 from bevviz.live.health import Health, set_nice
 from bevviz.live.notes import Notes
 from bevviz.live.output import Output
+from bevviz.live.raw import RawRecorder
+from bevviz.live.rawsaver import RawSaver
 from bevviz.live.settings import AT_START, Settings
+from bevviz.live.snapshots import Snapshots
 from bevviz.live.triggers import Triggers
 from bevviz.live.viewers import Viewer, remote, server, window
 from bevviz.logging import entities
@@ -38,7 +42,7 @@ ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 @dataclass(frozen=True, slots=True)
 class Outputs:
-    """Where the results go, any number at once: file, window, web viewer at a port, viewers elsewhere."""
+    """Where the results go, any number at once: files, window, web viewer at a port, viewers elsewhere."""
 
     save: Path | None = None
     window: bool = False
@@ -46,6 +50,7 @@ class Outputs:
     bind: str = "127.0.0.1"
     connect: Sequence[str] = ()
     blueprint: str = "live"
+    raw: Path | None = None  # .mcap file for the messages
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,6 +77,8 @@ class Live:
         on_result: called with each result in a thread of its own; when it is too slow the newest wins.
         loader: has the detector's network already.
         control: takes orders to save; None: one of its own.
+        raw: the messages that the source makes the frames of.
+        robot: topic of the robot's boxes that ours are compared with, empty: that which is fused; None: none.
 
     Raises:
         UserError: the detector's model, an output or the blueprint cannot be used.
@@ -88,6 +95,8 @@ class Live:
         on_result: Callable[[FrameResult], None] | None = None,
         loader: StageLoader | None = None,
         control: Control | None = None,
+        raw: RawRecorder | None = None,
+        robot: str | None = None,
     ) -> None:
         self.notes = notes
         self._control = control
@@ -106,12 +115,15 @@ class Live:
 
         self._nice(live.nice)
         self._session = Observing(settings.config) if observe else Session(settings.config, loader=loader)
+        self._robot_problem = ""
+        self.against = None if robot is None else AgainstRobot(robot, live)
         whole = WHOLE if live.viewer_rate is None else 1 / live.viewer_rate
-        self.encoder = Encoder(self.config, source.scene, outputs.blueprint, whole)
+        self.encoder = Encoder(self.config, source.scene, outputs.blueprint, whole, self.against)
         self._indexer = Indexer()
         self._watchers: list[Callable[[FrameResult], None]] = []
-        self._saves = ThreadPoolExecutor(1, "save")
         self.flight = FlightRecorder(live, self.encoder, self._indexer)
+        self._raw = raw
+        self._snapshots = Snapshots(self.flight, raw, notes)
         self._triggers = Triggers(live)
         self.health = Health()
         self._dropping = Dropping()
@@ -128,6 +140,13 @@ class Live:
         if outputs.save is not None:
             self.saver = Saver(outputs.save, live, self.encoder, self._indexer, notes)
             self._outputs.append(self.saver)
+        self.raw_saver: RawSaver | None = None
+        if outputs.raw is not None:
+            if raw is None:
+                raise UserError(f"--save {outputs.raw}: only a robot's messages can be saved")
+            self.raw_saver = RawSaver(outputs.raw, live, raw, notes, follows=self.saver is not None)
+            if self.saver is not None:
+                self.saver.on_part = self.raw_saver.next_part
         sparse = live.viewer_rate is not None
         self._outputs += [
             Viewer(program, live.output_queue, self.encoder, notes, sparse=sparse) for program in programs
@@ -174,6 +193,24 @@ class Live:
         self._outputs.append(output)
         self._watchers.append(watcher)
 
+    @property
+    def numbers(self) -> dict[str, float]:
+        """How it goes, by name: for a monitor."""
+        status = self.status
+        numbers = {
+            "frames": float(status.frames),
+            "latency p50, ms": 1e3 * status.p50,
+            "latency p99, ms": 1e3 * status.p99,
+            "CPU, percent of a core": status.cpu,
+            "memory, MB": status.memory,
+        }
+        numbers |= {f"dropped: {where}": float(count) for where, count in status.drops.items()}
+        return numbers | {path.rpartition("/")[2]: n for path, n in self._snapshots.scalars.items()}
+
+    def save(self, path: Path | None = None) -> Path:
+        """The last seconds, as ``Snapshots.save``; from any thread."""
+        return self._snapshots.save(path)
+
     def stop(self) -> None:
         """End ``run``, from any thread."""
         self._over.set()
@@ -190,7 +227,7 @@ class Live:
         def tick() -> None:
             if self._asked_to_save:
                 self._asked_to_save = False
-                self._save_soon("SIGUSR1")
+                self._snapshots.save_soon("SIGUSR1")
             if time.monotonic() - self._looked >= LOOK:
                 self._looked = time.monotonic()
                 self._look()
@@ -247,7 +284,9 @@ class Live:
     def _close(self) -> None:
         for output in self._outputs:
             output.close()
-        self._saves.shutdown()
+        if self.raw_saver is not None:
+            self.raw_saver.close()
+        self._snapshots.close()
         if self._indexer.waiting:
             self.notes.info("the recording gets its index; it is complete already")
         self._indexer.close()
@@ -256,17 +295,29 @@ class Live:
     def log(self, result: FrameResult) -> None:
         """Encode a frame once, for every output."""
         drops = {entities.drops(where): float(count) for where, count in self._drops().items()}
-        health = self.health.scalars() | drops
+        health = self.health.scalars() | drops | self._snapshots.scalars
         late, states = self._source.overtaken(), self._topic_states()
+        boxes = [(one.frame_stamp, one.boxes) for one in late if isinstance(one.boxes, LabelledBoxes3D)]
+        compared = self.against.see(result, boxes) if self.against is not None else ()
         notes, scene = self.notes.take(), self._source.scene
-        self._hand_out(self.encoder.encode(result, scene, health, notes, late, states))
+        self._hand_out(self.encoder.encode(result, scene, health, notes, late, states, compared))
         for watcher in self._watchers:
             watcher(result)
         self._logged = time.monotonic()
         self.health.logged(result.frame.received)
         self.frames += 1
         if reason := self._triggers.check(result):
-            self._save_soon(reason)
+            self._snapshots.save_soon(reason, self.config.live.trigger_after)
+        if self.against is not None:
+            self._watch_robot(self.against)
+
+    def _watch_robot(self, against: AgainstRobot) -> None:
+        if against.problem != self._robot_problem:
+            self._robot_problem = against.problem
+            if against.problem:
+                self.notes.warn(against.problem)
+        if reason := against.reason():
+            self._snapshots.save_soon(reason, self.config.live.trigger_after)
 
     def _log_meanwhile(self) -> None:
         """What is said while no frame comes is in the log and in the lanes all the same."""
@@ -289,26 +340,9 @@ class Live:
         drops = {"source": self._source.dropped, **self._dropping.dropped}
         for output in self._outputs:
             drops[output.name] = drops.get(output.name, 0) + output.dropped
+        if self.raw_saver is not None:
+            drops[self.raw_saver.name] = self.raw_saver.dropped
         return drops
-
-    # --- the flight recorder -------------------------------------------------------------------
-
-    def save(self, path: Path | None = None) -> Path:
-        """``FlightRecorder.save``, and say so."""
-        saved = self.flight.save(path)
-        self.notes.info(f"flight recorder saved in {saved}")
-        return saved
-
-    def _save_soon(self, reason: str) -> None:
-        """In a thread of its own: nothing waits for the disk."""
-
-        def save() -> None:
-            try:
-                self.notes.info(f"flight recorder saved in {self.flight.save()} ({reason})")
-            except UserError as error:
-                self.notes.warn(f"flight recorder not saved ({reason}): {error}")
-
-        self._saves.submit(save)
 
     # --- changes -------------------------------------------------------------------------------
 
@@ -334,6 +368,10 @@ class Live:
         changed = self._session.configure(config)
         self._settings.keep(config)
         self.flight.config = self._triggers.config = config.live
+        if self._raw is not None:
+            self._raw.config = config.live
+        if self.against is not None:
+            self.against.config = config.live
         if config.live.nice != nice:
             self._nice(config.live.nice)
         for key, change in changed.items():

@@ -13,16 +13,19 @@ from bevviz.closing import Closing
 from bevviz.config import Config, SourceConfig, stage_topics
 from bevviz.errors import UserError
 from bevviz.frame import Frame, Intrinsics, LateResult, Scene
+from bevviz.live.raw import RawRecorder
+from bevviz.live.rawtopics import RawTopics
 from bevviz.live.watch import SILENCE, Watch
 from bevviz.queues import NewestQueue
+from bevviz.ros import around
 from bevviz.ros.encode import typestore
 from bevviz.ros.graph import PublishedTopic, full_name, matched_qos, mismatches, published_topics
 from bevviz.ros.messages import MessageError, read_header
 from bevviz.ros.node import Node
-from bevviz.ros.roles import STAGE_KINDS, Roles, Topic, find_roles, foreign
+from bevviz.ros.roles import MARK, STAGE_KINDS, Roles, Topic, find_roles, foreign
 from bevviz.ros.typesupport import message_type
 from bevviz.run import BURST
-from bevviz.sync.feed import Handler, make_handlers
+from bevviz.sync.feed import Handler, make_around_handlers, make_handlers
 from bevviz.sync.synchronizer import OVERTAKEN, Synchronizer, blindness
 
 LOOK = 0.5  # seconds between two looks at the graph
@@ -43,6 +46,7 @@ KINDS = {
     "sensor_msgs/msg/Imu",
     "vision_msgs/msg/Detection2DArray",
     "vision_msgs/msg/Detection3DArray",
+    *around.TYPES,
 }
 
 
@@ -88,6 +92,7 @@ class LiveSource(Closing):
         arguments: what follows ``--ros-args``: remaps, namespace, parameters.
         tell: called with one sentence each, from the receiving thread.
         name: of the node.
+        raw: gets every message as it came, and those of further topics (``live.raw_topics``).
 
     Raises:
         UserError: no working rclpy, or arguments that it refuses.
@@ -100,6 +105,7 @@ class LiveSource(Closing):
         arguments: Sequence[str] = (),
         tell: Callable[[str], None] | None = None,
         name: str = "bevviz",
+        raw: RawRecorder | None = None,
     ) -> None:
         self.config = config
         self.roles = Roles()
@@ -122,6 +128,9 @@ class LiveSource(Closing):
         self._ended = False
 
         self._node = Node(arguments, on_end=self.stop, name=name)
+        self._raw = None if raw is None else RawTopics(self._node, raw)
+        mark = self._node.resolve(MARK)  # heard before anybody says something: it may be said once
+        self._mark = PublishedTopic(mark, "std_msgs/msg/String", ())
         self._add_timer(LOOK, self._look)
         self._add_timer(TICK, self._tick)
         self._node.start()
@@ -279,6 +288,8 @@ class LiveSource(Closing):
 
     def _receive(self, topic: str, kind: str, data: bytes, info: dict[str, Any]) -> None:
         message = LiveMessage(topic, kind, info["received_timestamp"] or time.time_ns(), data)
+        if self._raw is not None:
+            self._raw.put(self._known[topic], message.received, info, data)
         first = self._watch.add(topic, len(data))
         before = self._sync.intrinsics.get(topic)
         try:
@@ -317,12 +328,16 @@ class LiveSource(Closing):
     def _look(self) -> None:
         self.topics = published_topics(self._node)
         known = {name: topic for name, topic in self._known.items() if self.received[name]}
+        known.setdefault(self._mark.name, self._mark)
         self._known = known | {name: topic for name, topic in self.topics.items() if _concerns(topic)}
         self._assign()
+        if self._raw is not None:
+            self._raw.look(self.topics, self._subscriptions.keys())
         heard = self._subscriptions.keys() & self.topics.keys()
         self._sync.absent = frozenset(self._handlers.keys() - heard)
         for name, subscription in self._subscriptions.items():
-            self._look_at(name, subscription)
+            if name in self.topics or not any(name == shown for shown, _, _ in self.roles.around):
+                self._look_at(name, subscription)  # what is shown around the robot comes and goes
         self._look_at_frames()
         if not self._complete and self._is_settled():
             self._complete = True
@@ -401,6 +416,10 @@ class LiveSource(Closing):
             former, self._sync = self._sync, Synchronizer(roles, self.config, beside=results)
             self._sync.take_over(former)
             self._handlers = make_handlers(self._sync, roles, LiveMessage.decode)
+        elif roles.around != self.roles.around:
+            others = self._handlers.keys() - {topic for topic, _, _ in self.roles.around}
+            self._handlers = {topic: self._handlers[topic] for topic in others}
+            self._handlers |= make_around_handlers(self._sync, roles, LiveMessage.decode)
         self.roles = roles
         for name in self._subscriptions.keys() - self._handlers.keys():
             self._node.input.destroy_subscription(self._subscriptions.pop(name).handle)

@@ -43,6 +43,8 @@ def _lines(result: FrameResult) -> Iterator[str]:
     frame = result.frame
     yield f"### Frame {frame.index}"
     yield ""
+    around = frame.around
+    yield from _section("Marks", map(markdown, around.marks if around is not None else ()))
     yield from _section("Failures", (f"**{f.stage}**: {markdown(f.reason)}" for f in result.failures))
     problems = list(frame.problems)
     problems += [e.text for e in result.explanations if e.subject == "camera"]

@@ -18,6 +18,7 @@ RECEIVED = "received"  # when the cloud was received, or logged into the bag
 # --- entities ----------------------------------------------------------------------------------
 
 WORLD = "/world"
+DIAGNOSTICS = "/robot/diagnostics"
 FUSED = "/world/fused"
 MEASURED = "/world/fused/measured"
 MISSED = "/world/missed"
@@ -63,7 +64,7 @@ RESERVED = frozenset(
     {path.split("/")[2] for path in (FUSED, FRUSTUMS, GRID, TRUTH, TRACKS, MISSED, FALSE, UNNAMED)}
     | {path.split("/")[2] for path in (COMPARE_ABOUT, COMPARE_LOG, COMPARE_STATES)}
     | {"objects", "count"}  # of /compare
-    | {"pipeline"}  # of /explain/states
+    | {"pipeline", "marks"}  # of /explain/states
     | {"lidars"}  # several LiDARs that are merged
 )
 
@@ -127,6 +128,11 @@ def robot(topic: str) -> str:
 def robot_overlay(topic: str) -> str:
     """What the robot published, over the bird's-eye image."""
     return overlay(f"robot{_topic(topic)}")
+
+
+def diagnostic(name: str) -> str:
+    """State lane of what the robot's diagnostics say of one part."""
+    return f"{DIAGNOSTICS}/{_part(name)}"
 
 
 def state(*lane: str) -> str:

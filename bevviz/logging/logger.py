@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence, Set
 from dataclasses import dataclass, field
 from types import MappingProxyType
 
@@ -15,6 +15,7 @@ from bevviz.frame import CameraResult, Frame, FrameResult, Intrinsics, LateResul
 from bevviz.logging import entities
 from bevviz.logging.annotations import log_world
 from bevviz.logging.anomalies import log_anomalies, log_anomalies_looks
+from bevviz.logging.around import AroundLog, diagnostic_states, marks
 from bevviz.logging.bev import log_bev, log_grid
 from bevviz.logging.camera import (
     log_camera,
@@ -77,11 +78,13 @@ class Logger(Writer):
     ) -> None:
         super().__init__(recording, root, wait, stamps)
         self._inputs = not root if inputs is None else inputs
+        self._brought: set[str] = set()  # entities of the sensors and the robot
         self._config = config
         self._scene = scene
         self._intrinsics: dict[str, Intrinsics] = {}
         self._track_lanes = Lanes()
         self._state_lanes = StateLanes(COLORS)
+        self._around = AroundLog()
         self._onsets = Onsets()
         self._last: Frame | None = None
         self._rates = Rates()
@@ -93,6 +96,17 @@ class Logger(Writer):
         last = self._last
         clock = (0, 0, 0) if last is None else (last.index, last.stamp, last.received)
         return Context(self._config, self._scene, clock, self._intrinsics, self._state_lanes.states)
+
+    @property
+    def results(self) -> frozenset[str]:
+        """Entities that any frame had, but for what the sensors and the robot brought."""
+        return self.known - self._brought
+
+    def refresh(self, known: Set[str] = frozenset()) -> None:
+        """As a ``Writer``; inputs that are not written here are not cleared here either."""
+        super().refresh(known)
+        if not self._inputs:
+            self._shown -= self._brought
 
     # --- once ----------------------------------------------------------------------------------
 
@@ -136,6 +150,7 @@ class Logger(Writer):
         late: Sequence[LateResult] = (),
         states: Mapping[str, str] = MappingProxyType({}),
         beside: Callable[[], object] | None = None,
+        cloud: bool = False,
     ) -> None:
         """Everything of one frame. What the frame before had and this one has not is cleared.
 
@@ -146,6 +161,7 @@ class Logger(Writer):
             late: what the robot has published since and belongs to frames before.
             states: of further lanes, by entity.
             beside: puts something more into the frame.
+            cloud: write the raw cloud, which tells ground from obstacles, also where no inputs are written.
         """
         frame = result.frame
         for found in late:
@@ -153,8 +169,12 @@ class Logger(Writer):
             log_late(self, found, self._config.bev)
         self.begin(frame.index, frame.stamp, frame.received)
         self.put(entities.sensor(frame.lidar), transform(frame.pose))
+        before = set(self._now)
         if self._inputs:
             self._log_input(result)
+        elif cloud:
+            log_cloud(self, result)
+        self._brought |= self._now - before
         self._log_lidar_results(result)
         for camera in result.cameras:
             self._log_camera_results(camera)
@@ -165,7 +185,8 @@ class Logger(Writer):
         if result.bev is not None:
             log_bev(self, result.bev, self._config)
             log_grid(self, result, result.bev)
-        log_decisions(self, result, notes)
+        lines = marks(frame) if self.root else self._around.log(self, frame)
+        log_decisions(self, result, [*notes, *lines])
         log_anomalies(self, result, self._onsets.of(result.anomalies))
         self._log_states(result, states)
         self._rates.add(frame)
@@ -235,4 +256,6 @@ class Logger(Writer):
         if result.tracks is not None:
             log_speeds(self, result.tracks, rows)
             states |= track_states(result.tracks, rows)
+        if not self.root:
+            states |= diagnostic_states(result.frame)
         self._state_lanes.log(self, states)

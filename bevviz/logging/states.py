@@ -31,6 +31,9 @@ COLORS: Mapping[str, Color] = {
     "silent": (210, 70, 70),
     "unusable": (210, 70, 70),
     "no publisher": (210, 70, 70),
+    "warning": (220, 160, 50),  # of the robot's diagnostics
+    "error": (210, 70, 70),
+    "stale": (110, 110, 120),
 }
 
 
@@ -60,6 +63,8 @@ def states_of(result: FrameResult) -> dict[str, str]:
     """Lane -> state of the pipeline, of each camera and its classes, and of each kind of anomaly."""
     degraded = result.frame.problems or any(c.camera.problems for c in result.cameras)
     states = {entities.state("pipeline"): "failed" if result.failures else "degraded" if degraded else "ok"}
+    if result.frame.around is not None and result.frame.around.marks:
+        states[entities.state("marks")] = "; ".join(result.frame.around.marks)
     for camera in result.cameras:
         name = camera.camera.name
         is_fused = camera.detections is not None and camera.fusion is not None

@@ -114,6 +114,11 @@ def states() -> rrb.StateTimelineView:
     return rrb.StateTimelineView(name="States", origin=entities.STATES)
 
 
+def diagnostics() -> rrb.StateTimelineView:
+    """What the robot's own diagnostics say of its parts, over time."""
+    return rrb.StateTimelineView(name="Diagnostics", origin=entities.DIAGNOSTICS)
+
+
 def anomalies() -> rrb.StateTimelineView:
     """What was worth a look, by kind, over time."""
     return rrb.StateTimelineView(name="Anomalies", origin=entities.ANOMALY_STATES)

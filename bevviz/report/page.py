@@ -71,6 +71,7 @@ def page(facts: Facts, summary: WindowSummary, seal: str) -> str:
         frames=len(summary.frames),
         bad_frames=len(bad),
         problems=[f"{text} ({n} frame{'s' * (n > 1)})" for text, n in common],
+        marks=[f"{_when(f.received, facts)}: {mark}" for f in summary.frames for mark in f.marks],
         strip=list(_strip(summary, facts)),
         totals=list(_totals(summary)),
         plots=list(_plots(summary, facts)),
@@ -85,7 +86,7 @@ def _frame(result: FrameResult, facts: Facts) -> FramePage:
     detections = [e for e in loud if e.subject == "detection"]
     clusters = [e for e in loud if e.subject in ("cluster", "split")]
     return FramePage(
-        when=f"{(result.frame.received - facts.start) / SECOND:.3f} s",
+        when=_when(result.frame.received, facts),
         verdict=list(_verdict(result)),
         pictures=list(_pictures(result)),
         decisions=sorted(detections, key=lambda e: e.state == "matched"),
@@ -94,6 +95,10 @@ def _frame(result: FrameResult, facts: Facts) -> FramePage:
             "more: not kept, or out of view": [e for e in result.explanations if e.state in _QUIET],
         },
     )
+
+
+def _when(received: int, facts: Facts) -> str:
+    return f"{(received - facts.start) / SECOND:.3f} s"
 
 
 def _verdict(result: FrameResult) -> Iterator[str]:

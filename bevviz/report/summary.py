@@ -24,6 +24,7 @@ class FrameSummary:
     health: Mapping[str, float]  # by entity
     states: Counter[tuple[str, str, str]]
     problems: tuple[str, ...]
+    marks: tuple[str, ...] = ()  # notes of people
 
 
 @dataclass(slots=True)
@@ -61,7 +62,10 @@ class WindowSummary:
         problems += [f"{c.camera.name}: {p}" for c in result.cameras for p in c.camera.problems]
         self._rates.add(frame)
         measured = dict(health(result, self._last, self._rates))
-        moment = FrameSummary(frame.index, frame.stamp, frame.received, measured, states, tuple(problems))
+        marks = frame.around.marks if frame.around is not None else ()
+        moment = FrameSummary(
+            frame.index, frame.stamp, frame.received, measured, states, tuple(problems), marks
+        )
         if self._is_for_strip(len(self.frames)):
             self.strip.append((moment, strip_pictures(result)))
         if self.result is None or abs(frame.received - self.at) < abs(self.result.frame.received - self.at):

@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from bevviz.config import TUTORIAL_NAMES, Config, keys
+from bevviz.config import TUTORIAL_NAMES, Config, keys, values
 from bevviz.errors import UserError
 
 NO_LIMIT = 0  # a parameter cannot be empty
 
 
 class Orders:
-    """The tutorial's parameters (``range_x``, ``voxel_size`` ...) and the service ``~/save_recording``.
+    """Every key of the configuration as a parameter (``clustering.eps``), the tutorial's names (``range_x``,
+    ``voxel_size`` ...) beside them, and the service ``~/save_recording``.
 
     Values given with ``--ros-args -p`` are ordered before the constructor returns. ``config``, ``change`` and
     ``save`` may be replaced later.
@@ -39,9 +41,11 @@ class Orders:
         self.config = config
         self.change = change
         self.save = save
+        self._keys = {**{key: key for key in keys(config)}, **TUTORIAL_NAMES}  # by name of the parameter
+        about = keys(config)
         given = [
-            node.declare_parameter(name, _value(config, key), _descriptor(key))
-            for name, key in TUTORIAL_NAMES.items()
+            node.declare_parameter(name, _value(config, name, key), _descriptor(about[key]))
+            for name, key in self._keys.items()
         ]
         if settings := self._settings(given):
             change(settings)
@@ -56,15 +60,24 @@ class Orders:
         from rclpy.parameter import Parameter
 
         self.config = config
-        current = {name: _value(config, key) for name, key in TUTORIAL_NAMES.items()}
+        current = {name: _value(config, name, key) for name, key in self._keys.items()}
         self._node.set_parameters(
             [Parameter(n, value=v) for n, v in current.items() if self._node.get_parameter(n).value != v]
         )
 
     def _settings(self, parameters: Sequence[Any]) -> list[str]:
         """What differs from the configuration, in its words."""
-        keyed = [(TUTORIAL_NAMES[p.name], p.value) for p in parameters if p.name in TUTORIAL_NAMES]
-        return [f"{key}={_text(key, value)}" for key, value in keyed if value != _value(self.config, key)]
+        current = values(self.config)
+        ordered = []
+        for parameter in parameters:
+            name, value = parameter.name, parameter.value
+            key = self._keys.get(name)
+            if key is None or value == _value(self.config, name, key):
+                continue
+            empty = value == NO_LIMIT if name == "max_cluster_size" else value in ("", None)
+            none = empty and not isinstance(current[key], str)
+            ordered.append(f"{key}={'null' if none else _text(value)}")
+        return ordered
 
     def _set(self, parameters: Sequence[Any]) -> Any:
         from rcl_interfaces.msg import SetParametersResult
@@ -85,19 +98,25 @@ class Orders:
         return response
 
 
-def _value(config: Config, key: str) -> Any:
-    section, _, name = key.partition(".")
-    value = getattr(getattr(config, section), name)
-    return NO_LIMIT if value is None else value
+def _value(config: Config, name: str, key: str) -> Any:
+    """As ROS has it: what is no number, word or switch is YAML, what is empty an empty word."""
+    value = values(config)[key]
+    if value is None:
+        return NO_LIMIT if name == "max_cluster_size" else ""
+    return value if isinstance(value, bool | int | float | str) else _yaml(value)
 
 
-def _text(key: str, value: Any) -> str:
-    unlimited = key == "clustering.max_cluster_points" and value == NO_LIMIT
-    return "null" if unlimited else str(value)
+def _text(value: Any) -> str:
+    return _yaml(value) if isinstance(value, bool | list | tuple) or hasattr(value, "tolist") else str(value)
 
 
-def _descriptor(key: str) -> Any:
+def _yaml(value: Any) -> str:
+    """On one line; JSON is YAML."""
+    return json.dumps(value, default=lambda other: other.tolist() if hasattr(other, "tolist") else str(other))
+
+
+def _descriptor(about: str) -> Any:
     from rcl_interfaces.msg import ParameterDescriptor
 
     # Typed by the configuration: `ros2 param set` takes 20 for an integer where 20.0 is meant.
-    return ParameterDescriptor(description=keys()[key], dynamic_typing=True)
+    return ParameterDescriptor(description=about, dynamic_typing=True)

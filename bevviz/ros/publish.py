@@ -1,4 +1,4 @@
-"""What the tutorial's four nodes publish, from bevviz's results: for RViz, and to stand in for them."""
+"""What the tutorial's four nodes publish, from bevviz's results, and tracks: for RViz, and to stand in."""
 
 from __future__ import annotations
 
@@ -10,8 +10,15 @@ import numpy as np
 from bevviz import geometry
 from bevviz.config import Config
 from bevviz.errors import UserError
-from bevviz.frame import F32, F64, I64, Boxes3D, Cloud, FrameResult, Image
-from bevviz.ros.encode import encode_boxes_2d, encode_boxes_3d, encode_cloud, encode_image, typestore
+from bevviz.frame import F32, F64, I64, Boxes3D, Cloud, FrameResult, Image, Tracks
+from bevviz.ros.encode import (
+    encode_boxes_2d,
+    encode_boxes_3d,
+    encode_cloud,
+    encode_image,
+    encode_markers,
+    typestore,
+)
 from bevviz.ros.typesupport import message_type
 
 BEV = "/visualization/bev_image"
@@ -19,12 +26,17 @@ OBSTACLES = "/lidar/points_no_ground"
 CLUSTERS = "/detection/lidar_clusters"
 DETECTIONS = "/detection/camera_2d"
 FUSED = "/detection/fused_3d"
+TRACKS = "/detection/tracks_3d"
+MARKERS = "/visualization/tracks"
+SPEED = "speed_m_s"  # class of a track's second result, whose score it is
 TOPICS = {
     BEV: "sensor_msgs/msg/Image",
     OBSTACLES: "sensor_msgs/msg/PointCloud2",
     CLUSTERS: "vision_msgs/msg/Detection3DArray",
     DETECTIONS: "vision_msgs/msg/Detection2DArray",
     FUSED: "vision_msgs/msg/Detection3DArray",
+    TRACKS: "vision_msgs/msg/Detection3DArray",
+    MARKERS: "visualization_msgs/msg/MarkerArray",
 }
 
 
@@ -32,7 +44,8 @@ class Publisher:
     """Publishes each result that somebody subscribes to, under the header of its cloud or image.
 
     Clusters are those that were kept, with ``cluster_<row>`` as their class. Fused boxes are the named
-    ones; the class follows behind ``cluster_<row>``, where the tutorial's nodes look for it.
+    ones; the class follows behind ``cluster_<row>``, where the tutorial's nodes look for it. Tracks have
+    their number as ``id`` and behind the class their speed; as markers any RViz shows them.
 
     Args:
         node: an rclpy node, whose remaps hold.
@@ -73,6 +86,24 @@ class Publisher:
             scored = zip(objects.cluster.tolist(), objects.names, objects.score.tolist(), strict=True)
             results = [[(f"cluster_{row}", 1.0), (name, score)] for row, name, score in scored]
             self._send(FUSED, encode_boxes_3d(stamp, frame_id, objects.boxes, results, back))
+
+        if result.tracks is not None:
+            self._send_tracks(result, result.tracks, back)
+
+    def _send_tracks(self, result: FrameResult, tracks: Tracks, back: F64 | None) -> None:
+        """Those that have a name, in the fixed frame where there is one."""
+        stamp, pose = result.frame.stamp, None if tracks.absolute else back
+        rows = np.flatnonzero(tracks.confirmed)
+        boxes, speed = _rows(tracks.boxes, rows), tracks.speed
+        if self._wanted(TRACKS):
+            results = [[(tracks.names[t], 1.0), (SPEED, float(speed[t]))] for t in rows.tolist()]
+            ids = [str(number) for number in tracks.id[rows].tolist()]
+            self._send(TRACKS, encode_boxes_3d(stamp, tracks.frame_id, boxes, results, pose, ids))
+        if self._wanted(MARKERS):
+            texts = [f"{tracks.names[t]} #{tracks.id[t]} {speed[t]:.1f} m/s" for t in rows.tolist()]
+            velocity, ids_ = tracks.velocity[rows], tracks.id[rows]
+            markers = encode_markers(stamp, tracks.frame_id, boxes, velocity, ids_, texts, pose)
+            self._send(MARKERS, markers)
 
     def _send_detections(self, result: FrameResult) -> None:
         for camera in result.cameras:

@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from posixpath import commonprefix
 from types import MappingProxyType
+from typing import Literal
 
 from bevviz.config import SourceConfig
 from bevviz.errors import UserError
@@ -57,6 +58,7 @@ class Roles:
     robot_clouds: tuple[str, ...] = ()  # of obstacles, where the ground stage is the robot's
     stages: tuple[str, ...] = ()  # the robot's results that our stages are taken from
     truth: str = ""
+    around: tuple[tuple[str, str, str], ...] = field(default=(), compare=False)  # topic, what it tells, type
     # What follows is for sentences: it changes with topics that play no role.
     camera_infos: tuple[str, ...] = field(default=(), compare=False)  # all of them, whoever uses them
     no_lidar: str = field(default="", compare=False)  # why there is none, and what would help
@@ -122,6 +124,19 @@ def foreign(topic: Topic, sensor: str = "") -> str:
     return next((why for of, kind, why in _FOREIGN if sensor in ("", of) and kind.search(topic.type)), "")
 
 
+MARK = "bevviz/mark"  # topic, in the namespace of the node
+_MARK = re.compile(rf"(^|/){MARK}$")
+
+Kind = Literal["mark", "status", "shape"]
+SHAPES = frozenset(
+    {"LaserScan", "Path", "PoseStamped", "OccupancyGrid", "MarkerArray", "Marker", "NavSatFix"}
+)
+_AROUND = {
+    "mark": "notes of people",
+    "status": "the robot's diagnostics",
+    "shape": "around perception",
+}
+
 STAGE_KINDS = {  # what the robot publishes as the result of a stage
     "ground.method": "PointCloud2",
     "clustering.method": "Detection3DArray",
@@ -181,7 +196,11 @@ def find_roles(
     _note(notes, [*boxes, *detections], "the robot's own result")
     for key, topic in staged.items():
         notes[topic.name] = f"the robot's own result, taken for the stage {key.partition('.')[0]}"
+    around = [(t.name, kind, t.kind) for t in topics if (kind := kind_of(t.name, t.kind)) is not None]
+    helps = {t.name: f"; no LiDAR: {why}" if (why := foreign(t, "LiDAR")) else "" for t in topics}
+    notes.update({name: f"shown: {_AROUND[kind]}{helps[name]}" for name, kind, _ in around})
     return Roles(
+        around=tuple(around),
         lidars=_names(lidars),
         lidar_names=tuple(names[: len(lidars)]),
         cameras=cameras,
@@ -455,3 +474,15 @@ def _unique_names(named: Sequence[tuple[str, Topic]]) -> list[str]:
             free, number = f"{name}_{number}", number + 1
         unique.append(free)
     return unique
+
+
+# --- around perception -------------------------------------------------------------------------
+
+
+def kind_of(topic: str, short: str) -> Kind | None:
+    """What a topic tells, by its name and its type without the package; None: nothing of this."""
+    if short == "String" and _MARK.search(topic):
+        return "mark"
+    if short == "DiagnosticArray":
+        return "status"
+    return "shape" if short in SHAPES else None

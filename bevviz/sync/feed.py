@@ -8,6 +8,7 @@ from functools import partial
 from typing import Any, Protocol, TypeVar
 
 from bevviz.frame import Image
+from bevviz.ros.around import decode_shapes, decode_statuses
 from bevviz.ros.messages import (
     StampedTransform,
     decode_acceleration,
@@ -107,4 +108,21 @@ def make_handlers(sync: Synchronizer, roles: Roles, decode: Callable[[M], Any]) 
         handlers[topic] = lambda m: sync.add_boxes(decode_detections_3d(decode(m), m.topic, m.received))
     if roles.truth:
         handlers[roles.truth] = lambda m: sync.add_truth(decode_detections_3d(decode(m), m.topic, m.received))
-    return handlers
+    return handlers | make_around_handlers(sync, roles, decode)
+
+
+def make_around_handlers(
+    sync: Synchronizer, roles: Roles, decode: Callable[[M], Any]
+) -> dict[str, Handler[M]]:
+    """Of the topics that say something around perception."""
+
+    def add(message: M, kind: str, short: str) -> None:
+        content = decode(message)
+        if kind == "mark":
+            sync.around.add_mark(content.data)
+        elif kind == "status":
+            sync.around.add_statuses(decode_statuses(content))
+        else:
+            sync.around.add_shapes(message.topic, decode_shapes(content, short, message.topic))
+
+    return {topic: partial(add, kind=kind, short=short) for topic, kind, short in roles.around}

@@ -31,6 +31,7 @@ from bevviz.frame import (
 from bevviz.plugins import TOPIC
 from bevviz.ros.messages import StampedTransform
 from bevviz.ros.roles import CameraRole, Roles, entity_name
+from bevviz.sync.around import Surroundings
 from bevviz.sync.clocks import Clocks
 from bevviz.sync.tf import Lookup, Origin, TransformBuffer, TransformError
 from bevviz.sync.upright import Upright
@@ -247,6 +248,7 @@ class Synchronizer:
         self.tf = self.report.tf
         self.upright = Upright(self.tf, config.source.base_frame, config.sync.tf_tolerance)
         self.report.upright = self.upright.warnings
+        self.around = Surroundings()
         self.clocks = self.report.clocks = Clocks(config.sync.offsets, config.sync.by)
         self.report.clocked = (*roles.lidars, *(c.topic for c in roles.cameras), *roles.tf)
         self._roles = roles
@@ -290,6 +292,7 @@ class Synchronizer:
         self.report, self.absent = former.report, former.absent
         self.report.clocked = clocked
         self.tf, self.upright, self.clocks = former.tf, former.upright, former.clocks
+        self.around = former.around
         self.intrinsics, self._infos = former.intrinsics, former._infos
         self._odometry_frames = former._odometry_frames
         self._overtaken, self._places = former._overtaken, former._places
@@ -590,6 +593,7 @@ class Synchronizer:
             truth=truth[0] if truth else None,
             tf_age=place.tf_age,
             problems=tuple(problems),
+            around=self.around.take(lambda name: self._world_from(place, name)),
         )
         self._index += 1
         self._last = cloud.stamp
@@ -766,6 +770,16 @@ class Synchronizer:
         except TransformError:
             return None
         return geometry.inverse(place.points_from(found).matrix)
+
+    def _world_from(self, place: _Place, frame: str) -> F64 | None:
+        """world from a frame at the cloud's stamp; None where TF does not say."""
+        if not frame:
+            return None
+        from_points = self._mounting(place, frame)
+        if from_points is None:
+            return None
+        world = np.eye(4) if place.world_from_points is None else place.world_from_points
+        return world @ geometry.inverse(from_points)
 
     def _image(self, role: CameraRole, stamp: int, problems: list[str]) -> tuple[Image | None, int]:
         """The decoded image nearest to ``stamp``, and its stamp; without one, ``stamp``."""

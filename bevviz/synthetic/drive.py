@@ -241,8 +241,10 @@ class SyntheticSource:
         scenery = np.full(len(Material), OTHER_STRUCTURE, np.uint16)
         for material, number in SCENERY_LABELS.items():
             scenery[material] = number
-        kinds = [OBJECT_LABELS.get(actor.label, OTHER_OBJECT) for actor in self.world.actors]
-        of_object = np.array([0, *kinds], np.uint16)
+        actors = self.world.actors
+        of_object = np.zeros(1 + max((actor.number for actor in actors), default=0), np.uint16)
+        for actor in actors:
+            of_object[actor.number] = OBJECT_LABELS.get(actor.label, OTHER_OBJECT)
         return np.where(scan.object > 0, of_object[scan.object], scenery[scan.material])
 
     def _truth(self, stamp: int, time: float, map_from_lidar: F64) -> tuple[LabelledBoxes3D, I32]:

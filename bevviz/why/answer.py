@@ -226,7 +226,8 @@ def _in_vain(search: Search) -> str:
     helps = "that was tried does not help" if search.tried == 1 else "that were tried helps"
     if search.then is None:
         return f"{count} {helps}"
-    return f"{count} {helps}: with {', '.join(search.furthest)} it is lost as '{search.then.value}'"
+    what = "reported, but" if search.reported else "lost as"
+    return f"{count} {helps}: with {', '.join(search.furthest)} it is {what} '{search.then.value}'"
 
 
 def _rank(answer: Answer) -> tuple[bool, bool, bool, bool, bool, float]:

@@ -23,6 +23,7 @@ from bevviz.why.traces import Traces
 from bevviz.why.verdict import FLAWED, Reason, find_reason
 
 TRIES = 10  # configurations that are run for one subject
+SURE = 0.5  # IoU of a detection with its object that leaves no doubt
 FURTHER = 10  # more of them, that go on from where the first have brought it
 RESULTS = 20  # of other configurations that are kept, for further subjects of the frame
 
@@ -44,6 +45,17 @@ _SECTION = {  # whose parameters may help, by the reason
 
 
 _ORDER = {reason: place for place, reason in enumerate(Reason)}  # along the stages
+
+
+@dataclass(frozen=True, slots=True)
+class _Stage:
+    """How far a subject came."""
+
+    reported: bool
+    reason: Reason
+
+    def __gt__(self, other: _Stage) -> bool:
+        return (self.reported, _ORDER[self.reason]) > (other.reported, _ORDER[other.reason])
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,13 +81,15 @@ class Search:
         hints: the best that changes the verdict; empty: none of those that were tried does.
         tried: configurations that were run.
         furthest: settings that bring it to a later stage, where none helps; empty: none does.
-        then: why it is not reported with these.
+        then: why it is not reported with these, or what is wrong with how it is.
+        reported: whether it is.
     """
 
     hints: tuple[Hint, ...]
     tried: int
     furthest: tuple[str, ...] = ()
     then: Reason | None = None
+    reported: bool = False
 
 
 class WhatIf:
@@ -98,7 +112,7 @@ class WhatIf:
         that bring it to a later stage are joined with what the reason there suggests.
         """
         found: list[Hint] = []
-        reached: dict[Reason, tuple[Change, Evidence, Traces]] = {}  # later reasons, by the mildest change
+        reached: dict[_Stage, tuple[Change, Evidence, Traces]] = {}  # by the mildest change
         tried = 0
 
         def ways() -> Iterator[Change]:
@@ -114,19 +128,19 @@ class WhatIf:
             then = gather(subject, after)
             new, now_reported = find_reason(subject, then, after)
             text, own = _outcome(subject, (reason, reported), (new, now_reported), then, after)
-            if text:
+            if text and _is_sure(subject, change, then):
                 row = subject.row if subject.kind == "truth" else -1
                 objects, then_objects = self._result.objects, after.result.objects
                 harm = effects(objects, then_objects, self._traces.truth, row, own)
                 found.append(Hint(_settings(change), text, harm))
                 if not found[-1].effects.harm:
                     break
-            elif not now_reported and _ORDER[new] > _ORDER[reason]:
-                reached.setdefault(new, (change, then, after))
+            elif not text and (stage := _Stage(now_reported, new)) > _Stage(reported, reason):
+                reached.setdefault(stage, (change, then, after))
         if found or not reached:
             return Search(tuple(sorted(found, key=lambda hint: hint.effects.harm)[:1]), tried)
-        last = max(reached, key=_ORDER.__getitem__)
-        return Search((), tried, _settings(reached[last][0]), last)
+        last = max(reached)
+        return Search((), tried, _settings(reached[last][0]), last.reason, last.reported)
 
     def _run(self, change: Change) -> Traces | None:
         key = tuple(change.items())
@@ -193,18 +207,28 @@ def _outcome(
     return f"it is cluster {named.cluster} then, named {named.name}", named.row
 
 
+def _is_sure(subject: Subject, change: Change, e: Evidence) -> bool:
+    """Whether a detection that other limits let pass is the subject's own without a doubt."""
+    if subject.kind != "truth" or e.named is None or e.named.detection < 0:
+        return True
+    if not any(key.startswith(("detector.", "fusion.min", "fusion.split")) for key in change):
+        return True
+    camera, row = e.named.camera, e.named.detection
+    return any((c.camera, c.row) == (camera, row) and c.overlap >= SURE for c in e.candidates)
+
+
 def _settings(change: Change) -> tuple[str, ...]:
     return tuple(f"{key}={_written(value)}" for key, value in change.items())
 
 
-def _further(reached: Mapping[Reason, tuple[Change, Evidence, Traces]]) -> Iterator[Change]:
+def _further(reached: Mapping[_Stage, tuple[Change, Evidence, Traces]]) -> Iterator[Change]:
     """What might help in addition; ``reached`` may grow meanwhile. What came the farthest goes first."""
-    done: set[Reason] = set()
+    done: set[_Stage] = set()
     while left := reached.keys() - done:
-        reason = max(left, key=_ORDER.__getitem__)
-        done.add(reason)
-        change, evidence, after = reached[reason]
-        for more in _changes(evidence, reason, after):
+        stage = max(left)
+        done.add(stage)
+        change, evidence, after = reached[stage]
+        for more in _changes(evidence, stage.reason, after):
             yield {**change, **more}
 
 

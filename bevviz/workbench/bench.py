@@ -100,6 +100,7 @@ class Bench(Closing):
         self._tracks: dict[int, Tracks] = {}
         self._objects: dict[int, Objects | None] = {}
         self._layers: dict[tuple[int, bool], Layer] = {}  # by frame, and whether other values made it
+        self._recoloured: set[int] = set()  # frames whose raw cloud was drawn as other values have it
         self._onsets = Onsets()
         self._results: OrderedDict[tuple[int, Settings], FrameResult] = OrderedDict()
         self._variants, self._looking = Variants(drive.session.loader), threading.RLock()
@@ -141,6 +142,8 @@ class Bench(Closing):
             self._thread.join(PATIENCE)
         if self.native is not None:
             self.native.close()
+        for stream in (self._film_main, self._film_desk, self.trials.film):
+            stream.read()  # it would complain of what nobody has read
         self.film.close()
         self.desk.close()
         self.drive.close()
@@ -219,15 +222,21 @@ class Bench(Closing):
             self.opening = frame.stamp
             self.tell()
 
-    def _draw(self, logger: Logger, result: FrameResult, found: Sequence[Find], *, tried: bool) -> None:
+    def _draw(
+        self, logger: Logger, result: FrameResult, found: Sequence[Find], *, tried: bool, cloud: bool = False
+    ) -> None:
         layers: list[Layer] = []
-        logger.log(result, beside=lambda: layers.append(log_layer(logger, result, found)))
+        logger.log(result, beside=lambda: layers.append(log_layer(logger, result, found)), cloud=cloud)
         self._layers[result.frame.index, tried] = layers[0]
 
     def draw_tried(self, logger: Logger, result: FrameResult, found: Sequence[Find]) -> None:
         """A frame as other values make it, beside what the run has made of it."""
-        logger.refresh(self._logger.known)
-        self._draw(logger, result, found, tried=True)
+        logger.refresh(self._logger.results)
+        # Its colours tell ground from obstacles; once they are others, they have to be put back, too.
+        config, opened, number = result.config, self.drive.config, result.frame.index
+        if (config.voxel, config.ground) != (opened.voxel, opened.ground):
+            self._recoloured.add(number)
+        self._draw(logger, result, found, tried=True, cloud=number in self._recoloured)
 
     def end(self) -> None:
         """The run's last numbers."""

@@ -84,7 +84,7 @@ class Trials:
 
     def __init__(self, bench: Bench, news: Callable[[], None]) -> None:
         self._bench, self._news = bench, news
-        self._recording, self._film = bench.stream()
+        self._recording, self.film = bench.stream()
         self._thread: threading.Thread | None = None
         self.trial: Trial | None = None
 
@@ -129,7 +129,7 @@ class Trials:
         self._news()
 
     def _show(self) -> None:
-        self._bench.film.add(self._film.read())
+        self._bench.film.add(self.film.read())
         self._news()
 
 

@@ -52,6 +52,10 @@ function nothing(message) {
 }
 
 function failed(message) {
+  if (message.id === trying) {
+    $("effect").textContent = message.text;
+    return;
+  }
   if (message.id !== newest() && message.id !== asking) return;
   $("answer").className = "missed";
   $("verdict").textContent = message.text;

@@ -1,0 +1,156 @@
+"""Ours against the robot's, while both run: what ``bevviz compare --robot`` tells of a bag."""
+
+from __future__ import annotations
+
+import threading
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from bevviz import geometry
+from bevviz.compare.differences import Change, Difference, FrameDifferences, Seen, differences, seen
+from bevviz.compare.log import place
+from bevviz.compare.sides import published, robot_topic
+from bevviz.config import LiveConfig
+from bevviz.errors import UserError
+from bevviz.frame import F64, Boxes3D, FrameResult, LabelledBoxes3D
+
+SECOND = 1_000_000_000
+WAITING = 50  # frames that the robot may still say something of
+
+
+@dataclass(frozen=True, slots=True)
+class Ours:
+    """What is remembered of a frame: small."""
+
+    index: int
+    stamp: int
+    received: int
+    world_from_points: F64
+    seen: Seen
+
+
+@dataclass(frozen=True, slots=True)
+class Compared:
+    """How both differ in a frame."""
+
+    found: FrameDifferences
+    received: int
+    world_from_points: F64
+
+
+class AgainstRobot:
+    """Compares each frame with what the robot published of it, when it did.
+
+    A frame that the robot says nothing of is left out and counted. For one thread, but for ``reason``.
+
+    Args:
+        asked: the robot's Detection3DArray topic; empty: the one whose name says so.
+        config: from what on both differ.
+    """
+
+    def __init__(self, asked: str, config: LiveConfig) -> None:
+        self.config = config
+        self.topic = ""  # known when the robot has said something
+        self.frames = self.differing = 0
+        self.problem = ""  # why nothing is compared
+        self._asked = asked
+        self._topics: set[str] = set()
+        self._waiting: deque[Ours] = deque(maxlen=WAITING)
+        self._since: int | None = None  # stamp from which on both differ in every frame
+        self._fired = False
+        self._reason = ""
+        self._lock = threading.Lock()
+
+    @property
+    def names(self) -> tuple[str, str]:
+        """Of the two sides."""
+        return "bevviz", f"the robot's {self.topic or self._asked or 'fused boxes'}"
+
+    def see(self, result: FrameResult, late: Sequence[tuple[int, LabelledBoxes3D]] = ()) -> list[Compared]:
+        """Take in a frame.
+
+        Args:
+            result: of it.
+            late: the robot's boxes that came too late for their frame, with the stamp of that frame.
+
+        Returns:
+            What can be compared now.
+        """
+        frame = result.frame
+        for labelled in (*frame.robot_boxes, *(boxes for _, boxes in late)):
+            self._choose(labelled.topic)
+        ours = Ours(frame.index, frame.stamp, frame.received, frame.pose, seen(result))
+        compared = []
+        for stamp, boxes in late:
+            former = next((o for o in self._waiting if o.stamp == stamp), None)
+            if former is not None and boxes.topic == self.topic:
+                self._waiting.remove(former)
+                compared.append(self._compare(former, _placed(boxes, former.world_from_points)))
+        theirs = published(frame, self.topic, result.config) if self.topic else None
+        if theirs is None:
+            self._waiting.append(ours)
+        else:
+            compared.append(self._compare(ours, seen(theirs)))
+        return compared
+
+    def reason(self) -> str | None:
+        """Why the flight recorder should save: both have differed for ``live.robot_time``; once each time."""
+        with self._lock:
+            reason, self._reason = self._reason, ""
+        return reason or None
+
+    def _choose(self, topic: str) -> None:
+        if topic in self._topics:
+            return
+        self._topics.add(topic)
+        try:
+            self.topic, self.problem = robot_topic(tuple(sorted(self._topics)), self._asked), ""
+        except UserError as error:
+            self.topic, self.problem = "", str(error)
+
+    def _compare(self, ours: Ours, theirs: Seen) -> Compared:
+        found = differences(ours.index, ours.stamp, ours.seen, theirs)
+        different = [d for d in found.objects if self._differs(d)]
+        self.frames += 1
+        self.differing += bool(different)
+        if not different:
+            self._since, self._fired = None, False
+        elif self._since is None or ours.stamp < self._since:
+            self._since = ours.stamp
+        if self._since is not None and self.config.robot_time is not None and not self._fired:
+            lasted = (ours.stamp - self._since) / SECOND
+            if lasted >= self.config.robot_time:
+                self._fired = True
+                words = ", ".join(f"{_words(d)} {place(d, found)}" for d in different[:3])
+                more = f" and {len(different) - 3} more" if different[3:] else ""
+                with self._lock:
+                    self._reason = f"robot and ours differ for {lasted:.1f} s: {words}{more}"
+        return Compared(found, ours.received, ours.world_from_points)
+
+    def _differs(self, difference: Difference) -> bool:
+        if difference.change is Change.MOVED:
+            return difference.distance > self.config.robot_tolerance
+        return difference.change is not Change.SAME
+
+
+def _words(difference: Difference) -> str:
+    if difference.change is Change.ONLY_A:
+        return f"{difference.name_a} of ours alone"
+    if difference.change is Change.ONLY_B:
+        return f"{difference.name_b} of the robot alone"
+    if difference.change is Change.CLASS:
+        return f"our {difference.name_a} is the robot's {difference.name_b}"
+    return f"{difference.name_a} {difference.distance:.2f} m apart"
+
+
+def _placed(labelled: LabelledBoxes3D, world_from_points: F64) -> Seen:
+    """The robot's boxes in the frame of the points of a former frame."""
+    world = np.eye(4) if labelled.world_from_boxes is None else labelled.world_from_boxes
+    turn = geometry.inverse(world_from_points) @ world
+    boxes = labelled.boxes
+    yaw = boxes.yaw + np.float32(geometry.yaw(turn))
+    moved = Boxes3D(geometry.apply(turn, boxes.center), boxes.size, yaw)
+    return Seen(moved, labelled.labels, labelled.scores)

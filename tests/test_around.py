@@ -1,0 +1,195 @@
+"""What a robot publishes around its perception, decoded, kept and logged."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import rerun as rr
+
+from bevviz.config import load
+from bevviz.frame import Frame, FrameResult, Scene, Shape, Status
+from bevviz.logging.logger import Logger
+from bevviz.ros.around import decode_shapes, decode_statuses
+from bevviz.ros.encode import typestore
+from bevviz.ros.messages import MessageError
+from bevviz.ros.roles import kind_of
+from bevviz.sync.around import MANY, Surroundings
+from bevviz.synthetic import SyntheticSource
+from bevviz.synthetic.sensors import Lidar, PinholeCamera
+from tests.recordings import Recording
+
+
+def make(kind: str, **values: Any) -> Any:
+    return typestore().types[kind](**values)
+
+
+def header(frame: str = "map", stamp: int = 7) -> Any:
+    return make(
+        "std_msgs/msg/Header", stamp=make("builtin_interfaces/msg/Time", sec=0, nanosec=stamp), frame_id=frame
+    )
+
+
+def pose(x: float = 0.0, y: float = 0.0, yaw: float = 0.0) -> Any:
+    return make(
+        "geometry_msgs/msg/Pose",
+        position=make("geometry_msgs/msg/Point", x=x, y=y, z=0.0),
+        orientation=make("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=np.sin(yaw / 2), w=np.cos(yaw / 2)),
+    )
+
+
+def grid(cells: list[int], width: int, height: int) -> Any:
+    zero = make("builtin_interfaces/msg/Time", sec=0, nanosec=0)
+    about = make(
+        "nav_msgs/msg/MapMetaData",
+        map_load_time=zero,
+        resolution=0.5,
+        width=width,
+        height=height,
+        origin=pose(1.0),
+    )
+    return make("nav_msgs/msg/OccupancyGrid", header=header(), info=about, data=np.array(cells, np.int8))
+
+
+def marker(kind: int, points: list[tuple[float, float, float]] | None = None, **more: Any) -> Any:
+    lasting = make("builtin_interfaces/msg/Duration", sec=0, nanosec=0)
+    values: dict[str, Any] = {
+        "header": header(),
+        "ns": "wall",
+        "id": 3,
+        "type": kind,
+        "action": 0,
+        "pose": pose(2.0, yaw=np.pi / 2),
+        "scale": make("geometry_msgs/msg/Vector3", x=4.0, y=2.0, z=1.0),
+        "color": make("std_msgs/msg/ColorRGBA", r=1.0, g=0.5, b=0.0, a=1.0),
+        "lifetime": lasting,
+        "frame_locked": False,
+        "points": [make("geometry_msgs/msg/Point", x=x, y=y, z=z) for x, y, z in points or ()],
+        "colors": [],
+        "texture_resource": "",
+        "texture": None,
+        "uv_coordinates": [],
+        "text": "",
+        "mesh_resource": "",
+        "mesh_file": None,
+        "mesh_use_embedded_materials": False,
+    }
+    return make("visualization_msgs/msg/Marker", **(values | more))
+
+
+def test_a_laser_scan_has_the_points_within_its_range() -> None:
+    scan = make(
+        "sensor_msgs/msg/LaserScan",
+        header=header("laser"),
+        angle_min=0.0,
+        angle_max=np.pi,
+        angle_increment=np.pi / 2,
+        time_increment=0.0,
+        scan_time=0.0,
+        range_min=0.1,
+        range_max=10.0,
+        ranges=np.array([2.0, np.inf, 3.0], np.float32),
+        intensities=np.zeros(0, np.float32),
+    )
+    (shape,) = decode_shapes(scan, "LaserScan", "/scan")
+    assert shape.points is not None and (shape.topic, shape.frame_id, shape.stamp) == ("/scan", "laser", 7)
+    np.testing.assert_allclose(shape.points, [[2, 0, 0], [-3, 0, 0]], atol=1e-6)
+
+
+def test_a_map_has_its_cells_and_its_place() -> None:
+    (shape,) = decode_shapes(grid([0, 100, -1, 50, 0, 0], 3, 2), "OccupancyGrid", "/map")
+    assert shape.grid is not None and shape.grid.resolution == 0.5
+    assert shape.grid.cells.tolist() == [[0, 100, -1], [50, 0, 0]]
+    assert shape.grid.pose[:3, 3].tolist() == [1, 0, 0]
+    with pytest.raises(MessageError, match=r"/map: 5 cells in a map of 3 x 2"):
+        decode_shapes(grid([0] * 5, 3, 2), "OccupancyGrid", "/map")
+
+
+def test_a_marker_is_where_its_pose_says() -> None:
+    line = [(0.0, 0.0, 0.0), (1.0, 0.0, 0.0)]
+    markers = [
+        marker(1),
+        marker(4, line),
+        marker(5, line * 2),
+        marker(8, line),
+        marker(2),
+        marker(10),
+        marker(1, action=2),
+    ]
+    shapes = decode_shapes(make("visualization_msgs/msg/MarkerArray", markers=markers), "MarkerArray", "/m")
+    cube, strip, lines, points, sphere = shapes  # no mesh, nothing that is deleted
+    assert cube.topic == "/m/wall/3" and cube.color is not None and cube.color.tolist() == [255, 128, 0, 255]
+    assert cube.solids is not None and cube.solids.half.tolist() == [[2, 1, 0.5]] and not cube.solids.round
+    np.testing.assert_allclose(cube.solids.quaternion, [[0, 0, 0.5**0.5, 0.5**0.5]], atol=1e-6)
+    np.testing.assert_allclose(strip.strips[0], [[2, 0, 0], [2, 1, 0]], atol=1e-6)
+    assert len(lines.strips) == 2 and points.points is not None and len(points.points) == 2
+    assert sphere.solids is not None and sphere.solids.round
+
+
+def test_statuses_and_what_a_topic_tells() -> None:
+    status = make(
+        "diagnostic_msgs/msg/DiagnosticStatus", level=9, name="fan", message="odd", hardware_id="", values=[]
+    )
+    array = make("diagnostic_msgs/msg/DiagnosticArray", header=header(), status=[status])
+    assert decode_statuses(array) == [Status("fan", "error", "odd")]
+    kinds = {
+        ("/robot1/bevviz/mark", "String"): "mark",
+        ("/chatter", "String"): None,
+        ("/scan", "LaserScan"): "shape",
+    }
+    assert {topic: kind_of(*topic) for topic in kinds} == kinds
+
+
+def test_what_is_kept_is_bounded_and_marks_are_for_one_frame() -> None:
+    around = Surroundings()
+    assert around.take(lambda name: np.eye(4)) is None
+    around.add_mark("here")
+    around.add_statuses([Status(str(k), "ok", "") for k in range(3 * MANY)])
+    around.add_shapes("/m", [Shape("/m", "map", k) for k in range(3 * MANY)])
+    taken = around.take(lambda name: None)
+    assert taken is not None and taken.marks == ("here",)
+    assert len(taken.statuses) == len(taken.shapes) == MANY and taken.shapes[0].world_from_shape is None
+    again = around.take(lambda name: np.eye(4))
+    assert again is not None and again.marks == () and again.shapes[0].world_from_shape is not None
+
+
+@pytest.fixture
+def frame() -> Frame:
+    source = SyntheticSource(
+        frames=1, lidar=Lidar(beams=8, azimuths=90), camera=PinholeCamera(width=64, height=36, focal=44.0)
+    )
+    return source.snapshot(0).frame
+
+
+def test_shapes_are_logged_once_and_cleared_when_they_are_gone(frame: Frame, tmp_path: Path) -> None:
+    config, around = load(), Surroundings()
+    around.add_shapes("/map", decode_shapes(grid([0, 100, -1, 50, 0, 0], 3, 2), "OccupancyGrid", "/map"))
+    around.add_shapes("/m", decode_shapes(marker(1), "Marker", "/m"))
+    path = tmp_path / "around.rrd"
+    with rr.RecordingStream("test") as recording:
+        recording.save(path)
+        logger = Logger(recording, config, Scene("test", frame.lidar))
+        logger.log_static()
+        for index in range(3):
+            if index == 2:
+                around.add_shapes("/m", [])
+            now = replace(
+                frame, index=index, stamp=frame.stamp + index, around=around.take(lambda name: np.eye(4))
+            )
+            logger.log(FrameResult.unprocessed(now, config))
+    logged = Recording(path)
+    (number,) = logged.at["/robot/map"]["GridMap:data"]
+    data = logged.at["/robot/map"]["GridMap:data"][number][0]
+    assert number == 0 and np.array(data, np.uint8).view(np.int8).tolist() == [
+        50,
+        0,
+        0,
+        0,
+        100,
+        -1,
+    ]  # top first
+    assert list(logged.at["/robot/m/wall/3"]["Boxes3D:half_sizes"]) == [0]
+    assert logged.cleared("/robot/m/wall/3") == {2} and logged.cleared("/robot/map") == set()

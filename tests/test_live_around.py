@@ -1,0 +1,259 @@
+"""Around perception, on a real graph: marks, diagnostics of both sides, shapes; the bag tells the same."""
+
+from __future__ import annotations
+
+import random
+import subprocess
+import threading
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from bevviz.bags.source import BagSource
+from bevviz.config import load
+from bevviz.frame import Frame, FrameResult
+from bevviz.ros.encode import typestore
+from bevviz.session import Session
+from bevviz.synthetic import SyntheticSource
+from bevviz.synthetic.drive import TRUTH_TOPIC
+from tests.recordings import Recording
+from tests.ros_player import Play
+
+pytest.importorskip("rclpy", reason="needs rclpy: pip install 'bevviz[ros]'")
+
+from bevviz.live.notes import Notes
+from bevviz.live.raw import RawRecorder
+from bevviz.live.runtime import Live, Outputs
+from bevviz.live.settings import Settings
+from bevviz.live.source import LiveSource
+from bevviz.ros.diagnostics import TYPE, Diagnostics
+from bevviz.ros.node import Node
+from bevviz.ros.typesupport import message_type
+
+PATIENCE = 60.0
+BOXES = "vision_msgs/msg/Detection3DArray"
+MARK = "the person behind the van"
+
+
+@dataclass
+class Flight:
+    folder: Path
+    frames: list[Frame]
+    heard: list[Any]  # what bevviz said on /diagnostics
+    said: list[str]  # on the terminal
+    live: Live
+
+
+def until(condition: Callable[[], object], what: str) -> None:
+    end = time.monotonic() + PATIENCE
+    while not condition():
+        assert time.monotonic() < end, f"never: {what}"
+        time.sleep(0.05)
+
+
+def make(kind: str, **values: Any) -> Any:
+    return typestore().types[kind](**values)
+
+
+def header(frame: str) -> Any:
+    return make(
+        "std_msgs/msg/Header", stamp=make("builtin_interfaces/msg/Time", sec=0, nanosec=0), frame_id=frame
+    )
+
+
+def pose(x: float) -> Any:
+    point = make("geometry_msgs/msg/Point", x=x, y=0.0, z=0.0)
+    turn = make("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=0.0, w=1.0)
+    return make("geometry_msgs/msg/Pose", position=point, orientation=turn)
+
+
+class Robot:
+    """What it publishes beside what the player does."""
+
+    def __init__(self, node: Any) -> None:
+        self.node = node
+        self.publishers: dict[str, Any] = {}
+
+    def say(self, topic: str, kind: str, message: Any) -> None:
+        if topic not in self.publishers:
+            self.publishers[topic] = self.node.create_publisher(message_type(kind), topic, 10)
+        self.publishers[topic].publish(bytes(typestore().serialize_cdr(message, kind)))
+
+    def status(self, level: int, text: str) -> None:
+        status = make(
+            "diagnostic_msgs/msg/DiagnosticStatus",
+            level=level,
+            name="lidar/fan",
+            message=text,
+            hardware_id="",
+            values=[],
+        )
+        self.say("/diagnostics", TYPE, make(TYPE, header=header(""), status=[status]))
+
+    def objects(self, data: bytes) -> None:
+        """The ground truth as what is ours, and as the robot's own, a metre further."""
+        message: Any = typestore().deserialize_cdr(data, BOXES)
+        self.say("/ours/objects", BOXES, message)
+        for detection in message.detections:
+            detection.bbox.center.position.x += 1.0
+        self.say("/detection/fused_3d", BOXES, message)
+
+    def path(self) -> None:
+        poses = [
+            make("geometry_msgs/msg/PoseStamped", header=header("map"), pose=pose(x)) for x in (0.0, 1.0, 2.0)
+        ]
+        self.say("/plan", "nav_msgs/msg/Path", make("nav_msgs/msg/Path", header=header("map"), poses=poses))
+
+
+@pytest.fixture(scope="module")
+def flight(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Flight]:
+    folder = tmp_path_factory.mktemp("around")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("ROS_DOMAIN_ID", str(random.randint(1, 101)))
+        patch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+        patch.setenv("XDG_RUNTIME_DIR", str(folder))
+        patch.chdir(folder)
+        play = Play(frames=3, points=5_000)
+        with subprocess.Popen(
+            play.arguments(), cwd=Path(__file__).parents[1], stdout=subprocess.PIPE, text=True
+        ) as player:
+            try:
+                assert player.stdout is not None and player.stdout.readline() == "playing\n"
+                yield fly(folder)
+            finally:
+                player.terminate()
+
+
+def fly(folder: Path) -> Flight:
+    frames: list[Frame] = []
+    heard: list[Any] = []
+    said: list[str] = []
+    asked = ["objects.method=topic:/ours/objects", "live.robot_time=0.5 s", "live.trigger_after=0"]
+    settings = Settings(None, ["live.flight_time=20 s", *asked])
+    Session(settings.config).run(SyntheticSource(frames=1).snapshot(0).frame)  # what is compiled, is
+    raw = RawRecorder(settings.config.live)
+    with Node(name="robot") as node:
+        node.start()
+        robot = Robot(node.node)
+
+        def hear(data: bytes) -> None:
+            told: Any = typestore().deserialize_cdr(data, TYPE)
+            heard.extend(status for status in told.status if status.name.startswith("bevviz"))
+
+        node.node.create_subscription(message_type(TYPE), "/diagnostics", hear, 10, raw=True)
+        node.node.create_subscription(message_type(BOXES), TRUTH_TOPIC, robot.objects, 10, raw=True)
+        with LiveSource(settings.config, raw=raw) as source:
+            assert source.wait(PATIENCE), source.missing
+            diagnostics = Diagnostics(source.node)
+
+            def on_result(result: FrameResult) -> None:
+                frames.append(result.frame)
+                diagnostics.see(result)
+
+            live = Live(
+                source, settings, Outputs(), Notes(said.append), on_result=on_result, raw=raw, robot=""
+            )
+            diagnostics.every_second(lambda: diagnostics.publish(live.numbers, ["two LiDARs are one"]))
+
+            def latest(condition: Callable[[Any], object]) -> Callable[[], bool]:
+                return lambda: bool(frames and frames[-1].around and condition(frames[-1].around))
+
+            def during() -> None:
+                try:
+                    until(lambda: live.frames > 2, "frames")
+                    for text, level in (("spins", 0), ("is slow", 1)):
+                        robot.status(level, text)
+                        robot.path()
+
+                        def told(around: Any, text: str = text, level: int = level) -> bool:
+                            robot.status(level, text)
+                            robot.path()
+                            return bool(around.shapes and any(s.text == text for s in around.statuses))
+
+                        until(latest(told), text)
+                    mark = node.node.create_publisher(message_type("std_msgs/msg/String"), "/bevviz/mark", 10)
+                    until(mark.get_subscription_count, "somebody who hears marks")
+                    text = make("std_msgs/msg/String", data=MARK)
+                    mark.publish(bytes(typestore().serialize_cdr(text, "std_msgs/msg/String")))
+                    until(lambda: any(f.around and f.around.marks for f in list(frames)), "the mark")
+                    until(
+                        lambda: {s.name for s in heard} >= {f"bevviz: {p}" for p in PARTS}, "our diagnostics"
+                    )
+                    until(lambda: any("robot and ours differ" in text for text in said), "a save for that")
+                    count = live.frames
+                    until(lambda: live.frames > count + 3, "more frames")
+                    live.save(Path("snap.rrd"))
+                finally:
+                    live.stop()
+
+            thread = threading.Thread(target=during)
+            thread.start()
+            live.run()
+            thread.join()
+    return Flight(folder, frames, heard, said, live)
+
+
+PARTS = ("pipeline", "anomalies", "sources")
+
+
+def test_a_mark_is_a_note_at_one_frame(flight: Flight) -> None:
+    marked = [frame.index for frame in flight.frames if frame.around and frame.around.marks == (MARK,)]
+    assert len(marked) == 1
+    recording = Recording(flight.folder / "snap.rrd")
+    logged = [row for row in recording.rows["/explain/log"] if MARK in str(row["TextLog:text"])]
+    assert [row["frame"] for row in logged] == marked
+    lane = recording.at["/explain/states/marks"]["StateChange:state"]
+    assert {number: value[0] for number, value in lane.items() if value[0]} == {marked[0]: MARK}
+    assert f"- {MARK}" in recording.at["/explain"]["TextDocument:text"][marked[0]][0]
+
+
+def test_the_robots_diagnostics_have_lanes_and_lines(flight: Flight) -> None:
+    recording = Recording(flight.folder / "snap.rrd")
+    changes = recording.column("/robot/diagnostics/lidar_fan", "StateChange:state")
+    assert [value[0] for value in changes] == ["ok", "warning"]
+    texts = [text for row in recording.rows["/explain/log"] for text in row["TextLog:text"] or ()]
+    assert texts.count("diagnostics: lidar/fan: warning, is slow") == 1
+
+
+def test_ours_against_the_robots(flight: Flight) -> None:
+    against = flight.live.against
+    assert against is not None and against.topic == "/detection/fused_3d"
+    assert against.frames > 3 and against.differing == against.frames
+    recording = Recording(flight.folder / "snap.rrd")
+    moved = [value[0] for value in recording.column("/compare/count/moved", "Scalars:scalars")]
+    (only,) = {value[0] for value in recording.column("/compare/count/only_a", "Scalars:scalars")}
+    assert min(moved) >= 1 and only == 0
+    assert "/compare/objects/moved" in recording.at and recording.static["/compare/about"]
+    (told,) = [text for text in flight.said if "robot and ours differ" in text]
+    assert "1.00 m apart" in told and told.startswith("flight recorder saved in flight_")
+
+
+def test_what_bevviz_says_of_itself(flight: Flight) -> None:
+    by_name = {status.name: status for status in flight.heard}
+    assert set(by_name) == {f"bevviz: {part}" for part in PARTS}
+    assert int(by_name["bevviz: sources"].level) == 1
+    assert by_name["bevviz: sources"].message == "two LiDARs are one"
+    numbers = {pair.key: pair.value for pair in by_name["bevviz: pipeline"].values}
+    assert float(numbers["frames"]) > 0 and float(numbers["raw_mb"]) > 0 and "dropped: source" in numbers
+
+
+def test_a_plan_is_shown_where_it_is(flight: Flight) -> None:
+    recording = Recording(flight.folder / "snap.rrd")
+    (strip,) = recording.column("/robot/plan", "LineStrips3D:strips")[-1]
+    assert [point[0] for point in strip] == [0.0, 1.0, 2.0]
+    (shape,) = flight.frames[-1].around.shapes if flight.frames[-1].around else ()
+    assert shape.world_from_shape is not None and shape.frame_id == "map"
+
+
+def test_the_bag_tells_the_same(flight: Flight) -> None:
+    with BagSource([flight.folder / "snap.mcap"], load()) as source:
+        frames = list(source)
+        assert source.roles.notes["/plan"] == "shown: around perception"
+    assert [f.around.marks for f in frames if f.around and f.around.marks] == [(MARK,)]
+    last = frames[-1].around
+    assert last is not None and len(last.shapes) == 1
+    assert {(s.name, s.level) for s in last.statuses if s.name == "lidar/fan"} == {("lidar/fan", "warning")}

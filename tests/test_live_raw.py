@@ -1,0 +1,246 @@
+"""The raw seconds: what is kept of the messages beside the frames, and that it gives the same again."""
+
+from __future__ import annotations
+
+import errno
+import random
+import subprocess
+import threading
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from rosbags.highlevel import AnyReader
+from rosbags.interfaces import Connection, ConnectionExtRosbag2, MessageDefinition, MessageDefinitionFormat
+from ruamel.yaml import YAML
+
+from bevviz.bags.info import describe
+from bevviz.bags.mcap_writer import McapWriter
+from bevviz.bags.source import BagSource
+from bevviz.config import load
+from bevviz.errors import UserError
+from bevviz.files import write_all
+from bevviz.frame import FrameResult
+from bevviz.report.digest import compare, digest
+from bevviz.run import Observer
+from bevviz.run import run as run_frames
+from bevviz.session import Session
+from bevviz.synthetic import SyntheticSource
+from bevviz.synthetic.bag import TOPICS
+from bevviz.synthetic.drive import LIDAR_TOPIC
+from tests.recordings import Recording, verify
+from tests.ros_player import Play
+
+pytest.importorskip("rclpy", reason="needs rclpy: pip install 'bevviz[ros]'")
+
+from bevviz.live.notes import Notes
+from bevviz.live.raw import Earlier, RawMessage, RawRecorder, children, define
+from bevviz.live.runtime import Live, Outputs
+from bevviz.live.settings import Settings
+from bevviz.live.source import LiveSource
+from bevviz.ros.encode import encode_transforms, typestore
+from bevviz.ros.node import Node
+
+PATIENCE = 60.0
+WAIT = "sync.max_wait=10 s"  # on a busy machine a message may come late; then it is waited for
+SECONDS = 3.0  # that the flight recorder holds: less than the run takes
+
+
+@dataclass
+class Flight:
+    """A run beside a robot, what it made, and what it saved."""
+
+    folder: Path
+    results: dict[int, Any]  # stamp -> digest
+    said: list[str]
+    sizes: list[tuple[int, float]]  # of the raw recorder: bytes, seconds
+
+
+@pytest.fixture(scope="module")
+def flight(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Flight]:
+    folder = tmp_path_factory.mktemp("flight")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("ROS_DOMAIN_ID", str(random.randint(1, 101)))
+        patch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+        patch.setenv("XDG_RUNTIME_DIR", str(folder))
+        patch.chdir(folder)
+        play = Play(frames=4, points=10_000)
+        with subprocess.Popen(
+            play.arguments(), cwd=Path(__file__).parents[1], stdout=subprocess.PIPE, text=True
+        ) as robot:
+            try:
+                assert robot.stdout is not None and robot.stdout.readline() == "playing\n"
+                yield fly(folder)
+            finally:
+                robot.terminate()
+
+
+def fly(folder: Path) -> Flight:
+    from rclpy.qos import DurabilityPolicy, QoSProfile
+    from std_msgs.msg import String
+
+    said: list[str] = []
+    results: dict[int, Any] = {}
+    sizes: list[tuple[int, float]] = []
+    settings = Settings(None, [f"live.flight_time={SECONDS} s", WAIT])
+    Session(settings.config).run(SyntheticSource(frames=1).snapshot(0).frame)  # what is compiled, is
+    raw = RawRecorder(settings.config.live)
+    with Node(name="robot") as robot:
+        robot.start()
+        latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        description = robot.node.create_publisher(String, "/robot_description", latched)
+        description.publish(String(data="<robot name='r'/>"))
+        with LiveSource(settings.config, tell=said.append, raw=raw) as source:
+            assert source.wait(PATIENCE), source.missing
+            live = Live(
+                source,
+                settings,
+                Outputs(save=Path("all.rrd"), raw=Path("all.mcap")),
+                Notes(said.append),
+                on_result=lambda result: results.update({result.frame.stamp: digest(result)}),
+                raw=raw,
+            )
+
+            def during() -> None:
+                end = time.monotonic() + 2.5 * SECONDS
+                while time.monotonic() < end:
+                    time.sleep(0.25)
+                    sizes.append((raw.size, raw.seconds))
+                live.save(Path("snap.rrd"))
+                live.stop()
+
+            thread = threading.Thread(target=during)
+            thread.start()
+            live.run()
+            thread.join()
+    return Flight(folder, results, said, sizes)
+
+
+class Digests(Observer[FrameResult]):
+    def __init__(self) -> None:
+        self.by_stamp: dict[int, Any] = {}
+        self.results: list[FrameResult] = []
+
+    def see(self, result: FrameResult) -> None:
+        self.by_stamp[result.frame.stamp] = digest(result)
+        self.results.append(result)
+
+
+@pytest.mark.parametrize("bag", ["snap.mcap", "all.mcap"])
+def test_the_messages_give_the_same_results_in_every_bit(flight: Flight, bag: str) -> None:
+    config = load(settings=[WAIT])
+    again = Digests()
+    with BagSource([flight.folder / bag], config) as source:
+        run_frames(source, Session(config), [again])
+        assert source.scene.lidar == "rslidar" and source.scene.cameras == ("zed",)
+    shown = Recording((flight.folder / bag).with_suffix(".rrd")).times["stamp"].values()
+    shared = flight.results.keys() & set(shown)
+    assert len(shared) > 5 and shared <= again.by_stamp.keys()
+    assert [found for s in shared if (found := compare(flight.results[s], again.by_stamp[s]))] == []
+    last = again.results[-1].frame
+    assert last.world_frame == "map" and last.cameras[0].intrinsics is not None
+
+
+def test_other_libraries_read_it(flight: Flight) -> None:
+    path = flight.folder / "snap.mcap"
+    verify(path.with_suffix(".rrd"))
+    with path.open("rb") as file:
+        reader = make_reader(file, validate_crcs=True)
+        assert reader.get_header().profile == "ros2"
+        summary = reader.get_summary()
+        assert summary is not None and summary.statistics is not None
+        channels = {channel.topic: channel for channel in summary.channels.values()}
+        assert channels.keys() >= {*TOPICS, "/robot_description"}
+        schemas = summary.schemas
+        for topic, kind in TOPICS.items():
+            schema = schemas[channels[topic].schema_id]
+            assert (schema.name, schema.encoding) == (kind, "ros2msg")
+            assert channels[topic].message_encoding == "cdr"
+            assert channels[topic].metadata["topic_type_hash"].startswith("RIHS01_")
+        (profile,) = YAML(typ="safe").load(channels["/tf_static"].metadata["offered_qos_profiles"])
+        assert (profile["durability"], profile["reliability"]) == ("transient_local", "reliable")
+        messages = list(reader.iter_messages(log_time_order=False))
+    times = [message.log_time for _, _, message in messages]
+    assert times == sorted(times)
+    assert {channel.topic for _, channel, _ in messages[:3]} >= {"/tf_static", "/robot_description"}
+    with AnyReader([path]) as other:
+        counts = {connection.topic: connection.msgcount for connection in other.connections}
+        clouds = [c for c in other.connections if c.topic == LIDAR_TOPIC]
+        for connection, _, data in other.messages(clouds):
+            cloud: Any = other.deserialize(data, connection.msgtype)
+            assert cloud.width == 10_000
+    assert counts["/tf_static"] == counts["/robot_description"] == 1
+    assert counts[LIDAR_TOPIC] >= 10 * SECONDS
+
+
+def test_a_recording_stands_for_the_bag_beside_it(flight: Flight, tmp_path: Path) -> None:
+    info = describe([flight.folder / "snap.rrd"], load())
+    assert info.missing == ("no detector: --model FILE.onnx",) and info.cameras[0].image is not None
+    alone = tmp_path / "snap.rrd"
+    alone.write_bytes((flight.folder / "snap.rrd").read_bytes())
+    with pytest.raises(UserError, match=r"snap\.mcap, which 'bevviz live' saves with it, is not beside it"):
+        describe([alone], load())
+
+
+def test_what_is_held_is_bounded_and_shown(flight: Flight) -> None:
+    assert max(seconds for _, seconds in flight.sizes) <= SECONDS + 3.2
+    assert max(size for size, _ in flight.sizes) < 500e6
+    (saved,) = [text for text in flight.said if text.startswith("flight recorder saved")]
+    assert "snap.rrd and snap.mcap, " in saved and "messages of 6 s" in saved
+
+
+def test_a_message_stays_until_another_one_takes_its_place() -> None:
+    def said(topic: str, kind: str, received: int, data: bytes) -> RawMessage:
+        nothing = MessageDefinition(MessageDefinitionFormat.NONE, "")
+        connection = Connection(0, topic, kind, nothing, "", 0, ConnectionExtRosbag2("cdr", []), None)
+        return RawMessage(connection, received, received, data)
+
+    def pose(received: int, *names: str) -> RawMessage:
+        edges = [("a frame", name, np.eye(4)) for name in names]
+        data = typestore().serialize_cdr(encode_transforms(received, edges), "tf2_msgs/msg/TFMessage")
+        return said("/tf", "tf2_msgs/msg/TFMessage", received, bytes(data))
+
+    earlier = Earlier()
+    messages = [
+        said("/map", "nav_msgs/msg/OccupancyGrid", 1, b"old"),
+        pose(2, "odom", "b"),
+        pose(3, "odom"),
+        said("/points", "sensor_msgs/msg/PointCloud2", 4, b"cloud"),
+        said("/map", "nav_msgs/msg/OccupancyGrid", 5, b"new!"),
+        pose(6, "odom"),
+    ]
+    for message in messages:
+        earlier.note(message)
+    kept = earlier.before(1000)
+    assert [(m.sent, m.received) for m in kept] == [(2, 997), (5, 998), (6, 999)]
+    assert earlier.size == sum(len(m.data) for m in kept)
+    assert children(messages[1].data) == (b"odom", b"b") and children(b"\0\1\0\0\5") == ()
+
+
+def test_a_full_disk_leaves_a_bag_that_can_be_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    nothing = MessageDefinition(MessageDefinitionFormat.NONE, "")
+    connection = Connection(0, "/x", "a/msg/X", nothing, "", 0, ConnectionExtRosbag2("cdr", []), None)
+    written, room = write_all, 12_000_000
+
+    def limited(file: int, data: bytes) -> None:
+        nonlocal room
+        if len(data) > room:
+            written(file, data[:room])
+            raise OSError(errno.ENOSPC, "No space left on device")
+        room -= len(data)
+        written(file, data)
+
+    monkeypatch.setattr("bevviz.bags.mcap_writer.write_all", limited)
+    random_bytes = np.random.default_rng(0).bytes
+    with McapWriter(tmp_path / "x.mcap", define) as bag:
+        with pytest.raises(UserError, match="No space left"):
+            for time_ in range(100):
+                bag.write(connection, time_, random_bytes(1_000_000))
+        room = 1_000_000  # of the chunk that did not fit
+    with (tmp_path / "x.mcap").open("rb") as file:
+        assert len(list(make_reader(file, validate_crcs=True).iter_messages())) == 10

@@ -1,0 +1,123 @@
+"""The unit and the launch file under examples/robot say what bevviz and systemd take."""
+
+from __future__ import annotations
+
+import configparser
+import os
+import random
+import runpy
+import shlex
+import shutil
+import signal
+import subprocess
+import sys
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import pytest
+
+from bevviz.cli import _parser
+from bevviz.live.settings import Settings
+
+EXAMPLES = Path(__file__).parents[1] / "examples" / "robot"
+CONFIG = EXAMPLES / "robot.yaml"
+
+
+def unit() -> configparser.ConfigParser:
+    parser = configparser.ConfigParser(interpolation=None)
+    parser.optionxform = str  # type: ignore[assignment,method-assign]
+    parser.read_string((EXAMPLES / "bevviz.service").read_text().replace("\\\n", " "))
+    return parser
+
+
+def settings_of(arguments: list[str]) -> Settings:
+    """What bevviz makes of a command line, the configuration being that of the example."""
+    options = _parser()[0].parse_args(arguments)
+    assert options.config == Path("/etc/bevviz/robot.yaml")
+    given = [*options.set, f"live.nice={options.nice}"]
+    return Settings(
+        CONFIG, given if options.flight is None else [*given, f"live.flight_time={options.flight}"]
+    )
+
+
+def test_the_unit(tmp_path: Path) -> None:
+    service = unit()["Service"]
+    program, *arguments = shlex.split(service["ExecStart"])
+    live = settings_of(arguments).config.live
+    assert program.endswith("/bevviz") and arguments[0] == "live"
+    assert (live.flight_folder, live.flight_time, live.nice) == (service["WorkingDirectory"], 30.0, 10)
+    assert live.triggers == ("one_sensor", "tf", "stage") and live.raw_size == 500
+    # A robot reboots: it is started again however it ended, as often as that takes.
+    assert (service["Restart"], unit()["Unit"]["StartLimitIntervalSec"]) == ("always", "0")
+    if (verify := shutil.which("systemd-analyze")) is not None:
+        there = tmp_path / "bevviz.service"
+        there.write_text((EXAMPLES / "bevviz.service").read_text().replace(program, sys.executable))
+        done = subprocess.run([verify, "verify", str(there)], capture_output=True, text=True, check=False)
+        assert [line for line in done.stderr.splitlines() if "bevviz.service" in line] == []
+
+
+def test_the_unit_s_command_runs_and_ends(tmp_path: Path) -> None:
+    pytest.importorskip("rclpy", reason="needs rclpy: pip install 'bevviz[ros]'")
+    _, *arguments = shlex.split(unit()["Service"]["ExecStart"])
+    places = {"/etc/bevviz/robot.yaml": str(CONFIG), "live.flight_folder=/var/lib/bevviz": "live.every=1"}
+    command = [sys.executable, "-m", "bevviz", *(places.get(argument, argument) for argument in arguments)]
+    environment = os.environ | {
+        "ROS_DOMAIN_ID": str(random.randint(1, 101)),
+        "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
+        "XDG_RUNTIME_DIR": str(tmp_path),
+        "PYTHONPATH": str(EXAMPLES.parents[1]),
+    }
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True, cwd=tmp_path, env=environment) as run:
+        assert run.stderr is not None
+        try:
+            said = run.stderr.readline()
+            assert "waiting: nothing is published" in said
+        finally:
+            run.send_signal(signal.SIGTERM)
+            rest = run.stderr.read()
+        assert run.wait(60) >= 0 and "Traceback" not in rest
+
+
+def test_the_launch_file(monkeypatch: pytest.MonkeyPatch) -> None:
+    made = described(monkeypatch)
+    (process,) = [args for kind, args in made if kind == "ExecuteProcess"]
+    defaults = {args["name"]: args["default_value"] for kind, args in made if kind == "DeclareLaunchArgument"}
+
+    def text(part: Any) -> str:
+        if isinstance(part, list):
+            return "".join(map(text, part))
+        return defaults[part[1]["name"]] if isinstance(part, tuple) else str(part)
+
+    program, *arguments = map(text, process["cmd"])
+    assert program == "/opt/bevviz/bin/bevviz" and process["respawn"] is True
+    assert arguments[-3:] == ["--ros-args", "-r", "__ns:=/"]
+    settings = settings_of(arguments)
+    assert settings.config.detector.model == "" and settings.config.live.flight_folder == "/var/lib/bevviz"
+
+
+def described(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, dict[str, Any]]]:
+    """What the launch file says, kind and arguments of each, where no ROS is installed."""
+
+    def noted(kind: str) -> Any:
+        def make(name: Any = None, value: Any = None, **more: Any) -> tuple[str, dict[str, Any]]:
+            return kind, {"name": name, "value": value, **more} if name is not None else more
+
+        return make
+
+    kinds = {
+        "launch.actions": ("DeclareLaunchArgument", "ExecuteProcess", "SetEnvironmentVariable"),
+        "launch.substitutions": ("LaunchConfiguration",),
+    }
+    launch = ModuleType("launch")
+    launch.LaunchDescription = list  # type: ignore[attr-defined]
+    monkeypatch.setitem(sys.modules, "launch", launch)
+    for name, inside in kinds.items():
+        module = ModuleType(name)
+        for kind in inside:
+            setattr(module, kind, noted(kind))
+        monkeypatch.setitem(sys.modules, name, module)
+    said: list[tuple[str, dict[str, Any]]] = runpy.run_path(str(EXAMPLES / "bevviz.launch.py"))[
+        "generate_launch_description"
+    ]()
+    return said
