@@ -236,10 +236,13 @@ def follow(recording: Path, bag: Sequence[Path] = (), settings: Sequence[str] = 
     how, origin = read(recording)
     warnings: list[str] = []
     if origin is None and not bag:
-        raise UserError(
-            f"{recording}: it does not say which bag it was made from (a live run and the synthetic drive "
-            "have none): give --bag PATH"
-        )
+        beside = recording.with_suffix(".mcap")  # as 'bevviz live' saves both
+        if not beside.is_file():
+            raise UserError(
+                f"{recording}: it does not say which bag it was made from, and {beside.name} is not beside "
+                "it: give --bag PATH"
+            )
+        bag = [beside]
     given = flat_yaml(how, str(recording))
     if bag:
         paths = list(bag)
