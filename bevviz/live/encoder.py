@@ -56,7 +56,10 @@ class _Stream(Closing):
     def read(self) -> bytes:
         """What was logged since the last call. Its memory is given back: the file only looks long."""
         self.recording.flush()
-        start, self._end = self._end, os.fstat(self._file).st_size
+        start, size = self._end, os.fstat(self._file).st_size
+        if size <= start:  # emptied by the last call, and nothing came
+            return b""
+        self._end = size
         data = os.pread(self._file, self._end - start, start)
         os.ftruncate(self._file, 0)
         return data
