@@ -92,6 +92,6 @@ class Notes:
         text = json.dumps({"notes": [asdict(note) for note in notes]}, indent=1, ensure_ascii=False)
         with written(self.path, "notes") as given:
             try:
-                given.path.write_text(text + "\n", encoding="utf-8")
+                given.path.write_bytes(f"{text}\n".encode(errors="replace"))
             except OSError as error:
                 raise UserError(f"{self.path}: cannot write the notes: {error.strerror}") from None

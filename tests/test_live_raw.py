@@ -7,6 +7,7 @@ import random
 import subprocess
 import threading
 import time
+from array import array
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -82,7 +83,8 @@ def flight(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Flight]:
 
 def fly(folder: Path) -> Flight:
     from rclpy.qos import DurabilityPolicy, QoSProfile
-    from std_msgs.msg import String
+    from sensor_msgs.msg import Image
+    from std_msgs.msg import Float32MultiArray, String
 
     said: list[str] = []
     results: dict[int, Any] = {}
@@ -95,6 +97,12 @@ def fly(folder: Path) -> Flight:
         latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         description = robot.node.create_publisher(String, "/robot_description", latched)
         description.publish(String(data="<robot name='r'/>"))
+        others = {"/depth/image": Image, "/heightmap": Float32MultiArray}  # one is bulky by type, one by size
+        bulky = {name: robot.node.create_publisher(kind, name, 1) for name, kind in others.items()}
+        wide = Float32MultiArray(data=array("f", bytes(1_000_000)))
+        robot.node.create_timer(
+            0.2, lambda: (bulky["/depth/image"].publish(Image()), bulky["/heightmap"].publish(wide))
+        )
         with LiveSource(settings.config, tell=said.append, raw=raw) as source:
             assert source.wait(PATIENCE), source.missing
             live = Live(
@@ -180,6 +188,7 @@ def test_other_libraries_read_it(flight: Flight) -> None:
 
 def test_a_recording_stands_for_the_bag_beside_it(flight: Flight, tmp_path: Path) -> None:
     info = describe([flight.folder / "snap.rrd"], load())
+    assert info.size == (flight.folder / "snap.mcap").stat().st_size
     assert info.missing == ("no detector: --model FILE.onnx",) and info.cameras[0].image is not None
     alone = tmp_path / "snap.rrd"
     alone.write_bytes((flight.folder / "snap.rrd").read_bytes())
@@ -192,6 +201,9 @@ def test_what_is_held_is_bounded_and_shown(flight: Flight) -> None:
     assert max(size for size, _ in flight.sizes) < 500e6
     (saved,) = [text for text in flight.said if text.startswith("flight recorder saved")]
     assert "snap.rrd and snap.mcap, " in saved and "messages of 6 s" in saved
+    (left_out,) = [text for text in flight.said if text.startswith("not in snap.mcap")]
+    assert "/depth/image (it plays no role and is no small one)" in left_out
+    assert "/heightmap (it plays no role and has " in left_out
 
 
 def test_a_message_stays_until_another_one_takes_its_place() -> None:

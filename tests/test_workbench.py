@@ -13,7 +13,7 @@ import time
 import urllib.error
 import urllib.request
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import parse_qs, urlsplit
@@ -26,6 +26,7 @@ from bevviz.errors import UserError
 from bevviz.evaluate import truth_of
 from bevviz.frame import Frame, FrameResult
 from bevviz.logging import entities
+from bevviz.notes import Note, Notes
 from bevviz.workbench.bench import Bench
 from bevviz.workbench.film import Film
 from bevviz.workbench.missed import finds
@@ -384,8 +385,6 @@ def test_the_drive_is_run_with_other_values(talk: Talk, address: str) -> None:
 
 
 def test_notes_are_kept_beside_the_bag(talk: Talk, bag: Path) -> None:
-    from bevviz.notes import Notes
-
     _, stamp, _, pick, _ = talk.of("missed")[0]["sights"][0]
     talk.say(type="note", time=int(stamp), pick=pick, text=" look here ")
     (note,) = talk.until("notes", lambda message: message["notes"])["notes"]
@@ -422,6 +421,21 @@ def test_a_report_has_what_was_asked_and_noted(talk: Talk, address: str) -> None
     assert "up to 600" in talk.asked("never", type="report", time=stamp, before=1e9, after=0, text="")["text"]
 
 
+def test_the_command_s_report_has_the_notes_of_its_window(bag: Path, tmp_path: Path) -> None:
+    copy = tmp_path / "drive.mcap"
+    copy.hardlink_to(bag)
+    with bevviz.open(copy) as drive:
+        frames = [drive.raw(number) for number in (1, 5)]
+    for frame, text in zip(frames, ("in the window", "outside of it"), strict=True):
+        Notes([copy]).add(Note(frame.stamp, frame.received, text))
+    output = tmp_path / "bug.rrd"
+    options = ["--at", "0.1", "--before", "0", "--after", "0.1", "-o", str(output)]
+    assert main(["report", str(copy), *options]) == 0
+    page = output.with_suffix(".html").read_text()
+    assert "in the window" in page
+    assert "outside of it" not in page
+
+
 def test_the_frame_that_is_looked_at_comes_first(address: str) -> None:
     """Of a film that nobody acknowledges a few pieces come, and the one that is asked for."""
     from websockets.sync.client import connect
@@ -430,14 +444,28 @@ def test_the_frame_that_is_looked_at_comes_first(address: str) -> None:
     with Talk(address) as talk:
         last = max(int(s[1]) for entry in talk.of("missed", "false") for s in entry["sights"])
     parts = urlsplit(address)
-    url = f"ws://{parts.netloc}/film?{parts.query}&from=1"
-    with connect(url, origin=Origin(f"http://{parts.netloc}"), max_size=None) as channel:
-        channel.send(str(last))
-        pieces = []
-        with pytest.raises(TimeoutError):
-            while True:
-                pieces.append(channel.recv(timeout=2))
-    assert len(pieces) == len(set(pieces)) <= FRAMES + 1
+    url, origin = f"ws://{parts.netloc}/film?{parts.query}", Origin(f"http://{parts.netloc}")
+
+    def pieces(start: int, words: Callable[[], str], first: str = "") -> list[bytes]:
+        found = []
+        with connect(f"{url}&from={start}", origin=origin, max_size=None) as channel:
+            if first:
+                channel.send(first)
+            with suppress(TimeoutError):
+                while True:
+                    found.append(channel.recv(timeout=1.5, decode=False))
+                    if word := words():
+                        channel.send(word)
+        return found
+
+    whole = pieces(0, lambda: "got it")
+    assert len(whole) > FRAMES
+    few = pieces(0, lambda: "")
+    assert whole[: len(few)] == few
+    assert whole[FRAMES] not in few
+    asked = pieces(0, lambda: "", str(last))
+    assert len(set(asked)) == len(asked) == len(few)
+    assert whole[FRAMES] in asked
 
 
 # --- who is let in ------------------------------------------------------------------------------

@@ -138,14 +138,14 @@ class Recording(Closing):
     def __init__(self, paths: Sequence[Path]) -> None:
         if not paths:
             raise UserError("no bag given")
-        self.paths = tuple(paths)
+        self.paths = tuple(map(bag_beside, paths))
         self.files: list[BagFile] = []
         self._notes: list[str] = []
         self._stores: dict[tuple[object, ...], Typestore] = {}
         self._default = Stores.ROS2_JAZZY
         self._scratch = Scratch()
         try:
-            for path in paths:
+            for path in self.paths:
                 self._open(path)
             if not self.message_count:
                 raise UserError("; ".join([f"{self.name}: there are no messages in it", *self.warnings]))
@@ -309,7 +309,6 @@ class Recording(Closing):
             return ""
 
     def _open(self, path: Path) -> None:
-        path = bag_beside(path)
         try:
             if path.name == METADATA:
                 path = path.parent

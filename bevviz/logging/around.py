@@ -101,4 +101,5 @@ def _grid(grid: Grid) -> rr.GridMap:
         translation=grid.pose[:3, 3],
         quaternion=rr.Quaternion(xyzw=geometry.quaternion(grid.pose)),
         colormap=rr.components.Colormap.RvizMap,
+        opacity=0.6,  # what is below stays seen
     )

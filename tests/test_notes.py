@@ -1,0 +1,72 @@
+"""Notes beside a bag."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from bevviz.errors import UserError
+from bevviz.notes import Note, Notes
+
+LATE, EARLY = Note(200, 210, "later"), Note(100, 110, "Größe: 3 m", "car at 3 m", "truth//1")
+
+
+@pytest.fixture
+def bag(tmp_path: Path) -> Path:
+    return tmp_path / "drive.mcap"
+
+
+def test_they_are_kept_in_order_and_found_by_time(bag: Path) -> None:
+    notes = Notes([bag, bag.with_name("second.mcap")])
+    for note in (LATE, EARLY):
+        notes.add(note)
+    assert [str(note) for note in Notes([bag])] == ["car at 3 m: Größe: 3 m", "later"]
+    assert notes.between(110, 210) == [EARLY]
+    assert [path.name for path in bag.parent.iterdir()] == ["drive.mcap.notes.json"]
+    notes.remove(EARLY)
+    assert list(notes) == [LATE]
+    notes.remove(LATE)
+    assert not list(bag.parent.iterdir())
+
+
+@given(text=st.text(min_size=1, max_size=50).filter(str.strip))
+def test_any_text_comes_back(tmp_path_factory: pytest.TempPathFactory, text: str) -> None:
+    notes = Notes([tmp_path_factory.mktemp("notes") / "drive.mcap"])
+    notes.add(Note(1, 2, text))
+    assert [note.text for note in notes] == [text]
+
+
+@pytest.mark.parametrize("content", ["{", "[]", '{"notes": [{"stamp": 1}]}', '{"notes": 3}'])
+def test_a_file_that_holds_none_is_left_as_it_is(bag: Path, content: str) -> None:
+    notes = Notes([bag])
+    notes.path.write_text(content)
+    with pytest.raises(UserError, match="holds no notes"):
+        list(notes)
+    with pytest.raises(UserError, match="move it away"):
+        notes.add(LATE)
+    assert notes.path.read_text() == content
+
+
+def test_where_it_cannot_be_written_it_says_so(bag: Path) -> None:
+    notes = Notes([bag.parent / "missing" / "drive.mcap"])
+    with pytest.raises(UserError, match="cannot write the notes: No such file or directory"):
+        notes.add(LATE)
+
+
+@pytest.mark.parametrize("text", ["", "  \n", "x" * 3000])
+def test_a_note_says_something_and_no_book(bag: Path, text: str) -> None:
+    with pytest.raises(UserError, match="characters"):
+        Notes([bag]).add(Note(1, 2, text))
+    assert not list(bag.parent.iterdir())
+
+
+def test_they_are_plain_json(bag: Path) -> None:
+    Notes([bag]).add(EARLY)
+    (note,) = json.loads(Notes([bag]).path.read_text())["notes"]
+    assert note == {
+        "stamp": 100, "received": 110, "text": "Größe: 3 m", "about": "car at 3 m", "pick": "truth//1"
+    }  # fmt: skip
