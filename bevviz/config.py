@@ -392,6 +392,9 @@ class LiveConfig(Section):
     split_time: Seconds | None = Field(
         None, ge=1, description="--save: time that a part is closed after; empty: any"
     )
+    held: int = Field(
+        20, ge=1, le=1000, description="newest frames that can be asked about (--workbench), 5 to 20 MB each"
+    )
     flight_time: Seconds = Field(30.0, ge=0, le=3600, description="flight recorder: the last seconds; 0: off")
     flight_size: Megabytes = Field(500.0, ge=1, description="flight recorder: memory at most")
     raw_size: Megabytes = Field(
@@ -568,7 +571,7 @@ def load(
     file: str | Path | Sequence[Path] | None = None,
     settings: Iterable[str] = (),
     preset: Preset | None = None,
-    base: Config | None = None,
+    base: Config | Mapping[str, Any] | None = None,
 ) -> Config:
     """The effective configuration: preset, then the files, then each ``key=value``, later ones winning.
 
@@ -576,14 +579,15 @@ def load(
         file: YAML files.
         settings: ``key=value`` each.
         preset: which one; None: as the files say, else ``default``.
-        base: a whole configuration that all of this is to change.
+        base: a whole configuration that all of this is to change, or its values by dotted key.
 
     Raises:
         UserError: unreadable file, unknown key, wrong unit or value out of range, in one line.
     """
     given: list[tuple[str, Any, str]] = []  # key, value, and where it was stated
     if base is not None:
-        given += [(key, value, "configuration") for key, value in values(base).items()]
+        stated_there = values(base) if isinstance(base, Config) else base
+        given += [(key, value, "configuration") for key, value in stated_there.items()]
     files = [Path(file)] if isinstance(file, str | Path) else file or ()
     for path in files:
         given += [(key, value, str(path)) for key, value in _flatten(_read_yaml(path)).items()]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import ExitStack
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol, overload
@@ -23,6 +22,7 @@ if TYPE_CHECKING:
     from rerun.blueprint import Blueprint
 
     from bevviz.evaluate.evaluation import Evaluation
+    from bevviz.notebook import NotebookViewer, Selected
     from bevviz.why import Answer, Questioner
 
 Settings = Mapping[str, Any] | Sequence[str]
@@ -63,6 +63,7 @@ class Drive(Closing):
     Args:
         frames: where they come from.
         config: how they are run.
+        notes: what is to be said of them beforehand, one sentence each.
 
     Attributes:
         frames: the source.
@@ -72,10 +73,12 @@ class Drive(Closing):
         UserError: the detector's model or somebody's function cannot be used.
     """
 
-    def __init__(self, frames: Frames, config: Config) -> None:
+    def __init__(self, frames: Frames, config: Config, notes: Sequence[str] = ()) -> None:
         self.frames, self.session = frames, Session(config)
+        self._notes = list(notes)
         self._results: OrderedDict[tuple[int, int], FrameResult] = OrderedDict()
         self._questioner: Questioner | None = None
+        self._shown: NotebookViewer | None = None
 
     def close(self) -> None:
         self.frames.close()
@@ -99,7 +102,7 @@ class Drive(Closing):
     @property
     def warnings(self) -> list[str]:
         """What was lost or looked wrong so far, one sentence each."""
-        return list(self.frames.warnings)
+        return [*self._notes, *self.frames.warnings]
 
     @property
     def times(self) -> F64:
@@ -168,7 +171,8 @@ class Drive(Closing):
         """Why objects of a frame were reported, or were not: what ``bevviz why`` answers.
 
         Args:
-            time, frame: which scan, as for ``at``.
+            time, frame: which scan, as for ``at``; neither: the one that the notebook's viewer shows, and
+                with no selection what was clicked there last.
             cls: all of that class; with no selection at all: whatever went wrong.
             box: what is at the pixel u, v, or in the image box u0, v0, u1, v1.
             point: what is at x, y, z, in metres of the points' frame.
@@ -197,7 +201,27 @@ class Drive(Closing):
             detection=detection,
             camera=camera,
         )
-        return self.questioner(time, frame=frame).explain(selection, hints, everything=everything)
+        viewer = self._shown
+        if time is None and frame is None and viewer is not None:
+            frame = viewer.frame
+            if not (selection.one or selection.label) and (clicked := self.selected) is not None:
+                frame, selection = clicked.frame, clicked.selection(self.config == viewer.config)
+        questioner = self.questioner(time, frame=frame)
+        answers = questioner.explain(selection, hints, everything=everything)
+        if viewer is not None:
+            viewer.mark(questioner.traces.result, answers)
+        return answers
+
+    @property
+    def selected(self) -> Selected | None:
+        """What was clicked last in the notebook's viewer, see ``show``; None: nothing."""
+        viewer = self._shown
+        if viewer is None or viewer.clicked is None:
+            return None
+        if viewer.config == self.config:
+            return viewer.selected(self.at(frame=viewer.clicked))
+        as_shown = Session(viewer.config, loader=self.session.loader)
+        return viewer.selected(as_shown.alone(self.raw(viewer.clicked)))
 
     def questioner(self, time: str | float | None = None, *, frame: int | None = None) -> Questioner:
         """Answers any number of questions about one scan; what they have in common is worked out once.
@@ -240,7 +264,7 @@ class Drive(Closing):
 
     def _number(self, time: str | float | None, frame: int | None) -> int:
         if (time is None) == (frame is None):
-            raise UserError("which scan? Give a time, or frame=NUMBER")
+            raise UserError("which scan? Give a time, or frame=NUMBER; or show() it in a notebook, and click")
         if time is not None:
             return self.frames.number_at(time)
         assert frame is not None
@@ -300,28 +324,28 @@ class Drive(Closing):
                 raise KeyboardInterrupt
         return target
 
-    def show(self, blueprint: str | Blueprint = "debug") -> Any:
+    def show(self, blueprint: str | Blueprint | None = None) -> None:
         """Run the whole drive into a viewer: in a notebook into the cell, else into a window.
 
-        Returns:
-            The notebook's viewer; None where a window was opened.
+        What is clicked in a notebook's viewer is ``selected`` in the cells that are run next, and what
+        ``why()`` answers about; that is then marked in the viewer.
+
+        Args:
+            blueprint: layout; None: ``workbench`` in a notebook, else ``debug``.
 
         Raises:
             UserError: no viewer can be shown.
         """
         from bevviz.logging.recorder import Recorder
         from bevviz.logging.sinks import open_recording
-        from bevviz.notebook import in_notebook, notebook_viewer
+        from bevviz.notebook import NotebookViewer, in_notebook
 
-        with ExitStack() as stack:
-            viewer = None
-            if in_notebook():
-                viewer, recording = notebook_viewer(self.scene, blueprint)
-            else:
-                sinks = open_recording(self.scene, self.config, spawn=True, blueprint=blueprint)
-                recording = stack.enter_context(sinks).recording
-            self.run([Recorder(recording, self.config)])
-        return viewer
+        if in_notebook():
+            self._shown = NotebookViewer(self.scene, self.config, blueprint or "workbench")
+            self.run([self._shown])
+            return
+        with open_recording(self.scene, self.config, spawn=True, blueprint=blueprint or "debug") as sinks:
+            self.run([Recorder(sinks.recording, self.config)])
 
     def to_pandas(self) -> DataFrame:
         """Run the whole drive into a table: a row a frame, with counts, times and what went wrong."""
@@ -342,18 +366,21 @@ def open_drive(
     end: str | float | None = None,
     every: int = 1,
     frames: tuple[int | None, int | None] | None = None,
+    bag: str | PathLike[str] | None = None,
 ) -> Drive:
     """Open a recorded drive.
 
     Args:
         path: bag file or folder (MCAP, sqlite3, ROS 1); several are one drive. Or a folder of the KITTI
-            object benchmark (velodyne, image_2, calib, label_2): single frames, without times.
+            object benchmark (velodyne, image_2, calib, label_2): single frames, without times. Or a
+            recording (.rrd), which stands for the bag that it was made from and for its configuration.
         model: detector, as ``detector.model``.
         set: parameters: ``{"clustering.eps": 0.6}``, or ``["clustering.eps=60 cm"]`` as after ``--set``.
         config: YAML file, as ``bevviz config`` prints it.
         preset: ``default``, or ``reference``: as the ROS 2 tutorial pipeline.
         start, end, every, frames: which scans a run over the whole drive takes, as the options of
             ``bevviz bag``; any scan can be asked for one by one.
+        bag: of a recording, where it is not found by itself.
 
     Raises:
         UserError: no bag, nothing in it, an unknown parameter, or a model that cannot be used.
@@ -369,17 +396,26 @@ def open_drive(
     from bevviz.bags.source import BagSource
     from bevviz.datasets.kitti import KittiFrames, is_kitti
 
-    paths = [path] if isinstance(path, str | PathLike) else path
-    loaded = _load(model, set, config, preset)
-    times = {"start": None if start is None else str(start), "end": None if end is None else str(end)}
-    given = [Path(p) for p in paths]
-    source: Frames
-    if len(given) == 1 and is_kitti(given[0]):
-        source = KittiFrames(given[0], every=every, frames=frames)
+    paths = [Path(p) for p in ([path] if isinstance(path, str | PathLike) else path)]
+    settings, notes = _given(model, set), tuple[str, ...]()
+    if len(paths) == 1 and paths[0].suffix == ".rrd":
+        from bevviz.recorded import follow
+
+        recorded = follow(paths[0], [] if bag is None else [Path(bag)], settings)
+        paths, notes = list(recorded.paths), recorded.warnings
+        loaded = recorded.load(_file(config), settings, preset)
+    elif bag is not None:
+        raise UserError(f"bag={bag}: is where the bag of a recording lies, and {paths[0]} is none")
     else:
-        source = BagSource(given, loaded, every=every, frames=frames, **times)
+        loaded = load(_file(config), settings, preset)
+    times = {"start": None if start is None else str(start), "end": None if end is None else str(end)}
+    source: Frames
+    if len(paths) == 1 and is_kitti(paths[0]):
+        source = KittiFrames(paths[0], every=every, frames=frames)
+    else:
+        source = BagSource(paths, loaded, every=every, frames=frames, **times)
     try:
-        return Drive(source, loaded)
+        return Drive(source, loaded, notes)
     except BaseException:
         source.close()
         raise
@@ -408,15 +444,17 @@ def simulate(
     """
     from bevviz.synthetic import SyntheticSource
 
-    return Drive(SyntheticSource(frames, seed, plant=plant), _load(model, set, config, preset))
+    return Drive(SyntheticSource(frames, seed, plant=plant), load(_file(config), _given(model, set), preset))
 
 
-def _load(
-    model: str | PathLike[str], settings: Settings, config: str | PathLike[str] | None, preset: Preset | None
-) -> Config:
+def _given(model: str | PathLike[str], settings: Settings) -> list[str]:
+    """``key=value`` each."""
     given = _settings(settings) if isinstance(settings, Mapping) else list(settings)
-    named = [f"detector.model={model}"] if model else []
-    return load(None if config is None else Path(config), [*named, *given], preset)
+    return [*([f"detector.model={model}"] if model else []), *given]
+
+
+def _file(config: str | PathLike[str] | None) -> Path | None:
+    return None if config is None else Path(config)
 
 
 def _settings(tree: Mapping[str, Any]) -> list[str]:

@@ -145,6 +145,17 @@ def write_all(file: int, data: bytes | memoryview) -> None:
 # --- folders -----------------------------------------------------------------------------------
 
 
+def bag_files(folder: Path) -> list[Path]:
+    """Bag files of a folder by suffix, compressed ones too."""
+    suffixes = {".mcap", ".db3", ".bag", ".active"}
+    return sorted(
+        file
+        for file in folder.iterdir()
+        if file.is_file()
+        and (file.with_suffix("") if file.suffix in (".zstd", ".zst") else file).suffix in suffixes
+    )
+
+
 class Scratch:
     """A temporary folder, made when it is needed; the next one removes what a killed process left."""
 

@@ -14,6 +14,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import IntEnum
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Protocol
 
 import numpy as np
@@ -300,6 +301,8 @@ class Scene:
     cameras: tuple[str, ...] = ()
     robot: bool = False  # the robot's own results come along
     truth: bool = False  # ground truth comes along
+    bag: tuple[Path, ...] = ()  # files and folders that the frames are read from; (): none
+    topics: tuple[str, ...] = ()  # key=value each, which give the same topics the same roles
 
 
 class Source(Protocol):

@@ -390,7 +390,7 @@ def detection(messages: bags.Messages, stamp: int, label: str) -> Any:
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["a.rrd"], "compare OLD.rrd NEW.rrd"),
+        (["a.rrd"], "a.rrd: no such file"),
         (["drive", "a.rrd"], "compare OLD.rrd NEW.rrd"),
         (["a.rrd", "b.rrd"], "a.rrd: cannot be read"),
         (["a.rrd", "b.rrd", "--set-a", "voxel.size=0.2"], "leave the sides and the truth out"),

@@ -25,4 +25,5 @@ def test_a_notebook_runs(path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyP
     said = "\n".join(output.get("text", "") for cell in notebook.cells for output in cell.get("outputs", ()))
     if path.stem == "first_look":
         assert "The person at" in said and "was not reported because" in said
+        assert "\nNone\n" in said, "nothing is clicked here"
         assert (tmp_path / "drive.rrd").stat().st_size > 1_000_000

@@ -40,7 +40,7 @@ from bevviz.bags.reader import (
 from bevviz.bags.sqlite import SoundSqlite, SqliteRescuer
 from bevviz.closing import Closing
 from bevviz.errors import UserError
-from bevviz.files import Scratch
+from bevviz.files import Scratch, bag_files
 from bevviz.frame import I64
 from bevviz.ros import vision_msgs
 from bevviz.ros.messages import MessageError, read_header
@@ -450,17 +450,6 @@ def unpack_file(path: Path, target: Path) -> tuple[int, bool]:
     finally:
         source.close()
     return damaged, stream.eof
-
-
-def bag_files(folder: Path) -> list[Path]:
-    """Bag files of a folder by suffix, compressed ones too."""
-    suffixes = {".mcap", ".db3", ".bag", ".active"}
-    return sorted(
-        file
-        for file in folder.iterdir()
-        if file.is_file()
-        and (file.with_suffix("") if file.suffix in (".zstd", ".zst") else file).suffix in suffixes
-    )
 
 
 def is_ros1(connection: Connection) -> bool:

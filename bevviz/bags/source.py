@@ -76,7 +76,8 @@ class BagSource(Closing):
 
     @property
     def scene(self) -> Scene:
-        return self.roles.scene(self.recording.name)
+        scene = self.roles.scene(self.recording.name)
+        return replace(scene, bag=self.recording.paths, topics=self.roles.settings)
 
     @property
     def total(self) -> int:

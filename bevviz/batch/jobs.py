@@ -13,10 +13,11 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from bevviz.bags.recording import METADATA, bag_files
+from bevviz.bags.recording import METADATA
 from bevviz.batch.table import RunInfo, read_info
 from bevviz.config import Config
 from bevviz.errors import UserError
+from bevviz.files import bag_files
 from bevviz.provenance import dependencies_of, file_hash, model_path
 from bevviz.text import path_text
 

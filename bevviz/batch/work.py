@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Callable, Generator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeAlias
 from uuid import uuid4
@@ -86,6 +86,7 @@ def run(job: Job, threads: int, on_frame: Callable[[], None] = lambda: None) -> 
                 save=recording,
                 blueprint=job.blueprint,
                 recording_id=job.recording_id,
+                place=job.recording,
             ) as sinks:
                 assert sinks.file is not None
                 evaluation = None
@@ -98,7 +99,7 @@ def run(job: Job, threads: int, on_frame: Callable[[], None] = lambda: None) -> 
                 if run_frames(source, session, observers).interrupted:
                     raise KeyboardInterrupt
             rows = table_rows.rows
-            scene, warnings = source.scene, tuple(source.warnings)
+            scene, warnings = replace(source.scene, bag=(), topics=()), tuple(source.warnings)
         if not rows:
             raise UserError("; ".join([f"{job.bag.name}: no frame in it", *warnings]))
         seconds = time.perf_counter() - start

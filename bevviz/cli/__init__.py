@@ -30,7 +30,7 @@ from bevviz.cli import (
     workbench,
 )
 from bevviz.cli.inputs import check_outputs
-from bevviz.cli.options import with_negatives
+from bevviz.cli.options import follow_recording, with_negatives
 from bevviz.errors import UserError, first_line, interrupt_in
 
 if TYPE_CHECKING:
@@ -83,6 +83,7 @@ def _main(arguments: Sequence[str] | None) -> int:
         if options.verbose:
             _log_to_stderr()
         announce.to(outputs.say)
+        follow_recording(options)
         check_outputs(options)
         run: Callable[[argparse.Namespace], int] = options.run
         return run(options)

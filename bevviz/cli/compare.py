@@ -14,6 +14,7 @@ from bevviz.cli.options import (
     add_output,
     add_selection,
     add_truth,
+    loaded,
     open_bag,
 )
 from bevviz.cli.outputs import Outputs, hint, say
@@ -33,8 +34,8 @@ if TYPE_CHECKING:
 
 DESCRIPTION = """Run two configurations on the same frames and show how the results differ: objects that only
 A or only B has, that have moved, or that have another class. Without --a, --b, --set-a, --set-b, --preset
-and --config it is the reference preset (A) against the default one (B). Two .rrd files: what was
-saved, old (A) against new (B)."""
+and --config it is the reference preset (A) against the default one (B), or of a recording (.rrd) against
+its own configuration. Two .rrd files: what was saved, old (A) against new (B)."""
 
 
 def add(commands: Commands) -> None:
@@ -72,7 +73,9 @@ def _compare(options: argparse.Namespace) -> int:
     saved = [path.suffix == ".rrd" for path in options.paths]
     if any(saved) and not (options.robot is not None and len(saved) == 1):
         if not all(saved) or len(saved) != 2:
-            raise UserError("compare: expected a bag, or two .rrd files: bevviz compare OLD.rrd NEW.rrd")
+            raise UserError(
+                "compare: expected a bag, a recording, or two of these: bevviz compare OLD.rrd NEW.rrd"
+            )
         return _saved(options)
     if options.robot is not None:
         return _robot(options)
@@ -179,19 +182,23 @@ def _sides(options: argparse.Namespace) -> tuple[tuple[str, str], tuple[Config, 
     """What the sides are called and their configurations."""
     own = options.a, options.b, options.set_a, options.set_b
     if not any(own) and options.preset is None and options.config is None:
-        options.a, options.b = "reference", "default"
+        options.a, options.b = "reference", None if _recorded(options) else "default"
     a = _side(options, options.a, options.set_a)
     b = _side(options, options.b, options.set_b)
     return (a[0], b[0]), (a[1], b[1])
 
 
 def _side(options: argparse.Namespace, base: str | None, settings: list[str]) -> tuple[str, Config]:
-    from bevviz.config import load
-
     presets = ("default", "reference")
     preset = options.preset if base not in presets else cast("Preset", base)
     files = [] if options.config is None else [options.config]
     files += [] if base is None or base in presets else [Path(base)]
     model = [f"detector.model={options.model}"] if options.model else []
-    config = load(files, [*options.set, *model, *settings], preset)
-    return " ".join([base or str(options.config or config.preset), *settings]), config
+    config = loaded(options, files, [*options.set, *model, *settings], preset)
+    own = options.config or ("as recorded" if _recorded(options) and preset is None else config.preset)
+    return " ".join([base or str(own), *settings]), config
+
+
+def _recorded(options: argparse.Namespace) -> bool:
+    """Whether a recording stands for its bag, and its configuration for the default one."""
+    return getattr(options, "recorded", None) is not None

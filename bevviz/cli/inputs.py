@@ -9,7 +9,7 @@ from pathlib import Path
 
 from bevviz.errors import UserError
 
-READ = ("paths", "config", "model", "a", "b", "kitti_labels", "note_file", "blueprint")
+READ = ("paths", "recording", "config", "model", "a", "b", "kitti_labels", "note_file", "blueprint")
 WRITTEN = {
     "save": "--save",
     "output": "-o",

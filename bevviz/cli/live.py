@@ -5,12 +5,12 @@ from __future__ import annotations
 import argparse
 import os
 from collections.abc import Callable, Sequence
-from contextlib import suppress
+from contextlib import AbstractContextManager, nullcontext, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from bevviz.cli.interrupts import terminable
-from bevviz.cli.options import Commands, add_config, add_output, add_ros_args, positive
+from bevviz.cli.options import Commands, add_config, add_output, add_ros_args, port, positive
 from bevviz.cli.outputs import has_display, say
 from bevviz.errors import UserError
 
@@ -69,6 +69,14 @@ def add(commands: Commands) -> None:
     output = add_output(live, blueprint="live", raw=True)
     output.add_argument(
         "--split", type=_split, metavar="SIZE|TIME", help="--save in parts, e.g. 500MB or 10min"
+    )
+    output.add_argument(
+        "--workbench",
+        nargs="?",
+        type=port,
+        const=0,
+        metavar="PORT",
+        help="a page where a click answers why and parameters are changed (default: a free port)",
     )
     output.add_argument(
         "--flight", metavar="TIME", help="what the flight recorder holds (default: 30 s), for 'bevviz snap'"
@@ -244,7 +252,8 @@ def _watch(
 
     window = options.viewer
     save, messages = _files(options.save)
-    unsaid = not options.save and options.serve is None and options.connect is None and not window
+    places = options.serve, options.connect, options.workbench
+    unsaid = not options.save and all(place is None for place in places) and not window
     window = window or (unsaid and has_display())
     connect = [options.connect] if options.connect else []
     outputs = Outputs(save, window, options.serve, options.bind, connect, options.blueprint, messages)
@@ -269,6 +278,7 @@ def _watch(
     with (
         suppress(KeyboardInterrupt),
         terminable(),
+        _page(options, live),
         tqdm(unit="frame", desc=source.scene.name, disable=None) as bar,
     ):
 
@@ -288,6 +298,21 @@ def _watch(
     drops = [f"{count} ({place})" for place, count in live.status.drops.items() if count]
     say(f"{live.frames} frames{target}, {' + '.join(drops) or 'none'} dropped")
     return 0 if live.frames else 1
+
+
+def _page(options: argparse.Namespace, live: Live) -> AbstractContextManager[object]:
+    """The workbench's page beside the run, where it is asked for."""
+    if options.workbench is None:
+        return nullcontext()
+    try:
+        from bevviz.workbench.beside import LiveBench, LivePage
+    except ImportError as error:
+        raise UserError(
+            f"the workbench needs further packages ({error.name}): pip install 'bevviz[workbench]'"
+        ) from None
+    page = LivePage(LiveBench(live), options.workbench or None)
+    say(f"workbench at {page.address}")
+    return page
 
 
 def _files(paths: Sequence[Path]) -> tuple[Path | None, Path | None]:

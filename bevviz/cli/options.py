@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import argparse
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeAlias
 
+from bevviz.errors import UserError
+
 if TYPE_CHECKING:
     from bevviz.bags.source import BagSource
-    from bevviz.config import Config
+    from bevviz.config import Config, Preset
+    from bevviz.recorded import Recorded
 
 Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
 
@@ -26,9 +29,22 @@ def add_bag(parser: argparse.ArgumentParser, *, detector: bool = True) -> argpar
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
     parser.epilog = f"{parser.epilog}\n\n{TIMES}" if parser.epilog else TIMES
     parser.add_argument(
-        "paths", nargs="+", type=Path, metavar="PATH", help="bag file or folder; several are one drive"
+        "paths",
+        nargs="+",
+        type=Path,
+        metavar="PATH",
+        help="bag file or folder, several are one drive; or a recording (.rrd), whose bag is looked for",
     )
     group = parser.add_argument_group("what to run")
+    group.add_argument(
+        "--bag",
+        dest="bags",
+        action="append",
+        default=[],
+        type=Path,
+        metavar="PATH",
+        help="of a recording, where it is not found by itself",
+    )
     if detector:
         group.add_argument("--model", metavar="FILE.onnx", help="detector: YOLOv5, v8, v10, 11, 26 or YOLOX")
     return group
@@ -162,11 +178,48 @@ def add_ros_args(parser: argparse.ArgumentParser) -> None:
 
 def load_config(options: argparse.Namespace) -> Config:
     """The configuration asked for, ``--model`` included."""
+    return loaded(options, options.config, given_settings(options), options.preset)
+
+
+def given_settings(options: argparse.Namespace) -> list[str]:
+    """``key=value`` each, of ``--set`` and ``--model``."""
+    model = getattr(options, "model", None)
+    return [*options.set, *([f"detector.model={model}"] if model else [])]
+
+
+def loaded(
+    options: argparse.Namespace,
+    file: Path | Sequence[Path] | None,
+    settings: Sequence[str],
+    preset: Preset | None,
+) -> Config:
+    """``bevviz.config.load``, upon the configuration of the recording that was given instead of a bag."""
     from bevviz.config import load
 
-    model = getattr(options, "model", None)
-    more = [f"detector.model={model}"] if model else []
-    return load(options.config, [*options.set, *more], options.preset)
+    recorded: Recorded | None = getattr(options, "recorded", None)
+    return (load if recorded is None else recorded.load)(file, settings, preset)
+
+
+def follow_recording(options: argparse.Namespace) -> None:
+    """Where a recording is given instead of a bag, its bag takes its place, and it is told which.
+
+    Raises:
+        UserError: as ``bevviz.recorded.follow``; ``--bag`` without a recording.
+    """
+    if not hasattr(options, "bags") or getattr(options, "check", False):
+        return
+    given: list[Path] = options.paths
+    if len(given) != 1 or given[0].suffix != ".rrd":
+        if options.bags:
+            raise UserError("--bag says where the bag of a recording is: PATH has to be one .rrd file")
+        return
+    from bevviz.cli.outputs import say, warn
+    from bevviz.recorded import follow
+
+    recorded = follow(given[0], options.bags, given_settings(options))
+    options.recorded, options.recording, options.paths = recorded, given[0], list(recorded.paths)
+    say(f"{given[0]}: made from {', '.join(map(str, recorded.paths))}")
+    warn(recorded.warnings)
 
 
 def with_negatives(arguments: Iterable[str]) -> list[str]:

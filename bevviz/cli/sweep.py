@@ -7,7 +7,16 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from bevviz.cli.options import Commands, add_bag, add_config, add_output, add_selection, add_truth, open_bag
+from bevviz.cli.options import (
+    Commands,
+    add_bag,
+    add_config,
+    add_output,
+    add_selection,
+    add_truth,
+    loaded,
+    open_bag,
+)
 from bevviz.cli.outputs import Outputs, hint, say, warn
 from bevviz.cli.run import through
 
@@ -32,7 +41,6 @@ def add(commands: Commands) -> None:
 
 
 def _sweep(options: argparse.Namespace) -> int:
-    from bevviz.config import load
     from bevviz.evaluate import truth_source
     from bevviz.sweep import Sweep, combine, parse
     from bevviz.sweep.log import layout, log_sweep
@@ -42,7 +50,7 @@ def _sweep(options: argparse.Namespace) -> int:
     model = [f"detector.model={options.model}"] if options.model else []
 
     def configured(settings: list[str]) -> Config:
-        return load(options.config, [*constant, *model, *settings], options.preset)
+        return loaded(options, options.config, [*constant, *model, *settings], options.preset)
 
     configs = combine(parameters, configured)
     config = common_frames(configs.values())

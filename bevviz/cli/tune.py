@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from bevviz.cli.interrupts import terminable
-from bevviz.cli.options import Commands, add_bag, add_config, add_output
+from bevviz.cli.options import Commands, add_bag, add_config, add_output, given_settings, loaded
 from bevviz.cli.outputs import Outputs, hint, say, warn
 from bevviz.errors import UserError
 
@@ -39,12 +39,15 @@ def _tune(options: argparse.Namespace) -> int:
     from bevviz.run import Dropping, run
     from bevviz.tune import OneFrame, Saves, Version, VersionRecorder, create
 
-    model = [f"detector.model={options.model}"] if options.model else []
+    given = given_settings(options)
     if not options.config.exists() and create(
-        options.config, dump(load(None, [*options.set, *model], options.preset))
+        options.config, dump(loaded(options, None, given, options.preset))
     ):
         say(f"{options.config}: made, with every parameter")
-    settings = Settings(options.config, [*options.set, *model], options.preset)
+    elif (recorded := getattr(options, "recorded", None)) is not None:
+        say(f"{options.config}: is there already, and taken instead of the recording's configuration")
+        given = [*recorded.missing(load(options.config, given, options.preset)), *given]
+    settings = Settings(options.config, given, options.preset)
     frame, scene, warnings = _frame(options, settings)
     outputs = Outputs.of(options).or_viewer()
     if not outputs:

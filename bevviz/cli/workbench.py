@@ -42,6 +42,12 @@ def add(commands: Commands) -> None:
     page.add_argument(
         "--no-browser", dest="browser", action="store_false", help="print the address, open nothing"
     )
+    page.add_argument(
+        "--viewer", action="store_true", help="Rerun's viewer in a window, the page is the panel alone"
+    )
+    page.add_argument(
+        "--connect", metavar="URL", help="the same with a viewer that runs: rerun+http://127.0.0.1:9876/proxy"
+    )
     command.set_defaults(run=_open)
 
 
@@ -52,7 +58,7 @@ def _open(options: argparse.Namespace) -> int:
         raise UserError(
             f"the workbench needs further packages ({error.name}): pip install 'bevviz[workbench]'"
         ) from None
-    config = load_config(options)
+    config, beside = load_config(options), _beside(options)
     with ExitStack() as stack:
         from bevviz.bags.source import BagSource
 
@@ -62,12 +68,20 @@ def _open(options: argparse.Namespace) -> int:
 
         def make() -> Bench:
             _arrow_without_pandas()
+            hint(source.scene, config)
+            bench = made()
+            if beside:
+                from bevviz.workbench.native import NativeViewer
+
+                bench.native = NativeViewer((bench.film, bench.desk), bench.recording_id, options.connect)
+            return bench
+
+        def made() -> Bench:
             from bevviz.drive import Drive
             from bevviz.evaluate import truth_source
             from bevviz.workbench.bench import Bench
             from bevviz.workbench.labelled import Labelled
 
-            hint(source.scene, config)
             truth_of = truth_source(source.roles, options.truth, options.kitti_labels, len(source.scans))
             if truth_of is None or (options.truth is None and options.kitti_labels is None):
                 return Bench(Drive(source, config), again, options.paths, truth_of, first)
@@ -83,8 +97,20 @@ def _open(options: argparse.Namespace) -> int:
             say("open until Ctrl-C; only this machine can reach it")
 
         with suppress(KeyboardInterrupt), terminable():  # the way to end it
-            serve(make, "\n".join(str(path.resolve()) for path in options.paths), options.port, ready)
+            drive = "\n".join(str(path.resolve()) for path in options.paths)
+            serve(make, drive, options.port, ready, "native" if beside else "page")
     return 0
+
+
+def _beside(options: argparse.Namespace) -> bool:
+    """Whether Rerun's own viewer is shown beside the page; what stands against it is told now."""
+    if options.connect is not None:
+        from bevviz.logging.sinks import check_viewer
+
+        check_viewer(options.connect)
+    elif options.viewer and not has_display():
+        raise UserError("--viewer: no display; without it the page has a viewer of its own")
+    return options.viewer or options.connect is not None
 
 
 def _arrow_without_pandas() -> None:

@@ -118,16 +118,17 @@ class Live:
         self._robot_problem = ""
         self.against = None if robot is None else AgainstRobot(robot, live)
         whole = WHOLE if live.viewer_rate is None else 1 / live.viewer_rate
-        self._encoder = Encoder(self.config, source.scene, outputs.blueprint, whole, self.against)
+        self.encoder = Encoder(self.config, source.scene, outputs.blueprint, whole, self.against)
         self._indexer = Indexer()
-        self.flight = FlightRecorder(live, self._encoder, self._indexer)
+        self._watchers: list[Callable[[FrameResult], None]] = []
+        self.flight = FlightRecorder(live, self.encoder, self._indexer)
         self._raw = raw
         self._snapshots = Snapshots(self.flight, raw, notes)
         self._triggers = Triggers(live)
         self.health = Health()
         self._dropping = Dropping()
 
-        programs = [remote(url, self._encoder.recording_id) for url in outputs.connect]
+        programs = [remote(url, self.encoder.recording_id) for url in outputs.connect]
         if outputs.serve is not None:
             program, address = server(outputs.serve, outputs.bind, live.viewer_memory)
             programs.append(program)
@@ -137,7 +138,7 @@ class Live:
         self.saver: Saver | None = None
         self._outputs: list[Output] = []
         if outputs.save is not None:
-            self.saver = Saver(outputs.save, live, self._encoder, self._indexer, notes)
+            self.saver = Saver(outputs.save, live, self.encoder, self._indexer, notes)
             self._outputs.append(self.saver)
         self.raw_saver: RawSaver | None = None
         if outputs.raw is not None:
@@ -148,7 +149,7 @@ class Live:
                 self.saver.on_part = self.raw_saver.next_part
         sparse = live.viewer_rate is not None
         self._outputs += [
-            Viewer(program, live.output_queue, self._encoder, notes, sparse=sparse) for program in programs
+            Viewer(program, live.output_queue, self.encoder, notes, sparse=sparse) for program in programs
         ]
 
     @property
@@ -171,6 +172,26 @@ class Live:
             health.memory,
             self._drops(),
         )
+
+    @property
+    def session(self) -> Session:
+        """That every frame is run in."""
+        return self._session
+
+    @property
+    def scene(self) -> Scene:
+        """Names of the sensors."""
+        return self._source.scene
+
+    def attach(self, output: Output, watcher: Callable[[FrameResult], None]) -> None:
+        """One more output, before the run; it is closed at its end.
+
+        Args:
+            output: takes the packets.
+            watcher: called with each result that was logged, in the thread that logs.
+        """
+        self._outputs.append(output)
+        self._watchers.append(watcher)
 
     @property
     def numbers(self) -> dict[str, float]:
@@ -269,7 +290,7 @@ class Live:
         if self._indexer.waiting:
             self.notes.info("the recording gets its index; it is complete already")
         self._indexer.close()
-        self._encoder.close()
+        self.encoder.close()
 
     def log(self, result: FrameResult) -> None:
         """Encode a frame once, for every output."""
@@ -279,7 +300,9 @@ class Live:
         boxes = [(one.frame_stamp, one.boxes) for one in late if isinstance(one.boxes, LabelledBoxes3D)]
         compared = self.against.see(result, boxes) if self.against is not None else ()
         notes, scene = self.notes.take(), self._source.scene
-        self._hand_out(self._encoder.encode(result, scene, health, notes, late, states, compared))
+        self._hand_out(self.encoder.encode(result, scene, health, notes, late, states, compared))
+        for watcher in self._watchers:
+            watcher(result)
         self._logged = time.monotonic()
         self.health.logged(result.frame.received)
         self.frames += 1
@@ -303,7 +326,7 @@ class Live:
             return
         if (notes := self.notes.take()) or states != self._states:
             self._states = states
-            self._hand_out(self._encoder.encode_meanwhile(since, notes, states))
+            self._hand_out(self.encoder.encode_meanwhile(since, notes, states))
 
     def _hand_out(self, packet: Packet) -> None:
         for output in self._outputs:

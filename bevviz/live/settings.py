@@ -12,6 +12,7 @@ AT_START = (
     "sync.",
     "live.log_queue",
     "live.output_queue",
+    "live.held",
     "live.viewer_",
     "live.split_",
 )  # fixed once it runs

@@ -46,6 +46,7 @@ CONFIG = "/config"
 REPORT = "/report"
 DIGEST = "/report/digest"  # fingerprints of each frame's results
 PROPERTY = "bevviz"  # the recording's property that says how it was made
+BAG = "bag"  # the one that says what it was made from
 B = "/b"  # root of the same tree again, for the other one of two runs that are compared
 SWEEP = "/sweep"
 TUNE = "/tune"

@@ -29,6 +29,7 @@ from bevviz.logging.ports import (
     own_address,
     viewer_address,
 )
+from bevviz.recorded import Origin
 
 APPLICATION = "bevviz"
 MEMORY = "25%"  # of the machine's, for what a server keeps for those who join late, and for the viewer
@@ -68,6 +69,8 @@ def open_recording(
     spawn: bool = False,
     blueprint: str | rrb.Blueprint = "debug",
     recording_id: str | None = None,
+    place: Path | None = None,
+    origin: Origin | None = None,
 ) -> Iterator[Sinks]:
     """Open a recording that goes to everything that is asked for, with the blueprint.
 
@@ -85,6 +88,8 @@ def open_recording(
         blueprint: name of a layout, a .py or .rbl file, or a layout.
         recording_id: viewers and catalogs take two recordings with the same one for the same; None: a
             random one, the same for all recordings of a process.
+        place: where ``save`` is going to lie, if elsewhere.
+        origin: what it says of what it was made from; None: everything.
 
     Raises:
         UserError: unknown blueprint, file that cannot be written or that another
@@ -121,6 +126,10 @@ def open_recording(
             raise UserError(f"cannot open the outputs: {error}") from None
         if writer is not None:
             writer.begin()
+        if origin is None:
+            origin = Origin.of(scene, config, place or save)
+        if origin is not None:
+            origin.log(recording)
         try:
             yield Sinks(recording, urls, warnings, file, writer)
         finally:

@@ -13,15 +13,15 @@ from typing import Any
 import numpy as np
 from rerun.chunk import RrdReader
 
-from bevviz.config import STAGES, Config, changes, flat_yaml, load
+from bevviz.config import Config, changes, flat_yaml, load
 from bevviz.errors import UserError
 from bevviz.files import Scratch
 from bevviz.frame import FrameResult
 from bevviz.logging import entities
 from bevviz.logging.reading import readable
-from bevviz.plugins import is_foreign
 from bevviz.progress import Progress
 from bevviz.provenance import differences, file_hash, model_path, provenance
+from bevviz.recorded import check_functions
 from bevviz.report.digest import (
     ROUNDING,
     DigestDifference,
@@ -209,7 +209,7 @@ def _configs(
     info, file, names = stored.info, folder / "config.yaml", folder / "names.txt"
     file.write_text(stored.config)
     names.write_bytes(info.names.encode())
-    _check_functions(rrd, stored.config, settings)
+    check_functions(rrd, flat_yaml(stored.config, str(rrd)), "check it", settings)
     then = load(file)
     needed = model_path(then)
     here = [f"detector.names={names}"] if info.names else []
@@ -222,19 +222,6 @@ def _configs(
             raise UserError(f"{rrd}: it was made with {used}, which is not beside it: give --model FILE")
         here.append(f"detector.model={beside}")
     return then, load(file, [*here, *settings])
-
-
-def _check_functions(rrd: Path, config: str, settings: Sequence[str]) -> None:
-    """A report comes from somebody else: code that it names is run where the user names it, too."""
-    stated = flat_yaml(config, str(rrd))
-    for section, name in STAGES.items():
-        key = f"{section}.{name}"
-        function = str(stated.get(key, ""))
-        if is_foreign(function) and f"{key}={function}" not in settings:
-            raise UserError(
-                f"{rrd}: it was made with the function {function}, and to check it is to run that module; "
-                f"if you trust it, add --set {key}={function}"
-            )
 
 
 def _other(bag: Path) -> str:

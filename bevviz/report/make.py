@@ -8,7 +8,7 @@ import threading
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
 from contextlib import ExitStack
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -32,6 +32,7 @@ from bevviz.logging.sinks import open_recording
 from bevviz.notes import Note
 from bevviz.progress import Progress
 from bevviz.provenance import Provenance, file_hash, model_path, names_path, provenance, versions
+from bevviz.recorded import Origin
 from bevviz.report.digest import digest, pack
 from bevviz.report.facts import Asked, Facts, commands, file_lines, traceback_texts, window_text
 from bevviz.report.origin import ReportInfo, shareable
@@ -142,7 +143,11 @@ def make(
         notes = [note for note in request.notes if window.low <= note.received < window.high]
         public = shareable(request.config)
         source = stack.enter_context(open_window([bag], request.config, window.low, window.high))
-        sinks = stack.enter_context(open_recording(whole.scene, public, save=rrd, blueprint="bug_report"))
+        origin = Origin.of(source.scene, request.config, rrd, folders=False, redacted=request.redact)
+        scene = replace(whole.scene, bag=())  # where that lies is nobody's concern
+        sinks = stack.enter_context(
+            open_recording(scene, public, save=rrd, blueprint="bug_report", origin=origin)
+        )
         remains.forget(bag)
         recording = sinks.recording
         written.files.insert(0, rrd)

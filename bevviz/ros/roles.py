@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import json
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -63,6 +64,18 @@ class Roles:
     no_lidar: str = field(default="", compare=False)  # why there is none, and what would help
     no_camera: str = field(default="", compare=False)  # the same of cameras
     notes: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def settings(self) -> tuple[str, ...]:
+        """``key=value`` each, which give the sensors' topics the same roles whatever others there are."""
+        infos = {camera.topic: camera.info_topic for camera in self.cameras if camera.info_topic}
+        chosen = {
+            "lidar_topics": list(self.lidars),
+            "camera_topics": [camera.topic for camera in self.cameras],
+            "camera_info_topics": infos,
+            "odometry_topic": self.odometry,
+        }
+        return tuple(f"source.{key}={json.dumps(value)}" for key, value in chosen.items() if value)
 
     def scene(self, name: str) -> Scene:
         """What a source with these topics delivers."""

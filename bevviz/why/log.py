@@ -14,6 +14,7 @@ from bevviz.logging import entities
 from bevviz.logging.bev import footprints, seen_from_above
 from bevviz.logging.camera import over_image
 from bevviz.logging.pieces import boxes2d, document, edges, transform
+from bevviz.logging.writer import Writer
 from bevviz.why.answer import Answer
 from bevviz.why.subject import projected
 from bevviz.why.text import page
@@ -103,6 +104,22 @@ def _log_above(
     else:
         return
     recording.log(entities.overlay("why"), marks)
+
+
+def mark_answers(to: Writer, frame: Frame, answers: Sequence[Answer], above: BevConfig | None = None) -> None:
+    """The answers over the frame, and nothing of those before; gone again at the next frame.
+
+    Args:
+        to: a writer of its own.
+        frame: what was explained.
+        answers: all are drawn.
+        above: as of ``log_answers``.
+    """
+    to.set_time(frame.index, frame.stamp, frame.received)
+    clear_answers(to.recording)
+    log_answers(to.recording, frame, answers, len(answers), above)
+    to.set_time(frame.index + 1, frame.stamp + 1, frame.received and frame.received + 1)
+    clear_answers(to.recording)
 
 
 def _frustums(camera: Camera, answers: Sequence[Answer]) -> Iterator[tuple[F32, str]]:

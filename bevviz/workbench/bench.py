@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import rerun as rr
@@ -31,7 +31,7 @@ from bevviz.perceive import describe
 from bevviz.run import Items, Observer, run
 from bevviz.variants import Variants, check_same_frames
 from bevviz.why import Answer, Questioner
-from bevviz.why.log import clear_answers, log_answers
+from bevviz.why.log import mark_answers
 from bevviz.workbench.answers import selection, surroundings
 from bevviz.workbench.entries import Entries
 from bevviz.workbench.film import Film
@@ -41,6 +41,9 @@ from bevviz.workbench.missed import Find, finds, with_reasons
 from bevviz.workbench.pick import Pick, pick
 from bevviz.workbench.reports import Reports
 from bevviz.workbench.trial import Trials, attempt, tried_logger
+
+if TYPE_CHECKING:
+    from bevviz.workbench.native import NativeViewer
 
 KEPT = 6  # results of frames that were looked at
 PATIENCE = 10.0  # seconds that the run may take to end
@@ -67,6 +70,8 @@ class Bench(Closing):
     Attributes:
         film: what is shown: the whole drive.
         desk: what was asked and tried, which is shown with it.
+        recording_id: of both.
+        native: the viewer beside the page, where there is one.
         entries: what is worth a look.
         trials: runs over the drive with other values.
         reports: of what was found, in the folder that this was started in.
@@ -102,7 +107,8 @@ class Bench(Closing):
         self._asked: Questioner | None = None
         self._stop, self._quiet, self._go = threading.Event(), threading.Event(), threading.Event()
         self._quiet.set()
-        self._recording_id = f"bench-{time.time_ns()}"
+        self.native: NativeViewer | None = None
+        self.recording_id = f"bench-{time.time_ns()}"
         self._main, self._film_main = self.stream()
         self._desk, self._film_desk = self.stream()
         self._main.send_blueprint(blueprints.load("workbench", drive.scene), make_active=True)
@@ -118,7 +124,7 @@ class Bench(Closing):
 
     def stream(self) -> tuple[rr.RecordingStream, rr.BinaryStream]:
         """The recording, for a further thread that writes to it."""
-        recording = rr.RecordingStream(APPLICATION, recording_id=self._recording_id)
+        recording = rr.RecordingStream(APPLICATION, recording_id=self.recording_id)
         recording.set_log_time_enabled(False)
         return recording, rr.binary_stream(recording)
 
@@ -134,6 +140,8 @@ class Bench(Closing):
         self.reports.end()
         if self._thread.is_alive():
             self._thread.join(PATIENCE)
+        if self.native is not None:
+            self.native.close()
         for stream in (self._film_main, self._film_desk, self.trials.film):
             stream.read()  # it would complain of what nobody has read
         self.film.close()
@@ -385,12 +393,7 @@ class Bench(Closing):
         return self._asked
 
     def _mark(self, result: FrameResult, answer: Answer) -> None:
-        frame, logger = result.frame, self._desk_logger
-        logger.set_time(frame.index, frame.stamp, frame.received)
-        clear_answers(self._desk)
-        log_answers(self._desk, frame, [answer], 1, result.config.bev)
-        logger.set_time(frame.index + 1, frame.stamp + 1, frame.received and frame.received + 1)
-        clear_answers(self._desk)
+        mark_answers(self._desk_logger, result.frame, [answer], result.config.bev)
         self.desk.add(self._film_desk.read())
 
     # --- other values --------------------------------------------------------------------------

@@ -14,16 +14,24 @@ import uvicorn
 from bevviz.errors import UserError
 from bevviz.workbench.guard import HOSTS
 from bevviz.workbench.opening import Opening
-from bevviz.workbench.site import VIEWER, application
+from bevviz.workbench.site import VIEWER, Kind, application
 from bevviz.workbench.token import kept_token
 
 if TYPE_CHECKING:
+    from starlette.types import ASGIApp
+
     from bevviz.workbench.bench import Bench
 
 PORT = 9880  # where it is free: browsers keep the viewer, compiled, by the address that they had it from
 
 
-def serve(make: Callable[[], Bench], drive: str, port: int | None, ready: Callable[[str], None]) -> None:
+def serve(
+    make: Callable[[], Bench],
+    drive: str,
+    port: int | None,
+    ready: Callable[[str], None],
+    kind: Kind = "page",
+) -> None:
     """Serve the page of a drive until an interrupt; it is opened and run behind it.
 
     Args:
@@ -31,33 +39,33 @@ def serve(make: Callable[[], Bench], drive: str, port: int | None, ready: Callab
         drive: its paths: a page finds a server that was killed again, if that of the same drive comes back.
         port: of the page; None: 9880, else one that is free.
         ready: called with the address when it can be opened.
+        kind: where the viewer is.
 
     Raises:
         UserError: the port is in use, the viewer is not installed, or what ``make`` raises.
     """
     viewer = viewer_folder()
-    with _listening(port) as listening:
+    with bound(port) as listening:
         port = listening.getsockname()[1]
         with kept_token(port, drive) as token, Opening(make, lambda: server.end()) as opening:
-            config = uvicorn.Config(
-                application(opening, viewer, version("rerun-sdk"), token, port),
-                log_level="warning",
-                lifespan="off",
-                ws_per_message_deflate=False,
-                timeout_graceful_shutdown=1,
-            )
+            app = application(opening, viewer, version("rerun-sdk"), token, port, kind)
 
             def begin() -> None:
                 ready(f"http://{HOSTS[0]}:{port}/?token={token}")
                 opening.start()
 
-            server = _Server(config, begin)
+            server = Server(app, begin)
             server.run(sockets=[listening])
         if opening.error is not None:
             raise opening.error
 
 
-def _listening(port: int | None) -> socket.socket:
+def bound(port: int | None) -> socket.socket:
+    """A socket of this machine alone.
+
+    Raises:
+        UserError: the port is in use.
+    """
     listening = socket.socket()
     listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     for wanted in (PORT, 0) if port is None else (port,):
@@ -70,10 +78,17 @@ def _listening(port: int | None) -> socket.socket:
     raise UserError(f"--port {port}: {reason}; without --port a free one is taken")
 
 
-class _Server(uvicorn.Server):
+class Server(uvicorn.Server):
     """Says when it can be reached."""
 
-    def __init__(self, config: uvicorn.Config, ready: Callable[[], None]) -> None:
+    def __init__(self, app: ASGIApp, ready: Callable[[], None]) -> None:
+        config = uvicorn.Config(
+            app,
+            log_level="warning",
+            lifespan="off",
+            ws_per_message_deflate=False,
+            timeout_graceful_shutdown=1,
+        )
         super().__init__(config)
         self._ready = ready
 

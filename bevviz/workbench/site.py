@@ -8,11 +8,12 @@ import secrets
 from collections.abc import AsyncIterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import TYPE_CHECKING, Literal
 
 from starlette.applications import Starlette
 from starlette.requests import Request
 from starlette.responses import FileResponse, PlainTextResponse, Response
-from starlette.routing import Route, WebSocketRoute
+from starlette.routing import BaseRoute, Route, WebSocketRoute
 from starlette.types import ASGIApp
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
@@ -21,8 +22,23 @@ from bevviz.workbench.guard import Guard, cookie_name
 from bevviz.workbench.opening import Opening
 from bevviz.workbench.visit import Visit, listening
 
+if TYPE_CHECKING:
+    from bevviz.workbench.bench import Bench
+
+Kind = Literal["page", "native", "live"]  # viewer in the page, in a window of its own, in the page of a robot
+
 PAGE = Path(__file__).parent / "page"
-FILES = ("bench.css", "bench.js", "list.js", "state.js", "talk.js", "viewer.js", "work.js")
+FILES = (
+    "bench.css",
+    "bench.js",
+    "list.js",
+    "live.js",
+    "native.js",
+    "state.js",
+    "talk.js",
+    "viewer.js",
+    "work.js",
+)
 VIEWER = ("widget.js", "widget.css", "re_viewer_bg.wasm")
 KINDS = {".js": "text/javascript", ".css": "text/css", ".wasm": "application/wasm"}
 POLICY = (
@@ -33,7 +49,9 @@ POLICY = (
 AHEAD = 6  # pieces of the film that are sent ahead of what the page says it has
 
 
-def application(opening: Opening, viewer: Path, version: str, token: str, port: int) -> ASGIApp:
+def application(
+    opening: Opening, viewer: Path, version: str, token: str, port: int, kind: Kind = "page"
+) -> ASGIApp:
     """Everything that the page asks for, behind its guard.
 
     Args:
@@ -41,23 +59,33 @@ def application(opening: Opening, viewer: Path, version: str, token: str, port: 
         viewer: folder of the viewer's files, of that version.
         token: without which nothing is answered.
         port: that this is served at.
+        kind: where the viewer is.
     """
-    site = _Site(opening, viewer, version, token, port)
-    routes = [
+    site = Site(opening, viewer, version, token, port, kind)
+    return Guard(Starlette(routes=routes_of(site)), token, port)
+
+
+def routes_of(site: Site) -> list[BaseRoute]:
+    """What is where."""
+    return [
         Route("/", site.page),
         Route("/page/{name}", site.file),
-        Route(f"/viewer/{version}/{{name}}", site.viewer),
+        Route(f"/viewer/{site.version}/{{name}}", site.viewer),
         Route("/config.yaml", site.config),
         Route("/report/{number:int}/{name}", site.report),
         WebSocketRoute("/film", site.film),
         WebSocketRoute("/talk", site.talk),
+        WebSocketRoute("/native", site.native),
     ]
-    return Guard(Starlette(routes=routes), token, port)
 
 
-class _Site:
-    def __init__(self, opening: Opening, viewer: Path, version: str, token: str, port: int) -> None:
-        self._opening, self._viewer, self._version = opening, viewer, version
+class Site:
+    """The page, as routes."""
+
+    def __init__(
+        self, opening: Opening, viewer: Path, version: str, token: str, port: int, kind: Kind
+    ) -> None:
+        self._opening, self._viewer, self.version, self._kind = opening, viewer, version, kind
         self._token, self._port = token, port
         self._run = secrets.token_hex(4)  # a page that finds another one starts anew
         self._desk = ThreadPoolExecutor(1, "desk")  # answers one question after the other
@@ -65,7 +93,8 @@ class _Site:
     # --- files ---------------------------------------------------------------------------------
 
     async def page(self, request: Request) -> Response:
-        text = (PAGE / "index.html").read_text().replace("VIEWER_VERSION", self._version)
+        text = (PAGE / "index.html").read_text().replace("VIEWER_VERSION", self.version)
+        text = text.replace("VIEWER_KIND", self._kind)
         response = Response(text, media_type="text/html", headers={"Content-Security-Policy": POLICY})
         response.headers["Cache-Control"] = "no-store"
         response.headers["Referrer-Policy"] = "no-referrer"
@@ -130,7 +159,7 @@ class _Site:
             await socket.send_bytes(await asyncio.to_thread(film.__getitem__, number))
 
         with listening(film.listen) as more, contextlib.suppress(WebSocketDisconnect, RuntimeError):
-            async with _heard(socket, more) as heard:
+            async with heard_on(socket, more) as heard:
                 while not heard.gone:
                     more.clear()
                     while heard.wanted:
@@ -156,10 +185,22 @@ class _Site:
                 error = self._opening.error
                 await socket.send_json({"type": "failed", "text": str(error)})
                 return
-            await Visit(bench, socket, self._desk, self._run).stay()
+            await self._visit(bench, socket).stay()
+
+    def _visit(self, bench: Bench, socket: WebSocket) -> Visit:
+        return Visit(bench, socket, self._desk, self._run)
+
+    async def native(self, socket: WebSocket) -> None:
+        """The way to the viewer beside the page."""
+        bench = await self._opening.bench()
+        await socket.accept()
+        if bench is None or bench.native is None:
+            await socket.close()
+            return
+        await bench.native.talk(socket)
 
 
-class _Heard:
+class Heard:
     """What the page has said on a socket: a word for each piece that it has, and times that it wants."""
 
     def __init__(self) -> None:
@@ -168,8 +209,8 @@ class _Heard:
 
 
 @contextlib.asynccontextmanager
-async def _heard(socket: WebSocket, more: asyncio.Event) -> AsyncIterator[_Heard]:
-    heard = _Heard()
+async def heard_on(socket: WebSocket, more: asyncio.Event) -> AsyncIterator[Heard]:
+    heard = Heard()
 
     async def listen() -> None:
         with contextlib.suppress(WebSocketDisconnect, RuntimeError):

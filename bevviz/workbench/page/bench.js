@@ -3,7 +3,7 @@
 import * as list from "./list.js";
 import { $, asked, element, remember, state, stated } from "./state.js";
 import { connect, newest, on, send, want } from "./talk.js";
-import { isTried, seek, showSide, tell } from "./viewer.js";
+import { isTried, kind, seek, showSide, tell } from "./viewer.js";
 import * as work from "./work.js";
 
 let controls = [];
@@ -108,7 +108,7 @@ let trying = 0;
 function attempt() {
   if (state.time === null) return;
   showSide();
-  if (state.set.length) {
+  if (state.set.length || kind === "live") { // a robot has to be told that it is undone
     $("effect").textContent = "Running the stages ...";
     trying = send({ type: "try", time: Number(state.time), set: state.set, pick: state.pick });
   } else $("effect").textContent = "As it was opened.";

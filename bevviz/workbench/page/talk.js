@@ -1,7 +1,7 @@
 // The server: what is said to it, what it says, and that it may be gone.
 
 import { $, state } from "./state.js";
-import { toViewer, viewerReady } from "./viewer.js";
+import { kind, toViewer, viewerReady } from "./viewer.js";
 
 const RETRY = 1500; // ms between two tries to find the server again
 
@@ -41,7 +41,7 @@ export function connect() {
     if (message.type === "welcome") {
       if (state.run && state.run !== message.run) { location.reload(); return; }
       handlers.welcome(message);
-      viewerReady.then(() => { lanes = ["film", "desk"].map(film); });
+      if (kind !== "native") viewerReady.then(() => { lanes = ["film", "desk"].map(film); });
     } else if (message.type === "failed") gone(message.text);
     else handlers[message.type]?.(message);
   };

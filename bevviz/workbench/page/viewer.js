@@ -4,7 +4,8 @@ import { $, asked, state } from "./state.js";
 
 console.debug = () => {}; // the viewer tells it fifty thousand lines at its start, which takes seconds
 const version = $("viewer").dataset.version;
-const widget = (await import(`/viewer/${version}/widget.js`)).default;
+export const kind = $("viewer").dataset.kind; // page; native: a window of its own; live: of a robot
+const widget = (await import(kind === "native" ? "/page/native.js" : `/viewer/${version}/widget.js`)).default;
 
 // What the run made of a frame, and what other values make of it, are on two timelines of the same recording.
 const OPENED = "stamp";
@@ -30,7 +31,9 @@ export const viewerReady = new Promise((ready) => {
 export const toViewer = (message, buffers) => listeners["msg:custom"](message, buffers);
 export const tell = (whom) => Object.assign(told, whom);
 
-export const isTried = () => state.set.length > 0 && !state.flipped;
+window.addEventListener("to-viewer", ({ detail }) => toViewer(detail));
+
+export const isTried = () => kind !== "live" && state.set.length > 0 && !state.flipped; // a robot has one side
 const timeline = () => (isTried() ? TRIED : OPENED);
 const move = (stamp) => toViewer({ type: "time_ctrl", timeline: timeline(), timestamp_nanos: stamp, play: false });
 
@@ -46,7 +49,7 @@ export function seek(stamp) {
 }
 
 // The same time with the other values, or without.
-export const showSide = () => { if (state.time !== null) seek(state.time); };
+export const showSide = () => { if (kind !== "live" && state.time !== null) seek(state.time); };
 
 window.addEventListener("pointerup", () => { asked.released = performance.now(); }, true);
 

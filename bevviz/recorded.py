@@ -1,0 +1,361 @@
+"""From a recording (.rrd) back to the bag that it was made from, and to how it was made."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from itertools import islice
+from pathlib import Path
+from typing import Any, Self
+
+import rerun as rr
+
+from bevviz.config import STAGES, Config, Preset, flat_yaml, load, values
+from bevviz.errors import UserError, first_line
+from bevviz.files import bag_files
+from bevviz.frame import Scene
+from bevviz.logging import entities
+from bevviz.plugins import is_foreign
+from bevviz.provenance import model_path, names_path
+from bevviz.text import path_text
+
+FRAMES = ("source.", "sync.")  # sections that say what a frame is made of
+BLOCK = 1 << 16  # bytes at the beginning, in the middle and at the end of a file that are looked at
+AFTER = 500  # chunks in which one property follows another
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """A bag, or another file, as it was: found by where it was, known again by its content.
+
+    Attributes:
+        name: without the folder.
+        size: bytes; of a folder those of the bag's files in it.
+        fingerprint: of ``fingerprint``.
+        beside: path from the recording's folder; empty: the recording was no file.
+        path: absolute; empty: it is not told.
+    """
+
+    name: str
+    size: int
+    fingerprint: str
+    beside: str = ""
+    path: str = ""
+
+    @classmethod
+    def of(cls, path: Path, recording: Path | None, *, folders: bool) -> Self:
+        """That of a file or a bag's folder.
+
+        Args:
+            path: which.
+            recording: that names it; None: it is no file.
+            folders: whether folders of this machine may be told.
+        """
+        size, mark = fingerprint(path)
+        where = Path(os.path.normpath(path.absolute()))  # a link's own name
+        beside = ""
+        if recording is not None:
+            beside = os.path.relpath(where, recording.absolute().parent) if folders else where.name
+        return cls(path_text(where.name), size, mark, path_text(beside), path_text(where) if folders else "")
+
+    def candidates(self, recording: Path) -> list[Path]:
+        """Where it may be, the likeliest first."""
+        folder = recording.absolute().parent
+        found = [folder / (self.beside or self.name), folder / self.name]
+        found += [Path(self.path)] if self.path else []
+        return list(dict.fromkeys(Path(os.path.normpath(path)) for path in found))
+
+    def is_same(self, path: Path) -> bool:
+        """Whether that is what it was."""
+        try:
+            return fingerprint(path) == (self.size, self.fingerprint)
+        except OSError:
+            return False
+
+    def found(self, recording: Path) -> tuple[Path | None, str]:
+        """Where it is now, and in words where it was looked for."""
+        tried = self.candidates(recording)
+        for path in tried:
+            if self.is_same(path):
+                return path, ""
+        others = [path for path in tried if path.exists()]
+        absent = [str(path) for path in tried if path not in others]
+        said = [f"what is at {path} is another one (size or content)" for path in others]
+        said += [f"there is none at {' or '.join(absent)}"] if absent else []
+        return None, "; ".join(said)
+
+
+def fingerprint(path: Path) -> tuple[int, str]:
+    """Size and a quick SHA-256 (hexadecimal) of a file, or of the bag's files in a folder.
+
+    Of each file its size and the beginning, the middle and the end count: enough to tell two recordings
+    apart, and done at once for 100 GB.
+
+    Raises:
+        OSError: it is not there, or cannot be read.
+    """
+    total, mark = 0, hashlib.sha256()
+    for file in bag_files(path) if path.is_dir() else [path]:
+        with file.open("rb") as content:
+            size = os.fstat(content.fileno()).st_size
+            mark.update(size.to_bytes(8, "little"))
+            for start in sorted({0, max(size // 2 - BLOCK // 2, 0), max(size - BLOCK, 0)}):
+                content.seek(start)
+                mark.update(content.read(BLOCK))
+        total += size
+    return total, mark.hexdigest()
+
+
+@dataclass(frozen=True, slots=True)
+class Origin:
+    """What a recording holds of what it was made from.
+
+    Attributes:
+        bag: files and folders, several being one drive.
+        files: what the configuration names, by the key that names it.
+        topics: ``key=value`` each, which give the same topics the same roles.
+        redacted: the images of the bag are not those that the network saw.
+    """
+
+    bag: Sequence[Place]
+    files: Mapping[str, Place] = field(default_factory=dict)
+    topics: Sequence[str] = ()
+    redacted: bool = False
+
+    @classmethod
+    def of(
+        cls,
+        scene: Scene,
+        config: Config,
+        recording: Path | None,
+        *,
+        folders: bool = True,
+        redacted: bool = False,
+    ) -> Self | None:
+        """That of a recording that is to be made; None: it is not made from a bag, or this is gone.
+
+        Args:
+            scene: of the source.
+            config: of the run.
+            recording: the file that it will be; None: none.
+            folders: whether folders of this machine may be told.
+            redacted: see the attribute.
+        """
+        named = {"detector.model": model_path(config), "detector.names": names_path(config)}
+        try:
+            bag = [Place.of(path, recording, folders=folders) for path in scene.bag]
+            files = {
+                key: Place.of(path, recording, folders=folders)
+                for key, path in named.items()
+                if path is not None and config.detector.model != "demo"
+            }
+        except OSError:
+            return None
+        return cls(bag, files, scene.topics, redacted) if bag else None
+
+    def log(self, recording: rr.RecordingStream) -> None:
+        """As the recording's property."""
+        recording.send_property(entities.BAG, rr.AnyValues(about=json.dumps(asdict(self))))
+
+    @classmethod
+    def load(cls, text: str) -> Self:
+        """Raises ValueError, TypeError or KeyError where it is not what ``log`` has written."""
+        tree = json.loads(text)
+        return cls(
+            [Place(**place) for place in tree["bag"]],
+            {str(key): Place(**place) for key, place in tree["files"].items()},
+            [str(setting) for setting in tree["topics"]],
+            bool(tree["redacted"]),
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Recorded:
+    """A recording that stands for its bag.
+
+    Attributes:
+        recording: the file.
+        paths: of the bag.
+        settings: ``key=value`` each: topics as they were, and where the files lie that it was made with.
+        warnings: one sentence each.
+    """
+
+    recording: Path
+    paths: tuple[Path, ...]
+    settings: tuple[str, ...]
+    warnings: tuple[str, ...]
+    yaml: str  # the configuration, as ``dump`` wrote it
+
+    def load(
+        self,
+        file: Path | Sequence[Path] | None = None,
+        settings: Sequence[str] = (),
+        preset: Preset | None = None,
+    ) -> Config:
+        """The recording's configuration with other values.
+
+        A file or a preset takes its place; what frames are made of, and the detector, are then the
+        recording's where these have nothing but the preset's own.
+
+        Raises:
+            UserError: as ``bevviz.config.load``; it names somebody's function that ``settings`` do not.
+        """
+        if file or preset is not None:
+            stated = load(file, settings, preset)
+            return load(file, [*self.missing(stated), *settings], preset)
+        base, own = flat_yaml(self.yaml, str(self.recording)), {one.partition("=")[0] for one in settings}
+        left = {key: value for key, value in base.items() if key not in own}
+        check_functions(self.recording, left, "go on with it")
+        return load(settings=[*self.settings, *settings], base=base)
+
+    def missing(self, config: Config) -> list[str]:
+        """``key=value`` each: what frames are made of, and the detector, where a configuration leaves it."""
+        stated, own = values(config), values(load(preset=config.preset))
+        there = flat_yaml(self.yaml, str(self.recording))
+        frames = [f"{key}={json.dumps(value)}" for key, value in there.items() if key.startswith(FRAMES)]
+        model = str(there.get("detector.model") or "")
+        detector = [f"detector.model={model}"] if model and not is_foreign(model) else []
+        keys = [(one, one.partition("=")[0]) for one in (*frames, *detector, *self.settings)]
+        return [one for one, key in keys if key in own and stated[key] == own[key]]
+
+
+def follow(recording: Path, bag: Sequence[Path] = (), settings: Sequence[str] = ()) -> Recorded:
+    """The bag that a recording was made from, and how.
+
+    Args:
+        recording: .rrd file.
+        bag: where the bag is, where it is neither beside the recording nor where it was.
+        settings: that are going to be given, in which the detector's file may be named.
+
+    Raises:
+        UserError: no recording of bevviz; the bag, or the detector's file, is not found, or is another one.
+    """
+    how, origin = read(recording)
+    warnings: list[str] = []
+    if origin is None and not bag:
+        beside = recording.with_suffix(".mcap")  # as 'bevviz live' saves both
+        if not beside.is_file():
+            raise UserError(
+                f"{recording}: it does not say which bag it was made from, and {beside.name} is not beside "
+                "it: give --bag PATH"
+            )
+        bag = [beside]
+    given = flat_yaml(how, str(recording))
+    if bag:
+        paths = list(bag)
+        marks = {(p.size, p.fingerprint) for p in origin.bag} if origin is not None else set()
+        if origin is not None and {_mark(path) for path in bag} != marks:
+            names = ", ".join(place.name for place in origin.bag)
+            warnings.append(f"--bag is not what {recording.name} was made from, {names} (size or content)")
+    else:
+        assert origin is not None
+        paths = [_found(place, recording) for place in origin.bag]
+    if origin is not None and origin.redacted:
+        warnings.append(
+            f"the images in {paths[0].name} are redacted: what the detector finds in them is not what "
+            f"{recording.name} holds"
+        )
+    chosen = list(origin.topics) if origin is not None else []
+    own = {setting.partition("=")[0] for setting in settings}
+    for key, place in origin.files.items() if origin is not None else ():
+        if key in own:
+            continue
+        path, where = place.found(recording)
+        if path is None:
+            option = "--model FILE" if key == "detector.model" else f"--set {key}=FILE"
+            raise UserError(f"{recording}: it was made with {key} {place.name}; {where}: give {option}")
+        chosen.append(f"{key}={json.dumps(str(path))}")
+    stated = [one for one in chosen if one.startswith("detector.") or not given.get(one.partition("=")[0])]
+    return Recorded(recording, tuple(paths), tuple(stated), tuple(warnings), how)
+
+
+def _found(place: Place, recording: Path) -> Path:
+    path, where = place.found(recording)
+    if path is None:
+        raise UserError(
+            f"{recording}: it was made from the bag {place.name}; {where}: move it beside the recording, or "
+            "give --bag PATH"
+        )
+    return path
+
+
+def _mark(path: Path) -> tuple[int, str]:
+    try:
+        return fingerprint(path)
+    except OSError as error:
+        raise UserError(f"--bag {path}: cannot be read: {error.strerror}") from None
+
+
+def read(recording: Path) -> tuple[str, Origin | None]:
+    """The configuration (YAML) in a recording, and what it was made from; None: it does not say.
+
+    Raises:
+        UserError: no recording, or none of bevviz.
+    """
+    if not recording.is_file():
+        raise UserError(f"{recording}: no such file")
+    how: str | None = None
+    origin: Origin | None = None
+    try:
+        for path, chunk in _properties(recording):
+            if path == entities.PROPERTY:
+                how = str(_column(chunk, "config")[-1][0])
+            elif path == entities.BAG:
+                origin = Origin.load(_column(chunk, "about")[-1][0])
+            if how is not None and origin is not None:
+                break
+    except (OSError, ValueError, KeyError, TypeError, RuntimeError) as error:
+        raise UserError(f"{recording}: cannot be read as a recording: {first_line(error)}") from None
+    if how is None:
+        raise UserError(f"{recording}: no recording of bevviz: it does not say how it was made")
+    return how, origin
+
+
+def _properties(recording: Path) -> Iterator[tuple[str, Any]]:
+    """Name and chunk of each, which are near the beginning: of a long recording little is read."""
+    from rerun.chunk import RrdReader
+
+    chunks = iter(RrdReader(recording).stream())
+    for chunk in chunks:
+        head, _, name = chunk.entity_path.rpartition("/")
+        if head != "/__properties":
+            continue
+        yield name, chunk
+        if name == entities.PROPERTY:
+            break
+    for chunk in islice(chunks, AFTER):
+        head, _, name = chunk.entity_path.rpartition("/")
+        if head == "/__properties":
+            yield name, chunk
+
+
+def _column(chunk: Any, name: str) -> list[Any]:
+    found: list[Any] = chunk.to_record_batch().column(name).to_pylist()
+    return found
+
+
+def check_functions(
+    recording: Path, stated: Mapping[str, Any], what: str, trusted: Collection[str] = ()
+) -> None:
+    """A recording may come from somebody else: code that it names is run where the user names it, too.
+
+    Args:
+        recording: for the error.
+        stated: its configuration, by dotted key.
+        what: is to be done with it, for the error.
+        trusted: settings that the user has given, ``key=value`` each.
+
+    Raises:
+        UserError: it was made with somebody's function that the user has not named.
+    """
+    for section, name in STAGES.items():
+        key = f"{section}.{name}"
+        function = str(stated.get(key, ""))
+        if is_foreign(function) and f"{key}={function}" not in trusted:
+            raise UserError(
+                f"{recording}: it was made with the function {function}, and to {what} is to run that "
+                f"module; if you trust it, add --set {key}={function}"
+            )

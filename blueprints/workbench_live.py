@@ -1,0 +1,22 @@
+"""Beside a running robot, in the workbench's page: what can be clicked, at the newest frame."""
+
+from __future__ import annotations
+
+import rerun.blueprint as rrb
+
+from bevviz.frame import Scene
+from bevviz.logging import entities, views
+
+
+def blueprint(scene: Scene) -> rrb.Blueprint:
+    side: list[rrb.Container | rrb.View] = [views.cameras(scene, why=True)] if scene.cameras else []
+    beside = (f"{entities.ROBOT}/**", f"{entities.WHY}/**")
+    return rrb.Blueprint(
+        rrb.Horizontal(
+            views.space(scene, grid=False, frustums=False, beside=beside),
+            rrb.Vertical(*side, views.birds_eye(), row_shares=[*[3] * len(side), 2]),
+            column_shares=[4, 4],
+        ),
+        views.time_panel(play=rrb.components.PlayState.Following),
+        *views.panels(),
+    )

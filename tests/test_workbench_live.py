@@ -1,0 +1,277 @@
+"""The workbench's page beside a robot: a real graph, the real server; the tests speak the page's part."""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import re
+import signal
+import subprocess
+import sys
+import time
+from collections import deque
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+from urllib.parse import urlsplit
+
+import pytest
+
+import bevviz
+from bevviz.errors import UserError
+from bevviz.frame import FrameResult
+from bevviz.live.encoder import Encoder
+from bevviz.live.notes import Notes
+from bevviz.live.replay import Replay
+from bevviz.live.runtime import Live, Outputs
+from bevviz.live.settings import Settings
+from bevviz.logging import entities
+from bevviz.synthetic import SyntheticSource
+from bevviz.workbench.beside import KEPT, WHOLE, LiveBench, LiveFilm
+from bevviz.workbench.pick import Pick
+from tests.ros_player import Play
+
+pytestmark = pytest.mark.filterwarnings("ignore:RRD file has no footer")
+HELD = 4
+WAIT = 90.0  # seconds for what takes one or two on an idle machine
+
+
+# --- on a real graph ----------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def robot(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[str, Path]]:
+    """A robot that plays, and ``bevviz live --workbench`` beside it: its address and its folder."""
+    pytest.importorskip("rclpy", reason="needs rclpy: pip install 'bevviz[ros]'")
+    folder, root = tmp_path_factory.mktemp("live"), Path(__file__).parents[1]
+    ros = {"ROS_DOMAIN_ID": str(random.randint(1, 101)), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
+    environment = {**os.environ, **ros, "PYTHONPATH": str(root)}
+    play = Play(frames=3, points=10_000, rate=5.0)
+    with subprocess.Popen(
+        play.arguments(), cwd=root, env=environment, stdout=subprocess.PIPE, text=True
+    ) as player:
+        assert player.stdout is not None and player.stdout.readline() == "playing\n"
+        command = [sys.executable, "-m", "bevviz.cli", "live", "--model", "demo", "--workbench"]
+        said = folder / "said.txt"
+        with (
+            said.open("w") as log,
+            subprocess.Popen(command, cwd=folder, env=environment, stderr=log) as live,
+        ):
+            try:
+                yield _address(said, live), folder
+            finally:
+                live.send_signal(signal.SIGINT)
+                live.wait(timeout=60)
+                player.terminate()
+
+
+def _address(said: Path, live: subprocess.Popen[bytes]) -> str:
+    """What it prints, once it can be reached."""
+    from bevviz.logging.ports import answers
+
+    end = time.monotonic() + WAIT
+    while time.monotonic() < end and live.poll() is None:
+        found = re.search(r"workbench at (http://([^:]+):(\d+)\S+)", said.read_text())
+        if found and answers(found[2], int(found[3])):
+            return found[1]
+        time.sleep(0.1)
+    raise AssertionError(said.read_text())
+
+
+class Channel:
+    """One of the page's sockets."""
+
+    def __init__(self, address: str, path: str) -> None:
+        from websockets.sync.client import connect
+        from websockets.typing import Origin
+
+        parts = urlsplit(address)
+        origin = Origin(f"http://{parts.netloc}")
+        url = f"ws://{parts.netloc}{path}?{parts.query}"
+        self._open = ExitStack()
+        self._socket = self._open.enter_context(connect(url, origin=origin, max_size=None))
+        self._number = 0
+
+    def send(self, **message: Any) -> int:
+        self._number += 1
+        self._socket.send(json.dumps({"id": self._number, **message}))
+        return self._number
+
+    def piece(self) -> bytes:
+        data = self._socket.recv(timeout=WAIT)
+        assert isinstance(data, bytes)
+        return data
+
+    def until(self, kind: str, number: int | None = None) -> dict[str, Any]:
+        """The next message of a kind, or an error."""
+        end = time.monotonic() + WAIT
+        while time.monotonic() < end:
+            message: dict[str, Any] = json.loads(self._socket.recv(timeout=WAIT))
+            if message["type"] in (kind, "error") and number in (None, message.get("id")):
+                return message
+        raise AssertionError(f"no {kind}")
+
+    def close(self) -> None:
+        self._open.close()
+
+
+class Shown:
+    """What a page's viewer would show."""
+
+    def __init__(self, address: str, folder: Path) -> None:
+        self.channel, self._file = Channel(address, "/film"), folder / "piece.rrd"
+        self.stamp, self.texts, self.marked = 0, list[str](), False
+
+    def until(self, done: Callable[[], Any]) -> None:
+        end = time.monotonic() + WAIT
+        while not done():
+            assert time.monotonic() < end
+            self._take(self.channel.piece())
+
+    def _take(self, piece: bytes) -> None:
+        from rerun.chunk import RrdReader
+
+        self._file.write_bytes(piece)
+        reader = RrdReader(self._file)
+        for store in reader.recordings():
+            for chunk in reader.stream(store=store):
+                batch = chunk.to_record_batch()
+                if chunk.entity_path == entities.EXPLAIN:
+                    self.stamp = max(self.stamp, *(t.value for t in batch.column(entities.STAMP)))
+                if chunk.entity_path == entities.EXPLAIN_LOG:
+                    self.texts += [text for (text,) in batch.column("TextLog:text").to_pylist()]
+                self.marked |= chunk.entity_path.startswith(entities.why(""))
+
+
+def nearest_missed(message: dict[str, Any], frame: int) -> str:
+    """The pick of the first missed object in what is listed, all of which is of one frame."""
+    entries = message["entries"]
+    assert {sight[0] for entry in entries for sight in entry["sights"]} == {frame}
+    missed = [entry["sights"][0] for entry in entries if entry["what"] == "missed"]
+    return str(min(missed, key=lambda sight: sight[2])[3])
+
+
+def test_a_running_robot_is_asked_and_changed(robot: tuple[str, Path]) -> None:
+    """From the newest frame to a held one, its answer, a parameter for all to come, a mark, a snapshot."""
+    address, folder = robot
+    talk, orders, shown = Channel(address, "/talk"), Channel(address, "/live"), Shown(address, folder)
+    welcome = talk.until("welcome")
+    assert welcome["detector"]
+    assert any(control["key"] == "clustering.eps" for control in welcome["controls"])
+    shown.until(lambda: shown.stamp)
+
+    orders.send(type="hold", time=shown.stamp)
+    held = orders.until("held")
+    stamp = int(held["stamp"])
+    near = nearest_missed(talk.until("entries"), held["frame"])
+    number = talk.send(type="ask", time=stamp, pick=near, set=[])
+    answer = talk.until("answer", number)
+    assert answer["frame"] == held["frame"]
+    assert not answer["reported"]
+    shown.until(lambda: shown.marked)
+
+    number = talk.send(type="try", time=stamp, set=["clustering.min_cluster_points=100000"])
+    tried = talk.until("tried", number)
+    assert tried["changes"] == {"clustering.min_cluster_points": "10 -> 100000"}
+    lost = tried["effects"]["lost"]
+    assert lost and not tried["effects"]["added"]
+    shown.until(lambda: any("clustering.min_cluster_points 10 -> 100000" in t for t in shown.texts))
+    orders.send(type="hold", time=shown.stamp)
+    later = orders.until("held")
+    assert later["frame"] > held["frame"]
+    near = nearest_missed(talk.until("entries"), later["frame"])
+    number = talk.send(type="ask", time=int(later["stamp"]), pick=near, set=[])
+    assert "min_cluster_points" in json.dumps(talk.until("answer", number))
+    number = talk.send(type="try", time=int(later["stamp"]), set=[])  # undone
+    assert talk.until("tried", number)["effects"]["added"]
+    number = talk.send(type="try", time=stamp, set=["clustering.eps=-1"])
+    assert "must be greater than 0" in talk.until("tried", number)["text"]
+    number = talk.send(type="report", time=stamp, text="", before=1, after=1)
+    assert "a drive that is over" in talk.until("report", number)["text"]
+
+    orders.send(type="mark", time=stamp, text="odd")
+    said = orders.until("said")["text"]
+    assert said == f"mark at frame {held['frame']}: odd"
+    shown.until(lambda: said in shown.texts)
+    orders.send(type="snap")
+    saved = orders.until("said")["text"].removeprefix("saved in ")
+    assert (folder / saved).stat().st_size > 100_000
+    orders.send(type="dance")
+    assert orders.until("said")["wrong"]
+    for channel in (talk, orders, shown.channel):
+        channel.close()
+
+
+# --- without one --------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def results() -> list[FrameResult]:
+    with bevviz.simulate(frames=HELD + KEPT + 3, seed=1, set={"live.held": HELD}) as drive:
+        return list(drive)
+
+
+@pytest.fixture
+def bench(results: list[FrameResult]) -> Iterator[LiveBench]:
+    source = Replay([result.frame for result in results], SyntheticSource(frames=1).scene)
+    settings = Settings(None, ["detector.model=demo", f"live.held={HELD}"])
+    live = Live(source, settings, Outputs(), Notes(lambda line: None))
+    with LiveBench(live) as bench:
+        yield bench
+        live.encoder.close()
+
+
+def test_only_the_newest_frames_and_those_held_are_there(
+    bench: LiveBench, results: list[FrameResult]
+) -> None:
+    with pytest.raises(UserError, match="no frame has come yet"):
+        bench.number_at(0)
+    for result in results[:HELD]:
+        bench._see(result)
+    first = bench.hold(results[1].frame.stamp)
+    assert first is results[1]
+    for result in results[HELD:]:
+        bench._see(result)
+    assert bench.look(1) is first
+    assert bench.number_at(results[-1].frame.stamp + 10**7) == results[-1].frame.index
+    with pytest.raises(UserError, match=f"the newest {HELD} can be asked about"):
+        bench.number_at(results[0].frame.stamp)
+    with pytest.raises(UserError, match="frame 0 is gone"):
+        bench.look(0)
+    assert bench.hold(0) is first, "of a viewer that lags behind the oldest that is there"
+    for result in results[-KEPT:]:
+        bench.hold(result.frame.stamp)
+    with pytest.raises(UserError, match="frame 1 is gone"):
+        bench.look(1)
+    assert len(bench._held()) == HELD + KEPT
+
+
+def test_a_held_frame_can_be_asked_with_other_values(bench: LiveBench, results: list[FrameResult]) -> None:
+    for result in results[:2]:
+        bench._see(result)
+    assert results[1].objects is not None and len(results[1].objects)
+    assert "was reported" in bench.ask(1, (), Pick("object", 0))[0].verdict.text
+    tried = bench.look(1, ("clustering.min_cluster_points=100000",))
+    assert tried.objects is not None and not len(tried.objects)
+    assert bench.live.config == results[1].config.model_copy(update={"live": bench.live.config.live})
+
+
+def test_pages_begin_at_a_whole_frame_and_miss_none(bench: LiveBench, results: list[FrameResult]) -> None:
+    encoder: Encoder = bench.live.encoder
+    film: LiveFilm = bench.film
+    assert film.since(None) == ([], -1)
+    packets = deque(encoder.encode(result, bench.live.scene, {}, ()) for result in results[:3])
+    film._take(packets[0], True)
+    begin, number = film.since(None)
+    assert len(begin) == 3, "layout, what the frame relies on, the frame"
+    assert all(piece[:4] == begin[0][:4] for piece in begin)
+    film._take(packets[1], False)
+    film.add(b"marks")
+    assert film.since(number) == ([encoder.header + packets[1].data, b"marks"], number + 2)
+    for _ in range(WHOLE + 1):
+        film._take(packets[0], False)
+    again, following = film.since(0)
+    assert len(again) == 2, "what was missed is not made up for: a whole frame, and what it relies on"
+    assert film.since(following) == ([], following)
