@@ -157,7 +157,7 @@ def _check_outputs(options: argparse.Namespace) -> None:
     if options.connect is not None:
         check_viewer(options.connect)
     for path in options.save:
-        check_name(path)
+        check_name(path, ".rrd", ".mcap")
     blueprints.load(options.blueprint, Scene("live", "lidar", ("lidar",)))
 
 

@@ -71,10 +71,10 @@ class Indexer:
             self._waiting -= 1
 
 
-def check_name(path: Path) -> None:
+def check_name(path: Path, *suffixes: str) -> None:
     """Raises UserError where nothing is to be written: a slip must not overwrite something else."""
-    if path.suffix not in (".rrd", ".mcap"):
-        raise UserError(f"--save {path}: expected a file name that ends in .rrd or .mcap")
+    if path.suffix not in suffixes:
+        raise UserError(f"--save {path}: expected a file name that ends in {' or '.join(suffixes)}")
     if not path.absolute().parent.is_dir():
         raise UserError(f"--save {path}: there is no folder {path.parent}")
 
@@ -104,7 +104,7 @@ class Saver(Output):
         self, path: Path, config: LiveConfig, encoder: Encoder, indexer: Indexer, notes: Notes
     ) -> None:
         super().__init__("file", config.output_queue)
-        check_name(path)
+        check_name(path, ".rrd")
         remove_leftovers(path.parent)
         self.paths: list[Path] = []
         self.on_part: Callable[[], None] = lambda: None  # called when a further one begins
