@@ -23,7 +23,7 @@ import pytest
 import bevviz
 from bevviz.cli import main
 from bevviz.errors import UserError
-from bevviz.evaluate import truth_of
+from bevviz.evaluate import match, truth_of
 from bevviz.frame import Frame, FrameResult
 from bevviz.logging import entities
 from bevviz.notes import Note, Notes
@@ -695,7 +695,10 @@ def test_other_values_are_beside_what_the_drive_makes(bag: Path, tmp_path: Path)
         pieces = [film[row] for film in (bench.film, bench.desk) for row in range(len(film))]
         bench.close()
     assert result.objects is not None
+    assert result.frame.truth is not None
     assert len(told["effects"]["lost"]) == len(result.objects)
+    found, _ = match(result.objects, truth_of(result.frame, result.frame.truth))
+    assert len(told["effects"]["right"]) == (found >= 0).sum() > 0
     assert recoloured["effects"] != told["effects"]
     rows: dict[str, list[tuple[set[str], bool]]] = {}
     for number, piece in enumerate(pieces):  # each is a whole file

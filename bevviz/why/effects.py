@@ -128,12 +128,8 @@ def effects(
             else:
                 more.append(Effect(name, now[j], after=j))
         elif difference.change is Change.ONLY_A:
-            missed = was[i] if was[i] not in now else -1
-            twice = (
-                was[i] >= 0 and missed < 0
-            )  # one of two objects for the same thing: neither right nor false
-            if not twice:
-                gone.append(Effect(_name(a.names[i], a.boxes, i), missed, before=i))
+            missed = was[i] >= 0 and was[i] not in now
+            gone.append(Effect(_name(a.names[i], a.boxes, i), was[i], before=i, missed=missed))
         else:
             changed += 1
     return Effects(
