@@ -120,6 +120,19 @@ def test_the_sentence(search: Search, said: str, monkeypatch: pytest.MonkeyPatch
     assert asked.with_hints(answer).verdict.text == answer.verdict.text.removesuffix(".") + said
 
 
+@pytest.mark.parametrize("eps", [0.5, 19.0])
+def test_no_value_is_tried_that_nobody_may_set(eps: float) -> None:
+    """Of parts whose distance is not known, too, and where a larger value is beyond the limit."""
+    config = load(settings=["detector.model=demo", f"clustering.eps={eps}"])
+    asked = Questioner(Session(config).run(at("flat_car").frame), classes=CLASSES)
+    answer = next(a for a in asked.ask(Selection()) if a.subject.kind == "truth" and a.evidence.parts)
+    odd = replace(answer, evidence=replace(answer.evidence, apart=float("nan")))
+    split = replace(odd, verdict=replace(odd.verdict, reason=Reason.SPLIT))
+    search = asked.search(split)
+    assert search.tried > 0
+    assert all("nan" not in setting for hint in search.hints for setting in hint.settings)
+
+
 def test_what_was_tried_once_is_not_run_again() -> None:
     """Answers of a frame share their runs; the second question is answered alike."""
     answer = next(a for a in near("reference") if a.hints)
