@@ -354,6 +354,11 @@ comes after the detector is judged.
 {by_distance(tallies)}
 
 {by_visibility(tallies)}
+
+The weights of the fit and the rating were set by what they stand for, and looked at on these frames. Eleven
+of them halved and doubled, one at a time, on each half of the frames alone: the figures of the third case
+stay at 30 found, 26 to 28 with an IoU of 0.5 and 18 to 19 cars with 0.7, and no choice on one half is better
+on the other.
 """
 
 

@@ -59,7 +59,7 @@ class Tally:
     places: Counter[str] = field(default_factory=Counter)
     blind: Counter[str] = field(default_factory=Counter)  # asked without a ground truth
     wrong: list[str] = field(default_factory=list)  # each in words
-    seconds: list[float] = field(default_factory=list)  # of a question
+    seconds: list[float] = field(default_factory=list)  # of processor time, of a question
     hint_seconds: list[float] = field(default_factory=list)
 
     def of(self, reasons: Sequence[Reason]) -> Counter[str]:
@@ -105,9 +105,9 @@ class Bench:
                     self._blind(blind, (x0, y0, x1, y1), cause, about)
 
     def _asked(self, questioner: Questioner, selection: Selection) -> Answer:
-        start = time.perf_counter()
+        start = time.process_time()
         answer = questioner.ask(selection)[0]
-        self.tally.seconds.append(time.perf_counter() - start)
+        self.tally.seconds.append(time.process_time() - start)
         return answer
 
     def _verdict(self, answer: Answer, cause: Cause, about: str) -> None:
@@ -121,9 +121,9 @@ class Bench:
             self.tally.wrong.append(f"{about}: {_said(cause)}, not: {answer.verdict.text}")
 
     def _hint(self, known: Questioner, answer: Answer, again: _Again, row: int, about: str) -> None:
-        start = time.perf_counter()
+        start = time.process_time()
         hints = known.search(answer).hints
-        self.tally.hint_seconds.append(time.perf_counter() - start)
+        self.tally.hint_seconds.append(time.process_time() - start)
         if not hints:
             self.tally.hints.update(none=1)
             return
@@ -277,7 +277,9 @@ def section_of(tallies: Mapping[str, Tally], what: str) -> str:
             lines.append(f"| {reason.value} | {cells} |")
     seconds = [s for tally in tallies.values() for s in tally.seconds]
     hinted = [s for tally in tallies.values() for s in tally.hint_seconds]
-    lines.append(f"\nA question takes {_times(seconds)}, looking for a hint {_times(hinted)} more.")
+    lines.append(
+        f"\nA question takes {_times(seconds)} of processor time, looking for a hint {_times(hinted)} more."
+    )
     return "\n".join(lines) + "\n"
 
 

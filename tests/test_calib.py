@@ -278,8 +278,9 @@ def test_one_view_twelve_times_is_one_view(drive: Drive) -> None:
         calibrate(gather(drive.frames[3:4] * times, ["zed"], drive.pose)["zed"]) for times in (1, 12)
     )
     assert all(axis.interval < 1.0 for axis in once.axes[:3])
-    for axis, again in zip(once.axes, often.axes, strict=True):
-        assert again.interval > 0.6 * axis.interval
+    ratio = np.array([b.interval / a.interval for a, b in zip(once.axes, often.axes, strict=True)])
+    # Which of the edges are drawn differs; twelve views would give 0.29 of each.
+    assert ratio.min() > 0.4 and np.exp(np.log(ratio[:5]).mean()) > 0.7
 
 
 def changed(drive: Drive, change: object) -> Iterator[Frame]:

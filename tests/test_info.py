@@ -6,9 +6,11 @@ import re
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from bevviz.bags.info import WIDTH, describe, render
+from bevviz.bags.source import BagSource
 from bevviz.config import Config, load
 from bevviz.errors import UserError
 from tests import bags
@@ -96,6 +98,41 @@ def test_the_camera_info_that_is_offered_is_there_and_accepted(tmp_path: Path) -
     assert f"--set {offered}" in render(describe([path], Config()))
     config = load(settings=[offered.replace("'", "")])
     assert describe([path], config).missing == ("no detector: --model FILE.onnx",)
+
+
+def test_an_uncalibrated_camera_needs_no_other_topic(tmp_path: Path) -> None:
+    """What lacks is said, and nothing that would not help: 'bag' has the same words."""
+
+    def zero(item: bags.Item) -> bags.Item:
+        k, p = np.zeros(9), np.zeros(12)
+        return item if item.topic != bags.INFO else item._replace(message=replace(item.message, k=k, p=p))
+
+    path = bags.write(tmp_path / "drive", map(zero, bags.small_items(scans=4)))
+    said = f"{bags.INFO}: the camera is uncalibrated (K is zero or not finite); calibrate it"
+    info = describe([path], Config())
+    assert info.missing == (f"camera 'camera': {said}", "no detector: --model FILE.onnx")
+    with BagSource([path], Config()) as source:
+        frames = list(source)
+        assert [f.cameras[0].problems for f in frames] == [(said,)] * 4
+        assert not [text for text in source.warnings if "record" in text]
+
+
+def test_where_no_frame_id_is_stated_no_extrinsics_are_asked_for(tmp_path: Path) -> None:
+    """They have two names, one of which would be empty."""
+
+    def nameless(topic: str) -> str:
+        items = []
+        for item in bags.small_items(scans=3):
+            if item.topic == topic:
+                header = replace(item.message.header, frame_id="")
+                item = item._replace(message=replace(item.message, header=header))
+            items.append(item)
+        return " ".join(describe([bags.write(tmp_path / topic[1:7], items)], Config()).missing)
+
+    for topic, what in ((bags.CLOUD, "the points state"), (bags.IMAGE, "its images state")):
+        missing = nameless(topic)
+        assert f"camera 'camera' is not placed: {what} no frame_id; the driver must" in missing
+        assert "source.extrinsics" not in missing and "source.fixed_frame" not in missing
 
 
 def test_a_bag_without_a_lidar_is_described_all_the_same(tmp_path: Path) -> None:

@@ -40,6 +40,7 @@ from tests.recordings import Recording, verify
 from tests.test_cli import Capture, error_of
 
 NOTE = 'lost <script>alert("x")</script> & found\nsecond line'
+WHOLE = "the recording is, byte for byte, the file that the page beside it tells of"
 
 
 class Page(HTMLParser):
@@ -166,7 +167,8 @@ def test_the_model_without_its_folder(tmp_path: Path, small: Path, capsys: Captu
     assert Path("net.onnx").read_bytes() == model.read_bytes()
     capsys.readouterr()
     assert main(["report", "--check", "bug.rrd", "--model", "demo"]) == 0  # the same network elsewhere
-    same, covered = capsys.readouterr().out.splitlines()
+    same, covered, whole = capsys.readouterr().out.splitlines()
+    assert whole == WHOLE
     assert same == "1 frames: the same in every bit" and covered.startswith("compared: what the stages make")
     assert "not compared: " in covered
     other = onnx.load(model)
@@ -184,7 +186,8 @@ def test_the_model_without_its_folder(tmp_path: Path, small: Path, capsys: Captu
 
 def test_a_run_again_is_the_same(small: Path, capsys: Capture) -> None:
     assert main(["report", "--check", str(small)]) == 0
-    same, covered = capsys.readouterr().out.splitlines()
+    same, covered, whole = capsys.readouterr().out.splitlines()
+    assert whole == WHOLE
     assert same == "11 frames: the same in every bit"
     assert covered.startswith("compared: what the stages make") and "; not compared: " in covered
 
@@ -266,7 +269,8 @@ def test_whatever_may_be_the_reason_is_named(tmp_path: Path, capsys: Capture) ->
     names.unlink()
     capsys.readouterr()
     assert main(["report", "--check", "bug.rrd"]) == 0
-    same, covered = capsys.readouterr().out.splitlines()
+    same, covered, whole = capsys.readouterr().out.splitlines()
+    assert whole == WHOLE
     assert same == "1 frames: the same in every bit" and covered.startswith("compared: what the stages make")
     assert "not compared: " in covered
     names.write_text("\n".join(f"other {i}" for i in range(count)))

@@ -102,9 +102,10 @@ def test_what_somebodys_clustering_lost_is_said_with_its_name(here: Path) -> Non
 
 def test_a_hint_may_be_a_parameter_of_somebodys_function(here: Path) -> None:
     """Of ours only those that still have a say."""
-    result = Session(load(settings=["detector.model=demo", "clustering.method=somebody:cells"])).run(frame())
+    theirs = ("clustering.method=somebody:cells", "clustering.cell=0.3")
+    result = Session(load(settings=["detector.model=demo", *theirs])).run(frame())
     questioner = Questioner(result, classes=CLASSES)
-    hints = [hint for a in questioner.ask(Selection())[:25] for hint in questioner.search(a).hints]
+    hints = [hint for answer in questioner.missed() for hint in questioner.search(answer).hints]
     keys = {setting.partition("=")[0] for hint in hints for setting in hint.settings}
     assert "clustering.params.cell" in keys
     assert not keys & {"clustering.eps", "clustering.min_points"}
@@ -169,12 +170,18 @@ ROBOT = (
 
 
 def reported_object() -> tuple[int, int]:
-    """Row of the truth and of the object of one that went well, alone in its cluster and in its box."""
+    """Row of the truth and of the object of the one that went well and stands the most alone."""
+    clusters = ours().clusters
+    assert clusters is not None
+    centre, radius = clusters.obb.center[:, :2], np.linalg.norm(clusters.obb.size[:, :2], axis=1) / 2
+    gaps = {}
     for answer in ask(ours()):
         named = answer.evidence.named
         if answer.verdict.reason is Reason.REPORTED and named is not None and answer.distance < 25:
-            return answer.subject.row, named.row
-    raise AssertionError("nothing is reported")
+            others = clusters.kept & (np.arange(len(clusters)) != named.cluster)
+            away = np.linalg.norm(centre - centre[named.cluster], axis=1) - radius
+            gaps[answer.subject.row, named.row] = np.min(away[others]) - radius[named.cluster]
+    return max(gaps, key=lambda rows: gaps[rows])
 
 
 def robots_answer(robot: Frame, row: int, *settings: str) -> Answer:

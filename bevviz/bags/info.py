@@ -154,14 +154,19 @@ def find_missing(roles: Roles, frame: Frame | None, config: Config) -> list[str]
             if roles.camera_infos:
                 helps = f"--set source.camera_info_topics='{{{role.topic}: {roles.camera_infos[0]}}}'"
             found.append(f"{about} has no CameraInfo{': ' if roles.camera_infos else ', '}{helps}")
-        if not placed and camera.image is not None:
+        if not placed and camera.image is not None and not (frame.points_frame and camera.image.frame_id):
+            what = "its images state" if frame.points_frame else "the points state"
+            found.append(f"{about} is not placed: {what} no frame_id; the driver must")
+        elif not placed and camera.image is not None:
             between = f"'{frame.points_frame}' to '{camera.image.frame_id}'"
             edge = f"{frame.points_frame} {camera.image.frame_id}"
             setting = f"source.extrinsics='{{{edge}: [x, y, z, qx, qy, qz, qw]}}'"
             found.append(f"{about} is not placed, no transform from {between}: --set {setting}")
         if role.info_topic and placed:
             found += [f"{about}: {problem}" for problem in camera.problems]
-    if frame.world_from_points is None:
+    if frame.world_from_points is None and not frame.points_frame:
+        found.append("no fixed frame, so that motion is not compensated: the points state no frame_id")
+    elif frame.world_from_points is None:
         found.append(
             f"no fixed frame above '{frame.points_frame}', so that motion is not compensated: "
             "record nav_msgs/Odometry or the transforms above it, or name another frame that stands still: "

@@ -10,6 +10,7 @@ from typing import Any, Protocol, TypeVar
 from bevviz.frame import Image
 from bevviz.ros.around import decode_shapes, decode_statuses
 from bevviz.ros.messages import (
+    MessageError,
     StampedTransform,
     decode_acceleration,
     decode_camera_info,
@@ -68,7 +69,11 @@ def make_handlers(sync: Synchronizer, roles: Roles, decode: Callable[[M], Any]) 
         sync.add_image(message.topic, stamp, frame_id, message.received, load)
 
     def add_info(message: M, rectified: bool) -> None:
-        info = decode_camera_info(decode(message), rectified, message.topic)
+        try:
+            info = decode_camera_info(decode(message), rectified, message.topic)
+        except MessageError as error:
+            sync.refuse_camera_info(message.topic, str(error))
+            raise
         sync.add_camera_info(message.topic, info, message.header()[0], message.received)
 
     followed = ""  # the frame that odometry places

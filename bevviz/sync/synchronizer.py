@@ -268,6 +268,7 @@ class Synchronizer:
         self._camera_frames: dict[str, str] = {}  # image topic -> optical frame
         self.intrinsics: dict[str, Intrinsics] = {}  # CameraInfo topic -> the newest
         self._infos: dict[str, _Track[Intrinsics]] = {}  # by topic
+        self._refused_infos: dict[str, str] = {}  # topic -> why its calibration cannot be used
         self._info_counts: Counter[str] = Counter()
         self._image_counts: Counter[str] = Counter()
         self._odometry_frames: set[str] = set()
@@ -294,6 +295,7 @@ class Synchronizer:
         self.tf, self.upright, self.clocks = former.tf, former.upright, former.clocks
         self.around = former.around
         self.intrinsics, self._infos = former.intrinsics, former._infos
+        self._refused_infos = former._refused_infos
         self._odometry_frames = former._odometry_frames
         self._overtaken, self._places = former._overtaken, former._places
 
@@ -341,6 +343,10 @@ class Synchronizer:
         self._info_counts[topic] += 1
         track = self._infos.setdefault(topic, _Track(self._horizon))
         track.add(self._arrived(topic, stamp, received), intrinsics)
+
+    def refuse_camera_info(self, topic: str, reason: str) -> None:
+        """A calibration that cannot be used; the reason is that of the camera where there is no other."""
+        self._refused_infos[topic] = reason
 
     def add_transform(
         self, transform: StampedTransform, static: bool = False, fallback: bool = False
@@ -820,6 +826,9 @@ class Synchronizer:
             self._complain(problems, f"{missing} yet: using fx = fy = 267, cx 320, cy 180 of the reference")
             height, width = image.bgr.shape[:2] if image is not None else (360, 640)
             return Intrinsics(width, height, TUTORIAL_K, assumed=True)
+        if role.info_topic in self._refused_infos:
+            self._complain(problems, self._refused_infos[role.info_topic])
+            return None
         others = [topic for topic in self._roles.camera_infos if topic != role.info_topic]
         setting = f"source.camera_info_topics='{{{role.topic}: {others[0]}}}'" if others else ""
         helps = f"name the topic with --set {setting}" if setting else "record one"

@@ -145,10 +145,10 @@ class WhatIf:
     def _run(self, change: Change) -> Traces | None:
         key = tuple(change.items())
         if key not in self._runs:
-            config = changed(self._result.config, change)
             try:
+                config = changed(self._result.config, change)
                 stages = self._loader.load(config, self._known_detections(config, change))
-            except UserError:  # the model file has gone meanwhile: nothing can be proved
+            except (UserError, ValidationError):  # the model file has gone, or nobody may set that value
                 self._runs[key] = None
             else:
                 result = perceive(self._result.frame, config, stages, self._memo)
@@ -310,7 +310,8 @@ def _of_ours(e: Evidence, reason: Reason, config: Config) -> Iterator[Change]:
         elif not e.others:
             yield from ({"clustering.eps": round(c.eps * f, 3)} for f in (0.8, 0.6, 0.4))
     elif reason is Reason.SPLIT:
-        yield {"clustering.eps": round(max(e.apart * 1.1, c.eps * 1.1), 3)}
+        # How far apart is unknown where one of the parts is not a cluster.
+        yield {"clustering.eps": round(max(np.nan_to_num(e.apart), c.eps) * 1.1, 3)}
         yield {"clustering.min_points": max(1, c.min_points // 2)}
         yield {"clustering.eps": round(c.eps * 1.5, 3)}
     elif best is not None:

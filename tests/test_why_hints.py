@@ -1,0 +1,142 @@
+"""What ``bevviz why`` says would help: changes that are joined, and what is said where none helps."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from bevviz.config import load
+from bevviz.session import Session
+from bevviz.why import Answer, Questioner, Selection
+from bevviz.why.verdict import Reason
+from bevviz.why.whatif import SURE, Hint, Search
+from tests.test_faults import at, run
+
+CLASSES = ("car", "person", "cyclist")
+
+
+@cache
+def questioner(preset: str) -> Questioner:
+    return Questioner(run("flat_car", preset), classes=CLASSES)
+
+
+@cache
+def near(preset: str) -> tuple[Answer, ...]:
+    """With hints: what was missed within 25 m (``reference``), or for its size (``default``)."""
+    asked = questioner(preset)
+    missed = [a for a in asked.missed() if a.subject.kind == "truth"]
+    chosen = [
+        a
+        for a in missed
+        if (a.distance < 25 if preset == "reference" else a.verdict.reason is Reason.TOO_SMALL)
+    ]
+    return tuple(asked.with_hints(a) for a in chosen)
+
+
+def again(preset: str, answer: Answer) -> Answer:
+    """The same question with the settings of its hint, everything run anew."""
+    model = "detector.model=demo"
+    config = load(
+        None, [model, *answer.hints[0].settings], "reference" if preset == "reference" else "default"
+    )
+    after = Questioner(Session(config).run(at("flat_car").frame), classes=CLASSES)
+    return after.ask(Selection(truth=answer.subject.row))[0]
+
+
+def test_changes_that_help_together_only_are_named_together() -> None:
+    """Out of the ground, but then in pieces: the hint takes what each stage needs."""
+    both = [
+        a
+        for a in near("reference")
+        if a.hints and len({setting.partition(".")[0] for setting in a.hints[0].settings}) > 1
+    ]
+    assert both, "nothing needs two changes any more: another frame is to be asked about"
+    for answer in both[:1]:
+        (hint,) = answer.hints
+        assert f"; change {', '.join(hint.settings)}: it is cluster " in answer.verdict.text
+        assert again("reference", answer).verdict.reason is Reason.REPORTED
+        for setting in hint.settings:  # none of them is there for nothing
+            alone = replace(answer, hints=(replace(hint, settings=(setting,)),))
+            assert again("reference", alone).verdict.reason is not Reason.REPORTED, setting
+
+
+def test_a_change_of_limits_is_named_where_the_detection_is_its_own_without_a_doubt() -> None:
+    """Too small, and then the score is too low: three settings, of two stages, for a box that fits."""
+    (answer,) = near("default")
+    keys = [setting.partition("=")[0] for setting in answer.hints[0].settings]
+    assert keys == ["clustering.min_cluster_points", "detector.conf_threshold", "fusion.min_rating"]
+    after = again("default", answer)
+    named = after.evidence.named
+    assert after.verdict.reason is Reason.REPORTED and named is not None
+    assert max(c.overlap for c in after.evidence.candidates if c.row == named.detection) >= SURE
+
+
+def test_where_nothing_helps_it_is_said_how_far_what_was_tried_goes() -> None:
+    vain = [a for a in near("reference") if not a.hints and a.verdict.reason is not Reason.REPORTED]
+    searches = [questioner("reference").search(a) for a in vain]
+    assert any(search.furthest for search in searches)
+    for answer, search in zip(vain, searches, strict=True):
+        assert search.tried > 1, "a change that the reason suggests is tried"
+        assert f"; none of the {search.tried} changes that were tried helps" in answer.verdict.text
+        if search.then is not None:
+            state = "reported, but" if search.reported else "lost as"
+            end = f": with {', '.join(search.furthest)} it is {state} '{search.then.value}'."
+            assert answer.verdict.text.endswith(end)
+            tried = replace(answer, hints=(_as_hint(search.furthest),))
+            there = again("reference", tried).verdict
+            assert (there.reason, there.reported) == (search.then, search.reported)
+
+
+def _as_hint(settings: tuple[str, ...]) -> Hint:
+    hint = next(a.hints[0] for a in near("reference") if a.hints)
+    return replace(hint, settings=settings)
+
+
+@pytest.mark.parametrize(
+    ("search", "said"),
+    [
+        (Search((), 1), "; the change that was tried does not help."),
+        (Search((), 7), "; none of the 7 changes that were tried helps."),
+        (
+            Search((), 7, ("clustering.eps=0.3", "fusion.min_iou=0"), Reason.TAKEN),
+            "; none of the 7 changes that were tried helps:"
+            " with clustering.eps=0.3, fusion.min_iou=0 it is lost as 'taken'.",
+        ),
+        (
+            Search((), 1, ("fusion.method=frustum",), Reason.SPLIT, True),
+            "; the change that was tried does not help:"
+            " with fusion.method=frustum it is reported, but 'split'.",
+        ),
+        (Search((), 0), "."),
+    ],
+)
+def test_the_sentence(search: Search, said: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked = questioner("reference")
+    answer = asked.missed()[0]
+    monkeypatch.setattr(Questioner, "search", lambda self, answer: search)
+    assert asked.with_hints(answer).verdict.text == answer.verdict.text.removesuffix(".") + said
+
+
+@pytest.mark.parametrize("eps", [0.5, 19.0])
+def test_no_value_is_tried_that_nobody_may_set(eps: float) -> None:
+    """Of parts whose distance is not known, too, and where a larger value is beyond the limit."""
+    config = load(settings=["detector.model=demo", f"clustering.eps={eps}"])
+    asked = Questioner(Session(config).run(at("flat_car").frame), classes=CLASSES)
+    answer = next(a for a in asked.ask(Selection()) if a.subject.kind == "truth" and a.evidence.parts)
+    odd = replace(answer, evidence=replace(answer.evidence, apart=float("nan")))
+    split = replace(odd, verdict=replace(odd.verdict, reason=Reason.SPLIT))
+    search = asked.search(split)
+    assert search.tried > 0
+    assert all("nan" not in setting for hint in search.hints for setting in hint.settings)
+
+
+def test_what_was_tried_once_is_not_run_again() -> None:
+    """Answers of a frame share their runs; the second question is answered alike."""
+    answer = next(a for a in near("reference") if a.hints)
+    asked = questioner("reference")
+    first = asked.ask(Selection(truth=answer.subject.row))[0]
+    assert asked.with_hints(first).verdict.text == answer.verdict.text
+    assert np.isfinite(answer.distance)
