@@ -392,7 +392,7 @@ def detection(messages: bags.Messages, stamp: int, label: str) -> Any:
     [
         (["a.rrd"], "a.rrd: no such file"),
         (["drive", "a.rrd"], "compare OLD.rrd NEW.rrd"),
-        (["a.rrd", "b.rrd"], "a.rrd: cannot be read"),
+        (["a.rrd", "b.rrd"], "a.rrd: no such file"),
         (["a.rrd", "b.rrd", "--set-a", "voxel.size=0.2"], "leave the sides and the truth out"),
         (["drive", "--robot", "--set-a", "voxel.size=0.2"], "leave --a and --b out"),
         (["drive", "--robot"], "the bag has no vision_msgs/Detection3DArray"),
