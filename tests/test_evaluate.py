@@ -27,7 +27,7 @@ from bevviz.synthetic import SyntheticSource, write_bag
 from tests import bags
 from tests.recordings import Recording, verify
 
-REFERENCES = Path(__file__).parent / "references"
+REFERENCES = Path(__file__).parent / "references" / "metrics"
 
 
 # --- average precision -------------------------------------------------------------------------

@@ -517,7 +517,7 @@ def test_rates_are_counted_over_a_second() -> None:
         rates.add(dataclasses.replace(frame, stamp=at, received=at))
         found.append(dict(rates))
     assert found[1] == {}  # nothing is known of two
-    assert all(9 <= rate <= 12 for rates in found[4:] for rate in rates.values())
+    assert all(8 <= rate <= 13 for rates in found[4:] for rate in rates.values())
     slow = Rates()
     for index in range(3):  # every two seconds
         slow.add(dataclasses.replace(frame, stamp=index * 2_000_000_000, received=0))
@@ -757,8 +757,7 @@ def test_a_killed_process_leaves_what_it_had_logged(tmp_path: Path) -> None:
         import os, signal, time
         from pathlib import Path
         from bevviz.config import load
-        from bevviz.logging.health import Rates
-from bevviz.logging.logger import Logger
+        from bevviz.logging.logger import Logger
         from bevviz.logging.sinks import open_recording
         from tests.test_logging import SCENE, make
         with open_recording(SCENE, load(), save=Path({str(path)!r})) as sinks:

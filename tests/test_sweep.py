@@ -207,7 +207,7 @@ def test_no_labels(tmp_path: Path) -> None:
     with pytest.raises(UserError, match=r"calib/000000.txt: cannot be read: No such file"):
         read_labels(file)
     (tmp_path / "calib" / "000000.txt").write_text("P2: 1 2 3\n")
-    with pytest.raises(UserError, match="no R0_rect and Tr_velo_to_cam"):
+    with pytest.raises(UserError, match="no P2, R0_rect and Tr_velo_to_cam"):
         read_labels(file)
     rows = "R0_rect: 1 0 0 0 1 0 0 0 1\nTr_velo_to_cam: 0 -1 0 0 0 0 -1 0 1 0 0 0\n"
     (tmp_path / "calib" / "000000.txt").write_text(rows)

@@ -145,9 +145,11 @@ class Shown:
                 self.marked |= chunk.entity_path.startswith(entities.why(""))
 
 
-def nearest_missed(message: dict[str, Any], frame: int) -> str:
-    """The pick of the first missed object in what is listed, all of which is of one frame."""
-    entries = message["entries"]
+def nearest_missed(talk: Channel, frame: int) -> str:
+    """The pick of the nearest missed object of what is listed next, all of which is of one frame."""
+    entries: list[dict[str, Any]] = []
+    while not entries:  # those of the frame that was held before may go first
+        entries = talk.until("entries")["entries"]
     assert {sight[0] for entry in entries for sight in entry["sights"]} == {frame}
     missed = [entry["sights"][0] for entry in entries if entry["what"] == "missed"]
     return str(min(missed, key=lambda sight: sight[2])[3])
@@ -165,7 +167,7 @@ def test_a_running_robot_is_asked_and_changed(robot: tuple[str, Path]) -> None:
     orders.send(type="hold", time=shown.stamp)
     held = orders.until("held")
     stamp = int(held["stamp"])
-    near = nearest_missed(talk.until("entries"), held["frame"])
+    near = nearest_missed(talk, held["frame"])
     number = talk.send(type="ask", time=stamp, pick=near, set=[])
     answer = talk.until("answer", number)
     assert answer["frame"] == held["frame"]
@@ -181,7 +183,7 @@ def test_a_running_robot_is_asked_and_changed(robot: tuple[str, Path]) -> None:
     orders.send(type="hold", time=shown.stamp)
     later = orders.until("held")
     assert later["frame"] > held["frame"]
-    near = nearest_missed(talk.until("entries"), later["frame"])
+    near = nearest_missed(talk, later["frame"])
     number = talk.send(type="ask", time=int(later["stamp"]), pick=near, set=[])
     assert "min_cluster_points" in json.dumps(talk.until("answer", number))
     number = talk.send(type="try", time=int(later["stamp"]), set=[])  # undone

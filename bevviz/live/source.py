@@ -249,7 +249,10 @@ class LiveSource(Closing):
     def states(self) -> Mapping[str, str]:
         """How each topic that plays a role does."""
         with self._knowledge:
-            return self._watch.states({name: name in self.topics for name in self._subscriptions})
+            shown = {topic for topic, _, _ in self.roles.around} | {self._mark.name}  # such come and go
+            return self._watch.states(
+                {name: name in self.topics for name in self._subscriptions.keys() - shown}
+            )
 
     def overtaken(self) -> tuple[LateResult, ...]:
         """The robot's own results that no frame has taken, since the last call; from any thread."""
