@@ -133,6 +133,7 @@ def fly(folder: Path) -> Flight:
     heard: list[Any] = []
     said: list[str] = []
     asked = ["objects.method=topic:/ours/objects", "live.robot_time=0.5 s", "live.trigger_after=0"]
+    asked.append("live.log_queue=50")  # no frame is left out, least of all the one with the mark
     settings = Settings(None, ["live.flight_time=20 s", *asked])
     Session(settings.config).run(SyntheticSource(frames=1).snapshot(0).frame)  # what is compiled, is
     raw = RawRecorder(settings.config.live)

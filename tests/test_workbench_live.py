@@ -180,6 +180,8 @@ def test_a_running_robot_is_asked_and_changed(robot: tuple[str, Path]) -> None:
     lost = tried["effects"]["lost"]
     assert lost and not tried["effects"]["added"]
     shown.until(lambda: any("clustering.min_cluster_points 10 -> 100000" in t for t in shown.texts))
+    told = shown.stamp  # of a frame that may have been made before
+    shown.until(lambda: shown.stamp > told + 10**9)
     orders.send(type="hold", time=shown.stamp)
     later = orders.until("held")
     assert later["frame"] > held["frame"]
