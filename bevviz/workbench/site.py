@@ -193,7 +193,6 @@ class Site:
     async def native(self, socket: WebSocket) -> None:
         """The way to the viewer beside the page."""
         bench = await self._opening.bench()
-        await socket.accept()
         if bench is None or bench.native is None:
             await socket.close()
             return
