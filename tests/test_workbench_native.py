@@ -76,7 +76,7 @@ def test_panel_and_viewer_are_at_the_same_time(
         with suppress(TimeoutError):
             client.set_time(entities.STAMP, timestamp=np.datetime64(START + LAST, "ns"))
         until(lambda: f"at={START + LAST}" in page.evaluate("location.hash"))
-        page.locator("#found button").first.click()  # of an object that is missed from the first frame on
+        page.locator("#found button:has(.missed)").first.click()
         until(lambda: "missed" in (page.locator("#answer").get_attribute("class") or "") and verdict(page))
         stamp = int(state(page)["at"][0])
         first = state(page)["pick"][0]
