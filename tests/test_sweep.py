@@ -209,7 +209,8 @@ def test_no_labels(tmp_path: Path) -> None:
     (tmp_path / "calib" / "000000.txt").write_text("P2: 1 2 3\n")
     with pytest.raises(UserError, match="no P2, R0_rect and Tr_velo_to_cam"):
         read_labels(file)
-    rows = "P2: 700 0 600 0 0 700 180 0 0 0 1 0\nR0_rect: 1 0 0 0 1 0 0 0 1\nTr_velo_to_cam: 0 -1 0 0 0 0 -1 0 1 0 0 0\n"
+    rows = "P2: 700 0 600 0 0 700 180 0 0 0 1 0\nR0_rect: 1 0 0 0 1 0 0 0 1\n"
+    rows += "Tr_velo_to_cam: 0 -1 0 0 0 0 -1 0 1 0 0 0\n"
     (tmp_path / "calib" / "000000.txt").write_text(rows)
     with pytest.raises(UserError, match="line 1 has 3 numbers, a KITTI label has 14"):
         read_labels(file)

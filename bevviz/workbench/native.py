@@ -12,6 +12,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Callable, Sequence
+from concurrent.futures import Future
 from typing import Any
 
 import numpy as np
@@ -68,7 +69,25 @@ class NativeViewer(Closing):
             client.get_state()
         except (RuntimeError, TimeoutError, ValueError) as error:
             raise UserError(f"the viewer at {url} does not tell its time: {first_line(error)}") from None
-        relay = subprocess.Popen(
+        begun: Future[rerun_cli.Process] = Future()
+
+        def feed() -> None:
+            # Started here: the relay ends with the thread that starts it, and who opens it may end soon.
+            try:
+                relay = self._start_relay(url)
+            except OSError as error:
+                begun.set_exception(error)
+                return
+            begun.set_result(relay)
+            self._feed(relay)
+
+        threading.Thread(target=feed, name="native viewer", daemon=True).start()
+        relay = begun.result()
+        threading.Thread(target=self._watch, args=(relay, client), name="native viewer", daemon=True).start()
+        return relay
+
+    def _start_relay(self, url: str) -> rerun_cli.Process:
+        return subprocess.Popen(
             rerun_cli.tied([sys.executable, "-m", "bevviz.live.relay", url, self._recording_id]),
             stdin=subprocess.PIPE,
             stdout=subprocess.DEVNULL,
@@ -76,9 +95,6 @@ class NativeViewer(Closing):
             env=rerun_cli.environment(),
             start_new_session=True,  # Ctrl-C is for us alone
         )
-        for work in (lambda: self._feed(relay), lambda: self._watch(relay, client)):
-            threading.Thread(target=work, name="native viewer", daemon=True).start()
-        return relay
 
     def _start(self) -> str:
         port = free_port(FIRST_DATA_PORT)
