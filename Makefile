@@ -14,7 +14,7 @@ test: $(VENV)/.tested
 # The parts that are not ours to choose: data classes, pydantic, compiled kernels, ONNX, readers, the command line.
 FAST = config perceive run exchanged_stages clustering ground fusion tracking messages drive info
 test-fast: $(VENV)/.tested
-	$(BIN)/python -m pytest -q $(FAST:%=tests/test_%.py)
+	$(BIN)/python -m pytest -q -n 2 --dist loadfile $(FAST:%=tests/test_%.py)
 
 check: $(VENV)/.tested
 	$(BIN)/ruff check .
