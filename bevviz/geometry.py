@@ -233,6 +233,12 @@ def corners(boxes: Boxes3D) -> F32:
     return np.asarray(turned + boxes.center[:, None], np.float32)
 
 
+def moved(boxes: Boxes3D, b_from_a: F64) -> Boxes3D:
+    """Upright boxes of frame a in b, which is upright, too."""
+    turned = boxes.yaw + np.float32(yaw(b_from_a))
+    return Boxes3D(apply(b_from_a, boxes.center), boxes.size, turned)
+
+
 def inside(points: F32, boxes: Boxes3D, k: int) -> Bool:
     """(N,) which points are in box k, its surface included."""
     offset = points - boxes.center[k]

@@ -246,9 +246,7 @@ def _rank(sight: _Sight, row: int, strange: float) -> float:
 def _sight(result: FrameResult, tracks: Tracks) -> _Sight:
     boxes = tracks.boxes
     if tracks.absolute:
-        back = geometry.inverse(result.frame.pose)
-        turn = np.float32(geometry.yaw(back))
-        boxes = Boxes3D(geometry.apply(back, boxes.center), boxes.size, boxes.yaw + turn)
+        boxes = geometry.moved(boxes, geometry.inverse(result.frame.pose))
     n = len(boxes)
     open_, whole = np.ones(n, np.float32), np.zeros(n, bool)
     detected = np.zeros(n, bool)

@@ -146,7 +146,6 @@ def _live(options: argparse.Namespace) -> int:
 def _check_outputs(options: argparse.Namespace) -> None:
     """What cannot work is said before a robot is waited for."""
     from bevviz.frame import Scene
-    from bevviz.live.files import check_name
     from bevviz.logging import blueprints
     from bevviz.logging.ports import check_port, own_address
     from bevviz.logging.sinks import check_viewer
@@ -156,8 +155,6 @@ def _check_outputs(options: argparse.Namespace) -> None:
         check_port(options.serve)
     if options.connect is not None:
         check_viewer(options.connect)
-    for path in options.save:
-        check_name(path, ".rrd", ".mcap")
     blueprints.load(options.blueprint, Scene("live", "lidar", ("lidar",)))
 
 
@@ -317,10 +314,11 @@ def _page(options: argparse.Namespace, live: Live) -> AbstractContextManager[obj
 
 def _files(paths: Sequence[Path]) -> tuple[Path | None, Path | None]:
     """Those of ``--save``: for the recording, and for the messages."""
+    from bevviz.live.files import check_name
+
     found: dict[str, Path] = {}
     for path in paths:
-        if path.suffix not in (".rrd", ".mcap"):  # a slip must not overwrite something else
-            raise UserError(f"--save {path}: expected a file name that ends in .rrd or .mcap")
+        check_name(path, ".rrd", ".mcap")
         if path.suffix in found:
             raise UserError(f"--save {path}: {found[path.suffix]} is given already; one of each kind")
         found[path.suffix] = path

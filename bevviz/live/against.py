@@ -15,7 +15,7 @@ from bevviz.compare.log import place
 from bevviz.compare.sides import published, robot_topic
 from bevviz.config import LiveConfig
 from bevviz.errors import UserError
-from bevviz.frame import F64, Boxes3D, FrameResult, LabelledBoxes3D
+from bevviz.frame import F64, FrameResult, LabelledBoxes3D
 
 SECOND = 1_000_000_000
 T = TypeVar("T")
@@ -154,8 +154,5 @@ def _words(difference: Difference) -> str:
 def _placed(labelled: LabelledBoxes3D, world_from_points: F64) -> Seen:
     """The robot's boxes in the frame of the points of a former frame."""
     world = np.eye(4) if labelled.world_from_boxes is None else labelled.world_from_boxes
-    turn = geometry.inverse(world_from_points) @ world
-    boxes = labelled.boxes
-    yaw = boxes.yaw + np.float32(geometry.yaw(turn))
-    moved = Boxes3D(geometry.apply(turn, boxes.center), boxes.size, yaw)
-    return Seen(moved, labelled.labels, labelled.scores)
+    boxes = geometry.moved(labelled.boxes, geometry.inverse(world_from_points) @ world)
+    return Seen(boxes, labelled.labels, labelled.scores)

@@ -195,7 +195,8 @@ class LiveSource(Closing):
         if not self.roles.lidars:
             return misstated or [self.roles.no_lidar or "no LiDAR yet"]
         used = [*self.roles.lidars, *(camera.topic for camera in self.roles.cameras)]
-        silent = [topic for topic in used if not self.received[topic]]
+        received = self.received
+        silent = [topic for topic in used if not received[topic]]
         none = [f"no message on {', '.join(silent)} yet"] if silent else []
         return [*misstated, *none, *self._sync.lacking()] or [CHANGING]
 
@@ -330,7 +331,8 @@ class LiveSource(Closing):
 
     def _look(self) -> None:
         self.topics = published_topics(self._node)
-        known = {name: topic for name, topic in self._known.items() if self.received[name]}
+        received = self.received
+        known = {name: topic for name, topic in self._known.items() if received[name]}
         known.setdefault(self._mark.name, self._mark)
         self._known = known | {name: topic for name, topic in self.topics.items() if _concerns(topic)}
         self._assign()

@@ -109,8 +109,7 @@ def in_points_frame(frame: Frame, labelled: LabelledBoxes3D) -> Boxes3D:
     if labelled.world_from_boxes is None:
         return labelled.boxes
     points_from_boxes = geometry.inverse(frame.pose) @ labelled.world_from_boxes
-    turned = labelled.boxes.yaw + np.float32(geometry.yaw(points_from_boxes))
-    return Boxes3D(geometry.apply(points_from_boxes, labelled.boxes.center), labelled.boxes.size, turned)
+    return geometry.moved(labelled.boxes, points_from_boxes)
 
 
 def _boxes(frame: Frame, topic: str) -> LabelledBoxes3D:

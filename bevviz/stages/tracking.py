@@ -382,5 +382,4 @@ def _completed(
 
 def _placed(boxes: Boxes3D, rows: NDArray[Any], pose: F64) -> Boxes3D:
     """Upright boxes in another upright frame."""
-    yaw = boxes.yaw[rows] + np.float32(geometry.yaw(pose))
-    return Boxes3D(geometry.apply(pose, boxes.center[rows]), boxes.size[rows], yaw)
+    return geometry.moved(boxes.chosen(rows), pose)

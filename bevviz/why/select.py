@@ -119,9 +119,7 @@ def track_subject(traces: Traces, number: int) -> Subject:
     row = int(rows[0])
     box, name, k = one_of(tracks.boxes, row), tracks.names[row], int(tracks.cluster[row])
     if tracks.absolute:
-        points_from_world = geometry.inverse(frame.pose)
-        turned = box.yaw + np.float32(geometry.yaw(points_from_world))
-        box = Boxes3D(geometry.apply(points_from_world, box.center), box.size, turned)
+        box = geometry.moved(box, geometry.inverse(frame.pose))
     title = f"track {number}{f' ({name})' if name else ''} at {float(np.hypot(*box.center[0, :2])):.1f} m"
     points = np.flatnonzero(traces.cluster == k) if k >= 0 else None
     accepted = frozenset({name.lower()} if name else ())
