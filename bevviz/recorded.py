@@ -18,6 +18,7 @@ from bevviz.errors import UserError, first_line
 from bevviz.files import bag_files
 from bevviz.frame import Scene
 from bevviz.logging import entities
+from bevviz.logging.reading import check_decodes
 from bevviz.plugins import is_foreign
 from bevviz.provenance import model_path, names_path
 from bevviz.text import path_text
@@ -25,6 +26,7 @@ from bevviz.text import path_text
 FRAMES = ("source.", "sync.")  # sections that say what a frame is made of
 BLOCK = 1 << 16  # bytes at the beginning, in the middle and at the end of a file that are looked at
 AFTER = 500  # chunks in which one property follows another
+HEAD = 1 << 24  # bytes: what of a recording is read to find what it was made with, and more
 
 
 @dataclass(frozen=True, slots=True)
@@ -297,6 +299,7 @@ def read(recording: Path) -> tuple[str, Origin | None]:
     """
     if not recording.is_file():
         raise UserError(f"{recording}: no such file")
+    check_decodes(recording, first=HEAD)
     how: str | None = None
     origin: Origin | None = None
     try:

@@ -5,7 +5,9 @@ from __future__ import annotations
 import json
 import os
 import random
+import re
 import shutil
+import subprocess
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -16,7 +18,7 @@ import rerun as rr
 
 from bevviz.cli import main
 from bevviz.config import Config, dump
-from bevviz.logging import entities
+from bevviz.logging import entities, rerun_cli
 from tests import bags
 from tests.recordings import Recording
 from tests.test_cli import Capture, error_of
@@ -97,6 +99,38 @@ def test_damage_that_no_page_tells_of(capsys: Capture) -> None:
         out, said = capsys.readouterr()
         assert status in (0, 1, 2) and "bevviz itself" not in said, said
         assert status == 2 or "may have been changed" in out or "differ" in out
+
+
+def damage_that_breaks_the_reader(recording: Path) -> None:
+    """Change where a buffer lies in a chunk, until Rerun's own program breaks on it."""
+    sound = recording.read_bytes()
+    for found in re.finditer(rb"\x04\x20\x00", sound):  # of LZ4: the distance between two of these places
+        changed = bytearray(sound)
+        changed[found.end() - 1] ^= 2
+        recording.write_bytes(changed)
+        verify = [rerun_cli.program(), "rrd", "verify", str(recording)]
+        if subprocess.run(verify, capture_output=True, check=False).returncode > 100:
+            return
+    pytest.fail("nothing breaks the reader: is there need of bevviz.logging.reading.check_decodes?")
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        ["report", "--check", "bug.rrd"],
+        ["why", "bug.rrd", "--at-frame", "0"],
+        ["compare", "bug.rrd", "sound.rrd"],
+    ],
+    ids=lambda command: str(command[0]),
+)
+def test_damage_on_which_the_reader_breaks(command: list[str], capfd: pytest.CaptureFixture[str]) -> None:
+    """A panic in a thread of Rerun's reader would end the process that reads."""
+    Path("bug.html").unlink()
+    shutil.copy("bug.rrd", "sound.rrd")
+    damage_that_breaks_the_reader(Path("bug.rrd"))
+    assert main(command) == 2
+    said = capfd.readouterr().err
+    assert "bug.rrd" in said and "it is damaged" in said and "panic" not in said
 
 
 ZIP = np.frombuffer(b"PK\x03\x04 this is no archive", np.uint8)

@@ -23,7 +23,7 @@ from bevviz.frame import F64, Boxes3D, Scene
 from bevviz.logging import entities
 from bevviz.logging.camera import log_shared_image
 from bevviz.logging.pieces import CORNER
-from bevviz.logging.reading import readable
+from bevviz.logging.reading import check_decodes, readable
 from bevviz.logging.writer import Writer
 from bevviz.run import Items, Observer
 
@@ -69,6 +69,7 @@ class SavedRun:
         self._property: Row = {}
         if not path.is_file():
             raise UserError(f"{path}: {'it is no file' if path.exists() else 'no such file'}")
+        check_decodes(path)
         with readable(path):
             for chunk in self.stream():
                 self._read(chunk)

@@ -12,6 +12,7 @@ from rerun.recording_stream import RecordingStream
 import bevviz
 from bevviz.errors import UserError
 from bevviz.frame import Scene
+from bevviz.logging.reading import check_decodes
 
 
 def _folder() -> Path:
@@ -46,7 +47,10 @@ def load(name_or_path: str, scene: Scene) -> rrb.Blueprint:
         raise UserError(f"--blueprint {name_or_path}: unknown; {hint} (or give a .py or .rbl file)")
     if not path.is_file():
         raise UserError(f"--blueprint {path}: no such file")
-    return _from_python(path, scene) if path.suffix == ".py" else Saved(path)
+    if path.suffix == ".py":
+        return _from_python(path, scene)
+    check_decodes(path)
+    return Saved(path)
 
 
 def _from_python(path: Path, scene: Scene) -> rrb.Blueprint:

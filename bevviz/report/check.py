@@ -18,7 +18,7 @@ from bevviz.errors import UserError
 from bevviz.files import Scratch
 from bevviz.frame import FrameResult
 from bevviz.logging import entities
-from bevviz.logging.reading import readable
+from bevviz.logging.reading import check_decodes, readable
 from bevviz.progress import Progress
 from bevviz.provenance import differences, file_hash, model_path, provenance
 from bevviz.recorded import check_functions
@@ -129,6 +129,8 @@ def check(rrd: Path, *, model: Path | None = None, settings: Sequence[str] = ())
     if not rrd.is_file():
         raise UserError(f"{rrd}: {'it is no file' if rrd.exists() else 'no such file'}")
     sealed = check_seal(rrd)
+    if not sealed:
+        check_decodes(rrd, UNREADABLE)
     stored = read(rrd)
     info, bag = stored.info, rrd.with_suffix(".mcap")
     if not bag.is_file():
