@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from bevviz import announce
 from bevviz.cli.options import Commands, add_config, add_output, load_config, positive
 from bevviz.cli.outputs import Outputs
 from bevviz.cli.run import process
@@ -63,11 +64,7 @@ def _demo(options: argparse.Namespace) -> int:
 
     source = SyntheticSource(options.frames, options.seed, plant=options.plant, weave=options.weave)
     if options.bag is not None:
-        from tqdm import tqdm
-
-        write_bag(
-            source, options.bag, tqdm(source, total=source.total, unit="scan", desc="simulate", disable=None)
-        )
+        write_bag(source, options.bag, announce.bar(source, total=source.total, unit="scan", desc="simulate"))
         print(f"{options.bag}: {source.total} scans; 'bevviz bag {options.bag} --model demo' runs on it")
         return 0
     config = load_config(options)
