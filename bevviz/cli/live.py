@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from bevviz import announce
 from bevviz.cli.interrupts import terminable
-from bevviz.cli.options import Commands, add_config, add_output, add_ros_args, port, positive
+from bevviz.cli.options import Commands, add_config, add_output, add_ros_args, port, positive, project_layers
 from bevviz.cli.outputs import has_display, say, warn
 from bevviz.errors import UserError
 
@@ -128,7 +128,7 @@ def _live(options: argparse.Namespace) -> int:
         raise UserError(f"--save {messages}: the synthetic drive has no messages; 'bevviz demo --bag' does")
     if options.observe and options.robot is not None:
         raise UserError("--robot compares our objects with the robot's: leave --observe out")
-    settings = Settings(options.config, [*options.set, *more], options.preset)
+    settings = Settings(options.config, [*options.set, *more], options.preset, project_layers(options))
     _check_outputs(options)
     loader = StageLoader()
     if not options.observe:

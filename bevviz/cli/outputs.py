@@ -115,7 +115,7 @@ def hint(scene: Scene, config: Config) -> None:
             "set NUMBA_CACHE_DIR to a folder that can be written"
         )
     if scene.cameras and not config.detector.model:
-        say("no detector: give --model FILE.onnx to find objects in the images")
+        say("no detector: give --model FILE.onnx, or name it in bevviz.toml, to find objects in the images")
 
 
 def has_display() -> bool:
