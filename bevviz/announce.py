@@ -1,19 +1,28 @@
-"""What takes a while is said where somebody looks: on a terminal, or nowhere in a library."""
+"""What takes a while is said, and shown as a bar, where somebody looks; in a library nobody does."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 _say: Callable[[str], None] | None = None
+_bars = True
 
 
-def to(say: Callable[[str], None]) -> None:
-    """Have what is announced said by ``say``."""
-    global _say
-    _say = say
+def to(say: Callable[[str], None] | None, *, bars: bool = True) -> None:
+    """Have what is announced said by ``say``, None: by nobody; ``bars``: whether a terminal shows any."""
+    global _say, _bars
+    _say, _bars = say, bars
 
 
 def say(text: str) -> None:
     """One line, where anybody wants to know."""
     if _say is not None:
         _say(text)
+
+
+def bar(*given: Any, **named: Any) -> Any:
+    """``tqdm.tqdm`` of the same arguments, on a terminal alone."""
+    from tqdm import tqdm
+
+    return tqdm(*given, **named, disable=None if _bars else True)

@@ -22,6 +22,7 @@ from pydantic import (
     ConfigDict,
     Field,
     PositiveFloat,
+    PrivateAttr,
     ValidationError,
     ValidationInfo,
     field_validator,
@@ -100,6 +101,8 @@ GROUND = Methods(("polar", "plane"), {"ransac": "plane"})
 CLUSTERING = Methods(("dbscan",))
 OBJECTS = Methods(("frustum",))
 OURS = ("", "demo", *GROUND.ours, *GROUND.former, *CLUSTERING.ours, *OBJECTS.ours)
+
+BASE = "configuration"  # where values are stated that came as a whole
 
 STAGES = {  # section -> the key that names its function
     "ground": "method",
@@ -443,6 +446,27 @@ class Config(Section):
     logging: LoggingConfig = LoggingConfig()
     live: LiveConfig = LiveConfig()
 
+    _stated: Mapping[str, str] = PrivateAttr(default_factory=dict)
+
+    @property
+    def stated(self) -> Mapping[str, str]:
+        """Where each dotted key was stated that was: an option, a file, a variable. It is no part of what
+        two configurations have in common."""
+        return self._stated
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Config) and self.__dict__ == other.__dict__
+
+    __hash__ = None  # type: ignore[assignment]
+
+
+@dataclass(frozen=True, slots=True)
+class Layer:
+    """Values by dotted key, and where they are stated."""
+
+    where: str
+    values: Mapping[str, Any]
+
 
 REFERENCE: dict[str, dict[str, Any]] = {
     "voxel": {"size": 0.05, "average": True},
@@ -572,14 +596,17 @@ def load(
     settings: Iterable[str] = (),
     preset: Preset | None = None,
     base: Config | Mapping[str, Any] | None = None,
+    layers: Iterable[Layer] = (),
 ) -> Config:
-    """The effective configuration: preset, then the files, then each ``key=value``, later ones winning.
+    """The effective configuration: preset, then the layers, the files, then each ``key=value``, later ones
+    winning.
 
     Args:
         file: YAML files.
         settings: ``key=value`` each.
         preset: which one; None: as the files say, else ``default``.
         base: a whole configuration that all of this is to change, or its values by dotted key.
+        layers: of the project, see ``bevviz.project``.
 
     Raises:
         UserError: unreadable file, unknown key, wrong unit or value out of range, in one line.
@@ -587,10 +614,10 @@ def load(
     given: list[tuple[str, Any, str]] = []  # key, value, and where it was stated
     if base is not None:
         stated_there = values(base) if isinstance(base, Config) else base
-        given += [(key, value, "configuration") for key, value in stated_there.items()]
+        given += [(key, value, BASE) for key, value in stated_there.items()]
     files = [Path(file)] if isinstance(file, str | Path) else file or ()
-    for path in files:
-        given += [(key, value, str(path)) for key, value in _flatten(_read_yaml(path)).items()]
+    for layer in (*layers, *map(read_layer, files)):
+        given += [(key, value, layer.where) for key, value in layer.values.items()]
     for text in settings:
         key, sep, value = text.partition("=")
         if not sep:
@@ -599,7 +626,7 @@ def load(
         given.append((key.strip(), parsed, f"--set {text}"))
     given = [(TUTORIAL_NAMES.get(key, key), value, where) for key, value, where in given]
     chosen = preset or next((value for key, value, _ in reversed(given) if key == "preset"), "default")
-    of_preset = _flatten(REFERENCE) if chosen == "reference" else {}
+    of_preset = flattened(REFERENCE) if chosen == "reference" else {}
     stated: dict[str, Any] = {}
     origin: dict[str, str] = {}
     for key, value, where in given:
@@ -616,7 +643,7 @@ def load(
             section, _, name = key.partition(".")
             full = f"{section}.params.{name}"
             if full not in params:
-                raise UserError(f"{origin[key]}: {_unknown(key, known)}")
+                raise UserError(f"{origin[key]}: {unknown_key(key, known)}")
             origin[full] = origin[key]
         if full != "preset":
             _insert(tree, full, value)
@@ -627,18 +654,21 @@ def load(
                 mode="json"
             )
         prefix = ""
-        return Config.model_validate(tree)
+        made = Config.model_validate(tree)
     except ValidationError as error:
         first = error.errors()[0]
         loc = (*prefix.split(".")[:-1], *first["loc"])
         key = next((k for k in _prefixes(loc) if k in origin), ".".join(map(str, loc)))
-        where = origin.get(key, "configuration")
+        where = origin.get(key, BASE)
         silent = first["type"] in ("wrong_unit", "missing")
         value = f" (given: {first['input']!r})" if not silent else ""
         about = keys().get(key) or params.get(key, "")
         hint = f"; it is: {about}" if about else ""
         stated_unit = f", in {unit(key)}" if unit(key) and not silent else ""
         raise UserError(f"{where}: {key} {_lower(first['msg'])}{stated_unit}{value}{hint}") from None
+    before = base.stated if isinstance(base, Config) else {}
+    made._stated = {**before, **{key: where for key, where in origin.items() if where != BASE}}
+    return made
 
 
 def _params(stated: Mapping[str, Any], origin: Mapping[str, str]) -> dict[str, str]:
@@ -690,6 +720,15 @@ def dump(config: Config) -> str:
     return "\n".join(lines) + "\n"
 
 
+def stated_lines(config: Config, *, folders: bool = True) -> list[str]:
+    """For each place that states parameters one line, with their names: ``bevviz.toml: clustering.eps``."""
+    found: dict[str, list[str]] = {}
+    for key, where in config.stated.items():
+        place = "command line" if where.startswith("--") else where if folders else Path(where).name
+        found.setdefault(place, []).append(key)
+    return [f"{place}: {', '.join(names)}" for place, names in found.items()]
+
+
 def _note(key: str, about: Mapping[str, str]) -> str:
     text = (f"in {unit(key)}; " if unit(key) else "") + about.get(key, "")
     return f"  # {text}" if text else ""
@@ -710,7 +749,7 @@ def flat_yaml(text: str, where: str) -> dict[str, Any]:
     Raises:
         UserError: no YAML; ``where`` says whose.
     """
-    return _flatten(_yaml_value(text, where) or {})
+    return flattened(_yaml_value(text, where) or {})
 
 
 def _lower(message: str) -> str:
@@ -720,18 +759,29 @@ def _lower(message: str) -> str:
 
 def unit(key: str) -> str:
     """Name of the unit that the value of a dotted key is in; empty where it has none."""
+    found = _unit(key)
+    return found.name if found is not None else ""
+
+
+def unit_spellings(key: str) -> tuple[str, ...]:
+    """Units that the value of a dotted key may be given in, e.g. m, cm and mm."""
+    found = _unit(key)
+    return tuple(found.factors) if found is not None else ()
+
+
+def _unit(key: str) -> Unit | None:
     section, _, name = key.partition(".")
     model = _model(section)
     if model is None or name not in model.model_fields:
-        return ""
+        return None
     info = model.model_fields[name]
     # An optional quantity carries its unit inside the union.
     inner = [extra for part in get_args(info.annotation) for extra in getattr(part, "__metadata__", ())]
     for extra in [*info.metadata, *inner]:
         owner = getattr(getattr(extra, "func", None), "__self__", None)
         if isinstance(owner, Unit):
-            return owner.name
-    return ""
+            return owner
+    return None
 
 
 def _model(section: str) -> type[BaseModel] | None:
@@ -752,7 +802,8 @@ def _insert(tree: dict[str, Any], key: str, value: Any) -> None:
     tree[last] = value
 
 
-def _unknown(key: str, known: Sequence[str]) -> str:
+def unknown_key(key: str, known: Sequence[str]) -> str:
+    """That there is no such key, with the nearest of the ``known`` ones."""
     choices = {k.replace(".params.", "."): k for k in [*known, *TUTORIAL_NAMES]}
     by_last = [k for k in choices if k.rsplit(".", 1)[-1] == key.rsplit(".", 1)[-1]]
     near = by_last or difflib.get_close_matches(key.replace(".params.", "."), choices, 1, 0.3)
@@ -760,7 +811,7 @@ def _unknown(key: str, known: Sequence[str]) -> str:
     return f"unknown key '{key}'{hint} ('bevviz config' lists all)"
 
 
-def _flatten(tree: Mapping[str, Any]) -> dict[str, Any]:
+def flattened(tree: Mapping[str, Any]) -> dict[str, Any]:
     """Dotted keys of a tree of sections. What is deeper is a value, but for the parameters of plugins."""
     flat: dict[str, Any] = {}
     for name, value in tree.items():
@@ -773,6 +824,15 @@ def _flatten(tree: Mapping[str, Any]) -> dict[str, Any]:
             else:
                 flat[f"{name}.{inner}"] = content
     return flat
+
+
+def read_layer(path: Path) -> Layer:
+    """What a YAML file states.
+
+    Raises:
+        UserError: it cannot be read.
+    """
+    return Layer(str(path), flattened(_read_yaml(path)))
 
 
 def _read_yaml(path: Path) -> Mapping[str, Any]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+from bevviz import announce
 from bevviz.run import Items, Observer
 from bevviz.text import printable
 
@@ -20,10 +21,9 @@ class Progress(Observer[object]):
         self._bar: Any = None
 
     def begin(self, items: Items[object]) -> None:
-        from tqdm import tqdm
 
         description = self._what or printable(items.scene.name)
-        self._bar = tqdm(total=items.total, unit=self._unit, desc=description, disable=None)
+        self._bar = announce.bar(total=items.total, unit=self._unit, desc=description)
 
     def see(self, result: object) -> None:
         self._bar.update()

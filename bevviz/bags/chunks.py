@@ -14,8 +14,8 @@ import numpy as np
 import rosbags.rosbag1
 import rosbags.rosbag2
 from rosbags.interfaces import Connection
-from tqdm import tqdm
 
+from bevviz import announce
 from bevviz.bags.reader import (
     LAST,
     Bytes,
@@ -358,9 +358,7 @@ def rescue(path: Path, form: Form) -> IndexedChunks:
     """A reader of what is found by looking through a file from front to back."""
     found, file = Scan(), Bytes(path)
     try:
-        bar = tqdm(
-            total=file.size, unit="B", unit_scale=True, desc=f"rescue {path.name}", delay=1, disable=None
-        )
+        bar = announce.bar(total=file.size, unit="B", unit_scale=True, desc=f"rescue {path.name}", delay=1)
         with bar:
             form.scan(file, found, lambda offset: bar.update(offset - bar.n))
     finally:

@@ -14,7 +14,7 @@ from bevviz import table
 from bevviz.bags.reader import megabytes
 from bevviz.bags.recording import Recording
 from bevviz.bags.source import SECOND, BagSource, iso
-from bevviz.config import Config, stage_topics
+from bevviz.config import Config, stage_topics, stated_lines
 from bevviz.errors import UserError
 from bevviz.frame import Camera, Frame
 from bevviz.ros.roles import Roles, Topic, find_roles
@@ -49,6 +49,7 @@ class Contents:
     tree: Mapping[str, str] = field(default_factory=dict)  # child frame -> parent frame
     points_frame: str = ""
     world_frame: str = ""  # "": the fixed frame is not connected
+    configured: tuple[str, ...] = ()  # where parameters are stated, and which
     missing: tuple[str, ...] = ()  # for a full run, with the option that gives it
     warnings: tuple[str, ...] = ()
 
@@ -111,6 +112,7 @@ def _describe(
         tree=dict(source.tree) if source else {},
         points_frame=frame.points_frame if frame else "",
         world_frame=frame.world_frame if frame and frame.world_from_points is not None else "",
+        configured=tuple(stated_lines(config)),
         missing=tuple(missing),
         warnings=(*recording.warnings, *(source.doubts if source else ())),
     )
@@ -197,6 +199,7 @@ def render_contents(about: Mapping[str, str], info: Contents) -> str:
         *_section("roles", [f"{t.name}: {t.role}" for t in info.topics if t.role]),
         *_section("cameras", [_camera(camera) for camera in info.cameras]),
         *_section("transforms", list(_tree(info))),
+        *_section("configured by", info.configured),
         *_section("missing for a full run", info.missing or ["nothing"]),
         *_section("warnings", info.warnings),
     ]

@@ -22,8 +22,8 @@ from rosbags.interfaces import (
 )
 from rosbags.typesys import Stores, TypesysError, get_types_from_idl, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
-from tqdm import tqdm
 
+from bevviz import announce
 from bevviz.bags import mcap, mcap_scan, ros1, sqlite
 from bevviz.bags.beside import bag_beside
 from bevviz.bags.chunks import Form, SoundChunks, rescue
@@ -426,9 +426,7 @@ def unpack_file(path: Path, target: Path) -> tuple[int, bool]:
         How many places are damaged, and whether the last frame is whole.
     """
     source, damaged, stream = Bytes(path), 0, zstd.ZstdDecompressor()
-    bar = tqdm(
-        total=source.size, unit="B", unit_scale=True, desc=f"unpack {path.name}", delay=1, disable=None
-    )
+    bar = announce.bar(total=source.size, unit="B", unit_scale=True, desc=f"unpack {path.name}", delay=1)
     try:
         with target.open("wb") as out, bar:
             offset = 0

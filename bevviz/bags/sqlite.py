@@ -21,8 +21,8 @@ import numpy as np
 from numpy.typing import NDArray
 from rosbags.interfaces import Connection, ConnectionExtRosbag2, MessageDefinition
 from rosbags.rosbag2 import Reader as PublicReader
-from tqdm import tqdm
 
+from bevviz import announce
 from bevviz.bags.mcap import FORMATS, NOTHING
 from bevviz.bags.reader import (
     LAST,
@@ -331,7 +331,7 @@ class SqliteRescuer:
         self._incomplete = self._broken = 0
         self._unread: set[int] = set()
         count = self._pages.count
-        bar = tqdm(total=count, unit="page", desc=f"rescue {path.name}", delay=1, disable=None)
+        bar = announce.bar(total=count, unit="page", desc=f"rescue {path.name}", delay=1)
         seen: set[int] = set()
         with bar:
             for number in self._pages.leaves():

@@ -10,7 +10,7 @@ from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from bevviz import __version__, announce
+from bevviz import __version__
 from bevviz.cli import (
     bag,
     batch,
@@ -24,6 +24,7 @@ from bevviz.cli import (
     live,
     outputs,
     report,
+    style,
     sweep,
     tune,
     why,
@@ -31,6 +32,7 @@ from bevviz.cli import (
 )
 from bevviz.cli.inputs import check_outputs
 from bevviz.cli.options import follow_recording, with_negatives
+from bevviz.cli.parser import COMMAND, Parser
 from bevviz.errors import UserError, first_line, interrupt_in
 
 if TYPE_CHECKING:
@@ -77,19 +79,22 @@ def _main(arguments: Sequence[str] | None) -> int:
     try:
         parser, commands = _parser()
         given = with_negatives(sys.argv[1:] if arguments is None else arguments)
-        if given and given[0] not in commands and Path(given[0]).exists():
+        if not given:
+            parser.print_help()
+            return 2
+        if given[0] not in commands and Path(given[0]).exists():
             given = ["open", *given]
         options = parser.parse_args(given)
         if options.verbose:
             _log_to_stderr()
-        announce.to(outputs.say)
+        outputs.speak(quiet=options.quiet)
         follow_recording(options)
         check_outputs(options)
         run: Callable[[argparse.Namespace], int] = options.run
         return run(options)
     except UserError as error:
         _log().debug("what led to the error", exc_info=error)
-        print(f"bevviz: error: {error}", file=sys.stderr)
+        print(f"{style.error('bevviz: error:')} {error}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
         print("bevviz: interrupted", file=sys.stderr)
@@ -103,10 +108,8 @@ def _main(arguments: Sequence[str] | None) -> int:
             return 130
         _log().error("an error that nobody foresaw", exc_info=error)
         what = f"{type(error).__name__}: {first_line(error)}"
-        print(
-            f"bevviz: error of bevviz itself: {what}; --verbose shows where, please report it",
-            file=sys.stderr,
-        )
+        began = style.error("bevviz: error of bevviz itself:")
+        print(f"{began} {what}; --verbose shows where, please report it", file=sys.stderr)
         return 3
     finally:
         if arguments is None:
@@ -116,14 +119,14 @@ def _main(arguments: Sequence[str] | None) -> int:
 
 def _parser() -> tuple[argparse.ArgumentParser, Collection[str]]:
     """The parser, and the names of the commands."""
-    parser = argparse.ArgumentParser(
+    parser = Parser(
         prog="bevviz",
         description="See what a LiDAR-camera perception pipeline saw, made and decided, in Rerun.",
         epilog=EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--version", action="version", version=f"bevviz {__version__}")
-    commands = parser.add_subparsers(required=True, metavar="COMMAND")
+    commands = parser.add_subparsers(required=True, metavar=COMMAND)
     for command in (
         workbench,
         bag,
@@ -144,6 +147,9 @@ def _parser() -> tuple[argparse.ArgumentParser, Collection[str]]:
     for command_parser in commands.choices.values():
         command_parser.add_argument(
             "--verbose", action="store_true", help="also say on stderr where in the code something failed"
+        )
+        command_parser.add_argument(
+            "--quiet", action="store_true", help="no progress and no notes: only results, and what is wrong"
         )
     return parser, commands.choices
 

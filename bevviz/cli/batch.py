@@ -10,6 +10,7 @@ from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from bevviz import announce
 from bevviz.cli.interrupts import terminable, wait_for_interrupt
 from bevviz.cli.options import (
     TIMES,
@@ -135,7 +136,6 @@ def _jobs(options: argparse.Namespace) -> list[Job]:
 
 def _run(jobs: list[Job], options: argparse.Namespace, failed: list[tuple[str, str]]) -> bool:
     """Do what is left. Returns whether it was interrupted."""
-    from tqdm import tqdm
 
     from bevviz.batch.batch import left_to_do
 
@@ -146,7 +146,7 @@ def _run(jobs: list[Job], options: argparse.Namespace, failed: list[tuple[str, s
     try:
         with (
             terminable() as ended,
-            tqdm(total=len(jobs), initial=len(jobs) - len(todo), unit="bag", disable=None) as bar,
+            announce.bar(total=len(jobs), initial=len(jobs) - len(todo), unit="bag") as bar,
         ):
 
             def on_frame() -> None:
@@ -213,7 +213,7 @@ def _sum_up(
         frames = sum(info.frames for _, info in complete)
         say(f"{len(complete)} bags complete, {len(failed)} failed, {frames} frames. Summary: {page}")
         if viewer:
-            say(f"catalog at {url}, viewer at {viewer}; serving until Ctrl-C")
+            say(f"catalog at {url}, viewer at {viewer}; serving until Ctrl-C", always=True)
             wait_for_interrupt()
     return 1 if failed or not complete or not kept else 0
 
@@ -239,7 +239,7 @@ def _gate(
         if kept.reason
     ]
     for name, reason in broken:
-        say(f"{name}: not kept: {reason}")
+        say(f"{name}: not kept: {reason}", always=True)
     if junit is not None:
         write_junit(junit, suites)
     return not broken

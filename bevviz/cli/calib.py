@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
+from bevviz import announce
 from bevviz.cli.options import Commands, add_bag, add_config, add_output, add_selection, load_config, open_bag
 from bevviz.cli.outputs import Outputs, say, warn
 
@@ -35,7 +36,6 @@ def add(commands: Commands) -> None:
 
 
 def _calib(options: argparse.Namespace) -> int:
-    from tqdm import tqdm
 
     from bevviz.calib import calibrate, gather
     from bevviz.errors import UserError
@@ -50,15 +50,15 @@ def _calib(options: argparse.Namespace) -> int:
         names = _cameras(scene, options.camera, source.roles.no_camera)
     options.every = chosen or max(1, total // FRAMES)
     with open_bag(options, config) as source:
-        bar = tqdm(source, total=source.total, unit="frame", desc="find edges", disable=None)
+        bar = announce.bar(source, total=source.total, unit="frame", desc="find edges")
         shots = gather(bar, names, source.pose)
         warn(source.warnings)
     results = []
     for name in names:
         form = "{desc}: {percentage:3.0f}%|{bar}| {elapsed}{postfix}"
-        with tqdm(total=100, desc=f"align {name}", bar_format=form, disable=None) as steps:
+        with announce.bar(total=100, desc=f"align {name}", bar_format=form) as steps:
 
-            def show(done: float, what: str, steps: tqdm = steps) -> None:
+            def show(done: float, what: str, steps: Any = steps) -> None:
                 steps.set_postfix_str(what, refresh=False)
                 steps.update(round(100 * done) - steps.n)
 

@@ -6,19 +6,35 @@ import argparse
 
 from bevviz.cli.options import Commands, add_config, load_config
 
+EXAMPLES = """examples:
+  bevviz config > my.yaml                 all, to be changed and given to --config
+  bevviz config clustering.eps            what it is, its unit and range, and where its value comes from
+  bevviz config clustering                every parameter of that stage"""
+
 
 def add(commands: Commands) -> None:
     config = commands.add_parser(
         "config",
-        help="print the effective configuration",
-        description="Print every parameter with its unit and meaning, as YAML that --config reads back.",
+        help="print the effective configuration, or explain one parameter",
+        description="Print every parameter with its unit and meaning, as YAML that --config reads back; or "
+        "explain one.",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        epilog=EXAMPLES,
     )
+    config.add_argument("key", nargs="?", metavar="KEY", help="one parameter, or a section, to be explained")
     add_config(config)
     config.set_defaults(run=_config)
 
 
 def _config(options: argparse.Namespace) -> int:
-    from bevviz.config import dump
+    from bevviz.config import dump, stated_lines
+    from bevviz.parameters import explain
 
-    print(dump(load_config(options)), end="")
+    config = load_config(options)
+    if options.key is not None:
+        print(explain(options.key, config))
+        return 0
+    for line in stated_lines(config):
+        print(f"# {line}")
+    print(dump(config), end="")
     return 0

@@ -5,7 +5,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from bevviz.cli.options import Commands, add_config, add_output, load_config, positive
+from bevviz import announce
+from bevviz.cli.options import Commands, add_config, add_output, positive
 from bevviz.cli.outputs import Outputs
 from bevviz.cli.run import process
 
@@ -57,21 +58,17 @@ def add(commands: Commands) -> None:
 
 
 def _demo(options: argparse.Namespace) -> int:
-    from bevviz.config import load
+    from bevviz.config import Layer, load
     from bevviz.drive import Drive
     from bevviz.synthetic import SyntheticSource, write_bag
 
     source = SyntheticSource(options.frames, options.seed, plant=options.plant, weave=options.weave)
     if options.bag is not None:
-        from tqdm import tqdm
-
-        write_bag(
-            source, options.bag, tqdm(source, total=source.total, unit="scan", desc="simulate", disable=None)
-        )
+        write_bag(source, options.bag, announce.bar(source, total=source.total, unit="scan", desc="simulate"))
         print(f"{options.bag}: {source.total} scans; 'bevviz bag {options.bag} --model demo' runs on it")
         return 0
-    config = load_config(options)
-    if not config.detector.model:
-        # The configuration is frozen: the demo's own network is one more setting under the user's.
-        config = load(options.config, ["detector.model=demo", *options.set], options.preset)
+    # A project's sensors and network are not the demo's: it is the same everywhere.
+    config = load(
+        options.config, options.set, options.preset, layers=[Layer("demo", {"detector.model": "demo"})]
+    )
     return process(Drive(source, config), Outputs.of(options), Path("demo.rrd"))

@@ -123,7 +123,7 @@ def _report(evaluation: Evaluation, limits: list[Limit], options: argparse.Names
         write_junit(options.junit, {options.paths[0].resolve().stem: kept})
     for found in kept:
         if found.reason:
-            say(f"not kept: {found.reason}")
+            say(f"not kept: {found.reason}", always=True)
     if kept and not any(found.reason for found in kept):
         say(f"all {len(kept)} limits are kept" if len(kept) > 1 else f"kept: {kept[0].limit}")
     return int(any(found.reason for found in kept))

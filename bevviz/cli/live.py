@@ -9,9 +9,10 @@ from contextlib import AbstractContextManager, nullcontext, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from bevviz import announce
 from bevviz.cli.interrupts import terminable
-from bevviz.cli.options import Commands, add_config, add_output, add_ros_args, port, positive
-from bevviz.cli.outputs import has_display, say
+from bevviz.cli.options import Commands, add_config, add_output, add_ros_args, port, positive, project_layers
+from bevviz.cli.outputs import has_display, say, warn
 from bevviz.errors import UserError
 
 if TYPE_CHECKING:
@@ -127,7 +128,7 @@ def _live(options: argparse.Namespace) -> int:
         raise UserError(f"--save {messages}: the synthetic drive has no messages; 'bevviz demo --bag' does")
     if options.observe and options.robot is not None:
         raise UserError("--robot compares our objects with the robot's: leave --observe out")
-    settings = Settings(options.config, [*options.set, *more], options.preset)
+    settings = Settings(options.config, [*options.set, *more], options.preset, project_layers(options))
     _check_outputs(options)
     loader = StageLoader()
     if not options.observe:
@@ -221,13 +222,12 @@ def _watch_robot(
 
 
 def _replay(frames: int) -> Replay:
-    from tqdm import tqdm
 
     from bevviz.live.replay import Replay
     from bevviz.synthetic import SyntheticSource
 
     source = SyntheticSource(frames=frames)
-    drive = list(tqdm(source, total=source.total, unit="scan", desc="simulate", disable=None))
+    drive = list(announce.bar(source, total=source.total, unit="scan", desc="simulate"))
     return Replay(drive, source.scene)
 
 
@@ -243,7 +243,6 @@ def _watch(
     raw: RawRecorder | None = None,
 ) -> int:
     """The live run, until the source ends or the user ends it."""
-    from tqdm import tqdm
 
     from bevviz.live.runtime import Live, Outputs
 
@@ -269,14 +268,14 @@ def _watch(
     if follow is not None:
         live.on_change = follow(live)
     for url in live.urls:
-        say(f"viewer at {url}")
+        say(f"viewer at {url}", always=True)
     if unsaid and not window:
         say("no display: 'bevviz snap' saves the last seconds, --serve shows them in a browser")
     with (
         suppress(KeyboardInterrupt),
         terminable(),
         _page(options, live),
-        tqdm(unit="frame", desc=source.scene.name, disable=None) as bar,
+        announce.bar(unit="frame", desc=source.scene.name) as bar,
     ):
 
         def show(status: Status) -> None:
@@ -287,8 +286,7 @@ def _watch(
     if (against := live.against) is not None:
         text = f"{against.differing} of {against.frames} compared frames differ from {against.names[1]}"
         say(text if against.frames else f"the robot published nothing on {against.names[1]}")
-    for warning in source.warnings:
-        say(f"warning: {warning}")
+    warn(source.warnings)
     written = [saver.paths for saver in (live.saver, live.raw_saver) if saver is not None]
     targets = [f"{where[0]}" + (f" and {len(where) - 1} more" if where[1:] else "") for where in written]
     target = f" in {', '.join(targets)}" if targets else ""
@@ -308,7 +306,7 @@ def _page(options: argparse.Namespace, live: Live) -> AbstractContextManager[obj
             f"the workbench needs further packages ({error.name}): pip install 'bevviz[workbench]'"
         ) from None
     page = LivePage(LiveBench(live), options.workbench or None)
-    say(f"workbench at {page.address}")
+    say(f"workbench at {page.address}", always=True)
     return page
 
 

@@ -12,7 +12,7 @@ from bevviz.errors import UserError
 
 if TYPE_CHECKING:
     from bevviz.bags.source import BagSource
-    from bevviz.config import Config, Preset
+    from bevviz.config import Config, Layer, Preset
     from bevviz.recorded import Recorded
 
 Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
@@ -99,7 +99,10 @@ def open_bag(options: argparse.Namespace, config: Config) -> BagSource:
 
 
 def add_config(parser: argparse.ArgumentParser) -> None:
-    group = parser.add_argument_group("configuration")
+    group = parser.add_argument_group(
+        "configuration",
+        "What a bevviz.toml in this folder or above, or BEVVIZ_MODEL, states need not be given; this wins.",
+    )
     group.add_argument(
         "--preset", choices=("default", "reference"), help="reference: as the ROS 2 tutorial pipeline"
     )
@@ -193,11 +196,29 @@ def loaded(
     settings: Sequence[str],
     preset: Preset | None,
 ) -> Config:
-    """``bevviz.config.load``, upon the configuration of the recording that was given instead of a bag."""
+    """``bevviz.config.load`` upon the project's, or upon the recording's that was given instead of a bag."""
     from bevviz.config import load
 
     recorded: Recorded | None = getattr(options, "recorded", None)
-    return (load if recorded is None else recorded.load)(file, settings, preset)
+    if recorded is not None:
+        return recorded.load(file, settings, preset)
+    return load(file, settings, preset, layers=project_layers(options))
+
+
+def project_layers(options: argparse.Namespace) -> list[Layer]:
+    """What is stated for the working directory, looked for once; for a recording, its own is taken.
+
+    Raises:
+        UserError: as ``bevviz.project.layers``.
+    """
+    from bevviz.project import layers
+
+    if getattr(options, "recorded", None) is not None:
+        return []
+    if not hasattr(options, "layers"):
+        options.layers = layers(Path.cwd())
+    found: list[Layer] = options.layers
+    return found
 
 
 def follow_recording(options: argparse.Namespace) -> None:

@@ -10,6 +10,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
+from bevviz import announce
+from bevviz.cli import style
 from bevviz.cli.interrupts import wait_for_interrupt
 from bevviz.text import printable
 
@@ -70,7 +72,7 @@ class Outputs(NamedTuple):
             blueprint=self.blueprint,
         ) as sinks:
             for url in sinks.urls:
-                say(f"viewer at {url}")
+                say(f"viewer at {url}", always=True)
             warn(sinks.warnings)
             yield sinks
 
@@ -82,13 +84,25 @@ class Outputs(NamedTuple):
             wait_for_interrupt()
 
 
-def say(line: str) -> None:
-    print(f"bevviz: {printable(line)}", file=sys.stderr)
+_quiet = False
+
+
+def speak(*, quiet: bool) -> None:
+    """Of a process that is a command: what is announced is said, unless it is to be ``quiet``."""
+    global _quiet
+    _quiet = quiet
+    announce.to(None if quiet else say, bars=not quiet)
+
+
+def say(line: str, *, always: bool = False) -> None:
+    """On stderr; with ``--quiet`` only what is ``always`` said, as the address of a server."""
+    if always or not _quiet:
+        print(f"bevviz: {printable(line)}", file=sys.stderr)
 
 
 def warn(warnings: Iterable[str]) -> None:
     for warning in warnings:
-        say(f"warning: {warning}")
+        print(f"bevviz: {style.warning('warning:')} {printable(warning)}", file=sys.stderr)
 
 
 def hint(scene: Scene, config: Config) -> None:
@@ -101,7 +115,7 @@ def hint(scene: Scene, config: Config) -> None:
             "set NUMBA_CACHE_DIR to a folder that can be written"
         )
     if scene.cameras and not config.detector.model:
-        say("no detector: give --model FILE.onnx to find objects in the images")
+        say("no detector: give --model FILE.onnx, or name it in bevviz.toml, to find objects in the images")
 
 
 def has_display() -> bool:

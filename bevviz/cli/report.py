@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 from bevviz.cli.options import Commands, add_bag, add_config, load_config
-from bevviz.cli.outputs import say
+from bevviz.cli.outputs import say, warn
 from bevviz.errors import UserError
 
 
@@ -85,8 +85,7 @@ def _report(options: argparse.Namespace) -> int:
             notes=list(Notes(options.paths)),
         )
     )
-    for warning in report.warnings:
-        say(f"warning: {warning}")
+    warn(report.warnings)
     files = ", ".join(f"{path} ({megabytes(path.stat().st_size)})" for path in report.files)
     if report.interrupted:
         say(f"interrupted after {report.frames} frames; what was made until then is complete: {files}")

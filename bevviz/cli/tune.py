@@ -8,7 +8,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from bevviz.cli.interrupts import terminable
-from bevviz.cli.options import Commands, add_bag, add_config, add_output, given_settings, loaded
+from bevviz.cli.options import (
+    Commands,
+    add_bag,
+    add_config,
+    add_output,
+    given_settings,
+    loaded,
+    project_layers,
+)
 from bevviz.cli.outputs import Outputs, hint, say, warn
 from bevviz.errors import UserError
 
@@ -47,7 +55,7 @@ def _tune(options: argparse.Namespace) -> int:
     elif (recorded := getattr(options, "recorded", None)) is not None:
         say(f"{options.config}: is there already, and taken instead of the recording's configuration")
         given = [*recorded.missing(load(options.config, given, options.preset)), *given]
-    settings = Settings(options.config, given, options.preset)
+    settings = Settings(options.config, given, options.preset, project_layers(options))
     frame, scene, warnings = _frame(options, settings)
     outputs = Outputs.of(options).or_viewer()
     if not outputs:

@@ -6,6 +6,7 @@ import argparse
 from collections.abc import Callable, Iterable, Sequence
 from typing import TYPE_CHECKING
 
+from bevviz import announce
 from bevviz.cli.options import Commands, add_bag, add_config, add_output, load_config, positive
 from bevviz.cli.outputs import Outputs, say, warn
 from bevviz.errors import UserError
@@ -180,9 +181,8 @@ def _in_short(questioner: Questioner, selection: Selection) -> str:
 
 
 def _progress(answers: Sequence[Answer]) -> Iterable[Answer]:
-    from tqdm import tqdm
 
-    yield from tqdm(answers, unit="object", desc="what would change it", leave=False, disable=None)
+    yield from announce.bar(answers, unit="object", desc="what would change it", leave=False)
 
 
 def _print_json(

@@ -89,7 +89,7 @@ def _open(options: argparse.Namespace) -> int:
             return Bench(Drive(mine, config), others, options.paths, truth_of, first)
 
         def ready(address: str) -> None:
-            say(f"workbench at {address}")
+            say(f"workbench at {address}", always=True)
             if options.browser and has_display():
                 import webbrowser
 

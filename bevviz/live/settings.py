@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from bevviz.config import Config, Preset, load
+from bevviz.config import Config, Layer, Preset, load
 
 AT_START = (
     "source.",
@@ -19,20 +19,25 @@ AT_START = (
 
 
 class Settings:
-    """Preset, file and ``key=value`` settings, later ones winning; what ``update`` brings wins over all.
+    """Preset, project, file and ``key=value`` settings, later ones winning; what ``update`` brings wins.
 
     Raises:
         UserError: as ``bevviz.config.load``.
     """
 
     def __init__(
-        self, file: Path | None = None, settings: Sequence[str] = (), preset: Preset | None = None
+        self,
+        file: Path | None = None,
+        settings: Sequence[str] = (),
+        preset: Preset | None = None,
+        layers: Sequence[Layer] = (),
     ) -> None:
         self.file = file
         self._settings = list(settings)
         self._preset = preset
+        self._layers = layers
         self._version = self._stat()
-        self.config = load(file, self._settings, preset)
+        self.config = self.read()
 
     def changed(self) -> bool:
         """Whether the file was saved since the last call."""
@@ -48,7 +53,7 @@ class Settings:
         Raises:
             UserError: as ``bevviz.config.load``.
         """
-        return load(self.file, [*self._settings, *more], self._preset)
+        return load(self.file, [*self._settings, *more], self._preset, layers=self._layers)
 
     def take(self, more: Sequence[str]) -> None:
         """More settings, before anything runs with them.

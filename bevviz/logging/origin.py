@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import rerun as rr
 
-from bevviz.config import Config, dump
+from bevviz.config import Config, dump, stated_lines
 from bevviz.frame import Scene
 from bevviz.logging import entities
 from bevviz.logging.pieces import document
@@ -16,13 +16,15 @@ from bevviz.text import fenced, markdown
 def log_origin(to: Writer, config: Config, scene: Scene) -> None:
     """Source, configuration and versions."""
     settings = dump(config)
+    stated = stated_lines(config, folders=False)
     packages = [f"{name} {version}" for name, version in versions().items()]
+    lines = [*map(markdown, stated), *packages]
     to.static(
         entities.CONFIG,
         document(
             "# How this recording was made\n\n"
             f"Source: **{markdown(scene.name)}**, preset: **{config.preset}**\n\n"
-            f"{fenced(settings, 'yaml')}\n\n" + "\n".join(f"- {line}" for line in packages)
+            f"{fenced(settings, 'yaml')}\n\n" + "\n".join(f"- {line}" for line in lines)
         ),
     )
     if not to.root:
@@ -33,6 +35,7 @@ def log_origin(to: Writer, config: Config, scene: Scene) -> None:
             source=scene.name,
             preset=config.preset,
             config=settings,
+            stated=stated or None,
             versions=packages,
             lidars=list(scene.lidars or (scene.lidar,)),
             cameras=list(scene.cameras) or None,

@@ -14,9 +14,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import rerun as rr
-from tqdm import tqdm
 
-from bevviz import remains
+from bevviz import announce, remains
 from bevviz.bags.reader import megabytes
 from bevviz.bags.recording import RawMessage
 from bevviz.bags.source import MARGIN, SECOND, BagSource
@@ -256,7 +255,7 @@ def _cut(
     low, high = window.low - MARGIN, window.high + MARGIN
     times = [source.recording.times(name) for name in topics]
     total = sum(int(((t >= low) & (t < high)).sum()) for t in times)
-    with tqdm(total=total, unit="message", desc="cut", disable=None) as bar:
+    with announce.bar(total=total, unit="message", desc="cut") as bar:
 
         def edit(message: RawMessage, data: bytes | memoryview) -> bytes | memoryview | None:
             bar.update()

@@ -7,7 +7,8 @@ from typing import Any, Literal, get_args, get_origin
 import annotated_types
 from pydantic.fields import FieldInfo
 
-from bevviz.config import Config, Section, unit, values
+from bevviz.config import Config, unit, values
+from bevviz.parameters import field_of
 
 UNSEEN = ("source.", "live.", "logging.", "sync.", "detector.model")  # nothing that one frame could show anew
 
@@ -17,16 +18,8 @@ def controls(config: Config) -> list[dict[str, Any]]:
     return [
         _control(key, value, info)
         for key, value in values(config).items()
-        if not key.startswith(UNSEEN) and (info := _field(key)) is not None
+        if "." in key and not key.startswith(UNSEEN) and (info := field_of(key)) is not None
     ]
-
-
-def _field(key: str) -> FieldInfo | None:
-    section, _, name = key.partition(".")
-    model = Config.model_fields[section].annotation
-    if not (isinstance(model, type) and issubclass(model, Section)):
-        return None
-    return model.model_fields.get(name)
 
 
 def _control(key: str, value: Any, info: FieldInfo) -> dict[str, Any]:

@@ -1,0 +1,94 @@
+"""argparse, with the nearest name for one that is wrong, and the usage of the command that it is about."""
+
+from __future__ import annotations
+
+import argparse
+import difflib
+import re
+import sys
+from collections.abc import Iterable, Sequence
+from contextlib import suppress
+from itertools import takewhile
+from pathlib import Path
+from typing import NoReturn
+
+from bevviz.cli import style
+from bevviz.text import printable
+
+COMMAND = "COMMAND"
+_CHOICE = re.compile(r"invalid choice: '(?P<given>.*)' \(choose from (?P<known>.*)\)$", re.DOTALL)
+
+
+class Parser(argparse.ArgumentParser):
+    """Of the program, or of a command: what is wrong is one line, and a second one the command's usage."""
+
+    def parse_known_args(  # type: ignore[override]
+        self, args: Sequence[str], namespace: argparse.Namespace | None = None
+    ) -> tuple[argparse.Namespace, list[str]]:
+        """As argparse, but what is unknown is told first, and by the command that it was given to."""
+        for option in self._own(args):
+            name = option.partition("=")[0]
+            known = self._option_string_actions
+            if name not in known and not any(one.startswith(name) for one in known):
+                self.error(f"unknown option {name}{nearest(name, known)}")
+        found, unknown = super().parse_known_args(args, namespace)
+        if unknown:
+            self.error(f"{unknown[0]}: nothing is expected here")
+        return found, unknown
+
+    def _own(self, args: Sequence[str]) -> Iterable[str]:
+        """Options by their names; what comes after the name of a command, or is for ROS, is not ours."""
+        if any(isinstance(action, argparse._SubParsersAction) for action in self._actions):
+            args = list(takewhile(lambda arg: arg.startswith("-"), args))
+        mine = takewhile(lambda arg: arg not in ("--", "--ros-args"), args)
+        return (arg for arg in mine if arg.startswith("--"))
+
+    def error(self, message: str) -> NoReturn:
+        """Two lines on stderr; exit status 2."""
+        if choice := _CHOICE.search(message):
+            given, known = choice["given"], re.findall(r"[^\s',]+", choice["known"])
+            if message.startswith(f"argument {COMMAND}:"):
+                message = _no_command(given, known)
+            else:
+                message = f"{message[: choice.start()]}'{given}' is none of {', '.join(known)}"
+                message += nearest(given, known)
+        print(f"{style.error('bevviz: error:')} {printable(message)}\n{self.short_usage()}", file=sys.stderr)
+        self.exit(2)
+
+    def short_usage(self) -> str:
+        """One line: what has to be given, and where the rest is explained."""
+        words = [self.prog]
+        for action in self._get_positional_actions():
+            name = str(action.metavar or action.dest)
+            words.append(f"[{name}]" if action.nargs in ("?", "*") else name)
+        words += [
+            f"{action.option_strings[-1]} {action.metavar or ''}".strip()
+            for action in self._actions
+            if action.required and action.option_strings
+        ]
+        for group in self._mutually_exclusive_groups:
+            if group.required:
+                one = (f"{action.option_strings[-1]} {action.metavar}" for action in group._group_actions)
+                words.append(f"({' | '.join(one)})")
+        return f"usage: {' '.join(words)} [OPTION ...]    '{self.prog} --help' explains"
+
+
+def nearest(given: str, known: Iterable[str]) -> str:
+    """The end of a sentence: the likeliest name that was meant; empty: there is none.
+
+    >>> nearest("--modle", ["--model", "--set"])
+    "; did you mean '--model'?"
+    """
+    near = difflib.get_close_matches(given, list(known), 1, 0.66)
+    return f"; did you mean '{near[0]}'?" if near else ""
+
+
+def _no_command(given: str, known: Iterable[str]) -> str:
+    """Of what is neither a command nor a file; what looks like a file was meant as one."""
+    path = Path(given)
+    if path.suffix or len(path.parts) > 1:
+        there: list[str] = []
+        with suppress(OSError, ValueError):
+            there = [str(other) for other in path.parent.iterdir()]
+        return f"{given}: no such file or folder{nearest(given, there)}"
+    return f"'{given}' is no command, nor a file{nearest(given, known)}"

@@ -1,0 +1,117 @@
+"""What a project states once, for every command: ``bevviz.toml`` in the folder or above, ``BEVVIZ_MODEL``.
+
+    model = "models/yolo11n.onnx"      # files are named as seen from this one
+    config = "robot.yaml"              # or several, later ones winning
+    preset = "default"
+
+    [source]                           # and any other section, as 'bevviz config' prints them
+    lidar_topics = ["/front/points", "/rear/points"]
+
+The command line wins over the environment, that over the project file, that over the preset.
+"""
+
+from __future__ import annotations
+
+import difflib
+import os
+import tomllib
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Annotated, Any
+
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
+
+from bevviz import plugins
+from bevviz.config import OURS, TUTORIAL_NAMES, Config, Layer, Preset, flattened, read_layer
+from bevviz.errors import UserError
+
+NAME = "bevviz.toml"
+MODEL = "BEVVIZ_MODEL"
+
+
+def _several(given: Any) -> Any:
+    return [given] if isinstance(given, str) else given
+
+
+class ProjectFile(BaseModel):
+    """The keys that only a project file has; the sections beside them are those of ``Config``."""
+
+    model_config = ConfigDict(extra="allow", strict=True)
+
+    model: str = Field("", description="as --model")
+    config: Annotated[list[str], BeforeValidator(_several)] = Field([], description="as --config")
+    preset: Preset | None = Field(None, description="as --preset")
+
+
+def layers(folder: Path, environment: Mapping[str, str] = os.environ) -> list[Layer]:
+    """What is stated for a folder, the weakest first.
+
+    Raises:
+        UserError: the project file, or one that it names, cannot be used.
+    """
+    path = find(folder)
+    found = list(_of_file(path)) if path is not None else []
+    if model := environment.get(MODEL, "").strip():
+        found.append(Layer(MODEL, {"detector.model": model}))
+    return found
+
+
+def find(folder: Path) -> Path | None:
+    """The nearest project file, in the folder or above.
+
+    Raises:
+        UserError: it belongs to somebody else, who could have any code run by it.
+    """
+    for place in (folder, *folder.parents):
+        path = place / NAME
+        try:
+            owner = path.stat().st_uid if path.is_file() else None
+        except OSError as error:
+            raise UserError(f"{path}: cannot read the project file: {error.strerror}") from None
+        if owner is not None:
+            if os.geteuid() not in (0, owner) and owner != 0:
+                raise UserError(f"{path}: belongs to another user, and can name code to run; move or copy it")
+            return Path(os.path.relpath(path))
+    return None
+
+
+def _of_file(path: Path) -> Iterator[Layer]:
+    try:
+        tree = tomllib.loads(path.read_text(encoding="utf-8"))
+        stated = ProjectFile.model_validate(tree)
+    except OSError as error:
+        raise UserError(f"{path}: cannot read the project file: {error.strerror}") from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise UserError(f"{path}: is no TOML: {error}") from None
+    except ValidationError as error:
+        first = error.errors()[0]
+        key = ".".join(str(part) for part in first["loc"])
+        about = ProjectFile.model_fields[str(first["loc"][0])].description
+        message = first["msg"].replace("Input should be", "must be")
+        raise UserError(f"{path}: {key} {message} (given: {first['input']!r}); it is {about}") from None
+    sections = stated.model_extra or {}
+    known = [*ProjectFile.model_fields, *Config.model_fields, *TUTORIAL_NAMES]
+    for name in sections:
+        if name not in known and "." not in name:
+            near = difflib.get_close_matches(name, known, 1)
+            hint = f"; did you mean '{near[0]}'?" if near else ""
+            raise UserError(f"{path}: unknown key '{name}'{hint}")
+    for name in stated.config:
+        yield read_layer(path.parent / name)
+    own = flattened(sections)
+    if stated.preset is not None:
+        own["preset"] = stated.preset
+    if stated.model:
+        own["detector.model"] = stated.model
+    for key in ("detector.model", "detector.names"):
+        if isinstance(own.get(key), str):
+            own[key] = _from(path.parent, key, own[key])
+    yield Layer(str(path), own)
+
+
+def _from(folder: Path, key: str, value: str) -> str:
+    """A file as seen from here; what is no file stays as it is."""
+    from bevviz.stages.detector.names import GIVEN
+
+    known = (*OURS, *plugins.registered()) if key == "detector.model" else GIVEN
+    return value if not value or value in known or ":" in value else str(folder / value)
