@@ -1,7 +1,11 @@
 """The way from a missed object to a filed report in the workbench, in a real browser against the real server.
 
 ``python -m benchmarks.journey`` goes it on the synthetic drive and on KITTI's labelled frames, prints its
-steps, its clicks and the seconds that somebody waits, and clicks 40 times in the views.
+steps, its clicks and the seconds that somebody waits, clicks 40 times in the views, asks about 40 things of
+the list, and changes parameters 40 times. Of each it says what the viewer's own drawing takes, which without
+a graphics card is most of it.
+
+A browser gives its processes sessions and priorities of their own: ``nice`` does not reach them.
 """
 
 from __future__ import annotations
@@ -29,7 +33,14 @@ if TYPE_CHECKING:
 DATA = Path(os.environ.get("BEVVIZ_DATA") or Path(__file__).resolve().parents[2] / "shared/data")
 FRAMES = 20
 CLICKS, SECONDS = 6, 20.0  # that the journey may take
-FIRST, ANSWER = 3.0, 0.7  # seconds to the first frame, and from a click to its answer for 95 %
+FIRST = 3.0  # seconds to the first frame
+ANSWER, PICTURE = 0.7, 0.3  # seconds from a click to its answer, from a change to its picture, for 95 %
+CHANGES = {  # that are tried in turn: the first stage, the last ones, and one between
+    "voxel.size": (0.08, 0.15),
+    "ground.distance_threshold": (0.1, 0.4),
+    "clustering.eps": (0.3, 0.9),
+    "detector.conf_threshold": (0.1, 0.5),
+}
 WIDTH, HEIGHT = 1400, 900
 PANEL = 400  # pixels of the page's width that are not the viewer
 SOFTWARE = [
@@ -64,7 +75,7 @@ def main() -> int:
         "--frames", type=int, default=FRAMES, help=f"of the synthetic drive (default: {FRAMES})"
     )
     parser.add_argument("--only", choices=("demo", "kitti"), help="one of the two")
-    parser.add_argument("--clicks", type=int, default=40, help="in the views, timed one by one (default: 40)")
+    parser.add_argument("--clicks", type=int, default=40, help="of each sort, timed one by one (default: 40)")
     parser.add_argument("--once", action="store_true", help="do not start it a first time, for the browser")
     parser.add_argument("--pictures", type=Path, help="folder for a picture of each step")
     options = parser.parse_args()
@@ -139,27 +150,19 @@ def _go(name: str, arguments: list[str], folder: Path, options: argparse.Namespa
             start = time.monotonic()
             with serving(arguments, folder) as address:
                 page = context.new_page()
+                printed = time.monotonic() - start
                 page.goto(address)
-                _first_frame(page)
-                first = time.monotonic() - start
                 which = "again: the browser has the viewer" if warm else "the first time"
-                print(f"  {first:6.2f} s  from the command to the first frame, {which} (wanted: {FIRST:g} s)")
+                _first_frame(page, start, printed, which)
                 if warm:
                     journey = _journey(page, name, options.pictures)
-                    latencies = _clicks(page, options.clicks)
+                    _latencies(page, options.clicks)
                 page.close()
         context.close()
     print(
         f"  {journey.clicks} clicks (at most {CLICKS}), "
         f"{journey.waited:.1f} s of waiting (at most {SECONDS:g})"
     )
-    if latencies:
-        (p50, own50), (p95, own95) = np.percentile(latencies, [50, 95], axis=0)
-        print(
-            f"  {len(latencies)} clicks in the views: {p50:.2f} s (median), {p95:.2f} s (95 %) "
-            f"from the click to the verdict (wanted: {ANSWER:g} s); of it from the question that the viewer "
-            f"makes of a click to the answer {own50:.2f} s and {own95:.2f} s"
-        )
     return journey.clicks <= CLICKS and journey.waited <= SECONDS
 
 
@@ -170,7 +173,7 @@ def _journey(page: Page, name: str, pictures: Path | None) -> Journey:
         if pictures is not None:
             pictures.mkdir(parents=True, exist_ok=True)
             page.wait_for_timeout(3000)  # a browser without a graphics card draws late
-            page.screenshot(path=pictures / f"{name.split()[-1].lower()}-{what}.png")
+            page.screenshot(path=pictures / f"{name.split()[-1].lower()}-{what}.png", timeout=1000 * LATE)
 
     def waited(done: Callable[[], Any]) -> float:
         start = time.monotonic()
@@ -228,6 +231,72 @@ def _journey(page: Page, name: str, pictures: Path | None) -> Journey:
     return journey
 
 
+def _latencies(page: Page, number: int) -> None:
+    def told(what: str, seconds: list[tuple[float, float]], whole: str, own: str, wanted: float) -> None:
+        if not seconds:
+            print(f"  {what}: none was answered")
+            return
+        (p50, own50), (p95, own95) = np.percentile(seconds, [50, 95], axis=0)
+        print(
+            f"  {len(seconds)} {what}: {p50:.2f} s (median), {p95:.2f} s (95 %) {whole}; "
+            f"{own}: {own50:.2f} s, {own95:.2f} s (wanted: {wanted:g} s)"
+        )
+
+    print(f"  {_drawing(page):6.2f} s  for the viewer to draw one picture")
+    if page.locator("#reset").is_visible():
+        page.click("#reset")
+    verdict, question = "from the click to the verdict", "of it from the page's question to its answer"
+    told("things of the list", _questions(page, number), verdict, question, ANSWER)
+    told("clicks in the views", _clicks(page, number), verdict, question, ANSWER)
+    drawn, answered = "from the change to the picture", "of it to its answer, with what is to be drawn"
+    told("changed parameters", _changes(page, number), drawn, answered, PICTURE)
+
+
+def _drawing(page: Page) -> float:
+    """Median seconds of a picture, while the pointer moves over the view of space."""
+    times = []
+    for step in range(8):
+        page.mouse.move(200 + 5 * step, 400)
+        start = time.monotonic()
+        page.evaluate("new Promise((then) => requestAnimationFrame(() => requestAnimationFrame(then)))")
+        times.append(time.monotonic() - start)
+    return float(np.median(times))
+
+
+def _took(page: Page) -> tuple[float, float]:
+    """Of the newest answer, as the page counts them."""
+    took, own = (page.get_attribute("#answer", f"data-{name}") for name in ("took", "server"))
+    return float(took or "nan") / 1000, float(own or "nan") / 1000
+
+
+def _questions(page: Page, number: int) -> list[tuple[float, float]]:
+    """Seconds from a key press that goes to the next thing of the list to the verdict."""
+    found = []
+    page.locator("#verdict").click()  # keys are for the panel
+    for _ in range(number):
+        page.evaluate("delete document.getElementById('answer').dataset.took")
+        page.keyboard.press("n")
+        until(lambda: page.get_attribute("#answer", "data-took") and not busy(page), 0.02)
+        found.append(_took(page))
+    return found
+
+
+def _changes(page: Page, number: int) -> list[tuple[float, float]]:
+    """Seconds from a changed parameter to its picture, and to the answer that has what is to be drawn."""
+    rng, found = np.random.default_rng(0), list[tuple[float, float]]()
+    for step in range(number):
+        key, (low, high) = list(CHANGES.items())[step % len(CHANGES)]
+        page.fill("#search", key)
+        control = page.locator(f"[id='control-{key}']")
+        control.fill(f"{rng.uniform(low, high):.3f}")
+        page.evaluate("delete document.getElementById('effect').dataset.drawn")
+        control.press("Enter")
+        until(lambda: page.get_attribute("#effect", "data-drawn"), 0.02)
+        drawn, took = (page.get_attribute("#effect", f"data-{name}") for name in ("drawn", "took"))
+        found.append((float(drawn or "nan") / 1000, float(took or "nan") / 1000))
+    return found
+
+
 def _clicks(page: Page, number: int) -> list[tuple[float, float]]:
     """Seconds from a click in a view, and from the question, to the verdict, as the page counts them."""
     rng, found = np.random.default_rng(0), list[tuple[float, float]]()
@@ -243,14 +312,24 @@ def _clicks(page: Page, number: int) -> list[tuple[float, float]]:
         while time.monotonic() < end:
             page.wait_for_timeout(150)
             if not busy(page) and page.inner_text("#where") != before:
-                took, own = (page.get_attribute("#answer", f"data-{name}") for name in ("took", "server"))
-                found.append((float(took or "nan") / 1000, float(own or "nan") / 1000))
+                found.append(_took(page))
                 break
     return found
 
 
-def _first_frame(page: Page) -> None:
-    until(lambda: events(page, "time_update"), 0.1)
+def _first_frame(page: Page, start: float, printed: float, which: str) -> None:
+    """Wait for it, and say how long it took since the command was started."""
+    marks = (
+        "Object.fromEntries(performance.getEntriesByType('mark').map((m) => [m.name, m.startTime / 1000]))"
+    )
+    until(lambda: "frame" in page.evaluate(marks), 0.1)
+    opened = time.monotonic() - start - page.evaluate("performance.now()") / 1000
+    at = {name: opened + seconds for name, seconds in page.evaluate(marks).items()}
+    print(
+        f"  {at['frame']:6.2f} s  from the command to the first frame drawn, {which} (wanted: {FIRST:g} s): "
+        f"the address after {printed:.2f} s, the viewer begun {at['viewer']:.2f}, the frame at the viewer "
+        f"{at['piece']:.2f}, taken by it {at['told']:.2f}"
+    )
 
 
 def _answered(page: Page, before: str) -> Callable[[], bool]:

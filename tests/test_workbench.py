@@ -14,6 +14,7 @@ import urllib.error
 import urllib.request
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from html import unescape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import parse_qs, urlsplit
@@ -65,9 +66,10 @@ def result() -> Iterator[FrameResult]:
 
 @contextmanager
 def serving(*arguments: str, model: str = "demo") -> Iterator[tuple[str, subprocess.Popen[str]]]:
-    """``bevviz open`` as a user starts it, in the folder of the bag: its address and its process."""
+    """``bevviz open`` as a user starts it, in a folder that is not the bag's: its address and its process."""
     command = [sys.executable, "-m", "bevviz.cli", *arguments, "--model", model, "--no-browser"]
-    folder = next(Path(argument).parent for argument in arguments if argument.endswith(("mcap", "bag")))
+    beside = next(Path(argument).parent for argument in arguments if argument.endswith(("mcap", "bag")))
+    (folder := beside / "elsewhere").mkdir(exist_ok=True)
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True, cwd=folder) as server:
         try:
             assert server.stderr is not None
@@ -398,17 +400,24 @@ def test_notes_are_kept_beside_the_bag(talk: Talk, bag: Path) -> None:
     assert not Notes([bag]).path.exists()
 
 
-def test_a_report_has_what_was_asked_and_noted(talk: Talk, address: str) -> None:
-    """Its files are there for who has the token, and nobody else."""
+def test_a_report_has_what_was_asked_tried_and_noted(talk: Talk, address: str, bag: Path) -> None:
+    """Of the values that are tried, with what was asked before; beside the bag; for who has the token."""
     stamp, pick, hint = helped(talk)
+    before = talk.asked("answer", type="ask", time=stamp, set=[], pick=pick)
+    after = talk.asked("answer", type="ask", time=stamp, set=hint["settings"], pick=pick)
+    assert after["reported"] and not before["reported"]
     talk.say(type="note", time=stamp, pick=pick, text="a note of mine")
     talk.until("noted")
-    talk.say(type="report", time=stamp, before=0.2, after=0.1, text="it is plainly there")
+    said = {"before": 0.2, "after": 0.1, "text": "it is plainly there", "set": hint["settings"]}
+    talk.say(type="report", time=stamp, **said)
     made = talk.until("progress", lambda m: m["reports"] and m["reports"][-1]["state"] != "running")[
         "reports"
     ][-1]
     assert made["state"] == "over", made["error"]
     assert made["done"] == made["total"] > 0
+    assert made["settings"] == hint["settings"]
+    assert Path(made["folder"]) == bag.parent
+    assert {file["name"] for file in made["files"]} <= {path.name for path in bag.parent.iterdir()}
     site, token = address.split("/?")
     (page,) = [file["name"] for file in made["files"] if file["name"].endswith(".html")]
     link = f"{site}/report/{made['number']}/{page}"
@@ -419,6 +428,11 @@ def test_a_report_has_what_was_asked_and_noted(talk: Talk, address: str) -> None
     assert "it is plainly there" in text
     assert "a note of mine" in text
     assert f"change {hint['settings'][0]}" in text
+    key, _, value = hint["settings"][0].partition("=")
+    told = re.sub(r"<[^>]*>", " ", unescape(text))
+    assert after["verdict"] in told
+    assert f"Before other values were tried: {before['verdict']}" in told
+    assert re.search(rf"{re.escape(key)}\s+\S+\s+{re.escape(value)}", told)
     talk.say(type="unnote", stamp=str(stamp), text="a note of mine")
     assert "up to 600" in talk.asked("never", type="report", time=stamp, before=1e9, after=0, text="")["text"]
 

@@ -29,7 +29,8 @@ from bevviz.live.runtime import Live, Outputs
 from bevviz.live.settings import Settings
 from bevviz.logging import entities
 from bevviz.synthetic import SyntheticSource
-from bevviz.workbench.beside import KEPT, WHOLE, LiveBench, LiveFilm
+from bevviz.workbench.live_bench import KEPT, LiveBench
+from bevviz.workbench.live_film import WHOLE, LiveFilm
 from bevviz.workbench.pick import Pick
 from tests.ros_player import Play
 

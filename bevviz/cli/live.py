@@ -300,7 +300,8 @@ def _page(options: argparse.Namespace, live: Live) -> AbstractContextManager[obj
     if options.workbench is None:
         return nullcontext()
     try:
-        from bevviz.workbench.beside import LiveBench, LivePage
+        from bevviz.workbench.live_bench import LiveBench
+        from bevviz.workbench.live_page import LivePage
     except ImportError as error:
         raise UserError(
             f"the workbench needs further packages ({error.name}): pip install 'bevviz[workbench]'"

@@ -56,7 +56,8 @@ class ReportRequest:
     ``before`` and ``after`` are in seconds; ``topics``: patterns of those that go into the bag beside the
     ones that the pipeline reads, None: all; ``redact``: hide people and vehicles; ``unredacted``: patterns of
     topics that are kept even so where nobody can tell what they show; ``force``: overwrite; ``asked``: the
-    answers that go in; ``notes``: of the whole drive.
+    answers that go in; ``asked_before``: others, of the configuration that other values were then tried in
+    place of; ``notes``: of the whole drive.
     """
 
     paths: Sequence[Path]
@@ -72,6 +73,7 @@ class ReportRequest:
     include_model: bool = False
     force: bool = False
     asked: Sequence[Answer] = ()
+    asked_before: Sequence[Answer] = ()
     notes: Sequence[Note] = ()
 
 
@@ -313,8 +315,8 @@ def _facts(
         note=request.note,
         notes={f"{(note.received - window.start) / SECOND:.3f} s": str(note) for note in notes},
         asked=[
-            Asked(answer.verdict.text, answer.verdict.reported, [(s.stage, s.text) for s in answer.steps])
-            for answer in request.asked
+            *(_asked(answer) for answer in request.asked),
+            *(_asked(answer, "Before other values were tried: ") for answer in request.asked_before),
         ],
         where=where,
         start=window.start,
@@ -327,6 +329,12 @@ def _facts(
         files=file_lines(sizes, part.counts, made_with.dependencies.get("detector.model")),
         commands=commands(request.output, window, public, request.redact),
     )
+
+
+def _asked(answer: Answer, when: str = "") -> Asked:
+    text = answer.verdict.text
+    steps = [(step.stage, step.text) for step in answer.steps]
+    return Asked(f"{when}{text}", answer.verdict.reported, steps)
 
 
 def _class_names(config: Config) -> str:

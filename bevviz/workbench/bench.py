@@ -39,7 +39,7 @@ from bevviz.workbench.labelled import TruthOf
 from bevviz.workbench.layer import Layer, log_layer
 from bevviz.workbench.missed import Find, finds, with_reasons
 from bevviz.workbench.pick import Pick, pick
-from bevviz.workbench.reports import Reports
+from bevviz.workbench.reports import Reports, folder_of
 from bevviz.workbench.trial import Trials, attempt, tried_logger
 
 if TYPE_CHECKING:
@@ -74,7 +74,7 @@ class Bench(Closing):
         native: the viewer beside the page, where there is one.
         entries: what is worth a look.
         trials: runs over the drive with other values.
-        reports: of what was found, in the folder that this was started in.
+        reports: of what was found, beside the bag.
         notes: of the user, beside the bag.
         opening: stamp of the frame that a page is to open at; None: not run yet.
         over: whether the run over the drive has ended.
@@ -116,10 +116,10 @@ class Bench(Closing):
         self._logger.log_static()
         self._desk_logger = Logger(self._desk, drive.config, drive.scene, stamps=BOTH)
         self._tried_logger = tried_logger(self._desk, drive.session, self)
-        self.trials, self.reports = Trials(self, self.tell), Reports(self, self.tell, Path.cwd())
+        self.trials, self.reports = Trials(self, self.tell), Reports(self, self.tell, folder_of(paths))
         self.notes = Notes(paths)
         self.notes_changed = 0
-        self._answers: OrderedDict[tuple[int, str], tuple[int, Answer]] = OrderedDict()
+        self._answers: OrderedDict[tuple[int, Settings, str], tuple[int, Answer]] = OrderedDict()
         self._thread = threading.Thread(target=self._run, name="drive", daemon=True)
 
     def stream(self) -> tuple[rr.RecordingStream, rr.BinaryStream]:
@@ -331,8 +331,7 @@ class Bench(Closing):
             there = questioner.candidates(around)
         beside = [other for other in there if other.subject.key != answer.subject.key]
         self._mark(questioner.traces.result, answer)
-        if not settings:
-            self._keep(number, what, answer)
+        self._keep(number, settings, what, answer)
         return answer, beside
 
     def hints(self, number: int, settings: Settings, what: Pick) -> Answer:
@@ -345,22 +344,22 @@ class Bench(Closing):
         wanted = selection(what)
         there = questioner.candidates(wanted) if what.is_place else []
         answer = questioner.with_hints((there or questioner.ask(wanted))[0])
-        if not settings:
-            self._keep(number, what, answer)
+        self._keep(number, settings, what, answer)
         return answer
 
-    def _keep(self, number: int, what: Pick, answer: Answer) -> None:
-        """For reports: as the drive was opened, with its hints once they are known."""
-        key = number, str(what)
+    def _keep(self, number: int, settings: Settings, what: Pick, answer: Answer) -> None:
+        """For reports, with its hints once they are known."""
+        key = number, settings, str(what)
         if answer.hints or key not in self._answers:
             self._answers[key] = self.look(number).frame.received, answer
         self._answers.move_to_end(key)
         while len(self._answers) > ASKED:
             self._answers.popitem(last=False)
 
-    def asked_within(self, low: int, high: int) -> list[Answer]:
-        """What was asked about frames of these log times, the newest first."""
-        return [answer for at, answer in reversed(self._answers.values()) if low <= at <= high]
+    def asked_within(self, low: int, high: int, settings: Settings = ()) -> list[Answer]:
+        """What was asked about frames of these log times, with these values, the newest first."""
+        kept = reversed(self._answers.items())
+        return [answer for (_, own, _), (at, answer) in kept if own == settings and low <= at <= high]
 
     # --- notes ---------------------------------------------------------------------------------
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import threading
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -9,12 +10,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from bevviz.bags.source import iso
+from bevviz.config import revised
 from bevviz.errors import UserError, first_line
 from bevviz.frame import FrameResult
 from bevviz.run import Items, Observer
 
 if TYPE_CHECKING:
-    from bevviz.workbench.bench import Bench
+    from bevviz.workbench.bench import Bench, Settings
 
 LONGEST = 600.0  # seconds on either side
 
@@ -25,12 +27,14 @@ class Report:
 
     Attributes:
         number: of it, in its address.
+        settings: that differ from those the drive was opened with.
         state: running, over, cancelled or failed.
         files: that it has.
     """
 
     number: int
     name: str
+    settings: Settings = ()
     state: str = "running"
     error: str = ""
     done: int = 0
@@ -43,6 +47,7 @@ class Report:
         return {
             "number": self.number,
             "name": self.name,
+            "settings": list(self.settings),
             "state": self.state,
             "error": self.error,
             "done": self.done,
@@ -65,7 +70,7 @@ class Reports:
     Args:
         bench: whose drive they are of.
         news: called when there is something to tell.
-        folder: where they go.
+        folder: where they go, see ``folder_of``.
     """
 
     def __init__(self, bench: Bench, news: Callable[[], None], folder: Path) -> None:
@@ -73,16 +78,17 @@ class Reports:
         self._thread: threading.Thread | None = None
         self.made: list[Report] = []
 
-    def begin(self, number: int, before: float, after: float, note: str) -> Report:
-        """Make one, of the configuration that the drive was opened with.
+    def begin(self, number: int, settings: Settings, before: float, after: float, note: str) -> Report:
+        """Make one.
 
         Args:
             number: of the frame that it is about.
+            settings: that it is made with instead of those that the drive was opened with.
             before, after: seconds on either side.
             note: what went wrong, in the user's words.
 
         Raises:
-            UserError: one is being made, no such frame, or no such time.
+            UserError: one is being made, no such frame, no such time, or a wrong value.
         """
         from bevviz.report.make import ReportRequest
 
@@ -91,21 +97,23 @@ class Reports:
         if not (0 <= before <= LONGEST and 0 <= after <= LONGEST):
             raise UserError(f"a report is of up to {LONGEST:g} seconds before and after")
         bench = self._bench
-        received = bench.look(number).frame.received
+        received = bench.look(number, settings).frame.received
         seconds = (received - int(bench.drive.frames.scans[0])) / 1e9
         output = _free(self._folder, f"{bench.paths[0].resolve().stem}-{seconds:.1f}s")
+        low, high = received - round(before * 1e9), received + round(after * 1e9)
         request = ReportRequest(
             paths=bench.paths,
-            config=bench.drive.config,
+            config=revised(bench.drive.config, settings),
             at=iso(received),
             before=before,
             after=after,
             output=output,
             note=note.strip(),
-            asked=bench.asked_within(received - round(before * 1e9), received + round(after * 1e9)),
+            asked=bench.asked_within(low, high, settings),
+            asked_before=bench.asked_within(low, high) if settings else (),
             notes=list(bench.notes),
         )
-        report = Report(len(self.made), output.stem)
+        report = Report(len(self.made), output.stem, settings)
         self.made.append(report)
         self._thread = threading.Thread(target=self._make, args=(report, request), name="report", daemon=True)
         self._thread.start()
@@ -142,6 +150,12 @@ class _Counting(Observer[FrameResult]):
     def see(self, result: FrameResult) -> None:
         self._report.done += 1
         self._news()
+
+
+def folder_of(paths: Sequence[Path]) -> Path:
+    """Where reports of a drive go: beside its bag; the working directory where it cannot be written there."""
+    beside = paths[0].resolve().parent
+    return beside if os.access(beside, os.W_OK | os.X_OK) else Path.cwd()
 
 
 def _free(folder: Path, stem: str) -> Path:

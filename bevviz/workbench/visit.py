@@ -197,9 +197,9 @@ class Visit:
         await asyncio.to_thread(what.end)
 
     async def _report(self, number: int, message: dict[str, Any]) -> None:
-        frame, text = self._frame(message), str(message["text"])
+        frame, settings, text = self._frame(message), _settings(message), str(message["text"])
         before, after = float(message["before"]), float(message["after"])
-        await self._at_desk(number, lambda: self._bench.reports.begin(frame, before, after, text))
+        await self._at_desk(number, lambda: self._bench.reports.begin(frame, settings, before, after, text))
 
     async def _note(self, number: int, message: dict[str, Any]) -> None:
         from bevviz.workbench.pick import Pick

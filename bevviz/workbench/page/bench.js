@@ -3,7 +3,7 @@
 import * as list from "./list.js";
 import { $, asked, element, remember, state, stated } from "./state.js";
 import { connect, newest, on, send, want } from "./talk.js";
-import { isTried, kind, seek, showSide, tell } from "./viewer.js";
+import { drawnThen, isTried, kind, seek, showSide, tell } from "./viewer.js";
 import * as work from "./work.js";
 
 let controls = [];
@@ -105,8 +105,10 @@ function changed() {
 }
 
 let trying = 0;
+let tryingSince = 0;
 function attempt() {
   if (state.time === null) return;
+  tryingSince = performance.now();
   showSide();
   if (state.set.length || kind === "live") { // a robot has to be told that it is undone
     $("effect").textContent = "Running the stages ...";
@@ -117,6 +119,10 @@ function attempt() {
 
 function tried(message) {
   if (message.id !== trying) return;
+  const since = tryingSince;
+  const took = () => (performance.now() - since).toFixed(0);
+  $("effect").dataset.took = took();
+  drawnThen(() => { $("effect").dataset.drawn = took(); });
   const parts = [effects(message.effects) || "changes nothing that is reported"];
   if (message.f1) parts.push(`F1 ${message.f1.map((one) => one ?? "–").join(" → ")}`);
   parts.push(...message.failures);

@@ -26,6 +26,7 @@ function film(lane) {
   const socket = socketAt(`/film?lane=${lane}&from=${pieces[lane] - Math.min(pieces[lane], lane === "film" ? early : 0)}`);
   socket.binaryType = "arraybuffer";
   socket.onmessage = ({ data }) => {
+    if (!pieces.film) performance.mark("piece");
     pieces[lane] += 1;
     toViewer({ type: "rrd" }, [new DataView(data)]);
     if (lane === "film") requestAnimationFrame(() => { if (socket.readyState === WebSocket.OPEN) socket.send(""); });

@@ -1,7 +1,7 @@
 // What is made behind the page: the drive with other values, reports; and the user's own words.
 
 import { $, element, seconds, state } from "./state.js";
-import { seek } from "./viewer.js";
+import { isTried, seek } from "./viewer.js";
 import { send } from "./talk.js";
 
 let trial = null; // the newest, as the server tells it
@@ -14,7 +14,8 @@ export function start() {
   $("report").onclick = () => {
     const number = (id) => Number($(id).value) || 0;
     const range = { before: number("before"), after: number("after") };
-    send({ type: "report", time: Number(state.time), text: $("words").value, ...range });
+    const set = isTried() ? state.set : []; // of what is shown
+    send({ type: "report", time: Number(state.time), set, text: $("words").value, ...range });
   };
   $("note").onclick = () => send({ type: "note", time: Number(state.time), pick: state.pick, text: $("words").value });
   $("strip").onclick = (event) => {
@@ -105,7 +106,8 @@ function report(one) {
       return link;
     });
     item.append(element("b", "", one.name), ...links.flatMap((link) => [" ", link]),
-      element("span", "faint", ` in ${one.folder}${one.state === "cancelled" ? "; cancelled" : ""}`));
+      element("span", "faint", [` in ${one.folder}`, one.settings.join(", "),
+        one.state === "cancelled" ? "cancelled" : ""].filter(Boolean).join("; ")));
   }
   return item;
 }

@@ -1,0 +1,99 @@
+"""What the pages of a running robot are shown: the newest pieces of what is logged."""
+
+from __future__ import annotations
+
+import threading
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import rerun as rr
+
+from bevviz.frame import Scene
+from bevviz.live.encoder import Packet
+from bevviz.live.output import Output
+from bevviz.live.runtime import Live
+from bevviz.logging import blueprints
+from bevviz.logging.logger import Context
+from bevviz.logging.sinks import APPLICATION
+
+WHOLE = 3  # packets that need none before them, from the oldest of which on all are kept for pages
+
+
+@dataclass(frozen=True, slots=True)
+class _Piece:
+    number: int
+    data: bytes  # with the header that every recording begins with
+    context: Context | None  # of one that a page can begin with
+
+
+class LiveFilm(Output):
+    """The newest pieces of what is logged, for pages; one that is too slow goes on at the newest.
+
+    Args:
+        live: whose results it is.
+        queue: packets that may wait.
+    """
+
+    def __init__(self, live: Live, queue: int) -> None:
+        super().__init__("page", queue)
+        self._encoder = live.encoder
+        self._pieces: deque[_Piece] = deque()
+        self._next = 0
+        self._held = threading.Lock()
+        self._listeners: list[Callable[[], None]] = []
+        self._thread.start()
+
+    def close(self) -> None:
+        self._end()
+        self._thread.join(1.0)
+
+    def listen(self, listener: Callable[[], None]) -> Callable[[], None]:
+        """Call it, from some thread, whenever there is more. Returns what ends that."""
+        self._listeners.append(listener)
+        return lambda: self._listeners.remove(listener)
+
+    def add(self, data: bytes | None) -> None:
+        """A recording of its own that belongs to the same one; None is nothing."""
+        if data:
+            self._put(data, None)
+
+    def since(self, number: int | None) -> tuple[list[bytes], int]:
+        """What a page is to be given next.
+
+        Args:
+            number: of the piece that it has not yet; None: it has nothing.
+
+        Returns:
+            Recordings, and the number to go on with. Where pieces were missed they begin anew.
+        """
+        with self._held:
+            pieces = list(self._pieces)
+            following = self._next
+        begin = next((piece for piece in reversed(pieces) if piece.context is not None), None)
+        if number is not None and (not pieces or number >= pieces[0].number):
+            return [piece.data for piece in pieces if piece.number >= number], following
+        if begin is None or begin.context is None:
+            return [], -1 if number is None else number
+        head = [] if number is not None else [self._layout(begin.context.scene)]
+        head.append(self._encoder.prelude(begin.context, blueprint=False))
+        return head + [piece.data for piece in pieces if piece.number >= begin.number], following
+
+    def _layout(self, scene: Scene) -> bytes:
+        recording = rr.RecordingStream(APPLICATION, recording_id=self._encoder.recording_id)
+        stream = rr.binary_stream(recording)
+        recording.send_blueprint(blueprints.load("workbench_live", scene), make_active=True)
+        return stream.read() or b""
+
+    def _take(self, packet: Packet, fresh: bool) -> bool:
+        self._put(self._encoder.header + packet.data, packet.context if packet.whole else None)
+        return True
+
+    def _put(self, data: bytes, context: Context | None) -> None:
+        with self._held:
+            self._pieces.append(_Piece(self._next, data, context))
+            self._next += 1
+            while sum(piece.context is not None for piece in self._pieces) > WHOLE:
+                self._pieces.popleft()
+        for listener in tuple(self._listeners):
+            listener()

@@ -1,0 +1,166 @@
+"""The page of a running robot, served beside it."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import secrets
+import threading
+from concurrent.futures import ThreadPoolExecutor
+from importlib.metadata import version
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, cast
+
+from starlette.applications import Starlette
+from starlette.requests import Request
+from starlette.responses import Response
+from starlette.routing import WebSocketRoute
+from starlette.websockets import WebSocket, WebSocketDisconnect
+
+from bevviz.closing import Closing
+from bevviz.errors import UserError
+from bevviz.workbench.guard import HOSTS, Guard
+from bevviz.workbench.live_bench import LiveBench
+from bevviz.workbench.server import Server, bound, viewer_folder
+from bevviz.workbench.site import Site, heard_on, routes_of
+from bevviz.workbench.visit import Visit, listening
+
+if TYPE_CHECKING:
+    from bevviz.workbench.bench import Bench
+    from bevviz.workbench.opening import Opening
+
+PATIENCE = 3.0  # seconds that the page's threads may take to end
+
+
+class LivePage(Closing):
+    """The page, served by threads of its own, until it is closed.
+
+    Args:
+        bench: the robot.
+        port: of the page; None: one that is free.
+
+    Raises:
+        UserError: the port is in use, or the viewer is not installed.
+
+    Attributes:
+        address: what to open.
+    """
+
+    def __init__(self, bench: LiveBench, port: int | None) -> None:
+        self._bench = bench
+        viewer, token = viewer_folder(), secrets.token_urlsafe(16)
+        listening = bound(port)
+        port = listening.getsockname()[1]
+        site = LiveSite(bench, viewer, version("rerun-sdk"), token, port)
+        routes = [*routes_of(site), WebSocketRoute("/live", site.orders)]
+        self.address = f"http://{HOSTS[0]}:{port}/?token={token}"
+        ready = threading.Event()
+        self._server = Server(Guard(Starlette(routes=routes), token, port), ready.set)
+        self._listening = listening
+        self._thread = threading.Thread(
+            target=lambda: self._server.run(sockets=[listening]), name="page", daemon=True
+        )
+        self._thread.start()
+        ready.wait(PATIENCE)
+
+    def close(self) -> None:
+        self._server.end()
+        self._thread.join(PATIENCE)
+        self._listening.close()
+        self._bench.close()
+
+
+class _Open:
+    """A bench that is there from the beginning."""
+
+    error = None
+
+    def __init__(self, bench: LiveBench) -> None:
+        self._bench = bench
+
+    async def bench(self) -> LiveBench:
+        return self._bench
+
+
+class LiveVisit(Visit):
+    """A page of a running robot."""
+
+    def __init__(self, bench: LiveBench, socket: WebSocket, desk: ThreadPoolExecutor, run: str) -> None:
+        super().__init__(cast("Bench", bench), socket, desk, run)  # as far as it is asked below
+        self._live = bench
+        for name in ("drive", "cancel", "report", "note", "unnote"):
+            self._handlers[name] = self._refuse
+
+    async def _refuse(self, number: int, message: dict[str, Any]) -> None:
+        raise UserError("that is for a drive that is over: save what was seen, and open the recording's bag")
+
+    async def _ask(self, number: int, message: dict[str, Any]) -> None:
+        """A click is on what is shown; what is asked about again is so with the values of now."""
+        again = list(self._live.settings) if "pick" in message else []
+        await super()._ask(number, {**message, "set": again})
+
+    async def _settle(self, number: int, message: dict[str, Any]) -> None:
+        """Nothing is made ready: the next frame comes at once."""
+
+
+class LiveSite(Site):
+    """The page of a running robot."""
+
+    def __init__(self, bench: LiveBench, viewer: Path, version: str, token: str, port: int) -> None:
+        super().__init__(cast("Opening", _Open(bench)), viewer, version, token, port, "live")
+        self._live = bench
+
+    def _visit(self, bench: Bench, socket: WebSocket) -> Visit:
+        return LiveVisit(self._live, socket, self._desk, self._run)
+
+    async def page(self, request: Request) -> Response:
+        response = await super().page(request)
+        script = b'<script type="module" src="/page/live.js"></script>\n</body>'
+        response.body = bytes(response.body).replace(b"</body>", script)
+        response.headers["Content-Length"] = str(len(response.body))
+        return response
+
+    async def film(self, socket: WebSocket) -> None:
+        """The newest pieces, as they are made; what was asked is among them."""
+        await socket.accept()
+        film, number = self._live.film, None
+        if socket.query_params.get("lane") == "desk":
+            with contextlib.suppress(WebSocketDisconnect, RuntimeError):
+                await socket.receive_text()
+            return
+        with listening(film.listen) as more, contextlib.suppress(WebSocketDisconnect, RuntimeError):
+            async with heard_on(socket, more) as heard:
+                while not heard.gone:
+                    more.clear()
+                    pieces, following = await asyncio.to_thread(film.since, number)
+                    number = None if following < 0 else following
+                    for piece in pieces:
+                        await socket.send_bytes(piece)
+                    await more.wait()
+
+    async def orders(self, socket: WebSocket) -> None:
+        """Hold, snap and mark."""
+        await socket.accept()
+        with contextlib.suppress(WebSocketDisconnect, RuntimeError):
+            while True:
+                text = await socket.receive_text()
+                try:
+                    said = await asyncio.to_thread(self._order, json.loads(text))
+                except UserError as error:
+                    said = {"type": "said", "text": str(error), "wrong": True}
+                except (ValueError, KeyError, TypeError, AttributeError):
+                    said = {"type": "said", "text": "that message cannot be understood", "wrong": True}
+                await socket.send_text(json.dumps(said))
+
+    def _order(self, message: dict[str, Any]) -> dict[str, Any]:
+        what = message["type"]
+        if what == "snap":
+            return {"type": "said", "text": self._live.snap()}
+        stamp = round(float(message["time"]))
+        if what == "hold":
+            frame = self._live.hold(stamp).frame
+            return {"type": "held", "frame": frame.index, "stamp": str(frame.stamp)}
+        if what == "mark":
+            return {"type": "said", "text": self._live.mark(stamp, str(message.get("text", "")))}
+        raise ValueError(what)
