@@ -125,6 +125,8 @@ class StageSection(Section):
 class SourceConfig(Section):
     """Which topics play which role. Empty: found by type, name and frame (see ``bevviz info``)."""
 
+    dataset: str = Field("", description="data set that PATH is; empty: recognised by its folders")
+    sequence: str = Field("", description="drive of a data set that has several in one folder")
     lidar_topics: tuple[str, ...] = Field(
         (), description="PointCloud2 topics; several are merged in base_frame"
     )

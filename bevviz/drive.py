@@ -371,9 +371,9 @@ def open_drive(
     """Open a recorded drive.
 
     Args:
-        path: bag file or folder (MCAP, sqlite3, ROS 1); several are one drive. Or a folder of the KITTI
-            object benchmark (velodyne, image_2, calib, label_2): single frames, without times. Or a
-            recording (.rrd), which stands for the bag that it was made from and for its configuration.
+        path: bag file or folder (MCAP, sqlite3, ROS 1); several are one drive. Or the folder of a data set,
+            see docs/inputs.md. Or a recording (.rrd), which stands for the bag that it was made from and for
+            its configuration.
         model: detector, as ``detector.model``.
         set: parameters: ``{"clustering.eps": 0.6}``, or ``["clustering.eps=60 cm"]`` as after ``--set``.
         config: YAML file, as ``bevviz config`` prints it.
@@ -394,7 +394,6 @@ def open_drive(
         ...     print(answer.verdict.text)
     """
     from bevviz.bags.source import BagSource
-    from bevviz.datasets.kitti import KittiFrames, is_kitti
 
     paths = [Path(p) for p in ([path] if isinstance(path, str | PathLike) else path)]
     settings, notes = _given(model, set), tuple[str, ...]()
@@ -409,11 +408,7 @@ def open_drive(
     else:
         loaded = load(_file(config), settings, preset)
     times = {"start": None if start is None else str(start), "end": None if end is None else str(end)}
-    source: Frames
-    if len(paths) == 1 and is_kitti(paths[0]):
-        source = KittiFrames(paths[0], every=every, frames=frames)
-    else:
-        source = BagSource(paths, loaded, every=every, frames=frames, **times)
+    source = BagSource(paths, loaded, every=every, frames=frames, **times)
     try:
         return Drive(source, loaded, notes)
     except BaseException:

@@ -156,6 +156,25 @@ def bag_files(folder: Path) -> list[Path]:
     )
 
 
+def drive_files(folder: Path) -> list[Path]:
+    """The bag files of a folder; where there are none, all files in it, as a data set has them."""
+    found = bag_files(folder)
+    if found:
+        return found
+    return [Path(where, name) for where, _, names in os.walk(folder) for name in names]
+
+
+def sampled_files(folder: Path) -> tuple[int, list[Path]]:
+    """How many files are in a folder and below it, and of each folder its first, middle and last by name."""
+    count, chosen = 0, list[Path]()
+    for where, folders, names in os.walk(folder):
+        folders.sort()
+        names.sort()
+        count += len(names)
+        chosen += [Path(where, names[i]) for i in sorted({0, len(names) // 2, len(names) - 1}) if names]
+    return count, chosen
+
+
 class Scratch:
     """A temporary folder, made when it is needed; the next one removes what a killed process left."""
 

@@ -15,7 +15,7 @@ import rerun as rr
 
 from bevviz.config import STAGES, Config, Preset, flat_yaml, load, values
 from bevviz.errors import UserError, first_line
-from bevviz.files import bag_files
+from bevviz.files import bag_files, sampled_files
 from bevviz.frame import Scene
 from bevviz.logging import entities
 from bevviz.logging.reading import check_decodes
@@ -94,13 +94,17 @@ def fingerprint(path: Path) -> tuple[int, str]:
     """Size and a quick SHA-256 (hexadecimal) of a file, or of the bag's files in a folder.
 
     Of each file its size and the beginning, the middle and the end count: enough to tell two recordings
-    apart, and done at once for 100 GB.
+    apart, and done at once for 100 GB. Of a data set some files of each folder do, and how many there are.
 
     Raises:
         OSError: it is not there, or cannot be read.
     """
     total, mark = 0, hashlib.sha256()
-    for file in bag_files(path) if path.is_dir() else [path]:
+    files = bag_files(path) if path.is_dir() else [path]
+    if not files:
+        count, files = sampled_files(path)
+        mark.update(count.to_bytes(8, "little"))
+    for file in files:
         with file.open("rb") as content:
             size = os.fstat(content.fileno()).st_size
             mark.update(size.to_bytes(8, "little"))

@@ -79,7 +79,7 @@ def describe(paths: Sequence[Path], config: Config) -> BagInfo:
     try:
         source = BagSource(paths, config)
     except UserError as error:
-        with Recording(paths) as recording:
+        with Recording(paths, config.source) as recording:
             roles = find_roles(recording.topics, config.source, stage_topics(config))
             return _describe(recording, roles, config, missing=[str(error)])
     with source:

@@ -39,8 +39,11 @@ from bevviz.bags.reader import (
 )
 from bevviz.bags.sqlite import SoundSqlite, SqliteRescuer
 from bevviz.closing import Closing
+from bevviz.config import SourceConfig
+from bevviz.datasets import open_dataset
+from bevviz.datasets.reader import DatasetReader
 from bevviz.errors import UserError
-from bevviz.files import Scratch, bag_files
+from bevviz.files import Scratch, bag_files, drive_files
 from bevviz.frame import I64
 from bevviz.ros import vision_msgs
 from bevviz.ros.messages import MessageError, read_header
@@ -126,19 +129,26 @@ class RawMessage:
 
 
 class Recording(Closing):
-    """The messages of one or several bags as a single stream in order of log time.
+    """The messages of one or several bags, or data sets, as a single stream in order of log time.
 
     Args:
-        paths: bag files and folders, in any order.
+        paths: bag files and folders, and folders of data sets, in any order.
+        config: which data set they are, and which drive of it, where that is stated.
+
+    Attributes:
+        single_frames: nothing in one scan is in the next, and their times are made up.
 
     Raises:
-        UserError: a path that does not exist, cannot be read, is empty or is no bag.
+        UserError: a path that does not exist, cannot be read, is empty or is neither.
     """
 
-    def __init__(self, paths: Sequence[Path]) -> None:
+    def __init__(self, paths: Sequence[Path], config: SourceConfig | None = None) -> None:
         if not paths:
             raise UserError("no bag given")
         self.paths = tuple(map(bag_beside, paths))
+        self.single_frames = False
+        self._config = config or SourceConfig()
+        self._aside: dict[str, str] = {}
         self.files: list[BagFile] = []
         self._notes: list[str] = []
         self._stores: dict[tuple[object, ...], Typestore] = {}
@@ -165,7 +175,7 @@ class Recording(Closing):
     @cached_property
     def size(self) -> int:
         """Bytes on disk."""
-        files = [f for p in self.paths for f in (bag_files(p) if p.is_dir() else [p])]
+        files = [f for p in self.paths for f in (drive_files(p) if p.is_dir() else [p])]
         return sum(f.stat().st_size for f in files)
 
     @cached_property
@@ -208,6 +218,7 @@ class Recording(Closing):
                 counts[name],
                 self._frame_id(name) if counts[name] and self._has_header(first[name]) else "",
                 (counts[name] - 1) / duration if counts[name] > 1 and duration else None,
+                self._aside.get(name, ""),
             )
             for name in sorted(first)
         )
@@ -314,6 +325,8 @@ class Recording(Closing):
                 path = path.parent
             if path.is_dir():
                 self._open_folder(path)
+            elif self._config.dataset and path.exists():
+                open_dataset(path, self._config.dataset)
             else:
                 self.files.append(self._open_file(path))
         except FileNotFoundError:
@@ -325,10 +338,16 @@ class Recording(Closing):
 
     def _open_folder(self, folder: Path) -> None:
         files = bag_files(folder)
+        stated = self._config.dataset
+        if (stated or not files) and self._open_dataset(folder, stated):
+            return
         if not files:
             within = sorted(d.name for d in folder.iterdir() if d.is_dir() and bag_files(d))
             hint = f"; there are bags in its folders: {', '.join(within[:5])}" if within else ""
-            raise UserError(f"{folder}: a folder without a bag (no .mcap, .db3 or .bag file){hint}")
+            raise UserError(
+                f"{folder}: neither a bag (no .mcap, .db3 or .bag file) nor a data set that is known{hint}; "
+                "--dataset NAME says which"
+            )
         metadata = self._read_metadata(folder)
         failed: list[UserError] = []
         before = self.message_count
@@ -353,6 +372,17 @@ class Recording(Closing):
                 f"{folder}: {METADATA} counts {expected} messages, {found} were found: "
                 f"{expected - found} are lost"
             )
+
+    def _open_dataset(self, folder: Path, name: str) -> bool:
+        """Whether it is one."""
+        dataset = open_dataset(folder, name, self._config.sequence)
+        if dataset is None:
+            return False
+        reader = DatasetReader(dataset)
+        self.files.append(BagFile(folder, dataset.about, lambda: reader, lambda: reader))
+        self.single_frames |= dataset.single_frames
+        self._aside |= reader.aside
+        return True
 
     def _read_metadata(self, folder: Path) -> Mapping[str, Any]:
         from ruamel.yaml import YAML

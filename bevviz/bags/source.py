@@ -54,7 +54,7 @@ class BagSource(Closing):
         at: str | None = None,
     ) -> None:
         self.config = config
-        self.recording = Recording(paths)
+        self.recording = Recording(paths, config.source)
         try:
             self.roles = find_roles(self.recording.topics, config.source, stage_topics(config))
             self._driver = self._find_driver()
@@ -234,6 +234,11 @@ class BagSource(Closing):
     def _time(self, text: str | None, default: int) -> int:
         if text is None:
             return default
+        if self.recording.single_frames:
+            raise UserError(
+                f"{text}: {self.recording.name} has single frames, which have no times; give a number "
+                "(--frames, --at-frame)"
+            )
         start, end = self.recording.start, self.recording.end
         time = parse_time(text, start)
         if not start - SECOND <= time <= end + SECOND:

@@ -16,8 +16,9 @@ from typing import Any
 from bevviz.bags.recording import METADATA
 from bevviz.batch.table import RunInfo, read_info
 from bevviz.config import Config
+from bevviz.datasets import find_loader
 from bevviz.errors import UserError
-from bevviz.files import bag_files
+from bevviz.files import bag_files, sampled_files
 from bevviz.provenance import dependencies_of, file_hash, model_path
 from bevviz.text import path_text
 
@@ -158,7 +159,11 @@ def _bags(path: Path) -> Iterator[Path]:
     if not path.is_dir() or (path / METADATA).is_file():
         yield path
         return
-    yield from bag_files(path)
+    bags, loader = bag_files(path), find_loader(path)
+    if not bags and loader is not None and not loader.any_folder:
+        yield path
+        return
+    yield from bags
     for inner in sorted(path.iterdir()):
         if inner.is_dir() and not inner.name.startswith("."):
             yield from _bags(inner)
@@ -202,6 +207,8 @@ def _files(bag: Path) -> list[Path]:
     if not bag.is_dir():
         return [bag]
     metadata = bag / METADATA
+    if not bag_files(bag):
+        return sampled_files(bag)[1]
     return [*bag_files(bag), *([metadata] if metadata.is_file() else [])]
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -33,8 +32,8 @@ if TYPE_CHECKING:
     from bevviz.run import Observer
 
 DESCRIPTION = """Hold the results to what is really there: precision and recall by class and range, average
-precision as KITTI defines it, tracks (HOTA, MOTA, IDF1), image boxes, ground. PATH is a bag, or a folder of
-the KITTI object benchmark (with velodyne, image_2, calib and label_2 in it). With --min and --max it is a
+precision as KITTI defines it, tracks (HOTA, MOTA, IDF1), image boxes, ground. PATH is a bag, or a
+labelled data set (docs/inputs.md). With --min and --max it is a
 gate: the exit status is 1 where a limit is not kept."""
 
 EPILOG = """examples:
@@ -68,22 +67,12 @@ def _evaluate(options: argparse.Namespace) -> int:
 
     limits = parse_limits(options.min, options.max)
     config = load_config(options)
-    with closing(_frames(options, config)) as frames:
+    with open_bag(options, config) as frames:
         evaluation = Evaluation(truth_in(frames, options.truth, options.kitti_labels))
         status = _run(frames, config, evaluation, Outputs.of(options))
         if not evaluation.judged:
             raise UserError(f"{options.paths[0]}: there is truth for none of the {evaluation.without} frames")
         return _report(evaluation, limits, options) or status
-
-
-def _frames(options: argparse.Namespace, config: Config) -> Frames:
-    from bevviz.datasets.kitti import KittiFrames, is_kitti
-
-    if len(options.paths) != 1 or not is_kitti(options.paths[0]):
-        return open_bag(options, config)
-    if options.start or options.end:
-        raise UserError(f"{options.paths[0]}: single frames have no times; choose with --frames and --every")
-    return KittiFrames(options.paths[0], every=options.every, frames=options.frames)
 
 
 def _run(frames: Frames, config: Config, evaluation: Evaluation, outputs: Outputs) -> int:

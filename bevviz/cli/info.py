@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from bevviz.cli.options import Commands, add_config, add_ros_args, load_config, positive
+from bevviz.cli.options import Commands, add_config, add_dataset, add_ros_args, load_config, positive
 from bevviz.errors import UserError
 
 
@@ -15,7 +15,10 @@ def add(commands: Commands) -> None:
         help="what is in a bag, and what is missing for a full run",
         description="Topics, rates, gaps and frames of a bag, the role of each topic, and what is missing.",
     )
-    info.add_argument("paths", nargs="*", type=Path, metavar="PATH", help="bag file or folder")
+    info.add_argument(
+        "paths", nargs="*", type=Path, metavar="PATH", help="bag file or folder, or a data set's folder"
+    )
+    add_dataset(info)
     info.add_argument("--live", action="store_true", help="a running robot's topics instead of a bag's")
     info.add_argument(
         "--for",

@@ -33,9 +33,11 @@ def add_bag(parser: argparse.ArgumentParser, *, detector: bool = True) -> argpar
         nargs="+",
         type=Path,
         metavar="PATH",
-        help="bag file or folder, several are one drive; or a recording (.rrd), whose bag is looked for",
+        help="bag file or folder, several are one drive; a data set's folder; or a recording (.rrd), whose "
+        "bag is looked for",
     )
     group = parser.add_argument_group("what to run")
+    add_dataset(group)
     group.add_argument(
         "--bag",
         dest="bags",
@@ -48,6 +50,22 @@ def add_bag(parser: argparse.ArgumentParser, *, detector: bool = True) -> argpar
     if detector:
         group.add_argument("--model", metavar="FILE.onnx", help="detector: YOLOv5, v8, v10, 11, 26 or YOLOX")
     return group
+
+
+def add_dataset(group: argparse._ActionsContainer) -> None:
+    """Which data set, and which drive of it."""
+    group.add_argument(
+        "--dataset",
+        dest="source_dataset",
+        metavar="NAME",
+        help="what kind of data set PATH is, where it is not recognised (docs/inputs.md)",
+    )
+    group.add_argument(
+        "--sequence",
+        dest="source_sequence",
+        metavar="NAME",
+        help="which drive, of a data set with several in one folder",
+    )
 
 
 def add_truth(parser: argparse.ArgumentParser) -> None:
@@ -185,9 +203,14 @@ def load_config(options: argparse.Namespace) -> Config:
 
 
 def given_settings(options: argparse.Namespace) -> list[str]:
-    """``key=value`` each, of ``--set`` and ``--model``."""
+    """``key=value`` each, of ``--set``, ``--model`` and the data set."""
     model = getattr(options, "model", None)
-    return [*options.set, *([f"detector.model={model}"] if model else [])]
+    return [*options.set, *([f"detector.model={model}"] if model else []), *_dataset(options)]
+
+
+def _dataset(options: argparse.Namespace) -> list[str]:
+    stated = {key: getattr(options, f"source_{key}", None) for key in ("dataset", "sequence")}
+    return [f"source.{key}={value}" for key, value in stated.items() if value is not None]
 
 
 def loaded(
@@ -200,6 +223,7 @@ def loaded(
     from bevviz.config import load
 
     recorded: Recorded | None = getattr(options, "recorded", None)
+    settings = [*settings, *_dataset(options)]
     if recorded is not None:
         return recorded.load(file, settings, preset)
     return load(file, settings, preset, layers=project_layers(options))

@@ -1,41 +1,32 @@
-"""Frames and labels of the KITTI object benchmark (Geiger, Lenz and Urtasun 2012)."""
+"""What KITTI's data sets have in common: calibration, labels, and poses (Geiger, Lenz and Urtasun 2012)."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from bevviz import geometry
+from bevviz.datasets.dataset import XYZI, Stream, read_bytes, read_points, read_text
+from bevviz.datasets.names import KITTI
 from bevviz.errors import UserError
-from bevviz.frame import (
-    F64,
-    I64,
-    Boxes3D,
-    Camera,
-    Cloud,
-    Frame,
-    Image,
-    ImageLabels,
-    Intrinsics,
-    LabelledBoxes3D,
-    Scene,
+from bevviz.frame import F64, I64, Boxes3D, ImageLabels, Intrinsics, LabelledBoxes3D
+from bevviz.ros.encode import (
+    encode_compressed_image,
+    encode_intrinsics,
+    encode_labels,
+    encode_points,
+    encode_transforms,
 )
 
-LIDAR, CAMERA = "velodyne", "image_2"
-SECONDS_APART = 100  # of single frames: nothing in one is in the next
+LIDAR, IMU, MAP = "velodyne", "imu_link", "map"
+CLOUDS = "/velodyne_points"
+EARTH = 6378137.0  # metres, the radius that KITTI's development kit has
 
-# What a detector of COCO's classes may rightly call them.
-ACCEPTED = {
-    "Pedestrian": frozenset({"pedestrian", "person"}),
-    "Person_sitting": frozenset({"person_sitting", "pedestrian", "person"}),
-    "Cyclist": frozenset({"cyclist", "person", "bicycle"}),
-    "Car": frozenset({"car"}),
-    "Van": frozenset({"van", "car", "truck", "bus"}),
-    "Truck": frozenset({"truck", "car", "bus"}),
-    "Tram": frozenset({"tram", "train", "bus"}),
-}
+
+# --- labels ------------------------------------------------------------------------------------
 
 
 def label_files(path: Path) -> Sequence[Path]:
@@ -59,12 +50,30 @@ def read_labels(file: Path) -> LabelledBoxes3D:
     Raises:
         UserError: a file cannot be read, or is none of KITTI's.
     """
-    calibration = file.parent.parent / "calib" / file.name
-    lidar_from_camera = geometry.inverse(_calibration(calibration)[0])
-    labels, rows, dont_care = [], [], []
-    for number, line in enumerate(_read(file).splitlines(), 1):
-        kind, *values = line.split()
-        if kind not in ACCEPTED and kind != "DontCare":
+    calibration = Calibration(file.parent.parent / "calib" / file.name)
+    lines = list(enumerate(read_text(file).splitlines(), 1))
+    return labelled_boxes(file, lines, calibration.rectified_from_lidar)
+
+
+def labelled_boxes(
+    file: Path, lines: Sequence[tuple[int, str]], rectified_from_lidar: F64, ids: Sequence[str] = ()
+) -> LabelledBoxes3D:
+    """Labels in the frame of the LiDAR.
+
+    Args:
+        file: that they are in.
+        lines: each with its number: type, truncated, occluded, alpha, image box, size, location, turn.
+        rectified_from_lidar: (4, 4).
+        ids: of each line.
+
+    Raises:
+        UserError: a line is none of KITTI's.
+    """
+    lidar_from_camera = geometry.inverse(rectified_from_lidar)
+    labels, rows, dont_care, kept = [], [], [], []
+    for at, (number, line) in enumerate(lines):
+        kind, *values = line.split() or [""]
+        if kind not in KITTI and kind != "DontCare":
             continue
         if len(values) < 14:
             raise UserError(f"{file}: line {number} has {len(values)} numbers, a KITTI label has 14")
@@ -77,6 +86,7 @@ def read_labels(file: Path) -> LabelledBoxes3D:
             continue
         labels.append(kind)
         rows.append(row)
+        kept.append(at)
     table = np.array(rows, np.float64).reshape(-1, 14)
     height, width, length, x, y, z, turn = table[:, 7:].T
     # A location is the middle of the bottom, in the reference camera: x right, y down, z forward.
@@ -97,122 +107,156 @@ def read_labels(file: Path) -> LabelledBoxes3D:
         np.array(dont_care, np.float32).reshape(-1, 4),
     )
     ones = np.ones(len(labels), np.float32)
-    return LabelledBoxes3D(str(file), 0, "", boxes, tuple(labels), ones, image=image)
+    names = tuple(ids[at] for at in kept) if ids else ()
+    return LabelledBoxes3D(str(file), 0, "", boxes, tuple(labels), ones, ids=names, image=image)
 
 
-def is_kitti(folder: Path) -> bool:
-    """Whether it has what the object benchmark's folders are called."""
-    return all((folder / name).is_dir() for name in ("velodyne", "calib"))
+# --- calibration -------------------------------------------------------------------------------
 
 
-class KittiFrames:
-    """The frames of the object benchmark, each by itself: no drive, so that nothing is tracked.
-
-    Args:
-        folder: with ``velodyne`` and ``calib``, and ``image_2`` and ``label_2`` where there are any.
-        every: each such frame only.
-        frames: first and last + 1 of those that are run, counted from 0.
+class Calibration:
+    """A text file of ``NAME: numbers``; the tracking benchmark leaves some colons out.
 
     Raises:
-        UserError: no scan in it.
+        UserError: it cannot be read, or has no projections or mounting of the LiDAR.
     """
 
-    def __init__(
-        self, folder: Path, *, every: int = 1, frames: tuple[int | None, int | None] | None = None
-    ) -> None:
-        self._folder = folder
-        self._names = sorted(path.stem for path in (folder / "velodyne").glob("*.bin"))
-        if not self._names:
-            raise UserError(f"{folder / 'velodyne'}: no scan in it; expected 000000.bin")
-        self._chosen = range(len(self._names))[slice(*(frames or (None, None)))][::every]
-        self._labelled = (folder / "label_2").is_dir()
-        self.total = len(self._chosen)
-        self.warnings: tuple[str, ...] = ()
-        self.scene = Scene(folder.resolve().name, LIDAR, (LIDAR,), cameras=(CAMERA,), truth=self._labelled)
+    def __init__(self, file: Path) -> None:
+        self.file = file
+        self._rows = named_rows(file)
+        reference = self._matrix(3, 4, "Tr_velo_to_cam", "Tr_velo_cam", "Tr")
+        rectified = np.eye(4)
+        if not {"R0_rect", "R_rect"}.isdisjoint(self._rows):  # the odometry benchmark has it in Tr
+            rectified[:3, :3] = self._matrix(3, 3, "R0_rect", "R_rect")
+        self.rectified_from_lidar = rectified @ np.vstack([reference, [0, 0, 0, 1]])
+
+    def camera(self, number: int) -> tuple[F64, F64]:
+        """(3, 3) K and (4, 4) camera from LiDAR, of the left colour camera (2) or another."""
+        matrix, beside = split_projection(self._matrix(3, 4, f"P{number}"))
+        return matrix, beside @ self.rectified_from_lidar
 
     @property
-    def scans(self) -> I64:
-        """(N,) made-up stamps, in nanoseconds."""
-        return SECONDS_APART * 1_000_000_000 * np.arange(1, len(self._names) + 1, dtype=np.int64)
+    def lidar_from_imu(self) -> F64:
+        return np.vstack([self._matrix(3, 4, "Tr_imu_to_velo", "Tr_imu_velo"), [0, 0, 0, 1]])
 
-    def __iter__(self) -> Iterator[Frame]:
-        for number in self._chosen:
-            yield self.frame(number)
+    def _matrix(self, rows: int, columns: int, *names: str) -> F64:
+        values = next((self._rows[name] for name in names if name in self._rows), None)
+        if values is None or len(values) != rows * columns:
+            raise UserError(
+                f"{self.file}: no {' or '.join(names)} of {rows} x {columns} numbers, as KITTI writes it"
+            )
+        return values.reshape(rows, columns)
 
-    def close(self) -> None:
-        """Nothing is open."""
 
-    def number_at(self, time: str | float) -> int:
-        """Raises UserError: single frames have no times."""
-        raise UserError(f"{time}: {self.scene.name} has single frames, which have no times; give a number")
+def named_rows(file: Path) -> Mapping[str, F64]:
+    """The numbers behind each name; lines with something else are left out.
 
-    def frame(self, number: int) -> Frame:
-        """One frame.
-
-        Raises:
-            UserError: there is none of that number, or a file cannot be read.
-        """
-        if not 0 <= number < len(self._names):
-            raise UserError(f"frame {number}: there are {len(self._names)}, counted from 0")
-        name, stamp = self._names[number], int(self.scans[number])
-        scan = self._folder / f"velodyne/{name}.bin"
+    Raises:
+        UserError: the file cannot be read.
+    """
+    rows = {}
+    for line in read_text(file).splitlines():
+        name, *values = line.replace(":", " ", 1).split() or [""]
         try:
-            values = np.fromfile(scan, np.float32).reshape(-1, 4)
-        except (OSError, ValueError) as error:
-            raise UserError(f"{scan}: is no scan of x, y, z, reflectance: {error}") from None
-        values = values[np.isfinite(values).all(axis=1)]
-        points = np.ascontiguousarray(values[:, :3])
-        fields = {"intensity": np.ascontiguousarray(values[:, 3])}
-        labels = self._folder / f"label_2/{name}.txt"
-        return Frame(
-            index=number,
-            stamp=stamp,
-            received=stamp,
-            lidar=LIDAR,
-            points=points,
-            points_frame=LIDAR,
-            fields=fields,
-            world_frame=LIDAR,
-            clouds=(Cloud(stamp, LIDAR, points, fields, name=LIDAR),),
-            points_from_clouds=(np.eye(4),),
-            cameras=(self._camera(name, stamp),),
-            truth=read_labels(labels) if self._labelled else None,
-        )
-
-    def _camera(self, name: str, stamp: int) -> Camera:
-        """The left colour camera: beside the rectified reference camera, by P2's last column."""
-        import cv2
-
-        camera_from_lidar, p2 = _calibration(self._folder / f"calib/{name}.txt")
-        beside = np.eye(4)
-        beside[:3, 3] = np.linalg.solve(p2[:, :3], p2[:, 3])
-        file = self._folder / f"{CAMERA}/{name}.png"
-        bgr = cv2.imread(str(file)) if file.is_file() else None
-        if bgr is None:
-            return Camera(CAMERA, None, None, None, None, problems=(f"{file} is no image",))
-        intrinsics = Intrinsics(bgr.shape[1], bgr.shape[0], p2[:, :3])
-        placed = beside @ camera_from_lidar
-        image = Image(stamp, CAMERA, np.asarray(bgr, np.uint8))
-        return Camera(CAMERA, image, intrinsics, placed, geometry.inverse(placed), 0.0, mounting=placed)
+            rows[name] = np.array(values, np.float64)
+        except ValueError:
+            continue
+    return rows
 
 
-def _calibration(calibration: Path) -> tuple[F64, F64]:
-    """(4, 4) rectified reference camera from LiDAR, and (3, 4) P2, the left colour camera."""
-    lines = [line.split(":", 1) for line in _read(calibration).splitlines() if ":" in line]
-    rectified, reference = np.eye(4), np.eye(4)
+def split_projection(projection: F64) -> tuple[F64, F64]:
+    """(3, 3) K and (4, 4) camera from the rectified reference camera, of a (3, 4) projection."""
+    beside = np.eye(4)
     try:
-        rows = {name: np.array(values.split(), np.float64) for name, values in lines}
-        rectified[:3, :3] = rows["R0_rect"].reshape(3, 3)
-        reference[:3] = rows["Tr_velo_to_cam"].reshape(3, 4)
-        p2 = rows["P2"].reshape(3, 4)
-    except (KeyError, ValueError):
-        raise UserError(f"{calibration}: no P2, R0_rect and Tr_velo_to_cam as KITTI writes them") from None
-    return rectified @ reference, p2
+        beside[:3, 3] = np.linalg.solve(projection[:, :3], projection[:, 3])
+    except np.linalg.LinAlgError:
+        raise UserError(f"a projection of {projection.tolist()} is that of no camera") from None
+    return projection[:, :3], beside
 
 
-def _read(path: Path) -> str:
-    try:
-        return path.read_text()
-    except (OSError, UnicodeDecodeError) as error:
-        reason = getattr(error, "strerror", None) or "is no text"
-        raise UserError(f"{path}: cannot be read: {reason}") from None
+# --- positions ---------------------------------------------------------------------------------
+
+
+def poses_of_oxts(table: F64) -> F64:
+    """(N, 4, 4) first pose of the IMU from each, as the development kit has them.
+
+    Args:
+        table: (N, 6 or more) latitude, longitude, altitude in metres, roll, pitch, yaw.
+    """
+    latitude, longitude, altitude, roll, pitch, yaw = table[:, :6].T
+    scale = np.cos(np.radians(latitude[0])) if len(table) else 1.0
+    poses = np.tile(np.eye(4), (len(table), 1, 1))
+    poses[:, 0, 3] = scale * EARTH * np.radians(longitude)  # Mercator's projection
+    poses[:, 1, 3] = scale * EARTH * np.log(np.tan(np.radians(90.0 + latitude) / 2))
+    poses[:, 2, 3] = altitude
+    poses[:, :3, :3] = _turns(2, yaw) @ _turns(1, pitch) @ _turns(0, roll)
+    return np.asarray(geometry.inverse(poses[0]) @ poses if len(poses) else poses)
+
+
+def _turns(axis: int, angles: F64) -> F64:
+    """(N, 3, 3) rotations about an axis."""
+    a, b = (axis + 1) % 3, (axis + 2) % 3
+    turns = np.tile(np.eye(3), (len(angles), 1, 1))
+    turns[:, a, a] = turns[:, b, b] = np.cos(angles)
+    turns[:, b, a], turns[:, a, b] = np.sin(angles), -np.sin(angles)
+    return turns
+
+
+# --- streams -----------------------------------------------------------------------------------
+
+
+def clouds(times: I64, files: Sequence[Path]) -> Stream:
+    """Scans of x, y, z and reflectance."""
+
+    def make(row: int) -> Any:
+        return encode_points(int(times[row]), LIDAR, read_points(files[row], XYZI))
+
+    return Stream(CLOUDS, "sensor_msgs/msg/PointCloud2", times, make)
+
+
+def pictures(camera: str, times: I64, files: Sequence[Path], aside: str = "") -> Stream:
+    """Images of a camera that is called like its folder; they are rectified."""
+
+    def make(row: int) -> Any:
+        kind = files[row].suffix.lstrip(".").replace("jpg", "jpeg")
+        return encode_compressed_image(int(times[row]), camera, read_bytes(files[row]), kind)
+
+    topic = f"/{camera}/image_rect/compressed"
+    return Stream(topic, "sensor_msgs/msg/CompressedImage", times, make, aside)
+
+
+def camera_info(camera: str, times: I64, matrix: F64) -> Stream:
+    """One calibration for all images."""
+    once = times[:1]
+
+    def make(row: int) -> Any:
+        return encode_intrinsics(int(once[row]), camera, Intrinsics(0, 0, matrix))
+
+    return Stream(f"/{camera}/camera_info", "sensor_msgs/msg/CameraInfo", once, make)
+
+
+def mountings(start: int, edges: Sequence[tuple[str, str, F64]]) -> Stream:
+    """Of (parent, child, parent_from_child)."""
+    at = np.array([start], np.int64)
+    return Stream(
+        "/tf_static", "tf2_msgs/msg/TFMessage", at, lambda row: encode_transforms(int(at[row]), edges)
+    )
+
+
+def places(times: I64, child: str, poses: F64) -> Stream:
+    """Where a frame of the vehicle is in the map, (N, 4, 4)."""
+
+    def make(row: int) -> Any:
+        return encode_transforms(int(times[row]), [(MAP, child, poses[row])])
+
+    return Stream("/tf", "tf2_msgs/msg/TFMessage", times, make)
+
+
+def truth(message_type: str, times: I64, label: Any) -> Stream:
+    """Ground truth in the frame of the LiDAR; ``label`` gives that of a row."""
+
+    def make(row: int) -> Any:
+        there: LabelledBoxes3D = label(row)
+        return encode_labels(int(times[row]), LIDAR, there.boxes, there.labels, there.ids, there.image)
+
+    return Stream("/ground_truth", message_type, times, make)

@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, TypeAlias
 import numpy as np
 
 from bevviz import geometry
-from bevviz.datasets.kitti import ACCEPTED, label_files, read_labels
+from bevviz.datasets.kitti import label_files, read_labels
+from bevviz.datasets.names import ACCEPTED
 from bevviz.errors import UserError
 from bevviz.frame import Bool, Boxes3D, Camera, Frame, ImageLabels, LabelledBoxes3D
 from bevviz.ros.roles import Roles
@@ -130,17 +131,15 @@ def truth_of(frame: Frame, labelled: LabelledBoxes3D) -> Truth:
 
     Args:
         frame: the frame.
-        labelled: boxes, in any frame whose pose they come with. KITTI's labels accept the names that
-            detectors of COCO's classes have for them, others their own alone.
+        labelled: boxes, in any frame whose pose they come with. Labels of data sets accept the names
+            that detectors of COCO's classes have for them, others their own alone.
     """
     boxes = in_points_frame(frame, labelled)
     must = (np.hypot(*boxes.center[:, :2].T) <= RANGE) & _in_view(frame, boxes)
     must[must] = [
         geometry.inside(frame.points, boxes, k).sum() >= MIN_HITS for k in np.flatnonzero(must).tolist()
     ]
-    accepted = {label: frozenset((label.lower(),)) for label in labelled.labels}
-    if labelled.image is not None:
-        accepted |= ACCEPTED
+    accepted = {label: ACCEPTED.get(label, frozenset((label.lower(),))) for label in labelled.labels}
     camera = next((camera for camera in frame.cameras if _can_see(camera)), None)
     return Truth(
         boxes,

@@ -8,19 +8,30 @@ from functools import cache
 from typing import Any
 
 import numpy as np
-from rosbags.typesys import Stores, get_typestore
+from numpy.typing import NDArray
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
 from bevviz import geometry
-from bevviz.frame import F32, F64, I64, Boxes3D, Cloud, Image, Intrinsics
+from bevviz.frame import F32, F64, I64, Boxes3D, Cloud, Image, ImageLabels, Intrinsics
 from bevviz.ros import vision_msgs
+
+# A vision_msgs/Detection3DArray that also says what was labelled in an image, see frame.ImageLabels.
+_LABELLED = """std_msgs/Header header
+vision_msgs/Detection3D[] detections
+float32[] image_boxes
+float32[] truncated
+int32[] occluded
+float32[] dont_care
+"""
 
 
 @cache
 def typestore() -> Typestore:
-    """The definitions of ROS 2 Jazzy and of vision_msgs."""
+    """The definitions of ROS 2 Jazzy, of vision_msgs, and of what labelled data sets say beyond that."""
     store = get_typestore(Stores.ROS2_JAZZY)
     vision_msgs.register(store)
+    store.register(get_types_from_msg(_LABELLED, "bevviz_msgs/msg/Detection3DArray"))
     return store
 
 
@@ -34,19 +45,25 @@ def encode_cloud(cloud: Cloud) -> Any:
     points = np.zeros(len(cloud.xyz), layout)
     for name, values in columns.items():
         points[name] = values
+    return encode_points(cloud.stamp, cloud.frame_id, points)
+
+
+def encode_points(stamp: int, frame_id: str, points: NDArray[np.void]) -> Any:
+    """A sensor_msgs/PointCloud2 of (N,) points with fields of numbers, which is not copied."""
+    layout = points.dtype
     fields = [
         _make(
             "sensor_msgs/msg/PointField",
             name=name,
             offset=int(layout.fields[name][1]),  # type: ignore[index]
-            datatype=_POINT_FIELD[values.dtype.str[1:]],
+            datatype=_POINT_FIELD[layout[name].str[1:]],
             count=1,
         )
-        for name, values in columns.items()
+        for name in layout.names or ()
     ]
     return _make(
         "sensor_msgs/msg/PointCloud2",
-        header=_header(cloud.stamp, cloud.frame_id),
+        header=_header(stamp, frame_id),
         height=1,
         width=len(points),
         fields=fields,
@@ -76,15 +93,30 @@ def encode_image(image: Image) -> Any:
     )
 
 
+def encode_compressed_image(stamp: int, frame_id: str, encoded: bytes, kind: str) -> Any:
+    """A sensor_msgs/CompressedImage of the bytes of a file; ``kind``: png, jpeg."""
+    return _make(
+        "sensor_msgs/msg/CompressedImage",
+        header=_header(stamp, frame_id),
+        format=kind,
+        data=np.frombuffer(encoded, np.uint8),
+    )
+
+
 def encode_camera_info(image: Image, intrinsics: Intrinsics) -> Any:
     """The sensor_msgs/CameraInfo that belongs to an image."""
+    return encode_intrinsics(image.stamp, image.frame_id, intrinsics)
+
+
+def encode_intrinsics(stamp: int, frame_id: str, intrinsics: Intrinsics) -> Any:
+    """The same by stamp and frame."""
     k = intrinsics.K
     region = _make(
         "sensor_msgs/msg/RegionOfInterest", x_offset=0, y_offset=0, height=0, width=0, do_rectify=False
     )
     return _make(
         "sensor_msgs/msg/CameraInfo",
-        header=_header(image.stamp, image.frame_id),
+        header=_header(stamp, frame_id),
         height=intrinsics.height,
         width=intrinsics.width,
         distortion_model=intrinsics.distortion_model,
@@ -135,6 +167,30 @@ def encode_boxes_3d(
             )
         )
     return _make("vision_msgs/msg/Detection3DArray", header=about, detections=detections)
+
+
+def encode_labels(
+    stamp: int,
+    frame_id: str,
+    boxes: Boxes3D,
+    labels: Sequence[str],
+    ids: Sequence[str] = (),
+    image: ImageLabels | None = None,
+) -> Any:
+    """What somebody has labelled: a vision_msgs/Detection3DArray, with ``image`` one of bevviz_msgs."""
+    results = [[(label, 1.0)] for label in labels]
+    message = encode_boxes_3d(stamp, frame_id, boxes, results, ids=ids)
+    if image is None:
+        return message
+    return _make(
+        "bevviz_msgs/msg/Detection3DArray",
+        header=message.header,
+        detections=message.detections,
+        image_boxes=image.xyxy.astype(np.float32).reshape(-1),
+        truncated=image.truncated.astype(np.float32),
+        occluded=image.occluded.astype(np.int32),
+        dont_care=image.dont_care.astype(np.float32).reshape(-1),
+    )
 
 
 def encode_markers(

@@ -21,7 +21,18 @@ from numpy.typing import NDArray
 
 from bevviz import geometry
 from bevviz.errors import UserError, first_line
-from bevviz.frame import F32, F64, U8, Boxes3D, Cloud, Image, Intrinsics, LabelledBoxes2D, LabelledBoxes3D
+from bevviz.frame import (
+    F32,
+    F64,
+    U8,
+    Boxes3D,
+    Cloud,
+    Image,
+    ImageLabels,
+    Intrinsics,
+    LabelledBoxes2D,
+    LabelledBoxes3D,
+)
 from bevviz.loggers import logger
 from bevviz.ros.roles import VIDEO
 
@@ -587,7 +598,7 @@ def decode_detections_2d(msg: Any, topic: str, received: int) -> LabelledBoxes2D
 
 @_guarded
 def decode_detections_3d(msg: Any, topic: str, received: int) -> LabelledBoxes3D:
-    """The boxes of a vision_msgs/Detection3DArray, of ROS 1 or any version of ROS 2.
+    """The boxes of a vision_msgs/Detection3DArray, of ROS 1 or any version of ROS 2, or of bevviz_msgs.
 
     Only the turn about z is kept of an orientation; one left at zero is none. Boxes that are not finite
     are left out.
@@ -614,6 +625,19 @@ def decode_detections_3d(msg: Any, topic: str, received: int) -> LabelledBoxes3D
         scores=scores,
         received=received,
         ids=ids if all(ids) else (),
+        image=_image_labels(msg, len(labels)),
+    )
+
+
+def _image_labels(msg: Any, boxes: int) -> ImageLabels | None:
+    """What a data set says of the image, see ``encode_labels``; None: it says nothing."""
+    if not hasattr(msg, "image_boxes") or len(msg.truncated) != boxes:
+        return None
+    return ImageLabels(
+        np.array(msg.image_boxes, np.float32).reshape(boxes, 4),
+        np.array(msg.truncated, np.float32),
+        np.array(msg.occluded, np.int32),
+        np.array(msg.dont_care, np.float32).reshape(-1, 4),
     )
 
 

@@ -26,6 +26,7 @@ class Topic:
     count: int | None = None  # messages; None: not known, as on a live graph
     frame_id: str = ""  # of its first message; "": not known
     rate: float | None = None  # Hz
+    aside: str = ""  # why it plays no role unless it is stated
 
     @property
     def kind(self) -> str:
@@ -346,6 +347,8 @@ def _find_images(topics: Sequence[Topic], config: SourceConfig, notes: dict[str,
     for topic in images:
         if topic.count == 0:
             notes[topic.name] = "not used: without messages"
+        elif topic.aside:
+            notes[topic.name] = f"not used: {topic.aside}"
         elif match := _DERIVED_IMAGE.search(topic.name.lower()):
             notes[topic.name] = f"not used: '{match.group()}' in the name says it is no camera's colour image"
         else:

@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 
 from bevviz import geometry
-from bevviz.datasets.kitti import ACCEPTED
+from bevviz.datasets.names import ACCEPTED
 from bevviz.frame import F32, F64, I64, Bool, Boxes3D, Camera
 
 LINK = 0.3  # IoU from which a box is taken for one of a projected object

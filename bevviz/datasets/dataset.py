@@ -1,0 +1,184 @@
+"""What a loader of a data set is: the topics of one drive as in a bag, made when they are read."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bevviz.errors import UserError
+from bevviz.frame import F32, I64
+
+SECOND = 1_000_000_000
+XYZI = np.dtype([(name, "<f4") for name in ("x", "y", "z", "intensity")])
+BOXES = "bevviz_msgs/msg/Detection3DArray"
+IMAGES = (".png", ".jpg", ".jpeg", ".webp")
+
+
+@dataclass(frozen=True, slots=True)
+class Stream:
+    """One topic.
+
+    Attributes:
+        topic: as a driver would call it, so that roles are found as in a bag.
+        type: ROS 2 type of its messages.
+        times: (N,) stamps in nanoseconds, sorted; what is made has them in its header.
+        make: the message of a row of ``times``, from ``bevviz.ros.encode``; may raise UserError.
+        aside: why the topic plays no role unless it is asked for; "": it plays.
+    """
+
+    topic: str
+    type: str
+    times: I64
+    make: Callable[[int], Any]
+    aside: str = ""
+
+
+class Dataset:
+    """One drive of a data set. A subclass in a file of this package is a loader: it is found by itself.
+
+    Attributes:
+        name: as ``--dataset`` takes it.
+        about: what it is called in sentences.
+        single_frames: nothing in one frame is in the next; the stamps are made up.
+        any_folder: it takes what no other loader knows.
+        streams: of messages with the same stamp those of the earlier stream come first.
+        warnings: what is missing or damaged, as far as it was met, one sentence each.
+
+    Args:
+        path: the folder.
+        sequence: which of several drives in it; "": not said.
+
+    Raises:
+        UserError: something is missing or wrong; the sentence names the file and what to do.
+    """
+
+    name: ClassVar[str]
+    about: ClassVar[str]
+    expects: ClassVar[str]  # what a folder of it looks like, for the end of a sentence
+    single_frames: ClassVar[bool] = False
+    any_folder: ClassVar[bool] = False
+
+    def __init__(self, path: Path, sequence: str) -> None:
+        self.path, self.sequence = path, sequence
+        self.streams: Sequence[Stream] = ()
+        self.warnings: list[str] = []
+
+    @classmethod
+    def fits(cls, path: Path) -> bool:
+        """Whether a folder looks like one of it; quick, and no file is opened."""
+        raise NotImplementedError
+
+    def warn(self, text: str) -> None:
+        """Once."""
+        if text not in self.warnings:
+            self.warnings.append(text)
+
+    def check_sizes(self, files: Sequence[Path], step: int) -> None:
+        """Tell of scans that are no whole number of points, as cut ones are not."""
+        cut = [file for file in files if file.stat().st_size % step]
+        if cut:
+            more = f" and {len(cut) - 1} more" if len(cut) > 1 else ""
+            self.warn(
+                f"{cut[0].relative_to(self.path)}{more}: {cut[0].stat().st_size} bytes are no whole number "
+                f"of points of {step} bytes: cut; the whole points in it are read"
+            )
+        empty = [file for file in files if file.stat().st_size < step]
+        if empty:
+            more = f" and {len(empty) - 1} more" if len(empty) > 1 else ""
+            self.warn(f"{empty[0].relative_to(self.path)}{more}: no point in it")
+
+    def one_of(self, sequences: Sequence[str]) -> str:
+        """The drive that was asked for.
+
+        Raises:
+            UserError: none of that name, or several to choose from.
+        """
+        there = f"there are {', '.join(sequences[:8])}{' ...' if len(sequences) > 8 else ''}"
+        if not sequences:
+            raise UserError(f"{self.path}: no drive in it; {self.about} has {self.expects}")
+        if self.sequence:
+            if self.sequence not in sequences:
+                raise UserError(f"{self.path}: there is no --sequence {self.sequence}; {there}")
+            return self.sequence
+        if len(sequences) > 1:
+            raise UserError(f"{self.path}: {len(sequences)} drives; choose with --sequence NAME; {there}")
+        return sequences[0]
+
+
+def read_points(path: Path, layout: np.dtype[np.void]) -> NDArray[np.void]:
+    """(N,) the whole points of a file.
+
+    Raises:
+        UserError: it cannot be read.
+    """
+    try:
+        count = path.stat().st_size // layout.itemsize
+        return np.fromfile(path, layout, count)
+    except OSError as error:
+        raise UserError(f"{path}: cannot be read: {error.strerror}") from None
+
+
+def read_bytes(path: Path) -> bytes:
+    """Raises UserError: it cannot be read."""
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise UserError(f"{path}: cannot be read: {error.strerror}") from None
+
+
+def read_text(path: Path) -> str:
+    """Raises UserError: it cannot be read, or is no text."""
+    try:
+        return path.read_text()
+    except (OSError, UnicodeDecodeError) as error:
+        reason = getattr(error, "strerror", None) or "is no text"
+        raise UserError(f"{path}: cannot be read: {reason}") from None
+
+
+def read_table(path: Path, columns: int) -> NDArray[np.float64]:
+    """(N, columns) numbers, a row a line.
+
+    Raises:
+        UserError: it cannot be read, or a line has something else.
+    """
+    rows = []
+    for number, line in enumerate(read_text(path).splitlines(), 1):
+        if not line.strip():
+            continue
+        try:
+            row = [float(value) for value in line.split()[:columns]]
+        except ValueError:
+            raise UserError(f"{path}: line {number} has something that is no number") from None
+        if len(row) < columns:
+            raise UserError(f"{path}: line {number} has {len(row)} numbers, not {columns}")
+        rows.append(row)
+    return np.array(rows, np.float64).reshape(-1, columns)
+
+
+def frames_at(rate: float, numbers: Sequence[int]) -> I64:
+    """(N,) stamps of frames by their number, at so many a second, from one second on."""
+    return SECOND + np.round(np.asarray(numbers, np.float64) * (SECOND / rate)).astype(np.int64)
+
+
+def joined_columns(points: NDArray[np.void], more: dict[str, NDArray[Any]]) -> NDArray[np.void]:
+    """The points with further fields."""
+    layout = np.dtype(
+        [*((n, points.dtype[n]) for n in points.dtype.names or ()), *((n, v.dtype) for n, v in more.items())]
+    )
+    wider = np.empty(len(points), layout)
+    for name in points.dtype.names or ():
+        wider[name] = points[name]
+    for name, values in more.items():
+        wider[name] = values
+    return wider
+
+
+def columns_of(values: F32, names: Sequence[str]) -> NDArray[np.void]:
+    """(N, C) float32 as (N,) points with those fields, without a copy."""
+    layout = np.dtype([(name, "<f4") for name in names])
+    return np.ascontiguousarray(values, "<f4").view(layout).reshape(-1)

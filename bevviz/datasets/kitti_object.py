@@ -1,0 +1,74 @@
+"""The KITTI object benchmark: labelled frames of many drives, none of which follows the one before."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from bevviz import geometry
+from bevviz.datasets.dataset import BOXES, SECOND, XYZI, Dataset, Stream
+from bevviz.datasets.kitti import LIDAR, MAP, Calibration, clouds, mountings, pictures, read_labels, truth
+from bevviz.errors import UserError
+from bevviz.frame import Intrinsics
+from bevviz.ros.encode import encode_intrinsics, encode_transforms
+
+CAMERA = "image_2"
+APART = 100 * SECOND  # of single frames: nothing in one is in the next
+
+
+class KittiObject(Dataset):
+    """``velodyne/000000.bin``, ``calib/000000.txt``, and ``image_2`` and ``label_2`` where there are any."""
+
+    name = "kitti-object"
+    about = "KITTI object benchmark"
+    expects = "velodyne/000000.bin and calib/000000.txt, mostly image_2/000000.png and label_2/000000.txt too"
+    single_frames = True
+
+    @classmethod
+    def fits(cls, path: Path) -> bool:
+        return (path / "velodyne").is_dir() and any((path / "calib").glob("[0-9]" * 6 + ".txt"))
+
+    def __init__(self, path: Path, sequence: str) -> None:
+        super().__init__(path, sequence)
+        scans = sorted((path / "velodyne").glob("*.bin"))
+        if not scans:
+            raise UserError(f"{path / 'velodyne'}: no scan in it; expected 000000.bin")
+        self.check_sizes(scans, XYZI.itemsize)
+        times = APART * np.arange(1, len(scans) + 1, dtype=np.int64)
+        names = [scan.stem for scan in scans]
+
+        @lru_cache(maxsize=8)
+        def calibration(row: int) -> Calibration:
+            return Calibration(path / f"calib/{names[row]}.txt")
+
+        def mounting(row: int) -> Any:
+            _, camera_from_lidar = calibration(row).camera(2)
+            edge = (LIDAR, CAMERA, geometry.inverse(camera_from_lidar))
+            return encode_transforms(int(times[row]), [edge])
+
+        # Each frame has a map of its own, in which the LiDAR is at the origin.
+        self.streams = [
+            mountings(int(times[0]), [(MAP, LIDAR, np.eye(4))]),
+            Stream("/tf", "tf2_msgs/msg/TFMessage", times, mounting),
+        ]
+        images = [path / f"{CAMERA}/{name}.png" for name in names]
+        seen = [row for row, image in enumerate(images) if image.is_file()]
+        if seen:
+            at = times[seen]
+
+            def info(row: int) -> Any:
+                matrix, _ = calibration(seen[row]).camera(2)
+                return encode_intrinsics(int(at[row]), CAMERA, Intrinsics(0, 0, matrix))
+
+            self.streams += [
+                Stream(f"/{CAMERA}/camera_info", "sensor_msgs/msg/CameraInfo", at, info),
+                pictures(CAMERA, at, [images[row] for row in seen]),
+            ]
+        labels = [path / f"label_2/{name}.txt" for name in names]
+        known = [row for row, file in enumerate(labels) if file.is_file()]
+        if known:
+            self.streams.append(truth(BOXES, times[known], lambda row: read_labels(labels[known[row]])))
+        self.streams.append(clouds(times, scans))

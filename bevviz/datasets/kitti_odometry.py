@@ -1,0 +1,210 @@
+"""A sequence of the KITTI odometry benchmark, with the labels of SemanticKITTI (Behley et al. 2019)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from bevviz import geometry
+from bevviz.datasets.dataset import (
+    SECOND,
+    XYZI,
+    Dataset,
+    Stream,
+    frames_at,
+    joined_columns,
+    read_points,
+    read_table,
+)
+from bevviz.datasets.kitti import (
+    CLOUDS,
+    LIDAR,
+    Calibration,
+    camera_info,
+    clouds,
+    mountings,
+    pictures,
+    places,
+    truth,
+)
+from bevviz.errors import UserError
+from bevviz.frame import F64, I64, Boxes3D, LabelledBoxes3D
+from bevviz.ros.encode import encode_points
+
+RATE = 10.0  # Hz, where there is no times.txt
+# Numbers of its labels that are objects; from 252 on the moving ones.
+OBJECTS = {
+    10: "car",
+    11: "bicycle",
+    13: "bus",
+    15: "motorcycle",
+    16: "on-rails",
+    18: "truck",
+    20: "other-vehicle",
+    30: "person",
+    31: "bicyclist",
+    32: "motorcyclist",
+    252: "car",
+    253: "bicyclist",
+    254: "person",
+    255: "motorcyclist",
+    256: "on-rails",
+    257: "bus",
+    258: "truck",
+    259: "other-vehicle",
+}
+CAMERAS = {"image_2": "", "image_3": "the right eye of a stereo pair", "image_0": "grey", "image_1": "grey"}
+
+
+class KittiOdometry(Dataset):
+    """``velodyne``, ``calib.txt``; ``times.txt``, ``poses.txt``, ``labels``, ``image_2`` where they are."""
+
+    name = "kitti-odometry"
+    about = "KITTI odometry or SemanticKITTI sequence"
+    expects = "velodyne/000000.bin and calib.txt in it, or in sequences/00"
+
+    @classmethod
+    def fits(cls, path: Path) -> bool:
+        if (path / "sequences").is_dir():
+            return any((path / "sequences").glob("*/velodyne"))
+        return (path / "velodyne").is_dir() and (path / "calib.txt").is_file()
+
+    def __init__(self, path: Path, sequence: str) -> None:
+        super().__init__(path, sequence)
+        folder = path
+        if (path / "sequences").is_dir():
+            there = sorted(found.parent.name for found in (path / "sequences").glob("*/velodyne"))
+            folder = path / "sequences" / self.one_of(there)
+        elif sequence:
+            raise UserError(f"{path}: is one drive; leave --sequence {sequence} out")
+        scans = sorted((folder / "velodyne").glob("*.bin"))
+        if not scans:
+            raise UserError(f"{folder / 'velodyne'}: no scan in it; expected 000000.bin")
+        if not (folder / "calib.txt").is_file():
+            raise UserError(f"{folder / 'calib.txt'} is missing: it says where the cameras are")
+        self.check_sizes(scans, XYZI.itemsize)
+        calibration = Calibration(folder / "calib.txt")
+        numbers = _numbers(scans)
+        times = self._times(folder, numbers)
+        edges, cameras = [], list[Stream]()
+        for camera, aside in CAMERAS.items():
+            images = {int(file.stem): file for file in (folder / camera).glob("*.png") if file.stem.isdigit()}
+            rows = [row for row, number in enumerate(numbers) if number in images]
+            if not rows:
+                continue
+            at = times[rows]
+            matrix, camera_from_lidar = calibration.camera(int(camera[-1]))
+            edges.append((LIDAR, camera, geometry.inverse(camera_from_lidar)))
+            cameras += [
+                camera_info(camera, at, matrix),
+                pictures(camera, at, [images[numbers[row]] for row in rows], aside),
+            ]
+        self.streams = [mountings(int(times[0]), edges)] if edges else []
+        poses = self._poses(folder, calibration)
+        if poses is not None:
+            known = [row for row, number in enumerate(numbers) if number < len(poses)]
+            if len(known) < len(numbers):
+                self.warn(f"poses.txt has {len(poses)} poses: {len(numbers) - len(known)} scans have none")
+            self.streams.append(places(times[known], LIDAR, poses[[numbers[row] for row in known]]))
+        self.streams += cameras
+        labels = {int(file.stem): file for file in (folder / "labels").glob("*.label")}
+        if not labels:
+            self.streams.append(clouds(times, scans))
+            return
+        rows = [row for row, number in enumerate(numbers) if number in labels]
+        files = {row: labels[numbers[row]] for row in rows}
+
+        def cloud(row: int) -> Any:
+            points = read_points(scans[row], XYZI)
+            label = np.zeros(len(points), np.uint32)
+            if row in files:
+                label[:] = self._labels(files[row], len(points))
+            return encode_points(int(times[row]), LIDAR, joined_columns(points, {"label": label}))
+
+        def objects(row: int) -> LabelledBoxes3D:
+            points = read_points(scans[rows[row]], XYZI)
+            return boxes_of(files[rows[row]], points, self._labels(files[rows[row]], len(points)))
+
+        self.streams.append(truth("vision_msgs/msg/Detection3DArray", times[rows], objects))
+        self.streams.append(Stream(CLOUDS, "sensor_msgs/msg/PointCloud2", times, cloud))
+
+    def _times(self, folder: Path, numbers: list[int]) -> I64:
+        if not (folder / "times.txt").is_file():
+            self.warn(f"no times.txt: {RATE:.0f} scans a second are taken")
+            return frames_at(RATE, numbers)
+        table = read_table(folder / "times.txt", 1)[:, 0]
+        if len(table) <= max(numbers):
+            raise UserError(f"{folder / 'times.txt'}: {len(table)} times, and a scan {max(numbers):06d}.bin")
+        return SECOND + np.round(table[numbers] * 1e9).astype(np.int64)
+
+    def _poses(self, folder: Path, calibration: Calibration) -> F64 | None:
+        """(P, 4, 4) first scan from each; None: there are none."""
+        beside = folder.parent.parent / "poses" / f"{folder.name}.txt"
+        file = folder / "poses.txt" if (folder / "poses.txt").is_file() else beside
+        if not file.is_file():
+            return None
+        table = read_table(file, 12)
+        poses = np.tile(np.eye(4), (len(table), 1, 1))
+        poses[:, :3] = table.reshape(-1, 3, 4)
+        reference_from_lidar = calibration.rectified_from_lidar  # they are those of the camera
+        moved = geometry.inverse(reference_from_lidar) @ poses @ reference_from_lidar
+        return np.asarray(moved)
+
+    def _labels(self, file: Path, points: int) -> np.ndarray[Any, np.dtype[np.uint32]]:
+        """(points,) of each point."""
+        try:
+            labels = np.fromfile(file, "<u4")
+        except OSError as error:
+            raise UserError(f"{file}: cannot be read: {error.strerror}") from None
+        if len(labels) != points:
+            raise UserError(
+                f"{file}: {len(labels)} labels for {points} points: one of the two is cut, or of another scan"
+            )
+        return labels
+
+
+def boxes_of(file: Path, points: Any, labels: Any) -> LabelledBoxes3D:
+    """A box around the points of each object: as much of it as the LiDAR sees.
+
+    Seen from above it is the smallest turned rectangle around them, from below to above all of them.
+
+    Args:
+        file: for the result.
+        points: (N,) with x, y, z.
+        labels: (N,) class in the lower half, number of the object in the upper one, 0: it has none.
+    """
+    import cv2
+
+    kind = labels & 0xFFFF
+    chosen = np.flatnonzero((labels >> 16 > 0) & np.isin(kind, list(OBJECTS)))
+    order = chosen[np.argsort(labels[chosen], kind="stable")]
+    starts = np.flatnonzero(np.diff(labels[order].astype(np.int64), prepend=-1))
+    centers, sizes, turns, names, ids = [], [], [], list[str](), list[str]()
+    for mine in np.split(order, starts[1:]) if len(order) else ():
+        xy = np.column_stack([points["x"][mine], points["y"][mine]])
+        (x, y), (length, width), angle = cv2.minAreaRect(xy)
+        low, high = float(points["z"][mine].min()), float(points["z"][mine].max())
+        if width > length:
+            length, width, angle = width, length, angle + 90.0
+        centers.append([x, y, (low + high) / 2])
+        sizes.append([length, width, high - low])
+        turns.append(np.radians(angle))
+        names.append(OBJECTS[int(kind[mine[0]])])
+        ids.append(f"{names[-1]}-{int(labels[mine[0]] >> 16)}")
+    boxes = Boxes3D(
+        np.array(centers, np.float32).reshape(-1, 3),
+        np.array(sizes, np.float32).reshape(-1, 3),
+        np.array(turns, np.float32),
+    )
+    return LabelledBoxes3D(
+        str(file), 0, "", boxes, tuple(names), np.ones(len(names), np.float32), ids=tuple(ids)
+    )
+
+
+def _numbers(scans: list[Path]) -> list[int]:
+    wrong = next((scan for scan in scans if not scan.stem.isdigit()), None)
+    if wrong is not None:
+        raise UserError(f"{wrong}: its name is no number; expected 000000.bin")
+    return [int(scan.stem) for scan in scans]

@@ -1,0 +1,201 @@
+"""A drive of KITTI's raw data (Geiger, Lenz, Stiller and Urtasun 2013), its tracklets being the truth."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import numpy as np
+
+from bevviz import geometry
+from bevviz.datasets.dataset import XYZI, Dataset, Stream, read_table, read_text
+from bevviz.datasets.kitti import (
+    IMU,
+    LIDAR,
+    camera_info,
+    clouds,
+    mountings,
+    named_rows,
+    pictures,
+    places,
+    poses_of_oxts,
+    split_projection,
+    truth,
+)
+from bevviz.datasets.names import KITTI
+from bevviz.errors import UserError
+from bevviz.frame import F64, I64, Boxes3D, LabelledBoxes3D
+
+CAMERAS = {
+    "image_02": "",
+    "image_03": "the right eye of a stereo pair",
+    "image_00": "grey, beside a colour camera",
+    "image_01": "grey, beside a colour camera",
+}
+
+
+class KittiRaw(Dataset):
+    """``2011_09_26/2011_09_26_drive_0001_sync``, the calibration being in ``2011_09_26``."""
+
+    name = "kitti-raw"
+    about = "KITTI raw drive"
+    expects = "velodyne_points/data/0000000000.bin, and calib_velo_to_cam.txt in the folder above"
+
+    @classmethod
+    def fits(cls, path: Path) -> bool:
+        return (path / "velodyne_points").is_dir() or any(path.glob("*_drive_*/velodyne_points"))
+
+    def __init__(self, path: Path, sequence: str) -> None:
+        super().__init__(path, sequence)
+        folder = path
+        if not (path / "velodyne_points").is_dir():
+            there = sorted(found.parent.name for found in path.glob("*_drive_*/velodyne_points"))
+            folder = path / self.one_of(there)
+        elif sequence:
+            raise UserError(f"{path}: is one drive; leave --sequence {sequence} out")
+        if any((folder / "velodyne_points/data").glob("*.txt")):
+            raise UserError(f"{folder}: is unrectified (extract); give the drive that is called ..._sync")
+        scans, times = self._files(folder / "velodyne_points", ".bin")
+        if not scans:
+            raise UserError(f"{folder / 'velodyne_points/data'}: no scan in it; expected 0000000000.bin")
+        self.check_sizes(scans, XYZI.itemsize)
+        edges, sensors = self._cameras(folder)
+        table = self._oxts(folder)
+        self.streams = []
+        if table is not None:
+            oxts, poses = table
+            lidar_from_imu = _rigid(folder.parent / "calib_imu_to_velo.txt")
+            edges.append((IMU, LIDAR, geometry.inverse(lidar_from_imu)))
+            self.streams.append(places(oxts, IMU, poses))
+        if edges:
+            self.streams.insert(0, mountings(int(times[0]), edges))
+        self.streams += sensors
+        tracklets = folder / "tracklet_labels.xml"
+        if tracklets.is_file():
+            labelled = read_tracklets(tracklets)
+            numbers = [int(scan.stem) for scan in scans]
+            none = LabelledBoxes3D(str(tracklets), 0, "", Boxes3D.empty(), (), np.zeros(0, np.float32))
+            self.streams.append(
+                truth(
+                    "vision_msgs/msg/Detection3DArray",
+                    times,
+                    lambda row: labelled.get(numbers[row], none),
+                )
+            )
+        self.streams.append(clouds(times, scans))
+
+    def _cameras(self, folder: Path) -> tuple[list[tuple[str, str, F64]], list[Stream]]:
+        """Where they are, and what they saw."""
+        edges, streams = [], list[Stream]()
+        for camera, aside in CAMERAS.items():
+            images, times = self._files(folder / camera, ".png", ".jpg")
+            if not images:
+                continue
+            cameras = folder.parent / "calib_cam_to_cam.txt"
+            rows = named_rows(cameras)
+            number = camera[-2:]
+            try:
+                projection = rows[f"P_rect_{number}"].reshape(3, 4)
+                rectified = np.eye(4)
+                rectified[:3, :3] = rows["R_rect_00"].reshape(3, 3)
+            except (KeyError, ValueError):
+                raise UserError(f"{cameras}: no P_rect_{number} or R_rect_00, as KITTI writes it") from None
+            matrix, beside = split_projection(projection)
+            camera_from_lidar = beside @ rectified @ _rigid(folder.parent / "calib_velo_to_cam.txt")
+            edges.append((LIDAR, camera, geometry.inverse(camera_from_lidar)))
+            streams += [camera_info(camera, times, matrix), pictures(camera, times, images, aside)]
+        return edges, streams
+
+    def _oxts(self, folder: Path) -> tuple[I64, F64] | None:
+        """Stamps of the positions and (P, 4, 4) first pose from each; None: there are none."""
+        files, times = self._files(folder / "oxts", ".txt")
+        if not files:
+            return None
+        rows = [read_table(file, 6) for file in files]
+        short = next((file for file, row in zip(files, rows, strict=True) if len(row) != 1), None)
+        if short is not None:
+            raise UserError(f"{short}: expected one line of 30 numbers")
+        return times, poses_of_oxts(np.concatenate(rows))
+
+    def _files(self, folder: Path, *suffixes: str) -> tuple[list[Path], I64]:
+        """The files of a sensor and their stamps; a file is missing here and there, a stamp never."""
+        files = sorted(f for suffix in suffixes for f in (folder / "data").glob(f"*{suffix}"))
+        if not files:
+            return [], np.zeros(0, np.int64)
+        stamps = folder / "timestamps.txt"
+        times = [
+            _time(stamps, n, line) for n, line in enumerate(read_text(stamps).split("\n"), 1) if line.strip()
+        ]
+        numbers = [int(file.stem) if file.stem.isdigit() else -1 for file in files]
+        beyond = [f for f, number in zip(files, numbers, strict=True) if not 0 <= number < len(times)]
+        if beyond:
+            raise UserError(f"{stamps}: {len(times)} lines, and none for {beyond[0].name}")
+        at = np.array([times[number] for number in numbers], np.int64)
+        order = np.argsort(at, kind="stable")
+        return [files[i] for i in order.tolist()], at[order]
+
+
+def read_tracklets(file: Path) -> dict[int, LabelledBoxes3D]:
+    """The labelled objects of each scan, by its number, in the frame of the LiDAR.
+
+    Raises:
+        UserError: it cannot be read, or is none of KITTI's.
+    """
+    try:
+        root = ElementTree.fromstring(read_text(file))
+        items = [item for item in root.findall("tracklets/item") if item.find("objectType") is not None]
+        if root.find("tracklets") is None:
+            raise ValueError("no tracklets in it")
+        rows: dict[int, list[tuple[str, str, list[float]]]] = defaultdict(list)
+        for number, item in enumerate(items):
+            kind = _text(item, "objectType")
+            height, width, length = (float(_text(item, name)) for name in "hwl")
+            first = int(_text(item, "first_frame"))
+            if kind not in KITTI:
+                continue
+            for later, pose in enumerate(item.findall("poses/item")):
+                x, y, z, turn = (float(_text(pose, name)) for name in ("tx", "ty", "tz", "rz"))
+                # A place is the middle of the bottom.
+                values = [x, y, z + height / 2, length, width, height, turn]
+                rows[first + later].append((kind, str(number), values))
+    except (ElementTree.ParseError, ValueError) as error:
+        raise UserError(f"{file}: no tracklets as KITTI writes them: {error}") from None
+    found = {}
+    for scan, there in rows.items():
+        labels, ids, values = zip(*there, strict=True)
+        table = np.array(values, np.float32)
+        boxes = Boxes3D(table[:, :3], table[:, 3:6], table[:, 6])
+        ones = np.ones(len(labels), np.float32)
+        found[scan] = LabelledBoxes3D(str(file), 0, "", boxes, labels, ones, ids=ids)
+    return found
+
+
+def _text(item: Any, name: str) -> str:
+    found = item.findtext(name)
+    if found is None:
+        raise ValueError(f"an item has no {name}")
+    return str(found).strip()
+
+
+def _rigid(file: Path) -> F64:
+    """(4, 4) of a file with R and T."""
+    rows = named_rows(file)
+    pose = np.eye(4)
+    try:
+        pose[:3, :3], pose[:3, 3] = rows["R"].reshape(3, 3), rows["T"]
+    except (KeyError, ValueError):
+        raise UserError(f"{file}: no R and T, as KITTI writes them") from None
+    return pose
+
+
+def _time(file: Path, number: int, line: str) -> int:
+    """Nanoseconds of ``2011-09-26 13:02:25.964389445``, which is taken for UTC."""
+    day, _, fraction = line.strip().partition(".")
+    try:
+        whole = datetime.strptime(day, "%Y-%m-%d %H:%M:%S").replace(tzinfo=UTC)
+        return round(whole.timestamp()) * 10**9 + int(fraction[:9].ljust(9, "0") or "0")
+    except ValueError:
+        raise UserError(f"{file}: line {number} is no time, as 2011-09-26 13:02:25.964389445") from None

@@ -1,0 +1,107 @@
+"""A sequence of the KITTI tracking benchmark."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from pathlib import Path
+
+from bevviz import geometry
+from bevviz.datasets.dataset import BOXES, XYZI, Dataset, Stream, frames_at, read_table, read_text
+from bevviz.datasets.kitti import (
+    IMU,
+    LIDAR,
+    Calibration,
+    camera_info,
+    clouds,
+    labelled_boxes,
+    mountings,
+    pictures,
+    places,
+    poses_of_oxts,
+    truth,
+)
+from bevviz.errors import UserError
+
+RATE = 10.0  # Hz; the benchmark has no stamps
+CAMERAS = {"image_02": "", "image_03": "the right eye of a stereo pair"}
+
+
+class KittiTracking(Dataset):
+    """``velodyne/0000/000000.bin``, ``calib/0000.txt``; ``image_02``, ``label_02``, ``oxts``."""
+
+    name = "kitti-tracking"
+    about = "KITTI tracking benchmark"
+    expects = "velodyne/0000/000000.bin and calib/0000.txt"
+
+    @classmethod
+    def fits(cls, path: Path) -> bool:
+        if any((path / "calib").glob("[0-9]" * 4 + ".txt")):
+            return any((path / "velodyne").glob("[0-9]" * 4))
+        above = path.parent  # velodyne/0000 itself
+        return above.name == "velodyne" and (above.parent / f"calib/{path.name}.txt").is_file()
+
+    def __init__(self, path: Path, sequence: str) -> None:
+        super().__init__(path, sequence)
+        root, name = path, path.name
+        if path.parent.name == "velodyne":
+            root = path.parent.parent
+            if sequence not in ("", name):
+                raise UserError(f"{path}: is one drive; leave --sequence {sequence} out")
+        else:
+            name = self.one_of(sorted(f.name for f in (path / "velodyne").glob("[0-9]" * 4)))
+        scans = sorted((root / "velodyne" / name).glob("*.bin"))
+        if not scans:
+            raise UserError(f"{root / 'velodyne' / name}: no scan in it; expected 000000.bin")
+        self.path = root
+        self.check_sizes(scans, XYZI.itemsize)
+        calibration = Calibration(root / f"calib/{name}.txt")
+        times = frames_at(RATE, _numbers(scans))
+        edges, sensors = [], list[Stream]()
+        for camera, aside in CAMERAS.items():
+            images = sorted((root / camera / name).glob("*.png"))
+            if not images:
+                continue
+            at = frames_at(RATE, _numbers(images))
+            matrix, camera_from_lidar = calibration.camera(int(camera[-1]))
+            edges.append((LIDAR, camera, geometry.inverse(camera_from_lidar)))
+            sensors += [camera_info(camera, at, matrix), pictures(camera, at, images, aside)]
+        self.streams = []
+        oxts = root / f"oxts/{name}.txt"
+        if oxts.is_file():
+            table = read_table(oxts, 6)
+            edges.append((IMU, LIDAR, geometry.inverse(calibration.lidar_from_imu)))
+            self.streams.append(places(frames_at(RATE, range(len(table))), IMU, poses_of_oxts(table)))
+        if edges:
+            self.streams.insert(0, mountings(int(times[0]), edges))
+        self.streams += sensors
+        labels = root / f"label_02/{name}.txt"
+        if labels.is_file():
+            self.streams.append(self._truth(labels, calibration, scans))
+        self.streams.append(clouds(times, scans))
+
+    def _truth(self, file: Path, calibration: Calibration, scans: list[Path]) -> Stream:
+        """Of the scans: a line has the frame, the object, and what a label of the object benchmark has."""
+        lines: dict[int, list[tuple[int, str]]] = defaultdict(list)
+        ids: dict[int, list[str]] = defaultdict(list)
+        for number, line in enumerate(read_text(file).splitlines(), 1):
+            if not line.strip():
+                continue
+            frame, track, *rest = [*line.split(maxsplit=2), "", ""]
+            if not frame.isdigit() or not track.lstrip("-").isdigit():
+                raise UserError(f"{file}: line {number} does not begin with a frame and an object")
+            lines[int(frame)].append((number, rest[0]))
+            ids[int(frame)].append(track)
+        numbers, pose = _numbers(scans), calibration.rectified_from_lidar
+
+        return truth(
+            BOXES,
+            frames_at(RATE, numbers),
+            lambda row: labelled_boxes(file, lines[numbers[row]], pose, ids[numbers[row]]),
+        )
+
+
+def _numbers(files: list[Path]) -> list[int]:
+    wrong = next((file for file in files if not file.stem.isdigit()), None)
+    if wrong is not None:
+        raise UserError(f"{wrong}: its name is no number; expected 000000{wrong.suffix}")
+    return [int(file.stem) for file in files]
