@@ -74,7 +74,7 @@ class Session:
     def perceive(self, frame: Frame, network: Executor | None = None) -> FrameResult:
         """What the stages make of the next frame, with its tracks."""
         config, stages = self._in_force
-        return self._track(perceive(frame, config, stages, self._memo, network=network))
+        return self.track(perceive(frame, config, stages, self._memo, network=network))
 
     def finish(self, result: FrameResult) -> FrameResult:
         """The result of ``perceive`` with its bird's-eye view, explanations and anomalies."""
@@ -84,7 +84,8 @@ class Session:
         """The result with the anomalies of the drive so far."""
         return replace(result, anomalies=self._anomalies.update(result, result.config.anomalies))
 
-    def _track(self, result: FrameResult) -> FrameResult:
+    def track(self, result: FrameResult) -> FrameResult:
+        """The result with the tracks of the drive so far."""
         clusters, config = result.clusters, result.config.tracking
         if clusters is None or config.method == "none":
             return result

@@ -20,9 +20,9 @@ import rerun as rr
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bevviz.bags.source import BagSource
+from bevviz.bags.source import BagSource, FrameSelection
 from bevviz.batch.batch import claimed, left_to_do
-from bevviz.batch.jobs import PARTIAL, FrameSelection, Job, find_bags, make_jobs, name_bags, tables
+from bevviz.batch.jobs import PARTIAL, Job, find_bags, make_jobs, name_bags, tables
 from bevviz.batch.table import row
 from bevviz.cli import main
 from bevviz.config import Config, load

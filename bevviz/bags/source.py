@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from functools import cached_property
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
 
 from bevviz.bags.recording import RawMessage, Recording
+from bevviz.bags.state import Losses, ReadingState, dumps, loads
 from bevviz.closing import Closing
 from bevviz.config import Config, stage_topics
 from bevviz.errors import UserError
@@ -24,6 +25,36 @@ from bevviz.sync.synchronizer import Synchronizer, blindness
 SECOND = 1_000_000_000
 MARGIN = 2 * SECOND  # what else belongs to the first and the last cloud is looked for this far outside
 EPOCH = 1e8  # a larger number of seconds is a date
+
+
+@dataclass(frozen=True)
+class FrameSelection:
+    """Which frames of a bag, as in ``BagSource``."""
+
+    start: str | None = None
+    end: str | None = None
+    every: int = 1
+    frames: tuple[int | None, int | None] | None = None
+
+    def source(self, paths: Sequence[Path], config: Config) -> BagSource:
+        return BagSource(paths, config, start=self.start, end=self.end, every=self.every, frames=self.frames)
+
+
+@dataclass(frozen=True, slots=True)
+class Window:
+    """Consecutive frames of a source, to be read by themselves.
+
+    Attributes:
+        number: counted from 0.
+        length: frames in it, at most.
+        again: frames to be read before them: the last one of the window before, or none.
+        content: what the source remembered when it came there.
+    """
+
+    number: int
+    length: int
+    again: int
+    content: bytes
 
 
 class BagSource(Closing):
@@ -54,6 +85,7 @@ class BagSource(Closing):
         at: str | None = None,
     ) -> None:
         self.config = config
+        self.selection = FrameSelection(start, end, every, frames)
         self.recording = Recording(paths, config.source)
         try:
             self.roles = find_roles(self.recording.topics, config.source, stage_topics(config))
@@ -67,9 +99,7 @@ class BagSource(Closing):
         except BaseException:
             self.close()
             raise
-        self._damaged: Counter[str] = Counter()
-        self._first_damage: dict[str, str] = {}
-        self._sync: Synchronizer | None = None
+        self._state: ReadingState | None = None  # of the frames read last
 
     def close(self) -> None:
         self.recording.close()
@@ -85,22 +115,26 @@ class BagSource(Closing):
 
     @property
     def warnings(self) -> Sequence[str]:
-        synced = self._sync.report.warnings() if self._sync else ()
-        blind = blindness(self.config, self.roles, self._sync.report if self._sync else None)
+        report = self._state.sync.report if self._state else None
+        synced = report.warnings() if report else ()
+        blind = blindness(self.config, self.roles, report)
         return [*self.recording.warnings, *self._damage, *blind, *synced]
 
     @property
     def _damage(self) -> Sequence[str]:
         """Messages that could not be used, a sentence for each topic."""
+        state = self._state
+        if state is None:
+            return []
         return [
-            f"{count} message(s) of {topic} could not be used, the first: {self._first_damage[topic]}"
-            for topic, count in self._damaged.items()
+            f"{count} message(s) of {topic} could not be used, the first: {state.first_damage[topic]}"
+            for topic, count in state.damaged.items()
         ]
 
     @property
     def doubts(self) -> Sequence[str]:
         """What of the frames read so far may make all of them wrong, one sentence each."""
-        return [*self._damage, *(self._sync.report.doubts() if self._sync else ())]
+        return [*self._damage, *(self._state.sync.report.doubts() if self._state else ())]
 
     @property
     def span(self) -> tuple[int, int]:
@@ -110,14 +144,14 @@ class BagSource(Closing):
     @property
     def tree(self) -> Mapping[str, str]:
         """Child to parent of the transforms met so far."""
-        return self._sync.tf.tree() if self._sync else {}
+        return self._state.sync.tf.tree() if self._state else {}
 
     def pose(self, frame: Frame, stamp: int) -> F64 | None:
         """(4, 4) fixed_from_points at a stamp near that of a frame that was read last or a little before.
 
         None: no fixed frame above the points, or the transforms read so far do not reach the stamp.
         """
-        return self._sync.pose(frame, stamp) if self._sync else None
+        return self._state.sync.pose(frame, stamp) if self._state else None
 
     @cached_property
     def scans(self) -> I64:
@@ -150,52 +184,115 @@ class BagSource(Closing):
     def __iter__(self) -> Iterator[Frame]:
         return self._frames(self._low, self._high, self._first, self._chosen)
 
+    def windows(self, length: int) -> Iterator[Window]:
+        """The same frames in windows of so many, two at least, each to be read by another source.
+
+        All messages are read for it, but no image is decoded and no frame made: what frames lack is not among
+        the warnings then, see ``add_losses``.
+        """
+        state = self._begin(self._low)
+        state.sync.skims = True
+        content, again = dumps(state), 0
+        for n, _ in enumerate(self._deliver(state, self._low, self._high, self._first, self._chosen)):
+            if n % length == 0:
+                yield Window(n // length, length, again, content)
+            if n % length == length - 2:
+                content, again = dumps(state), 1
+
+    def window(self, window: Window) -> Iterator[tuple[Frame, bool]]:
+        """Its frames, and before them, told by False, the last one of the window before."""
+        state = self._state = loads(window.content, self.recording)
+        state.sync.skims = False
+        frames = self._deliver(state, self._low, self._high, self._first, self._chosen)
+        for frame in islice(frames, window.again):
+            yield frame, False
+        Losses.forget(state.sync)
+        for frame in islice(frames, window.length):
+            yield frame, True
+
+    @property
+    def losses(self) -> Losses:
+        """Of the frames read last."""
+        assert self._state is not None
+        return Losses.of(self._state.sync)
+
+    def add_losses(self, losses: Losses) -> None:
+        """Of a window that another source has read, in the order of the windows."""
+        if self._state is not None:
+            losses.add_to(self._state.sync)
+
     def _frames(self, low: int, high: int, first: int, chosen: range) -> Iterator[Frame]:
         """The chosen ones of the scans with low <= log time < high, the first of which is ``first``."""
-        sync = self._sync = Synchronizer(self.roles, self.config)
-        self._damaged.clear()
+        return self._deliver(self._begin(low), low, high, first, chosen)
+
+    def _begin(self, low: int) -> ReadingState:
+        sync = Synchronizer(self.roles, self.config)
+        state = self._state = ReadingState(sync, 0)
+        self._hold_throughout(state, make_handlers(sync, self.roles, self.recording.decode), low)
+        return state
+
+    def _deliver(
+        self, state: ReadingState, low: int, high: int, first: int, chosen: range
+    ) -> Iterator[Frame]:
+        """The frames from that state on, which is kept up to date."""
+        sync = state.sync
         handlers = make_handlers(sync, self.roles, self.recording.decode)
-        self._hold_throughout(sync, handlers, low)
-        numbers: dict[
-            int, list[int]
-        ] = {}  # time of receipt -> numbers of the scans that are not yet delivered
-        number = -1
-        stop = high + MARGIN
-        for message in self.recording.messages(handlers.keys(), low - MARGIN, stop):
-            if message.received > stop:
+        state.stop = state.stop or high + MARGIN
+        yield from self._numbered(sync.ready(), state)
+        for message in self._messages(handlers.keys(), state, low - MARGIN, high + MARGIN):
+            if message.received > state.stop:
                 break
             if message.topic == self._driver:
                 if not low <= message.received < high:
                     continue
-                number += 1
-                if number not in chosen:
+                state.number += 1
+                if state.number not in chosen:
                     continue
-                if number == chosen[-1]:
-                    stop = message.received + MARGIN
-                numbers.setdefault(message.received, []).append(first + number)
-            elif message.topic in self.roles.lidars and not (number in chosen or number + 1 in chosen):
+                if state.number == chosen[-1]:
+                    state.stop = message.received + MARGIN
+                state.numbers.setdefault(message.received, []).append(first + state.number)
+            elif message.topic in self.roles.lidars and not (
+                state.number in chosen or state.number + 1 in chosen
+            ):
                 continue
-            self._handle(handlers[message.topic], message)
-            yield from self._numbered(sync.ready(message.received), numbers)
-        yield from self._numbered(sync.flush(), numbers)
+            self._handle(handlers[message.topic], message, state)
+            yield from self._numbered(sync.ready(message.received), state)
+        yield from self._numbered(sync.flush(), state)
 
-    def _numbered(self, frames: Iterator[Frame], numbers: dict[int, list[int]]) -> Iterator[Frame]:
+    def _messages(
+        self, topics: Collection[str], state: ReadingState, start: int, stop: int
+    ) -> Iterator[RawMessage]:
+        """From where the state has come to."""
+        reached, known = state.reached or (start, 0)
+        for message in self.recording.messages(topics, reached, stop):
+            if message.received != reached:
+                reached, count = message.received, 1
+            elif known:
+                known -= 1
+                continue
+            else:
+                count = 1 if state.reached is None else state.reached[1] + 1
+            state.reached = reached, count
+            yield message
+
+    def _numbered(self, frames: Iterator[Frame], state: ReadingState) -> Iterator[Frame]:
         """The frames, each with the number of its scan in the part of the recording that is read."""
+        numbers = state.numbers
         for frame in frames:
             same = numbers.get(frame.received, ())
             yield replace(frame, index=same.pop(0) if same else frame.index)
             for received in [t for t in numbers if t < frame.received - 10 * MARGIN]:
                 del numbers[received]  # of scans that were dropped
 
-    def _handle(self, handler: Handler[RawMessage], message: RawMessage) -> None:
+    def _handle(self, handler: Handler[RawMessage], message: RawMessage, state: ReadingState) -> None:
         try:
             handler(message)
         except MessageError as error:
-            self._damaged[message.topic] += 1
-            self._first_damage.setdefault(message.topic, str(error))
+            state.damaged[message.topic] += 1
+            state.first_damage.setdefault(message.topic, str(error))
 
     def _hold_throughout(
-        self, sync: Synchronizer, handlers: Mapping[str, Handler[RawMessage]], low: int
+        self, state: ReadingState, handlers: Mapping[str, Handler[RawMessage]], low: int
     ) -> None:
         """Give what is published once to all frames, wherever in the bag it is.
 
@@ -210,10 +307,10 @@ class BagSource(Closing):
             except MessageError:
                 continue  # counted when its turn comes
         for transform in static.values():
-            sync.add_transform(transform, static=True)
+            state.sync.add_transform(transform, static=True)
         for topic in {camera.info_topic for camera in self.roles.cameras} - {""}:
             if (info := self.recording.first(topic)) is not None:
-                self._handle(handlers[topic], info)
+                self._handle(handlers[topic], info, state)
 
     def _find_driver(self) -> str:
         """The first LiDAR: its scans make the frames."""

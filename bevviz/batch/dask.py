@@ -6,13 +6,12 @@ from collections.abc import Callable, Sequence
 from typing import Any
 from urllib.parse import urlsplit
 
-from bevviz.batch.jobs import Job
-from bevviz.batch.work import JobResult, JobResults
+from bevviz.batch.task import JobResult, JobResults, Task
 from bevviz.errors import UserError, first_line
 from bevviz.logging.ports import answers
 
 
-def run_dask(jobs: Sequence[Job], address: str, retries: int, on_frame: Callable[[], None]) -> JobResults:
+def run_dask(jobs: Sequence[Task], address: str, retries: int, on_frame: Callable[[], None]) -> JobResults:
     """Run the jobs on a cluster, each once, and yield how they ended, as they end.
 
     A job whose worker dies is run again on another one, as often as the cluster's setting
@@ -42,9 +41,8 @@ def run_dask(jobs: Sequence[Job], address: str, retries: int, on_frame: Callable
         raise UserError(f"--dask {address}: no scheduler answers there ({first_line(error)})") from None
     with client:
         # The scheduler runs nothing twice that has the same key, not even for two clients.
-        futures: dict[Any, Job] = {
-            client.submit(_work, job, key=f"bevviz-{job.folder}-{job.name}-{job.key}", retries=retries): job
-            for job in jobs
+        futures: dict[Any, Task] = {
+            client.submit(_work, job, key=f"bevviz-{job.identity}", retries=retries): job for job in jobs
         }
         try:
             for future in as_completed(list(futures)):
@@ -57,7 +55,7 @@ def run_dask(jobs: Sequence[Job], address: str, retries: int, on_frame: Callable
             client.cancel([future for future in futures if not future.done()])
 
 
-def _result(job: Job, future: Any) -> JobResult:
+def _result(job: Task, future: Any) -> JobResult:
     if future.status == "finished":
         result: JobResult = future.result()
         return result
@@ -67,10 +65,8 @@ def _result(job: Job, future: Any) -> JobResult:
     return JobResult(job.name, error=f"{type(error).__name__}: {error}" if error else "cancelled")
 
 
-def _work(job: Job) -> JobResult:
+def _work(job: Task) -> JobResult:
     """On the worker."""
     from distributed import get_worker
 
-    from bevviz.batch.work import run
-
-    return run(job, get_worker().state.nthreads)
+    return job.run(get_worker().state.nthreads, lambda: None)

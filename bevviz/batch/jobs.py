@@ -7,14 +7,16 @@ import json
 import os
 import re
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 from bevviz.bags.recording import METADATA
+from bevviz.bags.source import FrameSelection
 from bevviz.batch.table import RunInfo, read_info
+from bevviz.batch.task import JobResult
 from bevviz.config import Config
 from bevviz.datasets import find_loader
 from bevviz.errors import UserError
@@ -23,16 +25,6 @@ from bevviz.provenance import dependencies_of, file_hash, model_path
 from bevviz.text import path_text
 
 PARTIAL = ".partial"  # folder of what is not complete
-
-
-@dataclass(frozen=True)
-class FrameSelection:
-    """Which frames of each bag, as in ``BagSource``."""
-
-    start: str | None = None
-    end: str | None = None
-    every: int = 1
-    frames: tuple[int | None, int | None] | None = None
 
 
 @dataclass(frozen=True)
@@ -83,6 +75,16 @@ class Job:
     def recording_id(self) -> str:
         """Another one for another result: a viewer takes recordings with the same one for the same."""
         return f"{self.name}-{self.key[:8]}"
+
+    @property
+    def identity(self) -> str:
+        return f"{self.folder}-{self.name}-{self.key}"
+
+    def run(self, threads: int, on_frame: Callable[[], None] = lambda: None) -> JobResult:
+        """See ``bevviz.batch.work.run``."""
+        from bevviz.batch.work import run
+
+        return run(self, threads, on_frame)
 
     def complete(self) -> RunInfo | None:
         """What is known of the result, None where it is missing or out of date."""

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import os
 import signal
-from collections import deque
-from collections.abc import Callable, Sequence
+from collections import Counter, deque
+from collections.abc import Callable, Iterable, Sized
 from dataclasses import dataclass
 from multiprocessing import get_context
 from multiprocessing.connection import Connection, wait
 from multiprocessing.context import SpawnProcess
 
-from bevviz.batch.jobs import Job
-from bevviz.batch.work import JobResult, JobResults
+from bevviz.batch.task import JobResult, JobResults, Task
 
 # concurrent.futures is of no use here: a worker that dies breaks the pool and every job that was on its way.
 
@@ -23,28 +22,32 @@ SIGNALS = {signal.SIGINT, signal.SIGTERM, signal.SIGHUP}
 class _Worker:
     process: SpawnProcess
     pipe: Connection
-    job: Job
+    job: Task
 
 
-def run_local(jobs: Sequence[Job], workers: int, retries: int, on_frame: Callable[[], None]) -> JobResults:
+def run_local(jobs: Iterable[Task], workers: int, retries: int, on_frame: Callable[[], None]) -> JobResults:
     """Run the jobs, each once, and yield how they ended, as they end.
 
     Args:
-        jobs: what to do; the first ones first.
+        jobs: what to do; the first ones first. Each is asked for when a worker is free.
         workers: processes at the same time.
         retries: how often a job is run again whose process died, or that failed for no fault of its bag.
         on_frame: called for each frame of any of them.
     """
-    if not jobs:
-        return
-    workers = min(workers, len(jobs))
-    threads = max(1, (os.cpu_count() or 1) // workers)
-    waiting = deque(jobs)
-    attempts = dict.fromkeys((job.name for job in jobs), 0)
+    if isinstance(jobs, Sized):
+        workers = min(workers, len(jobs))
+    threads = max(1, (os.cpu_count() or 1) // max(workers, 1))
+    coming = iter(jobs)
+    again: deque[Task] = deque()
+    attempts: Counter[str] = Counter()
     busy: list[_Worker] = []
+
+    def following() -> Task | None:
+        return again.popleft() if again else next(coming, None)
+
     try:
-        while waiting and len(busy) < workers:
-            busy.append(_start(waiting.popleft(), threads))
+        while len(busy) < workers and (job := following()) is not None:
+            busy.append(_start(job, threads))
         while busy:
             ready = wait([worker.pipe for worker in busy])
             for worker in [w for w in busy if w.pipe in ready]:
@@ -59,11 +62,12 @@ def run_local(jobs: Sequence[Job], workers: int, retries: int, on_frame: Callabl
                 retry, result = _judge(worker, message)
                 if retry and attempts[worker.job.name] < retries:
                     attempts[worker.job.name] += 1
-                    waiting.append(worker.job)
+                    again.append(worker.job)
                 else:
+                    attempts.pop(worker.job.name, None)
                     yield result
-                if waiting:
-                    busy.append(_next(worker, waiting.popleft(), threads))
+                if (job := following()) is not None:
+                    busy.append(_next(worker, job, threads))
                 else:
                     _end(worker)
     finally:
@@ -89,7 +93,7 @@ def _judge(worker: _Worker, message: JobResult | str | None) -> tuple[bool, JobR
     return True, JobResult(worker.job.name, error=f"its process ended {why}{hint}")
 
 
-def _start(job: Job, threads: int) -> _Worker:
+def _start(job: Task, threads: int) -> _Worker:
     context = get_context("spawn")  # a fork would copy threads of Rerun and onnxruntime in the midst of work
     ours, theirs = context.Pipe()
     process = context.Process(target=_work, args=(theirs, threads), name="bevviz batch", daemon=True)
@@ -105,7 +109,7 @@ def _start(job: Job, threads: int) -> _Worker:
     return _Worker(process, ours, job)
 
 
-def _next(worker: _Worker, job: Job, threads: int) -> _Worker:
+def _next(worker: _Worker, job: Task, threads: int) -> _Worker:
     """The same process goes on with another job; a new one where it has gone."""
     if worker.process.exitcode is None:
         try:
@@ -132,16 +136,14 @@ def _work(pipe: Connection, threads: int) -> None:
     os.environ["OMP_NUM_THREADS"] = str(threads)  # before Open3D is loaded
     import cv2
 
-    from bevviz.batch.work import run
-
     cv2.setNumThreads(threads)
     while True:
         try:
-            job = pipe.recv()
+            job: Task = pipe.recv()
         except EOFError:
             return
         try:
-            result: JobResult | str = run(job, threads, lambda: pipe.send(_FRAME))
+            result: JobResult | str = job.run(threads, lambda: pipe.send(_FRAME))
         except BrokenPipeError:
             return  # the batch has gone
         except Exception as error:

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable, Generator
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any
 from uuid import uuid4
 
-from bevviz.bags.source import BagSource
 from bevviz.batch.jobs import PARTIAL, Job
 from bevviz.batch.table import RunInfo, judged, row, write
+from bevviz.batch.task import JobResult
 from bevviz.errors import UserError
 from bevviz.evaluate.evaluation import Evaluation
 from bevviz.evaluate.log import EvaluationRecorder
@@ -32,19 +32,6 @@ class WithdrawnError(Exception):
 
     def __init__(self) -> None:
         super().__init__("its unfinished recording was removed")
-
-
-@dataclass(frozen=True, slots=True)
-class JobResult:
-    """How a job ended. ``error`` is empty where its results are complete."""
-
-    name: str
-    frames: int = 0
-    seconds: float = 0.0
-    error: str = ""
-
-
-JobResults: TypeAlias = Generator[JobResult, None, None]
 
 
 def run(job: Job, threads: int, on_frame: Callable[[], None] = lambda: None) -> JobResult:
@@ -71,14 +58,7 @@ def run(job: Job, threads: int, on_frame: Callable[[], None] = lambda: None) -> 
     selection, rows = job.selection, list[dict[str, Any]]()
     try:
         recording.parent.mkdir(parents=True, exist_ok=True)
-        with BagSource(
-            [job.bag],
-            config,
-            start=selection.start,
-            end=selection.end,
-            every=selection.every,
-            frames=selection.frames,
-        ) as source:
+        with selection.source([job.bag], config) as source:
             session = Session(config)
             with open_recording(
                 source.scene,

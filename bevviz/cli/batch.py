@@ -29,7 +29,7 @@ from bevviz.errors import UserError
 if TYPE_CHECKING:
     from bevviz.batch.jobs import Job
     from bevviz.batch.table import RunInfo
-    from bevviz.batch.work import JobResults
+    from bevviz.batch.task import JobResults
     from bevviz.evaluate.gate import Limit
 
 
@@ -118,7 +118,8 @@ def _limits(options: argparse.Namespace) -> list[Limit]:
 
 
 def _jobs(options: argparse.Namespace) -> list[Job]:
-    from bevviz.batch.jobs import FrameSelection, make_jobs
+    from bevviz.bags.source import FrameSelection
+    from bevviz.batch.jobs import make_jobs
     from bevviz.frame import Scene
     from bevviz.logging import blueprints
     from bevviz.stages.detector import Detector

@@ -18,19 +18,22 @@ _PARTS = ("points", "strips", "solids", "axes", "grid", "fix")
 _COLOR = (120, 200, 255)
 
 
+def log_shapes(to: Writer, frame: Frame) -> None:
+    """What has a place in the world."""
+    for shape in (frame.around or Around()).shapes:
+        if shape.fix is not None or shape.world_from_shape is not None:
+            _log_shape(to, shape)
+
+
 class AroundLog:
-    """Logs what is around each frame; remembers what the diagnostics said."""
+    """Remembers what the diagnostics said."""
 
     def __init__(self) -> None:
         self._said: dict[str, str] = {}  # by name of the status
 
-    def log(self, to: Writer, frame: Frame) -> list[tuple[str, str]]:
-        """The shapes. Returns marks and news of the diagnostics as lines of the log: level and text."""
-        around = frame.around or Around()
-        for shape in around.shapes:
-            if shape.fix is not None or shape.world_from_shape is not None:
-                _log_shape(to, shape)
-        return [*marks(frame), *self._news(around.statuses)]
+    def lines(self, frame: Frame) -> list[tuple[str, str]]:
+        """Marks and news of the diagnostics as lines of the log: level and text."""
+        return [*marks(frame), *self._news((frame.around or Around()).statuses)]
 
     def _news(self, statuses: Sequence[Status]) -> list[tuple[str, str]]:
         """What the robot's diagnostics say that they did not say before; at first what is not well."""

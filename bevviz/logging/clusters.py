@@ -6,9 +6,10 @@ from collections.abc import Iterable
 
 import numpy as np
 import rerun as rr
+from numpy.typing import NDArray
 
 from bevviz.config import ClusteringConfig
-from bevviz.frame import F32, Clusters, ClusterState, Frame, Tracks
+from bevviz.frame import F32, I64, Bool, Clusters, ClusterState, Frame, Tracks
 from bevviz.logging import entities, tracks
 from bevviz.logging.pieces import OUTLINE, boxes3d
 from bevviz.logging.writer import Writer
@@ -31,21 +32,21 @@ def log_clusters(
     tracked: Tracks | None,
     obstacles: F32,
     config: ClusteringConfig,
+    colored: bool = True,
 ) -> None:
-    """In the colours of their tracks. ``obstacles``: (P, 3), as of ``clusters.labels``."""
+    """In the colours of their tracks. ``obstacles``: (P, 3), as of ``clusters.labels``.
+
+    Without colours, they are for ``log_cluster_colors`` to log.
+    """
     boxes = clusters.boxes(config)
-    colors = tracks.class_ids(tracks.of_clusters(tracked, len(clusters)))
-    is_kept = clusters.kept
-    kept, others = np.flatnonzero(is_kept), np.flatnonzero(~is_kept)
+    kept, others = np.flatnonzero(clusters.kept), np.flatnonzero(~clusters.kept)
     if len(kept):
-        member = np.append(is_kept, False).take(clusters.labels)  # -1 is noise
+        member = _member(clusters)
+        of_points, of_boxes = _colors(clusters, tracked, member, kept) if colored else (None, None)
         to.put(
             entities.clusters(frame.lidar),
-            rr.Points3D(
-                obstacles.compress(member, axis=0),
-                class_ids=colors.take(clusters.labels.compress(member)),
-            ),
-            boxes3d(boxes, kept, [f"{k}" for k in kept], class_ids=colors[kept]),
+            rr.Points3D(obstacles.compress(member, axis=0), class_ids=of_points),
+            boxes3d(boxes, kept, [f"{k}" for k in kept], class_ids=of_boxes),
         )
     if len(others):
         states = [ClusterState(s) for s in clusters.state[others].tolist()]
@@ -58,3 +59,28 @@ def log_clusters(
                 class_ids=[entities.CLUSTER_CLASS[s] for s in states],
             ),
         )
+
+
+def log_cluster_colors(to: Writer, frame: Frame, clusters: Clusters, tracked: Tracks | None) -> None:
+    """Of a frame that ``log_clusters`` logged without."""
+    kept = np.flatnonzero(clusters.kept)
+    if len(kept):
+        of_points, of_boxes = _colors(clusters, tracked, _member(clusters), kept)
+        to.write(
+            entities.clusters(frame.lidar),
+            rr.Points3D.from_fields(class_ids=of_points),
+            rr.Boxes3D.from_fields(class_ids=of_boxes),
+        )
+
+
+def _member(clusters: Clusters) -> Bool:
+    """(P,) obstacle points of the clusters that were kept."""
+    return np.append(clusters.kept, False).take(clusters.labels)  # -1 is noise
+
+
+def _colors(
+    clusters: Clusters, tracked: Tracks | None, member: Bool, kept: I64
+) -> tuple[NDArray[np.uint16], NDArray[np.uint16]]:
+    """Class ids of those points, and of the boxes of the clusters that were kept."""
+    colors = tracks.class_ids(tracks.of_clusters(tracked, len(clusters)))
+    return colors.take(clusters.labels.compress(member)), colors[kept]

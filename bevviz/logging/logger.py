@@ -15,7 +15,7 @@ from bevviz.frame import CameraResult, Frame, FrameResult, Intrinsics, LateResul
 from bevviz.logging import entities
 from bevviz.logging.annotations import log_world
 from bevviz.logging.anomalies import log_anomalies, log_anomalies_looks
-from bevviz.logging.around import AroundLog, diagnostic_states, marks
+from bevviz.logging.around import AroundLog, diagnostic_states, log_shapes, marks
 from bevviz.logging.bev import log_bev, log_grid
 from bevviz.logging.camera import (
     log_camera,
@@ -25,7 +25,7 @@ from bevviz.logging.camera import (
     log_projected_points,
 )
 from bevviz.logging.cloud import log_cloud, log_cloud_looks, log_ground, log_obstacles, quantised
-from bevviz.logging.clusters import log_clusters, log_clusters_looks
+from bevviz.logging.clusters import log_cluster_colors, log_clusters, log_clusters_looks
 from bevviz.logging.decisions import log_decisions
 from bevviz.logging.frustums import log_frustums
 from bevviz.logging.health import Rates, log_health
@@ -168,6 +168,34 @@ class Logger(Writer):
             self._late[found.boxes.topic] = found.boxes.stamp
             log_late(self, found, self._config.bev)
         self.begin(frame.index, frame.stamp, frame.received)
+        self._log_alone(result, cloud=cloud)
+        self._log_in_order(result, health, notes, states)
+        if beside is not None:
+            beside()
+        self.end()
+
+    def log_alone(self, result: FrameResult) -> None:
+        """What no other frame has a part in but the one before it; ``log_in_order`` has the rest.
+
+        With both, by two loggers that need not know each other, a recording says of a frame what it says with
+        ``log``.
+        """
+        frame = result.frame
+        self.begin(frame.index, frame.stamp, frame.received)
+        self._log_alone(result, colored=False)
+        self.end()
+
+    def log_in_order(self, result: FrameResult) -> None:
+        """What the frames before have a part in: tracks and their colours, anomalies, states, rates."""
+        frame = result.frame
+        self.begin(frame.index, frame.stamp, frame.received)
+        if result.clusters is not None:
+            log_cluster_colors(self, frame, result.clusters, result.tracks)
+        self._log_in_order(result)
+        self.end()
+
+    def _log_alone(self, result: FrameResult, *, cloud: bool = False, colored: bool = True) -> None:
+        frame = result.frame
         self.put(entities.sensor(frame.lidar), transform(frame.pose))
         before = set(self._now)
         if self._inputs:
@@ -175,25 +203,33 @@ class Logger(Writer):
         elif cloud:
             log_cloud(self, result)
         self._brought |= self._now - before
-        self._log_lidar_results(result)
+        self._log_lidar_results(result, colored)
         for camera in result.cameras:
             self._log_camera_results(camera)
-        log_objects(self, result)
-        if result.tracks is not None:
-            log_tracks(self, frame, result.tracks, self._config.bev)
         log_frustums(self, frame, result.cameras)
         if result.bev is not None:
             log_bev(self, result.bev, self._config)
             log_grid(self, result, result.bev)
-        lines = marks(frame) if self.root else self._around.log(self, frame)
+        if not self.root:
+            log_shapes(self, frame)
+
+    def _log_in_order(
+        self,
+        result: FrameResult,
+        health: Mapping[str, float] = MappingProxyType({}),
+        notes: Sequence[tuple[str, str]] = (),
+        states: Mapping[str, str] = MappingProxyType({}),
+    ) -> None:
+        frame = result.frame
+        log_objects(self, result)
+        if result.tracks is not None:
+            log_tracks(self, frame, result.tracks, self._config.bev)
+        lines = marks(frame) if self.root else self._around.lines(frame)
         log_decisions(self, result, [*notes, *lines])
         log_anomalies(self, result, self._onsets.of(result.anomalies))
         self._log_states(result, states)
         self._rates.add(frame)
         log_health(self, result, self._last, self._rates, health)
-        if beside is not None:
-            beside()
-        self.end()
         self._last = frame
 
     def log_meanwhile(
@@ -234,7 +270,7 @@ class Logger(Writer):
         if last is None or (last.width, last.height) != size or not np.array_equal(last.K, intrinsics.K):
             log_intrinsics(self, name, intrinsics)
 
-    def _log_lidar_results(self, result: FrameResult) -> None:
+    def _log_lidar_results(self, result: FrameResult, colored: bool) -> None:
         frame, config = result.frame, self._config
         log_ground(self, result, config.voxel.size)
         if result.obstacles is None:
@@ -242,7 +278,7 @@ class Logger(Writer):
         obstacles = quantised(result.obstacles, config.voxel.size)
         log_obstacles(self, frame, obstacles)
         if result.clusters is not None:
-            log_clusters(self, frame, result.clusters, result.tracks, obstacles, config.clustering)
+            log_clusters(self, frame, result.clusters, result.tracks, obstacles, config.clustering, colored)
 
     def _log_camera_results(self, result: CameraResult) -> None:
         if result.detections is not None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections import defaultdict, deque
 from collections.abc import Iterable, Iterator, Mapping
+from functools import partial
 from statistics import median
 
 APART = 0.6  # seconds between the lags of two topics, from which on no delay is a likely reason
@@ -29,7 +30,7 @@ class Clocks:
     def __init__(self, offsets: Mapping[str, float], by: str) -> None:
         self._offsets = {topic: round(seconds * 1e9) for topic, seconds in offsets.items()}
         self._received = by == "received"
-        self._lags: dict[str, deque[int]] = defaultdict(lambda: deque(maxlen=LAST))
+        self._lags: dict[str, deque[int]] = defaultdict(partial(deque, maxlen=LAST))
 
     def stamp(self, topic: str, stamp: int, received: int) -> int:
         """The stamp to go by, nanoseconds."""

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, Protocol, TypeVar
+from typing import Any, Generic, Protocol, TypeVar
 
 from bevviz.frame import Image
 from bevviz.ros.around import decode_shapes, decode_statuses
@@ -44,6 +44,19 @@ M = TypeVar("M", bound=Message)
 Handler = Callable[[M], None]
 
 
+@dataclass(frozen=True, slots=True)
+class ImageLoader(Generic[M]):
+    """Decodes an image when a frame takes it."""
+
+    message: M
+    compressed: bool
+    decode: Callable[[M], Any]
+
+    def __call__(self) -> Image:
+        decode_pixels = decode_compressed_image if self.compressed else decode_image
+        return decode_pixels(self.decode(self.message), self.message.topic, self.message.received)
+
+
 def make_handlers(sync: Synchronizer, roles: Roles, decode: Callable[[M], Any]) -> dict[str, Handler[M]]:
     """What to do with a message, by topic: decode it and hand it on. An image is decoded when it is used.
 
@@ -59,13 +72,9 @@ def make_handlers(sync: Synchronizer, roles: Roles, decode: Callable[[M], Any]) 
         stamp = sync.clocks.stamp(message.topic, transform.stamp, message.received)
         return transform if stamp == transform.stamp else replace(transform, stamp=stamp)
 
-    def load_image(message: M, compressed: bool) -> Image:
-        decode_pixels = decode_compressed_image if compressed else decode_image
-        return decode_pixels(decode(message), message.topic, message.received)
-
     def add_image(message: M, camera: CameraRole) -> None:
         stamp, frame_id = message.header()
-        load = partial(load_image, message, camera.compressed)
+        load = ImageLoader(message, camera.compressed, decode)
         sync.add_image(message.topic, stamp, frame_id, message.received, load)
 
     def add_info(message: M, rectified: bool) -> None:
@@ -76,14 +85,11 @@ def make_handlers(sync: Synchronizer, roles: Roles, decode: Callable[[M], Any]) 
             raise
         sync.add_camera_info(message.topic, info, message.header()[0], message.received)
 
-    followed = ""  # the frame that odometry places
-
     def add_odometry(message: M) -> None:
-        nonlocal followed
-        if followed and not sync.tf.needs_odometry(followed):
+        if sync.followed and not sync.tf.needs_odometry(sync.followed):
             return
         transform = decode_odometry(decode(message), message.topic)
-        followed = transform.child
+        sync.followed = transform.child
         sync.add_transform(clocked(message, transform), fallback=True)
 
     def add_imu(message: M) -> None:

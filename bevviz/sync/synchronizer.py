@@ -240,10 +240,17 @@ class Synchronizer:
         config: tolerances and queues.
         beside: topics of the robot's boxes that no frame waits for: what comes too late for its frame is to
             be had from ``overtaken``.
+
+    Attributes:
+        followed: the frame that odometry places.
+        skims: remember what a frame leaves behind, and do not make it: somebody else does. The frames have
+            their numbers and stamps then, and what they would have complained of is not counted.
     """
 
     def __init__(self, roles: Roles, config: Config, beside: Collection[str] = ()) -> None:
         self.report = SyncReport()
+        self.followed = ""
+        self.skims = False
         self.absent: frozenset[str] = frozenset()  # topics that nobody publishes now: not waited for
         self.tf = self.report.tf
         self.upright = Upright(self.tf, config.source.base_frame, config.sync.tf_tolerance)
@@ -570,6 +577,8 @@ class Synchronizer:
         cloud = self._clouds.pop(0)
         problems: list[str] = []
         place = self._place(cloud, problems)
+        if self.skims:
+            return self._passed(place, self._skimmed(cloud, place))
         clouds, poses = self._gather(cloud, place, problems)
         in_place = place.upright is None and cloud.frame_id.lstrip("/") == place.points_frame
         points, fields = _merge(clouds, poses, in_place)
@@ -601,8 +610,37 @@ class Synchronizer:
             problems=tuple(problems),
             around=self.around.take(lambda name: self._world_from(place, name)),
         )
+        return self._passed(place, frame)
+
+    def _skimmed(self, cloud: Cloud, place: _Place) -> Frame:
+        """Of a frame what is known at once. What belongs to it is taken, as in ``_build``."""
+        window = self._window(cloud.stamp)
+        groups: tuple[Mapping[str, _Track[Any]], ...] = (
+            self._boxes,
+            self._truth,
+            self._detections,
+            self._robot_clouds,
+        )
+        for group in groups:
+            for track in group.values():
+                track.take(cloud.stamp, *window)
+        self.around.take(lambda name: None)
+        points, pose = np.zeros((0, 3), np.float32), place.world_from_points
+        return Frame(
+            self._index,
+            cloud.stamp,
+            cloud.received,
+            cloud.name,
+            points,
+            place.points_frame,
+            world_from_points=pose,
+        )
+
+    def _passed(self, place: _Place, frame: Frame) -> Frame:
+        """The frame, from here on that of before."""
+        last = self._window(frame.stamp)[1]
         self._index += 1
-        self._last = cloud.stamp
+        self._last = frame.stamp
         self.report.frames += 1
         self._places.append((place, frame.pose))
         unused: tuple[Mapping[str, _Track[Any]], ...] = (self._boxes, self._detections)
@@ -611,7 +649,7 @@ class Synchronizer:
                 for result in group[topic].shed(last):
                     self._overtake(result)
         for _, track in self._tracks():
-            track.forget(cloud.stamp - self._tolerance)
+            track.forget(frame.stamp - self._tolerance)
         return frame
 
     def _lidar_name(self, cloud: Cloud) -> str:

@@ -1,0 +1,173 @@
+"""What a worker does: one window of a drive, as far as it needs no other. The same here and on a cluster."""
+
+from __future__ import annotations
+
+import os
+import pickle
+import time
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+from typing import IO, cast
+from uuid import uuid4
+
+import numpy as np
+import rerun as rr
+
+from bevviz.bags.source import BagSource, FrameSelection, Window
+from bevviz.bags.state import Losses
+from bevviz.batch.task import JobResult
+from bevviz.config import Config
+from bevviz.errors import UserError
+from bevviz.frame import Camera, Cloud, FrameResult, Ground, Voxels
+from bevviz.logging.logger import Logger
+from bevviz.logging.sinks import APPLICATION
+from bevviz.perceive import StageLoader, Stages, describe, perceive
+
+
+@dataclass(frozen=True)
+class WindowJob:
+    """One window. Everything that a worker needs, also one on another machine that shares the file system."""
+
+    window: Window
+    paths: tuple[Path, ...]  # absolute
+    config: Config
+    selection: FrameSelection
+    folder: Path  # absolute, for what is made
+    recording_id: str
+
+    @property
+    def name(self) -> str:
+        return f"window {self.window.number}"
+
+    @property
+    def identity(self) -> str:
+        return f"{self.recording_id}-{self.folder}-{self.window.number}"
+
+    @property
+    def recording(self) -> Path:
+        """What each frame has by itself."""
+        return self.folder / f"{self.window.number:08}.rrd"
+
+    @property
+    def results(self) -> Path:
+        """What the rest is made of, see ``results_in``. It is there last."""
+        return self.recording.with_suffix(".results")
+
+    def run(self, threads: int, on_frame: Callable[[], None] = lambda: None) -> JobResult:
+        """Make both. ``threads``: at most so many for the network, where the configuration does not say."""
+        start, frames = time.perf_counter(), 0
+        recording = self.folder / f"{self.recording.stem}-{os.getpid()}-{uuid4().hex[:8]}.rrd"
+        results = recording.with_suffix(".results")
+        try:
+            source, stages = _opened(self.paths, self.config.model_dump_json(), self.selection, threads)
+            stream = rr.RecordingStream(APPLICATION, recording_id=self.recording_id, send_properties=False)
+            stream.set_log_time_enabled(False)
+            stream.save(recording)
+            logger = Logger(cast("rr.RecordingStream", _Nowhere()), self.config, source.scene)
+            with results.open("wb") as file:
+                for frame, mine in source.window(self.window):
+                    result = describe(perceive(frame, self.config, stages))
+                    if mine:
+                        logger.recording = stream
+                    logger.log_alone(result)
+                    if mine:
+                        pickle.dump(_kept(result), file, pickle.HIGHEST_PROTOCOL)
+                        frames += 1
+                        on_frame()
+                pickle.dump(source.losses, file, pickle.HIGHEST_PROTOCOL)
+            logger.close()
+            stream.disconnect()
+            recording.replace(self.recording)
+            results.replace(self.results)
+        except UserError as error:
+            return JobResult(self.name, frames, time.perf_counter() - start, str(error))
+        finally:
+            for path in (recording, results):
+                with suppress(OSError):
+                    path.unlink(missing_ok=True)
+        return JobResult(self.name, frames, time.perf_counter() - start)
+
+
+def results_in(path: Path, config: Config) -> Iterator[FrameResult | Losses]:
+    """The results of a window, without what only their frame needs, and what its frames lacked."""
+    with path.open("rb") as file:
+        while True:
+            found = _load(file)
+            if isinstance(found, Losses):
+                yield found
+                return
+            yield replace(found, config=config)
+
+
+def _load(file: IO[bytes]) -> FrameResult | Losses:
+    found = pickle.load(file)
+    assert isinstance(found, FrameResult | Losses)
+    return found
+
+
+class _Nowhere:
+    """Takes what is logged of a frame that another window has."""
+
+    def log(self, *args: object, **more: object) -> None: ...
+
+    def set_time(self, *args: object, **more: object) -> None: ...
+
+    def reset_time(self) -> None: ...
+
+
+@lru_cache(maxsize=1)
+def _opened(
+    paths: tuple[Path, ...], config: str, selection: FrameSelection, threads: int
+) -> tuple[BagSource, Stages]:
+    """Kept from window to window."""
+    found = Config.model_validate_json(config)
+    detector = found.detector.model_copy(update={"threads": found.detector.threads or threads})
+    stages = StageLoader().load(found.model_copy(update={"detector": detector}))
+    return selection.source(paths, found), stages
+
+
+# --- what the ordered pass needs ---------------------------------------------------------------
+
+
+def _kept(result: FrameResult) -> FrameResult:
+    """Tracks, anomalies and counts are made of this. Of what is only counted, the rows are left."""
+    cameras = {id(camera): _without_pixels(camera) for camera in result.frame.cameras}
+    frame = replace(
+        result.frame,
+        fields={},
+        clouds=tuple(map(_without_points, result.frame.clouds)),
+        robot_clouds=(),
+        cameras=tuple(cameras.values()),
+    )
+    voxels, ground = result.voxels, result.ground
+    return replace(
+        result,
+        frame=frame,
+        config=cast("Config", None),  # the reader has it
+        voxels=None if voxels is None else Voxels(_rows(len(voxels.points)), np.zeros(0, np.int32)),
+        ground=None if ground is None else Ground(ground.mask, np.zeros(0, np.float32)),
+        cameras=tuple(
+            replace(camera, camera=cameras[id(camera.camera)], uv=None, depth=None)
+            for camera in result.cameras
+        ),
+        bev=None,
+    )
+
+
+def _without_points(cloud: Cloud) -> Cloud:
+    return replace(cloud, xyz=_rows(len(cloud.xyz)), fields={})
+
+
+def _without_pixels(camera: Camera) -> Camera:
+    image = camera.image
+    if image is None:
+        return camera
+    return replace(camera, image=replace(image, bgr=image.bgr[..., :0].copy(), encoded=None))
+
+
+def _rows(count: int) -> np.ndarray[tuple[int, ...], np.dtype[np.float32]]:
+    """So many of nothing."""
+    return np.zeros((count, 0), np.float32)
