@@ -28,6 +28,7 @@ SAME = 0.3  # least IoU of an object's place in the image and a detection of it
 INSIDE = 0.9  # least share of an object's place that is in the image
 NOISE = 0.15  # metres, least spread of how far an object is from where it is expected
 SPREADS = 6.0  # a jump is so many times what the object's own past spreads
+LOST_SPREADS = 4.0  # where its own place is empty, and one of its length has turned up elsewhere
 REACH = 3.0  # metres that an object may have jumped
 LATEST = 0.25  # seconds that a track may be unseen for when it turns up elsewhere
 GROWTH = 0.5  # metres that what is measured may have become longer or shorter in a jump: else it was cut anew
@@ -144,7 +145,8 @@ def _jump(
     """
     if known.steps < PAST or known.center is None or sight.open[row] < config.visible:
         return
-    who, limit = label(tracks, row), max(config.jump, SPREADS * math.sqrt(known.spread + NOISE**2))
+    who, spread = label(tracks, row), math.sqrt(known.spread + NOISE**2)
+    limit = max(config.jump, SPREADS * spread)
     if tracks.cluster[row] >= 0:
         length, center = _measured(measured, tracks, row)
         away = min(float(tracks.innovation[row]), float(np.hypot(*(center - known.center)[:2])))
@@ -154,6 +156,7 @@ def _jump(
         return
     if tracks.coasting[row] > LATEST or result.obstacles is None:
         return
+    limit = max(config.jump, LOST_SPREADS * spread)
     offset = np.hypot(*(tracks.boxes.center[:, :2] - tracks.boxes.center[row, :2]).T)
     for other in np.flatnonzero((tracks.hits <= 2) & (offset > limit) & (offset <= REACH)).tolist():
         length, _ = _measured(measured, tracks, other)

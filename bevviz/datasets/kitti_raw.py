@@ -165,8 +165,8 @@ def read_tracklets(file: Path) -> dict[int, LabelledBoxes3D]:
         raise UserError(f"{file}: no tracklets as KITTI writes them: {error}") from None
     found = {}
     for scan, there in rows.items():
-        labels, ids, values = zip(*there, strict=True)
-        table = np.array(values, np.float32)
+        labels, ids, places = zip(*there, strict=True)
+        table = np.array(places, np.float32)
         boxes = Boxes3D(table[:, :3], table[:, 3:6], table[:, 6])
         ones = np.ones(len(labels), np.float32)
         found[scan] = LabelledBoxes3D(str(file), 0, "", boxes, labels, ones, ids=ids)
