@@ -1,5 +1,6 @@
 // Rerun's viewer: its notebook widget, which keeps its own wrapper of the viewer up to date; this page is its notebook.
 
+import { nextPicture, wake } from "./rest.js";
 import { $, asked, state } from "./state.js";
 
 console.debug = () => {}; // the viewer tells it fifty thousand lines at its start, which takes seconds
@@ -34,8 +35,11 @@ function begun(ready) {
   ready();
 }
 // What is before the viewer now has been drawn when two pictures more have begun.
-export const drawnThen = (then) => requestAnimationFrame(() => requestAnimationFrame(then));
-export const toViewer = (message, buffers) => listeners["msg:custom"](message, buffers);
+export const drawnThen = (then) => nextPicture(() => nextPicture(then));
+export function toViewer(message, buffers) {
+  wake();
+  listeners["msg:custom"](message, buffers);
+}
 export const tell = (whom) => Object.assign(told, whom);
 
 // The widget compiles a copy of the response, which counts its bytes: late, through this thread, and nothing that a
@@ -73,6 +77,7 @@ window.addEventListener("pointerup", () => { asked.released = performance.now();
 let drawn = false; // whether a frame has been on the screen
 let settling = 0;
 function viewerEvent(event) {
+  wake();
   window.dispatchEvent(new CustomEvent("viewer-event", { detail: event }));
   if (event.type === "recording_open" && state.opening !== null) seek(state.opening);
   if (event.type === "time_update" || event.type === "timeline_change") moved(event);
