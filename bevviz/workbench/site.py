@@ -34,6 +34,7 @@ FILES = (
     "list.js",
     "live.js",
     "native.js",
+    "rest.js",
     "state.js",
     "talk.js",
     "viewer.js",

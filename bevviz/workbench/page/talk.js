@@ -1,5 +1,6 @@
 // The server: what is said to it, what it says, and that it may be gone.
 
+import { nextPicture } from "./rest.js";
 import { $, state } from "./state.js";
 import { kind, toViewer, viewerReady } from "./viewer.js";
 
@@ -29,7 +30,7 @@ function film(lane) {
     if (!pieces.film) performance.mark("piece");
     pieces[lane] += 1;
     toViewer({ type: "rrd" }, [new DataView(data)]);
-    if (lane === "film") requestAnimationFrame(() => { if (socket.readyState === WebSocket.OPEN) socket.send(""); });
+    if (lane === "film") nextPicture(() => { if (socket.readyState === WebSocket.OPEN) socket.send(""); });
   };
   return socket;
 }

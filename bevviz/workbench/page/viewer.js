@@ -1,10 +1,12 @@
 // Rerun's viewer: its notebook widget, which keeps its own wrapper of the viewer up to date; this page is its notebook.
 
+import { nextPicture, wake } from "./rest.js";
 import { $, asked, state } from "./state.js";
 
 console.debug = () => {}; // the viewer tells it fifty thousand lines at its start, which takes seconds
 const version = $("viewer").dataset.version;
 export const kind = $("viewer").dataset.kind; // page; native: a window of its own; live: of a robot
+if (kind !== "native") keepCompiled(new URL(`/viewer/${version}/re_viewer_bg.wasm`, location.href).href);
 const widget = (await import(kind === "native" ? "/page/native.js" : `/viewer/${version}/widget.js`)).default;
 
 // What the run made of a frame, and what other values make of it, are on two timelines of the same recording.
@@ -23,13 +25,32 @@ export const viewerReady = new Promise((ready) => {
     model: {
       get: (name) => settings[name],
       on: (name, listener) => { listeners[name] = listener; },
-      send: (message) => (message === "ready" ? ready() : viewerEvent(JSON.parse(message))),
+      send: (message) => (message === "ready" ? begun(ready) : viewerEvent(JSON.parse(message))),
     },
     el: $("viewer"),
   });
 });
-export const toViewer = (message, buffers) => listeners["msg:custom"](message, buffers);
+function begun(ready) {
+  performance.mark("viewer");
+  ready();
+}
+// What is before the viewer now has been drawn when two pictures more have begun.
+export const drawnThen = (then) => nextPicture(() => nextPicture(then));
+export function toViewer(message, buffers) {
+  wake();
+  listeners["msg:custom"](message, buffers);
+}
 export const tell = (whom) => Object.assign(told, whom);
+
+// The widget compiles a copy of the response, which counts its bytes: late, through this thread, and nothing that a
+// browser could keep. This one is compiled as it comes, from the page's first moment on.
+function keepCompiled(url) {
+  const { fetch } = window;
+  const compile = WebAssembly.compileStreaming.bind(WebAssembly);
+  const module = compile(fetch(url));
+  window.fetch = (what, ...more) => (String(what) === url ? Promise.resolve(new Response()) : fetch(what, ...more));
+  WebAssembly.compileStreaming = () => module;
+}
 
 window.addEventListener("to-viewer", ({ detail }) => toViewer(detail));
 
@@ -56,6 +77,7 @@ window.addEventListener("pointerup", () => { asked.released = performance.now();
 let drawn = false; // whether a frame has been on the screen
 let settling = 0;
 function viewerEvent(event) {
+  wake();
   window.dispatchEvent(new CustomEvent("viewer-event", { detail: event }));
   if (event.type === "recording_open" && state.opening !== null) seek(state.opening);
   if (event.type === "time_update" || event.type === "timeline_change") moved(event);
@@ -76,7 +98,8 @@ function moved(event) {
   if (event.type === "time_update") target = null;
   if (!drawn) {
     drawn = true;
-    requestAnimationFrame(() => requestAnimationFrame(told.shown));
+    performance.mark("told");
+    drawnThen(() => { performance.mark("frame"); told.shown(); });
   }
   if (event.type !== "time_update" || (state.time !== null && Number(state.time) === event.time)) return;
   state.time = String(BigInt(Math.round(event.time)));
