@@ -259,6 +259,61 @@ def test_a_slow_log_drops_results_and_holds_nobody_up(
     assert drops["logging"] == sum(drops.values()) == 40 - len(logged)
 
 
+class Unread:
+    """A viewer's program that reads only while it is let."""
+
+    def __init__(self) -> None:
+        self.read, self.write = os.pipe()
+        self.let = threading.Event()
+        self.got = 0  # bytes
+        self.thread = threading.Thread(target=self._run, daemon=True)
+        self.thread.start()
+
+    def _run(self) -> None:
+        self.let.wait()
+        while data := os.read(self.read, 1 << 20):
+            self.got += len(data)
+
+
+def test_a_viewer_that_is_late_gets_the_newest_and_its_lag_is_known(
+    results: list[FrameResult], drive: SyntheticSource
+) -> None:
+    program = Unread()
+
+    class Screen(Viewer):
+        def _start(self) -> Any:
+            process = subprocess.Popen(["sleep", "1000"])
+            process.stdin = os.fdopen(program.write, "wb")
+            return process
+
+        def _show(self, packet: Packet, fresh: bool) -> bool:
+            done = super()._show(packet, fresh)
+            taken.extend([packet.context.clock[0]] * done)
+            return done
+
+    taken: list[int] = []
+    clock = Clock()
+    with closing(Encoder(load(), drive.scene, "live", clock=clock)) as encoder:
+        screen = Screen(Program("screen", ["sleep"]), 20, encoder, Notes(lambda text: None))
+
+        def log(*indices: int) -> None:
+            for index in indices:
+                result = results[index % len(results)]
+                frame = replace(result.frame, index=index, stamp=100_000_000 * (index + 1))
+                clock.now = 1000.0 + PERIOD * index
+                screen.put(encoder.encode(replace(result, frame=frame), drive.scene, {}, ()))
+
+        log(*range(25))
+        assert screen.lag == pytest.approx(2.4)
+        program.let.set()
+        wait_for(lambda: screen._sending is None and not len(screen._packets))
+        assert screen.lag < PERIOD * 6
+        screen.close(180.0)
+    program.thread.join()
+    assert taken[-5:] == [20, 21, 22, 23, 24], "from the newest whole one on"
+    assert len(taken) == 25 - screen.dropped <= 6 and program.got
+
+
 class Stalled:
     """Plays a replay, then only says how its topics do."""
 

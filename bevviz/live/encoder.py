@@ -89,7 +89,7 @@ class Encoder:
         against: AgainstRobot | None = None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        self._against, self._clock = against, clock
+        self._against, self.clock = against, clock
         self._differences: DifferenceLogger | None = None
         self._blueprint = blueprint
         self._step = whole
@@ -125,7 +125,7 @@ class Encoder:
         """
         with self._lock:
             self._follow(result.config, scene)
-            now = self._clock()
+            now = self.clock()
             whole = now - self._whole >= self._step
             if whole:
                 self._whole = now
@@ -140,7 +140,7 @@ class Encoder:
         """What is to be said while no frame comes; see ``Logger.log_meanwhile``."""
         with self._lock:
             self._logger.log_meanwhile(seconds, notes, states)
-            return Packet(self._stream.read(), False, self._logger.context, self._clock())
+            return Packet(self._stream.read(), False, self._logger.context, self.clock())
 
     def _follow(self, config: Config, scene: Scene) -> None:
         """Log whatever is new in them."""

@@ -29,13 +29,14 @@ from bevviz.live.settings import AT_START, Settings
 from bevviz.live.snapshots import Snapshots
 from bevviz.live.thinning import Thinned
 from bevviz.live.triggers import Triggers
-from bevviz.live.viewers import Viewer, remote, server, window
+from bevviz.live.viewers import LATE, Viewer, remote, server, window
 from bevviz.live.warm import warm_up
 from bevviz.logging import entities
 from bevviz.perceive import StageLoader
 from bevviz.run import Dropping, Items, Observer, run
 from bevviz.session import Session
 
+BEHIND = 3.0  # seconds that a viewer lags when it is told
 LOOK = 1.0  # seconds between two looks at the configuration file and the clock
 ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
@@ -110,6 +111,7 @@ class Live:
         self._over = threading.Event()
         self._asked_to_save = False
         self._looked = self._logged = 0.0  # seconds, monotonic
+        self._behind: set[str] = set()  # viewers of which it was told
         self._states: dict[str, str] = {}  # of the topics, as logged while no frame came
         live = settings.config.live
 
@@ -206,6 +208,7 @@ class Live:
             "memory, MB": status.memory,
         }
         numbers |= {f"dropped: {where}": float(count) for where, count in status.drops.items()}
+        numbers |= {f"lag of the {viewer.name} viewer, ms": 1e3 * viewer.lag for viewer in self._viewers}
         return numbers | {path.rpartition("/")[2]: n for path, n in self._snapshots.scalars.items()}
 
     def save(self, path: Path | None = None) -> Path:
@@ -278,6 +281,7 @@ class Live:
         if jump := self.health.clock_jump():
             self.notes.warn(f"the clock of this machine has jumped by {jump:+.1f} s")
         self._log_meanwhile()
+        self._watch_viewers()
         if self._shown is not self.config:
             self._shown = self.config
             self.on_change(self._shown)
@@ -301,7 +305,8 @@ class Live:
     def log(self, result: FrameResult) -> None:
         """Encode a frame once, for every output."""
         drops = {entities.drops(where): float(count) for where, count in self._drops().items()}
-        health = self.health.scalars() | drops | self._snapshots.scalars
+        lags = {entities.viewer_lag(viewer.name): 1e3 * viewer.lag for viewer in self._viewers}
+        health = self.health.scalars() | drops | lags | self._snapshots.scalars
         late, states = self._source.overtaken(), self._topic_states()
         boxes = [(one.frame_stamp, one.boxes) for one in late if isinstance(one.boxes, LabelledBoxes3D)]
         compared = self.against.see(result, boxes) if self.against is not None else ()
@@ -324,6 +329,23 @@ class Live:
                 self.notes.warn(against.problem)
         if reason := against.reason():
             self._snapshots.save_soon(reason, self.config.live.trigger_after)
+
+    @property
+    def _viewers(self) -> list[Viewer]:
+        return [output for output in self._outputs if isinstance(output, Viewer)]
+
+    def _watch_viewers(self) -> None:
+        for viewer in self._viewers:
+            if viewer.lag > BEHIND and viewer.name not in self._behind:
+                self._behind.add(viewer.name)
+                self.notes.warn(
+                    f"the {viewer.name} viewer is {viewer.lag:.0f} s behind: it gets the newest frames, the "
+                    f"others it misses; --set live.viewer_rate=2 sends it less"
+                )
+            elif viewer.lag < LATE and viewer.name in self._behind:
+                self._behind.remove(viewer.name)
+                missed = f"{viewer.dropped} frames" if viewer.dropped != 1 else "1 frame"
+                self.notes.info(f"the {viewer.name} viewer keeps up again; it has missed {missed} so far")
 
     def _log_meanwhile(self) -> None:
         """What is said while no frame comes is in the log and in the lanes all the same."""
