@@ -42,6 +42,18 @@ class NewestQueue(Generic[T]):
             self._items.append(item)
             self._changed.notify()
 
+    @property
+    def oldest(self) -> T | None:
+        """That waits; None: none does."""
+        with self._changed:
+            return self._items[0] if self._items else None
+
+    def clear(self) -> None:
+        """Leave out whatever waits."""
+        with self._changed:
+            self.dropped += len(self._items)
+            self._items.clear()
+
     def close(self) -> None:
         """No more items are taken in; those that wait are still handed out."""
         with self._changed:

@@ -20,6 +20,7 @@ def blueprint(scene: Scene) -> rrb.Blueprint:
                 rrb.Tabs(
                     views.rates(),
                     views.stage_times(),
+                    views.latencies(),
                     views.clocks(),
                     views.anomalies(),
                     views.states(),

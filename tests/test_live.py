@@ -28,16 +28,19 @@ from bevviz.files import lock
 from bevviz.frame import CameraResult, Decision, Detections, Frame, FrameResult, Fusion, Pairs, Scene
 from bevviz.live.encoder import WHOLE, Encoder, Packet
 from bevviz.live.files import Indexer, Saver, remove_leftovers
+from bevviz.live.flight import FlightRecorder
 from bevviz.live.notes import Notes
 from bevviz.live.replay import Replay
-from bevviz.live.runtime import Live, Outputs, thin
+from bevviz.live.runtime import Live, Outputs
 from bevviz.live.settings import Settings
+from bevviz.live.thinning import Thinned, thin
 from bevviz.live.triggers import Triggers
-from bevviz.live.viewers import Program, Viewer
+from bevviz.live.viewers import RETRY, Program, Viewer
 from bevviz.queues import NewestQueue
 from bevviz.session import Session
 from bevviz.synthetic import SyntheticSource
 from bevviz.synthetic.sensors import Lidar, PinholeCamera
+from tests.graphs import alone
 from tests.recordings import Recording, verify
 
 Run = Callable[..., "Outcome"]
@@ -56,6 +59,27 @@ def frames(drive: SyntheticSource) -> list[Frame]:
     return list(drive)
 
 
+class Paced(Replay):
+    """Plays each frame when the one before it is through: nothing is left out on a slow machine, too."""
+
+    def __init__(self, frames: Sequence[Frame], scene: Scene, total: int | None = None) -> None:
+        super().__init__(frames, scene, rate=1000.0, total=total)
+        self.through: Callable[[], int] = lambda: 0  # frames
+
+    def __iter__(self) -> Iterator[Frame]:
+        for frame in super().__iter__():
+            while self.through() < frame.index and not self._stopped.wait(0.002):
+                pass
+            yield frame
+
+
+class NoIndexer(Indexer):
+    """Files stay as they are written: the index is made with what time others leave."""
+
+    def add(self, path: Path) -> None:
+        pass
+
+
 class Outcome:
     """What a run said, counted and logged."""
 
@@ -68,7 +92,10 @@ class Outcome:
 
 @pytest.fixture
 def run(frames: list[Frame], drive: SyntheticSource, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Run:
-    """Plays the drive into a live run, with ``during(live)`` in a thread beside it."""
+    """Plays the drive into a live run, with ``during(live)`` in a thread beside it.
+
+    At a rate, which a slow machine does not keep up with, or else as fast as it can.
+    """
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
 
@@ -76,24 +103,32 @@ def run(frames: list[Frame], drive: SyntheticSource, tmp_path: Path, monkeypatch
         settings: Sequence[str] = (),
         *,
         total: int | None = 30,
-        rate: float = 20.0,
+        rate: float | None = None,
         during: Callable[[Live], None] | None = None,
         config: Path | None = None,
         source: Any = None,
         observe: bool = False,
         on_result: Callable[[FrameResult], None] | None = None,
         said: list[str] | None = None,
+        index: bool = False,
         **outputs: Any,
     ) -> Outcome:
+        monkeypatch.setattr("bevviz.live.runtime.Indexer", Indexer if index else NoIndexer)
         said = [] if said is None else said
+        if source is None and rate is not None:
+            source = Replay(frames, drive.scene, rate=rate, total=total)
+        source = source or Paced(frames, drive.scene, total)
         live = Live(
-            source or Replay(frames, drive.scene, rate=rate, total=total),
+            source,
             Settings(config, settings),
             Outputs(**outputs),
             Notes(said.append),
             observe=observe,
             on_result=on_result,
         )
+        paced = source.replay if isinstance(source, Stalled) else source
+        if isinstance(paced, Paced):
+            paced.through = lambda: live.frames
         failed: list[BaseException] = []
 
         def beside() -> None:
@@ -120,7 +155,7 @@ def run(frames: list[Frame], drive: SyntheticSource, tmp_path: Path, monkeypatch
     return play
 
 
-def wait_for(condition: Callable[[], object], seconds: float = 60.0) -> None:
+def wait_for(condition: Callable[[], object], seconds: float = 180.0) -> None:
     deadline = time.monotonic() + seconds
     while not condition():
         assert time.monotonic() < deadline, "it did not happen"
@@ -129,7 +164,11 @@ def wait_for(condition: Callable[[], object], seconds: float = 60.0) -> None:
 
 def numbers(path: Path) -> list[int]:
     """Of the frames in a recording."""
-    return sorted(row["frame"] for row in Recording(path).rows["/explain"])
+    return shown(Recording(path))
+
+
+def shown(recording: Recording) -> list[int]:
+    return sorted(row["frame"] for row in recording.rows["/explain"])
 
 
 # --- never behind ------------------------------------------------------------------------------
@@ -189,27 +228,97 @@ def test_a_slow_pipeline_takes_the_newest_frame(run: Run, monkeypatch: pytest.Mo
     assert 0 < health[-1][0] <= drops["incoming"]
 
 
-def test_a_slow_log_drops_results_and_holds_nobody_up(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
-    whole = Encoder.encode
+def test_a_slow_log_drops_results_and_holds_nobody_up(
+    run: Run, frames: list[Frame], drive: SyntheticSource, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole, free = Live.log, threading.Event()
 
-    def slow(self: Encoder, *arguments: Any) -> Packet:
-        time.sleep(0.3)
-        return whole(self, *arguments)
+    def slow(self: Live, result: FrameResult) -> None:
+        assert free.wait(180)
+        whole(self, result)
 
-    monkeypatch.setattr(Encoder, "encode", slow)
+    class Published(Paced):
+        """Comes as fast as the results are published."""
+
+        def __iter__(self) -> Iterator[Frame]:
+            self.through = lambda: len(seen)
+            return super().__iter__()
+
+    def publish(result: FrameResult) -> None:
+        seen.append(result.frame.index)
+        if len(seen) == 40:
+            free.set()
+
+    monkeypatch.setattr(Live, "log", slow)
     seen: list[int] = []
-    outcome = run(["live.log_queue=3"], total=40, rate=20, on_result=lambda r: seen.append(r.frame.index))
-    drops = outcome.live.status.drops
-    assert drops["logging"] > 15
-    assert outcome.live.frames + drops["logging"] + drops["incoming"] == 40
-    assert len(seen) > 30
+    source = Published(frames, drive.scene, 40)
+    outcome = run(["live.log_queue=3"], source=source, on_result=publish, save=Path("out.rrd"))
+    assert seen == list(range(40)), "nobody else waits for the log"
+    logged, drops = numbers(Path("out.rrd")), outcome.live.status.drops
+    assert logged[-3:] == [37, 38, 39] and 3 <= len(logged) <= 4
+    assert drops["logging"] == sum(drops.values()) == 40 - len(logged)
+
+
+class Unread:
+    """A viewer's program that reads only while it is let."""
+
+    def __init__(self) -> None:
+        self.read, self.write = os.pipe()
+        self.let = threading.Event()
+        self.got = 0  # bytes
+        self.thread = threading.Thread(target=self._run, daemon=True)
+        self.thread.start()
+
+    def _run(self) -> None:
+        self.let.wait()
+        while data := os.read(self.read, 1 << 20):
+            self.got += len(data)
+
+
+def test_a_viewer_that_is_late_gets_the_newest_and_its_lag_is_known(
+    results: list[FrameResult], drive: SyntheticSource
+) -> None:
+    program = Unread()
+
+    class Screen(Viewer):
+        def _start(self) -> Any:
+            process = subprocess.Popen(["sleep", "1000"])
+            process.stdin = os.fdopen(program.write, "wb")
+            return process
+
+        def _show(self, packet: Packet, fresh: bool) -> bool:
+            done = super()._show(packet, fresh)
+            taken.extend([packet.context.clock[0]] * done)
+            return done
+
+    taken: list[int] = []
+    clock = Clock()
+    with closing(Encoder(load(), drive.scene, "live", clock=clock)) as encoder:
+        screen = Screen(Program("screen", ["sleep"]), 20, encoder, Notes(lambda text: None))
+
+        def log(*indices: int) -> None:
+            for index in indices:
+                result = results[index % len(results)]
+                frame = replace(result.frame, index=index, stamp=100_000_000 * (index + 1))
+                clock.now = 1000.0 + PERIOD * index
+                screen.put(encoder.encode(replace(result, frame=frame), drive.scene, {}, ()))
+
+        log(*range(25))
+        assert screen.lag == pytest.approx(2.4)
+        program.let.set()
+        wait_for(lambda: screen._sending is None and not len(screen._packets))
+        assert screen.lag < PERIOD * 6
+        screen.close(180.0)
+    program.thread.join()
+    assert taken[-5:] == [20, 21, 22, 23, 24], "from the newest whole one on"
+    assert len(taken) == 25 - screen.dropped <= 6 and program.got
 
 
 class Stalled:
     """Plays a replay, then only says how its topics do."""
 
     def __init__(self, replay: Replay) -> None:
-        self._replay, self._over = replay, threading.Event()
+        self.replay, self._over = replay, threading.Event()
         self.scene, self.total, self.warnings = replay.scene, None, ()
         self.states = {"/points": "ok"}
 
@@ -217,14 +326,14 @@ class Stalled:
         self._over.set()
 
     def __iter__(self) -> Iterator[Frame]:
-        yield from self._replay
+        yield from self.replay
         self._over.wait()
 
 
 def test_what_is_said_while_no_frame_comes_is_logged(
     run: Run, frames: list[Frame], drive: SyntheticSource
 ) -> None:
-    source = Stalled(Replay(frames, drive.scene, rate=20, total=3))
+    source = Stalled(Paced(frames, drive.scene, 3))
 
     def stall(live: Live) -> None:
         wait_for(lambda: live.frames == 3)
@@ -244,7 +353,43 @@ def test_what_is_said_while_no_frame_comes_is_logged(
     assert line["stamp"] - last["stamp"] == line["received"] - last["received"] > 900_000_000
 
 
-def test_viewers_can_be_given_fewer_frames_than_files(frames: list[Frame], drive: SyntheticSource) -> None:
+class Clock:
+    """That a test turns."""
+
+    def __init__(self) -> None:
+        self.now = 1000.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+PERIOD = 0.1  # seconds between two packets
+
+
+@pytest.fixture(scope="module")
+def results(frames: list[Frame]) -> list[FrameResult]:
+    session = Session(load())
+    return [session.run(frame) for frame in frames]
+
+
+@contextmanager
+def packets_of(
+    results: list[FrameResult], scene: Scene, count: int, whole: float = WHOLE
+) -> Iterator[tuple[Encoder, list[Packet]]]:
+    """Of as many frames, made every 0.1 s."""
+    clock, packets = Clock(), []
+    with closing(Encoder(load(), scene, "live", whole=whole, clock=clock)) as encoder:
+        for index in range(count):
+            result = results[index % len(results)]
+            frame = replace(result.frame, index=index, stamp=round(PERIOD * 1e9) * (index + 1))
+            packets.append(encoder.encode(replace(result, frame=frame), scene, {}, ()))
+            clock.now += PERIOD
+        yield encoder, packets
+
+
+def test_viewers_can_be_given_fewer_frames_than_files(
+    results: list[FrameResult], drive: SyntheticSource
+) -> None:
     taken: list[int] = []
 
     class Screen(Viewer):
@@ -255,18 +400,13 @@ def test_viewers_can_be_given_fewer_frames_than_files(frames: list[Frame], drive
             taken.append(packet.context.clock[0])
             return super()._take(packet, fresh)
 
-    session = Session(load())
-    with closing(Encoder(load(), drive.scene, "live", whole=0.2)) as encoder:
+    with packets_of(results, drive.scene, 12, whole=0.35) as (encoder, packets):
         screen = Screen(Program("screen", ["cat"]), 20, encoder, Notes(lambda text: None), sparse=True)
-        packets = []
-        for index in range(12):
-            result = session.run(replace(frames[index % len(frames)], index=index))
-            packets.append(encoder.encode(result, drive.scene, {}, ()))
-            screen.put(packets[-1])
-            time.sleep(0.05)
-        screen.close()
-    whole = [packet.context.clock[0] for packet in packets if packet.whole]
-    assert taken == whole and 1 < len(whole) < 12
+        for packet in packets:
+            screen.put(packet)
+        screen.close(60.0)
+    assert taken == [0, 4, 8]
+    assert [packet.context.clock[0] for packet in packets if packet.whole] == taken
     assert screen.dropped == 0  # they were not wanted
 
 
@@ -280,11 +420,9 @@ def test_leftover_indexes_are_removed_and_those_in_work_are_not(tmp_path: Path) 
 
 
 def test_a_steady_run_logs_every_frame_with_its_health(run: Run) -> None:
-    outcome = run(total=30, rate=10, save=Path("out.rrd"))
+    outcome = run(total=30, save=Path("out.rrd"), index=True)
     recording = Recording(Path("out.rrd"))
-    logged = numbers(Path("out.rrd"))
-    assert len(logged) + sum(outcome.live.status.drops.values()) == 30
-    assert len(logged) > 5
+    assert numbers(Path("out.rrd")) == list(range(30)) and sum(outcome.live.status.drops.values()) == 0
     p50 = [v[0] for v in recording.column("/health/latency_ms/p50", "Scalars:scalars")]
     p99 = [v[0] for v in recording.column("/health/latency_ms/p99", "Scalars:scalars")]
     assert all(0 < a <= b for a, b in zip(p50, p99, strict=True))
@@ -293,15 +431,28 @@ def test_a_steady_run_logs_every_frame_with_its_health(run: Run) -> None:
     verify(Path("out.rrd"))
 
 
-def test_lightening(run: Run) -> None:
-    run(["live.every=3"], total=30, rate=30, save=Path("every.rrd"))
-    assert all(n % 3 == 0 for n in numbers(Path("every.rrd")))
-    outcome = run(["live.max_rate=5"], total=40, rate=20, save=Path("rate.rrd"))
-    assert 8 <= outcome.live.frames + sum(outcome.live.status.drops.values()) <= 12
-    assert outcome.live.thinned >= 28
-    run(["live.points=500"], total=5, rate=5, save=Path("points.rrd"))
-    counts = Recording(Path("points.rrd")).column("/health/count/points", "Scalars:scalars")
-    assert {c[0] for c in counts} == {500}
+def test_lightening(frames: list[Frame], drive: SyntheticSource) -> None:
+    clock = Clock()
+
+    class Scans(Replay):
+        """20 a second."""
+
+        def __iter__(self) -> Iterator[Frame]:
+            for frame in super().__iter__():
+                clock.now = 1000.0 + 0.05 * frame.index
+                yield frame
+
+    def left(setting: str) -> list[Frame]:
+        config = load(settings=[setting])
+        thinned = Thinned(Scans(frames, drive.scene, rate=1e6, total=40), lambda: config, clock)
+        kept = list(thinned)
+        assert thinned.thinned == 40 - len(kept)
+        return kept
+
+    assert [frame.index for frame in left("live.every=3")] == list(range(0, 40, 3))
+    slower = [frame.index for frame in left("live.max_rate=5")]
+    assert 8 <= len(slower) <= 12 and set(np.diff(slower[3:])) == {4}
+    assert {len(frame.points) for frame in left("live.points=500")} == {500}
 
 
 @given(st.integers(0, 300), st.integers(0, 300), st.integers(1, 400))
@@ -333,7 +484,7 @@ def test_observing_logs_what_the_robot_publishes_and_nothing_else(
     robot = [
         replace(f, robot_boxes=(replace(f.truth, topic="/detection/fused_3d"),)) for f in frames if f.truth
     ]
-    run(source=Replay(robot, drive.scene, total=6), observe=True, save=Path("out.rrd"))
+    run(source=Paced(robot, drive.scene, 6), observe=True, save=Path("out.rrd"))
     logged = Recording(Path("out.rrd")).at
     assert {"/world/rslidar/points", "/world/zed/image", "/robot/detection/fused_3d"} <= set(logged)
     assert not {"/bev", "/world/rslidar/clusters", "/world/fused", "/world/rslidar/points/ground"} & set(
@@ -353,47 +504,39 @@ def test_a_subscriber_that_fails_is_said_once(run: Run) -> None:
 # --- the flight recorder -----------------------------------------------------------------------
 
 
-def test_the_flight_recorder_holds_the_last_seconds(run: Run) -> None:
-    saved: list[Path] = []
-
-    def during(live: Live) -> None:
-        wait_for(lambda: live.frames >= 80)
-        saved.append(live.flight.save())
-        saved.append(live.flight.save(Path("second.rrd")))
+def test_the_flight_recorder_holds_the_last_seconds(
+    results: list[FrameResult], drive: SyntheticSource, tmp_path: Path
+) -> None:
+    config = load(settings=["live.flight_time=2 s", f"live.flight_folder={tmp_path}"]).live
+    indexer = Indexer()
+    with packets_of(results, drive.scene, 80) as (encoder, packets):
+        flight = FlightRecorder(config, encoder, indexer)
+        for packet in packets:
+            flight.put(packet)
+        saved = [flight.save(), flight.save(tmp_path / "second.rrd")]
         with pytest.raises(UserError, match="already there"):
-            live.flight.save(Path("second.rrd"))
-        live.stop()
-
-    settings = ["live.flight_time=2 s", "live.output_queue=1000"]
-    outcome = run(settings, total=None, during=during, save=Path("all.rrd"))
-    everything = numbers(Path("all.rrd"))
-    assert len(everything) == outcome.live.frames
+            flight.save(tmp_path / "second.rrd")
+    indexer.close()
     for path in saved:
         verify(path)
         recording = Recording(path)
-        held = numbers(path)
-        assert held == everything[everything.index(held[0]) : everything.index(held[-1]) + 1]
-        stamps = sorted(recording.times["stamp"].values())
-        assert 2.0 - WHOLE - 0.3 < (stamps[-1] - stamps[0]) * 1e-9 <= 2.1
+        assert numbers(path) == list(range(60, 80)), "from the first whole one on"
         assert recording.blueprints == 1
         assert "TextDocument:text" in recording.static["/config"]
         assert "Pinhole:image_from_camera" in recording.static["/world/zed"]
-        states = recording.at["/explain/states/pipeline"]["StateChange:state"]
-        assert min(states) == held[0]
+        assert min(recording.at["/explain/states/pipeline"]["StateChange:state"]) == 60
 
 
-def test_the_flight_recorder_is_bounded_in_memory(run: Run) -> None:
+def test_the_flight_recorder_is_bounded_in_memory(results: list[FrameResult], drive: SyntheticSource) -> None:
     sizes: list[int] = []
-
-    def during(live: Live) -> None:
-        while live.frames < 80:
-            sizes.append(live.flight.size)
-            time.sleep(0.05)
-        live.stop()
-
-    run(["live.flight_time=1000", "live.flight_size=2 MB"], total=None, during=during)
-    assert max(sizes) <= 2_000_000
-    assert max(sizes) > 500_000
+    config = load(settings=["live.flight_time=1000", "live.flight_size=1 MB"]).live
+    with packets_of(results, drive.scene, 80) as (encoder, packets):
+        flight = FlightRecorder(config, encoder, NoIndexer())
+        for packet in packets:
+            flight.put(packet)
+            sizes.append(flight.size)
+            assert flight.size == sum(len(held.data) for held in flight.held())
+    assert 500_000 < max(sizes) <= 1_000_000 < sum(len(packet.data) for packet in packets)
 
 
 def test_nothing_to_save(run: Run) -> None:
@@ -418,12 +561,13 @@ def test_a_recording_may_start_at_any_whole_packet(
 ) -> None:
     """What an entity had before the cut is not left standing, and states are known from the first frame."""
     config = load()
-    encoder = Encoder(config, drive.scene, "live")
+    clock = Clock()
+    encoder = Encoder(config, drive.scene, "live", clock=clock)
     session = Session(config)
     full = session.run(frames[0])
     gone = replace(full, frame=replace(frames[1], index=1), clusters=None, obstacles=None)
     packets = [encoder.encode(full, drive.scene, {}, ())]
-    time.sleep(WHOLE)
+    clock.now += WHOLE
     packets += [encoder.encode(gone, drive.scene, {}, [("WARN", "something was said")])]
     path = tmp_path / "late.rrd"
     path.write_bytes(encoder.prelude(packets[1].context) + packets[1].data)
@@ -520,38 +664,44 @@ def test_a_trigger_saves(run: Run) -> None:
     outcome = run(asked, total=20)
     (saved,) = Path("flights").glob("*.rrd")
     assert len(outcome.told(f"saved in {saved} (")) == 1
-    verify(saved)
+    assert numbers(saved)
 
 
 # --- files -------------------------------------------------------------------------------------
 
 
-def test_parts_open_on_their_own_and_lack_nothing_together(run: Run) -> None:
-    outcome = run(["live.split_time=2 s"], total=50, rate=10, save=Path("drive.rrd"))
-    parts = sorted(Path().glob("drive_*.rrd"))
-    assert outcome.live.saver is not None
-    assert outcome.live.saver.paths == parts
-    assert 2 <= len(parts) <= 3
+def save(path: Path, encoder: Encoder, packets: list[Packet], *settings: str) -> list[Path]:
+    """The parts that the packets are saved in."""
+    config = load(settings=[f"live.output_queue={len(packets)}", *settings]).live
+    saver = Saver(path, config, encoder, NoIndexer(), Notes(lambda text: None))
+    for packet in packets:
+        saver.put(packet)
+    saver.close()
+    assert saver.paths == sorted(path.parent.glob(f"{path.stem}_*.rrd"))
+    return saver.paths
+
+
+def test_parts_open_on_their_own_and_lack_nothing_together(
+    results: list[FrameResult], drive: SyntheticSource, tmp_path: Path
+) -> None:
+    with packets_of(results, drive.scene, 50) as (encoder, packets):
+        parts = save(tmp_path / "drive.rrd", encoder, packets, "live.split_time=2 s")
+        small = save(tmp_path / "small.rrd", encoder, packets, "live.split_size=6 MB")
+    assert [numbers(part) for part in parts] == [[*range(20)], [*range(20, 40)], [*range(40, 50)]]
     for part in parts:
-        verify(part)
         recording = Recording(part)
         assert recording.blueprints == 1
         assert "Pinhole:image_from_camera" in recording.static["/world/zed"]
         assert "StateChange:state" in recording.at["/explain/states/pipeline"]
-    together = [number for part in parts for number in numbers(part)]
-    assert together == sorted(set(together))
-    assert len(together) == outcome.live.frames
+    assert len(small) > 1 and max(part.stat().st_size for part in small) < 6_600_000
+    assert [number for part in small for number in numbers(part)] == list(range(50))
 
 
-def test_parts_of_a_size(run: Run) -> None:
-    def during(live: Live) -> None:
-        wait_for(lambda: live.frames > 60)
-        live.stop()
-
-    run(["live.split_size=2 MB"], total=None, rate=10, during=during, save=Path("drive.rrd"))
-    parts = sorted(Path().glob("drive_*.rrd"))
-    assert len(parts) > 1
-    assert all(part.stat().st_size < 2_500_000 for part in parts)
+def test_a_run_is_saved_in_parts(run: Run) -> None:
+    outcome = run(["live.split_time=1 s"], total=5, save=Path("drive.rrd"))
+    assert outcome.live.saver is not None
+    assert outcome.live.saver.paths == sorted(Path().glob("drive_*.rrd"))
+    assert [number for part in outcome.live.saver.paths for number in numbers(part)] == list(range(5))
 
 
 def test_a_full_disk_is_said_once_and_nothing_else_ends(run: Run) -> None:
@@ -566,7 +716,7 @@ def test_a_full_disk_is_said_once_and_nothing_else_ends(run: Run) -> None:
     outcome = run(total=None, save=Path("full.rrd"), during=during)
     assert len(outcome.told("saving ends here, the rest goes on: No space left on device")) == 1
     assert outcome.live.frames > 10
-    verify(saved[0])
+    assert len(numbers(saved[0])) >= 10
 
 
 @contextmanager
@@ -589,7 +739,7 @@ def test_what_was_written_before_the_disk_was_full_is_readable(
     size = len(encoder.prelude(packets[0].context)) + sum(len(p.data) for p in packets[:3])
     said: list[str] = []
     path = tmp_path / "out.rrd"
-    saver = Saver(path, config.live, encoder, Indexer(), Notes(said.append))
+    saver = Saver(path, config.live, encoder, NoIndexer(), Notes(said.append))
     with file_limit(size + len(packets[3].data) // 2):
         for packet in packets:
             saver.put(packet)
@@ -611,18 +761,20 @@ def test_the_configuration_is_reloaded_when_it_is_saved(run: Run) -> None:
     file = Path("c.yaml")
     file.write_text("clustering: {eps: 0.5}\n")
     applied: list[float] = []
+    said: list[str] = []
 
     def during(live: Live) -> None:
         live.on_change = lambda config: applied.append(config.clustering.eps)
         file.write_text("clustering: {eps: 0.75}\n")
         wait_for(lambda: live.config.clustering.eps == 0.75)
         before = live.frames
+        wait_for(lambda: live.frames > before + 2)
         file.write_text("clustering: {eps: -1}\n")
-        wait_for(lambda: live.frames > before + 30)
+        wait_for(lambda: any("stays as it was" in line for line in said))
         assert live.config.clustering.eps == 0.75
         live.stop()
 
-    outcome = run(total=None, rate=10, config=file, during=during, save=Path("out.rrd"))
+    outcome = run(total=None, config=file, during=during, said=said, save=Path("out.rrd"))
     assert outcome.told("configuration: clustering.eps 0.5 -> 0.75")
     assert len(outcome.told("clustering.eps")) == 2
     (refused,) = outcome.told("stays as it was")
@@ -645,10 +797,11 @@ def test_settings_from_outside(run: Run) -> None:
         frames = live.frames
         wait_for(lambda: live.frames > frames + 2)
         assert os.getpriority(os.PRIO_PROCESS, 0) == 1
+        live.stop()
 
     before = os.getpriority(os.PRIO_PROCESS, 0)
     try:
-        outcome = run(total=40, during=during, save=Path("out.rrd"))
+        outcome = run(total=None, during=during, save=Path("out.rrd"))
     finally:
         if os.getuid() == 0:
             os.setpriority(os.PRIO_PROCESS, 0, before)
@@ -658,7 +811,7 @@ def test_settings_from_outside(run: Run) -> None:
 
 
 def test_a_sensor_that_comes_late(run: Run, frames: list[Frame], drive: SyntheticSource) -> None:
-    class Late(Replay):
+    class Late(Paced):
         def __iter__(self) -> Iterator[Frame]:
             for frame in super().__iter__():
                 if frame.index == 10:
@@ -666,7 +819,7 @@ def test_a_sensor_that_comes_late(run: Run, frames: list[Frame], drive: Syntheti
                 yield frame if frame.index >= 10 else replace(frame, cameras=())
 
     lidar_only = Scene(drive.scene.name, drive.scene.lidar, drive.scene.lidars)
-    run(source=Late(frames, lidar_only, total=25), save=Path("out.rrd"))
+    run(source=Late(frames, lidar_only, 12), save=Path("out.rrd"))
     recording = Recording(Path("out.rrd"))
     assert "Pinhole:image_from_camera" in recording.static["/world/zed"]
     assert "AnnotationContext:context" in recording.static["/world/zed/image/points"]
@@ -704,16 +857,23 @@ def a_port() -> int:
         return int(probe.getsockname()[1])
 
 
-def received(port: int, path: Path, seconds: float = 4.0) -> Recording:
+def received(port: int, path: Path, enough: Callable[[Recording], object]) -> Recording:
     """What a viewer that comes now is sent."""
-    late = rerun(f"rerun+http://127.0.0.1:{port}/proxy", "--save", str(path), "--port", str(a_port()))
-    time.sleep(seconds)
-    end(late, signal.SIGTERM)
-    late.wait(20)
-    return Recording(path)
+    for seconds in (2, 4, 8, 16, 32):
+        late = rerun(f"rerun+http://127.0.0.1:{port}/proxy", "--save", str(path), "--port", str(a_port()))
+        time.sleep(seconds)
+        end(late, signal.SIGTERM)
+        late.wait(60)
+        if path.exists() and path.stat().st_size:
+            recording = Recording(path)
+            if enough(recording):
+                return recording
+    raise AssertionError("it was sent nothing, or not enough")
 
 
-def test_a_late_viewer_sees_the_static_data_and_the_recent_past(run: Run) -> None:
+def test_a_late_viewer_sees_the_static_data_and_the_recent_past(
+    run: Run, frames: list[Frame], drive: SyntheticSource
+) -> None:
     found: list[Recording] = []
     port = a_port()
 
@@ -721,18 +881,16 @@ def test_a_late_viewer_sees_the_static_data_and_the_recent_past(run: Run) -> Non
         (url,) = live.urls
         assert url.startswith(f"http://localhost:{port}/?url=")
         wait_for(lambda: listens(port))
-        wait_for(lambda: live.frames > 60)
+        wait_for(lambda: live.frames == 30)
         data_port = int(url.rpartition("localhost%3A")[2].partition("%2F")[0])
-        found.append(received(data_port, Path("late.rrd")))
+        found.append(received(data_port, Path("late.rrd"), lambda r: shown(r)[-1:] == [29]))
         live.stop()
 
-    run(total=None, rate=10, during=during, serve=port)
+    run(source=Stalled(Paced(frames, drive.scene, 30)), during=during, serve=port)
     (recording,) = found
-    logged = sorted(row["frame"] for row in recording.rows["/explain"])
+    assert shown(recording)[0] == 0
     assert recording.blueprints == 1
     assert "TextDocument:text" in recording.static["/config"]
-    assert logged[0] < 20
-    assert logged[-1] > 30
     assert not listens(port)
 
 
@@ -742,39 +900,30 @@ def test_viewers_that_hang_or_die_slow_nothing_down(run: Run) -> None:
     viewers = [rerun(*arguments)]
     wait_for(lambda: listens(port))
     found: list[Recording] = []
-    slow: list[int] = []
     said: list[str] = []
 
     def during(live: Live) -> None:
-        wait_for(lambda: live.frames > 20)
+        wait_for(lambda: live.frames > 5)
         end(viewers[0], signal.SIGSTOP)
-        start = live.frames
-        time.sleep(5)
-        slow.append(live.frames - start)
+        wait_for(lambda: live.status.drops["remote"] > 0)  # frames come, nobody waits
         end(viewers[0])
-        wait_for(lambda: not listens(port))
-        time.sleep(5)
+        wait_for(lambda: any("is gone" in line for line in said))
+        time.sleep(RETRY + 1)
         viewers.append(rerun(*arguments))
         wait_for(lambda: any("is back" in line for line in said))
-        start = live.frames
-        wait_for(lambda: live.frames > start + 30)
-        found.append(received(port, Path("late.rrd")))
+        found.append(received(port, Path("late.rrd"), lambda r: len(r.rows["/explain"]) > 20))
         live.stop()
 
     try:
         connect = [f"rerun+http://127.0.0.1:{port}/proxy"]
-        outcome = run(total=None, rate=10, during=during, said=said, connect=connect)
+        outcome = run(total=None, rate=20, during=during, said=said, connect=connect)
     finally:
         for viewer in viewers:
             end(viewer)
-    assert slow[0] > 20
-    assert outcome.live.status.drops["remote"] > 0
-    assert outcome.live.status.drops["logging"] < 10
     assert len(outcome.told("the remote viewer is gone")) == 1
     assert len(outcome.told("the remote viewer is back")) == 1
     (recording,) = found
     assert recording.blueprints == 1
-    assert len(recording.rows["/explain"]) > 20
 
 
 def test_nobody_listens_where_a_viewer_should_be(run: Run) -> None:
@@ -788,34 +937,32 @@ def test_nobody_listens_where_a_viewer_should_be(run: Run) -> None:
 def test_a_source_that_fails_leaves_a_readable_recording(
     run: Run, frames: list[Frame], drive: SyntheticSource
 ) -> None:
-    class Broken(Replay):
+    class Broken(Paced):
         def __iter__(self) -> Iterator[Frame]:
             yield from super().__iter__()
             raise RuntimeError("the middleware is gone")
 
     with pytest.raises(UserError, match="RuntimeError: the middleware is gone"):
-        run(source=Broken(frames, drive.scene, total=10), save=Path("out.rrd"))
-    assert len(numbers(Path("out.rrd"))) > 5
-    verify(Path("out.rrd"))
+        run(source=Broken(frames, drive.scene, 10), save=Path("out.rrd"))
+    assert numbers(Path("out.rrd")) == list(range(10))
 
 
 def test_stamps_that_jump(run: Run, frames: list[Frame], drive: SyntheticSource) -> None:
-    class Jumping(Replay):
+    class Jumping(Paced):
         def __iter__(self) -> Iterator[Frame]:
             for frame in super().__iter__():
                 jump = -3_600_000_000_000 if frame.index >= 5 else 0
                 yield replace(frame, stamp=frame.stamp + jump, received=frame.received + 2 * jump)
 
-    outcome = run(source=Jumping(frames, drive.scene, total=10, rate=5), save=Path("out.rrd"))
-    assert outcome.live.frames > 5
+    outcome = run(source=Jumping(frames, drive.scene, 10), save=Path("out.rrd"))
+    assert outcome.live.frames == 10
     p99 = Recording(Path("out.rrd")).column("/health/latency_ms/p99", "Scalars:scalars")
     assert all(value[0] < 60_000 for value in p99)
-    verify(Path("out.rrd"))
 
 
 def test_signals_and_snap_on_a_running_process(tmp_path: Path) -> None:
     environment = {k: v for k, v in os.environ.items() if k not in ("DISPLAY", "WAYLAND_DISPLAY")}
-    environment |= {"PYTHONPATH": str(Path(__file__).resolve().parents[1]), "XDG_RUNTIME_DIR": str(tmp_path)}
+    environment |= alone(tmp_path)
     command = [sys.executable, "-m", "bevviz.cli"]
     run = subprocess.Popen(
         [*command, "live", "--synthetic", "4", "--flight", "20 s", "--save", "all.rrd"],
@@ -843,7 +990,7 @@ def test_signals_and_snap_on_a_running_process(tmp_path: Path) -> None:
         run.send_signal(signal.SIGTERM)
         time.sleep(0.3)
         run.send_signal(signal.SIGTERM)  # somebody has no patience
-        _, said = run.communicate(timeout=60)
+        _, said = run.communicate(timeout=180)
     assert run.returncode == 0, said
     assert "Traceback" not in said
     assert snapped.stdout.strip() == str(tmp_path / "mine.rrd")

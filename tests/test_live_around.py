@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import random
-import subprocess
 import threading
-import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,6 +17,7 @@ from bevviz.ros.encode import typestore
 from bevviz.session import Session
 from bevviz.synthetic import SyntheticSource
 from bevviz.synthetic.drive import TRUTH_TOPIC
+from tests.graphs import PATIENCE, own_graph, playing, until
 from tests.recordings import Recording
 from tests.ros_player import Play
 
@@ -34,7 +32,6 @@ from bevviz.ros.diagnostics import TYPE, Diagnostics
 from bevviz.ros.node import Node
 from bevviz.ros.typesupport import message_type
 
-PATIENCE = 60.0
 BOXES = "vision_msgs/msg/Detection3DArray"
 MARK = "the person behind the van"
 
@@ -46,13 +43,6 @@ class Flight:
     heard: list[Any]  # what bevviz said on /diagnostics
     said: list[str]  # on the terminal
     live: Live
-
-
-def until(condition: Callable[[], object], what: str) -> None:
-    end = time.monotonic() + PATIENCE
-    while not condition():
-        assert time.monotonic() < end, f"never: {what}"
-        time.sleep(0.05)
 
 
 def make(kind: str, **values: Any) -> Any:
@@ -112,20 +102,11 @@ class Robot:
 @pytest.fixture(scope="module")
 def flight(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Flight]:
     folder = tmp_path_factory.mktemp("around")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("ROS_DOMAIN_ID", str(random.randint(1, 101)))
-        patch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+    with own_graph() as patch:
         patch.setenv("XDG_RUNTIME_DIR", str(folder))
         patch.chdir(folder)
-        play = Play(frames=3, points=5_000)
-        with subprocess.Popen(
-            play.arguments(), cwd=Path(__file__).parents[1], stdout=subprocess.PIPE, text=True
-        ) as player:
-            try:
-                assert player.stdout is not None and player.stdout.readline() == "playing\n"
-                yield fly(folder)
-            finally:
-                player.terminate()
+        with playing(Play(frames=3, points=5_000)):
+            yield fly(folder)
 
 
 def fly(folder: Path) -> Flight:

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import errno
-import random
 import re
-import subprocess
 import threading
 import time
 from array import array
@@ -35,6 +33,7 @@ from bevviz.session import Session
 from bevviz.synthetic import SyntheticSource
 from bevviz.synthetic.bag import TOPICS
 from bevviz.synthetic.drive import LIDAR_TOPIC
+from tests.graphs import PATIENCE, own_graph, playing
 from tests.recordings import Recording, verify
 from tests.ros_player import Play
 
@@ -48,7 +47,6 @@ from bevviz.live.source import LiveSource
 from bevviz.ros.encode import encode_transforms, typestore
 from bevviz.ros.node import Node
 
-PATIENCE = 60.0
 WAIT = ["sync.max_wait=10 s", "sync.queue=100"]  # on a busy machine messages come late: they are waited for
 SECONDS = 3.0  # that the flight recorder holds: less than the run takes
 
@@ -66,20 +64,11 @@ class Flight:
 @pytest.fixture(scope="module")
 def flight(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Flight]:
     folder = tmp_path_factory.mktemp("flight")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("ROS_DOMAIN_ID", str(random.randint(1, 101)))
-        patch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+    with own_graph() as patch:
         patch.setenv("XDG_RUNTIME_DIR", str(folder))
         patch.chdir(folder)
-        play = Play(frames=4, points=10_000)
-        with subprocess.Popen(
-            play.arguments(), cwd=Path(__file__).parents[1], stdout=subprocess.PIPE, text=True
-        ) as robot:
-            try:
-                assert robot.stdout is not None and robot.stdout.readline() == "playing\n"
-                yield fly(folder)
-            finally:
-                robot.terminate()
+        with playing(Play(frames=4, points=10_000)):
+            yield fly(folder)
 
 
 def fly(folder: Path) -> Flight:

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import os
-import random
 import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import ExitStack
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
@@ -20,7 +20,7 @@ import pytest
 
 from bevviz.config import Config, keys, load
 from bevviz.errors import UserError
-from bevviz.frame import Boxes3D, CameraResult, Detections, Frame, FrameResult, Objects
+from bevviz.frame import Boxes3D, CameraResult, Detections, Frame, FrameResult, LateResult, Objects
 from bevviz.ros.encode import encode_boxes_3d, encode_camera_info, encode_cloud, typestore
 from bevviz.ros.messages import (
     decode_cloud,
@@ -33,6 +33,7 @@ from bevviz.session import Session
 from bevviz.synthetic import SyntheticSource
 from bevviz.synthetic.bag import TOPICS
 from bevviz.synthetic.drive import CAMERA_INFO_TOPIC, LIDAR_TOPIC, TRUTH_TOPIC
+from tests.graphs import PATIENCE, alone, own_domain, own_graph, playing, until
 from tests.recordings import Recording, verify
 from tests.ros_player import Play
 
@@ -56,51 +57,25 @@ from bevviz.ros.publish import (
 )
 from bevviz.ros.publish import TOPICS as TOPICS_PUBLISHED
 
-PATIENCE = 60.0  # seconds for what takes one or two on an idle machine
 LIGHT = Play(frames=3, points=20_000)
-
-
-def new_domain() -> str:
-    return str(random.randint(1, 101))  # the ports of higher ones are taken by the system
 
 
 @pytest.fixture(scope="module")
 def robot() -> Iterator[str]:
     """The domain of a robot that plays for several tests."""
-    number = new_domain()
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("ROS_DOMAIN_ID", number)
-        patch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
-        player = playing(LIGHT)
-        player.__enter__()
-    yield number
-    player.__exit__(None, None, None)
+    with own_graph(), playing(LIGHT):
+        yield os.environ["ROS_DOMAIN_ID"]
 
 
 @pytest.fixture(autouse=True)
-def domain(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+def domain(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """The robot's graph, or an empty one, on this machine only."""
-    shared = "robot" in request.fixturenames
-    monkeypatch.setenv("ROS_DOMAIN_ID", request.getfixturevalue("robot") if shared else new_domain())
-    monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
-
-
-@contextmanager
-def playing(play: Play) -> Iterator[None]:
-    root = Path(__file__).parents[1]
-    with subprocess.Popen(play.arguments(), cwd=root, stdout=subprocess.PIPE, text=True) as process:
-        try:
-            assert process.stdout is not None and process.stdout.readline() == "playing\n"
-            yield
-        finally:
-            process.terminate()  # the graph learns of it at once, as of a node that is shut down
-
-
-def until(condition: Callable[[], Any], what: str) -> None:
-    end = time.monotonic() + PATIENCE
-    while not condition():
-        assert time.monotonic() < end, f"never: {what}"
-        time.sleep(0.05)
+    with ExitStack() as stack:
+        shared = "robot" in request.fixturenames
+        number = request.getfixturevalue("robot") if shared else stack.enter_context(own_domain())
+        monkeypatch.setenv("ROS_DOMAIN_ID", number)
+        monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+        yield
 
 
 def frames(source: LiveSource) -> Iterator[Frame]:
@@ -110,12 +85,14 @@ def frames(source: LiveSource) -> Iterator[Frame]:
 
 def test_frames_are_those_of_the_drive(robot: str) -> None:
     drive = [snapshot.frame for snapshot in map(SyntheticSource(frames=3).snapshot, range(3))]
-    with LiveSource(load()) as source:
-        heard = list(islice(frames(source), 7))
+    patient = ["sync.max_wait=10 s", "sync.queue=100"]  # a busy machine brings messages late
+    with LiveSource(load(settings=patient)) as source:
+        # Of a hundred images one is lost where nobody came for it in time.
+        heard = list(islice((frame for frame in frames(source) if frame.cameras[0].image is not None), 6))
         assert source.scene.lidar == "rslidar" and source.scene.cameras == ("zed",) and source.scene.truth
         assert set(source.received) == set(TOPICS)
     assert [frame.index for frame in heard] == sorted({frame.index for frame in heard})
-    for frame in heard[1:]:  # the first one may have no transforms yet
+    for frame in heard:
         true = next(f for f in drive if np.array_equal(np.resize(f.points, (20_000, 3)), frame.points))
         (camera,), (expected,) = frame.cameras, true.cameras
         assert frame.problems == camera.problems == ()
@@ -134,11 +111,11 @@ def test_frames_are_those_of_the_drive(robot: str) -> None:
 def test_newest_frame_wins(robot: str) -> None:
     with LiveSource(load()) as source:
         live = frames(source)
-        before = next(live).index
-        time.sleep(1.5)
+        before, dropped = next(live).index, source.dropped
+        until(lambda: source.dropped >= dropped + 5, "frames that nobody took")
+        least = source.dropped
         frame = next(live)
-        assert source.dropped >= frame.index - before - 1 >= 5
-        assert time.time_ns() - frame.received < 1e9
+        assert least <= dropped + frame.index - before - 1 <= source.dropped  # it is the oldest that was not
 
 
 def test_frames_do_not_wait_for_the_robots_results(robot: str) -> None:
@@ -166,14 +143,26 @@ def test_frames_do_not_wait_for_the_robots_results(robot: str) -> None:
             assert source.wait(PATIENCE)
             until(lambda: {"/soon/boxes", "/slow/boxes"} <= set(source.received), "results")
             source.overtaken()
-            heard = list(islice(source, 12))  # with such a wait there were one in 20 s, did they wait
-            late = source.overtaken()
-    stamps = {frame.index: frame.stamp for frame in heard}
+            stamps: dict[int, int] = {}
+            taken: Counter[str] = Counter()
+            late: list[LateResult] = []
+
+            def come(topic: str) -> int:
+                mine = [found for found in late if found.boxes.topic == topic and found.index in stamps]
+                return len(mine) + taken[topic]
+
+            # With such a wait there were a frame in 20 s, did they wait.
+            for frame in islice(source, 100):
+                stamps[frame.index] = frame.stamp
+                taken.update(box.topic for box in frame.robot_boxes)
+                late += source.overtaken()
+                if min(map(come, ("/soon/boxes", "/slow/boxes"))) > 2 and len(stamps) > 11:
+                    break
     for topic, shift in (("/soon/boxes", 12_000_000), ("/slow/boxes", 0)):
-        mine = [found for found in late if found.boxes.topic == topic and found.index in stamps]
-        taken = sum(box.topic == topic for frame in heard for box in frame.robot_boxes)
-        assert len(mine) + taken > 2
-        assert all(found.boxes.stamp - stamps[found.index] == shift for found in mine)
+        assert come(topic) > 2
+        for found in late:
+            if found.boxes.topic == topic and found.index in stamps:
+                assert found.boxes.stamp - stamps[found.index] == shift
     assert sum(found.boxes.topic == "/slow/boxes" for found in late) > 2
     assert any(text.startswith("/slow/boxes comes when its frame has gone on") for text in said)
 
@@ -189,22 +178,30 @@ def test_stated_topic_is_waited_for(robot: str) -> None:
     said: list[str] = []
     settings = ["source.lidar_topics=[/rosout]", "source.camera_topics=[/elsewhere]"]
     with LiveSource(load(settings=settings), tell=said.append) as source:
-        assert not source.wait(3.5)
         absent = "nobody publishes /elsewhere, which source.camera_topics states"
         wrong = "/rosout is a rcl_interfaces/msg/Log, but source.lidar_topics takes PointCloud2"
-        assert source.missing == f"{wrong}; {absent}"
-        assert {absent, wrong} <= set(said)
+        until(lambda: source.missing == f"{wrong}; {absent}", "both")
+        until(lambda: {absent, wrong} <= set(said), "both are told")
+        assert not source.wait(0)
 
 
 def test_info_says_what_is_missing() -> None:
     """The first command that a user runs: no LiDAR yet, then one without messages."""
+
+    def describe(config: Config, missing: str) -> info.LiveInfo:
+        for patience in (2.0, 10.0, 60.0):  # nodes of a busy machine take their time to meet
+            made = info.describe(config, seconds=0.1, patience=patience)
+            if made.missing[0].startswith(missing):
+                break
+        return made
+
     with Node(name="half_a_robot") as robots:
         robots.start()
-        made = info.describe(load(settings=["source.lidar_topics=[/points]"]), seconds=1.0, patience=2.0)
+        made = describe(load(settings=["source.lidar_topics=[/points]"]), "nobody publishes /points")
         assert made.missing[0] == "nobody publishes /points, which source.lidar_topics states"
         cloud = typesupport.message_type("sensor_msgs/msg/PointCloud2")
         robots.node.create_publisher(cloud, "/points", 5)
-        made = info.describe(load(), seconds=1.0, patience=3.0)
+        made = describe(load(), "no message on /points yet")
         assert made.missing == ("no message on /points yet", "no detector: --model FILE.onnx")
 
 
@@ -241,7 +238,7 @@ def test_what_stops_or_cannot_be_used_is_told_at_once_and_when_it_is_over() -> N
             publish(whole)
             time.sleep(0.05)
         until_told("no cloud for 2 s on /points")
-        assert source.states == {"/points": "silent"}
+        until(lambda: source.states == {"/points": "silent"}, "the state")
         until_told("the clouds are back", whole)
         with Node(name="second_driver") as second:
             second.start()
@@ -261,10 +258,9 @@ def test_the_first_frame_waits_for_its_calibration(monkeypatch: pytest.MonkeyPat
     static = tuple(TOPICS.keys() - {"/tf_static"})
     with playing(replace(LIGHT, without=late)), LiveSource(load(), tell=said.append) as source:
         until(lambda: source.received[LIDAR_TOPIC] > 3, "clouds")
+        absent = "no transform from 'rslidar' to 'zed2_left_camera_optical_frame' yet"
+        until(lambda: source.missing.startswith(absent), "what is waited for")
         assert not source.wait(1.5)
-        assert source.missing.startswith(
-            "no transform from 'rslidar' to 'zed2_left_camera_optical_frame' yet"
-        )
         info, transforms = (
             Play(frames=1, name=name, without=w) for name, w in (("info", only), ("tf", static))
         )
@@ -279,7 +275,8 @@ def test_info_shows_the_graph(robot: str) -> None:
     topics = {topic.name: topic for topic in made.topics}
     assert topics.keys() >= TOPICS.keys() | {"/rosout"}
     cloud = topics[LIDAR_TOPIC]
-    assert cloud.rate == pytest.approx(10.0, abs=2.5) and cloud.frame_id == "rslidar"
+    assert cloud.count and cloud.rate and cloud.frame_id == "rslidar"
+    assert made.seconds >= 2.0 and cloud.rate == pytest.approx(cloud.count / made.seconds)
     assert topics["/rosout"].count is None and topics["/rosout"].role == ""
     assert topics["/tf_static"].role == "static transforms; from /player (reliable, latched)"
     assert made.tree["rslidar"] == "base_link" and made.world_frame == "map"
@@ -301,7 +298,8 @@ def test_what_cannot_be_received_is_told_and_not_waited_for(
     said: list[str] = []
     with LiveSource(load(settings=["sync.max_wait=20"]), tell=said.append) as source:
         heard = list(islice(frames(source), 3))
-    assert said == [f"{TRUTH_TOPIC} is not received: vision_msgs is not installed"]
+    unheard = [text for text in said if "is not received" in text]
+    assert unheard == [f"{TRUTH_TOPIC} is not received: vision_msgs is not installed"]
     assert heard[-1].truth is None and heard[-1].cameras[0].image is not None
 
 
@@ -322,8 +320,8 @@ def test_late_publisher_then_restart_with_other_qos_and_calibration() -> None:
         assert any(text.startswith("/tf_static has no publisher") for text in source.warnings)
         with playing(replace(LIGHT, best_effort=True, focal=1.25)):
             until(lambda: any("calibration" in text for text in said), "the new calibration is told")
-            next(live)  # made before the restart, if nobody took it
-            second = next(live)
+            told = time.time_ns()  # what nobody took before is still handed out
+            second = next(frame for frame in live if frame.received > told)
         before, after = first.cameras[0].intrinsics, second.cameras[0].intrinsics
         assert before is not None and after is not None
         assert after.K[0, 0] == pytest.approx(1.25 * before.K[0, 0])
@@ -341,8 +339,8 @@ def test_incompatible_publisher_is_told() -> None:
     ):
         frame = next(frames(source))
         told = "/tf_static: /volatile is not heard, its quality of service does not fit (Volatile publisher"
-        until(lambda: said and said[-1].startswith(told), "the mismatch")
-        assert said[-1] in source.warnings
+        until(lambda: any(text.startswith(told) for text in source.warnings), "the mismatch")
+        assert any(text.startswith(told) for text in said)
         assert frame.cameras[0].camera_from_points is not None
 
 
@@ -472,7 +470,8 @@ def test_results_are_published_for_others_but_not_for_us(result: FrameResult) ->
 
         until(all_heard, f"all of {set(kinds)}")
         until(lambda: len(rviz.node.get_publishers_info_by_topic(BEV)) == 1, "the graph")
-        time.sleep(1.0)  # the source looks around twice
+        until(lambda: "no LiDAR" in source.missing, "the source has looked around")
+        time.sleep(1.0)  # twice
         assert source.roles.lidars == () and "no LiDAR" in source.missing
 
     frame, image = result.frame, result.cameras[0].camera.image
@@ -606,7 +605,7 @@ def test_the_command_beside_a_robot(robot: str, tmp_path: Path) -> None:
     from std_srvs.srv import Trigger
 
     environment = {k: v for k, v in os.environ.items() if k not in ("DISPLAY", "WAYLAND_DISPLAY")}
-    environment |= {"PYTHONPATH": str(Path(__file__).parents[1]), "XDG_RUNTIME_DIR": str(tmp_path)}
+    environment |= alone(tmp_path)
     command = [sys.executable, "-m", "bevviz.cli", "live", "--publish", "--save", "all.rrd"]
     command += ["--preset", "reference", "--ros-args", "-p", "range_x:=12.0", "-r", f"{BEV}:=/seen"]
     run = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, cwd=tmp_path, env=environment)
@@ -645,7 +644,7 @@ def test_the_command_beside_a_robot(robot: str, tmp_path: Path) -> None:
             until(saved, "a recording of what was published, once it is logged, too")
     finally:
         run.send_signal(signal.SIGTERM)
-        _, said = run.communicate(timeout=60)
+        _, said = run.communicate(timeout=PATIENCE)
     assert run.returncode == 0, said
     assert "configuration: bev.range_x 12.0 -> 6.0" in said and "Traceback" not in said
     for path in (tmp_path / "all.rrd", tmp_path / answer.message):
@@ -658,7 +657,7 @@ def test_the_command_beside_a_robot(robot: str, tmp_path: Path) -> None:
 
 def test_orders_while_a_robot_is_waited_for(tmp_path: Path) -> None:
     """SIGUSR1 and snap are answered, parameters are taken, and a wrong one ends the command at once."""
-    environment = dict(os.environ) | {"XDG_RUNTIME_DIR": str(tmp_path)}
+    environment = os.environ | alone(tmp_path)
     command = [sys.executable, "-m", "bevviz.cli", "live", "--observe"]
     wrong = [*command, "--ros-args", "-p", "voxel_size:=-1"]
     refused = subprocess.run(wrong, capture_output=True, text=True, timeout=PATIENCE, check=False)

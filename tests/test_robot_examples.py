@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import configparser
-import os
-import random
 import runpy
 import shlex
 import shutil
@@ -19,6 +17,7 @@ import pytest
 
 from bevviz.cli import _parser
 from bevviz.live.settings import Settings
+from tests.graphs import PATIENCE, own_graph
 
 EXAMPLES = Path(__file__).parents[1] / "examples" / "robot"
 CONFIG = EXAMPLES / "robot.yaml"
@@ -62,21 +61,18 @@ def test_the_unit_s_command_runs_and_ends(tmp_path: Path) -> None:
     _, *arguments = shlex.split(unit()["Service"]["ExecStart"])
     places = {"/etc/bevviz/robot.yaml": str(CONFIG), "live.flight_folder=/var/lib/bevviz": "live.every=1"}
     command = [sys.executable, "-m", "bevviz", *(places.get(argument, argument) for argument in arguments)]
-    environment = os.environ | {
-        "ROS_DOMAIN_ID": str(random.randint(1, 101)),
-        "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
-        "XDG_RUNTIME_DIR": str(tmp_path),
-        "PYTHONPATH": str(EXAMPLES.parents[1]),
-    }
-    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True, cwd=tmp_path, env=environment) as run:
-        assert run.stderr is not None
-        try:
-            said = run.stderr.readline()
-            assert "waiting: nothing is published" in said
-        finally:
-            run.send_signal(signal.SIGTERM)
-            rest = run.stderr.read()
-        assert run.wait(60) >= 0 and "Traceback" not in rest
+    with own_graph() as patch:
+        patch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+        patch.setenv("PYTHONPATH", str(EXAMPLES.parents[1]))
+        with subprocess.Popen(command, stderr=subprocess.PIPE, text=True, cwd=tmp_path) as run:
+            assert run.stderr is not None
+            try:
+                said = run.stderr.readline()
+                assert "waiting: nothing is published" in said
+            finally:
+                run.send_signal(signal.SIGTERM)
+                rest = run.stderr.read()
+            assert run.wait(PATIENCE) >= 0 and "Traceback" not in rest
 
 
 def test_the_launch_file(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
-import random
 import re
 import signal
 import subprocess
@@ -32,6 +30,7 @@ from bevviz.synthetic import SyntheticSource
 from bevviz.workbench.live_bench import KEPT, LiveBench
 from bevviz.workbench.live_film import WHOLE, LiveFilm
 from bevviz.workbench.pick import Pick
+from tests.graphs import own_graph, playing
 from tests.ros_player import Play
 
 pytestmark = pytest.mark.filterwarnings("ignore:RRD file has no footer")
@@ -47,25 +46,20 @@ def robot(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[str, Path]
     """A robot that plays, and ``bevviz live --workbench`` beside it: its address and its folder."""
     pytest.importorskip("rclpy", reason="needs rclpy: pip install 'bevviz[ros]'")
     folder, root = tmp_path_factory.mktemp("live"), Path(__file__).parents[1]
-    ros = {"ROS_DOMAIN_ID": str(random.randint(1, 101)), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
-    environment = {**os.environ, **ros, "PYTHONPATH": str(root)}
-    play = Play(frames=3, points=10_000, rate=5.0)
-    with subprocess.Popen(
-        play.arguments(), cwd=root, env=environment, stdout=subprocess.PIPE, text=True
-    ) as player:
-        assert player.stdout is not None and player.stdout.readline() == "playing\n"
+    with own_graph() as patch:
+        patch.setenv("PYTHONPATH", str(root))
         command = [sys.executable, "-m", "bevviz.cli", "live", "--model", "demo", "--workbench"]
         said = folder / "said.txt"
         with (
+            playing(Play(frames=3, points=10_000, rate=5.0)),
             said.open("w") as log,
-            subprocess.Popen(command, cwd=folder, env=environment, stderr=log) as live,
+            subprocess.Popen(command, cwd=folder, stderr=log) as live,
         ):
             try:
                 yield _address(said, live), folder
             finally:
                 live.send_signal(signal.SIGINT)
-                live.wait(timeout=60)
-                player.terminate()
+                live.wait(timeout=WAIT)
 
 
 def _address(said: Path, live: subprocess.Popen[bytes]) -> str:

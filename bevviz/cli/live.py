@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import argparse
 import os
+import threading
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext, suppress
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -169,6 +171,7 @@ def _watch_robot(
 ) -> int:
     """Publish back and take orders, as far as that is asked for."""
     from bevviz.live.control import Control, unasked
+    from bevviz.live.warm import warm_up
     from bevviz.ros.diagnostics import Diagnostics
     from bevviz.ros.orders import Orders
     from bevviz.ros.publish import Publisher
@@ -186,6 +189,9 @@ def _watch_robot(
         orders: Orders | None = None
         orders = Orders(source.node, settings.config, take, refuse)
         orders.config = settings.config
+        if not options.observe:  # while a robot is waited for
+            warm = partial(warm_up, settings.config, loader)
+            threading.Thread(target=warm, name="warm up", daemon=True).start()
         shown = ""
         with suppress(KeyboardInterrupt), terminable() as ended:
             while not source.wait(1.0):

@@ -8,7 +8,7 @@ from __future__ import annotations
 import os
 import threading
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
 
@@ -74,6 +74,7 @@ class Encoder:
         blueprint: name of a layout, or a .py or .rbl file.
         whole: seconds from one whole packet to the next, at most.
         against: compares with the robot; None: nobody does.
+        clock: seconds, for tests.
 
     Raises:
         UserError: no such blueprint.
@@ -86,8 +87,9 @@ class Encoder:
         blueprint: str,
         whole: float = WHOLE,
         against: AgainstRobot | None = None,
+        clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        self._against = against
+        self._against, self.clock = against, clock
         self._differences: DifferenceLogger | None = None
         self._blueprint = blueprint
         self._step = whole
@@ -122,7 +124,15 @@ class Encoder:
         ``compared``: how frames so far differ from what the robot made of them.
         """
         with self._lock:
-            return self._encode(result, scene, health, notes, late, states, compared)
+            self._follow(result.config, scene)
+            now = self.clock()
+            whole = now - self._whole >= self._step
+            if whole:
+                self._whole = now
+                self._logger.refresh()
+            self._logger.log(result, health, notes, late, states)
+            self._log_differences(compared, whole)
+            return Packet(self._stream.read(), whole, self._logger.context, now)
 
     def encode_meanwhile(
         self, seconds: float, notes: Sequence[tuple[str, str]], states: Mapping[str, str]
@@ -130,32 +140,16 @@ class Encoder:
         """What is to be said while no frame comes; see ``Logger.log_meanwhile``."""
         with self._lock:
             self._logger.log_meanwhile(seconds, notes, states)
-            return Packet(self._stream.read(), False, self._logger.context, time.monotonic())
+            return Packet(self._stream.read(), False, self._logger.context, self.clock())
 
-    def _encode(
-        self,
-        result: FrameResult,
-        scene: Scene,
-        health: Mapping[str, float],
-        notes: Sequence[tuple[str, str]],
-        late: Sequence[LateResult],
-        states: Mapping[str, str],
-        compared: Sequence[Compared],
-    ) -> Packet:
-        config = result.config
-        if (config, scene) != (self._config, self._scene):
-            if scene != self._scene:
-                self._stream.recording.send_blueprint(blueprints.load(self._blueprint, scene))
-            self._config, self._scene = config, scene
-            self._logger.reconfigure(config, scene)
-        now = time.monotonic()
-        whole = now - self._whole >= self._step
-        if whole:
-            self._whole = now
-            self._logger.refresh()
-        self._logger.log(result, health, notes, late, states)
-        self._log_differences(compared, whole)
-        return Packet(self._stream.read(), whole, self._logger.context, now)
+    def _follow(self, config: Config, scene: Scene) -> None:
+        """Log whatever is new in them."""
+        if (config, scene) == (self._config, self._scene):
+            return
+        if scene != self._scene:
+            self._stream.recording.send_blueprint(blueprints.load(self._blueprint, scene))
+        self._config, self._scene = config, scene
+        self._logger.reconfigure(config, scene)
 
     def _log_differences(self, compared: Sequence[Compared], whole: bool) -> None:
         if self._against is None or not (compared or self._differences):

@@ -32,7 +32,8 @@ class FlightRecorder:
     @property
     def size(self) -> int:
         """Bytes held."""
-        return self._size
+        with self._held:
+            return self._size
 
     def put(self, packet: Packet) -> None:
         with self._held:

@@ -8,15 +8,13 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from bevviz.config import Config
 from bevviz.errors import UserError
-from bevviz.frame import Frame, FrameResult, LabelledBoxes3D, LateResult, Scene, Source
+from bevviz.frame import Frame, FrameResult, LabelledBoxes3D, Scene, Source
 from bevviz.live.against import AgainstRobot
 from bevviz.live.control import Control
 from bevviz.live.encoder import WHOLE, Encoder, Packet
@@ -29,13 +27,16 @@ from bevviz.live.raw import RawRecorder
 from bevviz.live.rawsaver import RawSaver
 from bevviz.live.settings import AT_START, Settings
 from bevviz.live.snapshots import Snapshots
+from bevviz.live.thinning import Thinned
 from bevviz.live.triggers import Triggers
-from bevviz.live.viewers import Viewer, remote, server, window
+from bevviz.live.viewers import LATE, Viewer, remote, server, window
+from bevviz.live.warm import warm_up
 from bevviz.logging import entities
 from bevviz.perceive import StageLoader
-from bevviz.run import Dropping, Observer, run
+from bevviz.run import Dropping, Items, Observer, run
 from bevviz.session import Session
 
+BEHIND = 3.0  # seconds that a viewer lags when it is told
 LOOK = 1.0  # seconds between two looks at the configuration file and the clock
 ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
@@ -110,10 +111,12 @@ class Live:
         self._over = threading.Event()
         self._asked_to_save = False
         self._looked = self._logged = 0.0  # seconds, monotonic
+        self._behind: set[str] = set()  # viewers of which it was told
         self._states: dict[str, str] = {}  # of the topics, as logged while no frame came
         live = settings.config.live
 
         self._nice(live.nice)
+        self._observes = observe
         self._session = Observing(settings.config) if observe else Session(settings.config, loader=loader)
         self._robot_problem = ""
         self.against = None if robot is None else AgainstRobot(robot, live)
@@ -205,6 +208,7 @@ class Live:
             "memory, MB": status.memory,
         }
         numbers |= {f"dropped: {where}": float(count) for where, count in status.drops.items()}
+        numbers |= {f"lag of the {viewer.name} viewer, ms": 1e3 * viewer.lag for viewer in self._viewers}
         return numbers | {path.rpartition("/")[2]: n for path, n in self._snapshots.scalars.items()}
 
     def save(self, path: Path | None = None) -> Path:
@@ -277,6 +281,7 @@ class Live:
         if jump := self.health.clock_jump():
             self.notes.warn(f"the clock of this machine has jumped by {jump:+.1f} s")
         self._log_meanwhile()
+        self._watch_viewers()
         if self._shown is not self.config:
             self._shown = self.config
             self.on_change(self._shown)
@@ -292,10 +297,16 @@ class Live:
         self._indexer.close()
         self.encoder.close()
 
+    def warm_up(self) -> None:
+        """Compile and load what the first frame needs; scans that come meanwhile were not asked for."""
+        if not self._observes:
+            warm_up(self.config, self._session.loader)
+
     def log(self, result: FrameResult) -> None:
         """Encode a frame once, for every output."""
         drops = {entities.drops(where): float(count) for where, count in self._drops().items()}
-        health = self.health.scalars() | drops | self._snapshots.scalars
+        lags = {entities.viewer_lag(viewer.name): 1e3 * viewer.lag for viewer in self._viewers}
+        health = self.health.scalars() | drops | lags | self._snapshots.scalars
         late, states = self._source.overtaken(), self._topic_states()
         boxes = [(one.frame_stamp, one.boxes) for one in late if isinstance(one.boxes, LabelledBoxes3D)]
         compared = self.against.see(result, boxes) if self.against is not None else ()
@@ -318,6 +329,23 @@ class Live:
                 self.notes.warn(against.problem)
         if reason := against.reason():
             self._snapshots.save_soon(reason, self.config.live.trigger_after)
+
+    @property
+    def _viewers(self) -> list[Viewer]:
+        return [output for output in self._outputs if isinstance(output, Viewer)]
+
+    def _watch_viewers(self) -> None:
+        for viewer in self._viewers:
+            if viewer.lag > BEHIND and viewer.name not in self._behind:
+                self._behind.add(viewer.name)
+                self.notes.warn(
+                    f"the {viewer.name} viewer is {viewer.lag:.0f} s behind: it gets the newest frames, the "
+                    f"others it misses; --set live.viewer_rate=2 sends it less"
+                )
+            elif viewer.lag < LATE and viewer.name in self._behind:
+                self._behind.remove(viewer.name)
+                missed = f"{viewer.dropped} frames" if viewer.dropped != 1 else "1 frame"
+                self.notes.info(f"the {viewer.name} viewer keeps up again; it has missed {missed} so far")
 
     def _log_meanwhile(self) -> None:
         """What is said while no frame comes is in the log and in the lanes all the same."""
@@ -399,6 +427,9 @@ class LiveRecorder(Observer[FrameResult]):
         self._live = live
         self.beside = live.config.live.log_queue
 
+    def begin(self, items: Items[object]) -> None:
+        self._live.warm_up()
+
     def see(self, result: FrameResult) -> None:
         self._live.log(result)
 
@@ -433,85 +464,3 @@ class Observing(Session):
 
     def finish(self, result: FrameResult) -> FrameResult:
         return self.watch(result)
-
-
-class Thinned:
-    """A source without what the configuration leaves out on purpose: scans, and points of scans.
-
-    Args:
-        source: where the frames come from; with a method ``stop`` it is told when to end.
-        config: the one that is in force.
-    """
-
-    def __init__(self, source: Source, config: Callable[[], Config]) -> None:
-        self.thinned = 0
-        self._source, self._config = source, config
-
-    @property
-    def scene(self) -> Scene:
-        return self._source.scene
-
-    @property
-    def total(self) -> int | None:
-        return self._source.total
-
-    @property
-    def warnings(self) -> Sequence[str]:
-        return self._source.warnings
-
-    @property
-    def dropped(self) -> int:
-        """That the source itself has left out."""
-        return int(getattr(self._source, "dropped", 0))
-
-    @property
-    def states(self) -> Mapping[str, str]:
-        """How each topic does, where the source has topics."""
-        return getattr(self._source, "states", {})
-
-    def overtaken(self) -> tuple[LateResult, ...]:
-        """The robot's own results that came too late for their frames, since the last call."""
-        overtaken = getattr(self._source, "overtaken", None)
-        return () if overtaken is None else tuple(overtaken())
-
-    def stop(self) -> None:
-        stop = getattr(self._source, "stop", None)
-        if stop is not None:
-            stop()
-
-    def __iter__(self) -> Iterator[Frame]:
-        earliest = 0.0
-        for number, frame in enumerate(self._source):
-            live, now = self._config().live, time.monotonic()
-            if number % live.every or now < earliest:
-                self.thinned += 1
-                continue
-            if live.max_rate is not None:
-                # Frames that come a little early keep their turn; a pause earns no burst.
-                earliest = max(earliest + 1 / live.max_rate, now - 0.5 / live.max_rate)
-            yield thin(frame, live.points)
-
-
-def thin(frame: Frame, points: int | None) -> Frame:
-    """The frame with so many points: one at random out of each of as many equal runs of its points.
-
-    A fixed step would fall on the same ring of the LiDAR again and again.
-    """
-    count = len(frame.points)
-    if points is None or count <= points:
-        return frame
-    rng = np.random.default_rng(frame.index)
-    edges = np.arange(points + 1) * count // points
-    rows = rng.integers(edges[:-1], edges[1:])
-    ends = np.cumsum([len(cloud.xyz) for cloud in frame.clouds])
-    clouds = []
-    for cloud, end in zip(frame.clouds, ends.tolist(), strict=True):
-        kept = rows[(rows >= end - len(cloud.xyz)) & (rows < end)] - (end - len(cloud.xyz))
-        fields = {name: values[kept] for name, values in cloud.fields.items()}
-        clouds.append(replace(cloud, xyz=cloud.xyz[kept], fields=fields))
-    return replace(
-        frame,
-        points=frame.points[rows],
-        fields={name: values[rows] for name, values in frame.fields.items()},
-        clouds=tuple(clouds),
-    )

@@ -123,6 +123,8 @@ class LiveSource(Closing):
         self._complete = False  # the scene is known
         self._knowledge = threading.RLock()  # of all that the receiving thread changes piece by piece
         self._handover: NewestQueue[Frame] = NewestQueue(BURST, catch_up=True)
+        self._iterated = False
+        self._unasked = 0  # frames that came before anybody iterated
         self._frames = 0
         self._numbers: deque[tuple[int, int]] = deque(maxlen=OVERTAKEN)  # stamp and index of the last frames
         self._ended = False
@@ -161,8 +163,8 @@ class LiveSource(Closing):
 
     @property
     def dropped(self) -> int:
-        """Frames that were overtaken by newer ones before anybody took them."""
-        return self._handover.dropped
+        """Frames that were overtaken by newer ones before they were taken, since somebody iterates."""
+        return self._handover.dropped - self._unasked
 
     @property
     def tree(self) -> Mapping[str, str]:
@@ -266,6 +268,8 @@ class LiveSource(Closing):
             )
 
     def __iter__(self) -> Iterator[Frame]:
+        if not self._iterated:
+            self._iterated, self._unasked = True, self._handover.dropped
         for frame in self._handover:
             if self._ended:
                 break

@@ -27,6 +27,7 @@ from bevviz.logging.ports import (
 from bevviz.logging.sinks import check_viewer
 
 RETRY = 3.0  # seconds until a viewer that is gone is tried again
+LATE = 1.0  # seconds behind from which on nothing old is sent
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,7 +80,7 @@ def remote(url: str, recording_id: str) -> Program:
 
 
 class Viewer(Output):
-    """Feeds one program.
+    """Feeds one program. Who is late gets the newest whole packet next, and nothing of what waited before it.
 
     ``sparse``: with whole packets alone, for whoever is too slow for all of them.
     """
@@ -91,12 +92,28 @@ class Viewer(Output):
         self._sparse = sparse
         self._program = program
         self._encoder, self._notes = encoder, notes
+        self._lag = 0.0  # seconds, of the packet that was handed over last
+        self._sending: float | None = encoder.clock()  # time of what is being handed over
         self._process = self._start()
         self._thread.start()
 
+    @property
+    def lag(self) -> float:
+        """Seconds from when a frame was logged until the viewer's process has taken it.
+
+        What that process, and a browser behind it, still have before them is not known.
+        """
+        waiting, sending = self._packets.oldest, self._sending
+        if sending is None and waiting is not None:
+            sending = waiting.time
+        return self._lag if sending is None else self._encoder.clock() - sending
+
     def put(self, packet: Packet) -> None:
-        if packet.whole or not self._sparse:
-            super().put(packet)
+        if not packet.whole and self._sparse:
+            return
+        if packet.whole and self.lag > LATE:
+            self._packets.clear()
+        super().put(packet)
 
     def close(self, patience: float = 2.0) -> None:
         """Hand over what waits, if that is soon done. A window stays open, for the user to close."""
@@ -122,12 +139,19 @@ class Viewer(Output):
 
     def _run(self) -> None:
         self._begin(self._encoder.context)
+        self._sending = None
         super()._run()
         assert self._process.stdin is not None
         with suppress(OSError):
             self._process.stdin.close()
 
     def _take(self, packet: Packet, fresh: bool) -> bool:
+        self._sending = packet.time
+        taken = self._show(packet, fresh)
+        self._lag, self._sending = (self._encoder.clock() - packet.time if taken else 0.0), None
+        return taken
+
+    def _show(self, packet: Packet, fresh: bool) -> bool:
         if fresh and not self._send(self._encoder.prelude(packet.context, blueprint=False)):
             return self._recover(packet.context)
         return self._send(packet.data) or self._recover(packet.context)

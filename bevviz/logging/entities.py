@@ -223,6 +223,11 @@ def drops(where: str) -> str:
     return f"{HEALTH}/drops/{where}"
 
 
+def viewer_lag(name: str) -> str:
+    """From when a frame is logged until the process that shows it has taken it."""
+    return f"{HEALTH}/viewer_lag_ms/{name}"
+
+
 def process(what: str) -> str:
     """What the process itself takes."""
     return f"{HEALTH}/process/{what}"

@@ -179,6 +179,12 @@ def rates() -> rrb.TimeSeriesView:
     return plot("Rates, Hz", entities.rate(""))
 
 
+def latencies() -> rrb.TimeSeriesView:
+    """From a cloud's arrival until it is logged, and from there to the viewers."""
+    contents = [entities.latency("**"), entities.viewer_lag("**")]
+    return plot("Latency and lag of viewers, ms", entities.HEALTH, contents)
+
+
 def health() -> rrb.Tabs:
     return rrb.Tabs(stage_times(), clocks(), counts(), rates(), name="Health")
 

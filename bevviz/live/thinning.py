@@ -1,0 +1,97 @@
+"""What is left out on purpose, to make it lighter: scans, and points of scans."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from bevviz.config import Config
+from bevviz.frame import Frame, LateResult, Scene, Source
+
+
+class Thinned:
+    """A source without what the configuration leaves out on purpose: scans, and points of scans.
+
+    Args:
+        source: where the frames come from; with a method ``stop`` it is told when to end.
+        config: the one that is in force.
+        clock: seconds, for tests.
+    """
+
+    def __init__(
+        self, source: Source, config: Callable[[], Config], clock: Callable[[], float] = time.monotonic
+    ) -> None:
+        self.thinned = 0
+        self._source, self._config, self._clock = source, config, clock
+
+    @property
+    def scene(self) -> Scene:
+        return self._source.scene
+
+    @property
+    def total(self) -> int | None:
+        return self._source.total
+
+    @property
+    def warnings(self) -> Sequence[str]:
+        return self._source.warnings
+
+    @property
+    def dropped(self) -> int:
+        """That the source itself has left out."""
+        return int(getattr(self._source, "dropped", 0))
+
+    @property
+    def states(self) -> Mapping[str, str]:
+        """How each topic does, where the source has topics."""
+        return getattr(self._source, "states", {})
+
+    def overtaken(self) -> tuple[LateResult, ...]:
+        """The robot's own results that came too late for their frames, since the last call."""
+        overtaken = getattr(self._source, "overtaken", None)
+        return () if overtaken is None else tuple(overtaken())
+
+    def stop(self) -> None:
+        stop = getattr(self._source, "stop", None)
+        if stop is not None:
+            stop()
+
+    def __iter__(self) -> Iterator[Frame]:
+        earliest = 0.0
+        for number, frame in enumerate(self._source):
+            live, now = self._config().live, self._clock()
+            if number % live.every or now < earliest:
+                self.thinned += 1
+                continue
+            if live.max_rate is not None:
+                # Frames that come a little early keep their turn; a pause earns no burst.
+                earliest = max(earliest + 1 / live.max_rate, now - 0.5 / live.max_rate)
+            yield thin(frame, live.points)
+
+
+def thin(frame: Frame, points: int | None) -> Frame:
+    """The frame with so many points: one at random out of each of as many equal runs of its points.
+
+    A fixed step would fall on the same ring of the LiDAR again and again.
+    """
+    count = len(frame.points)
+    if points is None or count <= points:
+        return frame
+    rng = np.random.default_rng(frame.index)
+    edges = np.arange(points + 1) * count // points
+    rows = rng.integers(edges[:-1], edges[1:])
+    ends = np.cumsum([len(cloud.xyz) for cloud in frame.clouds])
+    clouds = []
+    for cloud, end in zip(frame.clouds, ends.tolist(), strict=True):
+        kept = rows[(rows >= end - len(cloud.xyz)) & (rows < end)] - (end - len(cloud.xyz))
+        fields = {name: values[kept] for name, values in cloud.fields.items()}
+        clouds.append(replace(cloud, xyz=cloud.xyz[kept], fields=fields))
+    return replace(
+        frame,
+        points=frame.points[rows],
+        fields={name: values[rows] for name, values in frame.fields.items()},
+        clouds=tuple(clouds),
+    )

@@ -1,0 +1,75 @@
+"""ROS graphs for tests: each of its own, whoever else tests on this machine."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import random
+import subprocess
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.ros_player import Play
+
+ROOT = Path(__file__).parents[1]
+DOMAINS = range(1, 102)  # the ports of higher ones are taken by the system
+PATIENCE = 180.0  # seconds for what takes one or two on an idle machine
+
+
+@contextmanager
+def own_domain() -> Iterator[str]:
+    """A domain that no other test uses meanwhile: in it nobody is met by chance."""
+    folder = Path(tempfile.gettempdir()) / "bevviz-test-domains"
+    folder.mkdir(exist_ok=True)
+    for number in random.sample(DOMAINS, len(DOMAINS)):
+        handle = os.open(folder / str(number), os.O_RDWR | os.O_CREAT, 0o666)
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            os.close(handle)
+            continue
+        try:
+            yield str(number)
+        finally:
+            os.close(handle)
+        return
+    raise RuntimeError(f"every domain is in use, see {folder}")
+
+
+@contextmanager
+def own_graph() -> Iterator[pytest.MonkeyPatch]:
+    """The environment of a graph of its own, on this machine only."""
+    with own_domain() as number, pytest.MonkeyPatch.context() as patch:
+        patch.setenv("ROS_DOMAIN_ID", number)
+        patch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+        yield patch
+
+
+@contextmanager
+def playing(play: Play) -> Iterator[None]:
+    """A robot in a process of its own."""
+    with subprocess.Popen(play.arguments(), cwd=ROOT, stdout=subprocess.PIPE, text=True) as process:
+        try:
+            assert process.stdout is not None and process.stdout.readline() == "playing\n"
+            yield
+        finally:
+            process.terminate()  # the graph learns of it at once, as of a node that is shut down
+
+
+def until(condition: Callable[[], Any], what: str) -> None:
+    """Wait for what is expected; how long it takes says nothing but how busy the machine is."""
+    end = time.monotonic() + PATIENCE
+    while not condition():
+        assert time.monotonic() < end, f"never: {what}"
+        time.sleep(0.05)
+
+
+def alone(folder: Path) -> dict[str, str]:
+    """The environment of a ``bevviz live`` that nobody else's is taken for: they are found by folders."""
+    return {"PYTHONPATH": str(ROOT), "XDG_RUNTIME_DIR": str(folder), "TMPDIR": str(folder)}
