@@ -625,6 +625,8 @@ def load(
         if not sep:
             raise UserError(f"--set {text}: expected key=value, for example --set clustering.eps=0.6")
         parsed = _yaml_value(value, f"--set {text}") if value.strip() else ""
+        if isinstance(parsed, int) and _is_text(key.strip()):  # 0001 is a name
+            parsed = value.strip()
         given.append((key.strip(), parsed, f"--set {text}"))
     given = [(TUTORIAL_NAMES.get(key, key), value, where) for key, value, where in given]
     chosen = preset or next((value for key, value, _ in reversed(given) if key == "preset"), "default")
@@ -671,6 +673,13 @@ def load(
     before = base.stated if isinstance(base, Config) else {}
     made._stated = {**before, **{key: where for key, where in origin.items() if where != BASE}}
     return made
+
+
+def _is_text(key: str) -> bool:
+    """Whether a parameter is a text, whatever is in it."""
+    section, _, name = key.partition(".")
+    model = Config.model_fields[section].annotation if section in Config.model_fields else None
+    return name in getattr(model, "model_fields", {}) and model.model_fields[name].annotation is str  # type: ignore[union-attr]
 
 
 def _params(stated: Mapping[str, Any], origin: Mapping[str, str]) -> dict[str, str]:

@@ -187,7 +187,6 @@ def test_a_derived_cloud_plays_where_there_is_no_other() -> None:
 @pytest.mark.parametrize(
     ("kind", "helps"),
     [
-        ("livox_ros_driver2/msg/CustomMsg", "set the driver's xfer_format to 0 for PointCloud2"),
         ("velodyne_msgs/msg/VelodyneScan", "play them through its driver and record its PointCloud2"),
         ("ouster_sensor_msgs/msg/PacketMsg", "play them through its driver"),
         ("nebula_msgs/msg/NebulaPackets", "play them through its driver"),

@@ -46,6 +46,7 @@ from bevviz.errors import UserError
 from bevviz.files import Scratch, bag_files, drive_files
 from bevviz.frame import I64
 from bevviz.ros import vision_msgs
+from bevviz.ros.livox import fields_of, is_livox, read_custom
 from bevviz.ros.messages import MessageError, read_header
 from bevviz.ros.roles import Topic
 from bevviz.text import path_text
@@ -241,7 +242,7 @@ class Recording(Closing):
         return np.sort(np.concatenate(parts))
 
     def decode(self, message: RawMessage) -> Any:
-        """The message as an object with the fields of its definition.
+        """The message as an object with the fields of its definition; Livox's clouds as a PointCloud2.
 
         Raises:
             MessageError: the data does not fit the definition, or there is none.
@@ -251,6 +252,9 @@ class Recording(Closing):
         try:
             data = message.content()
             store = self._store(connection)
+            if is_livox(msgtype):
+                fields = fields_of(store.fielddefs, msgtype)
+                return read_custom(data, ros1=is_ros1(connection), fields=fields)
             if is_ros1(connection):
                 return store.deserialize_ros1(data, msgtype)
             return store.deserialize_cdr(data, msgtype)
@@ -309,7 +313,7 @@ class Recording(Closing):
         try:
             _, fields = self._store(connection).fielddefs[normalized(connection.msgtype)]
         except KeyError:
-            return False
+            return is_livox(connection.msgtype)
         return bool(fields) and fields[0][1][1] == "std_msgs/msg/Header"
 
     def _frame_id(self, topic: str) -> str:

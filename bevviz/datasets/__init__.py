@@ -12,7 +12,7 @@ from importlib import import_module
 from pathlib import Path
 from pkgutil import iter_modules
 
-from bevviz.datasets.dataset import Dataset
+from bevviz.datasets.dataset import NOT_AS_DOCUMENTED, Dataset, describe
 from bevviz.errors import UserError
 
 
@@ -53,4 +53,9 @@ def open_dataset(path: Path, name: str = "", sequence: str = "") -> Dataset | No
         near = difflib.get_close_matches(name, loaders(), n=1)
         hint = f"did you mean {near[0]}? There are" if near else "there are"
         raise UserError(f"--dataset {name}: {hint} {', '.join(loaders())}")
-    return None if loader is None else loader(path, sequence)
+    if loader is None:
+        return None
+    try:
+        return loader(path, sequence)
+    except NOT_AS_DOCUMENTED as error:
+        raise UserError(f"{path}: not as {loader.about} is documented ({describe(error)})") from error

@@ -10,13 +10,22 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from bevviz.errors import UserError
+from bevviz.errors import UserError, first_line
 from bevviz.frame import F32, I64
 
 SECOND = 1_000_000_000
 XYZI = np.dtype([(name, "<f4") for name in ("x", "y", "z", "intensity")])
 BOXES = "bevviz_msgs/msg/Detection3DArray"
 IMAGES = (".png", ".jpg", ".jpeg", ".webp")
+
+
+# What a loader raises where a file holds something else than its data set documents.
+NOT_AS_DOCUMENTED = (KeyError, IndexError, TypeError, ValueError, AttributeError, OverflowError)
+
+
+def describe(error: Exception) -> str:
+    """In a few words."""
+    return f"{type(error).__name__}: {first_line(error)}"
 
 
 @dataclass(frozen=True, slots=True)

@@ -159,17 +159,17 @@ def read_tracklets(file: Path) -> dict[int, LabelledBoxes3D]:
             for later, pose in enumerate(item.findall("poses/item")):
                 x, y, z, turn = (float(_text(pose, name)) for name in ("tx", "ty", "tz", "rz"))
                 # A place is the middle of the bottom.
-                values = [x, y, z + height / 2, length, width, height, turn]
-                rows[first + later].append((kind, str(number), values))
+                row = [x, y, z + height / 2, length, width, height, turn]
+                rows[first + later].append((kind, str(number), row))
     except (ElementTree.ParseError, ValueError) as error:
         raise UserError(f"{file}: no tracklets as KITTI writes them: {error}") from None
     found = {}
     for scan, there in rows.items():
-        labels, ids, places = zip(*there, strict=True)
-        table = np.array(places, np.float32)
-        boxes = Boxes3D(table[:, :3], table[:, 3:6], table[:, 6])
+        labels, ids, values = zip(*there, strict=True)
+        boxed = np.array(values, np.float32)
+        boxes = Boxes3D(boxed[:, :3], boxed[:, 3:6], boxed[:, 6])
         ones = np.ones(len(labels), np.float32)
-        found[scan] = LabelledBoxes3D(str(file), 0, "", boxes, labels, ones, ids=ids)
+        found[scan] = LabelledBoxes3D(str(file), 0, "", boxes, tuple(labels), ones, ids=tuple(ids))
     return found
 
 

@@ -13,7 +13,7 @@ from rosbags.interfaces import (
     MessageDefinitionFormat,
 )
 
-from bevviz.datasets.dataset import Dataset
+from bevviz.datasets.dataset import NOT_AS_DOCUMENTED, Dataset, describe
 from bevviz.errors import UserError
 from bevviz.frame import I64
 from bevviz.ros.encode import typestore
@@ -62,6 +62,10 @@ class DatasetReader:
                 data = typestore().serialize_cdr(stream.make(int(row[i])), stream.type)
             except UserError as error:
                 self._dataset.warn(str(error))
+            except NOT_AS_DOCUMENTED as error:
+                self._dataset.warn(
+                    f"{stream.topic}: not as {self._dataset.about} is documented ({describe(error)})"
+                )
             yield self.connections[int(of[i])], int(at[i]), data
 
     def times(self, ids: Collection[int]) -> I64:

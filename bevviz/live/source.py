@@ -20,6 +20,7 @@ from bevviz.queues import NewestQueue
 from bevviz.ros import around
 from bevviz.ros.encode import typestore
 from bevviz.ros.graph import PublishedTopic, full_name, matched_qos, mismatches, published_topics
+from bevviz.ros.livox import is_livox, read_custom
 from bevviz.ros.messages import MessageError, read_header
 from bevviz.ros.node import Node
 from bevviz.ros.roles import MARK, STAGE_KINDS, Roles, Topic, find_roles, foreign
@@ -67,6 +68,8 @@ class LiveMessage:
             MessageError: the data does not fit the definition.
         """
         try:
+            if is_livox(self.type):
+                return read_custom(self.data, ros1=False)
             return typestore().deserialize_cdr(self.data, self.type)
         except Exception as error:  # generated decoders raise whatever the bytes lead them to
             reason = str(error) or type(error).__name__
@@ -476,7 +479,9 @@ class LiveSource(Closing):
 
 def _concerns(topic: PublishedTopic) -> bool:
     """Whether a topic can play a role, or holds what could, in a form that nothing here reads."""
-    return topic.type in KINDS or bool(foreign(Topic(topic.name, topic.type, None, "")))
+    return (
+        topic.type in KINDS or is_livox(topic.type) or bool(foreign(Topic(topic.name, topic.type, None, "")))
+    )
 
 
 def _stated(config: Config, resolve: Callable[[str], str]) -> dict[str, tuple[str, tuple[str, ...]]]:

@@ -15,6 +15,7 @@ from bevviz.config import SourceConfig
 from bevviz.errors import UserError
 from bevviz.frame import Scene
 from bevviz.logging.entities import RESERVED
+from bevviz.ros.livox import is_livox
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,8 +31,8 @@ class Topic:
 
     @property
     def kind(self) -> str:
-        """The type without its package: PointCloud2."""
-        return self.type.rpartition("/")[2]
+        """What it is read as: the type without its package, or PointCloud2 for Livox's own clouds."""
+        return "PointCloud2" if is_livox(self.type) else self.type.rpartition("/")[2]
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,11 +96,6 @@ MANY = 12  # topics; more are not listed in a sentence
 VIDEO = "video, which is not decoded here: republish it as images (image_transport) and record these"
 _FOREIGN = (  # what holds points or pixels in a form that nothing here reads, and what would help
     ("camera", re.compile(r"video|ffmpeg|theora|h26[45]", re.IGNORECASE), VIDEO),
-    (
-        "LiDAR",
-        re.compile(r"livox.*/CustomMsg$", re.IGNORECASE),
-        "Livox's own kind of cloud: set the driver's xfer_format to 0 for PointCloud2, and record that",
-    ),
     (
         "LiDAR",
         re.compile(

@@ -1,0 +1,264 @@
+"""A scene of nuScenes (Caesar et al. 2020), or of a set with its tables; the devkit is not needed."""
+
+from __future__ import annotations
+
+import json
+from collections import defaultdict
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from bevviz import geometry
+from bevviz.datasets.dataset import Dataset, Stream, columns_of, read_bytes
+from bevviz.errors import UserError
+from bevviz.frame import F32, F64, I64, Boxes3D, Intrinsics
+from bevviz.ros.encode import (
+    encode_compressed_image,
+    encode_intrinsics,
+    encode_labels,
+    encode_points,
+    encode_transforms,
+)
+
+MAP, BASE = "map", "base_link"
+TABLES = "sample_data.json"
+FIELDS = ("x", "y", "z", "intensity", "ring")
+PIECE = 1 << 22  # characters of a table that are read at once: the largest has a gigabyte
+CLASSES = {  # of the detection task; what belongs to none of them is left out, as there
+    "movable_object.barrier": "barrier",
+    "movable_object.trafficcone": "traffic_cone",
+    "vehicle.bicycle": "bicycle",
+    "vehicle.bus.bendy": "bus",
+    "vehicle.bus.rigid": "bus",
+    "vehicle.car": "car",
+    "vehicle.construction": "construction_vehicle",
+    "vehicle.motorcycle": "motorcycle",
+    "vehicle.trailer": "trailer",
+    "vehicle.truck": "truck",
+    "human.pedestrian.adult": "pedestrian",
+    "human.pedestrian.child": "pedestrian",
+    "human.pedestrian.construction_worker": "pedestrian",
+    "human.pedestrian.police_officer": "pedestrian",
+}
+Record = Mapping[str, Any]
+
+
+class NuScenes(Dataset):
+    """``v1.0-mini/*.json`` with ``samples`` and ``sweeps`` beside; one scene is a drive."""
+
+    name = "nuscenes"
+    about = "nuScenes"
+    expects = "v1.0-mini/sample_data.json, and samples and sweeps beside v1.0-mini"
+
+    @classmethod
+    def fits(cls, path: Path) -> bool:
+        return (path / TABLES).is_file() or any(path.glob(f"v*/{TABLES}"))
+
+    def __init__(self, path: Path, sequence: str) -> None:
+        super().__init__(path, sequence)
+        root = path
+        if (path / TABLES).is_file():
+            versions, root = [path], path.parent
+        else:
+            versions = sorted(found.parent for found in path.glob(f"v*/{TABLES}"))
+        scenes = {row["name"]: (row, tables) for tables in versions for row in records(tables / "scene.json")}
+        scene, tables = scenes[self.one_of(sorted(scenes))]
+        samples = _by_token(tables, "sample", lambda row: row["scene_token"] == scene["token"])
+        data = _by_token(tables, "sample_data", lambda row: row["sample_token"] in samples)
+        mounted = _chosen(
+            tables, "calibrated_sensor", {row["calibrated_sensor_token"] for row in data.values()}
+        )
+        sensors = _by_token(tables, "sensor", lambda row: True)
+        poses = _chosen(tables, "ego_pose", {row["ego_pose_token"] for row in data.values()})
+        taken: dict[str, list[Record]] = defaultdict(list)
+        lost = []
+        for row in sorted(data.values(), key=lambda row: row["timestamp"]):
+            sensor = sensors[mounted[row["calibrated_sensor_token"]]["sensor_token"]]
+            if sensor["modality"] == "radar":
+                continue
+            if (root / row["filename"]).is_file():
+                taken[sensor["channel"]].append(row)
+            else:
+                lost.append(row["filename"])
+        if lost:
+            self.warn(f"{len(lost)} files of the scene are not there, the first: {lost[0]}")
+        edges, clouds, images = [], list[Stream](), list[Stream]()
+        keys: dict[str, int] = {}  # sample -> stamp of its scan
+        for channel, rows in sorted(taken.items()):
+            calibration = mounted[rows[0]["calibrated_sensor_token"]]
+            pose = _pose(calibration)
+            times = 1000 * np.array([row["timestamp"] for row in rows], np.int64)
+            files = [root / row["filename"] for row in rows]
+            if sensors[calibration["sensor_token"]]["modality"] == "lidar":
+                turns = round(geometry.yaw(pose) / (np.pi / 2))
+                pose = pose @ _quarter_turns(-turns)
+                clouds.append(self._clouds(channel, times, files, turns))
+                keys |= {
+                    r["sample_token"]: int(t) for r, t in zip(rows, times, strict=True) if r["is_key_frame"]
+                }
+            else:
+                images += self._images(channel, times, files, calibration)
+            edges.append((BASE, channel, pose))
+        if not clouds:
+            raise UserError(
+                f"{root}: no LiDAR scan of {scene['name']} is there; its tables name {len(lost)} files"
+            )
+        self.streams = [
+            Stream(
+                "/tf_static",
+                "tf2_msgs/msg/TFMessage",
+                clouds[0].times[:1],
+                lambda _: encode_transforms(int(clouds[0].times[0]), edges),
+            ),
+            _places([poses[row["ego_pose_token"]] for rows in taken.values() for row in rows]),
+            *images,
+            *self._truth(tables, keys),
+            *clouds,
+        ]
+
+    def _clouds(self, channel: str, times: I64, files: Sequence[Path], turns: int) -> Stream:
+        """Scans of five float32 a point, turned by quarters of a circle so that x is ahead."""
+        step = 4 * len(FIELDS)
+        self.check_sizes(files, step)
+
+        def make(row: int) -> Any:
+            values = np.frombuffer(read_bytes(files[row]), "<f4")
+            points = values[: len(values) // len(FIELDS) * len(FIELDS)].reshape(-1, len(FIELDS))
+            return encode_points(int(times[row]), channel, columns_of(_turned(points, turns), FIELDS))
+
+        return Stream(f"/{channel}/points", "sensor_msgs/msg/PointCloud2", times, make)
+
+    def _images(
+        self, channel: str, times: I64, files: Sequence[Path], calibration: Record
+    ) -> Iterator[Stream]:
+        """They are rectified."""
+        matrix = np.array(calibration["camera_intrinsic"], np.float64)
+        if matrix.shape != (3, 3):
+            raise UserError(f"{self.path}: calibrated_sensor.json has no camera_intrinsic for {channel}")
+
+        def info(row: int) -> Any:
+            return encode_intrinsics(int(times[row]), channel, Intrinsics(0, 0, matrix))
+
+        def picture(row: int) -> Any:
+            kind = files[row].suffix.lstrip(".").replace("jpg", "jpeg")
+            return encode_compressed_image(int(times[row]), channel, read_bytes(files[row]), kind)
+
+        yield Stream(f"/{channel}/camera_info", "sensor_msgs/msg/CameraInfo", times[:1], info)
+        topic = f"/{channel}/image_rect/compressed"
+        yield Stream(topic, "sensor_msgs/msg/CompressedImage", times, picture)
+
+    def _truth(self, tables: Path, keys: Mapping[str, int]) -> Iterator[Stream]:
+        """What is labelled at the key frames, in the map."""
+        if not (tables / "sample_annotation.json").is_file():
+            return
+        labelled: dict[str, list[Record]] = defaultdict(list)
+        for row in records(tables / "sample_annotation.json"):
+            if row["sample_token"] in keys:
+                labelled[row["sample_token"]].append(row)
+        wanted = {row["instance_token"] for rows in labelled.values() for row in rows}
+        instances = _chosen(tables, "instance", wanted)
+        categories = {row["token"]: row["name"] for row in records(tables / "category.json")}
+        order = sorted((time, sample) for sample, time in keys.items())
+        times = np.array([time for time, _ in order], np.int64)
+
+        def make(at: int) -> Any:
+            stamp, sample = order[at]
+            rows = [
+                (row, categories[instances[row["instance_token"]]["category_token"]])
+                for row in labelled[sample]
+            ]
+            known = [(row, CLASSES[name]) for row, name in rows if name in CLASSES]
+            boxes = Boxes3D(
+                np.array([row["translation"] for row, _ in known], np.float32).reshape(-1, 3),
+                np.array([np.array(row["size"])[[1, 0, 2]] for row, _ in known], np.float32).reshape(-1, 3),
+                np.array([geometry.yaw(_pose(row)) for row, _ in known], np.float32),
+            )
+            ids = [row["instance_token"] for row, _ in known]
+            return encode_labels(stamp, MAP, boxes, [label for _, label in known], ids)
+
+        yield Stream("/ground_truth", "vision_msgs/msg/Detection3DArray", times, make)
+
+
+def _places(poses: Sequence[Record]) -> Stream:
+    """Where the vehicle is, by stamp."""
+    placed = {1000 * int(row["timestamp"]): row for row in poses}
+    times = np.array(sorted(placed), np.int64)
+
+    def make(row: int) -> Any:
+        stamp = int(times[row])
+        return encode_transforms(stamp, [(MAP, BASE, _pose(placed[stamp]))])
+
+    return Stream("/tf", "tf2_msgs/msg/TFMessage", times, make)
+
+
+def _pose(row: Record) -> F64:
+    """(4, 4) of a translation and a quaternion w, x, y, z."""
+    w, x, y, z = row["rotation"]
+    return geometry.transform(row["translation"], (x, y, z, w))
+
+
+def _quarter_turns(number: int) -> F64:
+    """(4, 4) rotation about z."""
+    pose = np.eye(4)
+    c, s = ((1, 0), (0, 1), (-1, 0), (0, -1))[number % 4]
+    pose[:2, :2] = [[c, -s], [s, c]]
+    return pose
+
+
+def _turned(points: F32, turns: int) -> F32:
+    """The points turned by quarters of a circle: every coordinate keeps its digits."""
+    x, y = points[:, 0], points[:, 1]
+    turned = points.copy()
+    turned[:, 0], turned[:, 1] = ((x, y), (-y, x), (-x, -y), (y, -x))[turns % 4]
+    return turned
+
+
+# --- tables ------------------------------------------------------------------------------------
+
+
+def records(table: Path) -> Iterator[dict[str, Any]]:
+    """The rows of a table, one after the other: of the largest, a gigabyte, little is in memory.
+
+    Raises:
+        UserError: it is missing, cut, or no list of objects.
+    """
+    decoder, buffer, at = json.JSONDecoder(), "", 0
+    try:
+        with table.open(encoding="utf-8") as file:
+            while True:
+                while at < len(buffer) and buffer[at] in "[, \t\r\n":
+                    at += 1
+                if at < len(buffer) and buffer[at] == "]":
+                    return
+                try:
+                    row, at = decoder.raw_decode(buffer, at)
+                    yield row
+                    continue
+                except json.JSONDecodeError:
+                    more = file.read(PIECE)
+                if not more:
+                    raise UserError(f"{table}: is cut, or no table of nuScenes")
+                buffer, at = buffer[at:] + more, 0
+    except OSError as error:
+        raise UserError(f"{table}: cannot be read: {error.strerror}") from None
+    except UnicodeDecodeError:
+        raise UserError(f"{table}: is no text") from None
+
+
+def _by_token(tables: Path, name: str, chosen: Any) -> dict[str, Record]:
+    """The rows that are chosen, by their token."""
+    return {row["token"]: row for row in records(tables / f"{name}.json") if chosen(row)}
+
+
+def _chosen(tables: Path, name: str, tokens: Collection[str]) -> dict[str, Record]:
+    """The rows with these tokens.
+
+    Raises:
+        UserError: one is missing.
+    """
+    found = _by_token(tables, name, lambda row: row["token"] in tokens)
+    if missing := set(tokens) - found.keys():
+        raise UserError(f"{tables / name}.json: no row {min(missing)}, which another table names")
+    return found

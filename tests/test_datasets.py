@@ -1,0 +1,451 @@
+"""Folders of data sets, held against the sets' own readers where there are any, else their documents."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pykitti  # type: ignore[import-untyped]
+import pytest
+
+import bevviz
+from bevviz import geometry
+from bevviz.cli import main
+from bevviz.drive import Drive
+from bevviz.evaluate import truth_in
+from bevviz.frame import F64, Boxes3D, Frame
+from tests import datasets
+
+Capture = pytest.CaptureFixture[str]
+STILL = {"sync.motion_compensation": False}
+
+
+def frames_of(drive: Drive) -> list[Frame]:
+    return [drive.raw(i) for i in range(len(drive))]
+
+
+def corners(frame: Frame) -> F64:
+    """(8, 3) of the only labelled box, in the frame of the points."""
+    truth = frame.truth
+    assert truth is not None
+    return np.asarray(geometry.corners(truth.boxes)[0], np.float64)
+
+
+# --- KITTI -------------------------------------------------------------------------------------
+
+
+def test_a_raw_drive_is_what_pykitti_reads(tmp_path: Path) -> None:
+    path = datasets.kitti_raw(tmp_path)
+    theirs = pykitti.raw(str(tmp_path), "2011_09_26", "0001")
+    with bevviz.open(path, set=STILL) as drive:
+        frames = frames_of(drive)
+        assert drive.warnings == []
+    assert len(frames) == 3  # the third scan is missing
+    for frame, number in zip(frames, (0, 1, 3), strict=True):
+        np.testing.assert_array_equal(
+            np.column_stack([frame.points, frame.fields["intensity"]]), datasets.scan(number)
+        )
+        assert frame.stamp == 1317042145_000000000 + number * 100_000_000  # 2011-09-26 13:02:25 UTC
+        (camera,) = frame.cameras
+        assert camera.image is not None
+        assert camera.intrinsics is not None
+        assert camera.camera_from_points is not None
+        assert camera.image.stamp == frame.stamp + 2_000_000
+        np.testing.assert_array_equal(camera.image.bgr[..., ::-1], np.asarray(theirs.get_cam2(number)))
+        np.testing.assert_allclose(camera.camera_from_points, theirs.calib.T_cam2_velo, atol=1e-6)
+        np.testing.assert_allclose(camera.intrinsics.K, theirs.calib.K_cam2)
+    # Positions come 7 ms after the scans; at their own time they are pykitti's, counted from the first.
+    first = np.linalg.inv(theirs.oxts[0].T_w_imu)
+    imu_from_velo = np.linalg.inv(theirs.calib.T_velo_imu)
+    with bevviz.open(
+        path, set={"sync.motion_compensation": False, "sync.offsets": {"/velodyne_points": 0.007}}
+    ) as drive:
+        for frame, number in zip(frames_of(drive), (0, 1, 3), strict=True):
+            expected = first @ theirs.oxts[number].T_w_imu @ imu_from_velo
+            np.testing.assert_allclose(frame.pose, expected, atol=1e-5)
+
+
+def test_tracklets_are_where_they_are_labelled(tmp_path: Path) -> None:
+    with bevviz.open(datasets.kitti_raw(tmp_path)) as drive:
+        frames = frames_of(drive)
+        truth = truth_in(drive.frames)(frames[2])
+    assert frames[0].truth is not None
+    assert len(frames[0].truth.boxes) == 0  # nothing is labelled yet, which is known
+    assert frames[1].truth is not None
+    assert frames[1].truth.labels == ("Car",)
+    assert frames[1].truth.ids == frames[2].truth.ids == ("0",)  # type: ignore[union-attr]
+    c, s = np.cos(0.25), np.sin(0.25)
+    turn = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+    local = np.array([[x, y, z] for x in (-2, 2) for y in (-0.8, 0.8) for z in (0, 1.5)])
+    expected = local @ turn.T + [15, 0, -1.7]  # of the fourth frame: 12 m, and 1 m a frame
+    found = corners(frames[2])
+    np.testing.assert_allclose(
+        found[np.lexsort(found.round(3).T)], expected[np.lexsort(expected.round(3).T)], atol=1e-4
+    )
+    assert truth is not None
+    assert truth.must.tolist() == [True]
+
+
+def test_a_raw_drive_is_seen_by_info(tmp_path: Path, capsys: Capture) -> None:
+    path = datasets.kitti_raw(tmp_path)
+    assert main(["info", str(path)]) == 0
+    said = capsys.readouterr().out
+    assert "KITTI raw drive" in said
+    assert "/image_00/image_rect/compressed: not used: grey, beside a colour camera" in said
+    assert "fixed frame of 'velodyne': map" in said
+    assert re.search(r"missing for a full run\n  no detector", said)
+
+
+def test_a_grey_camera_that_is_asked_for_is_used(tmp_path: Path) -> None:
+    path = datasets.kitti_raw(tmp_path)
+    theirs = pykitti.raw(str(tmp_path), "2011_09_26", "0001")
+    grey = {"source.camera_topics": ["/image_00/image_rect/compressed"], **STILL}
+    with bevviz.open(path, set=grey) as drive:
+        (camera,) = drive.raw(0).cameras
+    assert camera.camera_from_points is not None
+    np.testing.assert_allclose(camera.camera_from_points, theirs.calib.T_cam0_velo, atol=1e-6)
+
+
+def test_a_tracking_sequence(tmp_path: Path, capsys: Capture) -> None:
+    root = datasets.kitti_tracking(tmp_path)
+    theirs = pykitti.tracking(str(root), "0000")
+    with bevviz.open(root, set={"source.sequence": "0000"}) as drive:
+        frames = frames_of(drive)
+    assert [frame.stamp for frame in frames] == [1_000_000_000, 1_100_000_000, 1_300_000_000]
+    for row, (frame, number) in enumerate(zip(frames, (0, 1, 3), strict=True)):
+        np.testing.assert_array_equal(frame.points, theirs.get_velo(row)[:, :3])
+        camera, truth = frame.cameras[0], frame.truth
+        assert camera.image is not None
+        assert camera.camera_from_points is not None
+        np.testing.assert_array_equal(camera.image.bgr[..., ::-1], np.asarray(theirs.get_cam2(number)))
+        assert truth is not None
+        assert truth.image is not None
+        assert truth.ids == ("7",)
+        np.testing.assert_array_equal(truth.image.xyxy, [[20, 10, 60, 30]])
+        np.testing.assert_array_equal(truth.image.dont_care, [[80, 0, 99, 20]])
+        # By the benchmark's words: the bottom's middle in the rectified reference camera.
+        rectified = datasets.matrix(datasets.R_RECT) @ datasets.matrix(datasets.TR, 4)
+        center = rectified @ [*truth.boxes.center[0].tolist(), 1.0]
+        np.testing.assert_allclose(center, [0.1, 1.7 - 0.75, 12.0 + number], atol=1e-4)
+    # By that of one sequence it is the same drive.
+    with bevviz.open(root / "velodyne/0000") as drive:
+        assert len(drive) == 3
+    assert main(["info", str(root)]) == 2
+    assert "2 drives; choose with --sequence NAME; there are 0000, 0001" in capsys.readouterr().err
+    assert main(["info", str(root), "--sequence", "0007"]) == 2
+    assert "there is no --sequence 0007; there are 0000, 0001" in capsys.readouterr().err
+
+
+def test_tracking_is_evaluated_and_swept(tmp_path: Path, capsys: Capture) -> None:
+    root = str(datasets.kitti_tracking(tmp_path))
+    report = tmp_path / "found.json"
+    assert main(["evaluate", root, "--sequence", "0001", "--json", str(report)]) in (0, 1)
+    metrics = json.loads(report.read_text())["metrics"]
+    assert metrics["missed"] == 3  # of each scan its car: no detector is there to name it
+    assert main(["sweep", root, "--sequence", "0001", "--set", "clustering.eps=0.4:0.6:0.2"]) == 0
+    assert "recall" in capsys.readouterr().out
+
+
+def test_a_sequence_of_the_odometry_benchmark_is_what_pykitti_reads(tmp_path: Path) -> None:
+    sequence = datasets.kitti_odometry(tmp_path)
+    theirs = pykitti.odometry(str(tmp_path), "00")
+    with bevviz.open(sequence) as drive:
+        frames = frames_of(drive)
+    for number, frame in enumerate(frames):
+        np.testing.assert_array_equal(
+            np.column_stack([frame.points, frame.fields["intensity"]]), theirs.get_velo(number)
+        )
+        later = (frame.stamp - frames[0].stamp) * 1e-9
+        assert later == pytest.approx(theirs.timestamps[number].total_seconds(), abs=1e-6)
+        camera = frame.cameras[0]
+        assert camera.camera_from_points is not None
+        np.testing.assert_allclose(camera.camera_from_points, theirs.calib.T_cam2_velo, atol=1e-6)
+        moved = np.linalg.inv(theirs.calib.T_cam0_velo) @ theirs.poses[number] @ theirs.calib.T_cam0_velo
+        np.testing.assert_allclose(frame.pose, moved, atol=1e-6)
+
+
+def test_semantic_kitti_has_objects_and_ground(tmp_path: Path, capsys: Capture) -> None:
+    datasets.kitti_odometry(tmp_path)
+    with bevviz.open(tmp_path) as drive:
+        frame = drive.raw(1)
+        truth = truth_in(drive.frames)(frame)
+    assert np.unique(frame.fields["label"]).tolist() == [0, 40, 5 << 16 | 252]
+    assert truth is not None
+    assert truth.labels == ("car",)
+    np.testing.assert_allclose(truth.boxes.center, [[13, 0, -0.9]], atol=0.05)
+    np.testing.assert_allclose(truth.boxes.size, [[4, 1.6, 1.4]], atol=0.1)
+    # No point of the object is outside of its box.
+    mine = frame.fields["label"] >> 16 == 5
+    grown = Boxes3D(truth.boxes.center, truth.boxes.size + np.float32(1e-3), truth.boxes.yaw)
+    assert geometry.inside(frame.points[mine], grown, 0).all()
+    assert main(["evaluate", str(tmp_path)]) == 0
+    said = capsys.readouterr().out
+    assert re.search(r"^car +3 +0 +3", said, re.MULTILINE)
+    assert "ground" in said
+
+
+def test_real_frames_as_a_sequence(shared: Path) -> None:
+    with bevviz.open(shared / "kitti_drive") as drive:
+        assert len(drive) == 25
+        frame = drive.raw(24)
+    expected = np.fromfile(shared / "kitti_drive/velodyne/000024.bin", "<f4").reshape(-1, 4)
+    np.testing.assert_array_equal(frame.points, expected[:, :3])
+    image = frame.cameras[0].image
+    assert image is not None
+    assert image.encoded == (shared / "kitti_drive/image_2/000024.png").read_bytes()
+
+
+def test_a_missed_object_is_asked_about(shared: Path, capsys: Capture) -> None:
+    model = str(shared / "models/yolox_nano.onnx")
+    command = ["why", str(shared / "kitti"), "--at-frame", "1", "--model", model, "--class", "Cyclist"]
+    assert main(command) == 0
+    assert "cyclist" in capsys.readouterr().out.lower()
+    assert main(["why", str(shared / "kitti"), "--at", "3", "--model", model]) == 2
+    assert "single frames, which have no times; give a number" in capsys.readouterr().err
+
+
+# --- nuScenes ----------------------------------------------------------------------------------
+
+
+def test_a_scene_of_nuscenes_is_what_its_devkit_reads(tmp_path: Path) -> None:
+    """The reference is what nuscenes-devkit 1.2.0 makes of the same folder, see references/README.md."""
+    expected = json.loads((Path(__file__).parent / "references/metrics/nuscenes_devkit.json").read_text())
+    root = datasets.nuscenes(tmp_path)
+    with bevviz.open(root, set={"source.sequence": "scene-0061"}) as drive:
+        frames = frames_of(drive)
+        assert drive.warnings == []
+    assert [str(frame.stamp) for frame in frames] == [f"{stamp}000" for stamp in expected]
+    for frame, there in zip(frames, expected.values(), strict=True):
+        some, camera = frame.points[::40][:5], frame.cameras[0]
+        np.testing.assert_allclose(geometry.apply(frame.pose, some), there["map"], atol=2e-4)
+        assert camera.camera_from_points is not None
+        seen = geometry.apply(camera.camera_from_points, some)
+        np.testing.assert_allclose(seen, there["camera"], atol=2e-4)
+        assert frame.fields["ring"][:3].tolist() == [0, 1, 2]
+        if not there["boxes"]:
+            assert frame.truth is None  # a sweep between key frames
+            continue
+        (box,) = there["boxes"]  # the animal is of no class of the detection task
+        assert frame.truth is not None
+        assert frame.truth.labels == (box["name"],) == ("car",)
+        assert frame.truth.ids == (box["instance"],)
+        assert frame.truth.world_from_boxes is not None
+        mine = geometry.apply(frame.truth.world_from_boxes, corners(frame))
+        theirs = np.array(box["corners"])
+        np.testing.assert_allclose(
+            mine[np.lexsort(mine.round(2).T)], theirs[np.lexsort(theirs.round(2).T)], atol=1e-3
+        )
+
+
+def test_what_is_ahead_is_ahead_in_nuscenes(tmp_path: Path) -> None:
+    """Its LiDAR has x to the right: the points are turned, digit by digit the same."""
+    root = datasets.nuscenes(tmp_path)
+    with bevviz.open(root, set={"source.sequence": "scene-0061"}) as drive:
+        np.testing.assert_array_equal(drive.raw(0).points, datasets.scan(0)[:, :3] * [1, -1, 1])
+
+
+def test_nuscenes_from_its_tables_folder_and_with_lost_files(tmp_path: Path, capsys: Capture) -> None:
+    root = datasets.nuscenes(tmp_path)
+    assert main(["info", str(root)]) == 2
+    assert "choose with --sequence NAME; there are scene-0061, scene-0103" in capsys.readouterr().err
+    next((root / "sweeps/LIDAR_TOP").glob("*")).unlink()
+    assert main(["info", str(root / "v1.0-mini"), "--sequence", "scene-0061"]) in (0, 2)
+    said = capsys.readouterr().out
+    assert "format  nuScenes" in said
+    (root / "v1.0-mini/ego_pose.json").write_text('[{"token": "LIDAR_TOP-0-0", "timest')
+    assert main(["info", str(root), "--sequence", "scene-0061"]) == 2
+    assert "ego_pose.json: is cut, or no table of nuScenes" in capsys.readouterr().err
+
+
+def test_nuscenes_is_evaluated(tmp_path: Path, capsys: Capture) -> None:
+    root = datasets.nuscenes(tmp_path)
+    report = tmp_path / "found.json"
+    assert main(["evaluate", str(root), "--sequence", "scene-0061", "--json", str(report)]) == 0
+    assert json.loads(report.read_text())["metrics"]["missed"] == 2  # no detector
+    assert "2 frames, 1 without truth left out" in capsys.readouterr().out
+
+
+# --- a plain folder ----------------------------------------------------------------------------
+
+
+def plain(root: Path) -> Path:
+    """Two clouds of three points in each format, and images."""
+    for folder in ("top", "front"):
+        (root / folder).mkdir(parents=True)
+    for i, stamp in enumerate(("1700000000.100000000", "1700000000.200000000")):
+        head = (
+            "# .PCD v0.7\nVERSION 0.7\nFIELDS x y z intensity\nSIZE 4 4 4 4\nTYPE F F F F\nCOUNT 1 1 1 1\n"
+            "WIDTH 3\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS 3\n"
+        )
+        if i == 0:
+            (root / f"top/{stamp}.pcd").write_text(head + "DATA ascii\n1 2 3 4\n5 6 7 8\n9 10 11 12\n")
+        else:
+            body = np.arange(1, 13, dtype="<f4").tobytes()
+            (root / f"top/{stamp}.pcd").write_bytes(head.encode() + b"DATA binary\n" + body)
+        datasets.image(root / f"front/{stamp}.png", 80 * i)
+    return root
+
+
+POINTS = np.arange(1, 13, dtype=np.float32).reshape(3, 4)
+
+
+def test_a_folder_of_clouds_and_images(tmp_path: Path) -> None:
+    root = plain(tmp_path)
+    (root / "calibration.yaml").write_text(
+        "cameras:\n  front:\n    K: [100, 0, 62, 0, 100, 19, 0, 0, 1]\n"
+        "    pose: [0.5, 0, -0.2, -0.5, 0.5, -0.5, 0.5]\n"
+    )
+    (root / "poses.txt").write_text(
+        "# stamp\n".replace("# stamp\n", "") + "".join(f"1700000000.{i} {i} 0 0 0 0 0 1\n" for i in (1, 2))
+    )
+    with bevviz.open(root) as drive:
+        frames = frames_of(drive)
+        assert drive.warnings == []
+    for i, frame in enumerate(frames, 1):
+        assert frame.stamp == 1_700_000_000_000_000_000 + i * 100_000_000
+        np.testing.assert_array_equal(frame.points, POINTS[:, :3])
+        np.testing.assert_array_equal(frame.fields["intensity"], POINTS[:, 3])
+        (camera,) = frame.cameras
+        assert camera.name == "front"
+        assert camera.camera_from_points is not None
+        # Seen from half a metre ahead and 20 cm below: x ahead is z, left is -x, up is -y.
+        np.testing.assert_allclose(
+            geometry.apply(camera.camera_from_points, np.array([[10.5, 2, 0.8]])), [[-2, -1, 10]], atol=1e-5
+        )
+        np.testing.assert_allclose(frame.pose[:3, 3], [i, 0, 0])
+
+
+@pytest.mark.parametrize("form", ["bin", "npy", "ply", "ply-ascii"])
+def test_formats_of_clouds(tmp_path: Path, form: str) -> None:
+    """Two frames by number; PLY as its document has it."""
+    for i in range(2):
+        file = tmp_path / f"{i:06d}.{form[:3]}"
+        if form == "bin":
+            POINTS.tofile(file)
+        elif form == "npy":
+            np.save(file, POINTS)
+        else:
+            kind = "ascii" if form == "ply-ascii" else "binary_little_endian"
+            head = f"ply\nformat {kind} 1.0\nelement vertex 3\n"
+            head += (
+                "".join(f"property float {name}\n" for name in ("x", "y", "z", "intensity")) + "end_header\n"
+            )
+            body = b"1 2 3 4\n5 6 7 8\n9 10 11 12\n" if form == "ply-ascii" else POINTS.tobytes()
+            file.write_bytes(head.encode() + body)
+    with bevviz.open(tmp_path) as drive:
+        frames = frames_of(drive)
+        assert any("taken for frame numbers, at 10 a second" in warning for warning in drive.warnings)
+    assert [frame.stamp for frame in frames] == [1_000_000_000, 1_100_000_000]
+    for frame in frames:
+        np.testing.assert_array_equal(frame.points, POINTS[:, :3])
+        np.testing.assert_array_equal(frame.fields["intensity"], POINTS[:, 3])
+
+
+def test_stamps_of_a_table_and_of_names(tmp_path: Path, capsys: Capture) -> None:
+    for name in "ab":
+        POINTS.tofile(tmp_path / f"{name}.bin")
+    (tmp_path / "stamps.csv").write_text("file,stamp\na.bin,1700000000.5\nb.bin,1700000000600000000\n")
+    with bevviz.open(tmp_path) as drive:
+        assert [f.stamp for f in frames_of(drive)] == [1_700_000_000_500_000_000, 1_700_000_000_600_000_000]
+    (tmp_path / "stamps.csv").write_text("file,stamp\na.bin,1700000000.5\n")
+    assert main(["info", str(tmp_path)]) == 2
+    assert "stamps.csv: no stamp for b.bin" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("cameras: {front: {K: [1, 2]}}", "camera front: K needs 9 numbers"),
+        ("cameras: {front: {pose: [1, 2, 3]}}", "pose of front: 3 numbers; expected x y z qx qy qz qw"),
+        ("cameras: {rear: {}}", "no rear among the cameras; there are front"),
+        ("camera: {}", "camera is not known; there are D, K, cameras"),
+        ("cameras: [", "is not valid YAML"),
+    ],
+)
+def test_a_wrong_calibration_is_one_line(tmp_path: Path, text: str, message: str, capsys: Capture) -> None:
+    root = plain(tmp_path)
+    (root / "calibration.yaml").write_text(text)
+    assert main(["info", str(root)]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert message in line
+    assert "calibration.yaml" in line
+
+
+def test_a_damaged_cloud_is_told_and_the_rest_goes_on(tmp_path: Path, capfd: Capture) -> None:
+    root = plain(tmp_path)
+    (root / "top/1700000000.300000000.pcd").write_bytes(b"no cloud")
+    with bevviz.open(root) as drive:
+        frames = list(drive.frames)
+        assert len(frames) == 2
+        assert any("1700000000.300000000.pcd: cannot be read as a cloud" in w for w in drive.warnings)
+    assert capfd.readouterr().out == ""
+
+
+# --- what is wrong -----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("broken", "message"),
+    [
+        ("../calib_velo_to_cam.txt", "calib_velo_to_cam.txt: cannot be read: No such file or directory"),
+        ("../calib_cam_to_cam.txt", "calib_cam_to_cam.txt: cannot be read: No such file or directory"),
+        ("../calib_imu_to_velo.txt", "calib_imu_to_velo.txt: cannot be read: No such file or directory"),
+        ("velodyne_points/timestamps.txt", "timestamps.txt: cannot be read: No such file or directory"),
+    ],
+)
+def test_a_missing_file_is_named(tmp_path: Path, broken: str, message: str, capsys: Capture) -> None:
+    path = datasets.kitti_raw(tmp_path)
+    (path / broken).unlink()
+    assert main(["info", str(path)]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert message in line
+
+
+@pytest.mark.parametrize(
+    ("file", "content", "message"),
+    [
+        ("../calib_velo_to_cam.txt", "R: 1 2\n", "calib_velo_to_cam.txt: no R and T, as KITTI writes them"),
+        ("velodyne_points/timestamps.txt", "today\n", "timestamps.txt: line 1 is no time, as 2011-09-26"),
+        ("oxts/data/0000000001.txt", "49 8 x 0 0 0\n", "line 1 has something that is no number"),
+        ("tracklet_labels.xml", "<a>", "tracklet_labels.xml: no tracklets as KITTI writes them"),
+    ],
+)
+def test_a_damaged_file_is_named(
+    tmp_path: Path, file: str, content: str, message: str, capsys: Capture
+) -> None:
+    path = datasets.kitti_raw(tmp_path)
+    (path / file).write_text(content)
+    assert main(["info", str(path)]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert message in line
+
+
+def test_a_cut_scan_is_told_and_read(tmp_path: Path) -> None:
+    path = datasets.kitti_raw(tmp_path)
+    cut = path / "velodyne_points/data/0000000001.bin"
+    cut.write_bytes(cut.read_bytes()[:1003])
+    with bevviz.open(path) as drive:
+        frame = drive.raw(1)
+        np.testing.assert_array_equal(frame.points, datasets.scan(1)[:62, :3])
+        assert any("0000000001.bin: 1003 bytes are no whole number of points" in w for w in drive.warnings)
+
+
+def test_a_label_that_is_cut_costs_that_scan_its_labels(tmp_path: Path, capsys: Capture) -> None:
+    sequence = datasets.kitti_odometry(tmp_path)
+    label = sequence / "labels/000001.label"
+    label.write_bytes(label.read_bytes()[:-4])
+    assert main(["evaluate", str(sequence)]) == 0
+    said = capsys.readouterr()
+    assert "000001.label: 399 labels for 400 points" in said.err
+
+
+def test_which_data_set_can_be_forced(tmp_path: Path, capsys: Capture) -> None:
+    (tmp_path / "empty").mkdir()
+    assert main(["info", str(tmp_path / "empty"), "--dataset", "kitti-raw"]) == 2
+    assert "no drive in it; KITTI raw drive has velodyne_points/data" in capsys.readouterr().err
+    assert main(["info", str(tmp_path / "empty"), "--dataset", "kitti-row"]) == 2
+    assert "--dataset kitti-row: did you mean kitti-raw? There are" in capsys.readouterr().err
+    assert main(["info", str(tmp_path / "empty")]) == 2
+    assert "neither a bag (no .mcap, .db3 or .bag file) nor a data set" in capsys.readouterr().err
