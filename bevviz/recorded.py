@@ -278,6 +278,24 @@ def follow(recording: Path, bag: Sequence[Path] = (), settings: Sequence[str] = 
     return Recorded(recording, tuple(paths), tuple(stated), tuple(warnings), how)
 
 
+def stands_for_bag(recording: Path) -> bool:
+    """Whether ``follow`` has a bag to look for: not of the synthetic drive, nor of a comparison.
+
+    Raises:
+        UserError: no recording.
+    """
+    if not recording.is_file():
+        raise UserError(f"{recording}: no such file")
+    check_decodes(recording, first=HEAD)
+    if recording.with_suffix(".mcap").is_file():
+        return True
+    try:
+        _, origin = read(recording)
+    except UserError:
+        return False
+    return origin is not None
+
+
 def _found(place: Place, recording: Path) -> Path:
     path, where = place.found(recording)
     if path is None:

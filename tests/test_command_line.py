@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import os
+import re
+import sys
 from pathlib import Path
+from urllib.request import urlopen
 
 import pytest
 
 from bevviz.cli import main
-from bevviz.cli.outputs import speak
+from bevviz.cli.outputs import program, speak
 from tests import bags
 
 Capture = pytest.CaptureFixture[str]
@@ -95,3 +99,44 @@ def test_colour_is_asked_for_and_refused(capsys: Capture, monkeypatch: pytest.Mo
     monkeypatch.setenv("NO_COLOR", "1")
     assert main(["bag", "absent.mcap"]) == 2
     assert capsys.readouterr().err.startswith("bevviz: error: absent.mcap")
+
+
+# --- without a display ---------------------------------------------------------------------------------
+
+
+def test_a_demo_without_a_display_ends_with_what_shows_it(
+    monkeypatch: pytest.MonkeyPatch, capsys: Capture
+) -> None:
+    """The line is typed as it stands. A project's network (there is none of that name) is not the demo's."""
+    monkeypatch.setenv("BEVVIZ_MODEL", "absent.onnx")
+    monkeypatch.delenv("BROWSER", raising=False)
+    monkeypatch.setattr("sys.argv", [str(Path(sys.executable).with_name("bevviz"))])
+    monkeypatch.setenv("PATH", str(Path(sys.executable).parent), prepend=os.pathsep)
+    assert main(["demo", "--frames", "1"]) == 0
+    last = capsys.readouterr().err.splitlines()[-1]
+    assert last == "bevviz: to look at it in a browser: bevviz demo.rrd"
+
+    pages: list[str] = []
+
+    def visit() -> None:
+        (address,) = re.findall(r"viewer at (http://\S+)", capsys.readouterr().err)
+        with urlopen(address, timeout=60) as page:
+            pages.append(page.read().decode())
+
+    monkeypatch.setattr("bevviz.cli.workbench.wait_for_interrupt", visit)
+    assert main(["demo.rrd"]) == 0
+    assert "rerun" in pages[0].lower()
+
+
+def test_a_program_that_is_not_on_the_path_is_named_by_its_file(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PATH", "/nowhere")
+    monkeypatch.setattr("sys.argv", [".venv/bin/bevviz"])
+    assert program() == ".venv/bin/bevviz"
+    monkeypatch.setattr("sys.argv", ["/somewhere/bevviz/__main__.py"])
+    assert program().endswith(" -m bevviz")
+
+
+def test_what_is_no_recording_is_not_shown(capsys: Capture) -> None:
+    Path("x.rrd").write_text("nothing")
+    assert main(["x.rrd"]) == 2
+    assert "x.rrd" in capsys.readouterr().err

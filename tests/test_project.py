@@ -147,11 +147,6 @@ def test_info_and_a_recording_say_it(tmp_path: Path, project: Path, capsys: Capt
     assert "eps: 0.6" in text
 
 
-def test_the_demo_is_the_same_everywhere(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("BEVVIZ_MODEL", "absent.onnx")
-    assert main(["demo", "--frames", "1", "--save", "demo.rrd"]) == 0
-
-
 def test_one_parameter_is_explained(capsys: Capture, project: Path) -> None:
     project.unlink()
     assert main(["config", "cluster_tolerance"]) == 0

@@ -248,6 +248,8 @@ def project_layers(options: argparse.Namespace) -> list[Layer]:
 def follow_recording(options: argparse.Namespace) -> None:
     """Where a recording is given instead of a bag, its bag takes its place, and it is told which.
 
+    One that has none behind it is ``options.shown``, for the command that can show it as it is.
+
     Raises:
         UserError: as ``bevviz.recorded.follow``; ``--bag`` without a recording.
     """
@@ -259,8 +261,11 @@ def follow_recording(options: argparse.Namespace) -> None:
             raise UserError("--bag says where the bag of a recording is: PATH has to be one .rrd file")
         return
     from bevviz.cli.outputs import say, warn
-    from bevviz.recorded import follow
+    from bevviz.recorded import follow, stands_for_bag
 
+    if getattr(options, "shows_recordings", False) and not options.bags and not stands_for_bag(given[0]):
+        options.shown = given[0]
+        return
     recorded = follow(given[0], options.bags, given_settings(options))
     options.recorded, options.recording, options.paths = recorded, given[0], list(recorded.paths)
     say(f"{given[0]}: made from {', '.join(map(str, recorded.paths))}")

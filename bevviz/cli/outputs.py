@@ -4,11 +4,16 @@ from __future__ import annotations
 
 import argparse
 import os
+import re
+import shlex
+import shutil
+import socket
 import sys
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
+from urllib.parse import unquote
 
 from bevviz import announce
 from bevviz.cli import style
@@ -32,6 +37,8 @@ class Outputs(NamedTuple):
     connect: str | None = None  # URL
     viewer: bool = False
     blueprint: str | Blueprint = "debug"
+    unseen: bool = False  # saved as nothing could be shown
+    browser: bool = False  # where the page of ``serve`` is opened
 
     @staticmethod
     def of(options: argparse.Namespace) -> Outputs:
@@ -53,8 +60,12 @@ class Outputs(NamedTuple):
         chosen = self.or_viewer()
         if chosen:
             return chosen
-        say(f"no display: saving {default} (--serve shows it in a browser)")
-        return chosen._replace(save=default)
+        if has_browser():
+            from bevviz.logging.ports import free_port
+
+            return chosen._replace(serve=free_port(9090), browser=True)
+        say(f"no display: saving {default}")
+        return chosen._replace(save=default, unseen=True)
 
     @contextmanager
     def opened(self, scene: Scene, config: Config) -> Iterator[Sinks]:
@@ -73,6 +84,8 @@ class Outputs(NamedTuple):
         ) as sinks:
             for url in sinks.urls:
                 say(f"viewer at {url}", always=True)
+                if self.browser:
+                    open_browser(url)
             warn(sinks.warnings)
             yield sinks
 
@@ -116,6 +129,40 @@ def hint(scene: Scene, config: Config) -> None:
         )
     if scene.cameras and not config.detector.model:
         say("no detector: give --model FILE.onnx, or name it in bevviz.toml, to find objects in the images")
+
+
+def tell_of_browser(address: str) -> None:
+    """Where to look, also from elsewhere, while a server runs."""
+    say(f"viewer at {address}", always=True)
+    ports = [str(port) for port in re.findall(r":(\d+)", unquote(address))]
+    over_ssh = " ".join(f"-L {port}:localhost:{port}" for port in ports)
+    if os.environ.get("SSH_CONNECTION"):
+        say(f"on your own machine first: ssh {over_ssh} {socket.gethostname()}")
+    if has_browser():
+        open_browser(address)
+    say("serving until Ctrl-C; only this machine can reach it")
+
+
+def program() -> str:
+    """How this program was called, to be typed again."""
+    called = Path(sys.argv[0])
+    if called.name == "__main__.py":
+        return f"{shlex.quote(sys.executable)} -m bevviz"
+    found = shutil.which("bevviz")
+    if found is not None and Path(found).resolve() == called.resolve():
+        return "bevviz"
+    return shlex.quote(str(called))
+
+
+def has_browser() -> bool:
+    """Whether one opens without a display: $BROWSER, as remote editors and WSL set it for their user."""
+    return bool(os.environ.get("BROWSER")) and not has_display()
+
+
+def open_browser(address: str) -> None:
+    import webbrowser
+
+    webbrowser.open(address)
 
 
 def has_display() -> bool:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
 from bevviz.cli.interrupts import terminable
-from bevviz.cli.outputs import Outputs, hint, say, warn
+from bevviz.cli.outputs import Outputs, hint, program, say, warn
 
 if TYPE_CHECKING:
     from rerun import RecordingStream
@@ -92,4 +93,6 @@ def logged(
         say(f"interrupted after {end.frames} frames; what was made until then is complete{target}")
         return 130
     say(f"{end.frames} frames{target}")
+    if outputs.unseen:
+        say(f"to look at it in a browser: {program()} {shlex.quote(str(outputs.save))}", always=True)
     return 0 if end.frames else 1

@@ -5,11 +5,12 @@ from __future__ import annotations
 import argparse
 import sys
 from contextlib import ExitStack, suppress
+from pathlib import Path
 from typing import TYPE_CHECKING
 
-from bevviz.cli.interrupts import terminable
+from bevviz.cli.interrupts import terminable, wait_for_interrupt
 from bevviz.cli.options import Commands, add_bag, add_config, add_truth, load_config, port
-from bevviz.cli.outputs import has_display, hint, say, warn
+from bevviz.cli.outputs import has_display, hint, say, tell_of_browser, warn
 from bevviz.errors import UserError
 
 if TYPE_CHECKING:
@@ -19,6 +20,7 @@ EXAMPLES = """examples:
   bevviz drive.mcap                                     the same as bevviz open drive.mcap
   bevviz open drive.mcap --model yolo11n.onnx           a page: click what you see, and it answers
   bevviz open drive.mcap --model yolo11n.onnx --at 12.5 that scan first
+  bevviz open demo.rrd                                  a recording without a bag, shown as it is
   bevviz open drive.mcap --port 8400 --no-browser       over ssh -L 8400:127.0.0.1:8400"""
 
 
@@ -48,10 +50,12 @@ def add(commands: Commands) -> None:
     page.add_argument(
         "--connect", metavar="URL", help="the same with a viewer that runs: rerun+http://127.0.0.1:9876/proxy"
     )
-    command.set_defaults(run=_open)
+    command.set_defaults(run=_open, shows_recordings=True)
 
 
 def _open(options: argparse.Namespace) -> int:
+    if (shown := getattr(options, "shown", None)) is not None:
+        return _show(shown, options)
     try:
         from bevviz.workbench.server import serve
     except ImportError as error:
@@ -99,6 +103,20 @@ def _open(options: argparse.Namespace) -> int:
         with suppress(KeyboardInterrupt), terminable():  # the way to end it
             drive = "\n".join(str(path.resolve()) for path in options.paths)
             serve(make, drive, options.port, ready, "native" if beside else "page")
+    return 0
+
+
+def _show(recording: Path, options: argparse.Namespace) -> int:
+    """A recording without a bag: nothing can be asked, but all of it looked at."""
+    from bevviz.logging import shown
+
+    say(f"{recording}: no bag behind it, shown as it is")
+    if has_display():
+        shown.in_viewer(recording)
+        return 0
+    with shown.in_browser(recording, options.port) as address:
+        tell_of_browser(address)
+        wait_for_interrupt()
     return 0
 
 
