@@ -243,6 +243,15 @@ class Around:
 
 
 @dataclass(frozen=True, slots=True)
+class Mark:
+    """A note of people's, and the frame that it belongs to."""
+
+    text: str
+    index: int
+    stamp: int
+
+
+@dataclass(frozen=True, slots=True)
 class LateResult:
     """Boxes of the robot's own that came when the frame of their time had gone on: beside a robot alone."""
 

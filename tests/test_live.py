@@ -25,7 +25,7 @@ from bevviz.anomalies import AnomalyDetector
 from bevviz.config import load
 from bevviz.errors import UserError
 from bevviz.files import lock
-from bevviz.frame import CameraResult, Decision, Detections, Frame, FrameResult, Fusion, Pairs, Scene
+from bevviz.frame import CameraResult, Decision, Detections, Frame, FrameResult, Fusion, Mark, Pairs, Scene
 from bevviz.live.encoder import WHOLE, Encoder, Packet
 from bevviz.live.files import Indexer, Saver, remove_leftovers
 from bevviz.live.flight import FlightRecorder
@@ -499,6 +499,29 @@ def test_a_subscriber_that_fails_is_said_once(run: Run) -> None:
     outcome = run(total=10, on_result=fail)
     assert len(outcome.told("results cannot be published: ValueError: no network")) == 1
     assert outcome.live.frames > 0
+
+
+def test_a_mark_outlives_its_frame(run: Run, frames: list[Frame], drive: SyntheticSource) -> None:
+    class Marked(Paced):
+        waiting: Sequence[Mark] = (Mark("a person", 1, 0), Mark("a van", 3, 0), Mark("never", 9, 0))
+
+        def marks(self, index: int) -> list[Mark]:
+            """As of a source that has left out the frames 1 to 3 in front of the fourth."""
+            found = [mark for mark in self.waiting if mark.index <= index and index >= 4]
+            self.waiting = [mark for mark in self.waiting if mark not in found]
+            return found
+
+        def __iter__(self) -> Iterator[Frame]:
+            yield from (replace(frame, stamp=10**9 * frame.index) for frame in super().__iter__())
+
+    run(source=Marked(frames, drive.scene, 6), save=Path("out.rrd"))
+    recording = Recording(Path("out.rrd"))
+    rows = recording.rows["/explain/log"]
+    told = [(row["frame"], text) for row in rows for text in row["TextLog:text"] or () if "mark" in text]
+    assert told == [(4, f"mark: {what} (4.00 s before this frame)") for what in ("a person", "a van")]
+    lane = recording.at["/explain/states/marks"]["StateChange:state"]
+    marked = {number: value[0] for number, value in lane.items() if value[0]}
+    assert list(marked) == [4] and "a person (4.00 s before this frame)" in marked[4]
 
 
 # --- the flight recorder -----------------------------------------------------------------------

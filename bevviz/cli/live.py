@@ -293,6 +293,9 @@ def _watch(
     if (against := live.against) is not None:
         text = f"{against.differing} of {against.frames} compared frames differ from {against.names[1]}"
         say(text if against.frames else f"the robot published nothing on {against.names[1]}")
+        if against.late_images:
+            late = f"{against.late_images} of the robot's detections in images"
+            say(f"{late} came when their frames were compared already: not compared")
     for warning in source.warnings:
         say(f"warning: {warning}")
     written = [saver.paths for saver in (live.saver, live.raw_saver) if saver is not None]

@@ -12,7 +12,7 @@ from typing import Any
 from bevviz.closing import Closing
 from bevviz.config import Config, SourceConfig, stage_topics
 from bevviz.errors import UserError
-from bevviz.frame import Frame, Intrinsics, LateResult, Scene
+from bevviz.frame import Frame, Intrinsics, LateResult, Mark, Scene
 from bevviz.live.raw import RawRecorder
 from bevviz.live.rawtopics import RawTopics
 from bevviz.live.watch import SILENCE, Watch
@@ -25,6 +25,7 @@ from bevviz.ros.node import Node
 from bevviz.ros.roles import MARK, STAGE_KINDS, Roles, Topic, find_roles, foreign
 from bevviz.ros.typesupport import message_type
 from bevviz.run import BURST
+from bevviz.sync.around import MARKS
 from bevviz.sync.feed import Handler, make_around_handlers, make_handlers
 from bevviz.sync.synchronizer import OVERTAKEN, Synchronizer, blindness
 
@@ -127,6 +128,7 @@ class LiveSource(Closing):
         self._unasked = 0  # frames that came before anybody iterated
         self._frames = 0
         self._numbers: deque[tuple[int, int]] = deque(maxlen=OVERTAKEN)  # stamp and index of the last frames
+        self._marks: deque[Mark] = deque(maxlen=MARKS)  # that nobody has asked for
         self._ended = False
 
         self._node = Node(arguments, on_end=self.stop, name=name)
@@ -267,6 +269,14 @@ class LiveSource(Closing):
                 if late.frame_stamp in numbers
             )
 
+    def marks(self, index: int) -> tuple[Mark, ...]:
+        """Of the frames up to this index, also of those that were dropped, since the last call."""
+        with self._knowledge:
+            found = tuple(mark for mark in self._marks if mark.index <= index)
+            for _ in found:
+                self._marks.popleft()
+        return found
+
     def __iter__(self) -> Iterator[Frame]:
         if not self._iterated:
             self._iterated, self._unasked = True, self._handover.dropped
@@ -328,6 +338,8 @@ class LiveSource(Closing):
             if not self._complete:
                 continue
             self._numbers.append((frame.stamp, self._frames))
+            for text in frame.around.marks if frame.around else ():
+                self._marks.append(Mark(text, self._frames, frame.stamp))
             self._handover.put(replace(frame, index=self._frames))
             self._frames += 1
 
