@@ -141,7 +141,9 @@ def _live(options: argparse.Namespace) -> int:
     from bevviz.live.source import LiveSource
 
     raw = RawRecorder(settings.config.live)
-    with LiveSource(settings.config, arguments=options.ros_args, tell=notes.info, raw=raw) as source:
+    with LiveSource(
+        settings.config, arguments=options.ros_args, tell=notes.info, raw=raw, results=options.observe
+    ) as source:
         return _watch_robot(source, settings, options, notes, loader, raw)
 
 

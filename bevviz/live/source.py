@@ -94,6 +94,7 @@ class LiveSource(Closing):
         tell: called with one sentence each, from the receiving thread.
         name: of the node.
         raw: gets every message as it came, and those of further topics (``live.raw_topics``).
+        results: the robot's own bird's-eye view and obstacles are received and shown, too.
 
     Raises:
         UserError: no working rclpy, or arguments that it refuses.
@@ -107,8 +108,10 @@ class LiveSource(Closing):
         tell: Callable[[str], None] | None = None,
         name: str = "bevviz",
         raw: RawRecorder | None = None,
+        results: bool = False,
     ) -> None:
         self.config = config
+        self._results = results
         self.roles = Roles()
         self.lost: Counter[str] = Counter()  # topic -> messages that the middleware could not deliver
         self.frame_ids: dict[str, str] = {}  # of each sensor topic's first message
@@ -426,7 +429,7 @@ class LiveSource(Closing):
         stages = {key: self._node.resolve(name) for key, name in stage_topics(self.config).items()}
         stages = {key: name for key, name in stages.items() if name in there}
         try:
-            roles = find_roles(*_without_absent(topics, stated), stages)
+            roles = find_roles(*_without_absent(topics, stated), stages, results=self._results)
         except UserError as error:
             self._watch.note("roles", str(error))
             return
