@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
@@ -18,8 +17,10 @@ from bevviz.errors import UserError
 from bevviz.frame import F64, I64, Frame, Scene
 from bevviz.ros.messages import MessageError, decode_transforms
 from bevviz.ros.roles import find_roles
+from bevviz.sync.damage import Damage
 from bevviz.sync.feed import Handler, make_handlers
-from bevviz.sync.synchronizer import Synchronizer, blindness
+from bevviz.sync.report import blindness
+from bevviz.sync.synchronizer import Synchronizer
 
 SECOND = 1_000_000_000
 MARGIN = 2 * SECOND  # what else belongs to the first and the last cloud is looked for this far outside
@@ -67,8 +68,7 @@ class BagSource(Closing):
         except BaseException:
             self.close()
             raise
-        self._damaged: Counter[str] = Counter()
-        self._first_damage: dict[str, str] = {}
+        self._damage = Damage()
         self._sync: Synchronizer | None = None
 
     def close(self) -> None:
@@ -87,20 +87,12 @@ class BagSource(Closing):
     def warnings(self) -> Sequence[str]:
         synced = self._sync.report.warnings() if self._sync else ()
         blind = blindness(self.config, self.roles, self._sync.report if self._sync else None)
-        return [*self.recording.warnings, *self._damage, *blind, *synced]
-
-    @property
-    def _damage(self) -> Sequence[str]:
-        """Messages that could not be used, a sentence for each topic."""
-        return [
-            f"{count} message(s) of {topic} could not be used, the first: {self._first_damage[topic]}"
-            for topic, count in self._damaged.items()
-        ]
+        return [*self.recording.warnings, *self._damage.sentences, *blind, *synced]
 
     @property
     def doubts(self) -> Sequence[str]:
         """What of the frames read so far may make all of them wrong, one sentence each."""
-        return [*self._damage, *(self._sync.report.doubts() if self._sync else ())]
+        return [*self._damage.sentences, *(self._sync.report.doubts() if self._sync else ())]
 
     @property
     def span(self) -> tuple[int, int]:
@@ -153,7 +145,7 @@ class BagSource(Closing):
     def _frames(self, low: int, high: int, first: int, chosen: range) -> Iterator[Frame]:
         """The chosen ones of the scans with low <= log time < high, the first of which is ``first``."""
         sync = self._sync = Synchronizer(self.roles, self.config)
-        self._damaged.clear()
+        self._damage = Damage()
         handlers = make_handlers(sync, self.roles, self.recording.decode)
         self._hold_throughout(sync, handlers, low)
         numbers: dict[
@@ -191,8 +183,7 @@ class BagSource(Closing):
         try:
             handler(message)
         except MessageError as error:
-            self._damaged[message.topic] += 1
-            self._first_damage.setdefault(message.topic, str(error))
+            self._damage.add(message.topic, str(error))
 
     def _hold_throughout(
         self, sync: Synchronizer, handlers: Mapping[str, Handler[RawMessage]], low: int

@@ -27,7 +27,8 @@ from bevviz.ros.typesupport import message_type
 from bevviz.run import BURST
 from bevviz.sync.around import MARKS
 from bevviz.sync.feed import Handler, make_around_handlers, make_handlers
-from bevviz.sync.synchronizer import OVERTAKEN, Synchronizer, blindness
+from bevviz.sync.report import blindness
+from bevviz.sync.synchronizer import OVERTAKEN, Synchronizer
 
 LOOK = 0.5  # seconds between two looks at the graph
 TICK = 0.05  # seconds between two looks at the clouds that have waited long enough
