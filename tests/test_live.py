@@ -909,9 +909,14 @@ def test_a_late_viewer_sees_the_static_data_and_the_recent_past(
         found.append(received(data_port, Path("late.rrd"), lambda r: shown(r)[-1:] == [29]))
         live.stop()
 
-    run(source=Stalled(Paced(frames, drive.scene, 30)), during=during, serve=port)
+    class Later(Stalled):
+        def __iter__(self) -> Iterator[Frame]:
+            wait_for(lambda: listens(port))
+            yield from super().__iter__()
+
+    run(["live.output_queue=1000"], source=Later(Paced(frames, drive.scene, 30)), during=during, serve=port)
     (recording,) = found
-    assert shown(recording)[0] == 0
+    assert shown(recording) == list(range(shown(recording)[0], 30)) and len(shown(recording)) > 1
     assert recording.blueprints == 1
     assert "TextDocument:text" in recording.static["/config"]
     assert not listens(port)
