@@ -228,6 +228,7 @@ class Shape:
     axes: F64 | None = None  # (4, 4) frame_id from a pose
     grid: Grid | None = None
     fix: tuple[float, float] | None = None  # degrees of latitude and longitude
+    picture: U8 | None = None  # (H, W, 3) BGR
     color: U8 | None = None  # red, green, blue, alpha
     text: str = ""
     world_from_shape: F64 | None = None  # (4, 4); None: not connected with the points
@@ -240,6 +241,15 @@ class Around:
     marks: tuple[str, ...] = ()  # set by people, at this frame
     statuses: tuple[Status, ...] = ()
     shapes: tuple[Shape, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Mark:
+    """A note of people's, and the frame that it belongs to."""
+
+    text: str
+    index: int
+    stamp: int
 
 
 @dataclass(frozen=True, slots=True)

@@ -16,7 +16,7 @@ def blueprint(scene: Scene) -> rrb.Blueprint:
             views.space(scene, raw=False, grid=False),
             rrb.Vertical(
                 *side,
-                views.birds_eye(),
+                rrb.Tabs(views.birds_eye(), views.robots_birds_eye()) if scene.robot else views.birds_eye(),
                 rrb.Tabs(
                     views.rates(),
                     views.stage_times(),

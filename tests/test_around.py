@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 import rerun as rr
 
-from bevviz.config import load
-from bevviz.frame import Frame, FrameResult, Scene, Shape, Status
+from bevviz.config import SourceConfig, load
+from bevviz.frame import Frame, FrameResult, Image, Scene, Shape, Status
 from bevviz.logging.logger import Logger
 from bevviz.ros.around import decode_shapes, decode_statuses
-from bevviz.ros.encode import typestore
+from bevviz.ros.encode import encode_cloud, encode_image, typestore
 from bevviz.ros.messages import MessageError
-from bevviz.ros.roles import kind_of
+from bevviz.ros.roles import Topic, find_roles, kind_of
 from bevviz.sync.around import MANY, Surroundings
 from bevviz.synthetic import SyntheticSource
 from bevviz.synthetic.sensors import Lidar, PinholeCamera
@@ -193,3 +193,65 @@ def test_shapes_are_logged_once_and_cleared_when_they_are_gone(frame: Frame, tmp
     ]  # top first
     assert list(logged.at["/robot/m/wall/3"]["Boxes3D:half_sizes"]) == [0]
     assert logged.cleared("/robot/m/wall/3") == {2} and logged.cleared("/robot/map") == set()
+
+
+URDF = """<robot name="van">
+  <link name="base_link">
+  <visual><origin xyz="1 0 0.5" rpy="0 0 1.5707963"/><geometry><box size="4 2 1"/></geometry></visual>
+  <visual><geometry><mesh filename="package://van/roof.stl"/></geometry></visual></link>
+  <link name="mast"/>
+  <link name="wheel"><visual><geometry><cylinder radius="0.3" length="0.2"/></geometry></visual></link>
+</robot>"""
+
+
+def test_the_links_of_a_robots_description() -> None:
+    description = make("std_msgs/msg/String", data=URDF)
+    base, mast, wheel = decode_shapes(description, "String", "/robot_description")
+    assert [shape.frame_id for shape in (base, mast, wheel)] == ["base_link", "mast", "wheel"]
+    assert base.solids is not None and mast.solids is not None and wheel.solids is not None
+    np.testing.assert_allclose(base.solids.center, [[1, 0, 0.5]])
+    np.testing.assert_allclose(base.solids.half, [[2, 1, 0.5]])
+    np.testing.assert_allclose(base.solids.quaternion, [[0, 0, 0.5**0.5, 0.5**0.5]], atol=1e-6)
+    np.testing.assert_allclose(wheel.solids.half, [[0.3, 0.3, 0.1]], rtol=1e-6)
+    assert mast.solids.round and mast.topic == "/robot_description/mast"
+    assert kind_of("/robot1/robot_description", "String") == "shape" and kind_of("/chatter", "String") is None
+    for wrong in ("<robot", URDF.replace("4 2 1", "4 2")):
+        with pytest.raises(MessageError, match="/robot_description: "):
+            decode_shapes(make("std_msgs/msg/String", data=wrong), "String", "/robot_description")
+
+
+def test_the_robots_own_picture_and_obstacles_are_shown_where_nothing_of_ours_is(tmp_path: Path) -> None:
+    kinds = {"/points": "PointCloud2", "/lidar/points_no_ground": "PointCloud2"}
+    kinds |= {"/visualization/bev_image": "Image", "/camera/image": "Image"}
+    topics = [Topic(name, f"sensor_msgs/msg/{kind}", None, name) for name, kind in kinds.items()]
+    assert find_roles(topics, SourceConfig()).around == ()
+    roles = find_roles(topics, SourceConfig(), results=True)
+    assert {(topic, kind) for topic, kind, _ in roles.around} == {
+        ("/lidar/points_no_ground", "shape"),
+        ("/visualization/bev_image", "shape"),
+    }
+    assert roles.lidars == ("/points",) and [camera.topic for camera in roles.cameras] == ["/camera/image"]
+
+    frame = (
+        SyntheticSource(
+            frames=1, lidar=Lidar(beams=8, azimuths=90), camera=PinholeCamera(width=64, height=36, focal=44.0)
+        )
+        .snapshot(0)
+        .frame
+    )
+    cloud = encode_cloud(replace(frame.clouds[0], frame_id="map"))
+    image = encode_image(Image(7, "rslidar", np.full((4, 6, 3), 9, np.uint8)))
+    around = Surroundings()
+    around.add_shapes("/obstacles", decode_shapes(cloud, "PointCloud2", "/lidar/points_no_ground"))
+    around.add_shapes("/bev", decode_shapes(image, "Image", "/visualization/bev_image"))
+    frame = replace(frame, around=around.take(lambda name: np.eye(4) if name == "map" else None))
+    path = tmp_path / "out.rrd"
+    scene = Scene("s", "rslidar", ("rslidar",), ("zed",))
+    with rr.RecordingStream("test") as recording:
+        recording.save(path)
+        Logger(recording, load(), scene).log(FrameResult.unprocessed(frame, load()))
+        recording.flush()
+    shown = Recording(path).at
+    points = shown["/robot/lidar/points_no_ground"]["Points3D:positions"][0]
+    assert len(points) == len(frame.points)
+    assert "Image:buffer" in shown["/robot/visualization/bev_image"]

@@ -25,7 +25,7 @@ from bevviz.anomalies import AnomalyDetector
 from bevviz.config import load
 from bevviz.errors import UserError
 from bevviz.files import lock
-from bevviz.frame import CameraResult, Decision, Detections, Frame, FrameResult, Fusion, Pairs, Scene
+from bevviz.frame import CameraResult, Decision, Detections, Frame, FrameResult, Fusion, Mark, Pairs, Scene
 from bevviz.live.encoder import WHOLE, Encoder, Packet
 from bevviz.live.files import Indexer, Saver, remove_leftovers
 from bevviz.live.flight import FlightRecorder
@@ -501,6 +501,29 @@ def test_a_subscriber_that_fails_is_said_once(run: Run) -> None:
     assert outcome.live.frames > 0
 
 
+def test_a_mark_outlives_its_frame(run: Run, frames: list[Frame], drive: SyntheticSource) -> None:
+    class Marked(Paced):
+        waiting: Sequence[Mark] = (Mark("a person", 1, 0), Mark("a van", 3, 0), Mark("never", 9, 0))
+
+        def marks(self, index: int) -> list[Mark]:
+            """As of a source that has left out the frames 1 to 3 in front of the fourth."""
+            found = [mark for mark in self.waiting if mark.index <= index and index >= 4]
+            self.waiting = [mark for mark in self.waiting if mark not in found]
+            return found
+
+        def __iter__(self) -> Iterator[Frame]:
+            yield from (replace(frame, stamp=10**9 * frame.index) for frame in super().__iter__())
+
+    run(source=Marked(frames, drive.scene, 6), save=Path("out.rrd"))
+    recording = Recording(Path("out.rrd"))
+    rows = recording.rows["/explain/log"]
+    told = [(row["frame"], text) for row in rows for text in row["TextLog:text"] or () if "mark" in text]
+    assert told == [(4, f"mark: {what} (4.00 s before this frame)") for what in ("a person", "a van")]
+    lane = recording.at["/explain/states/marks"]["StateChange:state"]
+    marked = {number: value[0] for number, value in lane.items() if value[0]}
+    assert list(marked) == [4] and "a person (4.00 s before this frame)" in marked[4]
+
+
 # --- the flight recorder -----------------------------------------------------------------------
 
 
@@ -886,9 +909,14 @@ def test_a_late_viewer_sees_the_static_data_and_the_recent_past(
         found.append(received(data_port, Path("late.rrd"), lambda r: shown(r)[-1:] == [29]))
         live.stop()
 
-    run(source=Stalled(Paced(frames, drive.scene, 30)), during=during, serve=port)
+    class Later(Stalled):
+        def __iter__(self) -> Iterator[Frame]:
+            wait_for(lambda: listens(port))
+            yield from super().__iter__()
+
+    run(["live.output_queue=1000"], source=Later(Paced(frames, drive.scene, 30)), during=during, serve=port)
     (recording,) = found
-    assert shown(recording)[0] == 0
+    assert shown(recording) == list(range(shown(recording)[0], 30)) and len(shown(recording)) > 1
     assert recording.blueprints == 1
     assert "TextDocument:text" in recording.static["/config"]
     assert not listens(port)

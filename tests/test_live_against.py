@@ -9,7 +9,7 @@ import pytest
 
 from bevviz.compare.differences import Change
 from bevviz.config import load
-from bevviz.frame import Boxes3D, Frame, FrameResult, LabelledBoxes3D, Objects
+from bevviz.frame import Boxes3D, Frame, FrameResult, LabelledBoxes2D, LabelledBoxes3D, Objects
 from bevviz.live.against import WAITING, AgainstRobot
 from bevviz.synthetic import SyntheticSource
 from bevviz.synthetic.sensors import Lidar, PinholeCamera
@@ -68,6 +68,29 @@ def test_boxes_may_come_with_their_frame_after_it_or_before_its_result(first: Fr
         3,
         1,
     )  # 0.4 m is no difference yet
+
+
+def detections(frame: Frame, camera: str) -> LabelledBoxes2D:
+    box = np.array([[1, 1, 20, 20]], np.float32)
+    return LabelledBoxes2D(
+        "/camera_2d", frame.stamp, "optical", box, ("car",), np.ones(1, np.float32), camera
+    )
+
+
+def test_image_boxes_count_where_they_come_before_the_boxes_in_space(first: Frame) -> None:
+    against = AgainstRobot("", CONFIG.live)
+    camera = first.cameras[0].name
+    assert against.see(result(first, 0)) == []
+    old = result(first, 0).frame
+    assert against.see(result(first, 1), [(old.stamp, detections(old, camera))]) == []
+    (after,) = against.see(result(first, 2), [(old.stamp, theirs(old, 10.0))])
+    assert after.found.index == 0 and after.found.b.images[camera].names == ("car",)
+    assert against.late_images == 0
+    (direct,) = against.see(result(first, 3, robot=10.0))
+    assert direct.found.b.images == {}
+    known = result(first, 3).frame
+    against.see(result(first, 4), [(known.stamp, detections(known, camera))])
+    assert against.late_images == 1
 
 
 def test_a_difference_that_lasts_is_a_reason_once(first: Frame) -> None:

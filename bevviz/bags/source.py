@@ -20,7 +20,8 @@ from bevviz.frame import F64, I64, Frame, Scene
 from bevviz.ros.messages import MessageError, decode_transforms
 from bevviz.ros.roles import find_roles
 from bevviz.sync.feed import Handler, make_handlers
-from bevviz.sync.synchronizer import Synchronizer, blindness
+from bevviz.sync.report import blindness
+from bevviz.sync.synchronizer import Synchronizer
 
 SECOND = 1_000_000_000
 MARGIN = 2 * SECOND  # what else belongs to the first and the last cloud is looked for this far outside
@@ -123,13 +124,7 @@ class BagSource(Closing):
     @property
     def _damage(self) -> Sequence[str]:
         """Messages that could not be used, a sentence for each topic."""
-        state = self._state
-        if state is None:
-            return []
-        return [
-            f"{count} message(s) of {topic} could not be used, the first: {state.first_damage[topic]}"
-            for topic, count in state.damaged.items()
-        ]
+        return self._state.damage.sentences if self._state else ()
 
     @property
     def doubts(self) -> Sequence[str]:
@@ -288,8 +283,7 @@ class BagSource(Closing):
         try:
             handler(message)
         except MessageError as error:
-            state.damaged[message.topic] += 1
-            state.first_damage.setdefault(message.topic, str(error))
+            state.damage.add(message.topic, str(error))
 
     def _hold_throughout(
         self, state: ReadingState, handlers: Mapping[str, Handler[RawMessage]], low: int

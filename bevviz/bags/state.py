@@ -11,6 +11,7 @@ from typing import Any
 from bevviz.bags.recording import RawMessage, Recording
 from bevviz.frame import Image
 from bevviz.ros.messages import MessageError, decode_compressed_image, decode_image
+from bevviz.sync.damage import Damage
 from bevviz.sync.feed import ImageLoader
 from bevviz.sync.synchronizer import Synchronizer
 
@@ -27,7 +28,7 @@ class ReadingState:
         number: of the last scan met, from the first that is read; -1: none.
         numbers: time of receipt -> numbers of the scans that are not yet delivered.
         reached: log time of the last message read, and how many of that time were.
-        damaged, first_damage: messages that could not be used, by topic, and why the first could not.
+        damage: messages that could not be used.
     """
 
     sync: Synchronizer
@@ -35,8 +36,7 @@ class ReadingState:
     number: int = -1
     numbers: dict[int, list[int]] = field(default_factory=dict)
     reached: tuple[int, int] | None = None
-    damaged: Counter[str] = field(default_factory=Counter)
-    first_damage: dict[str, str] = field(default_factory=dict)
+    damage: Damage = field(default_factory=Damage)
 
 
 @dataclass(frozen=True, slots=True)

@@ -142,7 +142,9 @@ def _live(options: argparse.Namespace) -> int:
     from bevviz.live.source import LiveSource
 
     raw = RawRecorder(settings.config.live)
-    with LiveSource(settings.config, arguments=options.ros_args, tell=notes.info, raw=raw) as source:
+    with LiveSource(
+        settings.config, arguments=options.ros_args, tell=notes.info, raw=raw, results=options.observe
+    ) as source:
         return _watch_robot(source, settings, options, notes, loader, raw)
 
 
@@ -292,6 +294,9 @@ def _watch(
     if (against := live.against) is not None:
         text = f"{against.differing} of {against.frames} compared frames differ from {against.names[1]}"
         say(text if against.frames else f"the robot published nothing on {against.names[1]}")
+        if against.late_images:
+            late = f"{against.late_images} of the robot's detections in images"
+            say(f"{late} came when their frames were compared already: not compared")
     warn(source.warnings)
     written = [saver.paths for saver in (live.saver, live.raw_saver) if saver is not None]
     targets = [f"{where[0]}" + (f" and {len(where) - 1} more" if where[1:] else "") for where in written]

@@ -3,19 +3,28 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections import deque
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import TypeVar
 
 import numpy as np
 
 from bevviz import geometry
-from bevviz.compare.differences import Change, Difference, FrameDifferences, Seen, differences, seen
+from bevviz.compare.differences import (
+    Change,
+    Difference,
+    FrameDifferences,
+    ImageBoxes,
+    Seen,
+    differences,
+    seen,
+)
 from bevviz.compare.log import place
 from bevviz.compare.sides import published, robot_topic
 from bevviz.config import LiveConfig
 from bevviz.errors import UserError
-from bevviz.frame import F64, FrameResult, LabelledBoxes3D
+from bevviz.frame import F64, FrameResult, LabelledBoxes2D, LabelledBoxes3D
 
 SECOND = 1_000_000_000
 T = TypeVar("T")
@@ -31,6 +40,7 @@ class Ours:
     received: int
     world_from_points: F64
     seen: Seen
+    images: Mapping[str, ImageBoxes]  # by camera, what the robot has said of them with the frame
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,7 +55,8 @@ class Compared:
 class AgainstRobot:
     """Compares each frame with what the robot published of it, when it did.
 
-    A frame that the robot says nothing of is left out and counted. For one thread, but for ``reason``.
+    A frame that the robot says nothing of is left out and counted. Its boxes in the images are compared where
+    they come before its boxes in space do, else counted. For one thread, but for ``reason``.
 
     Args:
         asked: the robot's Detection3DArray topic; empty: the one whose name says so.
@@ -57,10 +68,13 @@ class AgainstRobot:
         self.topic = ""  # known when the robot has said something
         self.frames = self.differing = 0
         self.problem = ""  # why nothing is compared
+        self.late_images = 0  # of the robot's image boxes that came when their frame was compared already
         self._asked = asked
         self._topics: set[str] = set()
         self._waiting: dict[int, Ours] = {}  # by stamp: frames that the robot has said nothing of yet
         self._late: dict[int, LabelledBoxes3D] = {}  # by stamp of their frame, whose result is yet to come
+        self._images: dict[int, dict[str, ImageBoxes]] = {}  # the same of its image boxes, by camera
+        self._compared: deque[int] = deque(maxlen=WAITING)  # stamps
         self._since: int | None = None  # stamp from which on both differ in every frame
         self._fired = False
         self._reason = ""
@@ -71,7 +85,9 @@ class AgainstRobot:
         """Of the two sides."""
         return "bevviz", f"the robot's {self.topic or self._asked or 'fused boxes'}"
 
-    def see(self, result: FrameResult, late: Sequence[tuple[int, LabelledBoxes3D]] = ()) -> list[Compared]:
+    def see(
+        self, result: FrameResult, late: Sequence[tuple[int, LabelledBoxes2D | LabelledBoxes3D]] = ()
+    ) -> list[Compared]:
         """Take in a frame.
 
         Args:
@@ -82,10 +98,18 @@ class AgainstRobot:
             What can be compared now.
         """
         frame = result.frame
-        for labelled in (*frame.robot_boxes, *(boxes for _, boxes in late)):
+        in_space = {stamp: boxes for stamp, boxes in late if isinstance(boxes, LabelledBoxes3D)}
+        for labelled in (*frame.robot_boxes, *in_space.values()):
             self._choose(labelled.topic)
-        self._waiting[frame.stamp] = Ours(frame.index, frame.stamp, frame.received, frame.pose, seen(result))
-        self._late |= {stamp: boxes for stamp, boxes in late if boxes.topic == self.topic}
+        images = {found.camera: _image_boxes(found) for found in frame.robot_detections if found.camera}
+        pose = frame.pose
+        self._waiting[frame.stamp] = Ours(
+            frame.index, frame.stamp, frame.received, pose, seen(result), images
+        )
+        for stamp, found in late:
+            if isinstance(found, LabelledBoxes2D):
+                self._add_images(stamp, found)
+        self._late |= {stamp: boxes for stamp, boxes in in_space.items() if boxes.topic == self.topic}
         compared = []
         if self.topic and (theirs := published(frame, self.topic, result.config)) is not None:
             compared.append(self._compare(self._waiting.pop(frame.stamp), seen(theirs)))
@@ -94,6 +118,7 @@ class AgainstRobot:
             compared.append(self._compare(ours, _placed(boxes, ours.world_from_points)))
         _forget(self._waiting)
         _forget(self._late)
+        _forget(self._images)
         return sorted(compared, key=lambda one: one.found.stamp)
 
     def reason(self) -> str | None:
@@ -101,6 +126,12 @@ class AgainstRobot:
         with self._lock:
             reason, self._reason = self._reason, ""
         return reason or None
+
+    def _add_images(self, stamp: int, found: LabelledBoxes2D) -> None:
+        if stamp in self._compared or not found.camera:
+            self.late_images += 1
+        else:
+            self._images.setdefault(stamp, {})[found.camera] = _image_boxes(found)
 
     def _choose(self, topic: str) -> None:
         if topic in self._topics:
@@ -112,7 +143,9 @@ class AgainstRobot:
             self.topic, self.problem = "", str(error)
 
     def _compare(self, ours: Ours, theirs: Seen) -> Compared:
-        found = differences(ours.index, ours.stamp, ours.seen, theirs)
+        self._compared.append(ours.stamp)
+        images = {**ours.images, **theirs.images, **self._images.pop(ours.stamp, {})}
+        found = differences(ours.index, ours.stamp, ours.seen, replace(theirs, images=images))
         different = [d for d in found.objects if self._differs(d)]
         self.frames += 1
         self.differing += bool(different)
@@ -149,6 +182,10 @@ def _words(difference: Difference) -> str:
     if difference.change is Change.CLASS:
         return f"our {difference.name_a} is the robot's {difference.name_b}"
     return f"{difference.name_a} {difference.distance:.2f} m apart"
+
+
+def _image_boxes(found: LabelledBoxes2D) -> ImageBoxes:
+    return ImageBoxes(found.xyxy, found.labels)
 
 
 def _placed(labelled: LabelledBoxes3D, world_from_points: F64) -> Seen:

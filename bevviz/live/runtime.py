@@ -8,13 +8,13 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from bevviz.config import Config
 from bevviz.errors import UserError
-from bevviz.frame import Frame, FrameResult, LabelledBoxes3D, Scene, Source
+from bevviz.frame import Around, Frame, FrameResult, Scene, Source
 from bevviz.live.against import AgainstRobot
 from bevviz.live.control import Control
 from bevviz.live.encoder import WHOLE, Encoder, Packet
@@ -307,8 +307,9 @@ class Live:
         drops = {entities.drops(where): float(count) for where, count in self._drops().items()}
         lags = {entities.viewer_lag(viewer.name): 1e3 * viewer.lag for viewer in self._viewers}
         health = self.health.scalars() | drops | lags | self._snapshots.scalars
+        result = self._with_marks(result)
         late, states = self._source.overtaken(), self._topic_states()
-        boxes = [(one.frame_stamp, one.boxes) for one in late if isinstance(one.boxes, LabelledBoxes3D)]
+        boxes = [(one.frame_stamp, one.boxes) for one in late]
         compared = self.against.see(result, boxes) if self.against is not None else ()
         notes, scene = self.notes.take(), self._source.scene
         self._hand_out(self.encoder.encode(result, scene, health, notes, late, states, compared))
@@ -321,6 +322,19 @@ class Live:
             self._snapshots.save_soon(reason, self.config.live.trigger_after)
         if self.against is not None:
             self._watch_robot(self.against)
+
+    def _with_marks(self, result: FrameResult) -> FrameResult:
+        """Together with the marks of frames before it that were left out, each with its time."""
+        frame = result.frame
+        lost = [mark for mark in self._source.marks(frame.index) if mark.index < frame.index]
+        if not lost:
+            return result
+        around = frame.around or Around()
+        texts = [
+            f"{mark.text} ({(frame.stamp - mark.stamp) * 1e-9:.2f} s before this frame)" for mark in lost
+        ]
+        around = replace(around, marks=(*texts, *around.marks))
+        return replace(result, frame=replace(frame, around=around))
 
     def _watch_robot(self, against: AgainstRobot) -> None:
         if against.problem != self._robot_problem:

@@ -12,7 +12,7 @@ from typing import Any
 from bevviz.closing import Closing
 from bevviz.config import Config, SourceConfig, stage_topics
 from bevviz.errors import UserError
-from bevviz.frame import Frame, Intrinsics, LateResult, Scene
+from bevviz.frame import Frame, Intrinsics, LateResult, Mark, Scene
 from bevviz.live.raw import RawRecorder
 from bevviz.live.rawtopics import RawTopics
 from bevviz.live.watch import SILENCE, Watch
@@ -26,8 +26,10 @@ from bevviz.ros.node import Node
 from bevviz.ros.roles import MARK, STAGE_KINDS, Roles, Topic, find_roles, foreign
 from bevviz.ros.typesupport import message_type
 from bevviz.run import BURST
+from bevviz.sync.around import MARKS
 from bevviz.sync.feed import Handler, make_around_handlers, make_handlers
-from bevviz.sync.synchronizer import OVERTAKEN, Synchronizer, blindness
+from bevviz.sync.report import blindness
+from bevviz.sync.synchronizer import OVERTAKEN, Synchronizer
 
 LOOK = 0.5  # seconds between two looks at the graph
 TICK = 0.05  # seconds between two looks at the clouds that have waited long enough
@@ -96,6 +98,7 @@ class LiveSource(Closing):
         tell: called with one sentence each, from the receiving thread.
         name: of the node.
         raw: gets every message as it came, and those of further topics (``live.raw_topics``).
+        results: the robot's own bird's-eye view and obstacles are received and shown, too.
 
     Raises:
         UserError: no working rclpy, or arguments that it refuses.
@@ -109,8 +112,10 @@ class LiveSource(Closing):
         tell: Callable[[str], None] | None = None,
         name: str = "bevviz",
         raw: RawRecorder | None = None,
+        results: bool = False,
     ) -> None:
         self.config = config
+        self._results = results
         self.roles = Roles()
         self.lost: Counter[str] = Counter()  # topic -> messages that the middleware could not deliver
         self.frame_ids: dict[str, str] = {}  # of each sensor topic's first message
@@ -130,6 +135,7 @@ class LiveSource(Closing):
         self._unasked = 0  # frames that came before anybody iterated
         self._frames = 0
         self._numbers: deque[tuple[int, int]] = deque(maxlen=OVERTAKEN)  # stamp and index of the last frames
+        self._marks: deque[Mark] = deque(maxlen=MARKS)  # that nobody has asked for
         self._ended = False
 
         self._node = Node(arguments, on_end=self.stop, name=name)
@@ -270,6 +276,14 @@ class LiveSource(Closing):
                 if late.frame_stamp in numbers
             )
 
+    def marks(self, index: int) -> tuple[Mark, ...]:
+        """Of the frames up to this index, also of those that were dropped, since the last call."""
+        with self._knowledge:
+            found = tuple(mark for mark in self._marks if mark.index <= index)
+            for _ in found:
+                self._marks.popleft()
+        return found
+
     def __iter__(self) -> Iterator[Frame]:
         if not self._iterated:
             self._iterated, self._unasked = True, self._handover.dropped
@@ -331,6 +345,8 @@ class LiveSource(Closing):
             if not self._complete:
                 continue
             self._numbers.append((frame.stamp, self._frames))
+            for text in frame.around.marks if frame.around else ():
+                self._marks.append(Mark(text, self._frames, frame.stamp))
             self._handover.put(replace(frame, index=self._frames))
             self._frames += 1
 
@@ -417,7 +433,7 @@ class LiveSource(Closing):
         stages = {key: self._node.resolve(name) for key, name in stage_topics(self.config).items()}
         stages = {key: name for key, name in stages.items() if name in there}
         try:
-            roles = find_roles(*_without_absent(topics, stated), stages)
+            roles = find_roles(*_without_absent(topics, stated), stages, results=self._results)
         except UserError as error:
             self._watch.note("roles", str(error))
             return

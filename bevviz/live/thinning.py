@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from bevviz.config import Config
-from bevviz.frame import Frame, LateResult, Scene, Source
+from bevviz.frame import Frame, LateResult, Mark, Scene, Source
 
 
 class Thinned:
@@ -53,6 +53,11 @@ class Thinned:
         """The robot's own results that came too late for their frames, since the last call."""
         overtaken = getattr(self._source, "overtaken", None)
         return () if overtaken is None else tuple(overtaken())
+
+    def marks(self, index: int) -> tuple[Mark, ...]:
+        """What people have marked up to the frame of this index, since the last call."""
+        marks = getattr(self._source, "marks", None)
+        return () if marks is None else tuple(marks(index))
 
     def stop(self) -> None:
         stop = getattr(self._source, "stop", None)

@@ -9,6 +9,8 @@ from dataclasses import dataclass, field
 from statistics import median
 from typing import Literal
 
+from bevviz.sync.damage import Damage
+
 SILENCE = 2.0  # seconds without a message that are told, or five usual steps
 STREAM = 5  # messages after which a topic is taken for a stream that should go on
 AGAIN = 10  # unusable messages in a row that are told again, after usable ones
@@ -23,9 +25,7 @@ class _Arrivals:
     count: int = 0
     bytes: int = 0
     times: deque[float] = field(default_factory=lambda: deque(maxlen=20))  # seconds, monotonic
-    unusable: int = 0
     row: int = 0  # unusable ones since the last that could be used
-    reason: str = ""  # why the first one could not be used
 
 
 class Watch:
@@ -40,6 +40,7 @@ class Watch:
         self.tell, self._clock = tell, clock
         self._told: set[str] = set()
         self._topics: dict[str, _Arrivals] = defaultdict(_Arrivals)
+        self._damage = Damage()
         self._notes: dict[str, str] = {}  # what a sentence is about -> the sentence, while it holds
 
     # --- messages ------------------------------------------------------------------------------
@@ -70,10 +71,8 @@ class Watch:
     def unusable(self, topic: str, reason: str) -> None:
         """What cannot be used, and the reason, which names the topic."""
         arrivals = self._topics[topic]
-        arrivals.reason = arrivals.reason or reason
-        arrivals.unusable += 1
         arrivals.row += 1
-        if arrivals.unusable == 1 or arrivals.row == AGAIN:
+        if self._damage.add(topic, reason) == 1 or arrivals.row == AGAIN:
             self.note(f"{topic} unusable", f"a message cannot be used: {reason}")
 
     def silent_for(self, topic: str) -> float:
@@ -112,14 +111,9 @@ class Watch:
     @property
     def warnings(self) -> list[str]:
         """What holds now, and how much could not be used."""
-        unusable = {name: topic for name, topic in self._topics.items() if topic.unusable}
         holds = [text for about, text in self._notes.items() if not about.endswith(" unusable")]
-        return [*holds, *(_counted(name, topic) for name, topic in unusable.items())]
+        return [*holds, *self._damage.sentences]
 
     def states(self, published: Mapping[str, bool]) -> dict[str, TopicState]:
         """Of each topic, given whether anybody publishes it."""
         return {name: self.state(name, there) for name, there in published.items()}
-
-
-def _counted(name: str, topic: _Arrivals) -> str:
-    return f"{topic.unusable} message(s) of {name} could not be used, the first: {topic.reason}"

@@ -14,14 +14,15 @@ from bevviz.logging.writer import Writer
 
 LANES = 40  # of the robot's diagnostics; the worst
 _WORST = ("error", "stale", "warning", "ok")
-_PARTS = ("points", "strips", "solids", "axes", "grid", "fix")
+_PARTS = ("points", "strips", "solids", "axes", "grid", "fix", "picture")
 _COLOR = (120, 200, 255)
 
 
 def log_shapes(to: Writer, frame: Frame) -> None:
     """What has a place in the world."""
     for shape in (frame.around or Around()).shapes:
-        if shape.fix is not None or shape.world_from_shape is not None:
+        flat = shape.fix is not None or shape.picture is not None
+        if flat or shape.world_from_shape is not None:
             _log_shape(to, shape)
 
 
@@ -64,7 +65,7 @@ def _log_shape(to: Writer, shape: Shape) -> None:
     path = entities.robot(shape.topic)
     version = hash((shape.stamp, *(id(getattr(shape, part)) for part in _PARTS)))
     color = [_COLOR if shape.color is None else shape.color.tolist()]
-    if shape.world_from_shape is not None:
+    if shape.world_from_shape is not None and shape.picture is None:
         to.write(path, transform(shape.world_from_shape))
     if to.keep(path, version):
         return
@@ -77,6 +78,8 @@ def _log_shape(to: Writer, shape: Shape) -> None:
         to.put(path, rr.Arrows3D(origins=[place], vectors=[turn[:, 0]], colors=color))
     if shape.grid is not None:
         to.put(path, _grid(shape.grid))
+    if shape.picture is not None:
+        to.put(path, rr.Image(shape.picture, color_model="BGR"))
     if shape.fix is not None:
         to.put(path, rr.GeoPoints(lat_lon=[shape.fix], colors=color, radii=rr.Radius.ui_points(6)))
     if (solids := shape.solids) is not None:

@@ -94,6 +94,12 @@ def birds_eye(root: str = "", name: str = "Bird's-eye view") -> rrb.Spatial2DVie
     return rrb.Spatial2DView(name=name, origin=bev, contents=["$origin/**", *channels], background=_DARK)
 
 
+def robots_birds_eye() -> rrb.Spatial2DView:
+    """The bird's-eye image that the robot itself publishes."""
+    origin = entities.robot("/visualization/bev_image")
+    return rrb.Spatial2DView(name="The robot's", origin=origin, background=_DARK)
+
+
 def explain(root: str = "", name: str = "Explain") -> rrb.TextDocumentView:
     """Every decision of the frame in words."""
     return rrb.TextDocumentView(name=name, origin=root + entities.EXPLAIN, contents=["$origin"])

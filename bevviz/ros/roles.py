@@ -128,6 +128,11 @@ Kind = Literal["mark", "status", "shape"]
 SHAPES = frozenset(
     {"LaserScan", "Path", "PoseStamped", "OccupancyGrid", "MarkerArray", "Marker", "NavSatFix"}
 )
+RESULTS = {  # of the robot's own pipeline, shown where nothing of ours is
+    "PointCloud2": re.compile(r"(^|/)lidar/points_no_ground$"),
+    "Image": re.compile(r"(^|/)visualization/bev_image$"),
+}
+_DESCRIPTION = re.compile(r"(^|/)robot_description$")
 _AROUND = {
     "mark": "notes of people",
     "status": "the robot's diagnostics",
@@ -143,7 +148,11 @@ STAGE_KINDS = {  # what the robot publishes as the result of a stage
 
 
 def find_roles(
-    topics: Sequence[Topic], config: SourceConfig, stages: Mapping[str, str] = MappingProxyType({})
+    topics: Sequence[Topic],
+    config: SourceConfig,
+    stages: Mapping[str, str] = MappingProxyType({}),
+    *,
+    results: bool = False,
 ) -> Roles:
     """Give each topic its role.
 
@@ -155,6 +164,7 @@ def find_roles(
         topics: all that there are.
         config: which topics are stated.
         stages: the robot's topics that stages are taken from, by the dotted key that names each.
+        results: the robot's bird's-eye view and obstacles are shown, too.
 
     Raises:
         UserError: a stated topic does not exist, or is of another type.
@@ -194,6 +204,9 @@ def find_roles(
     for key, topic in staged.items():
         notes[topic.name] = f"the robot's own result, taken for the stage {key.partition('.')[0]}"
     around = [(t.name, kind, t.kind) for t in topics if (kind := kind_of(t.name, t.kind)) is not None]
+    if results:
+        free = [t for t in topics if t not in (*lidars, *images, *staged.values()) and t.kind in RESULTS]
+        around += [(t.name, "shape", t.kind) for t in free if RESULTS[t.kind].search(t.name)]
     helps = {t.name: f"; no LiDAR: {why}" if (why := foreign(t, "LiDAR")) else "" for t in topics}
     notes.update({name: f"shown: {_AROUND[kind]}{helps[name]}" for name, kind, _ in around})
     return Roles(
@@ -484,4 +497,5 @@ def kind_of(topic: str, short: str) -> Kind | None:
         return "mark"
     if short == "DiagnosticArray":
         return "status"
-    return "shape" if short in SHAPES else None
+    described = short == "String" and _DESCRIPTION.search(topic)
+    return "shape" if short in SHAPES or described else None

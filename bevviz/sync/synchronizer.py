@@ -7,8 +7,8 @@ import re
 from bisect import bisect_left
 from collections import Counter, deque
 from collections.abc import Callable, Collection, Iterator, Mapping
-from dataclasses import dataclass, field, replace
-from typing import Any, Generic, TypeVar
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,114 +28,22 @@ from bevviz.frame import (
     LabelledBoxes3D,
     LateResult,
 )
-from bevviz.plugins import TOPIC
 from bevviz.ros.messages import StampedTransform
 from bevviz.ros.roles import CameraRole, Roles, entity_name
 from bevviz.sync.around import Surroundings
 from bevviz.sync.clocks import Clocks
-from bevviz.sync.tf import Lookup, Origin, TransformBuffer, TransformError
+from bevviz.sync.report import SyncReport
+from bevviz.sync.tf import Lookup, Origin, TransformError
+from bevviz.sync.track import JUMP, Track
 from bevviz.sync.upright import Upright
 
-T = TypeVar("T")
-
 SECOND = 1_000_000_000
-JUMP = SECOND  # a stamp that is this much older than its topic's newest means that the clock was reset
 LATENCY = 2 * SECOND  # the longest a cloud is expected to arrive after an image of the same stamp
 FIXED_FRAMES = {"map", "odom", "world", "earth", "global", "utm", "enu", "ned", "mocap", "vicon", "init"}
 FAR = 500.0  # metres that no LiDAR has half of its points beyond
 OVERTAKEN = 64  # results and frames that late results are placed by
 GLOBE_FRAMES = {"earth", "ecef", "utm"}  # coordinates too large for the float32 of a viewer
 TUTORIAL_K = np.array([[267.0, 0.0, 320.0], [0.0, 267.0, 180.0], [0.0, 0.0, 1.0]])
-
-
-@dataclass(slots=True)
-class SyncReport:
-    """What arrived, what was lost and what looked wrong so far."""
-
-    clouds: int = 0  # of every LiDAR
-    frames: int = 0
-    reordered: int = 0  # clouds that came out of order, put back in their place
-    late: int = 0  # clouds dropped: a newer one had been delivered already
-    duplicates: int = 0  # clouds dropped: same stamp as another
-    unwaited: int = 0  # clouds sent on early, the queue being full
-    resets: int = 0  # stamps of the clouds that jumped back
-    gaps: int = 0  # stamps of the clouds that jumped forward, by a second and three usual steps or more
-    longest_gap: float = 0.0  # seconds
-    idle: str = ""  # topic of the LiDAR that should drive, while only others deliver
-    unstamped: Counter[str] = field(default_factory=Counter)  # topic -> messages with stamp zero
-    without_image: Counter[str] = field(default_factory=Counter)  # camera -> frames
-    images: int = 0  # of all cameras, decoded
-    undecodable: Counter[str] = field(default_factory=Counter)  # camera -> images
-    first_undecodable: dict[str, str] = field(default_factory=dict)  # camera -> why the first was
-    problems: Counter[str] = field(default_factory=Counter)  # missing transforms and CameraInfo -> frames
-    tf: TransformBuffer = field(default_factory=TransformBuffer)  # for what looked wrong in the transforms
-    upright: Mapping[str, str] = field(default_factory=dict)  # for what is doubtful about the vertical
-    clocks: Clocks = field(default_factory=lambda: Clocks({}, "stamp"))
-    clocked: tuple[str, ...] = ()  # topics whose clocks must be one
-    oddities: dict[str, str] = field(default_factory=dict)  # topic -> what its messages should not say
-    overtaken: Counter[str] = field(default_factory=Counter)  # topic -> results whose frame had gone on
-    slowest: dict[str, float] = field(default_factory=dict)  # topic -> seconds after its stamp, at worst
-
-    def doubts(self) -> tuple[str, ...]:
-        """One sentence for whatever may make every frame wrong: clocks, units, which way is up."""
-        return (*self.clocks.doubts(self.clocked), *self.oddities.values(), *self.upright.values())
-
-    def warnings(self) -> tuple[str, ...]:
-        """One sentence each."""
-        counted = [
-            (self.reordered, "{} came out of order and {} put back in order"),
-            (self.late, "{} came after a newer one had gone on and {} dropped"),
-            (self.duplicates, "{} had the stamp of another one and {} dropped"),
-            (self.unwaited, "{} went on early because sync.queue was full"),
-        ]
-        found = [
-            text.format("1 cloud" if n == 1 else f"{n} clouds", "was" if n == 1 else "were")
-            for n, text in counted
-            if n
-        ]
-        if self.resets:
-            found.append(f"the stamps of the clouds jumped back {_times(self.resets)}")
-        if self.gaps:
-            gaps = "1 gap" if self.gaps == 1 else f"{self.gaps} gaps"
-            found.append(f"the stamps of the clouds have {gaps}, the longest {self.longest_gap:.2f} s")
-        if self.idle:
-            found.append(
-                f"no cloud on {self.idle}, which should drive: set source.lidar_topics, the driving one first"
-            )
-        for topic, n in self.unstamped.items():
-            found.append(f"{topic}: no stamp in the header {_times(n)}, time of receipt used instead")
-        for topic, n in self.overtaken.items():
-            found.append(
-                f"{topic}: {n} result{'' if n == 1 else 's'} came when the frame of that time had gone on, "
-                f"at worst {self.slowest[topic]:.2f} s after the stamp: shown at that stamp, and not compared"
-            )
-        for camera, n in self.without_image.items():
-            found.append(f"{n} of {self.frames} frames have no image of camera '{camera}'")
-        for camera, n in self.undecodable.items():
-            first = self.first_undecodable[camera]
-            found.append(f"camera '{camera}': an image could not be decoded {_times(n)}, the first: {first}")
-        found += [f"{text} ({n} of {self.frames} frames)" for text, n in self.problems.items()]
-        return (*self.doubts(), *found, *self.tf.problems)
-
-
-def blindness(config: Config, roles: Roles, report: SyncReport | None) -> list[str]:
-    """Why the detector's model was shown no image at all, in one sentence; empty where it was shown one.
-
-    ``report``: of the frames so far; None: there were none yet.
-    """
-    model = config.detector.model
-    if not model or model.startswith(TOPIC):
-        return []
-    if roles.no_camera:
-        return [f"detector.model {model} sees nothing: {roles.no_camera}"]
-    if report is None or not report.frames or report.images:
-        return []
-    reasons = [*report.first_undecodable.values(), "no image at the time of any scan"]
-    return [f"detector.model {model} has seen nothing in {report.frames} frames: {reasons[0]}"]
-
-
-def _times(n: int) -> str:
-    return "once" if n == 1 else f"{n} times"
 
 
 @dataclass(frozen=True, slots=True)
@@ -145,66 +53,6 @@ class _Undecoded:
     stamp: int
     frame_id: str
     load: Callable[[], Image]
-
-
-class _Track(Generic[T]):
-    """The last messages of one topic, in order of stamp, ``horizon`` nanoseconds of them."""
-
-    def __init__(self, horizon: int) -> None:
-        self._horizon = horizon
-        self._stamps: list[int] = []
-        self._items: list[T] = []
-
-    def __len__(self) -> int:
-        return len(self._items)
-
-    @property
-    def newest(self) -> int | None:
-        return self._stamps[-1] if self._stamps else None
-
-    def add(self, stamp: int, item: T) -> None:
-        if self._stamps and stamp < self._stamps[-1] - JUMP:
-            self.keep(0, -1)
-        i = bisect_left(self._stamps, stamp)
-        if i < len(self._stamps) and self._stamps[i] == stamp:
-            self._items[i] = item
-            return
-        self._stamps.insert(i, stamp)
-        self._items.insert(i, item)
-        self.forget(self._stamps[-1] - self._horizon)
-
-    def nearest(self, stamp: int) -> tuple[int, T] | None:
-        near = bisect_left(self._stamps, stamp)
-        best = min(range(near - 1, near + 1), key=lambda i: self._distance(i, stamp))
-        return (self._stamps[best], self._items[best]) if 0 <= best < len(self) else None
-
-    def _distance(self, i: int, stamp: int) -> float:
-        return abs(self._stamps[i] - stamp) if 0 <= i < len(self) else float("inf")
-
-    def take(self, stamp: int, first: int, last: int) -> T | None:
-        """Remove and return the item within [first, last] that is nearest to ``stamp``."""
-        inside = [i for i, s in enumerate(self._stamps) if first <= s <= last]
-        if not inside:
-            return None
-        best = min(inside, key=lambda i: self._distance(i, stamp))
-        del self._stamps[best]
-        return self._items.pop(best)
-
-    def shed(self, last: int) -> list[T]:
-        """Remove and return what has that stamp or an earlier one."""
-        end = bisect_left(self._stamps, last + 1)
-        gone, self._items = self._items[:end], self._items[end:]
-        del self._stamps[:end]
-        return gone
-
-    def forget(self, before: int) -> None:
-        """Drop what is older, but for the last of it, which may be the nearest to the next cloud."""
-        first = max(0, bisect_left(self._stamps, before) - 1)
-        del self._stamps[:first], self._items[:first]
-
-    def keep(self, first: int, last: int) -> None:
-        low, high = bisect_left(self._stamps, first), bisect_left(self._stamps, last + 1)
-        self._stamps, self._items = self._stamps[low:high], self._items[low:high]
 
 
 @dataclass(frozen=True, slots=True)
@@ -269,20 +117,20 @@ class Synchronizer:
         self._index = 0
         self._last: int | None = None  # stamp of the last frame
         self._step = math.inf  # nanoseconds between the last two clouds; a gap is much longer
-        self._partners: dict[str, _Track[Cloud]] = self._make_tracks(*roles.lidars[1:])
-        self._images: dict[str, _Track[_Undecoded]] = self._make_tracks(*(c.topic for c in roles.cameras))
+        self._partners: dict[str, Track[Cloud]] = self._make_tracks(*roles.lidars[1:])
+        self._images: dict[str, Track[_Undecoded]] = self._make_tracks(*(c.topic for c in roles.cameras))
         self._lidar_frames: dict[str, str] = {}  # cloud topic -> frame
         self._camera_frames: dict[str, str] = {}  # image topic -> optical frame
         self.intrinsics: dict[str, Intrinsics] = {}  # CameraInfo topic -> the newest
-        self._infos: dict[str, _Track[Intrinsics]] = {}  # by topic
+        self._infos: dict[str, Track[Intrinsics]] = {}  # by topic
         self._refused_infos: dict[str, str] = {}  # topic -> why its calibration cannot be used
         self._info_counts: Counter[str] = Counter()
         self._image_counts: Counter[str] = Counter()
         self._odometry_frames: set[str] = set()
-        self._boxes: dict[str, _Track[LabelledBoxes3D]] = self._make_tracks(*roles.robot_detections_3d)
-        self._detections: dict[str, _Track[LabelledBoxes2D]] = self._make_tracks(*roles.robot_detections_2d)
-        self._robot_clouds: dict[str, _Track[Cloud]] = self._make_tracks(*roles.robot_clouds)
-        self._truth: dict[str, _Track[LabelledBoxes3D]] = self._make_tracks(*filter(None, [roles.truth]))
+        self._boxes: dict[str, Track[LabelledBoxes3D]] = self._make_tracks(*roles.robot_detections_3d)
+        self._detections: dict[str, Track[LabelledBoxes2D]] = self._make_tracks(*roles.robot_detections_2d)
+        self._robot_clouds: dict[str, Track[Cloud]] = self._make_tracks(*roles.robot_clouds)
+        self._truth: dict[str, Track[LabelledBoxes3D]] = self._make_tracks(*filter(None, [roles.truth]))
         self._beside = frozenset(beside)
         self._overtaken: deque[LateResult] = deque(maxlen=OVERTAKEN)
         self._places: deque[tuple[_Place, F64]] = deque(
@@ -291,8 +139,8 @@ class Synchronizer:
         for names, pose in config.source.extrinsics.items():
             self.tf.add(_extrinsic(names, pose), static=True, origin=Origin.CONFIG)
 
-    def _make_tracks(self, *topics: str) -> dict[str, _Track[Any]]:
-        return {topic: _Track(self._horizon) for topic in topics}
+    def _make_tracks(self, *topics: str) -> dict[str, Track[Any]]:
+        return {topic: Track(self._horizon) for topic in topics}
 
     def take_over(self, former: Synchronizer) -> None:
         """Go on with the transforms, calibrations and counts of ``former``, when the roles change."""
@@ -348,7 +196,7 @@ class Synchronizer:
         """``topic`` is that of the CameraInfo; for an image the one that is nearest in stamp holds."""
         self.intrinsics[topic] = intrinsics
         self._info_counts[topic] += 1
-        track = self._infos.setdefault(topic, _Track(self._horizon))
+        track = self._infos.setdefault(topic, Track(self._horizon))
         track.add(self._arrived(topic, stamp, received), intrinsics)
 
     def refuse_camera_info(self, topic: str, reason: str) -> None:
@@ -380,13 +228,13 @@ class Synchronizer:
         """Ground truth boxes."""
         self._add_result(self._truth, truth)
 
-    def _add_result(self, tracks: dict[str, _Track[Any]], result: LabelledBoxes2D | LabelledBoxes3D) -> None:
+    def _add_result(self, tracks: dict[str, Track[Any]], result: LabelledBoxes2D | LabelledBoxes3D) -> None:
         stamp = self._arrived(result.topic, result.stamp, result.received)
         result = replace(result, stamp=stamp)
         if result.topic in self._beside and self._is_past(stamp):
             self._overtake(result)
         else:
-            tracks.setdefault(result.topic, _Track(self._horizon)).add(stamp, result)
+            tracks.setdefault(result.topic, Track(self._horizon)).add(stamp, result)
 
     def _is_past(self, stamp: int) -> bool:
         """Whether the frame that is nearest to a stamp has gone on."""
@@ -456,9 +304,9 @@ class Synchronizer:
         for _, track in self._tracks():
             track.keep(0, stamp + JUMP)
 
-    def _tracks(self) -> Iterator[tuple[str, _Track[Any]]]:
+    def _tracks(self) -> Iterator[tuple[str, Track[Any]]]:
         """Topic and messages."""
-        groups: tuple[Mapping[str, _Track[Any]], ...] = (
+        groups: tuple[Mapping[str, Track[Any]], ...] = (
             self._partners,
             self._images,
             self._boxes,
@@ -521,7 +369,7 @@ class Synchronizer:
         waited = [track for topic, track in self._tracks() if topic not in beside]
         if any(track.newest is None or track.newest < stamp for track in waited):
             return False
-        groups: tuple[Mapping[str, _Track[Any]], ...] = (
+        groups: tuple[Mapping[str, Track[Any]], ...] = (
             self._boxes,
             self._detections,
             self._robot_clouds,
@@ -546,7 +394,7 @@ class Synchronizer:
         one_each = self._info_counts[role.info_topic] * 2 > self._image_counts[role.topic] > 1
         return not one_each or track.newest >= image[0]
 
-    def _may_be_of_next(self, track: _Track[Any], stamp: int) -> bool:
+    def _may_be_of_next(self, track: Track[Any], stamp: int) -> bool:
         nearest = track.nearest(stamp)
         return nearest is not None and 0 < nearest[0] - stamp <= self._tolerance
 
@@ -557,7 +405,7 @@ class Synchronizer:
         if moving and not place.world_frame:
             return False
         asked = [(cloud.stamp, cloud.frame_id)]
-        joined: list[_Track[Any]] = [*self._images.values(), *self._partners.values()]
+        joined: list[Track[Any]] = [*self._images.values(), *self._partners.values()]
         for track in joined:
             nearest = track.nearest(cloud.stamp)
             if nearest is not None and abs(nearest[0] - cloud.stamp) <= self._tolerance:
@@ -615,7 +463,7 @@ class Synchronizer:
     def _skimmed(self, cloud: Cloud, place: _Place) -> Frame:
         """Of a frame what is known at once. What belongs to it is taken, as in ``_build``."""
         window = self._window(cloud.stamp)
-        groups: tuple[Mapping[str, _Track[Any]], ...] = (
+        groups: tuple[Mapping[str, Track[Any]], ...] = (
             self._boxes,
             self._truth,
             self._detections,
@@ -643,7 +491,7 @@ class Synchronizer:
         self._last = frame.stamp
         self.report.frames += 1
         self._places.append((place, frame.pose))
-        unused: tuple[Mapping[str, _Track[Any]], ...] = (self._boxes, self._detections)
+        unused: tuple[Mapping[str, Track[Any]], ...] = (self._boxes, self._detections)
         for group in unused:
             for topic in self._beside & group.keys():
                 for result in group[topic].shed(last):

@@ -1,0 +1,27 @@
+"""Messages that could not be used: counted by topic, with the reason of the first."""
+
+from __future__ import annotations
+
+from collections import Counter
+
+
+class Damage:
+    """Of a bag as of a robot."""
+
+    def __init__(self) -> None:
+        self._counts: Counter[str] = Counter()
+        self._first: dict[str, str] = {}
+
+    def add(self, topic: str, reason: str) -> int:
+        """One more, and why, which names the topic. Returns how many of the topic there are."""
+        self._counts[topic] += 1
+        self._first.setdefault(topic, reason)
+        return self._counts[topic]
+
+    @property
+    def sentences(self) -> list[str]:
+        """One for each topic."""
+        return [
+            f"{count} message(s) of {topic} could not be used, the first: {self._first[topic]}"
+            for topic, count in self._counts.items()
+        ]

@@ -1,0 +1,103 @@
+"""What synchronising has counted and found odd, and its words."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+from bevviz.config import Config
+from bevviz.plugins import TOPIC
+from bevviz.ros.roles import Roles
+from bevviz.sync.clocks import Clocks
+from bevviz.sync.tf import TransformBuffer
+
+
+@dataclass(slots=True)
+class SyncReport:
+    """What arrived, what was lost and what looked wrong so far."""
+
+    clouds: int = 0  # of every LiDAR
+    frames: int = 0
+    reordered: int = 0  # clouds that came out of order, put back in their place
+    late: int = 0  # clouds dropped: a newer one had been delivered already
+    duplicates: int = 0  # clouds dropped: same stamp as another
+    unwaited: int = 0  # clouds sent on early, the queue being full
+    resets: int = 0  # stamps of the clouds that jumped back
+    gaps: int = 0  # stamps of the clouds that jumped forward, by a second and three usual steps or more
+    longest_gap: float = 0.0  # seconds
+    idle: str = ""  # topic of the LiDAR that should drive, while only others deliver
+    unstamped: Counter[str] = field(default_factory=Counter)  # topic -> messages with stamp zero
+    without_image: Counter[str] = field(default_factory=Counter)  # camera -> frames
+    images: int = 0  # of all cameras, decoded
+    undecodable: Counter[str] = field(default_factory=Counter)  # camera -> images
+    first_undecodable: dict[str, str] = field(default_factory=dict)  # camera -> why the first was
+    problems: Counter[str] = field(default_factory=Counter)  # missing transforms and CameraInfo -> frames
+    tf: TransformBuffer = field(default_factory=TransformBuffer)  # for what looked wrong in the transforms
+    upright: Mapping[str, str] = field(default_factory=dict)  # for what is doubtful about the vertical
+    clocks: Clocks = field(default_factory=lambda: Clocks({}, "stamp"))
+    clocked: tuple[str, ...] = ()  # topics whose clocks must be one
+    oddities: dict[str, str] = field(default_factory=dict)  # topic -> what its messages should not say
+    overtaken: Counter[str] = field(default_factory=Counter)  # topic -> results whose frame had gone on
+    slowest: dict[str, float] = field(default_factory=dict)  # topic -> seconds after its stamp, at worst
+
+    def doubts(self) -> tuple[str, ...]:
+        """One sentence for whatever may make every frame wrong: clocks, units, which way is up."""
+        return (*self.clocks.doubts(self.clocked), *self.oddities.values(), *self.upright.values())
+
+    def warnings(self) -> tuple[str, ...]:
+        """One sentence each."""
+        counted = [
+            (self.reordered, "{} came out of order and {} put back in order"),
+            (self.late, "{} came after a newer one had gone on and {} dropped"),
+            (self.duplicates, "{} had the stamp of another one and {} dropped"),
+            (self.unwaited, "{} went on early because sync.queue was full"),
+        ]
+        found = [
+            text.format("1 cloud" if n == 1 else f"{n} clouds", "was" if n == 1 else "were")
+            for n, text in counted
+            if n
+        ]
+        if self.resets:
+            found.append(f"the stamps of the clouds jumped back {_times(self.resets)}")
+        if self.gaps:
+            gaps = "1 gap" if self.gaps == 1 else f"{self.gaps} gaps"
+            found.append(f"the stamps of the clouds have {gaps}, the longest {self.longest_gap:.2f} s")
+        if self.idle:
+            found.append(
+                f"no cloud on {self.idle}, which should drive: set source.lidar_topics, the driving one first"
+            )
+        for topic, n in self.unstamped.items():
+            found.append(f"{topic}: no stamp in the header {_times(n)}, time of receipt used instead")
+        for topic, n in self.overtaken.items():
+            found.append(
+                f"{topic}: {n} result{'' if n == 1 else 's'} came when the frame of that time had gone on, "
+                f"at worst {self.slowest[topic]:.2f} s after the stamp: shown at that stamp, and not compared"
+            )
+        for camera, n in self.without_image.items():
+            found.append(f"{n} of {self.frames} frames have no image of camera '{camera}'")
+        for camera, n in self.undecodable.items():
+            first = self.first_undecodable[camera]
+            found.append(f"camera '{camera}': an image could not be decoded {_times(n)}, the first: {first}")
+        found += [f"{text} ({n} of {self.frames} frames)" for text, n in self.problems.items()]
+        return (*self.doubts(), *found, *self.tf.problems)
+
+
+def blindness(config: Config, roles: Roles, report: SyncReport | None) -> list[str]:
+    """Why the detector's model was shown no image at all, in one sentence; empty where it was shown one.
+
+    ``report``: of the frames so far; None: there were none yet.
+    """
+    model = config.detector.model
+    if not model or model.startswith(TOPIC):
+        return []
+    if roles.no_camera:
+        return [f"detector.model {model} sees nothing: {roles.no_camera}"]
+    if report is None or not report.frames or report.images:
+        return []
+    reasons = [*report.first_undecodable.values(), "no image at the time of any scan"]
+    return [f"detector.model {model} has seen nothing in {report.frames} frames: {reasons[0]}"]
+
+
+def _times(n: int) -> str:
+    return "once" if n == 1 else f"{n} times"
