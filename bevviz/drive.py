@@ -307,20 +307,37 @@ class Drive(Closing):
         self.run([evaluation])
         return evaluation
 
-    def save(self, path: str | PathLike[str], blueprint: str | Blueprint = "debug") -> Path:
+    def save(self, path: str | PathLike[str], blueprint: str | Blueprint = "debug", jobs: int = 1) -> Path:
         """Run the whole drive into a Rerun recording.
 
+        Args:
+            path: of the file, .rrd.
+            blueprint: layout.
+            jobs: processes that a bag is cut into windows for, as ``bevviz bag --jobs``. A script that asks
+                for them needs ``if __name__ == "__main__":`` around what it does.
+
         Raises:
-            UserError: the file cannot be written, or there is no such blueprint.
+            UserError: the file cannot be written, there is no such blueprint, or a drive that is to be cut
+                cannot be.
         """
-        from bevviz.logging.recorder import DiskWatch, Recorder
+        from bevviz.logging.recorder import DiskWatch, OrderedRecorder, Recorder
         from bevviz.logging.sinks import open_recording
         from bevviz.progress import Progress
 
         target = Path(path)
         with open_recording(self.scene, self.config, save=target, blueprint=blueprint) as sinks:
-            recorder = Recorder(sinks.recording, self.config)
-            if self.run([recorder, DiskWatch(sinks), Progress()]).interrupted:
+            if jobs > 1:
+                from bevviz.parallel.drive import obstacle
+                from bevviz.parallel.run import run_windows
+
+                session = self.new_session()
+                if reason := obstacle(self, session):
+                    raise UserError(f"jobs={jobs}: {reason}")
+                ordered = [OrderedRecorder(sinks.recording, self.config), DiskWatch(sinks)]
+                end = run_windows(self, session, sinks, ordered, jobs)
+            else:
+                end = self.run([Recorder(sinks.recording, self.config), DiskWatch(sinks), Progress()])
+            if end.interrupted:
                 raise KeyboardInterrupt
         return target
 

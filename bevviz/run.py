@@ -119,6 +119,7 @@ def run(
     observers: Sequence[Observer[R]] = (),
     *,
     dropping: Dropping | None = None,
+    depth: int = DEPTH,
     stop: threading.Event | None = None,
     tick: Callable[[], None] = lambda: None,
 ) -> RunEnd:
@@ -133,6 +134,7 @@ def run(
         processor: what makes a result of each.
         observers: in the order in which they see it.
         dropping: the newest win, and nothing waits; None: every item is worked on.
+        depth: items that are drawn ahead of what is observed, where nothing is dropped.
         stop: ends the run when it is set.
         tick: called every ``TICK`` seconds by the thread that waits.
 
@@ -140,7 +142,7 @@ def run(
         Exception: of the items, the processor or an observer, after all observers were told the end.
     """
     stop = stop or threading.Event()
-    loop = _Loop(items, processor, observers, dropping, stop)
+    loop = _Loop(items, processor, observers, dropping, depth, stop)
     thread = threading.Thread(target=loop.work, name="run", daemon=True)
     interrupted = False
     thread.start()
@@ -194,13 +196,14 @@ class _Loop(Generic[T, R]):
         processor: Processor[T, R],
         observers: Sequence[Observer[R]],
         dropping: Dropping | None,
+        depth: int,
         stop: threading.Event,
     ) -> None:
         self.frames = 0
         self.error: BaseException | None = None
         self.over = threading.Event()
         self._items, self._processor, self._observers = items, processor, observers
-        self._dropping, self._stop = dropping, stop
+        self._dropping, self._depth, self._stop = dropping, depth, stop
 
     def work(self) -> None:
         try:
@@ -224,7 +227,7 @@ class _Loop(Generic[T, R]):
             return self._processor.perceive(item, network)
 
         if self._dropping is None:
-            return overlapped(self._until_stopped(), work, DEPTH)
+            return overlapped(self._until_stopped(), work, self._depth)
         return _newest(self._items, work, self._dropping, self._stop)
 
     def _until_stopped(self) -> Iterator[T]:

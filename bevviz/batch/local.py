@@ -60,16 +60,16 @@ def run_local(jobs: Iterable[Task], workers: int, retries: int, on_frame: Callab
                     continue
                 busy.remove(worker)
                 retry, result = _judge(worker, message)
-                if retry and attempts[worker.job.name] < retries:
+                retry = retry and attempts[worker.job.name] < retries
+                if retry:
                     attempts[worker.job.name] += 1
                     again.append(worker.job)
-                else:
-                    attempts.pop(worker.job.name, None)
-                    yield result
                 if (job := following()) is not None:
                     busy.append(_next(worker, job, threads))
                 else:
                     _end(worker)
+                if not retry:
+                    yield result
     finally:
         for worker in busy:
             worker.process.terminate()

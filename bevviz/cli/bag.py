@@ -5,7 +5,16 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from bevviz.cli.options import Commands, add_bag, add_config, add_output, add_selection, load_config, open_bag
+from bevviz.cli.options import (
+    Commands,
+    add_bag,
+    add_config,
+    add_output,
+    add_selection,
+    load_config,
+    open_bag,
+    processes,
+)
 from bevviz.cli.outputs import Outputs
 from bevviz.cli.run import process
 
@@ -16,7 +25,21 @@ def add(commands: Commands) -> None:
         help="run the pipeline over a recorded bag",
         description="Run the pipeline over a bag: MCAP, sqlite3 (.db3) or ROS 1 (.bag), compressed or not.",
     )
-    add_selection(add_bag(bag))
+    group = add_bag(bag)
+    add_selection(group)
+    group.add_argument(
+        "--jobs",
+        type=processes,
+        default=1,
+        metavar="N|auto",
+        help="cut the drive into windows for so many processes; auto: one for each core (default: 1)",
+    )
+    group.add_argument(
+        "--dask",
+        default="",
+        metavar="ADDRESS",
+        help="windows for the workers of a Dask cluster instead, e.g. tcp://host:8786; with --save",
+    )
     add_config(bag)
     add_output(bag)
     bag.set_defaults(run=_bag)
@@ -27,4 +50,6 @@ def _bag(options: argparse.Namespace) -> int:
 
     config = load_config(options)
     with open_bag(options, config) as source:
-        return process(Drive(source, config), Outputs.of(options), Path(options.paths[0].stem + ".rrd"))
+        return process(
+            Drive(source, config), Outputs.of(options), Path(options.paths[0].stem + ".rrd"), options.jobs
+        )

@@ -16,7 +16,9 @@ if TYPE_CHECKING:
     from bevviz.config import Config
     from bevviz.drive import Drive
     from bevviz.frame import FrameResult
+    from bevviz.logging.sinks import Sinks
     from bevviz.run import Items, Observer, Processor, RunEnd
+    from bevviz.session import Session
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -31,29 +33,59 @@ def through(items: Items[T], processor: Processor[T, R], observers: Sequence[Obs
         return run(items, processor, [*observers, Progress()], stop=ended)
 
 
-def process(drive: Drive, outputs: Outputs, default: Path) -> int:
-    """Every stage on every frame, logged to every output that is asked for."""
+def process(drive: Drive, outputs: Outputs, default: Path, jobs: int = 1, dask: str = "") -> int:
+    """Every stage on every frame, logged to every output that is asked for.
+
+    Args:
+        drive: the frames.
+        outputs: where to.
+        default: file where there is no display.
+        jobs: processes that the drive is cut for.
+        dask: address of a cluster that it is cut for instead.
+    """
     from bevviz.anomalies import AnomalySummary, FailureSummary
-    from bevviz.logging.recorder import Recorder
+    from bevviz.logging.recorder import OrderedRecorder, Recorder
 
     anomalies, failures = AnomalySummary(), FailureSummary()
+    session = drive.new_session()
+    windows = (jobs > 1 or bool(dask)) and _can_be_cut(drive, session)
 
     def observers(recording: RecordingStream) -> list[Observer[FrameResult]]:
         hint(drive.scene, drive.config)
-        return [Recorder(recording, drive.config), anomalies, failures]
+        recorder = OrderedRecorder if windows else Recorder
+        return [recorder(recording, drive.config), anomalies, failures]
 
     def finish() -> None:
         warn(failures.warnings)
         say(f"anomalies: {anomalies}")
 
+    def in_windows(sinks: Sinks, seen: Sequence[Observer[FrameResult]]) -> RunEnd:
+        from bevviz.parallel.drive import cluster
+        from bevviz.parallel.run import run_windows
+
+        engine = cluster(dask) if dask else None
+        with terminable() as ended:
+            return run_windows(drive, session, sinks, seen, jobs, engine, ended)
+
     return logged(
         drive.frames,
-        drive.new_session(),
+        session,
         drive.config,
         outputs.or_file(default),
         observers,
         finish,
+        in_windows if windows else None,
     )
+
+
+def _can_be_cut(drive: Drive, session: Session) -> bool:
+    """Whether a drive can be made in windows; where it cannot, it is said why."""
+    from bevviz.parallel.drive import obstacle
+
+    reason = obstacle(drive, session)
+    if reason:
+        say(f"in one process: {reason}")
+    return not reason
 
 
 def logged(
@@ -63,6 +95,7 @@ def logged(
     outputs: Outputs,
     observers: Callable[[RecordingStream], Sequence[Observer[R]]],
     finish: Callable[[], None] = lambda: None,
+    otherwise: Callable[[Sinks, Sequence[Observer[R]]], RunEnd] | None = None,
 ) -> int:
     """A run whose observers log.
 
@@ -73,6 +106,7 @@ def logged(
         outputs: where what is logged goes.
         observers: of the recording.
         finish: called after the last one, before what was made is served.
+        otherwise: shows the results to observers in another way than ``through`` does.
 
     Returns:
         The exit status.
@@ -83,7 +117,7 @@ def logged(
         seen = [*observers(sinks.recording), DiskWatch(sinks)]
         early = list(items.warnings)  # known before an hour's work, and said before it
         warn(early)
-        end = through(items, processor, seen)
+        end = through(items, processor, seen) if otherwise is None else otherwise(sinks, seen)
         warn(warning for warning in items.warnings if warning not in early)
         finish()
         if end.frames and not end.interrupted:

@@ -36,6 +36,13 @@ class Recorder(Observer[FrameResult]):
         self.logger.flush()
 
 
+class OrderedRecorder(Recorder):
+    """Writes of a run what the frames before have a part in, where others have written the rest."""
+
+    def see(self, result: FrameResult) -> None:
+        self.logger.log_in_order(result)
+
+
 class DiskWatch(Observer[Any]):
     """Ends a run whose recording cannot be written any more: the rest would be for nothing."""
 

@@ -12,6 +12,7 @@ from urllib.parse import urlsplit
 
 import rerun as rr
 import rerun.blueprint as rrb
+from rerun.chunk import RrdReader
 
 from bevviz.config import Config
 from bevviz.errors import UserError
@@ -29,6 +30,7 @@ from bevviz.logging.ports import (
     own_address,
     viewer_address,
 )
+from bevviz.logging.reading import readable
 from bevviz.recorded import Origin
 
 APPLICATION = "bevviz"
@@ -50,6 +52,21 @@ class Sinks:
     warnings: list[str] = field(default_factory=list)
     file: Path | None = None
     writer: FileWriter | None = None
+
+    @property
+    def recording_id(self) -> str:
+        found = rr.get_recording_id(self.recording)
+        assert found is not None
+        return str(found)
+
+    def add(self, part: Path) -> None:
+        """What another process has logged of the same recording.
+
+        Raises:
+            UserError: the file cannot be read.
+        """
+        with readable(part):
+            rr.send_chunks(RrdReader(part).stream(), recording=self.recording)
 
     def check(self) -> None:
         """Raises UserError where the file cannot be written any more."""

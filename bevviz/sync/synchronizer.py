@@ -424,9 +424,12 @@ class Synchronizer:
     def _build(self) -> Frame:
         cloud = self._clouds.pop(0)
         problems: list[str] = []
-        place = self._place(cloud, problems)
         if self.skims:
+            counted, self.report.problems = self.report.problems, Counter()
+            place = self._place(cloud, problems)
+            self.report.problems = counted
             return self._passed(place, self._skimmed(cloud, place))
+        place = self._place(cloud, problems)
         clouds, poses = self._gather(cloud, place, problems)
         in_place = place.upright is None and cloud.frame_id.lstrip("/") == place.points_frame
         points, fields = _merge(clouds, poses, in_place)

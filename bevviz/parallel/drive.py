@@ -1,0 +1,219 @@
+"""A drive in windows: they are made side by side, and what needs the order of frames as they come in."""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
+from contextlib import closing
+from functools import partial
+from pathlib import Path
+from threading import Event
+from typing import TypeVar
+
+from bevviz import remains
+from bevviz.bags.source import BagSource
+from bevviz.bags.state import Losses
+from bevviz.batch.local import run_local
+from bevviz.batch.task import JobResults
+from bevviz.closing import Closing
+from bevviz.config import Config
+from bevviz.drive import Drive
+from bevviz.errors import UserError
+from bevviz.frame import FrameResult, Scene
+from bevviz.logging.sinks import Sinks
+from bevviz.parallel.work import WindowJob, results_in
+from bevviz.run import Items, Observer
+from bevviz.session import Session
+from bevviz.stages.foreign import Foreign
+
+LENGTH = 25  # frames of a window, at most
+SHORTEST = 8  # each begins with a frame that is made for nothing
+SHARE = 4  # windows that each process should have at least, so that none is left alone with one in the end
+AHEAD = 2  # windows that are cut before a process is free
+RETRIES = 2  # of a window whose process died
+
+T = TypeVar("T")
+Engine = Callable[[Iterable[WindowJob], Callable[[], None]], JobResults]
+
+
+def obstacle(drive: Drive, session: Session) -> str:
+    """Why a drive cannot be cut, in one sentence; empty where it can."""
+    if not isinstance(drive.frames, BagSource):
+        return "only the frames of a bag can be cut into windows"
+    stages = session.stages
+    given = [f for f in (stages.ground, stages.clustering, stages.objects, stages.network) if f is not None]
+    for stage in given:
+        if isinstance(stage, Foreign):
+            return f"{stage.name} may remember what it saw: no frame is sure without those before it"
+    return ""
+
+
+def cluster(address: str) -> Engine:
+    """Workers of a Dask cluster, which see the bag and the recording's folder under the same paths."""
+    from bevviz.batch.dask import run_dask
+
+    return lambda jobs, on_frame: run_dask(jobs, address, RETRIES, on_frame)
+
+
+def here(workers: int) -> Engine:
+    """Processes of this machine."""
+    return lambda jobs, on_frame: run_local(jobs, workers, RETRIES, on_frame)
+
+
+class Windows(Closing):
+    """The windows of a drive, in order, each when it and all before it are made. Items of a run.
+
+    Args:
+        source: is read for it, without making frames.
+        config: how they are made.
+        recording_id: of the recording that they become part of.
+        workers: windows that are made at the same time.
+        engine: what makes them.
+        on_frame: called for each frame that is made, in the order in which they are.
+        place: folder for what is on its way.
+    """
+
+    def __init__(
+        self,
+        source: BagSource,
+        config: Config,
+        recording_id: str,
+        workers: int,
+        engine: Engine,
+        on_frame: Callable[[], None] = lambda: None,
+        place: Path | None = None,
+    ) -> None:
+        self._source, self._config, self._id = source, config, recording_id
+        self._engine, self._on_frame = engine, on_frame
+        self._length = min(LENGTH, max(SHORTEST, -(-source.total // (SHARE * workers))))
+        self._stopped = Event()
+        self._folder = Path(tempfile.mkdtemp(prefix=".bevviz-windows-", dir=place)).resolve()
+        remains.remember(self, partial(shutil.rmtree, self._folder, ignore_errors=True))
+
+    def close(self) -> None:
+        """Whatever is left of what was on its way goes."""
+        shutil.rmtree(self._folder, ignore_errors=True)
+        remains.forget(self)
+
+    @property
+    def scene(self) -> Scene:
+        return self._source.scene
+
+    @property
+    def total(self) -> int:
+        return self._source.total
+
+    @property
+    def warnings(self) -> Sequence[str]:
+        return self._source.warnings
+
+    def stop(self) -> None:
+        """After the window at hand."""
+        self._stopped.set()
+
+    def add_losses(self, losses: Losses) -> None:
+        """What the frames of a window lacked, for the warnings."""
+        self._source.add_losses(losses)
+
+    def __iter__(self) -> Iterator[WindowJob]:
+        """Whoever takes a window removes its files."""
+        made: dict[str, WindowJob] = {}
+        waiting: deque[WindowJob] = deque()
+
+        def jobs() -> Iterator[WindowJob]:
+            for window in ahead(self._source.windows(self._length), AHEAD):
+                paths = tuple(path.resolve() for path in self._source.recording.paths)
+                job = WindowJob(window, paths, self._config, self._source.selection, self._folder, self._id)
+                waiting.append(job)
+                yield job
+
+        def on_frame() -> None:
+            self._on_frame()
+            if self._stopped.is_set():
+                raise _StoppedError
+
+        try:
+            with closing(self._engine(jobs(), on_frame)) as ends:
+                for end in ends:
+                    if end.error:
+                        raise UserError(f"{end.name}: {end.error}")
+                    made |= {job.name: job for job in waiting if job.name == end.name}
+                    while waiting and waiting[0].name in made:
+                        yield made.pop(waiting.popleft().name)
+        except _StoppedError:
+            return
+
+
+class AsTheyAre:
+    """Processor of items that are made already."""
+
+    def perceive(self, item: WindowJob, network: Executor | None = None, /) -> WindowJob:
+        return item
+
+    def finish(self, item: WindowJob, /) -> WindowJob:
+        return item
+
+
+class InOrder(Observer[WindowJob]):
+    """Makes of each window what needs the frames before it, and shows its results to others.
+
+    Args:
+        windows: where they come from.
+        session: remembers the drive.
+        sinks: where the part of the recording goes that each window has made.
+        observers: of the results, which lack what only their frame needs: the points' fields, images, voxels.
+    """
+
+    def __init__(
+        self,
+        windows: Windows,
+        session: Session,
+        sinks: Sinks,
+        observers: Sequence[Observer[FrameResult]],
+    ) -> None:
+        self.frames = 0
+        self._windows, self._session, self._sinks, self._observers = windows, session, sinks, observers
+        self._begun: list[Observer[FrameResult]] = []
+
+    def begin(self, items: Items[object]) -> None:
+        for observer in self._observers:
+            observer.begin(items)
+            self._begun.append(observer)
+
+    def see(self, result: WindowJob) -> None:
+        self._sinks.add(result.recording)
+        for found in results_in(result.results, self._session.config):
+            if isinstance(found, Losses):
+                self._windows.add_losses(found)
+                continue
+            whole = self._session.watch(self._session.track(found))
+            for observer in self._observers:
+                observer.see(whole)
+            self.frames += 1
+        for path in (result.recording, result.results):
+            path.unlink(missing_ok=True)
+
+    def end(self) -> None:
+        for observer in self._begun:
+            observer.end()
+
+
+class _StoppedError(Exception):
+    """The rest is not wanted."""
+
+
+def ahead(items: Iterable[T], count: int) -> Iterator[T]:
+    """The items, so many of them drawn before they are asked for, in a thread of its own."""
+    source = iter(items)
+    waiting: deque[Future[T | None]] = deque()
+    drawer = ThreadPoolExecutor(1, "windows")
+    try:
+        waiting.extend(drawer.submit(next, source, None) for _ in range(count))
+        while (item := waiting.popleft().result()) is not None:
+            waiting.append(drawer.submit(next, source, None))
+            yield item
+    finally:
+        drawer.shutdown(cancel_futures=True)
