@@ -12,6 +12,7 @@ import pytest
 
 import bevviz
 from bevviz import geometry
+from bevviz.batch.jobs import find_bags
 from bevviz.cli import main
 from bevviz.drive import Drive
 from bevviz.evaluate import truth_in
@@ -381,6 +382,17 @@ def test_a_damaged_cloud_is_told_and_the_rest_goes_on(tmp_path: Path, capfd: Cap
         assert len(frames) == 2
         assert any("1700000000.300000000.pcd: cannot be read as a cloud" in w for w in drive.warnings)
     assert capfd.readouterr().out == ""
+
+
+# --- many drives -------------------------------------------------------------------------------
+
+
+def test_a_batch_finds_the_drives_of_a_folder(tmp_path: Path) -> None:
+    raw, tracking = datasets.kitti_raw(tmp_path / "raw"), datasets.kitti_tracking(tmp_path / "tracking")
+    sequence = datasets.kitti_odometry(tmp_path / "odometry")
+    scenes = datasets.nuscenes(tmp_path / "nuscenes")
+    expected = [scenes, sequence, raw, tracking / "velodyne/0000", tracking / "velodyne/0001"]
+    assert sorted(find_bags([tmp_path])) == sorted(expected)
 
 
 # --- what is wrong -----------------------------------------------------------------------------
