@@ -460,4 +460,7 @@ def test_which_data_set_can_be_forced(tmp_path: Path, capsys: Capture) -> None:
     assert main(["info", str(tmp_path / "empty"), "--dataset", "kitti-row"]) == 2
     assert "--dataset kitti-row: did you mean kitti-raw? There are" in capsys.readouterr().err
     assert main(["info", str(tmp_path / "empty")]) == 2
-    assert "neither a bag (no .mcap, .db3 or .bag file) nor a data set" in capsys.readouterr().err
+    assert (
+        "a folder without a bag (no .mcap, .db3 or .bag file), and no data set that is recognised"
+        in capsys.readouterr().err
+    )
