@@ -132,6 +132,11 @@ class SourceConfig(Section):
     )
     camera_topics: tuple[str, ...] = Field((), description="Image or CompressedImage topics")
     camera_info_topics: Mapping[str, str] = Field({}, description="camera topic -> its CameraInfo topic")
+    boxes: Mapping[str, str] = Field(
+        {},
+        description="topic with the robot's boxes in messages of its own, and where in them: topic, objects, "
+        "center, size, orientation or yaw, label, score, id",
+    )
     odometry_topic: str = Field("", description="nav_msgs/Odometry used where /tf has no fixed frame")
     base_frame: str = Field("base_link", description="frame that several LiDARs are merged in")
     fixed_frame: str = Field("", description="world frame; empty: map, odom or the like, where TF has one")

@@ -12,6 +12,7 @@ import pytest
 
 import bevviz
 from bevviz import geometry
+from bevviz.batch.jobs import find_bags
 from bevviz.cli import main
 from bevviz.drive import Drive
 from bevviz.evaluate import truth_in
@@ -383,6 +384,17 @@ def test_a_damaged_cloud_is_told_and_the_rest_goes_on(tmp_path: Path, capfd: Cap
     assert capfd.readouterr().out == ""
 
 
+# --- many drives -------------------------------------------------------------------------------
+
+
+def test_a_batch_finds_the_drives_of_a_folder(tmp_path: Path) -> None:
+    raw, tracking = datasets.kitti_raw(tmp_path / "raw"), datasets.kitti_tracking(tmp_path / "tracking")
+    sequence = datasets.kitti_odometry(tmp_path / "odometry")
+    scenes = datasets.nuscenes(tmp_path / "nuscenes")
+    expected = [scenes, sequence, raw, tracking / "velodyne/0000", tracking / "velodyne/0001"]
+    assert sorted(find_bags([tmp_path])) == sorted(expected)
+
+
 # --- what is wrong -----------------------------------------------------------------------------
 
 
@@ -448,4 +460,7 @@ def test_which_data_set_can_be_forced(tmp_path: Path, capsys: Capture) -> None:
     assert main(["info", str(tmp_path / "empty"), "--dataset", "kitti-row"]) == 2
     assert "--dataset kitti-row: did you mean kitti-raw? There are" in capsys.readouterr().err
     assert main(["info", str(tmp_path / "empty")]) == 2
-    assert "neither a bag (no .mcap, .db3 or .bag file) nor a data set" in capsys.readouterr().err
+    assert (
+        "a folder without a bag (no .mcap, .db3 or .bag file), and no data set that is recognised"
+        in capsys.readouterr().err
+    )

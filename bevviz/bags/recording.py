@@ -349,8 +349,8 @@ class Recording(Closing):
             within = sorted(d.name for d in folder.iterdir() if d.is_dir() and bag_files(d))
             hint = f"; there are bags in its folders: {', '.join(within[:5])}" if within else ""
             raise UserError(
-                f"{folder}: neither a bag (no .mcap, .db3 or .bag file) nor a data set that is known{hint}; "
-                "--dataset NAME says which"
+                f"{folder}: a folder without a bag (no .mcap, .db3 or .bag file), and no data set that is "
+                f"recognised (--dataset NAME){hint}"
             )
         metadata = self._read_metadata(folder)
         failed: list[UserError] = []

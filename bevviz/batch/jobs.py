@@ -163,7 +163,7 @@ def _bags(path: Path) -> Iterator[Path]:
         return
     bags, loader = bag_files(path), find_loader(path)
     if not bags and loader is not None and not loader.any_folder:
-        yield path
+        yield from loader.drives(path)
         return
     yield from bags
     for inner in sorted(path.iterdir()):

@@ -82,6 +82,11 @@ class Dataset:
         """Whether a folder looks like one of it; quick, and no file is opened."""
         raise NotImplementedError
 
+    @classmethod
+    def drives(cls, path: Path) -> list[Path]:
+        """The folders that are one drive each, as far as drives have folders."""
+        return [path]
+
     def warn(self, text: str) -> None:
         """Once."""
         if text not in self.warnings:

@@ -71,12 +71,17 @@ class KittiOdometry(Dataset):
             return any((path / "sequences").glob("*/velodyne"))
         return (path / "velodyne").is_dir() and (path / "calib.txt").is_file()
 
+    @classmethod
+    def drives(cls, path: Path) -> list[Path]:
+        if not (path / "sequences").is_dir():
+            return [path]
+        return sorted(found.parent for found in (path / "sequences").glob("*/velodyne"))
+
     def __init__(self, path: Path, sequence: str) -> None:
         super().__init__(path, sequence)
         folder = path
         if (path / "sequences").is_dir():
-            there = sorted(found.parent.name for found in (path / "sequences").glob("*/velodyne"))
-            folder = path / "sequences" / self.one_of(there)
+            folder = path / "sequences" / self.one_of([drive.name for drive in self.drives(path)])
         elif sequence:
             raise UserError(f"{path}: is one drive; leave --sequence {sequence} out")
         scans = sorted((folder / "velodyne").glob("*.bin"))

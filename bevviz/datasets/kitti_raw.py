@@ -48,12 +48,17 @@ class KittiRaw(Dataset):
     def fits(cls, path: Path) -> bool:
         return (path / "velodyne_points").is_dir() or any(path.glob("*_drive_*/velodyne_points"))
 
+    @classmethod
+    def drives(cls, path: Path) -> list[Path]:
+        if (path / "velodyne_points").is_dir():
+            return [path]
+        return sorted(found.parent for found in path.glob("*_drive_*/velodyne_points"))
+
     def __init__(self, path: Path, sequence: str) -> None:
         super().__init__(path, sequence)
         folder = path
         if not (path / "velodyne_points").is_dir():
-            there = sorted(found.parent.name for found in path.glob("*_drive_*/velodyne_points"))
-            folder = path / self.one_of(there)
+            folder = path / self.one_of([drive.name for drive in self.drives(path)])
         elif sequence:
             raise UserError(f"{path}: is one drive; leave --sequence {sequence} out")
         if any((folder / "velodyne_points/data").glob("*.txt")):

@@ -40,6 +40,12 @@ class KittiTracking(Dataset):
         above = path.parent  # velodyne/0000 itself
         return above.name == "velodyne" and (above.parent / f"calib/{path.name}.txt").is_file()
 
+    @classmethod
+    def drives(cls, path: Path) -> list[Path]:
+        if path.parent.name == "velodyne":
+            return [path]
+        return sorted((path / "velodyne").glob("[0-9]" * 4))
+
     def __init__(self, path: Path, sequence: str) -> None:
         super().__init__(path, sequence)
         root, name = path, path.name
@@ -48,7 +54,7 @@ class KittiTracking(Dataset):
             if sequence not in ("", name):
                 raise UserError(f"{path}: is one drive; leave --sequence {sequence} out")
         else:
-            name = self.one_of(sorted(f.name for f in (path / "velodyne").glob("[0-9]" * 4)))
+            name = self.one_of([drive.name for drive in self.drives(path)])
         scans = sorted((root / "velodyne" / name).glob("*.bin"))
         if not scans:
             raise UserError(f"{root / 'velodyne' / name}: no scan in it; expected 000000.bin")

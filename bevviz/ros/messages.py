@@ -34,6 +34,7 @@ from bevviz.frame import (
     LabelledBoxes3D,
 )
 from bevviz.loggers import logger
+from bevviz.ros.objects import decode_objects
 from bevviz.ros.roles import VIDEO
 
 _log = logger(__name__)
@@ -594,6 +595,21 @@ def decode_detections_2d(msg: Any, topic: str, received: int) -> LabelledBoxes2D
         scores=scores,
         received=received,
     )
+
+
+@_guarded
+def decode_boxes(msg: Any, topic: str, received: int, stated: Mapping[str, str]) -> LabelledBoxes3D:
+    """The boxes of a Detection3DArray, or of another message, see ``bevviz.ros.objects``.
+
+    Raises:
+        MessageError: they cannot be found in it.
+    """
+    if hasattr(msg, "detections") and not stated:
+        return decode_detections_3d(msg, topic, received)
+    try:
+        return decode_objects(msg, topic, received, stated)
+    except (ValueError, TypeError, AttributeError) as error:
+        raise MessageError(f"{topic}: no boxes in a {type(msg).__name__}: {first_line(error)}") from None
 
 
 @_guarded

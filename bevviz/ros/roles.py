@@ -6,7 +6,7 @@ import difflib
 import json
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from posixpath import commonprefix
 from types import MappingProxyType
 from typing import Literal
@@ -16,6 +16,7 @@ from bevviz.errors import UserError
 from bevviz.frame import Scene
 from bevviz.logging.entities import RESERVED
 from bevviz.ros.livox import is_livox
+from bevviz.ros.objects import check, holds_boxes
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,11 +29,14 @@ class Topic:
     frame_id: str = ""  # of its first message; "": not known
     rate: float | None = None  # Hz
     aside: str = ""  # why it plays no role unless it is stated
+    boxes: bool = False  # source.boxes says where in its messages they are
 
     @property
     def kind(self) -> str:
-        """What it is read as: the type without its package, or PointCloud2 for Livox's own clouds."""
-        return "PointCloud2" if is_livox(self.type) else self.type.rpartition("/")[2]
+        """What it is read as: the type without its package, but PointCloud2 for Livox's own clouds."""
+        if is_livox(self.type):
+            return "PointCloud2"
+        return "Detection3DArray" if self.boxes or holds_boxes(self.type) else self.type.rpartition("/")[2]
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,6 +64,7 @@ class Roles:
     robot_clouds: tuple[str, ...] = ()  # of obstacles, where the ground stage is the robot's
     stages: tuple[str, ...] = ()  # the robot's results that our stages are taken from
     truth: str = ""
+    boxes: Mapping[str, str] = field(default_factory=dict)  # as source.boxes has it
     around: tuple[tuple[str, str, str], ...] = field(default=(), compare=False)  # topic, what it tells, type
     # What follows is for sentences: it changes with topics that play no role.
     camera_infos: tuple[str, ...] = field(default=(), compare=False)  # all of them, whoever uses them
@@ -170,6 +175,7 @@ def find_roles(
         UserError: a stated topic does not exist, or is of another type.
     """
     topics = sorted(topics, key=lambda t: t.name)  # the order of a bag's or a graph's topics is chance
+    topics = _with_boxes(topics, config)
     notes = {t.name: f"not used: {foreign(t) or f'nothing here reads {t.type}'}" for t in topics}
     staged = {key: _stated(name, topics, key, STAGE_KINDS[key]) for key, name in stages.items()}
     obstacles = [topic for key, topic in staged.items() if key == "ground.method"]
@@ -210,6 +216,7 @@ def find_roles(
     helps = {t.name: f"; no LiDAR: {why}" if (why := foreign(t, "LiDAR")) else "" for t in topics}
     notes.update({name: f"shown: {_AROUND[kind]}{helps[name]}" for name, kind, _ in around})
     return Roles(
+        boxes=config.boxes,
         around=tuple(around),
         lidars=_names(lidars),
         lidar_names=tuple(names[: len(lidars)]),
@@ -228,6 +235,17 @@ def find_roles(
         no_camera="" if images else _no_camera(topics),
         notes=notes,
     )
+
+
+def _with_boxes(topics: list[Topic], config: SourceConfig) -> list[Topic]:
+    """The topic that ``source.boxes`` is of is read as boxes."""
+    check(config.boxes)
+    name = config.boxes.get("topic", "")
+    if name and name not in _names(topics):
+        near = difflib.get_close_matches(name, _names(topics), n=3, cutoff=0.4)
+        there = f"; the nearest are {', '.join(near)}" if near else ""
+        raise UserError(f"source.boxes: there is no topic {name}{there}")
+    return [replace(topic, boxes=topic.name == name) for topic in topics] if name else topics
 
 
 def _no_lidar(topics: Sequence[Topic]) -> str:

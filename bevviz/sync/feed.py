@@ -7,17 +7,17 @@ from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, Generic, Protocol, TypeVar
 
-from bevviz.frame import Image
+from bevviz.frame import Image, LabelledBoxes3D
 from bevviz.ros.around import decode_shapes, decode_statuses
 from bevviz.ros.messages import (
     MessageError,
     StampedTransform,
     decode_acceleration,
+    decode_boxes,
     decode_camera_info,
     decode_cloud,
     decode_compressed_image,
     decode_detections_2d,
-    decode_detections_3d,
     decode_image,
     decode_odometry,
     decode_transforms,
@@ -96,6 +96,10 @@ def make_handlers(sync: Synchronizer, roles: Roles, decode: Callable[[M], Any]) 
         if sync.upright.needs_gravity:
             sync.upright.add_acceleration(decode_acceleration(decode(message), message.topic))
 
+    def read_boxes(message: M) -> LabelledBoxes3D:
+        stated = roles.boxes if roles.boxes.get("topic") == message.topic else {}
+        return decode_boxes(decode(message), message.topic, message.received, stated)
+
     handlers: dict[str, Handler[M]] = {}
     for topic in roles.lidars:
         handlers[topic] = lambda m: sync.add_cloud(decode_cloud(decode(m), m.topic, m.received))
@@ -116,9 +120,9 @@ def make_handlers(sync: Synchronizer, roles: Roles, decode: Callable[[M], Any]) 
     for topic in roles.robot_detections_2d:
         handlers[topic] = lambda m: sync.add_detections(decode_detections_2d(decode(m), m.topic, m.received))
     for topic in roles.robot_detections_3d:
-        handlers[topic] = lambda m: sync.add_boxes(decode_detections_3d(decode(m), m.topic, m.received))
+        handlers[topic] = lambda m: sync.add_boxes(read_boxes(m))
     if roles.truth:
-        handlers[roles.truth] = lambda m: sync.add_truth(decode_detections_3d(decode(m), m.topic, m.received))
+        handlers[roles.truth] = lambda m: sync.add_truth(read_boxes(m))
     return handlers | make_around_handlers(sync, roles, decode)
 
 

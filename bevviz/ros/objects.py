@@ -1,0 +1,245 @@
+"""Boxes in messages other than vision_msgs': Autoware's, radars', markers, and private ones by stated fields.
+
+What a message is made of is read from the bag; here are only the names of the fields, as paths of attributes.
+"""
+
+from __future__ import annotations
+
+import difflib
+import math
+import re
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+
+from bevviz.errors import UserError
+from bevviz.frame import Boxes3D, LabelledBoxes3D
+
+CUBE, CYLINDER, TEXT, ADD = 1, 3, 9, 0  # of visualization_msgs/Marker
+POLYGON = 2  # of Autoware's Shape
+
+
+@dataclass(frozen=True, slots=True)
+class Fields:
+    """Where things are in a message: paths ``a.b.c``, with ``|`` between names that versions differ in."""
+
+    objects: str = ""  # the list, in the message; "": the message's only list of messages
+    center: str = "pose.position"  # with x, y, z
+    size: str = "size"  # with x, y, z, or three numbers: lengths along the box's own axes
+    orientation: str = ""  # quaternion; "": what is beside the centre, else none
+    yaw: str = ""  # radians, instead
+    label: str = ""  # a text, or a number that the definition names
+    score: str = ""
+    id: str = ""
+
+
+AUTOWARE = Fields(
+    objects="objects",
+    center="kinematics.pose_with_covariance|initial_pose_with_covariance.pose.position",
+    size="shape.dimensions",
+    label="classification.label",
+    score="existence_probability",
+    id="object_id|id|uuid",
+)
+RADAR = Fields(objects="tracks", center="position", size="size", label="classification", id="uuid")
+TYPES = re.compile(
+    r"autoware(_auto)?_perception_msgs/(msg/)?(Detected|Tracked|Predicted)Objects$|radar_msgs/(msg/)?RadarTracks$"
+)
+
+
+def holds_boxes(msgtype: str) -> bool:
+    """Whether the boxes in a message of that type are known."""
+    return TYPES.search(msgtype) is not None
+
+
+def check(stated: Mapping[str, str]) -> None:
+    """Of ``source.boxes``.
+
+    Raises:
+        UserError: a name that is none, or something is missing.
+    """
+    known = ["topic", *(field.name for field in fields(Fields))]
+    for name in stated:
+        if name not in known:
+            near = difflib.get_close_matches(name, known, n=1)
+            hint = f", did you mean {near[0]}? There are" if near else "; there are"
+            raise UserError(f"source.boxes: {name} is not known{hint} {', '.join(known)}")
+    if stated and "topic" not in stated:
+        raise UserError("source.boxes: topic is missing: of which the boxes are")
+
+
+def decode_objects(msg: Any, topic: str, received: int, stated: Mapping[str, str]) -> LabelledBoxes3D:
+    """The boxes of a message that is no Detection3DArray.
+
+    Of markers, each CUBE or CYLINDER that is added is a box; its label is the text of a TEXT_VIEW_FACING
+    marker with the same id, else its namespace.
+
+    Args:
+        msg: with a header, or objects that have one.
+        topic, received: for the result.
+        stated: ``source.boxes`` where it is of this topic; empty: known kinds alone.
+
+    Raises:
+        ValueError: a field is missing; which, and what there is.
+    """
+    paths = {name: path for name, path in stated.items() if name != "topic"}
+    if hasattr(msg, "markers") and not paths:
+        return _markers(msg.markers, topic, received)
+    known = RADAR if hasattr(msg, "tracks") else AUTOWARE
+    where = Fields(**paths) if paths else known
+    items = list(_follow(msg, where.objects)[1] if where.objects else _only_list(msg))
+    rows, labels, scores, ids = [], list[str](), list[float](), list[str]()
+    for item in items:
+        row = _row(item, where)
+        if not all(map(math.isfinite, row)):
+            continue
+        rows.append(row)
+        labels.append(_label(item, where.label) if where.label else "")
+        scores.append(float(_follow(item, where.score)[1]) if _has(item, where.score) else 1.0)
+        ids.append(_identity(_follow(item, where.id)[1]) if _has(item, where.id) else "")
+    header = getattr(msg, "header", None) or next(
+        (item.header for item in items if hasattr(item, "header")), None
+    )
+    if header is None and items:
+        raise ValueError("neither the message nor its objects have a header, which says the frame")
+    return _boxes(header, topic, received, rows, labels, scores, ids)
+
+
+def _row(item: Any, where: Fields) -> tuple[float, ...]:
+    """Centre, size and yaw."""
+    holder, center = _follow(item, where.center)
+    x, y, z = _vector(center)
+    yaw = 0.0
+    if where.yaw:
+        yaw = float(_follow(item, where.yaw)[1])
+    elif where.orientation:
+        yaw = _yaw(_follow(item, where.orientation)[1])
+    elif hasattr(holder, "orientation"):
+        yaw = _yaw(holder.orientation)
+    length, width, height = _vector(_follow(item, where.size)[1])
+    shape = getattr(item, "shape", None)
+    if shape is not None and getattr(shape, "type", None) == POLYGON and hasattr(shape, "footprint"):
+        outline = np.array([(p.x, p.y) for p in shape.footprint.points], np.float64).reshape(-1, 2)
+        if len(outline):  # in the object's own axes
+            low, high = outline.min(axis=0), outline.max(axis=0)
+            (length, width), (dx, dy) = (high - low).tolist(), ((low + high) / 2).tolist()
+            c, s = math.cos(yaw), math.sin(yaw)
+            x, y = x + c * dx - s * dy, y + s * dx + c * dy
+    return x, y, z, length, width, height, yaw
+
+
+def _markers(markers: Iterable[Any], topic: str, received: int) -> LabelledBoxes3D:
+    rows, labels, ids, header = list[tuple[float, ...]](), list[str](), list[str](), None
+    shown = [marker for marker in markers if marker.action == ADD]
+    texts = {marker.id: str(marker.text) for marker in shown if marker.type == TEXT}
+    for marker in shown:
+        if marker.type not in (CUBE, CYLINDER):
+            continue
+        header = header or marker.header
+        row = *_vector(marker.pose.position), *_vector(marker.scale), _yaw(marker.pose.orientation)
+        if all(map(math.isfinite, row)):
+            rows.append(row)
+            labels.append(texts.get(marker.id) or str(marker.ns))
+            ids.append(f"{marker.ns}/{marker.id}")
+    return _boxes(header, topic, received, rows, labels, [1.0] * len(rows), ids)
+
+
+def _boxes(
+    header: Any,
+    topic: str,
+    received: int,
+    rows: list[tuple[float, ...]],
+    labels: list[str],
+    scores: list[float],
+    ids: list[str],
+) -> LabelledBoxes3D:
+    table = np.array(rows, np.float32).reshape(-1, 7)
+    stamp = received if header is None else int(header.stamp.sec) * 10**9 + int(header.stamp.nanosec)
+    return LabelledBoxes3D(
+        topic=topic,
+        stamp=stamp,
+        frame_id="" if header is None else str(header.frame_id).removeprefix("/"),
+        boxes=Boxes3D(table[:, :3], table[:, 3:6], table[:, 6]),
+        labels=tuple(labels),
+        scores=np.nan_to_num(np.array(scores, np.float32)),
+        received=received,
+        ids=tuple(ids) if all(ids) else (),
+    )
+
+
+# --- fields ------------------------------------------------------------------------------------
+
+
+def _follow(item: Any, path: str) -> tuple[Any, Any]:
+    """What has the last attribute of a path, and its value; of a list the likeliest is followed."""
+    holder, value = item, item
+    for name in path.split("."):
+        holder = _likeliest(value)
+        found = next((one for one in name.split("|") if hasattr(holder, one)), None)
+        if found is None:
+            raise ValueError(f"no field {name} (of {path}); there are {', '.join(_names(holder)) or 'none'}")
+        value = getattr(holder, found)
+    return holder, value
+
+
+def _has(item: Any, path: str) -> bool:
+    try:
+        _follow(item, path if path else "-")
+    except ValueError:
+        return False
+    return True
+
+
+def _likeliest(value: Any) -> Any:
+    if not isinstance(value, list | tuple):
+        return value
+    if not value:
+        return None
+    return max(value, key=lambda one: float(getattr(one, "probability", getattr(one, "score", 0.0))))
+
+
+def _only_list(msg: Any) -> Any:
+    lists = {name: value for name in _names(msg) if isinstance(value := getattr(msg, name), list)}
+    if len(lists) != 1:
+        raise ValueError(
+            f"objects is not stated, and there are {len(lists)} lists: {', '.join(lists) or 'none'}"
+        )
+    return next(iter(lists.values()))
+
+
+def _names(item: Any) -> list[str]:
+    """The fields of a message, as rosbags or rclpy have it."""
+    stated = getattr(item, "__dataclass_fields__", None) or getattr(item, "_fields_and_field_types", {})
+    return [name for name in stated if not name.startswith("__")]
+
+
+def _vector(value: Any) -> tuple[float, float, float]:
+    if hasattr(value, "x"):
+        return float(value.x), float(value.y), float(value.z)
+    x, y, z = value
+    return float(x), float(y), float(z)
+
+
+def _yaw(q: Any) -> float:
+    """Turn about z; one left at zero is none."""
+    return math.atan2(2 * (q.w * q.z + q.x * q.y), q.w * q.w + q.x * q.x - q.y * q.y - q.z * q.z)
+
+
+def _label(item: Any, path: str) -> str:
+    """A text as it is; a number by the constant of that value beside the field, in lower case."""
+    if not _has(item, path):
+        return ""  # of a list of classes that is empty
+    holder, value = _follow(item, path)
+    if not isinstance(value, int | np.integer):
+        return str(value)
+    field = path.rpartition(".")[2].upper()
+    named = [name for name in dir(type(holder)) if name.isupper() and getattr(type(holder), name) == value]
+    named = [name for name in named if name.startswith(field)] or named
+    return named[0].removeprefix(f"{field}_").lower() if len(named) == 1 else str(value)
+
+
+def _identity(value: Any) -> str:
+    inner = getattr(value, "uuid", value)
+    return bytes(inner).hex() if isinstance(inner, np.ndarray | bytes | list) else str(inner)
