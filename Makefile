@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN = $(VENV)/bin
 
-.PHONY: demo test test-fast check bench accuracy clean
+.PHONY: demo test test-fast check docs bench accuracy clean
 
 demo: $(VENV)/.installed
 	$(BIN)/bevviz demo
@@ -20,6 +20,11 @@ check: $(VENV)/.tested
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
+
+docs: $(VENV)/.tested
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
+	@echo "build/site/index.html; '$(BIN)/mkdocs serve' shows it while it is written"
 
 bench: $(VENV)/.installed
 	$(BIN)/python -m benchmarks.performance --write docs/performance.md

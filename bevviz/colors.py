@@ -4,24 +4,62 @@ from __future__ import annotations
 
 import colorsys
 import zlib
+from enum import Enum
 from functools import lru_cache
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bevviz.frame import F32, U8
 
-CLASS_COLORS = {
-    "person": (255, 92, 92),
-    "pedestrian": (255, 92, 92),
-    "rider": (255, 170, 60),
-    "cyclist": (255, 170, 60),
-    "bicycle": (255, 170, 60),
-    "motorcycle": (255, 120, 200),
-    "car": (80, 170, 255),
-    "van": (120, 200, 255),
-    "truck": (150, 120, 255),
-    "bus": (200, 140, 255),
+Color: TypeAlias = tuple[int, int, int]
+
+# Told apart also by who is colour-blind, after Okabe & Ito (2008), on dark and on light; held by a test.
+CLASS_COLORS: dict[str, Color] = {
+    "person": (230, 110, 30),
+    "pedestrian": (230, 110, 30),
+    "rider": (240, 228, 66),
+    "cyclist": (240, 228, 66),
+    "bicycle": (240, 228, 66),
+    "motorcycle": (225, 140, 190),
+    "car": (86, 180, 233),
+    "van": (190, 235, 250),
+    "truck": (20, 100, 190),
+    "bus": (120, 60, 130),
+}
+
+
+class State(Enum):
+    """What a colour says of anything that can be well or not."""
+
+    GOOD = (86, 180, 233)
+    DOUBTFUL = (255, 200, 50)
+    BAD = (225, 75, 60)
+    OTHER = (170, 90, 160)  # neither: taken by another, of another class
+    UNKNOWN = (120, 125, 135)
+
+
+# Of what is held to the truth, of the two sides of a comparison, and of where points are lost.
+TRUTH: dict[str, Color] = {
+    "true": State.GOOD.value,
+    "missed": State.DOUBTFUL.value,
+    "false": State.BAD.value,
+}
+SIDES: dict[str, Color] = {
+    "same": (125, 135, 140),
+    "moved": (240, 228, 66),
+    "class": (214, 120, 190),
+    "only A": (230, 110, 30),
+    "only B": (70, 170, 240),
+}
+FATES: dict[str, Color] = {
+    "ground": (150, 120, 95),
+    "noise": (215, 70, 40),
+    "set aside": (240, 145, 70),
+    "clustered": (250, 230, 80),
+    "reported": (110, 200, 250),
+    "in front": (45, 90, 200),
 }
 
 
@@ -35,7 +73,7 @@ def palette(size: int = 64) -> U8:
     return colors
 
 
-def class_color(name: str) -> tuple[int, int, int]:
+def class_color(name: str) -> Color:
     """RGB colour of a class: the same in every run and on every machine."""
     known = CLASS_COLORS.get(name.lower())
     if known is not None:

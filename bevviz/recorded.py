@@ -29,6 +29,10 @@ AFTER = 500  # chunks in which one property follows another
 HEAD = 1 << 24  # bytes: what of a recording is read to find what it was made with, and more
 
 
+class ForeignRecordingError(UserError):
+    """One that is whole, and does not say how it was made: another program's, or of no run."""
+
+
 @dataclass(frozen=True, slots=True)
 class Place:
     """A bag, or another file, as it was: found by where it was, known again by its content.
@@ -284,16 +288,11 @@ def stands_for_bag(recording: Path) -> bool:
     Raises:
         UserError: no recording.
     """
-    if not recording.is_file():
-        raise UserError(f"{recording}: no such file")
-    check_decodes(recording, first=HEAD)
-    if recording.with_suffix(".mcap").is_file():
-        return True
     try:
         _, origin = read(recording)
-    except UserError:
+    except ForeignRecordingError:
         return False
-    return origin is not None
+    return origin is not None or recording.with_suffix(".mcap").is_file()
 
 
 def _found(place: Place, recording: Path) -> Path:
@@ -335,7 +334,7 @@ def read(recording: Path) -> tuple[str, Origin | None]:
     except (OSError, ValueError, KeyError, TypeError, RuntimeError) as error:
         raise UserError(f"{recording}: cannot be read as a recording: {first_line(error)}") from None
     if how is None:
-        raise UserError(f"{recording}: no recording of bevviz: it does not say how it was made")
+        raise ForeignRecordingError(f"{recording}: no recording of bevviz: it does not say how it was made")
     return how, origin
 
 

@@ -24,7 +24,7 @@ from bevviz.errors import UserError
 from bevviz.frame import F64, I64, U8, Camera, Cloud, Frame, Image, Intrinsics
 from bevviz.synthetic import SyntheticSource, write_bag
 from bevviz.synthetic.drive import PERIOD, START
-from tests import bags
+from tests import bags, forms
 from tests.recordings import Recording, verify
 
 Capture = pytest.CaptureFixture[str]
@@ -400,7 +400,9 @@ def test_command(turned: Path, capsys: Capture) -> None:
     assert "too far right" in recording.static["/calib/zed/result"]["TextDocument:text"][0]
 
     assert main(["calib", str(turned), "--config", "fixed.yaml", "--json", "--frames", ":8"]) == 0
-    (again,) = json.loads(capsys.readouterr().out)
+    tree = json.loads(capsys.readouterr().out)
+    forms.check(tree, "bevviz.calib/1")
+    (again,) = tree["cameras"]
     assert not [name for name, axis in again["axes"].items() if axis["finding"] == "off"]
 
 

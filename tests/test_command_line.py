@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
+import subprocess
 import sys
 from pathlib import Path
 from urllib.request import urlopen
@@ -11,8 +13,9 @@ from urllib.request import urlopen
 import pytest
 
 from bevviz.cli import main
+from bevviz.cli.machine import with_json
 from bevviz.cli.outputs import program, speak
-from tests import bags
+from tests import bags, forms
 
 Capture = pytest.CaptureFixture[str]
 
@@ -140,3 +143,52 @@ def test_what_is_no_recording_is_not_shown(capsys: Capture) -> None:
     Path("x.rrd").write_text("nothing")
     assert main(["x.rrd"]) == 2
     assert "x.rrd" in capsys.readouterr().err
+
+
+# --- for programs ------------------------------------------------------------------------------------
+
+
+def test_json_on_stdout_or_in_a_file(tmp_path: Path, capsys: Capture) -> None:
+    """Of every command the form is held to its page, here of those that are quick on a small bag."""
+    bags.write(tmp_path / "drive", bags.small_items(scans=6))
+    assert main(["info", "--json", "drive"]) == 0
+    info = json.loads(capsys.readouterr().out)
+    forms.check(info, "bevviz.info/1")
+    assert [camera["K"][0][0] for camera in info["cameras"]] == [60.0]
+    assert info["transforms"]["velodyne"] == "base_link"
+
+    swept = ["--set", "clustering.eps=0.5,0.6", "--frames", ":1"]
+    assert main(["sweep", "drive", *swept, "--json", "sweep.json"]) == 0
+    assert "clustering.eps" in capsys.readouterr().out
+    sweep = json.loads(Path("sweep.json").read_text())
+    forms.check(sweep, "bevviz.sweep/1")
+    assert [run["values"] for run in sweep["runs"]] == [["0.5"], ["0.6"]]
+
+    assert main(["compare", "drive", "--frames", ":1", "--json", "--save", "c.rrd"]) == 0
+    forms.check(json.loads(capsys.readouterr().out), "bevviz.compare/1")
+    assert main(["why", "drive", "--at-frame", "0", "--point", "5,0,0", "--json"]) == 0
+    forms.check(json.loads(capsys.readouterr().out), "bevviz.why/1")
+
+
+def test_json_never_takes_the_bag_for_its_file() -> None:
+    assert with_json(["why", "--json", "drive.mcap"]) == ["why", "--json=-", "drive.mcap"]
+    assert with_json(["why", "drive.mcap", "--json", "a.json"]) == ["why", "drive.mcap", "--json", "a.json"]
+    assert with_json(["why", "--json"]) == ["why", "--json"]
+
+
+def completed(line: str) -> list[str]:
+    """What a shell is offered behind a line."""
+    given = {**os.environ, "_ARGCOMPLETE": "1", "COMP_LINE": line, "COMP_POINT": str(len(line))}
+    given |= {"_ARGCOMPLETE_IFS": "\n", "_ARGCOMPLETE_STDOUT_FILENAME": str(Path("offered").resolve())}
+    Path("offered").touch()
+    subprocess.run([sys.executable, "-m", "bevviz"], env=given, check=True, capture_output=True, timeout=120)
+    return [word.strip() for word in Path("offered").read_text().split("\n")]
+
+
+def test_a_shell_completes_names(monkeypatch: pytest.MonkeyPatch, capsys: Capture) -> None:
+    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).resolve().parents[1]))
+    assert set(completed("bevviz co")) == {"compare", "config", "completion"}
+    assert completed("bevviz bag drive.mcap --mod") == ["--model"]
+    assert completed("bevviz bag d --set clustering.ep") == ["clustering.eps="]
+    assert main(["completion", "bash"]) == 0
+    assert "bevviz" in capsys.readouterr().out

@@ -24,7 +24,7 @@ from bevviz.evaluate.precision import DIFFICULTIES, AveragePrecision, Found
 from bevviz.frame import Boxes3D, ImageLabels, Objects
 from bevviz.stages.robot import in_points_frame
 from bevviz.synthetic import SyntheticSource, write_bag
-from tests import bags
+from tests import bags, forms
 from tests.recordings import Recording, verify
 
 REFERENCES = Path(__file__).parent / "references" / "metrics"
@@ -200,6 +200,7 @@ def test_a_gate_that_is_kept_and_one_that_is_not(drive: Path, tmp_path: Path, ca
     suite = ElementTree.parse(tmp_path / "e.xml").getroot()[0]
     assert (suite.get("name"), suite.get("tests"), suite.get("failures")) == ("drive", "2", "0")
     tree = json.loads((tmp_path / "e.json").read_text())
+    forms.check(tree, "bevviz.evaluate/1")
     assert tree["frames"] == 4
     counts = [len(frame["missed"]) + len(frame["false"]) for frame in tree["worst"]]
     assert counts == sorted(counts, reverse=True)

@@ -171,10 +171,10 @@ def test_no_output_is_an_input(capsys: Capture) -> None:
     assert "is what is read" in error_of(
         capsys, "calib", "drive", "--config", "my.yaml", "--write", "my.yaml"
     )
-    assert "is what is read" in error_of(capsys, "compare", "drive", "--json", bag)
+    assert "is what is read" in error_of(capsys, "compare", "drive", f"--json={bag}")
     assert "there is no folder no" in error_of(capsys, "compare", "drive", "--csv", "no/same.txt")
-    both = ("--csv", "same.txt", "--json", "same.txt")
-    assert "--json same.txt: --csv writes that file" in error_of(capsys, "compare", "drive", *both)
+    both = ("--csv", "same.json", "--json", "same.json")
+    assert "--json same.json: --csv writes that file" in error_of(capsys, "compare", "drive", *both)
     assert bag.read_bytes() == before and Path("my.yaml").read_text().startswith("voxel")
 
 

@@ -24,7 +24,7 @@ from bevviz.why.subject import projected
 from bevviz.why.text import summary
 from bevviz.why.traces import Fate, Traces
 from bevviz.why.verdict import Reason
-from tests import bags
+from tests import bags, forms
 from tests.recordings import Recording
 from tests.test_faults import at, drive, planted, run
 
@@ -540,6 +540,7 @@ def test_the_command_for_machines(bag: Path, capsys: Capture) -> None:
     command = ["why", str(bag), "--at", "0", "--model", "demo", "--json", "--point", "10,-2.7,-1.6"]
     assert main(command) == 0
     found = json.loads(capsys.readouterr().out)
+    forms.check(found, "bevviz.why/1")
     (answer,) = found["answers"]
     assert found["preset"] == "default" and answer["kind"] == "point"
     assert answer["reported"] and answer["reason"] == "reported"
@@ -597,25 +598,3 @@ def test_wrong_numbers(bag: Path, capsys: Capture, arguments: list[str]) -> None
         main(["why", str(bag), "--at", "0", *arguments])
     assert ended.value.code == 2
     assert "error: argument" in capsys.readouterr().err
-
-
-# --- the page ----------------------------------------------------------------------------------
-
-
-def test_the_page_shows_what_the_command_says(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capture
-) -> None:
-    """Word for word; numbers may differ a little where another processor adds up in another order."""
-    page = (Path(__file__).parents[1] / "docs/why.md").read_text()
-    sample = next(block for block in page.split("```") if "bevviz demo" in block).removeprefix("console\n")
-    demo, command, *shown = sample.splitlines()
-    monkeypatch.chdir(tmp_path)
-    assert main(demo.removeprefix("$ bevviz ").split()) == 0
-    capsys.readouterr()
-    assert main(command.removeprefix("$ bevviz ").split()) == 0
-    said, told = (
-        (NUMBER.split(text), NUMBER.findall(text))
-        for text in (" ".join(capsys.readouterr().out.split()), " ".join(" ".join(shown).split()))
-    )
-    assert told[0] == said[0]
-    assert [float(x) for x in told[1]] == pytest.approx([float(x) for x in said[1]], rel=0.02, abs=0.02)

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import textwrap
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field, fields
 from itertools import islice
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -175,6 +176,31 @@ def find_missing(roles: Roles, frame: Frame | None, config: Config) -> list[str]
             "--set source.fixed_frame=name"
         )
     return [*found, *frame.problems]
+
+
+def as_tree(info: Contents) -> dict[str, Any]:
+    """For JSON: all but the pictures and clouds."""
+    own = {f.name: getattr(info, f.name) for f in fields(info) if f.name not in ("topics", "cameras", "tree")}
+    return {
+        **own,
+        "topics": [asdict(topic) for topic in info.topics],
+        "cameras": [_camera_tree(camera) for camera in info.cameras],
+        "transforms": dict(info.tree),
+    }
+
+
+def _camera_tree(camera: Camera) -> dict[str, Any]:
+    image, model, placed = camera.image, camera.intrinsics, camera.camera_from_points
+    return {
+        "name": camera.name,
+        "width": None if image is None else image.bgr.shape[1],
+        "height": None if image is None else image.bgr.shape[0],
+        "K": None if model is None else model.K.tolist(),
+        "distortion_model": None if model is None else model.distortion_model,
+        "D": None if model is None else model.D.tolist(),
+        "camera_from_points": None if placed is None else placed.tolist(),
+        "problems": list(camera.problems),
+    }
 
 
 def render(info: BagInfo) -> str:

@@ -11,7 +11,7 @@ from bevviz import geometry, table
 from bevviz.calib.axes import TIME, error_pose
 from bevviz.calib.result import Calibration, Finding
 from bevviz.calib.shots import Shot
-from bevviz.colors import bins
+from bevviz.colors import State, bins
 from bevviz.config import LoggingConfig
 from bevviz.frame import F32, F64, Bool, Intrinsics
 from bevviz.logging import entities
@@ -19,12 +19,12 @@ from bevviz.logging.annotations import depth_annotations
 from bevviz.logging.pieces import CORNER, document, encode_image
 from bevviz.text import fenced, markdown
 
-_STATED, _CORRECTED = (255, 80, 80), (90, 230, 120)
+_STATED, _CORRECTED = State.BAD.value, State.GOOD.value
 _COLORS = {
-    Finding.FINE: (70, 160, 90),
-    Finding.OFF: (210, 70, 70),
-    Finding.UNKNOWN: (130, 130, 145),
-    Finding.CONFLICT: (225, 160, 60),
+    Finding.FINE: State.GOOD.value,
+    Finding.OFF: State.BAD.value,
+    Finding.UNKNOWN: State.UNKNOWN.value,
+    Finding.CONFLICT: State.DOUBTFUL.value,
 }
 
 

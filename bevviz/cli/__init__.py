@@ -16,6 +16,7 @@ from bevviz.cli import (
     batch,
     calib,
     compare,
+    completion,
     config,
     demo,
     evaluate,
@@ -31,6 +32,7 @@ from bevviz.cli import (
     workbench,
 )
 from bevviz.cli.inputs import check_outputs
+from bevviz.cli.machine import with_json
 from bevviz.cli.options import follow_recording, with_negatives
 from bevviz.cli.parser import COMMAND, Parser
 from bevviz.errors import UserError, first_line, interrupt_in
@@ -55,6 +57,7 @@ EPILOG = """examples:
   bevviz snap                                 save what it saw in the last 30 seconds
   bevviz calib drive.mcap                     is it the calibration or the clock?
   bevviz config --preset reference            every parameter, with its unit and meaning
+  bevviz config clustering.eps                one of them explained, and where its value is stated
 """
 
 
@@ -78,7 +81,9 @@ def _main(arguments: Sequence[str] | None) -> int:
         interrupts.install()
     try:
         parser, commands = _parser()
-        given = with_negatives(sys.argv[1:] if arguments is None else arguments)
+        if "_ARGCOMPLETE" in os.environ:
+            completion.complete(parser)
+        given = with_json(with_negatives(sys.argv[1:] if arguments is None else arguments))
         if not given:
             parser.print_help()
             return 2
@@ -142,6 +147,7 @@ def _parser() -> tuple[argparse.ArgumentParser, Collection[str]]:
         demo,
         live,
         config,
+        completion,
     ):
         command.add(commands)
     for command_parser in commands.choices.values():

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from bevviz import announce
+from bevviz.cli.machine import add_json, give, on_stdout
 from bevviz.cli.options import Commands, add_bag, add_config, add_output, add_selection, load_config, open_bag
 from bevviz.cli.outputs import Outputs, say, warn
 
@@ -31,7 +32,7 @@ def add(commands: Commands) -> None:
     add_config(calib)
     output = add_output(calib, blueprint="calib")
     output.add_argument("--write", type=Path, metavar="FILE.yaml", help="write the corrected configuration")
-    output.add_argument("--json", action="store_true", help="print the result as JSON")
+    add_json(output)
     calib.set_defaults(run=_calib)
 
 
@@ -63,7 +64,9 @@ def _calib(options: argparse.Namespace) -> int:
                 steps.update(round(100 * done) - steps.n)
 
             results.append(calibrate(shots[name], show, config.sync.offsets))
-    _print(results, options.json)
+    give(options, "calib", {"cameras": [result.to_dict() for result in results]})
+    if not on_stdout(options):
+        _print(results)
     if options.write is not None:
         _write(results, options.write)
     _log(results, shots, scene, config, options)
@@ -82,12 +85,7 @@ def _cameras(scene: Scene, wanted: str | None, why_none: str) -> tuple[str, ...]
     return (wanted,)
 
 
-def _print(results: list[Calibration], as_json: bool) -> None:
-    import json
-
-    if as_json:
-        print(json.dumps([result.to_dict() for result in results], indent=2))
-        return
+def _print(results: list[Calibration]) -> None:
     for result in results:
         print(result.answer)
         print(f"\n{result.table()}\n")

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
+from bevviz.cli.machine import add_json, give, on_stdout
 from bevviz.cli.options import (
     Commands,
     add_bag,
@@ -64,7 +65,7 @@ def add(commands: Commands) -> None:
     )
     add_truth(compare)
     output = add_output(compare, blueprint="compare")
-    output.add_argument("--json", type=Path, metavar="FILE", help="the table and every difference")
+    add_json(output)
     output.add_argument("--csv", type=Path, metavar="FILE", help="a row for each object that differs")
     compare.set_defaults(run=_compare)
 
@@ -171,9 +172,9 @@ def _default(options: argparse.Namespace) -> Path:
 
 
 def _report(summary: ComparisonSummary, options: argparse.Namespace) -> None:
-    print(summary.table(), flush=True)
-    if options.json is not None:
-        summary.write_json(options.json)
+    if not on_stdout(options):
+        print(summary.table(), flush=True)
+    give(options, "compare", summary.as_tree())
     if options.csv is not None:
         summary.write_csv(options.csv)
 

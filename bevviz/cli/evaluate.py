@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
 from typing import TYPE_CHECKING
 
+from bevviz.cli.machine import add_json, give, on_stdout
 from bevviz.cli.options import (
     Commands,
     add_bag,
@@ -56,7 +56,7 @@ def add(commands: Commands) -> None:
     add_config(evaluate)
     output = add_output(evaluate, blueprint="evaluate")
     output.description = "None, but the table. Several can be given at once."
-    output.add_argument("--json", type=Path, metavar="FILE", help="every metric, and the frames, worst first")
+    add_json(output)
     evaluate.set_defaults(run=_evaluate)
 
 
@@ -69,13 +69,13 @@ def _evaluate(options: argparse.Namespace) -> int:
     config = load_config(options)
     with open_bag(options, config) as frames:
         evaluation = Evaluation(truth_in(frames, options.truth, options.kitti_labels))
-        status = _run(frames, config, evaluation, Outputs.of(options))
+        status = _run(frames, config, evaluation, Outputs.of(options), table=not on_stdout(options))
         if not evaluation.judged:
             raise UserError(f"{options.paths[0]}: there is truth for none of the {evaluation.without} frames")
         return _report(evaluation, limits, options) or status
 
 
-def _run(frames: Frames, config: Config, evaluation: Evaluation, outputs: Outputs) -> int:
+def _run(frames: Frames, config: Config, evaluation: Evaluation, outputs: Outputs, *, table: bool) -> int:
     """The exit status of the run."""
     from bevviz.session import Session
 
@@ -95,19 +95,22 @@ def _run(frames: Frames, config: Config, evaluation: Evaluation, outputs: Output
         hint(frames.scene, config)
         return [Recorder(recording, config), evaluation, EvaluationRecorder(recording, evaluation)]
 
-    return logged(frames, session, config, outputs, observers, lambda: print(evaluation.table(), flush=True))
+    def finish() -> None:
+        if table:
+            print(evaluation.table(), flush=True)
+
+    return logged(frames, session, config, outputs, observers, finish)
 
 
 def _report(evaluation: Evaluation, limits: list[Limit], options: argparse.Namespace) -> int:
     """The exit status of the gate."""
     from bevviz.evaluate.gate import check, write_junit
 
-    if not Outputs.of(options):
+    if not Outputs.of(options) and not on_stdout(options):
         print(evaluation.table())
     kept = check(limits, evaluation.metrics)
-    if options.json is not None:
-        gate = [{"limit": str(k.limit), "kept": not k.reason, "reason": k.reason} for k in kept]
-        evaluation.write_json(options.json, {"limits": gate})
+    gate = [{"limit": str(k.limit), "kept": not k.reason, "reason": k.reason} for k in kept]
+    give(options, "evaluate", {**evaluation.as_tree(), "limits": gate})
     if options.junit is not None:
         write_junit(options.junit, {options.paths[0].resolve().stem: kept})
     for found in kept:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from bevviz.cli.machine import add_json, give, on_stdout
 from bevviz.cli.options import Commands, add_config, add_dataset, add_ros_args, load_config, positive
 from bevviz.errors import UserError
 
@@ -27,23 +28,31 @@ def add(commands: Commands) -> None:
         metavar="SECONDS",
         help="--live: how long to listen, for rates, sizes and delays (default: 3); Ctrl-C ends it earlier",
     )
+    info.add_argument("--model", metavar="FILE.onnx", help="detector that is going to be used")
+    add_json(info)
     add_config(info)
     add_ros_args(info)
     info.set_defaults(run=_info)
 
 
 def _info(options: argparse.Namespace) -> int:
-    from bevviz.bags.info import describe, render
+    from bevviz.bags.info import as_tree, describe, render
 
     if options.live:
         from bevviz.live import info
 
         seconds = options.seconds or info.LISTEN
-        print(info.render(info.describe(load_config(options), options.ros_args, seconds)))
+        live = info.describe(load_config(options), options.ros_args, seconds)
+        give(options, "info", as_tree(live))
+        if not on_stdout(options):
+            print(info.render(live))
         return 0
     if options.seconds is not None:
         raise UserError("bevviz info: --for is for --live; a bag is read as a whole")
     if not options.paths:
         raise UserError("bevviz info: which bag? Give its path, or --live for a running robot")
-    print(render(describe(options.paths, load_config(options))))
+    found = describe(options.paths, load_config(options))
+    give(options, "info", as_tree(found))
+    if not on_stdout(options):
+        print(render(found))
     return 0

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 
+from bevviz.cli.machine import STDOUT
 from bevviz.errors import UserError
 
 READ = ("paths", "recording", "config", "model", "a", "b", "kitti_labels", "note_file", "blueprint")
@@ -35,7 +36,7 @@ def check_outputs(options: argparse.Namespace) -> None:
     outputs: dict[Path, str] = {}
     for name, option in WRITTEN.items():
         target = getattr(options, name, None)
-        if not isinstance(target, Path) or target.is_dir():
+        if not isinstance(target, Path) or target.is_dir() or target == Path(STDOUT):
             continue
         other = outputs.setdefault(target.resolve(), option)
         if other != option and (target.is_file() or not target.exists()):

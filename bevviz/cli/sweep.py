@@ -7,6 +7,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from bevviz.cli.machine import add_json, give, on_stdout
 from bevviz.cli.options import (
     Commands,
     add_bag,
@@ -36,6 +37,7 @@ def add(commands: Commands) -> None:
     add_truth(sweep)
     add_config(sweep)
     output = add_output(sweep, blueprint=None)
+    add_json(output)
     output.add_argument("--csv", type=Path, metavar="FILE", help="the table, with each stage and class")
     sweep.set_defaults(run=_sweep)
 
@@ -64,7 +66,9 @@ def _sweep(options: argparse.Namespace) -> int:
             hint(source.scene, config)
             end = through(source, sweep, [])
             warn(source.warnings)
-            print(sweep.table())
+            if not on_stdout(options):
+                print(sweep.table())
+            give(options, "sweep", sweep.as_tree())
             if options.csv is not None:
                 sweep.write_csv(options.csv)
             if sinks is not None:

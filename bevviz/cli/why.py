@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable, Iterable, Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from bevviz import announce
+from bevviz.cli.machine import add_json, give, on_stdout
 from bevviz.cli.options import Commands, add_bag, add_config, add_output, load_config, positive
 from bevviz.cli.outputs import Outputs, say, warn
 from bevviz.errors import UserError
@@ -68,7 +69,7 @@ def add(commands: Commands) -> None:
     what.add_argument(
         "--all", action="store_true", help="also what went well, and what nothing could be done about"
     )
-    why.add_argument("--json", action="store_true", help="for machines")
+    add_json(why)
     add_config(why)
     add_output(why, blueprint="explain").description = "None, unless one is given."
     why.set_defaults(run=_why)
@@ -127,9 +128,8 @@ def _why(options: argparse.Namespace) -> int:
         answers = questioner.explain(selection, options.limit, _progress, everything=options.all)
         beside = _beside(questioner, selection, answers)
         in_short = _in_short(questioner, selection)
-        if options.json:
-            _print_json(result, answers, beside, in_short)
-        else:
+        give(options, "why", _tree(result, answers, beside, in_short))
+        if not on_stdout(options):
             print(printable(f"frame {frame.index}, preset {config.preset}: {in_short}"))
             if answers:
                 print(f"\n{plain(answers, options.limit, beside)}")
@@ -185,15 +185,13 @@ def _progress(answers: Sequence[Answer]) -> Iterable[Answer]:
     yield from announce.bar(answers, unit="object", desc="what would change it", leave=False)
 
 
-def _print_json(
+def _tree(
     result: FrameResult, answers: Sequence[Answer], beside: Sequence[Answer], in_short: str
-) -> None:
-    import json
-
+) -> dict[str, Any]:
     frame = result.frame
     head = {"frame": frame.index, "stamp": frame.stamp, "preset": result.config.preset, "summary": in_short}
     there = [{"name": a.subject.name, "verdict": a.verdict.text} for a in beside]
-    print(json.dumps({**head, "answers": [a.as_dict() for a in answers], "beside": there}, indent=2))
+    return {**head, "answers": [a.as_dict() for a in answers], "beside": there}
 
 
 def _show(result: FrameResult, answers: Sequence[Answer], scene: Scene, outputs: Outputs, limit: int) -> None:

@@ -8,6 +8,7 @@ import numpy as np
 import rerun as rr
 
 from bevviz import table
+from bevviz.colors import SIDES
 from bevviz.compare.differences import DIFFERENT, WORST_FIRST, Change, Difference, FrameDifferences
 from bevviz.frame import F64
 from bevviz.logging import entities
@@ -18,11 +19,11 @@ from bevviz.logging.writer import Writer
 from bevviz.text import markdown
 
 COLORS = {
-    Change.SAME: (70, 160, 90),
-    Change.MOVED: (255, 215, 60),
-    Change.CLASS: (200, 120, 255),
-    Change.ONLY_A: (255, 110, 70),
-    Change.ONLY_B: (60, 190, 255),
+    Change.SAME: SIDES["same"],
+    Change.MOVED: SIDES["moved"],
+    Change.CLASS: SIDES["class"],
+    Change.ONLY_A: SIDES["only A"],
+    Change.ONLY_B: SIDES["only B"],
 }
 
 

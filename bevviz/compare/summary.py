@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import json
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from io import StringIO
@@ -201,13 +200,9 @@ class ComparisonSummary(Observer[Compared]):
         objects = "no object differs" if self._detected else "no detector (--model FILE.onnx), so no objects"
         return f"{objects}; the number of clusters differs in {self._other_clusters} of {frames}"
 
-    def write_json(self, path: Path) -> None:
-        """Everything that the table is made of, and each difference.
-
-        Raises:
-            UserError: the file cannot be written.
-        """
-        tree = {
+    def as_tree(self) -> dict[str, Any]:
+        """For JSON: everything that the table is made of, and each difference."""
+        return {
             "a": self.names[0],
             "b": self.names[1],
             "config": self.config,
@@ -217,7 +212,6 @@ class ComparisonSummary(Observer[Compared]):
             "truth": self.truth,
             "frames": self.frames,
         }
-        save(path, json.dumps(tree, indent=1), "--json")
 
     def write_csv(self, path: Path) -> None:
         """A row for each object that differs.

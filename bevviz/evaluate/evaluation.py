@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from bevviz.errors import UserError
 from bevviz.evaluate.detections import count_detections
 from bevviz.evaluate.ground import count_ground
 from bevviz.evaluate.identity import TrackScore
@@ -202,13 +199,6 @@ class Evaluation(Observer[FrameResult]):
             "metrics": {name: _plain(value) for name, value in self.metrics.items()},
             "worst": self.worst,
         }
-
-    def write_json(self, path: Path, more: Mapping[str, Any] | None = None) -> None:
-        """Raises UserError where the file cannot be written."""
-        try:
-            path.write_text(json.dumps({**self.as_tree(), **(more or {})}, indent=1))
-        except OSError as error:
-            raise UserError(f"--json {path}: cannot be written: {error.strerror}") from None
 
     def to_pandas(self) -> DataFrame:
         """A row for each metric: its name, class, range and value."""

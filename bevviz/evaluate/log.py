@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 import rerun as rr
 
+from bevviz.colors import TRUTH
 from bevviz.evaluate.evaluation import Evaluation
 from bevviz.evaluate.tables import page
 from bevviz.evaluate.truth import Truth
@@ -16,8 +17,6 @@ from bevviz.logging.pieces import boxes3d, document, transform
 from bevviz.logging.writer import WAIT, Writer
 from bevviz.run import Items, Observer
 from bevviz.text import markdown
-
-COLORS = {"true": (70, 190, 100), "missed": (255, 150, 40), "false": (240, 60, 70)}
 
 
 class EvaluationRecorder(Observer[FrameResult]):
@@ -33,7 +32,7 @@ class EvaluationRecorder(Observer[FrameResult]):
         self._writer = Writer(recording, wait=WAIT)
 
     def begin(self, items: Items[object]) -> None:
-        for what, color in COLORS.items():
+        for what, color in TRUTH.items():
             looks = rr.Boxes3D.from_fields(colors=[color], radii=rr.Radius.ui_points(2.5), show_labels=True)
             self._writer.static(entities.judged(what), looks)
             series = rr.SeriesLines(colors=[color], names=[what], widths=[2])

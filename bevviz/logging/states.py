@@ -10,30 +10,29 @@ import rerun as rr
 
 from bevviz import anomalies
 from bevviz.anomalies import KINDS
+from bevviz.colors import Color, State
 from bevviz.frame import CameraResult, Decision, FrameResult, Tracks
 from bevviz.logging import entities
 from bevviz.logging.writer import Writer
 
-Color = tuple[int, int, int]
-
 COLORS: Mapping[str, Color] = {
-    "ok": (70, 160, 90),
-    "matched": (70, 160, 90),
-    "degraded": (220, 160, 50),
-    "failed": (210, 70, 70),
-    "no cluster": (210, 70, 70),
-    "too few points": (220, 160, 50),
-    "low overlap": (220, 160, 50),
-    "misfit": (220, 160, 50),
-    "taken": (150, 120, 220),
-    "too far": (110, 130, 160),
-    "not fused": (110, 110, 120),
-    "silent": (210, 70, 70),
-    "unusable": (210, 70, 70),
-    "no publisher": (210, 70, 70),
-    "warning": (220, 160, 50),  # of the robot's diagnostics
-    "error": (210, 70, 70),
-    "stale": (110, 110, 120),
+    "ok": State.GOOD.value,
+    "matched": State.GOOD.value,
+    "degraded": State.DOUBTFUL.value,
+    "failed": State.BAD.value,
+    "no cluster": State.BAD.value,
+    "too few points": State.DOUBTFUL.value,
+    "low overlap": State.DOUBTFUL.value,
+    "misfit": State.DOUBTFUL.value,
+    "taken": State.OTHER.value,
+    "too far": State.UNKNOWN.value,
+    "not fused": State.UNKNOWN.value,
+    "silent": State.BAD.value,
+    "unusable": State.BAD.value,
+    "no publisher": State.BAD.value,
+    "warning": State.DOUBTFUL.value,  # of the robot's diagnostics
+    "error": State.BAD.value,
+    "stale": State.UNKNOWN.value,
 }
 
 

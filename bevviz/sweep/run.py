@@ -10,6 +10,7 @@ from concurrent.futures import Executor
 from dataclasses import dataclass, field
 from io import StringIO
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -132,6 +133,26 @@ class Sweep:
 
     def _metrics(self) -> list[str]:
         return max((list(outcome.metrics) for outcome in self.outcomes.values()), key=len)
+
+    def as_tree(self) -> dict[str, Any]:
+        """For JSON: every number of the table, each stage's time, counts by class."""
+        return {
+            "parameters": [parameter.key for parameter in self.parameters],
+            "runs": [
+                {
+                    "values": list(values),
+                    "frames": outcome.frames,
+                    "metrics": outcome.metrics,
+                    "classes": {
+                        name: {kind: outcome.score.classes[name][kind] for kind in ("tp", "fp", "fn")}
+                        for name in outcome.score.names
+                    },
+                    "failures": outcome.failures,
+                }
+                for values, outcome in self.outcomes.items()
+            ],
+            "best": None if self.best is None else list(self.best),
+        }
 
     def write_csv(self, path: Path) -> None:
         """A row for each combination: every number of the table, each stage's time, counts by class.

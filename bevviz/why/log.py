@@ -8,6 +8,7 @@ import numpy as np
 import rerun as rr
 
 from bevviz import geometry
+from bevviz.colors import FATES
 from bevviz.config import BevConfig
 from bevviz.frame import F32, U8, Camera, Frame
 from bevviz.logging import entities
@@ -21,12 +22,12 @@ from bevviz.why.text import page
 from bevviz.why.traces import Fate
 
 COLORS = {
-    Fate.GROUND: (170, 110, 60),
-    Fate.NOISE: (255, 60, 60),
-    Fate.SET_ASIDE: (255, 150, 40),
-    Fate.CLUSTERED: (255, 230, 60),
-    Fate.REPORTED: (80, 230, 110),
-    Fate.IN_FRONT: (80, 140, 255),
+    Fate.GROUND: FATES["ground"],
+    Fate.NOISE: FATES["noise"],
+    Fate.SET_ASIDE: FATES["set aside"],
+    Fate.CLUSTERED: FATES["clustered"],
+    Fate.REPORTED: FATES["reported"],
+    Fate.IN_FRONT: FATES["in front"],
 }
 _SUBJECT = (255, 60, 200)
 _DEPTH = 20.0  # metres that a frustum is drawn to where the distance is unknown
