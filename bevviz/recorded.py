@@ -26,6 +26,7 @@ from bevviz.text import path_text
 FRAMES = ("source.", "sync.")  # sections that say what a frame is made of
 BLOCK = 1 << 16  # bytes at the beginning, in the middle and at the end of a file that are looked at
 AFTER = 500  # chunks in which one property follows another
+MAGIC = b"RRF"  # and a digit, for the generation of the format
 HEAD = 1 << 24  # bytes: what of a recording is read to find what it was made with, and more
 
 
@@ -320,6 +321,9 @@ def read(recording: Path) -> tuple[str, Origin | None]:
     """
     if not recording.is_file():
         raise UserError(f"{recording}: no such file")
+    with recording.open("rb") as file:
+        if file.read(len(MAGIC)) != MAGIC:
+            raise UserError(f"{recording}: no recording: it does not begin as one of Rerun's")
     check_decodes(recording, first=HEAD)
     how: str | None = None
     origin: Origin | None = None
