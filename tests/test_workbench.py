@@ -235,8 +235,11 @@ def test_missed_objects_are_listed_and_sought(browser: Browser, address: str) ->
     with opened(browser, address) as page:
         until(lambda: f"{FRAMES} frames" in page.inner_text("#run"))
         rows = page.locator("#found button")
-        late = next(
-            row for row in rows.all() if row.locator(".time").inner_text() not in ("0.00 s", "")
+        shown_first = ("0.00 s", "")
+        late = until(
+            lambda: next(
+                (row for row in rows.all() if row.locator(".time").inner_text() not in shown_first), None
+            )
         )  # of another frame than that which is shown
         assert late.locator(".missed").inner_text() == "missed"
         shown = len(events(page, "time_update"))
@@ -265,8 +268,10 @@ def test_parameters_are_tried_on_the_shown_frame(browser: Browser, address: str)
         control.press("Enter")
         until(lambda: "loses" in page.inner_text("#effect"))
         assert state(page)["set"] == ["clustering.min_cluster_points=100000"]
+        assert page.evaluate("document.activeElement.id") == "control-clustering.min_cluster_points"
         assert "F1" in page.inner_text("#effect")
-        page.click("#undo")
+        page.keyboard.press("Escape")
+        page.keyboard.press("u")
         until(lambda: "As it was opened" in page.inner_text("#effect"))
         assert "set" not in state(page)
         control = page.locator("[id='control-clustering.min_cluster_points']")

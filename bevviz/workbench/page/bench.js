@@ -158,7 +158,12 @@ function showControls() {
   const own = new Map(state.set.map((one) => [one.slice(0, one.indexOf("=")), one.slice(one.indexOf("=") + 1)]));
   const wanted = controls.filter((one) => own.has(one.key) || (words.length
     && words.every((word) => `${one.key} ${one.about} ${one.unit}`.toLowerCase().includes(word))));
+  // What is changed stays on top, then what is named so; 'eps' is in 'keeps', too.
+  const rank = (one) => (own.has(one.key) ? 0 : 1 + Number(!words.every((word) => one.key.includes(word))));
+  wanted.sort((a, b) => rank(a) - rank(b));
+  const focused = document.activeElement?.id;
   $("controls").replaceChildren(...wanted.map((one) => control(one, own)));
+  if (focused?.startsWith("control-")) $(focused)?.focus();
 }
 
 function control(one, own) {
@@ -257,6 +262,7 @@ $("search").oninput = showControls;
 window.addEventListener("keydown", (event) => {
   const own = event.target.closest?.("aside"); // the viewer has inputs of its own, hidden ones
   const typing = own && ["INPUT", "SELECT"].includes(event.target.tagName);
+  if (typing && event.key === "Escape") event.target.blur();
   if (typing || event.ctrlKey || event.metaKey || event.altKey || !(event.key in actions)) return;
   event.preventDefault();
   event.stopPropagation();

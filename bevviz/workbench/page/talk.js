@@ -30,6 +30,7 @@ function film(lane) {
     if (!pieces.film) performance.mark("piece");
     pieces[lane] += 1;
     toViewer({ type: "rrd" }, [new DataView(data)]);
+    if (lanes.length === 1) lanes.push(film("desk")); // the layout has to be there first
     if (lane === "film") nextPicture(() => { if (socket.readyState === WebSocket.OPEN) socket.send(""); });
   };
   return socket;
@@ -43,7 +44,7 @@ export function connect() {
     if (message.type === "welcome") {
       if (state.run && state.run !== message.run) { location.reload(); return; }
       handlers.welcome(message);
-      if (kind !== "native") viewerReady.then(() => { lanes = ["film", "desk"].map(film); });
+      if (kind !== "native") viewerReady.then(() => { lanes = [film("film")]; });
     } else if (message.type === "failed") gone(message.text);
     else handlers[message.type]?.(message);
   };

@@ -39,6 +39,10 @@ export const drawnThen = (then) => nextPicture(() => nextPicture(then));
 export function toViewer(message, buffers) {
   wake();
   listeners["msg:custom"](message, buffers);
+  if (message.type === "rrd" && target !== null) { // which may have what it is on its way to
+    tries = TRIES;
+    nextPicture(() => { if (target !== null) move(target); });
+  }
 }
 export const tell = (whom) => Object.assign(told, whom);
 
@@ -52,18 +56,24 @@ function keepCompiled(url) {
   WebAssembly.compileStreaming = () => module;
 }
 
-window.addEventListener("to-viewer", ({ detail }) => toViewer(detail));
+window.addEventListener("to-viewer", ({ detail }) => { target = null; toViewer(detail); });
 
 export const isTried = () => kind !== "live" && state.set.length > 0 && !state.flipped; // a robot has one side
 const timeline = () => (isTried() ? TRIED : OPENED);
 const move = (stamp) => toViewer({ type: "time_ctrl", timeline: timeline(), timestamp_nanos: stamp, play: false });
 
 // A viewer that has just opened a recording goes to its beginning of itself, and takes no time before that.
-let target = null; // stamp that the viewer is on its way to
+// One that is opened again with other values has their timeline only when the first of them has come.
+const TRIES = 3; // before there is something new
+let target = null; // stamp that the viewer is to show, until somebody moves it
 let tries = 0;
+let current = null; // timeline
+for (const sign of ["pointerdown", "keydown", "wheel"]) {
+  window.addEventListener(sign, (event) => { if ($("viewer").contains(event.target)) target = null; }, true);
+}
 export function seek(stamp) {
   target = String(stamp);
-  tries = 3;
+  tries = TRIES;
   state.time = target;
   told.sought(target);
   move(target);
@@ -90,12 +100,14 @@ function viewerEvent(event) {
 }
 
 function moved(event) {
-  if (event.type === "time_update" && target !== null && Number(target) !== event.time && tries > 0) {
+  if (event.type === "timeline_change") current = event.timeline;
+  const there = Number(target) === event.time && (current ?? timeline()) === timeline();
+  if (there && kind === "native") target = null; // whose own slider is not seen here
+  if (target !== null && !there && event.type === "time_update") { // late, of where it was before
+    if (tries > 0) move(target);
     tries -= 1;
-    move(target);
     return;
   }
-  if (event.type === "time_update") target = null;
   if (!drawn) {
     drawn = true;
     performance.mark("told");
