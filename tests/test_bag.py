@@ -425,7 +425,7 @@ def test_a_missing_file(tmp_path: Path) -> None:
 
 def test_a_folder_without_a_bag(tmp_path: Path) -> None:
     make(tmp_path)
-    with pytest.raises(UserError, match=r"neither a bag.*there are bags in its folders: drive"):
+    with pytest.raises(UserError, match=r"a folder without a bag.*there are bags in its folders: drive"):
         frames_of(tmp_path)
 
 

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import signal
 import time
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager, redirect_stderr
 from dataclasses import dataclass, replace
@@ -23,7 +25,7 @@ from hypothesis import strategies as st
 from bevviz.bags.source import BagSource, FrameSelection
 from bevviz.batch.batch import claimed, left_to_do
 from bevviz.batch.jobs import PARTIAL, Job, find_bags, make_jobs, name_bags, tables
-from bevviz.batch.table import row
+from bevviz.batch.table import SEVERITIES, row, severity
 from bevviz.cli import main
 from bevviz.config import Config, load
 from bevviz.errors import UserError
@@ -289,6 +291,29 @@ def test_the_page_stands_on_its_own(batch: Batch) -> None:
     assert worst["remarks"][0] in page.text
     assert page.text.index(worst["remarks"][0]) > page.text.index("Worst frames")
     assert f"rerun {worst['recording']}.rrd" in page.text
+
+
+def test_frames_are_counted_and_filtered_by_the_gravest_thing_in_them(batch: Batch) -> None:
+    text = (batch.folder / "summary.html").read_text()
+    frames = pq.read_table(batch.folder / "summary.parquet").to_pylist()
+    kinds = Counter(severity(row) for row in frames)
+    counted = re.findall(r'<li class="(\w+)"><b>(\d+)</b>', text)
+    assert dict(counted) == {kind: str(kinds[kind]) for kind in SEVERITIES}
+    assert sum(int(number) for _, number in counted) == len(frames)
+    nothing: dict[str, Any] = dict.fromkeys(("failures", "problems", "missed", "false", "anomalies"), 0)
+    nothing["unmatched"] = []
+    assert severity(nothing) == "well"
+    assert severity({**nothing, "unmatched": ["car"]}) == "unmatched"
+    assert severity({**nothing, "unmatched": ["car"], "anomalies": 1, "false": None}) == "strange"
+    assert severity({**nothing, "anomalies": 1, "missed": 2}) == "wrong"
+    assert severity({**nothing, "problems": 1, "missed": 2}) == "lacking"
+    assert severity({**nothing, "problems": 1, "failures": 1}) == "failed"
+    shown = re.findall(r'^<tr class="(\w+)">$', text, re.MULTILINE)
+    assert shown == [severity(row) for row in frames[: len(shown)]]
+    assert {f"only-{kind}" for kind in SEVERITIES if kind != "well"} == set(
+        re.findall(r'id="(only-\w+)"', text)
+    )
+    assert all(f"#only-{kind}:checked" in text for kind in SEVERITIES if kind != "well")
 
 
 # --- the catalog -------------------------------------------------------------------------------

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections import Counter
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -17,10 +19,20 @@ from tests.pages import Page
 EVIL = "</style></script><script>alert('x')</script>\"'><img src=x onerror=alert(1)> &amp; {{ 7 * 7 }}"
 
 
+COUNTED: dict[str, object] = {
+    "failures": 0,
+    "problems": 1,
+    "missed": None,
+    "false": None,
+    "anomalies": 0,
+    "unmatched": [],
+}
+
+
 def totals(name: str) -> BagTotals:
     counts = dict.fromkeys(("failures", "problems", "clusters", "detections", "matched", "no_cluster"), 1)
     info = RunInfo("key", name, "id", 1, 0.5, Scene(name, "lidar"), (name,))
-    return BagTotals(name, info, 0, 0.5, counts, 10.0, 20.0, 1, 3.5)
+    return BagTotals(name, info, 0, 0.5, counts, 10.0, 20.0, Counter(lacking=1), 3.5)
 
 
 def batch(text: str) -> str:
@@ -33,6 +45,7 @@ def batch(text: str) -> str:
         "tf_age_ms": None,
         "remarks": [text] * 9,
         "link": None,
+        **COUNTED,
     }
     return page(text, [totals(text)], [row], [(text, text)], "")
 
@@ -48,7 +61,7 @@ def test_no_name_becomes_markup(name: str) -> None:
 
 
 def test_only_addresses_of_recordings_are_linked() -> None:
-    row = {"badness": 1, "recording": "a", "frame": 0, "stamp": 0, "remarks": []}
+    row = {"badness": 1, "recording": "a", "frame": 0, "stamp": 0, "remarks": [], **COUNTED}
     row |= {"sync_error_ms": None, "tf_age_ms": None, "link": "javascript:alert(1)"}
     with pytest.raises(ValueError, match="no address of a recording"):
         page("x", [], [row], [], "")

@@ -8,7 +8,7 @@ from typing import Any
 from urllib.parse import quote, urlsplit
 
 from bevviz.bags.source import iso
-from bevviz.batch.table import RunInfo
+from bevviz.batch.table import SEVERITIES, RunInfo, severity
 from bevviz.html import render
 
 SHOWN = 6  # remarks of one frame
@@ -25,7 +25,7 @@ class BagTotals:
     totals: Mapping[str, int]  # of each count
     median_ms: float
     p95_ms: float
-    bad: int  # frames in which something went wrong
+    kinds: Mapping[str, int]  # frames by the gravest thing in them
     worst: float
 
     @property
@@ -38,6 +38,7 @@ class BagTotals:
 class WorstFrame:
     """A row of the page. ``address`` and ``command``: what opens the frame, in a browser and typed."""
 
+    kind: str
     badness: float
     recording: str
     number: int
@@ -72,7 +73,8 @@ def page(
         evaluated=any(bag.info.metrics is not None for bag in bags),
         frames=sum(bag.info.frames for bag in bags),
         minutes=sum(bag.duration for bag in bags) / 60,
-        bad=sum(bag.bad for bag in bags),
+        severities=SEVERITIES,
+        kinds={kind: sum(bag.kinds[kind] for bag in bags) for kind in SEVERITIES},
         failed=failed,
         warnings=[(bag.name, text) for bag in bags for text in bag.info.warnings],
         worst=[_worst_frame(row, viewer) for row in worst],
@@ -82,6 +84,7 @@ def page(
 def _worst_frame(row: Mapping[str, Any], viewer: str) -> WorstFrame:
     address, command = _opened_by(row["link"], row["recording"], viewer)
     return WorstFrame(
+        kind=severity(row),
         badness=row["badness"],
         recording=row["recording"],
         number=row["frame"],

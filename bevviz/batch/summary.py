@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -11,7 +12,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from bevviz.batch.page import BagTotals, page
-from bevviz.batch.table import SCHEMA, RunInfo
+from bevviz.batch.table import SCHEMA, SEVERITIES, RunInfo, severity
 from bevviz.files import save, written
 
 NAME = "summary"
@@ -58,9 +59,15 @@ def _totals(name: str, info: RunInfo, part: pa.Table) -> BagTotals:
         totals={count: int(part[count].to_numpy().sum(dtype=np.int64)) for count in counts},
         median_ms=float(np.median(times)),
         p95_ms=float(np.percentile(times, 95)),
-        bad=sum(map(bool, part["remarks"].to_pylist())),
+        kinds=_kinds(part),
         worst=float(part["badness"].to_numpy().max()),
     )
+
+
+def _kinds(part: pa.Table) -> dict[str, int]:
+    columns = ["failures", "problems", "missed", "false", "anomalies", "unmatched"]
+    found = Counter(severity(row) for row in part.select(columns).to_pylist())
+    return {kind: found[kind] for kind in SEVERITIES}
 
 
 def write_summary(

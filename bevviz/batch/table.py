@@ -58,6 +58,28 @@ SCHEMA = pa.schema(
 )
 
 
+SEVERITIES = {  # of a frame, the gravest first: what is wrong in it
+    "failed": "a stage failed",
+    "lacking": "an input is missing",
+    "wrong": "an object is missed or false",
+    "strange": "an anomaly",
+    "unmatched": "a detection has no match",
+    "well": "nothing",
+}
+
+
+def severity(row: Mapping[str, Any]) -> str:
+    """The gravest thing in a frame; one of ``SEVERITIES``."""
+    found = {
+        "failed": row["failures"],
+        "lacking": row["problems"],
+        "wrong": (row["missed"] or 0) + (row["false"] or 0),
+        "strange": row["anomalies"],
+        "unmatched": len(row["unmatched"]),
+    }
+    return next((kind for kind, number in found.items() if number), "well")
+
+
 @dataclass(frozen=True, slots=True)
 class RunInfo:
     """What a table was made from and how; kept in it."""

@@ -62,7 +62,7 @@ def add(commands: Commands) -> None:
     results = batch.add_argument_group("results")
     results.add_argument("--blueprint", default="debug", metavar="NAME|FILE", help="layout (default: debug)")
     results.add_argument(
-        "--top", type=positive, default=100, metavar="N", help="worst frames shown (default: 100)"
+        "--top", type=positive, default=30, metavar="N", help="worst frames shown (default: 30)"
     )
     results.add_argument("--catalog", metavar="URL", help="register with this Rerun catalog server")
     results.add_argument(
