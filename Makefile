@@ -38,7 +38,7 @@ accuracy: $(VENV)/.tested
 $(VENV)/.installed: pyproject.toml
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/pip install --quiet --upgrade "pip>=25.1"
-	$(BIN)/pip install --quiet --editable .
+	$(BIN)/pip install --quiet --editable ".[workbench]"
 	touch $@
 
 $(VENV)/.tested: $(VENV)/.installed
