@@ -888,7 +888,10 @@ def received(port: int, path: Path, enough: Callable[[Recording], object]) -> Re
         end(late, signal.SIGTERM)
         late.wait(60)
         if path.exists() and path.stat().st_size:
-            recording = Recording(path)
+            try:
+                recording = Recording(path)
+            except RuntimeError:  # ended while it wrote
+                continue
             if enough(recording):
                 return recording
     raise AssertionError("it was sent nothing, or not enough")
