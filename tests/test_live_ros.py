@@ -650,7 +650,7 @@ def test_the_command_beside_a_robot(robot: str, tmp_path: Path) -> None:
     for path in (tmp_path / "all.rrd", tmp_path / answer.message):
         verify(path)
         recording = Recording(path)
-        assert len(recording.rows["/bev"]) > 1
+        assert recording.rows["/bev"]  # of what was saved at once there may be one frame
         configs = recording.static["/config"] or recording.rows["/config"]
         assert "range_x" in str(configs)
 
