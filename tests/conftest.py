@@ -13,6 +13,16 @@ settings.register_profile("ci", derandomize=True, deadline=None)
 settings.register_profile("developer", deadline=None)
 settings.load_profile("ci" if os.environ.get("CI") else "developer")
 
+# They run a robot, a viewer or a browser beside the clock on the wall.
+REAL_TIME = ("test_live", "test_workbench", "test_robot_examples", "test_control")
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """What fails for the lack of a quiet machine is run once more, and told as a rerun."""
+    for item in items:
+        if item.path.name.startswith(REAL_TIME):
+            item.add_marker(pytest.mark.flaky(reruns=1))
+
 
 @pytest.fixture(scope="session")
 def shared() -> Path:
