@@ -30,8 +30,8 @@ MAGIC = b"RRF"  # and a digit, for the generation of the format
 HEAD = 1 << 24  # bytes: what of a recording is read to find what it was made with, and more
 
 
-class ForeignRecordingError(UserError):
-    """One that is whole, and does not say how it was made: another program's, or of no run."""
+class NoBagError(UserError):
+    """A recording without a bag behind it: another program's, of the synthetic drive, a comparison."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -242,14 +242,15 @@ def follow(recording: Path, bag: Sequence[Path] = (), settings: Sequence[str] = 
         settings: that are going to be given, in which the detector's file may be named.
 
     Raises:
-        UserError: no recording of bevviz; the bag, or the detector's file, is not found, or is another one.
+        NoBagError: it has none, or does not say which.
+        UserError: no recording; the bag, or the detector's file, is not found, or is another one.
     """
     how, origin = read(recording)
     warnings: list[str] = []
     if origin is None and not bag:
         beside = recording.with_suffix(".mcap")  # as 'bevviz live' saves both
         if not beside.is_file():
-            raise UserError(
+            raise NoBagError(
                 f"{recording}: it does not say which bag it was made from, and {beside.name} is not beside "
                 "it: give --bag PATH"
             )
@@ -281,19 +282,6 @@ def follow(recording: Path, bag: Sequence[Path] = (), settings: Sequence[str] = 
         chosen.append(f"{key}={json.dumps(str(path))}")
     stated = [one for one in chosen if one.startswith("detector.") or not given.get(one.partition("=")[0])]
     return Recorded(recording, tuple(paths), tuple(stated), tuple(warnings), how)
-
-
-def stands_for_bag(recording: Path) -> bool:
-    """Whether ``follow`` has a bag to look for: not of the synthetic drive, nor of a comparison.
-
-    Raises:
-        UserError: no recording.
-    """
-    try:
-        _, origin = read(recording)
-    except ForeignRecordingError:
-        return False
-    return origin is not None or recording.with_suffix(".mcap").is_file()
 
 
 def _found(place: Place, recording: Path) -> Path:
@@ -338,7 +326,7 @@ def read(recording: Path) -> tuple[str, Origin | None]:
     except (OSError, ValueError, KeyError, TypeError, RuntimeError) as error:
         raise UserError(f"{recording}: cannot be read as a recording: {first_line(error)}") from None
     if how is None:
-        raise ForeignRecordingError(f"{recording}: no recording of bevviz: it does not say how it was made")
+        raise NoBagError(f"{recording}: no recording of bevviz: it does not say how it was made")
     return how, origin
 
 

@@ -262,12 +262,15 @@ def follow_recording(options: argparse.Namespace) -> None:
             raise UserError("--bag says where the bag of a recording is: PATH has to be one .rrd file")
         return
     from bevviz.cli.outputs import say, warn
-    from bevviz.recorded import follow, stands_for_bag
+    from bevviz.recorded import NoBagError, follow
 
-    if getattr(options, "shows_recordings", False) and not options.bags and not stands_for_bag(given[0]):
+    try:
+        recorded = follow(given[0], options.bags, given_settings(options))
+    except NoBagError:
+        if not getattr(options, "shows_recordings", False) or options.bags:
+            raise
         options.shown = given[0]
         return
-    recorded = follow(given[0], options.bags, given_settings(options))
     options.recorded, options.recording, options.paths = recorded, given[0], list(recorded.paths)
     say(f"{given[0]}: made from {', '.join(map(str, recorded.paths))}")
     warn(recorded.warnings)
