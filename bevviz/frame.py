@@ -313,6 +313,9 @@ class Scene:
     truth: bool = False  # ground truth comes along
     bag: tuple[Path, ...] = ()  # files and folders that the frames are read from; (): none
     topics: tuple[str, ...] = ()  # key=value each, which give the same topics the same roles
+    above: tuple[float, float, float, float] | None = (
+        None  # where a look from above begins: u, v, u, v of its image
+    )
 
 
 class Source(Protocol):

@@ -11,7 +11,7 @@ import rerun as rr
 
 from bevviz.anomalies import Onsets
 from bevviz.config import Config
-from bevviz.frame import CameraResult, Frame, FrameResult, Intrinsics, LateResult, Scene
+from bevviz.frame import Frame, FrameResult, Intrinsics, LateResult, Scene
 from bevviz.logging import entities
 from bevviz.logging.annotations import log_world
 from bevviz.logging.anomalies import log_anomalies, log_anomalies_looks
@@ -83,7 +83,7 @@ class Logger(Writer):
         self._scene = scene
         self._intrinsics: dict[str, Intrinsics] = {}
         self._track_lanes = Lanes()
-        self._state_lanes = StateLanes(COLORS)
+        self._state_lanes = StateLanes(COLORS, plain_lanes=entities.ANOMALY_STATES)
         self._around = AroundLog()
         self._onsets = Onsets()
         self._last: Frame | None = None
@@ -205,7 +205,9 @@ class Logger(Writer):
         self._brought |= self._now - before
         self._log_lidar_results(result, colored)
         for camera in result.cameras:
-            self._log_camera_results(camera)
+            log_detections(self, camera, result.explanations)
+            if self._config.logging.projected_points:
+                log_projected_points(self, camera)
         log_frustums(self, frame, result.cameras)
         if result.bev is not None:
             log_bev(self, result.bev, self._config)
@@ -279,12 +281,6 @@ class Logger(Writer):
         log_obstacles(self, frame, obstacles)
         if result.clusters is not None:
             log_clusters(self, frame, result.clusters, result.tracks, obstacles, config.clustering, colored)
-
-    def _log_camera_results(self, result: CameraResult) -> None:
-        if result.detections is not None:
-            log_detections(self, result.camera.name, result.detections)
-        if self._config.logging.projected_points:
-            log_projected_points(self, result)
 
     def _log_states(self, result: FrameResult, more: Mapping[str, str]) -> None:
         states = {**states_of(result), **more}

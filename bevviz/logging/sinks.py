@@ -113,7 +113,7 @@ def open_recording(
             process writes, port in use, no viewer found or reached;
             on leaving, when not everything could be written.
     """
-    layout = blueprints.load(blueprint, scene) if isinstance(blueprint, str) else blueprint
+    layout = blueprints.load(blueprint, scene, config.bev) if isinstance(blueprint, str) else blueprint
     sinks: list[rr.FileSink | rr.GrpcSink | rr.GrpcServerSink] = []
     urls: list[str] = []
     warnings: list[str] = []

@@ -18,7 +18,6 @@ def space(
     scene: Scene,
     *,
     raw: bool = True,
-    grid: bool = True,
     frustums: bool = True,
     why: bool = False,
     name: str = "3D",
@@ -27,12 +26,12 @@ def space(
 ) -> rrb.Spatial3DView:
     """Points, boxes, frusta and poses around the robot, seen from behind and above it.
 
-    The origin is the LiDAR: the robot stays where it is and the world moves, whichever way it drives.
+    The origin is the LiDAR: the robot stays where it is and the world moves, whichever way it drives. The
+    occupancy on the ground and tracks without an object in the frame are there to be switched on.
 
     Args:
         scene: names of the sensors.
         raw: with every raw point, coloured as ground or obstacle.
-        grid: with the occupancy on the ground.
         frustums: with what each detection sees.
         why: with the chain of what ``bevviz why`` explains.
         name: of the view.
@@ -43,7 +42,7 @@ def space(
     # The coloured points of the clusters and the raw cloud already show what is obstacle.
     hidden += [entities.obstacles(scene.lidar)] if raw else []
     hidden += [] if raw else [entities.points(lidar) for lidar in scene.lidars or (scene.lidar,)]
-    hidden += [] if grid else [entities.GRID]
+    hidden += [entities.GRID, entities.UNSEEN]
     hidden += [] if frustums else [entities.FRUSTUMS]
     # The points of what is explained stand out by their colours, which tell another story than the clusters'.
     hidden += [entities.clusters(scene.lidar), entities.FRUSTUMS] if why else []
@@ -85,13 +84,18 @@ def cameras(scene: Scene, *, why: bool = False) -> rrb.Container | rrb.View:
     return rrb.Tabs(*views, name="Cameras") if len(views) > 2 else rrb.Vertical(*views, name="Cameras")
 
 
-def birds_eye(root: str = "", name: str = "Bird's-eye view") -> rrb.Spatial2DView:
+def birds_eye(scene: Scene, root: str = "", name: str = "Bird's-eye view") -> rrb.Spatial2DView:
     """The bird's-eye image with the outlines of ground truth and of the robot's own boxes."""
     bev = root + entities.BEV
     channels = [
         f"- {root}{entities.channel(name)}/**" for name in ("density", "height", "intensity", "occupancy")
     ]
-    return rrb.Spatial2DView(name=name, origin=bev, contents=["$origin/**", *channels], background=_DARK)
+    bounds = None
+    if scene.above is not None:
+        left, top, right, bottom = scene.above
+        bounds = rrb.VisualBounds2D(x_range=(left, right), y_range=(top, bottom))
+    contents = ["$origin/**", *channels]
+    return rrb.Spatial2DView(name=name, origin=bev, contents=contents, background=_DARK, visual_bounds=bounds)
 
 
 def robots_birds_eye() -> rrb.Spatial2DView:
@@ -110,9 +114,15 @@ def why() -> rrb.TextDocumentView:
     return rrb.TextDocumentView(name="Why", origin=entities.WHY, contents=["$origin"])
 
 
+def text_log(name: str, origin: str) -> rrb.TextLogView:
+    """Frame, time and text of each line."""
+    columns = rrb.TextLogColumns(timeline_columns=[entities.FRAME, entities.STAMP], text_log_columns=["body"])
+    return rrb.TextLogView(name=name, origin=origin, columns=columns)
+
+
 def log() -> rrb.TextLogView:
     """Failures, problems and rejected detections of all frames."""
-    return rrb.TextLogView(name="Log", origin=entities.EXPLAIN_LOG)
+    return text_log("Log", entities.EXPLAIN_LOG)
 
 
 def states() -> rrb.StateTimelineView:
@@ -132,7 +142,7 @@ def anomalies() -> rrb.StateTimelineView:
 
 def anomaly_log() -> rrb.TextLogView:
     """Each anomaly when it began, with its numbers."""
-    return rrb.TextLogView(name="Anomaly log", origin=entities.ANOMALY_LOG)
+    return text_log("Anomaly log", entities.ANOMALY_LOG)
 
 
 def tracks() -> rrb.StateTimelineView:
@@ -192,6 +202,7 @@ def latencies() -> rrb.TimeSeriesView:
 
 
 def health() -> rrb.Tabs:
+    """In tabs: side by side, their legends would hide the curves."""
     return rrb.Tabs(stage_times(), clocks(), counts(), rates(), name="Health")
 
 
