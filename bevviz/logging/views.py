@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import rerun.blueprint as rrb
@@ -45,21 +46,36 @@ def space(
     hidden += [entities.GRID, entities.UNSEEN]
     hidden += [] if frustums else [entities.FRUSTUMS]
     # The points of what is explained stand out by their colours, which tell another story than the clusters'.
-    hidden += [entities.clusters(scene.lidar), entities.FRUSTUMS] if why else []
+    hidden += (
+        [entities.clusters(scene.lidar), entities.FRUSTUMS, entities.names(entities.FUSED)] if why else []
+    )
+    position, target = (-16.0, 5.0, 11.0), (10.0, 0.0, -1.0)
+    if why and scene.focus is not None:
+        position, target = _beside(scene.focus), scene.focus
     return rrb.Spatial3DView(
         name=name,
         origin=root + entities.sensor(scene.lidar),
         contents=[f"{root}{entities.WORLD}/**", *beside, *([f"{entities.WHY}/**"] if why else [])],
         background=_DARK,
         line_grid=False,
+        # Said, as the viewer takes the fixed frame instead where contents lie outside of the origin's tree.
+        spatial_information=rrb.SpatialInformation(target_frame=f"tf#{root}{entities.sensor(scene.lidar)}"),
         eye_controls=rrb.EyeControls3D(
             kind=rrb.Eye3DKind.Orbital,
-            position=(-3.0, 2.0, 5.0) if why else (-16.0, 5.0, 11.0),
-            look_target=(10.0, -0.5, -1.0) if why else (10.0, 0.0, -1.0),
+            position=position,
+            look_target=target,
             eye_up=(0.0, 0.0, 1.0),
         ),
         overrides=dict.fromkeys((root + path for path in hidden), HIDDEN),
     )
+
+
+def _beside(place: tuple[float, float, float]) -> tuple[float, float, float]:
+    """Where to look at it from: the robot's side, a few metres before it, to the left and above."""
+    x, y, z = place
+    away = max(math.hypot(x, y), 1e-6)
+    back = min(away, 6.0)
+    return x - back * x / away - 2.0 * y / away, y - back * y / away + 2.0 * x / away, z + 2.5
 
 
 def camera(scene: Scene, name: str, *, why: bool = False) -> rrb.Spatial2DView:
@@ -68,11 +84,13 @@ def camera(scene: Scene, name: str, *, why: bool = False) -> rrb.Spatial2DView:
     ``why``: with the weak detections and what ``bevviz why`` explains instead of the points.
     """
     contents = ["$origin/**", *([f"{entities.ROBOT}/**"] if scene.robot else [])]
+    told = [entities.projected(name), entities.names(entities.detections(name))]
+    hidden = told if why else [entities.weak(name)]
     return rrb.Spatial2DView(
         name=name,
         origin=entities.sensor(name),
         contents=[*contents, *([f"{entities.why(name)}/**"] if why else [])],
-        overrides={entities.projected(name) if why else entities.weak(name): HIDDEN},
+        overrides=dict.fromkeys(hidden, HIDDEN),
     )
 
 
