@@ -55,9 +55,9 @@ class Compared:
 class AgainstRobot:
     """Compares each frame with what the robot published of it, when it did.
 
-    A frame that the robot says nothing of is left out, and so is one that a failed stage of ours made no objects
-    of: that says nothing of what is there. The robot's boxes in the images are compared where they come before
-    its boxes in space do, else counted. For one thread, but for ``reason``.
+    A frame that the robot says nothing of is left out, and so is one that a failed stage of ours made no
+    objects of: that says nothing of what is there. The robot's boxes in the images are compared where they
+    come before its boxes in space do, else counted. For one thread, but for ``reason``.
 
     Args:
         asked: the robot's Detection3DArray topic; empty: the one whose name says so.
