@@ -396,6 +396,9 @@ class LiveConfig(Section):
     viewer_rate: float | None = Field(
         None, ge=1, le=100, description="frames a second that viewers get at most, files get all; empty: all"
     )
+    viewer_points: int | None = Field(
+        None, ge=1, description="points of each cloud that viewers get at most, files get all; empty: all"
+    )
     split_size: Megabytes | None = Field(
         None, ge=1, description="--save: size that a part is closed at; empty: any"
     )

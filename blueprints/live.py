@@ -29,6 +29,7 @@ def blueprint(scene: Scene) -> rrb.Blueprint:
                     views.tracks(),
                     views.diagnostics(),
                     *([compare.difference_counts(), compare.difference_states()] if scene.robot else []),
+                    *views.motion(scene),
                     views.log(),
                 ),
                 row_shares=[*[2] * len(side), 3, 2],

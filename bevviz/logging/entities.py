@@ -29,6 +29,8 @@ GRID = "/world/bev"
 TRUTH = "/world/ground_truth"
 BEV = "/bev"
 ROBOT = "/robot"
+ROTATION = "/motion/rotation_rad_s"
+ACCELERATION = "/motion/acceleration_m_s2"
 TRACKS = "/world/tracks"
 UNSEEN = "/world/tracks/unseen"
 TRAILS = "/world/tracks/trails"
@@ -138,6 +140,16 @@ def overlay(what: str) -> str:
 
 def robot(topic: str) -> str:
     return f"{ROBOT}{_topic(topic)}"
+
+
+def rotation(topic: str) -> str:
+    """Of an Imu."""
+    return f"{ROTATION}{_topic(topic)}"
+
+
+def acceleration(topic: str) -> str:
+    """Of an Imu."""
+    return f"{ACCELERATION}{_topic(topic)}"
 
 
 def robot_overlay(topic: str) -> str:

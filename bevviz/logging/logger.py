@@ -15,7 +15,15 @@ from bevviz.frame import Frame, FrameResult, Intrinsics, LateResult, Scene
 from bevviz.logging import entities
 from bevviz.logging.annotations import log_world
 from bevviz.logging.anomalies import log_anomalies, log_anomalies_looks
-from bevviz.logging.around import AroundLog, diagnostic_states, log_shapes, marks
+from bevviz.logging.around import (
+    AroundLog,
+    Fixed,
+    diagnostic_states,
+    fixed_parts,
+    log_motions,
+    log_shapes,
+    marks,
+)
 from bevviz.logging.bev import log_bev, log_grid
 from bevviz.logging.camera import (
     log_camera,
@@ -49,6 +57,9 @@ class Context:
     clock: tuple[int, int, int] = (0, 0, 0)  # index, stamp and received of the frame
     intrinsics: Mapping[str, Intrinsics] = field(default_factory=dict)
     lanes: Mapping[str, str] = field(default_factory=dict)  # state lane -> its state
+    fixed: Mapping[str, Fixed] = field(
+        default_factory=dict
+    )  # entity -> what holds at all times since it came
 
 
 class Logger(Writer):
@@ -82,6 +93,7 @@ class Logger(Writer):
         self._config = config
         self._scene = scene
         self._intrinsics: dict[str, Intrinsics] = {}
+        self._fixed: dict[str, Fixed] = {}
         self._track_lanes = Lanes()
         self._state_lanes = StateLanes(COLORS, plain_lanes=entities.ANOMALY_STATES)
         self._around = AroundLog()
@@ -95,7 +107,9 @@ class Logger(Writer):
         """What the frame that was logged last relies on."""
         last = self._last
         clock = (0, 0, 0) if last is None else (last.index, last.stamp, last.received)
-        return Context(self._config, self._scene, clock, self._intrinsics, self._state_lanes.states)
+        return Context(
+            self._config, self._scene, clock, self._intrinsics, self._state_lanes.states, self._fixed
+        )
 
     @property
     def results(self) -> frozenset[str]:
@@ -128,6 +142,8 @@ class Logger(Writer):
         self.log_static()
         for name, intrinsics in context.intrinsics.items():
             self._log_intrinsics(name, intrinsics)
+        for path, fixed in context.fixed.items():
+            self.static(path, *fixed)
         if context.lanes:
             self.set_time(*context.clock)
             self._state_lanes.log(self, context.lanes)
@@ -213,7 +229,9 @@ class Logger(Writer):
             log_bev(self, result.bev, self._config)
             log_grid(self, result, result.bev)
         if not self.root:
+            self._log_fixed(frame)
             log_shapes(self, frame)
+            log_motions(self, frame)
 
     def _log_in_order(
         self,
@@ -261,6 +279,13 @@ class Logger(Writer):
             if frame.stamp - stamp > STALE:
                 del self._late[topic]
                 forget_late(self, topic)
+
+    def _log_fixed(self, frame: Frame) -> None:
+        """Where it is new."""
+        for path, make in fixed_parts(frame).items():
+            if path not in self._fixed and (fixed := make()) is not None:
+                self._fixed = {**self._fixed, path: fixed}  # a context may hold the one before
+                self.static(path, *fixed)
 
     def _log_intrinsics(self, name: str, intrinsics: Intrinsics) -> None:
         """Where they are new."""

@@ -219,6 +219,13 @@ def latencies() -> rrb.TimeSeriesView:
     return plot("Latency and lag of viewers, ms", entities.HEALTH, contents)
 
 
+def motion(scene: Scene) -> list[rrb.View]:
+    """What Imus measure, where there are some."""
+    if not scene.imu:
+        return []
+    return [plot("Rotation, rad/s", entities.ROTATION), plot("Acceleration, m/s²", entities.ACCELERATION)]
+
+
 def health() -> rrb.Tabs:
     """In tabs: side by side, their legends would hide the curves."""
     return rrb.Tabs(stage_times(), clocks(), counts(), rates(), name="Health")

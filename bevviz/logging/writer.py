@@ -10,6 +10,7 @@ import numpy as np
 import rerun as rr
 
 from bevviz.closing import Closing
+from bevviz.frame import F64, I64
 from bevviz.logging import entities
 
 STAMPS = (entities.STAMP, entities.TRIED, entities.RECEIVED)  # timelines in nanoseconds; the others count
@@ -119,6 +120,17 @@ class Writer(Closing):
             self._scalars[path].append((self._clock, value))
         else:
             self.write(path, rr.Scalars(value))
+
+    def samples(self, path: str, stamps: I64, received: I64, values: F64) -> None:
+        """Numbers to plot that came between the frames, each row at its own time: (N, D)."""
+        clocks = []
+        for stamp, received_at in zip(stamps.tolist(), received.tolist(), strict=True):
+            clock = self._clock | dict.fromkeys(self._stamps, stamp)
+            if entities.RECEIVED in clock:
+                clock[entities.RECEIVED] = received_at
+            clocks.append(clock)
+        columns = rr.Scalars.columns(scalars=values.ravel()).partition([values.shape[1]] * len(values))
+        self._write_columns(path, clocks, columns)
 
     def lines(self, path: str, lines: Sequence[tuple[str, str]]) -> None:
         """Lines of a log: level and text of each."""

@@ -19,6 +19,7 @@ from bevviz.ros.messages import (
     decode_compressed_image,
     decode_detections_2d,
     decode_image,
+    decode_motion,
     decode_odometry,
     decode_transforms,
 )
@@ -93,8 +94,12 @@ def make_handlers(sync: Synchronizer, roles: Roles, decode: Callable[[M], Any]) 
         sync.add_transform(clocked(message, transform), fallback=True)
 
     def add_imu(message: M) -> None:
+        content = decode(message)
+        rotation, acceleration, stamp = decode_motion(content)
+        at = sync.clocks.stamp(message.topic, stamp, message.received)
+        sync.around.add_motion(message.topic, at, message.received, rotation, acceleration)
         if sync.upright.needs_gravity:
-            sync.upright.add_acceleration(decode_acceleration(decode(message), message.topic))
+            sync.upright.add_acceleration(decode_acceleration(content, message.topic))
 
     def read_boxes(message: M) -> LabelledBoxes3D:
         stated = roles.boxes if roles.boxes.get("topic") == message.topic else {}
