@@ -50,6 +50,5 @@ def _bag(options: argparse.Namespace) -> int:
 
     config = load_config(options)
     with open_bag(options, config) as source:
-        return process(
-            Drive(source, config), Outputs.of(options), Path(options.paths[0].stem + ".rrd"), options.jobs
-        )
+        default = Path(options.paths[0].stem + ".rrd")
+        return process(Drive(source, config), Outputs.of(options), default, options.jobs, options.dask)
