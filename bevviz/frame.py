@@ -313,6 +313,7 @@ class Scene:
     truth: bool = False  # ground truth comes along
     bag: tuple[Path, ...] = ()  # files and folders that the frames are read from; (): none
     topics: tuple[str, ...] = ()  # key=value each, which give the same topics the same roles
+    raw: bool = True  # every raw cloud is logged
 
 
 class Source(Protocol):

@@ -9,7 +9,7 @@ import os
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import MappingProxyType
 
 import rerun as rr
@@ -21,6 +21,7 @@ from bevviz.config import Config
 from bevviz.frame import FrameResult, LateResult, Scene
 from bevviz.live.against import AgainstRobot, Compared
 from bevviz.logging import blueprints
+from bevviz.logging.keep import is_whole
 from bevviz.logging.logger import Context, Logger
 from bevviz.logging.sinks import APPLICATION
 
@@ -147,7 +148,8 @@ class Encoder:
         if (config, scene) == (self._config, self._scene):
             return
         if scene != self._scene:
-            self._stream.recording.send_blueprint(blueprints.load(self._blueprint, scene))
+            layout = blueprints.load(self._blueprint, replace(scene, raw=is_whole(config)))
+            self._stream.recording.send_blueprint(layout)
         self._config, self._scene = config, scene
         self._logger.reconfigure(config, scene)
 
@@ -163,7 +165,8 @@ class Encoder:
 
     def prelude(self, context: Context, *, blueprint: bool = True) -> bytes:
         """The beginning of a recording whose first packet has this context. From any thread."""
-        layout = blueprints.load(self._blueprint, context.scene) if blueprint else None
+        scene = replace(context.scene, raw=is_whole(context.config))
+        layout = blueprints.load(self._blueprint, scene) if blueprint else None
         with _Stream(self.recording_id, layout) as stream:
             Logger(stream.recording, context.config, context.scene).log_context(context)
             if self._against is not None:

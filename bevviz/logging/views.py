@@ -39,16 +39,17 @@ def space(
         root: entity that the run is logged under.
         beside: what else is shown.
     """
-    hidden = [entities.ground(scene.lidar), entities.set_aside(scene.lidar)]
+    hidden = [entities.set_aside(scene.lidar)]
     # The coloured points of the clusters and the raw cloud already show what is obstacle.
-    hidden += [entities.obstacles(scene.lidar)] if raw else []
+    hidden += [entities.ground(scene.lidar)] if scene.raw or why else []
+    hidden += [entities.obstacles(scene.lidar)] if raw and scene.raw else []
     hidden += [] if raw else [entities.points(lidar) for lidar in scene.lidars or (scene.lidar,)]
     hidden += [] if grid else [entities.GRID]
     hidden += [] if frustums else [entities.FRUSTUMS]
     # The points of what is explained stand out by their colours, which tell another story than the clusters'.
     hidden += [entities.clusters(scene.lidar), entities.FRUSTUMS] if why else []
     return rrb.Spatial3DView(
-        name=name,
+        name=name if scene.raw else f"{name}, voxels (raw clouds now and then, or none)",
         origin=root + entities.sensor(scene.lidar),
         contents=[f"{root}{entities.WORLD}/**", *beside, *([f"{entities.WHY}/**"] if why else [])],
         background=_DARK,
