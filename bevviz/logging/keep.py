@@ -90,6 +90,11 @@ class Around:
         self._until = -1
         self._count = 0
 
+    @property
+    def held(self) -> int:
+        """Frames that may be wanted yet."""
+        return len(self._held)
+
     def see(self, frame: Held, config: LoggingConfig, *, strange: bool) -> Sequence[Held]:
         """Those to be logged now, oldest first.
 

@@ -47,7 +47,7 @@ class VideoEncoder:
         """The next image, (H, W, 3), and its stamp in nanoseconds."""
         if self._context is None or bgr.shape[:2] != self._size:
             self._size, self._count = (bgr.shape[0], bgr.shape[1]), 0
-            self._context = _opened(bgr)
+            self._context, self._again = _opened(bgr), True
         key = self._again or not 0 <= stamp - self._key < GOP
         if key:
             self._key, self._again = stamp, False
