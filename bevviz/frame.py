@@ -347,9 +347,8 @@ class Scene:
     bag: tuple[Path, ...] = ()  # files and folders that the frames are read from; (): none
     topics: tuple[str, ...] = ()  # key=value each, which give the same topics the same roles
     focus: tuple[float, float, float] | None = None  # what is asked about, in metres of Frame.points_frame
-    above: tuple[float, float, float, float] | None = (
-        None  # where a look from above begins: u, v, u, v of its image
-    )
+    above: tuple[float, float, float, float] | None = None  # u, v, u, v: where a look from above begins
+    raw: bool = True  # every raw cloud is logged
 
 
 class Source(Protocol):

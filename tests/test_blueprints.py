@@ -80,7 +80,7 @@ def test_the_eye_stays_with_the_robot_and_looks_at_what_is_explained(tmp_path: P
 
 def test_the_look_from_above_begins_ahead(tmp_path: Path) -> None:
     scene = SCENES["one camera"]
-    path = save(blueprints.load("debug", scene, load().bev), tmp_path / "layout.rbl")
+    path = save(blueprints.load("debug", scene, load()), tmp_path / "layout.rbl")
     _, above = properties(path)["Bird's-eye view"]
     assert above["VisualBounds2D:range"] == [{"x_range": [200, 600], "y_range": [40, 500]}]
     _, all_of_it = properties(save(blueprints.load("debug", scene), tmp_path / "all.rbl"))["Bird's-eye view"]

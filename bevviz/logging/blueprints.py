@@ -11,9 +11,10 @@ import rerun.blueprint as rrb
 from rerun.recording_stream import RecordingStream
 
 import bevviz
-from bevviz.config import BevConfig
+from bevviz.config import BevConfig, Config
 from bevviz.errors import UserError
 from bevviz.frame import Scene
+from bevviz.logging.keep import is_whole
 from bevviz.logging.reading import check_decodes
 
 
@@ -29,20 +30,21 @@ def names() -> list[str]:
     return sorted(path.stem for path in _folder().glob("*.py") if not path.stem.startswith("_"))
 
 
-def load(name_or_path: str, scene: Scene, bev: BevConfig | None = None) -> rrb.Blueprint:
+def load(name_or_path: str, scene: Scene, config: Config | None = None) -> rrb.Blueprint:
     """A layout for the scene.
 
     Args:
         name_or_path: one of ``names()``, a .py file with a function ``blueprint(scene)`` that returns an
             ``rrb.Blueprint``, or a .rbl file that was saved in the viewer.
         scene: names of the sensors.
-        bev: of the bird's-eye image, which is shown where objects can be expected; None: all of it.
+        config: of the run: which raw clouds there are, and where the look from above begins, which is where
+            objects can be expected; None: all of both.
 
     Raises:
         UserError: unknown name, no such file, or a file that makes no layout.
     """
-    if bev is not None:
-        scene = replace(scene, above=_ahead(bev))
+    if config is not None:
+        scene = replace(scene, above=_ahead(config.bev), raw=is_whole(config))
     if name_or_path in names():
         return _from_python(_folder() / f"{name_or_path}.py", scene)
     path = Path(name_or_path)

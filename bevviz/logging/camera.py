@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import rerun as rr
@@ -24,11 +24,14 @@ from bevviz.frame import (
     Image,
     Intrinsics,
 )
-from bevviz.logging import entities
+from bevviz.logging import entities, keep
 from bevviz.logging.annotations import FAINT, depth_annotations
 from bevviz.logging.pieces import CORNER, boxes2d, encode_image, scored, transform
 from bevviz.logging.spoken import NEAR, log_spoken_in_image, log_spoken_looks_in_image
 from bevviz.logging.writer import Writer
+
+if TYPE_CHECKING:
+    from bevviz.logging.video import VideoEncoder
 
 
 def log_camera_looks(to: Writer, cameras: Iterable[str]) -> None:
@@ -73,13 +76,21 @@ def camera_pose(frame: Frame, result: CameraResult) -> F64 | None:
     return None
 
 
-def log_camera(to: Writer, frame: Frame, result: CameraResult, quality: int) -> None:
-    """Pose and image; the intrinsics are static, see ``log_intrinsics``."""
+def log_camera(
+    to: Writer, frame: Frame, result: CameraResult, quality: int, videos: Videos | None = None
+) -> None:
+    """Pose and image; the intrinsics are static, see ``log_intrinsics``.
+
+    ``videos``: take what came raw or without loss.
+    """
     camera, world_from_camera = result.camera, camera_pose(frame, result)
     if world_from_camera is not None:
         to.put(entities.sensor(camera.name), transform(world_from_camera))
     if camera.image is not None:
-        log_image(to, camera.name, camera.image, quality)
+        if videos is not None and camera.image.media_type not in keep.LOSSY:
+            videos.log(to, camera.name, camera.image)
+        else:
+            log_image(to, camera.name, camera.image, quality)
 
 
 def log_intrinsics(to: Writer, name: str, intrinsics: Intrinsics) -> None:
@@ -100,6 +111,37 @@ def log_image(to: Writer, name: str, image: Image, quality: int) -> None:
     path = entities.image(name)
     if not to.keep(path, image.stamp):
         to.put(path, encode_image(image, quality))
+
+
+class Videos:
+    """Images of cameras as H.264."""
+
+    def __init__(self) -> None:
+        self._encoders: dict[str, VideoEncoder] = {}
+        self._recording: object = None
+
+    def restart(self) -> None:
+        """What comes next needs nothing before it."""
+        for encoder in self._encoders.values():
+            encoder.restart()
+
+    def log(self, to: Writer, name: str, image: Image) -> None:
+        """Once for each image, as ``log_image``."""
+        if self._recording is not to.recording:
+            self._recording = to.recording
+            self.restart()
+        path = entities.image(name)
+        if to.keep(path, image.stamp):
+            return
+        if name not in self._encoders:
+            from bevviz.logging.video import VideoEncoder  # takes its time, and few need it
+
+            self._encoders[name] = VideoEncoder()
+        sample = self._encoders[name](image.bgr, image.stamp)
+        if sample.key:
+            to.put(path, rr.VideoStream.from_fields(codec=rr.VideoCodec.H264, sample=sample.data))
+        else:
+            to.put(path, rr.VideoStream.from_fields(sample=sample.data))
 
 
 def log_detections(to: Writer, result: CameraResult, explanations: Iterable[Explanation]) -> None:
@@ -149,11 +191,15 @@ def _large(xyxy: F32) -> Bool:
     return large
 
 
-def log_projected_points(to: Writer, result: CameraResult) -> None:
-    """The obstacle points in the image, by depth."""
+def log_projected_points(to: Writer, result: CameraResult, *, packed: bool = False) -> None:
+    """The obstacle points in the image, by depth. ``packed``: rounded and sorted as where less is kept."""
     if result.uv is None or result.depth is None:
         return
     seen = np.isfinite(result.uv[:, 0])
     if seen.any():
         depth = bins(result.depth[seen], 0, entities.DEPTH_RANGE, entities.DEPTH_BINS)
-        to.put(entities.projected(result.camera.name), rr.Points2D(result.uv[seen] + CORNER, class_ids=depth))
+        uv = result.uv[seen] + CORNER
+        if packed:
+            rows = keep.sorted_rows(uv, keep.PIXEL)
+            uv, depth = np.rint(uv[rows] * keep.PIXEL) / np.float32(keep.PIXEL), depth[rows]
+        to.put(entities.projected(result.camera.name), rr.Points2D(uv, class_ids=depth))

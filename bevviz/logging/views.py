@@ -39,9 +39,10 @@ def space(
         root: entity that the run is logged under.
         beside: what else is shown.
     """
-    hidden = [entities.ground(scene.lidar), entities.set_aside(scene.lidar)]
+    hidden = [entities.set_aside(scene.lidar)]
     # The coloured points of the clusters and the raw cloud already show what is obstacle.
-    hidden += [entities.obstacles(scene.lidar)] if raw else []
+    hidden += [entities.ground(scene.lidar)] if scene.raw or why else []
+    hidden += [entities.obstacles(scene.lidar)] if raw and scene.raw else []
     hidden += [] if raw else [entities.points(lidar) for lidar in scene.lidars or (scene.lidar,)]
     hidden += [entities.GRID, entities.UNSEEN]
     hidden += [] if frustums else [entities.FRUSTUMS]
@@ -53,7 +54,7 @@ def space(
     if why and scene.focus is not None:
         position, target = _beside(scene.focus), scene.focus
     return rrb.Spatial3DView(
-        name=name,
+        name=name if scene.raw else f"{name}, voxels (raw clouds now and then, or none)",
         origin=root + entities.sensor(scene.lidar),
         contents=[f"{root}{entities.WORLD}/**", *beside, *([f"{entities.WHY}/**"] if why else [])],
         background=_DARK,

@@ -111,7 +111,7 @@ class Bench(Closing):
         self.recording_id = f"bench-{time.time_ns()}"
         self._main, self._film_main = self.stream()
         self._desk, self._film_desk = self.stream()
-        layout = blueprints.load("workbench", drive.scene, drive.config.bev)
+        layout = blueprints.load("workbench", drive.scene, drive.config)
         self._main.send_blueprint(layout, make_active=True)
         self._logger = Logger(self._main, drive.config, drive.scene, wait=WAIT, stamps=BOTH)
         self._logger.log_static()

@@ -146,7 +146,7 @@ class LiveFilm(Output):
     def _layout(self, context: Context) -> bytes:
         recording = rr.RecordingStream(APPLICATION, recording_id=self._encoder.recording_id)
         stream = rr.binary_stream(recording)
-        layout = blueprints.load("workbench_live", context.scene, context.config.bev)
+        layout = blueprints.load("workbench_live", context.scene, context.config)
         recording.send_blueprint(layout, make_active=True)
         return stream.read() or b""
 
