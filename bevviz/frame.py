@@ -34,6 +34,8 @@ I32 = NDArray[np.int32]
 I64 = NDArray[np.int64]
 U8 = NDArray[np.uint8]
 
+Codec = Literal["h264", "h265", "av1", "vp8", "vp9"]  # of video that Rerun shows as it is
+
 
 def data_frame(columns: Mapping[str, Any] | Sequence[Mapping[str, Any]]) -> DataFrame:
     """A table, where pandas is installed.
@@ -79,8 +81,21 @@ class Intrinsics:
 
 
 @dataclass(frozen=True, slots=True)
+class Clip:
+    """Packets of a video up to a picture: from the key frame that it needs, and the group before that."""
+
+    codec: Codec
+    places: tuple[tuple[int, int], ...]  # of each in its topic: time of receipt and stamp
+    packets: tuple[bytes, ...]
+    key: int  # row of the key frame
+
+
+@dataclass(frozen=True, slots=True)
 class Image:
-    """One camera image. ``encoded`` is the untouched JPEG or PNG, where the source had one."""
+    """One camera image. ``encoded`` is the untouched JPEG or PNG, where the source had one.
+
+    Of video, ``clip`` is what it was decoded from, where Rerun shows that: no picture needs later ones.
+    """
 
     stamp: int
     frame_id: str
@@ -89,6 +104,7 @@ class Image:
     media_type: str = ""
     topic: str = ""
     received: int = 0
+    clip: Clip | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -223,15 +223,18 @@ class BagSource(Closing):
     def _begin(self, low: int) -> ReadingState:
         sync = Synchronizer(self.roles, self.config)
         state = self._state = ReadingState(sync, 0)
-        self._hold_throughout(state, make_handlers(sync, self.roles, self.recording.decode), low)
+        self._hold_throughout(state, self._handlers(sync), low)
         return state
+
+    def _handlers(self, sync: Synchronizer) -> dict[str, Handler[RawMessage]]:
+        return make_handlers(sync, self.roles, self.recording.decode, self.recording.packets)
 
     def _deliver(
         self, state: ReadingState, low: int, high: int, first: int, chosen: range
     ) -> Iterator[Frame]:
         """The frames from that state on, which is kept up to date."""
         sync = state.sync
-        handlers = make_handlers(sync, self.roles, self.recording.decode)
+        handlers = self._handlers(sync)
         state.stop = state.stop or high + MARGIN
         yield from self._numbered(sync.ready(), state)
         for message in self._messages(handlers.keys(), state, low - MARGIN, high + MARGIN):

@@ -14,6 +14,7 @@ from bevviz.ros.messages import MessageError, decode_compressed_image, decode_im
 from bevviz.sync.damage import Damage
 from bevviz.sync.feed import ImageLoader
 from bevviz.sync.synchronizer import Synchronizer
+from bevviz.sync.video import Video
 
 HEAD = 128  # bytes of a message that tell it from others of the same time: stamp and frame are in them
 
@@ -76,7 +77,7 @@ class Losses:
 
 
 def dumps(state: ReadingState) -> bytes:
-    """As bytes. Images that wait are told by where they are in the recording."""
+    """As bytes. Images that wait are told by where they are in the recording, and so is video."""
     file = io.BytesIO()
     _Pickler(file, pickle.HIGHEST_PROTOCOL).dump(state)
     return file.getvalue()
@@ -126,6 +127,8 @@ class _Pickler(pickle.Pickler):
             return "image", _Place.of(obj.message), obj.compressed
         if isinstance(obj, _PlacedImage):
             return "image", obj.place, obj.compressed
+        if isinstance(obj, Video):
+            return "video", obj.topic
         return None
 
 
@@ -133,7 +136,10 @@ class _Unpickler(pickle.Unpickler):
     def __init__(self, file: io.BytesIO, recording: Recording) -> None:
         super().__init__(file)
         self._recording = recording
+        self._videos: dict[str, Video] = {}
 
-    def persistent_load(self, pid: Any) -> _PlacedImage:
+    def persistent_load(self, pid: Any) -> _PlacedImage | Video:
+        if pid[0] == "video":
+            return self._videos.setdefault(pid[1], Video(pid[1], self._recording.packets))
         _, place, compressed = pid
         return _PlacedImage(place, compressed, self._recording)

@@ -80,7 +80,11 @@ def log_intrinsics(to: Writer, name: str, intrinsics: Intrinsics) -> None:
 def log_image(to: Writer, name: str, image: Image, quality: int) -> None:
     """Once for each image: a camera may be slower than the LiDAR."""
     path = entities.image(name)
-    if not to.keep(path, image.stamp):
+    if to.keep(path, image.stamp):
+        return
+    if image.clip is not None and to.streams_video:
+        to.video(path, image.clip)
+    else:
         to.put(path, encode_image(image, quality))
 
 

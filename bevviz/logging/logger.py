@@ -80,6 +80,7 @@ class Logger(Writer):
         self._inputs = not root if inputs is None else inputs
         self._brought: set[str] = set()  # entities of the sensors and the robot
         self._config = config
+        self.streams_video = config.logging.video == "stream"
         self._scene = scene
         self._intrinsics: dict[str, Intrinsics] = {}
         self._track_lanes = Lanes()
@@ -135,6 +136,7 @@ class Logger(Writer):
     def reconfigure(self, config: Config, scene: Scene) -> None:
         """From here on the results are made in another way, or of other sensors."""
         same, self._config, self._scene = scene == self._scene, config, scene
+        self.streams_video = config.logging.video == "stream"
         if same:  # the viewer loses class colours that are logged twice
             log_origin(self, config, scene)
         else:

@@ -36,6 +36,7 @@ from bevviz.sync.report import SyncReport
 from bevviz.sync.tf import Lookup, Origin, TransformError
 from bevviz.sync.track import JUMP, Track
 from bevviz.sync.upright import Upright
+from bevviz.sync.video import Video
 
 SECOND = 1_000_000_000
 LATENCY = 2 * SECOND  # the longest a cloud is expected to arrive after an image of the same stamp
@@ -118,6 +119,7 @@ class Synchronizer:
         self._last: int | None = None  # stamp of the last frame
         self._step = math.inf  # nanoseconds between the last two clouds; a gap is much longer
         self._partners: dict[str, Track[Cloud]] = self._make_tracks(*roles.lidars[1:])
+        self.videos: dict[str, Video] = {}  # by topic
         self._images: dict[str, Track[_Undecoded]] = self._make_tracks(*(c.topic for c in roles.cameras))
         self._lidar_frames: dict[str, str] = {}  # cloud topic -> frame
         self._camera_frames: dict[str, str] = {}  # image topic -> optical frame
@@ -148,7 +150,7 @@ class Synchronizer:
         self.report, self.absent = former.report, former.absent
         self.report.clocked = clocked
         self.tf, self.upright, self.clocks = former.tf, former.upright, former.clocks
-        self.around = former.around
+        self.around, self.videos = former.around, former.videos
         self.intrinsics, self._infos = former.intrinsics, former._infos
         self._refused_infos = former._refused_infos
         self._odometry_frames = former._odometry_frames
