@@ -280,7 +280,7 @@ class LateResult:
 
 @dataclass(frozen=True, slots=True)
 class Frame:
-    """One LiDAR scan with all that belongs to its time.
+    """One LiDAR scan with all that belongs to its time; without a LiDAR, one image of the first camera.
 
     ``points`` are the points of every LiDAR in ``points_frame``: the LiDAR's own frame where there is
     one LiDAR, the base frame where several are merged. Where that frame is not upright, they are turned
@@ -290,7 +290,7 @@ class Frame:
     index: int
     stamp: int
     received: int
-    lidar: str  # entity name: that of the LiDAR, or "lidars" for merged ones
+    lidar: str  # entity name: that of the LiDAR, "lidars" for merged ones, empty where cameras are alone
     points: F32  # (N, 3)
     points_frame: str
     fields: Mapping[str, NDArray[Any]] = field(default_factory=dict)  # extra fields common to all clouds
@@ -322,7 +322,7 @@ class Scene:
     """What a source will deliver: the names that entities and blueprints are made from."""
 
     name: str  # of the bag or drive, for the recording's title
-    lidar: str  # entity name of Frame.points
+    lidar: str  # entity name of Frame.points; empty: there is no LiDAR
     lidars: tuple[str, ...] = ()  # entity name of each LiDAR; the same as lidar where there is one
     cameras: tuple[str, ...] = ()
     robot: bool = False  # the robot's own results come along

@@ -10,6 +10,7 @@ from typing import Any
 
 import av
 import cv2
+import numpy as np
 import pytest
 
 from bevviz.bags.source import BagSource
@@ -22,6 +23,7 @@ from bevviz.report.window import choose_topics, cut, find_window, open_window
 from bevviz.ros.bitstream import Continuity, is_key
 from bevviz.sync import video
 from tests import bags, videos
+from tests.networks import FLOAT, answer
 from tests.recordings import Recording, verify
 from tests.videos import encode, number_of, numbered
 
@@ -237,3 +239,33 @@ def test_what_a_source_remembers_is_small(tmp_path: Path) -> None:
         next(iter(source))
         assert source._state is not None
         assert len(dumps(source._state)) < 50_000
+
+
+def alone(path: Path) -> Path:
+    made = videos.messages()
+    found = videos.items(made, encode(numbered(12)))
+    found += [item for item in bags.small_items(made, 12) if item.topic not in (bags.IMAGE, bags.CLOUD)]
+    return videos.write_mcap(path, found, made)
+
+
+def test_cameras_alone_make_frames_and_the_detector_is_explained(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rows = np.array([[[8, 8, 40, 40, 0.9, 2], [4, 4, 20, 30, 0.1, 0]]], np.float32)
+    model = answer(tmp_path / "model.onnx", {"output0": rows}, [("images", (1, 3, 64, 64), FLOAT)])
+    path, saved = alone(tmp_path / "alone.mcap"), tmp_path / "alone.rrd"
+    assert main(["bag", str(path), "--model", model, "--save", str(saved), "--quiet"]) == 0
+    verify(saved)
+    recording = Recording(saved)
+    assert sorted(recording.at["/world/camera/image/detections"]["Boxes2D:labels"]) == list(range(12))
+    assert not [entity for entity in recording.at if entity.startswith(("/bev", "/world/fused"))]
+    told = capsys.readouterr().err
+    assert told.count("no LiDAR") == 1
+    assert "the frames are /camera/image_rect_color/foxglove's" in told
+    assert main(["why", str(path), "--model", model, "--at", "0.52", "--all"]) == 0
+    told = capsys.readouterr().out
+    assert "was reported: car 0.90 was kept" in told
+    assert "without a LiDAR nothing tells where it is" in told
+    assert "below detector.conf_threshold" in told
+    assert main(["info", str(path)]) == 0
+    assert "no LiDAR: none of" in capsys.readouterr().out

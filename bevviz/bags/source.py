@@ -119,7 +119,8 @@ class BagSource(Closing):
         report = self._state.sync.report if self._state else None
         synced = report.warnings() if report else ()
         blind = blindness(self.config, self.roles, report)
-        return [*self.recording.warnings, *self._damage, *blind, *synced]
+        alone = [f"{self.roles.no_lidar}: the frames are {self._driver}'s"] if self.roles.no_lidar else []
+        return [*self.recording.warnings, *alone, *self._damage, *blind, *synced]
 
     @property
     def _damage(self) -> Sequence[str]:
@@ -310,12 +311,12 @@ class BagSource(Closing):
                 self._handle(handlers[topic], info, state)
 
     def _find_driver(self) -> str:
-        """The first LiDAR: its scans make the frames."""
-        if self.roles.no_lidar:
+        """The first LiDAR: its scans make the frames. Without one, the first camera."""
+        driver = self.roles.driver
+        if not driver:
             raise UserError(f"{self.recording.name}: {self.roles.no_lidar}")
         counts = {t.name: t.count for t in self.recording.topics if t.kind == "PointCloud2"}
-        driver = self.roles.lidars[0]
-        if not counts[driver]:
+        if self.roles.lidars and not counts[driver]:
             others = [name for name, count in counts.items() if count]
             helps = (
                 f"choose another one: --set source.lidar_topics=[{others[0]}]"

@@ -39,6 +39,8 @@ def load(name_or_path: str, scene: Scene) -> rrb.Blueprint:
         UserError: unknown name, no such file, or a file that makes no layout.
     """
     if name_or_path in names():
+        if not scene.lidar and scene.cameras:
+            name_or_path = "cameras"
         return _from_python(_folder() / f"{name_or_path}.py", scene)
     path = Path(name_or_path)
     if path.suffix not in (".py", ".rbl"):

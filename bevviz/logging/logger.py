@@ -113,7 +113,7 @@ class Logger(Writer):
 
     def log_static(self) -> None:
         """How the recording was made, the axes, the classes and the looks: what no frame changes."""
-        lidars = list(dict.fromkeys((self._scene.lidar, *self._scene.lidars)))
+        lidars = list(dict.fromkeys(filter(None, (self._scene.lidar, *self._scene.lidars))))
         log_origin(self, self._config, self._scene)
         log_world(self)
         log_cloud_looks(self, lidars)
@@ -198,7 +198,8 @@ class Logger(Writer):
 
     def _log_alone(self, result: FrameResult, *, cloud: bool = False, colored: bool = True) -> None:
         frame = result.frame
-        self.put(entities.sensor(frame.lidar), transform(frame.pose))
+        if frame.lidar:
+            self.put(entities.sensor(frame.lidar), transform(frame.pose))
         before = set(self._now)
         if self._inputs:
             self._log_input(result)

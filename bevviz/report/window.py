@@ -43,7 +43,7 @@ class Cut:
 
 def find_window(source: BagSource, at: int, before: float, after: float) -> Window:
     """The window from the first scan to the last one within ``before`` and ``after`` seconds of ``at``."""
-    times = source.recording.times(source.roles.lidars[0])
+    times = source.recording.times(source.roles.driver)
     first, last = np.searchsorted(times, [at - round(before * SECOND), at + round(after * SECOND) + 1])
     low = int(times[first]) // MILLISECOND * MILLISECOND
     high = (int(times[last - 1]) // MILLISECOND + 1) * MILLISECOND

@@ -76,6 +76,11 @@ class Roles:
     notes: Mapping[str, str] = field(default_factory=dict)
 
     @property
+    def driver(self) -> str:
+        """The topic whose messages make the frames: the first LiDAR's, without one the first camera's."""
+        return next(iter((*self.lidars, *(camera.topic for camera in self.cameras))), "")
+
+    @property
     def settings(self) -> tuple[str, ...]:
         """``key=value`` each, which give the sensors' topics the same roles whatever others there are."""
         infos = {camera.topic: camera.info_topic for camera in self.cameras if camera.info_topic}
@@ -92,7 +97,7 @@ class Roles:
         lidars = self.lidar_names
         return Scene(
             name=name,
-            lidar=lidars[0] if len(lidars) == 1 else "lidars",
+            lidar="lidars" if len(lidars) > 1 else "".join(lidars),
             lidars=lidars,
             cameras=tuple(camera.name for camera in self.cameras),
             robot=bool(self.robot_detections_2d or self.robot_detections_3d),

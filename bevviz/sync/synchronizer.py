@@ -170,6 +170,10 @@ class Synchronizer:
         if cloud.topic in self._partners:
             self._partners[cloud.topic].add(cloud.stamp, cloud)
             return
+        self._drive(cloud)
+
+    def _drive(self, cloud: Cloud) -> None:
+        """A frame for a cloud of the driving LiDAR."""
         self._watch_clock(cloud.stamp)
         stamps = [waiting.stamp for waiting in self._clouds]
         place = bisect_left(stamps, cloud.stamp)
@@ -193,6 +197,9 @@ class Synchronizer:
             self._camera_frames[topic] = frame_id
             self._image_counts[topic] += 1
             self._images[topic].add(stamp, _Undecoded(stamp, frame_id, load))
+            if topic == self._roles.driver:  # there is no LiDAR
+                self.report.clouds += 1
+                self._drive(Cloud(stamp, frame_id, np.zeros((0, 3), np.float32), {}, topic, received))
 
     def add_camera_info(self, topic: str, intrinsics: Intrinsics, stamp: int, received: int) -> None:
         """``topic`` is that of the CameraInfo; for an image the one that is nearest in stamp holds."""
@@ -358,7 +365,7 @@ class Synchronizer:
             yield self._done.popleft()
         yield from self._build_all()
         if self.report.clouds and not self.report.frames:
-            self.report.idle = self._roles.lidars[0]
+            self.report.idle = self._roles.driver
 
     def _build_all(self) -> Iterator[Frame]:
         while self._clouds:
@@ -519,7 +526,7 @@ class Synchronizer:
         place = _Place(cloud.stamp, points_frame, world, inertial)
         if problems is None:
             return place
-        turn = self.upright.turn(cloud, world)
+        turn = self.upright.turn(cloud, world) if self._roles.lidars else None
         if points_frame == cloud.frame_id.lstrip("/"):
             place = replace(place, upright=turn)
         if self._partners and points_frame != base:
@@ -528,6 +535,8 @@ class Synchronizer:
                 f"no transform from '{points_frame}' to source.base_frame '{base}': "
                 f"the LiDARs are merged in '{points_frame}'",
             )
+        if not world and not self._roles.lidars:
+            return place
         if not world:
             self.report.problems[
                 f"no fixed frame (map, odom or the like) above '{points_frame}' in TF: motion is not "
@@ -608,7 +617,7 @@ class Synchronizer:
         camera = Camera(role.name, image, intrinsics, None, None, problems=tuple(problems))
         if image is not None:
             camera = replace(camera, sync_error=(stamp - place.stamp) * 1e-9)
-            off = self.clocks.apart(role.topic, self._roles.lidars[0])
+            off = self.clocks.apart(role.topic, self._roles.driver)
             if off:
                 self._complain(
                     problems,
