@@ -46,6 +46,8 @@ def load(name_or_path: str, scene: Scene, config: Config | None = None) -> rrb.B
     if config is not None:
         scene = replace(scene, above=_ahead(config.bev), raw=is_whole(config))
     if name_or_path in names():
+        if not scene.lidar and scene.cameras:
+            name_or_path = "cameras"
         return _from_python(_folder() / f"{name_or_path}.py", scene)
     path = Path(name_or_path)
     if path.suffix not in (".py", ".rbl"):

@@ -87,7 +87,8 @@ def log_camera(
     if world_from_camera is not None:
         to.put(entities.sensor(camera.name), transform(world_from_camera))
     if camera.image is not None:
-        if videos is not None and camera.image.media_type not in keep.LOSSY:
+        is_video = camera.image.clip is not None and to.streams_video
+        if videos is not None and not is_video and camera.image.media_type not in keep.LOSSY:
             videos.log(to, camera.name, camera.image)
         else:
             log_image(to, camera.name, camera.image, quality)
@@ -109,7 +110,11 @@ def log_intrinsics(to: Writer, name: str, intrinsics: Intrinsics) -> None:
 def log_image(to: Writer, name: str, image: Image, quality: int) -> None:
     """Once for each image: a camera may be slower than the LiDAR."""
     path = entities.image(name)
-    if not to.keep(path, image.stamp):
+    if to.keep(path, image.stamp):
+        return
+    if image.clip is not None and to.streams_video:
+        to.video(path, image.clip)
+    else:
         to.put(path, encode_image(image, quality))
 
 

@@ -102,6 +102,7 @@ class Logger(Writer):
         self._inputs = not root if inputs is None else inputs
         self._brought: set[str] = set()  # entities of the sensors and the robot
         self._config = config
+        self.streams_video = config.logging.video == "stream"
         self._scene = scene
         self._intrinsics: dict[str, Intrinsics] = {}
         self._fixed: dict[str, Fixed] = {}
@@ -144,7 +145,7 @@ class Logger(Writer):
 
     def log_static(self) -> None:
         """How the recording was made, the axes, the classes and the looks: what no frame changes."""
-        lidars = list(dict.fromkeys((self._scene.lidar, *self._scene.lidars)))
+        lidars = list(dict.fromkeys(filter(None, (self._scene.lidar, *self._scene.lidars))))
         log_origin(self, self._config, self._scene)
         log_world(self)
         log_cloud_looks(self, lidars)
@@ -170,6 +171,7 @@ class Logger(Writer):
         """From here on the results are made in another way, or of other sensors."""
         same, self._config, self._scene = scene == self._scene, config, scene
         self._changed = True
+        self.streams_video = config.logging.video == "stream"
         if same:  # the viewer loses class colours that are logged twice
             log_origin(self, config, scene)
         else:
@@ -232,7 +234,8 @@ class Logger(Writer):
 
     def _log_alone(self, result: FrameResult, *, cloud: bool = False, colored: bool = True) -> None:
         frame = result.frame
-        self.put(entities.sensor(frame.lidar), transform(frame.pose))
+        if frame.lidar:
+            self.put(entities.sensor(frame.lidar), transform(frame.pose))
         before = set(self._now)
         if self._inputs:
             self._log_input(result)

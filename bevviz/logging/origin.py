@@ -41,7 +41,7 @@ def log_origin(to: Writer, config: Config, scene: Scene) -> None:
             config=settings,
             stated=stated or None,
             versions=packages,
-            lidars=list(scene.lidars or (scene.lidar,)),
+            lidars=[name for name in scene.lidars or (scene.lidar,) if name] or None,
             cameras=list(scene.cameras) or None,
             keep=config.logging.keep,
             left_out=lacking or None,

@@ -175,7 +175,7 @@ def _without_pixels(camera: Camera) -> Camera:
     image = camera.image
     if image is None:
         return camera
-    return replace(camera, image=replace(image, bgr=image.bgr[..., :0].copy(), encoded=None))
+    return replace(camera, image=replace(image, bgr=image.bgr[..., :0].copy(), encoded=None, clip=None))
 
 
 def _rows(count: int) -> np.ndarray[tuple[int, ...], np.dtype[np.float32]]:
