@@ -14,7 +14,7 @@ import rerun as rr
 
 from bevviz import geometry
 from bevviz.colors import Color
-from bevviz.frame import F32, Boxes3D
+from bevviz.frame import F32, Bool, Boxes3D
 from bevviz.logging import entities
 from bevviz.logging.pieces import CORNER, edges
 from bevviz.logging.writer import Writer
@@ -78,6 +78,13 @@ def log_spoken_in_image(
             rr.Points2D((corners[:, 2] + corners[:, 3]) / 2, labels=_filled(names)),
             words,
         )
+
+
+def near(places: F32) -> Bool:
+    """(K,) the ``NEAR`` nearest of (K, 2 or 3) places."""
+    away = np.hypot(places[:, 0], places[:, 1])
+    found: Bool = away <= (np.sort(away)[NEAR - 1] if len(away) > NEAR else np.inf)
+    return found
 
 
 def _rows(count: int) -> list[int]:

@@ -21,6 +21,7 @@ def space(
     raw: bool = True,
     frustums: bool = True,
     why: bool = False,
+    names: bool = True,
     name: str = "3D",
     root: str = "",
     beside: Sequence[str] = (f"{entities.ROBOT}/**",),
@@ -35,6 +36,7 @@ def space(
         raw: with every raw point, coloured as ground or obstacle.
         frustums: with what each detection sees.
         why: with the chain of what ``bevviz why`` explains.
+        names: of what was found and is near.
         name: of the view.
         root: entity that the run is logged under.
         beside: what else is shown.
@@ -47,9 +49,8 @@ def space(
     hidden += [entities.GRID, entities.UNSEEN]
     hidden += [] if frustums else [entities.FRUSTUMS]
     # The points of what is explained stand out by their colours, which tell another story than the clusters'.
-    hidden += (
-        [entities.clusters(scene.lidar), entities.FRUSTUMS, entities.names(entities.FUSED)] if why else []
-    )
+    hidden += [entities.clusters(scene.lidar), entities.FRUSTUMS] if why else []
+    hidden += [entities.names(entities.FUSED)] if why or not names else []
     position, target = (-16.0, 5.0, 11.0), (10.0, 0.0, -1.0)
     if why and scene.focus is not None:
         position, target = _beside(scene.focus), scene.focus
