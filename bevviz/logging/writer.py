@@ -206,4 +206,4 @@ class Writer(Closing):
                 times.append(rr.TimeColumn(name, timestamp=np.array(numbers, "datetime64[ns]")))
             else:
                 times.append(rr.TimeColumn(name, sequence=numbers))
-        rr.send_columns(self.root + path, times, columns, recording=self.recording)
+        self.recording.send_columns(self.root + path, times, columns)
