@@ -36,6 +36,7 @@ from bevviz.frame import AnomalyKind
 from bevviz.plugins import TOPIC
 
 Preset = Literal["default", "reference"]
+Keep = Literal["everything", "inspect", "report"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -376,7 +377,18 @@ class BevConfig(Section):
 
 
 class LoggingConfig(Section):
+    keep: Keep = Field(
+        "everything",
+        description="inspect: a fifth, with raw clouds now and then; report: less, without (docs/size.md)",
+    )
+    raw_every: int = Field(50, ge=1, description="keep=inspect: raw cloud of each N-th frame")
+    raw_around: Seconds = Field(
+        0.5, ge=0, le=5, description="keep=inspect: raw clouds before and after an anomaly or a change"
+    )
     jpeg_quality: int = Field(85, ge=1, le=100, description="for images that came uncompressed")
+    video: Literal["stream", "images"] = Field(
+        "stream", description="video as it came, or each picture as JPEG, which takes no decoder in a viewer"
+    )
     raw_cloud: bool = Field(True, description="log every raw point")
     projected_points: bool = Field(True, description="log obstacle points over the image, coloured by depth")
 

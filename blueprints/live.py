@@ -13,10 +13,12 @@ def blueprint(scene: Scene) -> rrb.Blueprint:
     side: list[rrb.Container | rrb.View] = [views.cameras(scene)] if scene.cameras else []
     return rrb.Blueprint(
         rrb.Horizontal(
-            views.space(scene, raw=False, grid=False),
+            views.space(scene, raw=False),
             rrb.Vertical(
                 *side,
-                rrb.Tabs(views.birds_eye(), views.robots_birds_eye()) if scene.robot else views.birds_eye(),
+                rrb.Tabs(views.birds_eye(scene), views.robots_birds_eye())
+                if scene.robot
+                else views.birds_eye(scene),
                 rrb.Tabs(
                     views.rates(),
                     views.stage_times(),

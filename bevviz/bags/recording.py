@@ -6,8 +6,10 @@ import heapq
 import re
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import islice
 from operator import itemgetter
 from pathlib import Path, PurePath
 from typing import Any, Literal
@@ -45,10 +47,11 @@ from bevviz.datasets.reader import DatasetReader
 from bevviz.errors import UserError
 from bevviz.files import Scratch, bag_files, drive_files
 from bevviz.frame import I64
-from bevviz.ros import grid_map_msgs, vision_msgs
+from bevviz.ros import grid_map_msgs, video, vision_msgs
 from bevviz.ros.livox import fields_of, is_livox, read_custom
 from bevviz.ros.messages import MessageError, read_header
 from bevviz.ros.roles import Topic
+from bevviz.ros.video import Packet, decode_packet, is_video
 from bevviz.text import path_text
 
 ZSTD = b"\x28\xb5\x2f\xfd"
@@ -92,6 +95,10 @@ OTHERS = {
     b"#ROSBAG V1": "a bag of ROS before 1.2: 'rosbag fix' converts it",
 }
 METADATA = "metadata.yaml"
+COMPRESSED = "sensor_msgs/msg/CompressedImage"
+STAMPED = ["timestamp", "frame_id"]  # what foxglove's messages begin with, which are laid out as a Header
+REWIND = 2_000_000_000  # nanoseconds that a key frame is looked for in first
+MOST_HEADERS = 16  # messages that a video begins with and are no pictures
 
 
 @dataclass(frozen=True, slots=True)
@@ -220,6 +227,7 @@ class Recording(Closing):
                 self._frame_id(name) if counts[name] and self._has_header(first[name]) else "",
                 (counts[name] - 1) / duration if counts[name] > 1 and duration else None,
                 self._aside.get(name, ""),
+                video=normalized(first[name].msgtype) == COMPRESSED and self._holds_video(name),
             )
             for name in sorted(first)
         )
@@ -240,6 +248,26 @@ class Recording(Closing):
         """Log times of all messages of a topic in nanoseconds, sorted, without reading them."""
         parts = [f.times([c for c in f.connections if c.topic == topic]) for f in self.files]
         return np.sort(np.concatenate(parts))
+
+    def packets(self, topic: str, received: int) -> list[Packet]:
+        """The packets of a topic with video that the one received at that time needs, and that one.
+
+        They begin with the last key frame before it, or with the recording where there is none, and what a
+        stream says before its first picture.
+        """
+        start, found = received + 1, list[Packet]()
+        back = REWIND
+        while start > self.start and not any(packet.is_key for packet in found):
+            stop, start, back = start, max(self.start, start - back), 4 * back
+            found = [*self._packets(topic, start, stop), *found]
+        keys = [row for row, packet in enumerate(found) if packet.is_key]
+        first = islice(self._packets(topic, None, None), MOST_HEADERS)
+        return [*(packet for packet in first if packet.is_header), *found[keys[-1] if keys else 0 :]]
+
+    def _packets(self, topic: str, start: int | None, stop: int | None) -> Iterator[Packet]:
+        for message in self.messages([topic], start, stop):
+            with suppress(MessageError):  # counted when its turn comes
+                yield decode_packet(self.decode(message), topic, message.received)
 
     def decode(self, message: RawMessage) -> Any:
         """The message as an object with the fields of its definition; Livox's clouds as a PointCloud2.
@@ -307,6 +335,7 @@ class Recording(Closing):
                 store = get_typestore(Stores.ROS1_NOETIC if ros1 else self._default)
                 vision_msgs.register(store)
                 grid_map_msgs.register(store)
+                video.register(store)
             self._stores[key] = store
         return self._stores[key]
 
@@ -315,7 +344,8 @@ class Recording(Closing):
             _, fields = self._store(connection).fielddefs[normalized(connection.msgtype)]
         except KeyError:
             return is_livox(connection.msgtype)
-        return bool(fields) and fields[0][1][1] == "std_msgs/msg/Header"
+        names = [name for name, _ in fields[:2]]
+        return bool(fields) and (fields[0][1][1] == "std_msgs/msg/Header" or names == STAMPED)
 
     def _frame_id(self, topic: str) -> str:
         message = self.first(topic)
@@ -323,6 +353,14 @@ class Recording(Closing):
             return message.header()[1] if message else ""
         except MessageError:
             return ""
+
+    def _holds_video(self, topic: str) -> bool:
+        """Whether images are packets of video."""
+        message = self.first(topic)
+        try:
+            return message is not None and is_video(self.decode(message))
+        except (MessageError, AttributeError, TypeError):
+            return False
 
     def _open(self, path: Path) -> None:
         try:

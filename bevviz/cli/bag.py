@@ -9,6 +9,7 @@ from bevviz.cli.options import (
     Commands,
     add_bag,
     add_config,
+    add_keep,
     add_output,
     add_selection,
     load_config,
@@ -41,7 +42,7 @@ def add(commands: Commands) -> None:
         help="windows for the workers of a Dask cluster instead, e.g. tcp://host:8786; with --save",
     )
     add_config(bag)
-    add_output(bag)
+    add_keep(add_output(bag))
     bag.set_defaults(run=_bag)
 
 
@@ -50,6 +51,5 @@ def _bag(options: argparse.Namespace) -> int:
 
     config = load_config(options)
     with open_bag(options, config) as source:
-        return process(
-            Drive(source, config), Outputs.of(options), Path(options.paths[0].stem + ".rrd"), options.jobs
-        )
+        default = Path(options.paths[0].stem + ".rrd")
+        return process(Drive(source, config), Outputs.of(options), default, options.jobs, options.dask)

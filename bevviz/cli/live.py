@@ -13,7 +13,16 @@ from typing import TYPE_CHECKING
 
 from bevviz import announce
 from bevviz.cli.interrupts import terminable
-from bevviz.cli.options import Commands, add_config, add_output, add_ros_args, port, positive, project_layers
+from bevviz.cli.options import (
+    Commands,
+    add_config,
+    add_keep,
+    add_output,
+    add_ros_args,
+    port,
+    positive,
+    project_layers,
+)
 from bevviz.cli.outputs import has_display, say, warn
 from bevviz.errors import UserError
 
@@ -70,6 +79,7 @@ def add(commands: Commands) -> None:
     )
     add_config(live)
     output = add_output(live, blueprint="live", raw=True)
+    add_keep(output)
     output.add_argument(
         "--split", type=_split, metavar="SIZE|TIME", help="--save in parts, e.g. 500MB or 10min"
     )
@@ -116,6 +126,7 @@ def _live(options: argparse.Namespace) -> int:
         "live.max_rate": options.max_rate,
         "live.points": options.points,
         "live.nice": options.nice,
+        "logging.keep": options.keep,
         "live.flight_time": options.flight,
     }
     more = [f"{key}={value}" for key, value in given.items() if value is not None]

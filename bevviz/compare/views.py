@@ -7,7 +7,7 @@ import rerun.blueprint as rrb
 from bevviz.compare.differences import DIFFERENT, Change
 from bevviz.frame import Scene
 from bevviz.logging import entities
-from bevviz.logging.views import HIDDEN, LINKED, birds_eye, plot, space
+from bevviz.logging.views import HIDDEN, LINKED, birds_eye, plot, space, text_log
 
 _SIDES = {"": ("A", Change.ONLY_A), entities.B: ("B", Change.ONLY_B)}
 
@@ -16,7 +16,7 @@ def side_space(scene: Scene, root: str) -> rrb.Spatial3DView:
     """What one run has found, with the differences that concern it: obstacles, clusters, objects."""
     name, only = _SIDES[root]
     beside = [entities.TRUTH, *changes(only, Change.MOVED, Change.CLASS)]
-    return space(scene, raw=False, grid=False, name=f"3D {name}", root=root, beside=beside)
+    return space(scene, raw=False, name=f"3D {name}", root=root, beside=beside)
 
 
 def side_camera(camera_name: str, root: str) -> rrb.Spatial2DView:
@@ -36,7 +36,7 @@ def side_pictures(scene: Scene, root: str) -> rrb.Tabs:
     """The cameras and the bird's-eye view of one run."""
     name = _SIDES[root][0]
     cameras = [side_camera(camera_name, root) for camera_name in scene.cameras]
-    return rrb.Tabs(*cameras, birds_eye(root, f"Bird's-eye view {name}"))
+    return rrb.Tabs(*cameras, birds_eye(scene, root, f"Bird's-eye view {name}"))
 
 
 def differences() -> rrb.TextDocumentView:
@@ -55,7 +55,7 @@ def compared() -> rrb.TextDocumentView:
 
 
 def difference_log() -> rrb.TextLogView:
-    return rrb.TextLogView(name="Log of differences", origin=entities.COMPARE_LOG)
+    return text_log("Log of differences", entities.COMPARE_LOG)
 
 
 def difference_counts() -> rrb.TimeSeriesView:

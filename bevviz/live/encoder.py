@@ -190,7 +190,7 @@ class Encoder:
         if (config, scene) == (self._config, self._scene):
             return
         if scene != self._scene:
-            self._stream.recording.send_blueprint(blueprints.load(self._blueprint, scene))
+            self._stream.recording.send_blueprint(blueprints.load(self._blueprint, scene, config))
         self._config, self._scene = config, scene
         self._logger.reconfigure(config, scene)
 
@@ -206,7 +206,7 @@ class Encoder:
 
     def prelude(self, context: Context, *, blueprint: bool = True) -> bytes:
         """The beginning of a recording whose first packet has this context. From any thread."""
-        layout = blueprints.load(self._blueprint, context.scene) if blueprint else None
+        layout = blueprints.load(self._blueprint, context.scene, context.config) if blueprint else None
         with _Stream(self.recording_id, layout) as stream:
             Logger(stream.recording, context.config, context.scene).log_context(context)
             if self._against is not None:

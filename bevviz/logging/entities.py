@@ -110,6 +110,21 @@ def weak(camera: str) -> str:
     return f"{WORLD}/{camera}/image/detections/weak"
 
 
+def outlines(boxes: str) -> str:
+    """Over these boxes, a sentence for each; see ``bevviz.logging.spoken``."""
+    return f"{boxes}/outlines"
+
+
+def names(boxes: str) -> str:
+    """Beside these boxes."""
+    return f"{boxes}/names"
+
+
+def boxes_of(path: str) -> str:
+    """The boxes that these outlines or names belong to; other entities are their own."""
+    return path.removesuffix("/outlines").removesuffix("/names")
+
+
 def projected(camera: str) -> str:
     return f"{WORLD}/{camera}/image/points"
 

@@ -30,12 +30,15 @@ class Topic:
     rate: float | None = None  # Hz
     aside: str = ""  # why it plays no role unless it is stated
     boxes: bool = False  # source.boxes says where in its messages they are
+    video: bool = False  # its messages are packets of video, whatever their type says
 
     @property
     def kind(self) -> str:
-        """What it is read as: the type without its package, but PointCloud2 for Livox's own clouds."""
+        """What it is read as: the type without its package, but for types that stand for others."""
         if is_livox(self.type):
             return "PointCloud2"
+        if self.video or _VIDEO.search(self.type):
+            return "CompressedVideo"
         return "Detection3DArray" if self.boxes or holds_boxes(self.type) else self.type.rpartition("/")[2]
 
 
@@ -45,7 +48,7 @@ class CameraRole:
     topic: str
     info_topic: str  # "": there is none
     rectified: bool
-    compressed: bool
+    kind: str  # Image, CompressedImage or CompressedVideo
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,6 +76,11 @@ class Roles:
     notes: Mapping[str, str] = field(default_factory=dict)
 
     @property
+    def driver(self) -> str:
+        """The topic whose messages make the frames: the first LiDAR's, without one the first camera's."""
+        return next(iter((*self.lidars, *(camera.topic for camera in self.cameras))), "")
+
+    @property
     def settings(self) -> tuple[str, ...]:
         """``key=value`` each, which give the sensors' topics the same roles whatever others there are."""
         infos = {camera.topic: camera.info_topic for camera in self.cameras if camera.info_topic}
@@ -89,7 +97,7 @@ class Roles:
         lidars = self.lidar_names
         return Scene(
             name=name,
-            lidar=lidars[0] if len(lidars) == 1 else "lidars",
+            lidar="lidars" if len(lidars) > 1 else "".join(lidars),
             lidars=lidars,
             cameras=tuple(camera.name for camera in self.cameras),
             robot=bool(self.robot_detections_2d or self.robot_detections_3d),
@@ -99,7 +107,11 @@ class Roles:
 
 
 MANY = 12  # topics; more are not listed in a sentence
-VIDEO = "video, which is not decoded here: republish it as images (image_transport) and record these"
+_VIDEO = re.compile(
+    r"foxglove\w*[./](msg/)?CompressedVideo$|ffmpeg_image_transport_msgs/(msg/)?FFMPEGPacket$"
+    r"|theora_image_transport/(msg/)?Packet$"
+)
+VIDEO = "video of a kind that is not decoded here: republish it as images (image_transport) and record these"
 _FOREIGN = (  # what holds points or pixels in a form that nothing here reads, and what would help
     ("camera", re.compile(r"video|ffmpeg|theora|h26[45]", re.IGNORECASE), VIDEO),
     (
@@ -353,8 +365,8 @@ def _one_a_frame(
 
 # --- cameras -----------------------------------------------------------------------------------
 
-_IMAGES = ("Image", "CompressedImage")
-_TRANSPORT = re.compile(r"/(compressed|compressedDepth|theora|ffmpeg|zstd)$")
+_IMAGES = ("Image", "CompressedImage", "CompressedVideo")
+_TRANSPORT = re.compile(r"/(compressed|compressedDepth|theora|ffmpeg|foxglove|zstd|h26[45]|video)$")
 _DERIVED_IMAGE = re.compile(
     r"depth(?!ai)|disparity|confidence|annotat|debug|dbg|bev|mask|overlay|detect|visuali[sz]|segment|semantic"
     r"|label|heat_?map|costmap|stereo(_raw)?/image|track|result|infra|normal|cloud|side_by_side"
@@ -382,13 +394,13 @@ def _find_images(topics: Sequence[Topic], config: SourceConfig, notes: dict[str,
         else:
             usable.append(topic)
 
-    def distance(topic: Topic) -> tuple[bool, bool, bool, bool, int, str]:
+    def distance(topic: Topic) -> tuple[bool, bool, bool, int, int, str]:
         name = topic.name.lower()
         return (
             not _RECTIFIED.search(name),
             "gray" in name or "mono" in name,
             not _info_topic(topic, topics),
-            topic.kind == "CompressedImage",  # what the robot's detector saw is mostly the other one
+            _IMAGES.index(topic.kind),  # what the robot's detector saw is mostly the first one
             len(name),
             name,
         )
@@ -415,7 +427,7 @@ def _camera(
     if config.rectified != "auto":
         rectified = config.rectified == "yes"
     notes[topic.name] += f", {'rectified' if rectified else 'not rectified'}, {info or 'without CameraInfo'}"
-    return CameraRole(name, topic.name, info, rectified, topic.kind == "CompressedImage")
+    return CameraRole(name, topic.name, info, rectified, topic.kind)
 
 
 def _info_topic(image: Topic, topics: Sequence[Topic]) -> str:

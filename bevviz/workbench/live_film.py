@@ -10,7 +10,6 @@ from dataclasses import dataclass
 
 import rerun as rr
 
-from bevviz.frame import Scene
 from bevviz.live.encoder import Packet
 from bevviz.live.output import Output
 from bevviz.live.runtime import Live
@@ -140,14 +139,15 @@ class LiveFilm(Output):
             return [], -1 if number is None else number
         if number is not None:
             self._missed += begin.number - number
-        head = [] if number is not None else [self._layout(begin.context.scene)]
+        head = [] if number is not None else [self._layout(begin.context)]
         head.append(self._encoder.prelude(begin.context, blueprint=False))
         return head + [piece.data for piece in pieces if piece.number >= begin.number], following
 
-    def _layout(self, scene: Scene) -> bytes:
+    def _layout(self, context: Context) -> bytes:
         recording = rr.RecordingStream(APPLICATION, recording_id=self._encoder.recording_id)
         stream = rr.binary_stream(recording)
-        recording.send_blueprint(blueprints.load("workbench_live", scene), make_active=True)
+        layout = blueprints.load("workbench_live", context.scene, context.config)
+        recording.send_blueprint(layout, make_active=True)
         return stream.read() or b""
 
     def _take(self, packet: Packet, fresh: bool) -> bool:
