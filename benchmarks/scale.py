@@ -92,7 +92,7 @@ def _fitted(bag: Path, folder: Path, scans: int) -> list[str]:
         next(iter(warm))
     with Drive(BagSource([bag], config), config) as drive:
         start = time.process_time()
-        with open_recording(drive.scene, config, save=folder / "fitted.rrd") as sinks:
+        with open_recording(drive.scene, config, save=folder / "fitted.rrd", in_parts=True) as sinks:
             seen = [OrderedRecorder(sinks.recording, config)]
             run_windows(drive, drive.new_session(), sinks, seen, 2, here)
         total = time.process_time() - start

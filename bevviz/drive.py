@@ -325,7 +325,9 @@ class Drive(Closing):
         from bevviz.progress import Progress
 
         target = Path(path)
-        with open_recording(self.scene, self.config, save=target, blueprint=blueprint) as sinks:
+        with open_recording(
+            self.scene, self.config, save=target, blueprint=blueprint, in_parts=jobs > 1
+        ) as sinks:
             if jobs > 1:
                 from bevviz.parallel.drive import obstacle
                 from bevviz.parallel.run import run_windows

@@ -189,7 +189,7 @@ def test_an_interrupted_run_leaves_a_recording_of_whole_windows(tmp_path: Path, 
                 if made == 2:
                     stop.set()
 
-        with open_recording(drive.scene, drive.config, save=saved) as sinks:
+        with open_recording(drive.scene, drive.config, save=saved, in_parts=True) as sinks:
             seen = [OrderedRecorder(sinks.recording, drive.config)]
             end = run_windows(drive, drive.new_session(), sinks, seen, 2, until, stop)
     assert end.frames == 16

@@ -106,14 +106,14 @@ def logged(
         outputs: where what is logged goes.
         observers: of the recording.
         finish: called after the last one, before what was made is served.
-        otherwise: shows the results to observers in another way than ``through`` does.
+        otherwise: shows the results to observers in another way than ``through`` does, in parts.
 
     Returns:
         The exit status.
     """
     from bevviz.logging.recorder import DiskWatch
 
-    with outputs.opened(items.scene, config) as sinks:
+    with outputs.opened(items.scene, config, in_parts=otherwise is not None) as sinks:
         seen = [*observers(sinks.recording), DiskWatch(sinks)]
         early = list(items.warnings)  # known before an hour's work, and said before it
         warn(early)
