@@ -79,7 +79,7 @@ def _fitted(bag: Path, folder: Path, scans: int) -> list[str]:
     """Processor time of a frame, by who spends it, and what follows from that."""
     windows = 0.0
 
-    def here(jobs: Iterable[WindowJob], on_frame: Callable[[], None]) -> JobResults:
+    def here(jobs: Iterable[WindowJob], on_frame: Callable[[], None], tick: Callable[[], None]) -> JobResults:
         nonlocal windows
         for job in list(jobs):  # cut before: it has threads of its own
             start = time.process_time()
