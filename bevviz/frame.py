@@ -696,6 +696,7 @@ class FrameResult:
     tracks: Tracks | None = None
     anomalies: tuple[Anomaly, ...] = ()
     splits: Splits | None = None  # None: clusters are as the LiDAR alone has them
+    ranges: F32 | None = None  # of ``visibility.range_image``, where it was made before it was asked for
 
     @staticmethod
     def unprocessed(
