@@ -333,10 +333,19 @@ class Drive(Closing):
                 session = self.new_session()
                 if reason := obstacle(self, session):
                     raise UserError(f"jobs={jobs}: {reason}")
-                ordered = [OrderedRecorder(sinks.recording, self.config), DiskWatch(sinks)]
+                ordered = [
+                    OrderedRecorder(sinks.recording, self.config, session.stages.provider),
+                    DiskWatch(sinks),
+                ]
                 end = run_windows(self, session, sinks, ordered, jobs)
             else:
-                end = self.run([Recorder(sinks.recording, self.config), DiskWatch(sinks), Progress()])
+                end = self.run(
+                    [
+                        Recorder(sinks.recording, self.config, self.session.stages.provider),
+                        DiskWatch(sinks),
+                        Progress(),
+                    ]
+                )
             if end.interrupted:
                 raise KeyboardInterrupt
         return target
@@ -362,7 +371,7 @@ class Drive(Closing):
             self.run([self._shown])
             return
         with open_recording(self.scene, self.config, spawn=True, blueprint=blueprint or "debug") as sinks:
-            self.run([Recorder(sinks.recording, self.config)])
+            self.run([Recorder(sinks.recording, self.config, self.session.stages.provider)])
 
     def to_pandas(self) -> DataFrame:
         """Run the whole drive into a table: a row a frame, with counts, times and what went wrong."""
