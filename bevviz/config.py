@@ -237,7 +237,10 @@ class DetectorConfig(StageSection):
         100, ge=1, le=10_000, description="candidates kept for explanation, duplicates last"
     )
     classes: tuple[str, ...] = Field((), description="only these class names; empty: all")
-    provider: str = Field("auto", description="onnxruntime execution provider, e.g. CPU, CUDA, TensorRT")
+    provider: str = Field(
+        "auto",
+        description="onnxruntime's: auto (a GPU's, where it works), CPU, CUDA, TensorRT",
+    )
     threads: int = Field(0, ge=0, description="onnxruntime threads; 0: all cores")
 
 

@@ -207,7 +207,7 @@ def test_windows_keep_what_one_process_keeps(bag: Path, read: dict[str, Recordin
     path = tmp_path / "windows.rrd"
     with bevviz.open(bag, set=[*SETTINGS, "logging.keep=inspect"]) as drive:
         assert isinstance(drive.frames, BagSource)
-        with open_recording(drive.scene, drive.config, save=path) as sinks:
+        with open_recording(drive.scene, drive.config, save=path, in_parts=True) as sinks:
             seen = [OrderedRecorder(sinks.recording, drive.config)]
             assert run_windows(drive, drive.new_session(), sinks, seen, 2, serially).frames == SCANS
     one, other = read["inspect"], Recording(path)

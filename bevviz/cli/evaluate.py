@@ -95,7 +95,11 @@ def _run(frames: Frames, config: Config, evaluation: Evaluation, outputs: Output
 
     def observers(recording: RecordingStream) -> list[Observer[FrameResult]]:
         hint(frames.scene, config)
-        return [Recorder(recording, config), evaluation, EvaluationRecorder(recording, evaluation)]
+        return [
+            Recorder(recording, config, session.stages.provider),
+            evaluation,
+            EvaluationRecorder(recording, evaluation),
+        ]
 
     def finish() -> None:
         if table:

@@ -75,8 +75,8 @@ class _Stream(Closing):
 class _FrameLogger(Logger):
     """Sets clouds that viewers shall not have whole aside, to be written once so and once thinned."""
 
-    def __init__(self, recording: rr.RecordingStream, config: Config, scene: Scene) -> None:
-        super().__init__(recording, config, scene)
+    def __init__(self, recording: rr.RecordingStream, config: Config, scene: Scene, network: str) -> None:
+        super().__init__(recording, config, scene, network=network)
         self.limit: int | None = None  # points
         self.clouds: list[tuple[str, rr.AsComponents]] = []  # by path, set aside
 
@@ -99,6 +99,7 @@ class Encoder:
         whole: seconds from one whole packet to the next, at most.
         against: compares with the robot; None: nobody does.
         clock: seconds, for tests.
+        network: what the detector's runs on; stored in recordings.
 
     Raises:
         UserError: no such blueprint.
@@ -112,15 +113,16 @@ class Encoder:
         whole: float = WHOLE,
         against: AgainstRobot | None = None,
         clock: Callable[[], float] = time.monotonic,
+        network: str = "",
     ) -> None:
-        self._against, self.clock = against, clock
+        self._against, self.clock, self._network = against, clock, network
         self._differences: DifferenceLogger | None = None
         self._blueprint = blueprint
         self._step = whole
         blueprints.load(blueprint, scene)  # what is wrong with it is said at the start
         self._config, self._scene = config, scene
         self._stream = _Stream()
-        self._logger = _FrameLogger(self._stream.recording, config, scene)
+        self._logger = _FrameLogger(self._stream.recording, config, scene, network=network)
         self._whole = float("-inf")
         self._lock = threading.Lock()
         self.recording_id: str = self._stream.recording.get_recording_id() or ""
@@ -208,7 +210,8 @@ class Encoder:
         """The beginning of a recording whose first packet has this context. From any thread."""
         layout = blueprints.load(self._blueprint, context.scene, context.config) if blueprint else None
         with _Stream(self.recording_id, layout) as stream:
-            Logger(stream.recording, context.config, context.scene).log_context(context)
+            logger = Logger(stream.recording, context.config, context.scene, network=self._network)
+            logger.log_context(context)
             if self._against is not None:
                 DifferenceLogger(stream.recording, self._against.names, "")
             return stream.read()

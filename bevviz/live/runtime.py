@@ -121,7 +121,10 @@ class Live:
         self._robot_problem = ""
         self.against = None if robot is None else AgainstRobot(robot, live)
         whole = WHOLE if live.viewer_rate is None else 1 / live.viewer_rate
-        self.encoder = Encoder(self.config, source.scene, outputs.blueprint, whole, self.against)
+        network = "" if observe else self._session.stages.provider
+        self.encoder = Encoder(
+            self.config, source.scene, outputs.blueprint, whole, self.against, network=network
+        )
         self._indexer = Indexer()
         self._watchers: list[Callable[[FrameResult], None]] = []
         self.flight = FlightRecorder(live, self.encoder, self._indexer)

@@ -86,6 +86,7 @@ class Logger(Writer):
             another logger writes: what the sensors and the robot brought is not written twice.
         wait, stamps: as of ``Writer``.
         inputs: write what the sensors and the robot brought; default: without a root.
+        network: what the detector's runs on; stored in the recording.
     """
 
     def __init__(
@@ -97,13 +98,14 @@ class Logger(Writer):
         wait: float = 0.0,
         stamps: Sequence[str] = (entities.STAMP,),
         inputs: bool | None = None,
+        network: str = "",
     ) -> None:
         super().__init__(recording, root, wait, stamps)
         self._inputs = not root if inputs is None else inputs
         self._brought: set[str] = set()  # entities of the sensors and the robot
         self._config = config
         self.streams_video = config.logging.video == "stream"
-        self._scene = scene
+        self._scene, self._network = scene, network
         self._intrinsics: dict[str, Intrinsics] = {}
         self._fixed: dict[str, Fixed] = {}
         self._track_lanes = Lanes()
@@ -146,7 +148,7 @@ class Logger(Writer):
     def log_static(self) -> None:
         """How the recording was made, the axes, the classes and the looks: what no frame changes."""
         lidars = list(dict.fromkeys(filter(None, (self._scene.lidar, *self._scene.lidars))))
-        log_origin(self, self._config, self._scene)
+        log_origin(self, self._config, self._scene, self._network)
         log_world(self)
         log_cloud_looks(self, lidars)
         log_clusters_looks(self, lidars)
@@ -173,7 +175,7 @@ class Logger(Writer):
         self._changed = True
         self.streams_video = config.logging.video == "stream"
         if same:  # the viewer loses class colours that are logged twice
-            log_origin(self, config, scene)
+            log_origin(self, config, scene, self._network)
         else:
             self.log_static()
 

@@ -14,12 +14,12 @@ from bevviz.provenance import versions
 from bevviz.text import fenced, markdown
 
 
-def log_origin(to: Writer, config: Config, scene: Scene) -> None:
-    """Source, configuration and versions."""
+def log_origin(to: Writer, config: Config, scene: Scene, network: str = "") -> None:
+    """Source, configuration, versions, and what the detector's network runs on."""
     settings = dump(config)
     stated = stated_lines(config, folders=False)
     packages = [f"{name} {version}" for name, version in versions().items()]
-    lines = [*map(markdown, stated), *packages]
+    lines = [*map(markdown, stated), *packages, *([f"network on {markdown(network)}"] if network else [])]
     lacking = list(left_out(config.logging))
     lacks = "".join(f"- {line}\n" for line in lacking)
     lacks = f"## Not in this recording (keep: {config.logging.keep})\n\n{lacks}\n" if lacks else ""
@@ -45,5 +45,6 @@ def log_origin(to: Writer, config: Config, scene: Scene) -> None:
             cameras=list(scene.cameras) or None,
             keep=config.logging.keep,
             left_out=lacking or None,
+            network=network or None,
         ),
     )
