@@ -264,7 +264,7 @@ def test_cameras_alone_make_frames_and_the_detector_is_explained(
     assert "the frames are /camera/image_rect_color/foxglove's" in told
     assert main(["why", str(path), "--model", model, "--at", "0.52", "--all"]) == 0
     told = capsys.readouterr().out
-    assert "was reported: car 0.90 was kept" in told
+    assert "was reported: class_2 0.90 was kept" in told
     assert "without a LiDAR nothing tells where it is" in told
     assert "below detector.conf_threshold" in told
     assert main(["info", str(path)]) == 0

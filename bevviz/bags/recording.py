@@ -44,10 +44,10 @@ from bevviz.closing import Closing
 from bevviz.config import SourceConfig
 from bevviz.datasets import open_dataset
 from bevviz.datasets.reader import DatasetReader
-from bevviz.errors import UserError
+from bevviz.errors import UserError, first_line
 from bevviz.files import Scratch, bag_files, drive_files
 from bevviz.frame import I64
-from bevviz.ros import grid_map_msgs, video, vision_msgs
+from bevviz.ros import foxglove, grid_map_msgs, video, vision_msgs
 from bevviz.ros.livox import fields_of, is_livox, read_custom
 from bevviz.ros.messages import MessageError, read_header
 from bevviz.ros.roles import Topic
@@ -132,8 +132,22 @@ class RawMessage:
             data = self.content()
         except zstd.ZstdError:
             raise MessageError(f"{self.topic}: a message of {len(self.data)} bytes is damaged") from None
+        if form_of(self.connection):
+            return foxglove.header(self.parsed(data), self.connection.msgtype)
         little = is_ros1(self.connection) or data[1:2] != b"\0"
         return read_header(data, "<" if little else ">", self.topic)
+
+    def parsed(self, data: bytes | memoryview) -> Any:
+        """The message of Foxglove's that these bytes are.
+
+        Raises:
+            MessageError: they are none.
+        """
+        about = self.connection
+        try:
+            return foxglove.parse(data, about.msgtype, form_of(about), about.msgdef.data)
+        except Exception as error:  # the parsers have errors of their own
+            raise MessageError(f"{self.topic}: not a {about.msgtype}: {first_line(error)}") from None
 
 
 class Recording(Closing):
@@ -279,17 +293,23 @@ class Recording(Closing):
         msgtype = normalized(connection.msgtype)
         try:
             data = message.content()
+            if form_of(connection):
+                return foxglove.as_ros(message.parsed(data), connection.msgtype)
             store = self._store(connection)
             if is_livox(msgtype):
                 fields = fields_of(store.fielddefs, msgtype)
                 return read_custom(data, ros1=is_ros1(connection), fields=fields)
             if is_ros1(connection):
-                return store.deserialize_ros1(data, msgtype)
-            return store.deserialize_cdr(data, msgtype)
+                found = store.deserialize_ros1(data, msgtype)
+            else:
+                found = store.deserialize_cdr(data, msgtype)
+            return foxglove.as_ros(found, msgtype) if foxglove.short_of(msgtype) else found
         except KeyError:
             raise MessageError(
                 f"{message.topic}: the bag does not say what a {msgtype} is made of, and neither does bevviz"
             ) from None
+        except MessageError:
+            raise
         except Exception as error:  # generated decoders raise whatever the bytes lead them to
             reason = str(error) or type(error).__name__
             raise MessageError(f"{message.topic}: not a {msgtype}: {reason}") from None
@@ -340,6 +360,8 @@ class Recording(Closing):
         return self._stores[key]
 
     def _has_header(self, connection: Connection) -> bool:
+        if form_of(connection):
+            return True
         try:
             _, fields = self._store(connection).fielddefs[normalized(connection.msgtype)]
         except KeyError:
@@ -521,6 +543,12 @@ def unpack_file(path: Path, target: Path) -> tuple[int, bool]:
     finally:
         source.close()
     return damaged, stream.eof
+
+
+def form_of(connection: Connection) -> str:
+    """How messages of Foxglove's are serialised where ROS does not: protobuf or json; else empty."""
+    form = getattr(connection.ext, "serialization_format", "")
+    return form if form in foxglove.ENCODINGS and foxglove.short_of(connection.msgtype) else ""
 
 
 def is_ros1(connection: Connection) -> bool:

@@ -298,8 +298,12 @@ class BagSource(Closing):
     ) -> None:
         """Give what is published once to all frames, wherever in the bag it is.
 
-        Of each static transform the last one before the start, else the first one after it.
+        Of each static transform the last one before the start, else the first one after it; of transforms
+        that hold until there are others, those of the first second.
         """
+        for message in self.recording.messages(self.roles.tf_held, None, self.recording.start + SECOND):
+            if message.received < low - MARGIN:
+                self._handle(handlers[message.topic], message, state)
         static = {}
         for message in self.recording.messages(self.roles.tf_static):
             try:

@@ -15,6 +15,7 @@ from bevviz.config import SourceConfig
 from bevviz.errors import UserError
 from bevviz.frame import Scene
 from bevviz.logging.entities import RESERVED
+from bevviz.ros.foxglove import KINDS, short_of
 from bevviz.ros.livox import is_livox
 from bevviz.ros.objects import check, holds_boxes
 
@@ -37,6 +38,8 @@ class Topic:
         """What it is read as: the type without its package, but for types that stand for others."""
         if is_livox(self.type):
             return "PointCloud2"
+        if short := short_of(self.type):
+            return KINDS[short]
         if self.video or _VIDEO.search(self.type):
             return "CompressedVideo"
         return "Detection3DArray" if self.boxes or holds_boxes(self.type) else self.type.rpartition("/")[2]
@@ -60,6 +63,7 @@ class Roles:
     cameras: tuple[CameraRole, ...] = ()
     tf: tuple[str, ...] = ()
     tf_static: tuple[str, ...] = ()
+    tf_held: tuple[str, ...] = ()  # of tf, those whose transforms hold until there are others, as Foxglove's
     odometry: str = ""
     imus: tuple[str, ...] = ()  # tell which way is up, where transforms do not
     robot_detections_2d: tuple[str, ...] = ()
@@ -107,10 +111,7 @@ class Roles:
 
 
 MANY = 12  # topics; more are not listed in a sentence
-_VIDEO = re.compile(
-    r"foxglove\w*[./](msg/)?CompressedVideo$|ffmpeg_image_transport_msgs/(msg/)?FFMPEGPacket$"
-    r"|theora_image_transport/(msg/)?Packet$"
-)
+_VIDEO = re.compile(r"ffmpeg_image_transport_msgs/(msg/)?FFMPEGPacket$|theora_image_transport/(msg/)?Packet$")
 VIDEO = "video of a kind that is not decoded here: republish it as images (image_transport) and record these"
 _FOREIGN = (  # what holds points or pixels in a form that nothing here reads, and what would help
     ("camera", re.compile(r"video|ffmpeg|theora|h26[45]", re.IGNORECASE), VIDEO),
@@ -236,6 +237,7 @@ def find_roles(
         cameras=cameras,
         tf=_names(moving),
         tf_static=_names(static),
+        tf_held=_names(t for t in moving if short_of(t.type)),
         odometry=odometry,
         imus=_names(imus),
         robot_detections_2d=_names(detections),
@@ -468,7 +470,7 @@ def _find_odometry(topics: Sequence[Topic], config: SourceConfig, notes: dict[st
 # --- names -------------------------------------------------------------------------------------
 
 _IMAGE_WORDS = re.compile(
-    r"(?:image|rgb|colou?r|raw|rect|gray|mono|rectified)(?:_(?:image|rgb|colou?r|raw|rect|gray|mono))*"
+    r"(?:image|rgb|colou?r|raw|rect|gray|mono|rectified)(?:_(?:image|rgb|colou?r|raw|rect|gray|mono|compressed))*"
 )
 _WEAK = {"left", "right", "front", "rear", "back", "center", "camera", "cam", "sensor", "driver", "points"}
 

@@ -77,7 +77,7 @@ def make_handlers(
 
     def add_transforms(message: M, static: bool) -> None:
         for transform in decode_transforms(decode(message), message.topic):
-            sync.add_transform(clocked(message, transform), static=static)
+            sync.add_transform(clocked(message, transform), static, held=message.topic in roles.tf_held)
 
     def clocked(message: M, transform: StampedTransform) -> StampedTransform:
         """With the stamp to go by."""

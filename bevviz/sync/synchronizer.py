@@ -221,12 +221,15 @@ class Synchronizer:
         self._refused_infos[topic] = reason
 
     def add_transform(
-        self, transform: StampedTransform, static: bool = False, fallback: bool = False
+        self, transform: StampedTransform, static: bool = False, fallback: bool = False, held: bool = False
     ) -> None:
-        """``fallback``: from Odometry, used only where nothing else states the child's parent."""
+        """``fallback``: from Odometry, used only where nothing else states the child's parent.
+
+        ``held``: what is stated once holds until there is more.
+        """
         if fallback:
             self._odometry_frames.add(transform.parent.lstrip("/"))
-        self.tf.add(transform, static, Origin.ODOMETRY if fallback else Origin.TF)
+        self.tf.add(transform, static, Origin.ODOMETRY if fallback else Origin.TF, held)
 
     def add_boxes(self, boxes: LabelledBoxes3D) -> None:
         """The robot's own 3D boxes."""
