@@ -63,6 +63,9 @@ FATES: dict[str, Color] = {
 }
 
 
+SERIES: tuple[Color, ...] = ((86, 180, 233), (230, 159, 0), (0, 170, 130), (225, 140, 190), (240, 228, 66))
+
+
 @lru_cache(maxsize=4)
 def palette(size: int = 64) -> U8:
     """(size, 3) RGB colours, neighbours far apart in hue (golden-ratio steps), bright enough on black."""

@@ -12,7 +12,7 @@ from bevviz.logging import views
 def blueprint(scene: Scene) -> rrb.Blueprint:
     pages: list[rrb.Container | rrb.View] = [
         rrb.Horizontal(
-            rrb.Vertical(*alignment(name)),
+            alignment(name),
             rrb.Vertical(calibration(name), score_curves(name), row_shares=[2, 3]),
             column_shares=[5, 4],
             name=name,

@@ -131,7 +131,7 @@ def test_the_layout_of_a_calibration_has_every_camera(scene: Scene, tmp_path: Pa
     assert {f"{camera}, {how}" for camera in scene.cameras for how in ("as stated", "corrected")} <= set(
         found
     )
-    assert ("time of the image, ms" in found) == bool(scene.cameras)
+    assert ("image time, ms" in found) == bool(scene.cameras)
 
 
 def test_a_users_own_python_file(tmp_path: Path) -> None:

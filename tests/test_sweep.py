@@ -9,6 +9,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from bevviz.cli import main
 from bevviz.config import load
@@ -19,6 +21,7 @@ from bevviz.frame import Boxes3D, Frame, LabelledBoxes3D, Objects
 from bevviz.geometry import apply as move
 from bevviz.geometry import corners, project
 from bevviz.sweep import Parameter, Sweep, combine, parse
+from bevviz.sweep.chart import HEIGHT, WIDTH, scale
 from bevviz.synthetic import SyntheticSource, write_bag
 from tests import bags
 from tests.recordings import Recording, verify
@@ -242,8 +245,15 @@ def test_a_sweep_of_the_synthetic_drive(drive: str, capsys: Capture) -> None:
     assert sum(int(few[f"{name} tp"]) for name in ("car", "person") if f"{name} tp" in few) > 0
     verify(Path("s.rrd"))
     recording = Recording(Path("s.rrd"))
-    bars = recording.static["/sweep/recall"]
-    assert bars["BarChart:values"][0]["buffer"] is not None
+    chart = "/sweep/Precision\\,_recall\\,_F1"
+    assert recording.static[f"{chart}/values"]["Points2D:labels"] == ["5", "5000"]
+    told = recording.static[f"{chart}/recall/points"]
+    assert told["says"] == [f"recall {float(few['recall']):.4g} at 5", "recall 0 at 5000"]
+    (left, above), (right, below) = told["Points2D:positions"]
+    assert (left, right, below) == (0, WIDTH, HEIGHT) and 0 <= above < below
+    marks = [recording.static[f"{chart}/mark_{n}/word"] for n in (0, 1)]
+    assert [mark["Points2D:labels"] for mark in marks] == [["best: 5"], ["now: 10"]]
+    assert marks[0]["Points2D:positions"][0][0] == 0 < marks[1]["Points2D:positions"][0][0] < 0.01 * WIDTH
     assert "| clustering.min_points |" in recording.static["/sweep"]["TextDocument:text"][0]
     assert recording.blueprints == 1
 
@@ -335,3 +345,10 @@ def test_wrong_calls(arguments: list[str], message: str, drive: str, capsys: Cap
     said = capsys.readouterr().err.splitlines()[-1]
     assert said.startswith("bevviz: error: ")
     assert message in said
+
+
+@given(st.floats(-1e6, 1e6), st.floats(0, 1e6))
+def test_axes_hold_every_number_with_few_ticks(low: float, span: float) -> None:
+    begin, end, step = scale(low, low + span)
+    assert begin <= low + 1e-6 * step and low + span <= end + 1e-6 * step
+    assert 1 <= round((end - begin) / step) <= 8

@@ -22,6 +22,7 @@ class Axis:
 
     name: str
     what: str  # how it is called
+    short: str  # the same where room is short
     positive: str  # what the stated calibration does wrong where the offset is positive
     negative: str
     unit: str
@@ -51,7 +52,7 @@ _CM: dict[str, Any] = {
     "floor": 1.0,
     "least": 1.5,
     "sure": 6.0,
-    "reach": 30.0,
+    "reach": 20.0,
     "decimals": 1,
 }
 _MS: dict[str, Any] = {
@@ -66,13 +67,20 @@ _MS: dict[str, Any] = {
 }
 
 AXES: tuple[Axis, ...] = (
-    Axis("rx", "turn about the camera's x axis", "looks too high", "looks too low", **_DEGREES),
-    Axis("ry", "turn about the camera's y axis", "looks too far right", "looks too far left", **_DEGREES),
-    Axis("rz", "turn about the camera's z axis", "is rolled right", "is rolled left", **_DEGREES),
-    Axis("tx", "shift along the camera's x axis", "is too far right", "is too far left", **_CM),
-    Axis("ty", "shift along the camera's y axis", "is too low", "is too high", **_CM),
-    Axis("tz", "shift along the camera's z axis", "is too far ahead", "is too far back", **_CM),
-    Axis("dt", "time of the image", "the stamps are late", "the stamps are early", **_MS),
+    Axis("rx", "turn about the camera's x axis", "turn x", "looks too high", "looks too low", **_DEGREES),
+    Axis(
+        "ry",
+        "turn about the camera's y axis",
+        "turn y",
+        "looks too far right",
+        "looks too far left",
+        **_DEGREES,
+    ),
+    Axis("rz", "turn about the camera's z axis", "turn z", "is rolled right", "is rolled left", **_DEGREES),
+    Axis("tx", "shift along the camera's x axis", "shift x", "is too far right", "is too far left", **_CM),
+    Axis("ty", "shift along the camera's y axis", "shift y", "is too low", "is too high", **_CM),
+    Axis("tz", "shift along the camera's z axis", "shift z", "is too far ahead", "is too far back", **_CM),
+    Axis("dt", "time of the image", "image time", "the stamps are late", "the stamps are early", **_MS),
 )
 TIME = 6  # row of the last one
 SCALES = np.array([axis.scale for axis in AXES])

@@ -8,9 +8,9 @@ from bevviz.calib.axes import AXES
 from bevviz.logging import entities
 
 
-def alignment(camera: str) -> tuple[rrb.Spatial2DView, rrb.Spatial2DView]:
-    """Points by depth and the edges of the cloud over the image: as stated, and as corrected."""
-    return (
+def alignment(camera: str) -> rrb.Tabs:
+    """Points by depth and the edges of the cloud over the image, before and after at the same place."""
+    return rrb.Tabs(
         rrb.Spatial2DView(name=f"{camera}, as stated", origin=entities.calib_stated(camera)),
         rrb.Spatial2DView(name=f"{camera}, corrected", origin=entities.calib_corrected(camera)),
     )
@@ -25,7 +25,11 @@ def score_curves(camera: str) -> rrb.Grid:
     """How well the edges meet over the offset along each axis."""
     return rrb.Grid(
         *(
-            rrb.BarChartView(name=f"{axis.what}, {axis.unit}", origin=entities.calib_curve(camera, axis.name))
+            rrb.BarChartView(
+                name=f"{axis.short}, {axis.unit}",
+                origin=entities.calib_curve(camera, axis.name),
+                plot_legend=rrb.PlotLegend(visible=False),
+            )
             for axis in AXES
         ),
         grid_columns=2,

@@ -43,6 +43,7 @@ def add(commands: Commands) -> None:
 
 
 def _sweep(options: argparse.Namespace) -> int:
+    from bevviz.config import flattened
     from bevviz.evaluate import truth_source
     from bevviz.sweep import Sweep, combine, parse
     from bevviz.sweep.log import layout, log_sweep
@@ -72,7 +73,9 @@ def _sweep(options: argparse.Namespace) -> int:
             if options.csv is not None:
                 sweep.write_csv(options.csv)
             if sinks is not None:
-                log_sweep(sinks.recording, sweep, source.scene.name)
+                values = flattened(configured([]).model_dump())
+                present = {p.key: f"{values.get(p.key, '')}" for p in parameters}
+                log_sweep(sinks.recording, sweep, source.scene.name, present)
                 if not end.interrupted:
                     outputs.keep_serving(sinks)
     if end.interrupted:

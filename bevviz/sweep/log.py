@@ -13,27 +13,32 @@ from bevviz import table
 from bevviz.frame import F64
 from bevviz.logging import entities
 from bevviz.logging.pieces import document
+from bevviz.sweep.chart import chart_view, log_chart
 from bevviz.sweep.parameters import Parameter
 from bevviz.sweep.run import COUNTS, SCORES, STAGES, Sweep
 from bevviz.text import markdown
 
-BAR = 0.8  # of the distance between two values
 
+def log_sweep(recording: rr.RecordingStream, sweep: Sweep, name: str, present: Mapping[str, str]) -> None:
+    """The table, and every number over the parameter: curves, or over two parameters a heat map.
 
-def log_sweep(recording: rr.RecordingStream, sweep: Sweep, name: str) -> None:
-    """The table, and every number over the parameter: bars, or over two parameters a heat map."""
+    Args:
+        recording: where to; static.
+        sweep: with its outcomes.
+        name: of the drive.
+        present: parameter -> its value without the sweep.
+    """
     recording.send_recording_name(name)
     columns = table.markdown([*sweep.rows("time ms")])
     page = f"# {sweep.title}\n\n{markdown(name)}\n\n{columns}"
     recording.log(entities.SWEEP, document(page), static=True)
-    for series in _plots(sweep).values():
-        for place, metric in enumerate(series):
-            values = np.array([o.metrics.get(metric, math.nan) for o in sweep.outcomes.values()])
-            if len(sweep.parameters) == 2:
-                shown: rr.Tensor | rr.BarChart = _heat_map(sweep.parameters, values)
-            else:
-                shown = _bars(sweep.parameters[0], values, place, len(series))
-            recording.log(entities.sweep(metric), shown, static=True)
+    for title, series in _plots(sweep).items():
+        found = {m: np.array([o.metrics.get(m, math.nan) for o in sweep.outcomes.values()]) for m in series}
+        if len(sweep.parameters) == 1:
+            _log_curves(recording, entities.sweep(title), sweep, found, present)
+            continue
+        for metric, values in found.items():
+            recording.log(entities.sweep(metric), _heat_map(sweep.parameters, values), static=True)
 
 
 def _heat_map(parameters: Sequence[Parameter], values: F64) -> rr.Tensor:
@@ -45,13 +50,24 @@ def _heat_map(parameters: Sequence[Parameter], values: F64) -> rr.Tensor:
     return rr.Tensor(values.reshape(shape), dim_names=names, value_range=span)
 
 
-def _bars(parameter: Parameter, values: F64, place: int, series: int) -> rr.BarChart:
-    """Those of one series of several, beside each other."""
+def _log_curves(
+    recording: rr.RecordingStream,
+    path: str,
+    sweep: Sweep,
+    curves: Mapping[str, F64],
+    present: Mapping[str, str],
+) -> None:
+    [parameter] = sweep.parameters
     at = parameter.numbers
-    step = float(np.diff(at).min()) if len(at) > 1 else 1.0
-    width = BAR * abs(step) / series
-    at = at + (place - (series - 1) / 2) * width
-    return rr.BarChart(np.nan_to_num(values), abscissa=at, widths=np.full(len(at), width))
+    order = np.argsort(at, kind="stable")
+    marks: dict[str, float] = {}
+    if sweep.best is not None:
+        marks[f"best: {sweep.best[0]}"] = float(at[parameter.values.index(sweep.best[0])])
+    now = present.get(parameter.key, "")
+    if (place := parameter.place(now)) is not None:
+        marks[f"now: {now}"] = place
+    values = [parameter.values[i] for i in order]
+    log_chart(recording, path, at[order], values, {m: c[order] for m, c in curves.items()}, marks)
 
 
 def layout(sweep: Sweep) -> rrb.Blueprint:
@@ -69,11 +85,10 @@ def layout(sweep: Sweep) -> rrb.Blueprint:
                 for metric in series
             ]
         else:
-            paths = [entities.sweep(metric) for metric in series]
-            plots.append(rrb.BarChartView(name=name, origin=entities.SWEEP, contents=paths))
+            plots.append(chart_view(f"{name}, over {sweep.parameters[0].key}", entities.sweep(name)))
     words = rrb.TextDocumentView(name="Table", origin=entities.SWEEP, contents=["$origin"])
     return rrb.Blueprint(
-        rrb.Horizontal(rrb.Grid(*plots, grid_columns=2), words, column_shares=[3, 2]),
+        rrb.Horizontal(rrb.Grid(*plots, grid_columns=2), words, column_shares=[5, 4]),
         rrb.TimePanel(state="hidden"),
         rrb.BlueprintPanel(state="collapsed"),
         rrb.SelectionPanel(state="collapsed"),

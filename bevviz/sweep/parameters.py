@@ -38,6 +38,16 @@ class Parameter:
         except ValueError:
             return np.arange(len(self.values), dtype=np.float64)
 
+    def place(self, value: str) -> float | None:
+        """Where this value is on the axis; None: off it."""
+        if value in self.values:
+            return float(self.numbers[self.values.index(value)])
+        try:
+            number, [*_] = float(value), [float(one) for one in self.values]
+        except ValueError:
+            return None
+        return number if self.numbers.min() <= number <= self.numbers.max() else None
+
 
 def parse(settings: Sequence[str]) -> tuple[list[Parameter], list[str]]:
     """Split ``key=value`` settings: with a range ``a:b:step`` or a list ``x,y,z``, and constant ones.
