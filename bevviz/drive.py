@@ -341,10 +341,19 @@ class Drive(Closing):
                 open_recording(self.scene, self.config, save=target, blueprint=blueprint, in_parts=jobs > 1)
             )
             if processes is not None:
-                ordered = [OrderedRecorder(sinks.recording, self.config), DiskWatch(sinks)]
+                ordered = [
+                    OrderedRecorder(sinks.recording, self.config, session.stages.provider),
+                    DiskWatch(sinks),
+                ]
                 end = run_windows(self, session, sinks, ordered, jobs, here(processes))
             else:
-                end = self.run([Recorder(sinks.recording, self.config), DiskWatch(sinks), Progress()])
+                end = self.run(
+                    [
+                        Recorder(sinks.recording, self.config, self.session.stages.provider),
+                        DiskWatch(sinks),
+                        Progress(),
+                    ]
+                )
             if end.interrupted:
                 raise KeyboardInterrupt
         return target
@@ -370,7 +379,7 @@ class Drive(Closing):
             self.run([self._shown])
             return
         with open_recording(self.scene, self.config, spawn=True, blueprint=blueprint or "debug") as sinks:
-            self.run([Recorder(sinks.recording, self.config)])
+            self.run([Recorder(sinks.recording, self.config, self.session.stages.provider)])
 
     def to_pandas(self) -> DataFrame:
         """Run the whole drive into a table: a row a frame, with counts, times and what went wrong."""

@@ -138,7 +138,9 @@ def plain(value: Any) -> Any:
     return "nan" if isinstance(value, float) and math.isnan(value) else value
 
 
-def serially(jobs: Iterable[WindowJob], on_frame: Callable[[], None]) -> JobResults:
+def serially(
+    jobs: Iterable[WindowJob], on_frame: Callable[[], None], tick: Callable[[], None] = lambda: None
+) -> JobResults:
     """An engine without processes, for what does not depend on them."""
     for job in jobs:
         yield job.run(1, on_frame)

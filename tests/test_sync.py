@@ -37,8 +37,8 @@ SECOND = 1_000_000_000
 T0 = 1_700_000_000 * SECOND  # stamps as a robot has them
 OPTICAL = geometry.transform(np.zeros(3), np.array([-0.5, 0.5, -0.5, 0.5]))
 K = np.array([[320.0, 0, 319.5], [0, 320.0, 179.5], [0, 0, 1]])
-LEFT = CameraRole("zed", "/zed/image", "/zed/camera_info", True, False)
-REAR = CameraRole("rear", "/rear/image", "/rear/camera_info", True, False)
+LEFT = CameraRole("zed", "/zed/image", "/zed/camera_info", True, "Image")
+REAR = CameraRole("rear", "/rear/image", "/rear/camera_info", True, "Image")
 ONE = Roles(lidars=("/rslidar_points",), lidar_names=("rslidar",), cameras=(LEFT,))
 
 
@@ -832,7 +832,7 @@ def test_a_static_transform_that_was_sent_once_on_tf() -> None:
 
 def test_the_second_camera_of_a_stereo_pair() -> None:
     """In the frame of the first one it is a baseline beside it; in a frame of its own it is where TF says."""
-    right = CameraRole("right", "/right/image", "/right/camera_info", True, False)
+    right = CameraRole("right", "/right/image", "/right/camera_info", True, "Image")
     roles = Roles(lidars=ONE.lidars, lidar_names=ONE.lidar_names, cameras=(LEFT, right))
     places = {}
     for frame in ("optical", "right_optical"):

@@ -14,6 +14,7 @@ from bevviz.ros.messages import MessageError
 from bevviz.sync.damage import Damage
 from bevviz.sync.feed import Loader
 from bevviz.sync.synchronizer import Synchronizer
+from bevviz.sync.video import Video
 
 HEAD = 128  # bytes of a message that tell it from others of the same time: stamp and frame are in them
 
@@ -79,7 +80,7 @@ class Losses:
 
 
 def dumps(state: ReadingState) -> bytes:
-    """As bytes. Messages that wait to be decoded are told by where they are in the recording."""
+    """As bytes. Messages that wait to be decoded, and video, are told by where they are in the recording."""
     file = io.BytesIO()
     _Pickler(file, pickle.HIGHEST_PROTOCOL).dump(state)
     return file.getvalue()
@@ -125,9 +126,11 @@ class _Placed:
 class _Pickler(pickle.Pickler):
     def persistent_id(self, obj: object) -> tuple[object, ...] | None:
         if isinstance(obj, Loader):
-            return _Place.of(obj.message), obj.read
+            return "message", _Place.of(obj.message), obj.read
         if isinstance(obj, _Placed):
-            return obj.place, obj.read
+            return "message", obj.place, obj.read
+        if isinstance(obj, Video):
+            return "video", obj.topic
         return None
 
 
@@ -135,7 +138,10 @@ class _Unpickler(pickle.Unpickler):
     def __init__(self, file: io.BytesIO, recording: Recording) -> None:
         super().__init__(file)
         self._recording = recording
+        self._videos: dict[str, Video] = {}
 
-    def persistent_load(self, pid: Any) -> _Placed:
-        place, read = pid
+    def persistent_load(self, pid: Any) -> _Placed | Video:
+        if pid[0] == "video":
+            return self._videos.setdefault(pid[1], Video(pid[1], self._recording.packets))
+        _, place, read = pid
         return _Placed(place, read, self._recording)

@@ -10,6 +10,7 @@ from bevviz.cli.options import (
     Commands,
     add_bag,
     add_config,
+    add_keep,
     add_output,
     add_selection,
     load_config,
@@ -42,7 +43,7 @@ def add(commands: Commands) -> None:
         help="windows for the workers of a Dask cluster instead, e.g. tcp://host:8786; with --save",
     )
     add_config(bag)
-    add_output(bag)
+    add_keep(add_output(bag))
     bag.set_defaults(run=_bag)
 
 

@@ -17,6 +17,7 @@ from bevviz.cli.options import (
     Commands,
     add_bind,
     add_config,
+    add_keep,
     add_limits,
     add_selection,
     load_config,
@@ -60,6 +61,7 @@ def add(commands: Commands) -> None:
         "--retries", type=int, default=2, metavar="N", help="again, where a process dies (default: 2)"
     )
     results = batch.add_argument_group("results")
+    add_keep(results)
     results.add_argument("--blueprint", default="debug", metavar="NAME|FILE", help="layout (default: debug)")
     results.add_argument(
         "--top", type=positive, default=30, metavar="N", help="worst frames shown (default: 30)"

@@ -58,7 +58,7 @@ def process(
     def observers(recording: RecordingStream) -> list[Observer[FrameResult]]:
         hint(drive.scene, drive.config)
         recorder = OrderedRecorder if windows else Recorder
-        return [recorder(recording, drive.config), anomalies, failures]
+        return [recorder(recording, drive.config, session.stages.provider), anomalies, failures]
 
     def finish() -> None:
         warn(failures.warnings)

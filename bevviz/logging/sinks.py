@@ -19,6 +19,7 @@ from bevviz.files import Unfinished, written
 from bevviz.frame import Scene
 from bevviz.logging import blueprints, rerun_cli
 from bevviz.logging.file_writer import FileWriter
+from bevviz.logging.keep import is_whole
 from bevviz.logging.parts import Parts, PartsWriter
 from bevviz.logging.ports import (
     FIRST_DATA_PORT,
@@ -33,6 +34,8 @@ from bevviz.logging.ports import (
 from bevviz.recorded import Origin
 
 APPLICATION = "bevviz"
+TICK = 2.0  # seconds that a frame may wait for others to go into a file with
+CHUNK = 1 << 24  # bytes that may wait
 MEMORY = "25%"  # of the machine's, for what a server keeps for those who join late, and for the viewer
 
 
@@ -116,7 +119,7 @@ def open_recording(
             process writes, port in use, no viewer found or reached;
             on leaving, when not everything could be written.
     """
-    layout = blueprints.load(blueprint, scene) if isinstance(blueprint, str) else blueprint
+    layout = blueprints.load(blueprint, scene, config) if isinstance(blueprint, str) else blueprint
     sinks: list[rr.FileSink | rr.GrpcSink | rr.GrpcServerSink] = []
     urls: list[str] = []
     warnings: list[str] = []
@@ -143,7 +146,8 @@ def open_recording(
             server, address = stack.enter_context(_served(serve, bind))
             sinks.append(server)
             urls.append(address)
-        recording = _stream(recording_id)
+        watched = connect is not None or spawn or serve is not None
+        recording = _stream(recording_id, batcher=None if watched else batches(config))
         try:
             if in_parts:
                 parts = stack.enter_context(_parts(recording, sinks, layout, joined, file))
@@ -170,8 +174,12 @@ def open_recording(
             into.check()
 
 
-def _stream(recording_id: str | None, *, properties: bool = True) -> rr.RecordingStream:
-    recording = rr.RecordingStream(APPLICATION, recording_id=recording_id, send_properties=properties)
+def _stream(
+    recording_id: str | None, *, properties: bool = True, batcher: rr.ChunkBatcherConfig | None = None
+) -> rr.RecordingStream:
+    recording = rr.RecordingStream(
+        APPLICATION, recording_id=recording_id, send_properties=properties, batcher_config=batcher
+    )
     recording.set_log_time_enabled(False)  # frames have their own clocks
     return recording
 
@@ -203,6 +211,15 @@ def _parts(
         parts.close()
         if shown is not None:
             _close(shown)
+
+
+def batches(config: Config) -> rr.ChunkBatcherConfig | None:
+    """How many rows a file's chunks have: of small frames more, which packs better. None: as Rerun does."""
+    if is_whole(config):
+        return None
+    found = rr.ChunkBatcherConfig()
+    found.flush_tick, found.flush_num_bytes = TICK, CHUNK
+    return found
 
 
 def _close(recording: rr.RecordingStream) -> None:

@@ -74,7 +74,7 @@ class SyncReport:
         for topic, n in self.overtaken.items():
             found.append(
                 f"{topic}: {n} result{'' if n == 1 else 's'} came when the frame of that time had gone on, "
-                f"at worst {self.slowest[topic]:.2f} s after the stamp: shown at that stamp, and not compared"
+                f"{_after(self.slowest[topic])}: shown at that stamp, and not compared"
             )
         for camera, n in self.without_image.items():
             found.append(f"{n} of {self.frames} frames have no image of camera '{camera}'")
@@ -84,6 +84,13 @@ class SyncReport:
         found += self.damage.sentences
         found += [f"{text} ({n} of {self.frames} frames)" for text, n in self.problems.items()]
         return (*self.doubts(), *found, *self.tf.problems)
+
+
+def _after(seconds: float) -> str:
+    """Of the latest one: stamps may be ahead of their receipt, too."""
+    if seconds < 0.005:
+        return "none of them later than its stamp"
+    return f"at worst {seconds:.2f} s after the stamp"
 
 
 def blindness(config: Config, roles: Roles, report: SyncReport | None) -> list[str]:

@@ -36,6 +36,7 @@ from bevviz.sync.report import SyncReport
 from bevviz.sync.tf import Lookup, Origin, TransformError
 from bevviz.sync.track import JUMP, Track
 from bevviz.sync.upright import Upright
+from bevviz.sync.video import Video
 
 SECOND = 1_000_000_000
 LATENCY = 2 * SECOND  # the longest a cloud is expected to arrive after an image of the same stamp
@@ -126,6 +127,7 @@ class Synchronizer:
         self._last: int | None = None  # stamp of the last frame
         self._step = math.inf  # nanoseconds between the last two clouds; a gap is much longer
         self._partners: dict[str, Track[Cloud]] = self._make_tracks(*roles.lidars[1:])
+        self.videos: dict[str, Video] = {}  # by topic
         self._images: dict[str, Track[_Undecoded]] = self._make_tracks(*(c.topic for c in roles.cameras))
         self._lidar_frames: dict[str, str] = {}  # cloud topic -> frame
         self._camera_frames: dict[str, str] = {}  # image topic -> optical frame
@@ -156,7 +158,7 @@ class Synchronizer:
         self.report, self.absent = former.report, former.absent
         self.report.clocked = clocked
         self.tf, self.upright, self.clocks = former.tf, former.upright, former.clocks
-        self.around = former.around
+        self.around, self.videos = former.around, former.videos
         self.intrinsics, self._infos = former.intrinsics, former._infos
         self._refused_infos = former._refused_infos
         self._odometry_frames = former._odometry_frames
@@ -176,6 +178,10 @@ class Synchronizer:
         if cloud.topic in self._partners:
             self._partners[cloud.topic].add(cloud.stamp, cloud)
             return
+        self._drive(cloud)
+
+    def _drive(self, cloud: Cloud) -> None:
+        """A frame for a cloud of the driving LiDAR."""
         self._watch_clock(cloud.stamp)
         stamps = [waiting.stamp for waiting in self._clouds]
         place = bisect_left(stamps, cloud.stamp)
@@ -199,6 +205,9 @@ class Synchronizer:
             self._camera_frames[topic] = frame_id
             self._image_counts[topic] += 1
             self._images[topic].add(stamp, _Undecoded(stamp, frame_id, load))
+            if topic == self._roles.driver:  # there is no LiDAR
+                self.report.clouds += 1
+                self._drive(Cloud(stamp, frame_id, np.zeros((0, 3), np.float32), {}, topic, received))
 
     def add_camera_info(self, topic: str, intrinsics: Intrinsics, stamp: int, received: int) -> None:
         """``topic`` is that of the CameraInfo; for an image the one that is nearest in stamp holds."""
@@ -212,12 +221,15 @@ class Synchronizer:
         self._refused_infos[topic] = reason
 
     def add_transform(
-        self, transform: StampedTransform, static: bool = False, fallback: bool = False
+        self, transform: StampedTransform, static: bool = False, fallback: bool = False, held: bool = False
     ) -> None:
-        """``fallback``: from Odometry, used only where nothing else states the child's parent."""
+        """``fallback``: from Odometry, used only where nothing else states the child's parent.
+
+        ``held``: what is stated once holds until there is more.
+        """
         if fallback:
             self._odometry_frames.add(transform.parent.lstrip("/"))
-        self.tf.add(transform, static, Origin.ODOMETRY if fallback else Origin.TF)
+        self.tf.add(transform, static, Origin.ODOMETRY if fallback else Origin.TF, held)
 
     def add_boxes(self, boxes: LabelledBoxes3D) -> None:
         """The robot's own 3D boxes."""
@@ -368,7 +380,7 @@ class Synchronizer:
             yield self._done.popleft()
         yield from self._build_all()
         if self.report.clouds and not self.report.frames:
-            self.report.idle = self._roles.lidars[0]
+            self.report.idle = self._roles.driver
 
     def _build_all(self) -> Iterator[Frame]:
         while self._clouds:
@@ -528,7 +540,7 @@ class Synchronizer:
         place = _Place(cloud.stamp, points_frame, world, inertial)
         if problems is None:
             return place
-        turn = self.upright.turn(cloud, world)
+        turn = self.upright.turn(cloud, world) if self._roles.lidars else None
         if points_frame == cloud.frame_id.lstrip("/"):
             place = replace(place, upright=turn)
         if self._partners and points_frame != base:
@@ -537,6 +549,8 @@ class Synchronizer:
                 f"no transform from '{points_frame}' to source.base_frame '{base}': "
                 f"the LiDARs are merged in '{points_frame}'",
             )
+        if not world and not self._roles.lidars:
+            return place
         if not world:
             self.report.problems[
                 f"no fixed frame (map, odom or the like) above '{points_frame}' in TF: motion is not "
@@ -617,7 +631,7 @@ class Synchronizer:
         camera = Camera(role.name, image, intrinsics, None, None, problems=tuple(problems))
         if image is not None:
             camera = replace(camera, sync_error=(stamp - place.stamp) * 1e-9)
-            off = self.clocks.apart(role.topic, self._roles.lidars[0])
+            off = self.clocks.apart(role.topic, self._roles.driver)
             if off:
                 self._complain(
                     problems,
