@@ -15,6 +15,11 @@ def to(say: Callable[[str], None] | None, *, bars: bool = True) -> None:
     _say, _bars = say, bars
 
 
+def heard() -> bool:
+    """Whether anybody wants to know."""
+    return _say is not None
+
+
 def say(text: str) -> None:
     """One line, where anybody wants to know."""
     if _say is not None:

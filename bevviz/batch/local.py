@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import sys
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
@@ -12,6 +13,7 @@ from multiprocessing import get_context
 from multiprocessing.connection import Connection, wait
 from multiprocessing.context import SpawnProcess
 
+from bevviz import announce
 from bevviz.batch.task import JobResult, JobResults, Task
 from bevviz.closing import Closing
 
@@ -43,7 +45,7 @@ class Processes(Closing):
         self._idle: list[_Worker] = []
         try:
             while len(self._idle) < count:
-                self._idle.append(self._start())
+                self._idle.append(self._start(speaks=announce.heard() and not self._idle))
         except BaseException:
             self.close()
             raise
@@ -112,10 +114,10 @@ class Processes(Closing):
                 _end(worker)
             self.close()
 
-    def _start(self) -> _Worker:
+    def _start(self, *, speaks: bool = False) -> _Worker:
         context = get_context("spawn")  # a fork would copy threads of Rerun and onnxruntime in midst of work
         ours, theirs = context.Pipe()
-        given = (theirs, self._threads, self._modules)
+        given = (theirs, self._threads, self._modules, speaks)
         process = context.Process(target=_work, args=given, name="bevviz batch", daemon=True)
         # Inherited: signals of the terminal are for the batch alone, which ends its workers. It must not be
         # interrupted itself between a worker's start and its name.
@@ -165,8 +167,10 @@ def _end(worker: _Worker) -> None:
     worker.process.join()
 
 
-def _work(pipe: Connection, threads: int, modules: Sequence[str]) -> None:
+def _work(pipe: Connection, threads: int, modules: Sequence[str], speaks: bool) -> None:
     """The process: one job after another, until the other end of the pipe is closed."""
+    if speaks:  # of all that compile the stages at the same time one says so
+        announce.to(lambda text: print(f"bevviz: {text}", file=sys.stderr), bars=False)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGTERM})
     os.environ["OMP_NUM_THREADS"] = str(threads)  # before Open3D is loaded
     import cv2
