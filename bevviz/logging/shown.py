@@ -19,8 +19,8 @@ def too_large_for_web(recording: Path, size: int) -> str:
         return ""
     return (
         f"{recording.name} has {size / 1e9:.1f} GB, and a browser's viewer can hold {WEB / 1e9:.1f} GB: its "
-        f"beginning will be missing; Rerun's own viewer reads what it shows from the file (rerun {recording}), "
-        "and --keep inspect saves a fifth"
+        f"beginning is missing; Rerun's own viewer reads what it shows from the file (rerun {recording}); "
+        "--keep inspect saves a fifth"
     )
 
 
