@@ -389,6 +389,9 @@ class LoggingConfig(Section):
         0.5, ge=0, le=5, description="keep=inspect: raw clouds before and after an anomaly or a change"
     )
     jpeg_quality: int = Field(85, ge=1, le=100, description="for images that came uncompressed")
+    video: Literal["stream", "images"] = Field(
+        "stream", description="video as it came, or each picture as JPEG, which takes no decoder in a viewer"
+    )
     raw_cloud: bool = Field(True, description="log every raw point")
     projected_points: bool = Field(True, description="log obstacle points over the image, coloured by depth")
 
@@ -407,6 +410,9 @@ class LiveConfig(Section):
     )
     viewer_rate: float | None = Field(
         None, ge=1, le=100, description="frames a second that viewers get at most, files get all; empty: all"
+    )
+    viewer_points: int | None = Field(
+        None, ge=1, description="points of each cloud that viewers get at most, files get all; empty: all"
     )
     split_size: Megabytes | None = Field(
         None, ge=1, description="--save: size that a part is closed at; empty: any"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol, overload
@@ -325,19 +326,26 @@ class Drive(Closing):
         from bevviz.progress import Progress
 
         target = Path(path)
-        with open_recording(self.scene, self.config, save=target, blueprint=blueprint) as sinks:
+        with ExitStack() as stack:
+            processes = None
+            session = self.new_session()
             if jobs > 1:
-                from bevviz.parallel.drive import obstacle
+                from bevviz.batch.local import Processes
+                from bevviz.parallel.drive import here, obstacle
                 from bevviz.parallel.run import run_windows
 
-                session = self.new_session()
                 if reason := obstacle(self, session):
                     raise UserError(f"jobs={jobs}: {reason}")
+                processes = stack.enter_context(Processes(jobs, ["bevviz.parallel.work"]))
+            sinks = stack.enter_context(
+                open_recording(self.scene, self.config, save=target, blueprint=blueprint, in_parts=jobs > 1)
+            )
+            if processes is not None:
                 ordered = [
                     OrderedRecorder(sinks.recording, self.config, session.stages.provider),
                     DiskWatch(sinks),
                 ]
-                end = run_windows(self, session, sinks, ordered, jobs)
+                end = run_windows(self, session, sinks, ordered, jobs, here(processes))
             else:
                 end = self.run(
                     [

@@ -29,6 +29,7 @@ def explain(
     clusters: Clusters | None,
     config: Config,
     splits: Splits | None = None,
+    lidar: bool = True,
 ) -> tuple[Explanation, ...]:
     """One self-contained sentence for each detection, each cluster, each split and each problem of a camera.
 
@@ -42,12 +43,13 @@ def explain(
         clusters: the frame's clusters, None where their stage failed.
         config: what the frame was run with.
         splits: where detections split and merged clusters.
+        lidar: whether there is one, so that clusters are to be expected.
     """
     found: list[Explanation] = []
     for result in cameras:
         found.extend(_problems(result, config))
         if result.detections is not None:
-            found.extend(_detections(result, result.detections, clusters, config))
+            found.extend(_detections(result, result.detections, clusters, config, lidar))
     if clusters is not None:
         found.extend(_clusters(cameras, clusters, config))
     if splits is not None:
@@ -68,7 +70,7 @@ def _problems(result: CameraResult, config: Config) -> Iterator[Explanation]:
 
 
 def _detections(
-    result: CameraResult, detections: Detections, clusters: Clusters | None, config: Config
+    result: CameraResult, detections: Detections, clusters: Clusters | None, config: Config, lidar: bool
 ) -> Iterator[Explanation]:
     for d, value in enumerate(detections.state.tolist()):
         state = DetectionState(value)
@@ -81,7 +83,7 @@ def _detections(
             text = f"suppressed by {rival}, IoU {detections.overlap[d]:.2f} > {limit}"
         elif result.fusion is None or clusters is None:
             why = "; ".join(result.camera.problems) or "no clusters in this frame"
-            text = f"not compared with clusters: {why}"
+            text = f"not compared with clusters: {why}" if lidar else "kept"
         else:
             decision = Decision(int(result.fusion.detection_decision[d]))
             key = decision.name.lower()

@@ -34,6 +34,8 @@ I32 = NDArray[np.int32]
 I64 = NDArray[np.int64]
 U8 = NDArray[np.uint8]
 
+Codec = Literal["h264", "h265", "av1", "vp8", "vp9"]  # of video that Rerun shows as it is
+
 
 def data_frame(columns: Mapping[str, Any] | Sequence[Mapping[str, Any]]) -> DataFrame:
     """A table, where pandas is installed.
@@ -79,8 +81,21 @@ class Intrinsics:
 
 
 @dataclass(frozen=True, slots=True)
+class Clip:
+    """Packets of a video up to a picture: from the key frame that it needs, and the group before that."""
+
+    codec: Codec
+    places: tuple[tuple[int, int], ...]  # of each in its topic: time of receipt and stamp
+    packets: tuple[bytes, ...]
+    key: int  # row of the key frame
+
+
+@dataclass(frozen=True, slots=True)
 class Image:
-    """One camera image. ``encoded`` is the untouched JPEG or PNG, where the source had one."""
+    """One camera image. ``encoded`` is the untouched JPEG or PNG, where the source had one.
+
+    Of video, ``clip`` is what it was decoded from, where Rerun shows that: no picture needs later ones.
+    """
 
     stamp: int
     frame_id: str
@@ -89,6 +104,7 @@ class Image:
     media_type: str = ""
     topic: str = ""
     received: int = 0
+    clip: Clip | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -216,6 +232,35 @@ class Solids:
 
 
 @dataclass(frozen=True, slots=True)
+class Surface:
+    """A map of heights, or of other values on a plane: triangles between the centres of its known cells."""
+
+    vertices: F32  # (V, 3)
+    triangles: NDArray[np.uint32]  # (T, 3) rows of the vertices
+    values: F32  # (V,) that the colours are of
+
+
+@dataclass(frozen=True, slots=True)
+class MeshFile:
+    """A file with a mesh, and where it is in its frame."""
+
+    path: Path
+    pose: F64  # (4, 4)
+    scale: tuple[float, float, float] = (1.0, 1.0, 1.0)
+
+
+@dataclass(frozen=True, slots=True)
+class Motion:
+    """What an Imu has measured since the frame before, in its own frame; NaN where it measures none."""
+
+    topic: str
+    stamp: I64  # (N,)
+    received: I64  # (N,)
+    rotation: F64  # (N, 3) rad/s
+    acceleration: F64  # (N, 3) m/s^2, or in g: drivers differ
+
+
+@dataclass(frozen=True, slots=True)
 class Shape:
     """What has a place in the world, in the coordinates of ``frame_id``."""
 
@@ -227,6 +272,8 @@ class Shape:
     solids: Solids | None = None
     axes: F64 | None = None  # (4, 4) frame_id from a pose
     grid: Grid | None = None
+    surface: Surface | None = None
+    meshes: tuple[MeshFile, ...] = ()
     fix: tuple[float, float] | None = None  # degrees of latitude and longitude
     picture: U8 | None = None  # (H, W, 3) BGR
     color: U8 | None = None  # red, green, blue, alpha
@@ -241,6 +288,7 @@ class Around:
     marks: tuple[str, ...] = ()  # set by people, at this frame
     statuses: tuple[Status, ...] = ()
     shapes: tuple[Shape, ...] = ()
+    motions: tuple[Motion, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -264,7 +312,7 @@ class LateResult:
 
 @dataclass(frozen=True, slots=True)
 class Frame:
-    """One LiDAR scan with all that belongs to its time.
+    """One LiDAR scan with all that belongs to its time; without a LiDAR, one image of the first camera.
 
     ``points`` are the points of every LiDAR in ``points_frame``: the LiDAR's own frame where there is
     one LiDAR, the base frame where several are merged. Where that frame is not upright, they are turned
@@ -274,7 +322,7 @@ class Frame:
     index: int
     stamp: int
     received: int
-    lidar: str  # entity name: that of the LiDAR, or "lidars" for merged ones
+    lidar: str  # entity name: that of the LiDAR, "lidars" for merged ones, empty where cameras are alone
     points: F32  # (N, 3)
     points_frame: str
     fields: Mapping[str, NDArray[Any]] = field(default_factory=dict)  # extra fields common to all clouds
@@ -306,13 +354,16 @@ class Scene:
     """What a source will deliver: the names that entities and blueprints are made from."""
 
     name: str  # of the bag or drive, for the recording's title
-    lidar: str  # entity name of Frame.points
+    lidar: str  # entity name of Frame.points; empty: there is no LiDAR
     lidars: tuple[str, ...] = ()  # entity name of each LiDAR; the same as lidar where there is one
     cameras: tuple[str, ...] = ()
     robot: bool = False  # the robot's own results come along
     truth: bool = False  # ground truth comes along
+    imu: bool = False  # rotation and acceleration come along
     bag: tuple[Path, ...] = ()  # files and folders that the frames are read from; (): none
     topics: tuple[str, ...] = ()  # key=value each, which give the same topics the same roles
+    focus: tuple[float, float, float] | None = None  # what is asked about, in metres of Frame.points_frame
+    above: tuple[float, float, float, float] | None = None  # u, v, u, v: where a look from above begins
     raw: bool = True  # every raw cloud is logged
 
 
@@ -645,6 +696,7 @@ class FrameResult:
     tracks: Tracks | None = None
     anomalies: tuple[Anomaly, ...] = ()
     splits: Splits | None = None  # None: clusters are as the LiDAR alone has them
+    ranges: F32 | None = None  # of ``visibility.range_image``, where it was made before it was asked for
 
     @staticmethod
     def unprocessed(

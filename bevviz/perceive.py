@@ -243,7 +243,9 @@ def perceive(
     found = [network.submit(detect, camera) for camera in frame.cameras] if network is not None else []
 
     voxels = ground = obstacles = clusters = None
-    if len(frame.points) == 0:
+    if not frame.lidar:
+        pass
+    elif len(frame.points) == 0:
         log.failures.append(Failure("cloud", "the cloud holds no finite point"))
     else:
         voxels = log.run("voxel", voxel_grid, frame.points, config.voxel)
@@ -308,17 +310,21 @@ def describe(result: FrameResult) -> FrameResult:
     raw_ground = None
     if result.voxels is not None and result.ground is not None:
         raw_ground = log.run("bev", of_points, result.ground.mask, result.voxels.inverse)
-    image = log.run(
-        "bev",
-        bev,
-        frame.points,
-        frame.fields.get("intensity"),
-        raw_ground,
-        result.objects,
-        result.clusters,
-        config.bev,
+    image = None
+    if frame.lidar:
+        image = log.run(
+            "bev",
+            bev,
+            frame.points,
+            frame.fields.get("intensity"),
+            raw_ground,
+            result.objects,
+            result.clusters,
+            config.bev,
+        )
+    explanations = log.run(
+        "explain", explain, result.cameras, result.clusters, config, result.splits, bool(frame.lidar)
     )
-    explanations = log.run("explain", explain, result.cameras, result.clusters, config, result.splits)
     wall = clock() - start
     return replace(
         result,

@@ -138,7 +138,7 @@ def test_where_no_frame_id_is_stated_no_extrinsics_are_asked_for(tmp_path: Path)
 def test_a_bag_without_a_lidar_is_described_all_the_same(tmp_path: Path) -> None:
     info = describe([write(tmp_path / "drive", bags.CLOUD)], Config())
     assert [t.name for t in info.topics] == [bags.INFO, bags.IMAGE, "/tf", "/tf_static"]
-    assert info.missing[0].startswith("drive: no LiDAR: none of 4 topics is a sensor_msgs/PointCloud2; there")
+    assert info.missing[0].startswith("no LiDAR: none of 4 topics is a sensor_msgs/PointCloud2; there")
     assert "no LiDAR" in render(info)
 
 

@@ -465,7 +465,7 @@ def test_bad_compressed_images_are_named() -> None:
             messages.decode_compressed_image(compressed(data, ""), "/image", 0)
     with pytest.raises(MessageError, match=r"/image: .*'avif' holds neither JPEG, PNG nor WebP data"):
         messages.decode_compressed_image(compressed(b"\0\0\0\x1cftypavif", "avif"), "/image", 0)
-    with pytest.raises(MessageError, match=r"/image: 'h264' is video, which is not decoded here: republish"):
+    with pytest.raises(MessageError, match=r"/image: 'h264' is video of a kind that is not decoded"):
         messages.decode_compressed_image(compressed(b"\0\0\0\1abc", "h264"), "/image", 0)
     with pytest.raises(MessageError, match="/image: '16UC1; compressedDepth png' is a depth image"):
         messages.decode_compressed_image(compressed(png, "16UC1; compressedDepth png"), "/image", 0)

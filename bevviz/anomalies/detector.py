@@ -102,12 +102,13 @@ class AnomalyDetector:
 
     def _transforms(self, result: FrameResult, config: AnomaliesConfig) -> Iterator[Anomaly]:
         frame = result.frame
-        ages = {frame.lidar: frame.tf_age} | {camera.name: camera.tf_age for camera in frame.cameras}
+        ages = {frame.lidar: frame.tf_age} if frame.lidar else {}
+        ages |= {camera.name: camera.tf_age for camera in frame.cameras}
         for sensor, age in ages.items():
             if age > config.tf_age:
                 yield Anomaly("tf", sensor, f"the transform of {sensor} is {1e3 * age:.0f} ms old", rank=0.7)
         placed = {c.name for c in frame.cameras if c.camera_from_points is not None}
-        if frame.world_from_points is not None:
+        if frame.lidar and frame.world_from_points is not None:
             placed.add(frame.lidar)
         for sensor in sorted(self._placed - placed):
             yield Anomaly("tf", sensor, f"the transform of {sensor} is lost", "ERROR", rank=1.0)

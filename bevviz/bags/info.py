@@ -162,6 +162,8 @@ def find_missing(roles: Roles, frame: Frame | None, config: Config) -> list[str]
     found = []
     if roles.no_camera:
         found.append(roles.no_camera)
+    if roles.no_lidar:
+        found.append(roles.no_lidar)
     for role, camera in zip(roles.cameras, frame.cameras, strict=True):
         about = f"camera '{role.name}'"
         placed = camera.camera_from_points is not None or camera.image is None
@@ -180,7 +182,9 @@ def find_missing(roles: Roles, frame: Frame | None, config: Config) -> list[str]
             found.append(f"{about} is not placed, no transform from {between}: --set {setting}")
         if role.info_topic and placed:
             found += [f"{about}: {problem}" for problem in camera.problems]
-    if frame.world_from_points is None and not frame.points_frame:
+    if not frame.lidar:
+        pass
+    elif frame.world_from_points is None and not frame.points_frame:
         found.append("no fixed frame, so that motion is not compensated: the points state no frame_id")
     elif frame.world_from_points is None:
         found.append(

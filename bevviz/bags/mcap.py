@@ -58,6 +58,8 @@ class Channels:
             msgtype, encoding, text = strings(record, 2, 3)
             kind = FORMATS.get(encoding.decode(errors="replace"), MessageDefinitionFormat.NONE)
             definition = MessageDefinition(kind, text.decode(errors="replace")) if kind.value else NOTHING
+            if encoding in (b"protobuf", b"jsonschema"):  # a character for each byte
+                definition = MessageDefinition(MessageDefinitionFormat.NONE, text.decode("latin-1"))
             self.schemas.setdefault(number, (msgtype.decode(errors="replace"), definition))
         elif opcode == CHANNEL:
             number, schema = struct.unpack_from("<HH", record)

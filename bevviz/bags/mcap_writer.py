@@ -44,6 +44,8 @@ from bevviz.files import claim, unfinished, write_all
 HEADER, CHUNK_INDEX, STATISTICS = 1, 8, 0x0B
 CHUNK_SIZE = 1 << 22  # bytes that a chunk is closed at
 
+_SCHEMAS = {"protobuf": "protobuf", "json": "jsonschema"}  # of messages that are not ROS's
+
 
 class McapWriter:
     """Context manager: ``write`` messages in order of log time. The file appears when all went well.
@@ -159,9 +161,9 @@ class McapWriter:
 
     def _add_channel(self, connection: Connection, number: int) -> int:
         extra, definition = connection.ext, self._define(connection)
-        ros2 = isinstance(extra, ConnectionExtRosbag2) and extra.serialization_format != "ros1"
+        form = extra.serialization_format if isinstance(extra, ConnectionExtRosbag2) else "ros1"
         schema = self._schemas.get((connection.msgtype, definition)) or self._add_schema(
-            connection.msgtype, definition, ros2
+            connection.msgtype, definition, form
         )
         metadata = b""
         if isinstance(extra, ConnectionExtRosbag2) and extra.offered_qos_profiles:
@@ -173,22 +175,20 @@ class McapWriter:
             metadata += _text("topic_type_hash") + _text(connection.digest)
         self._declare(
             CHANNEL,
-            struct.pack("<HH", number, schema)
-            + _text(connection.topic)
-            + _text("cdr" if ros2 else "ros1")
-            + _bytes(metadata),
+            struct.pack("<HH", number, schema) + _text(connection.topic) + _text(form) + _bytes(metadata),
         )
         return number
 
-    def _add_schema(self, msgtype: str, definition: MessageDefinition, ros2: bool) -> int:
+    def _add_schema(self, msgtype: str, definition: MessageDefinition, form: str) -> int:
         number = self._schemas[msgtype, definition] = len(self._schemas) + 1
         kind = {
-            MessageDefinitionFormat.MSG: "ros2msg" if ros2 else "ros1msg",
+            MessageDefinitionFormat.MSG: "ros1msg" if form == "ros1" else "ros2msg",
             MessageDefinitionFormat.IDL: "ros2idl",
-            MessageDefinitionFormat.NONE: "",
+            MessageDefinitionFormat.NONE: _SCHEMAS.get(form, ""),
         }[definition.format]
-        name = msgtype if ros2 else msgtype.replace("/msg/", "/")
-        self._declare(SCHEMA, struct.pack("<H", number) + _text(name) + _text(kind) + _text(definition.data))
+        name = msgtype.replace("/msg/", "/") if form == "ros1" else msgtype
+        content = definition.data.encode("latin-1" if form in _SCHEMAS else "utf-8")
+        self._declare(SCHEMA, struct.pack("<H", number) + _text(name) + _text(kind) + _bytes(content))
         return number
 
     def _declare(self, opcode: int, content: bytes) -> None:

@@ -347,6 +347,8 @@ def megabytes(size: int) -> str:
 def normalized(msgtype: str) -> str:
     """The name of a type as ROS 2 spells it: sensor_msgs/msg/Image."""
     package, _, name = msgtype.rpartition("/")
+    if not package and "." in name:  # protobuf's: foxglove.PointCloud
+        return msgtype
     if package.rpartition("/")[2] in ("msg", "action"):
         return msgtype
     return f"{package}/msg/{name}".lstrip("/")

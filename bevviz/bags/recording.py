@@ -6,8 +6,10 @@ import heapq
 import re
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import islice
 from operator import itemgetter
 from pathlib import Path, PurePath
 from typing import Any, Literal
@@ -42,13 +44,14 @@ from bevviz.closing import Closing
 from bevviz.config import SourceConfig
 from bevviz.datasets import open_dataset
 from bevviz.datasets.reader import DatasetReader
-from bevviz.errors import UserError
+from bevviz.errors import UserError, first_line
 from bevviz.files import Scratch, bag_files, drive_files
 from bevviz.frame import I64
-from bevviz.ros import vision_msgs
+from bevviz.ros import foxglove, grid_map_msgs, video, vision_msgs
 from bevviz.ros.livox import fields_of, is_livox, read_custom
 from bevviz.ros.messages import MessageError, read_header
 from bevviz.ros.roles import Topic
+from bevviz.ros.video import Packet, decode_packet, is_video
 from bevviz.text import path_text
 
 ZSTD = b"\x28\xb5\x2f\xfd"
@@ -92,6 +95,10 @@ OTHERS = {
     b"#ROSBAG V1": "a bag of ROS before 1.2: 'rosbag fix' converts it",
 }
 METADATA = "metadata.yaml"
+COMPRESSED = "sensor_msgs/msg/CompressedImage"
+STAMPED = ["timestamp", "frame_id"]  # what foxglove's messages begin with, which are laid out as a Header
+REWIND = 2_000_000_000  # nanoseconds that a key frame is looked for in first
+MOST_HEADERS = 16  # messages that a video begins with and are no pictures
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,8 +132,22 @@ class RawMessage:
             data = self.content()
         except zstd.ZstdError:
             raise MessageError(f"{self.topic}: a message of {len(self.data)} bytes is damaged") from None
+        if form_of(self.connection):
+            return foxglove.header(self.parsed(data), self.connection.msgtype)
         little = is_ros1(self.connection) or data[1:2] != b"\0"
         return read_header(data, "<" if little else ">", self.topic)
+
+    def parsed(self, data: bytes | memoryview) -> Any:
+        """The message of Foxglove's that these bytes are.
+
+        Raises:
+            MessageError: they are none.
+        """
+        about = self.connection
+        try:
+            return foxglove.parse(data, about.msgtype, form_of(about), about.msgdef.data)
+        except Exception as error:  # the parsers have errors of their own
+            raise MessageError(f"{self.topic}: not a {about.msgtype}: {first_line(error)}") from None
 
 
 class Recording(Closing):
@@ -220,6 +241,7 @@ class Recording(Closing):
                 self._frame_id(name) if counts[name] and self._has_header(first[name]) else "",
                 (counts[name] - 1) / duration if counts[name] > 1 and duration else None,
                 self._aside.get(name, ""),
+                video=normalized(first[name].msgtype) == COMPRESSED and self._holds_video(name),
             )
             for name in sorted(first)
         )
@@ -241,6 +263,26 @@ class Recording(Closing):
         parts = [f.times([c for c in f.connections if c.topic == topic]) for f in self.files]
         return np.sort(np.concatenate(parts))
 
+    def packets(self, topic: str, received: int) -> list[Packet]:
+        """The packets of a topic with video that the one received at that time needs, and that one.
+
+        They begin with the last key frame before it, or with the recording where there is none, and what a
+        stream says before its first picture.
+        """
+        start, found = received + 1, list[Packet]()
+        back = REWIND
+        while start > self.start and not any(packet.is_key for packet in found):
+            stop, start, back = start, max(self.start, start - back), 4 * back
+            found = [*self._packets(topic, start, stop), *found]
+        keys = [row for row, packet in enumerate(found) if packet.is_key]
+        first = islice(self._packets(topic, None, None), MOST_HEADERS)
+        return [*(packet for packet in first if packet.is_header), *found[keys[-1] if keys else 0 :]]
+
+    def _packets(self, topic: str, start: int | None, stop: int | None) -> Iterator[Packet]:
+        for message in self.messages([topic], start, stop):
+            with suppress(MessageError):  # counted when its turn comes
+                yield decode_packet(self.decode(message), topic, message.received)
+
     def decode(self, message: RawMessage) -> Any:
         """The message as an object with the fields of its definition; Livox's clouds as a PointCloud2.
 
@@ -251,17 +293,23 @@ class Recording(Closing):
         msgtype = normalized(connection.msgtype)
         try:
             data = message.content()
+            if form_of(connection):
+                return foxglove.as_ros(message.parsed(data), connection.msgtype)
             store = self._store(connection)
             if is_livox(msgtype):
                 fields = fields_of(store.fielddefs, msgtype)
                 return read_custom(data, ros1=is_ros1(connection), fields=fields)
             if is_ros1(connection):
-                return store.deserialize_ros1(data, msgtype)
-            return store.deserialize_cdr(data, msgtype)
+                found = store.deserialize_ros1(data, msgtype)
+            else:
+                found = store.deserialize_cdr(data, msgtype)
+            return foxglove.as_ros(found, msgtype) if foxglove.short_of(msgtype) else found
         except KeyError:
             raise MessageError(
                 f"{message.topic}: the bag does not say what a {msgtype} is made of, and neither does bevviz"
             ) from None
+        except MessageError:
+            raise
         except Exception as error:  # generated decoders raise whatever the bytes lead them to
             reason = str(error) or type(error).__name__
             raise MessageError(f"{message.topic}: not a {msgtype}: {reason}") from None
@@ -306,15 +354,20 @@ class Recording(Closing):
             if store is None:
                 store = get_typestore(Stores.ROS1_NOETIC if ros1 else self._default)
                 vision_msgs.register(store)
+                grid_map_msgs.register(store)
+                video.register(store)
             self._stores[key] = store
         return self._stores[key]
 
     def _has_header(self, connection: Connection) -> bool:
+        if form_of(connection):
+            return True
         try:
             _, fields = self._store(connection).fielddefs[normalized(connection.msgtype)]
         except KeyError:
             return is_livox(connection.msgtype)
-        return bool(fields) and fields[0][1][1] == "std_msgs/msg/Header"
+        names = [name for name, _ in fields[:2]]
+        return bool(fields) and (fields[0][1][1] == "std_msgs/msg/Header" or names == STAMPED)
 
     def _frame_id(self, topic: str) -> str:
         message = self.first(topic)
@@ -322,6 +375,14 @@ class Recording(Closing):
             return message.header()[1] if message else ""
         except MessageError:
             return ""
+
+    def _holds_video(self, topic: str) -> bool:
+        """Whether images are packets of video."""
+        message = self.first(topic)
+        try:
+            return message is not None and is_video(self.decode(message))
+        except (MessageError, AttributeError, TypeError):
+            return False
 
     def _open(self, path: Path) -> None:
         try:
@@ -482,6 +543,12 @@ def unpack_file(path: Path, target: Path) -> tuple[int, bool]:
     finally:
         source.close()
     return damaged, stream.eof
+
+
+def form_of(connection: Connection) -> str:
+    """How messages of Foxglove's are serialised where ROS does not: protobuf or json; else empty."""
+    form = getattr(connection.ext, "serialization_format", "")
+    return form if form in foxglove.ENCODINGS and foxglove.short_of(connection.msgtype) else ""
 
 
 def is_ros1(connection: Connection) -> bool:

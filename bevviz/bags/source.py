@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from functools import cached_property
@@ -119,7 +119,8 @@ class BagSource(Closing):
         report = self._state.sync.report if self._state else None
         synced = report.warnings() if report else ()
         blind = blindness(self.config, self.roles, report)
-        return [*self.recording.warnings, *self._damage, *blind, *synced]
+        alone = [f"{self.roles.no_lidar}: the frames are {self._driver}'s"] if self.roles.no_lidar else []
+        return [*self.recording.warnings, *alone, *self._damage, *blind, *synced]
 
     @property
     def _damage(self) -> Sequence[str]:
@@ -179,20 +180,24 @@ class BagSource(Closing):
     def __iter__(self) -> Iterator[Frame]:
         return self._frames(self._low, self._high, self._first, self._chosen)
 
-    def windows(self, length: int) -> Iterator[Window]:
-        """The same frames in windows of so many, two at least, each to be read by another source.
+    def windows(self, length: Callable[[int], int]) -> Iterator[Window]:
+        """The same frames in windows, each to be read by another source.
 
-        All messages are read for it, but no image is decoded and no frame made: what frames lack is not among
-        the warnings then, see ``add_losses``.
+        ``length`` tells how many frames one has, two at least, by how many there are left. All messages are
+        read for it, but no image is decoded and no frame made: what frames lack is not among the warnings
+        then, see ``add_losses``.
         """
         state = self._begin(self._low)
         state.sync.skims = True
         content, again = dumps(state), 0
+        number, first, end = 0, 0, length(self.total)
         for n, _ in enumerate(self._deliver(state, self._low, self._high, self._first, self._chosen)):
-            if n % length == 0:
-                yield Window(n // length, length, again, content)
-            if n % length == length - 2:
+            if n == first:
+                yield Window(number, end - first, again, content)
+            if n == end - 2:
                 content, again = dumps(state), 1
+            if n == end - 1:
+                number, first, end = number + 1, end, end + length(max(self.total - end, 0))
 
     def window(self, window: Window) -> Iterator[tuple[Frame, bool]]:
         """Its frames, and before them, told by False, the last one of the window before."""
@@ -223,15 +228,18 @@ class BagSource(Closing):
     def _begin(self, low: int) -> ReadingState:
         sync = Synchronizer(self.roles, self.config)
         state = self._state = ReadingState(sync, 0)
-        self._hold_throughout(state, make_handlers(sync, self.roles, self.recording.decode), low)
+        self._hold_throughout(state, self._handlers(sync), low)
         return state
+
+    def _handlers(self, sync: Synchronizer) -> dict[str, Handler[RawMessage]]:
+        return make_handlers(sync, self.roles, self.recording.decode, self.recording.packets)
 
     def _deliver(
         self, state: ReadingState, low: int, high: int, first: int, chosen: range
     ) -> Iterator[Frame]:
         """The frames from that state on, which is kept up to date."""
         sync = state.sync
-        handlers = make_handlers(sync, self.roles, self.recording.decode)
+        handlers = self._handlers(sync)
         state.stop = state.stop or high + MARGIN
         yield from self._numbered(sync.ready(), state)
         for message in self._messages(handlers.keys(), state, low - MARGIN, high + MARGIN):
@@ -290,8 +298,12 @@ class BagSource(Closing):
     ) -> None:
         """Give what is published once to all frames, wherever in the bag it is.
 
-        Of each static transform the last one before the start, else the first one after it.
+        Of each static transform the last one before the start, else the first one after it; of transforms
+        that hold until there are others, those of the first second.
         """
+        for message in self.recording.messages(self.roles.tf_held, None, self.recording.start + SECOND):
+            if message.received < low - MARGIN:
+                self._handle(handlers[message.topic], message, state)
         static = {}
         for message in self.recording.messages(self.roles.tf_static):
             try:
@@ -307,12 +319,12 @@ class BagSource(Closing):
                 self._handle(handlers[topic], info, state)
 
     def _find_driver(self) -> str:
-        """The first LiDAR: its scans make the frames."""
-        if self.roles.no_lidar:
+        """The first LiDAR: its scans make the frames. Without one, the first camera."""
+        driver = self.roles.driver
+        if not driver:
             raise UserError(f"{self.recording.name}: {self.roles.no_lidar}")
         counts = {t.name: t.count for t in self.recording.topics if t.kind == "PointCloud2"}
-        driver = self.roles.lidars[0]
-        if not counts[driver]:
+        if self.roles.lidars and not counts[driver]:
             others = [name for name, count in counts.items() if count]
             helps = (
                 f"choose another one: --set source.lidar_topics=[{others[0]}]"

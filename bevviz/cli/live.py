@@ -305,6 +305,8 @@ def _watch(
     if (against := live.against) is not None:
         text = f"{against.differing} of {against.frames} compared frames differ from {against.names[1]}"
         say(text if against.frames else f"the robot published nothing on {against.names[1]}")
+        if against.without_ours:
+            say(f"{against.without_ours} frames are not compared: no objects of ours were made of them")
         if against.late_images:
             late = f"{against.late_images} of the robot's detections in images"
             say(f"{late} came when their frames were compared already: not compared")

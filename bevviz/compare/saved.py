@@ -77,7 +77,7 @@ class SavedRun:
             raise UserError(f"{path}: no recording of bevviz: it does not say how it was made")
         self.frames = {stamp: frame for stamp, frame in self.frames.items() if frame.index >= 0}
         self.cameras = tuple(self._property.get("cameras") or ())
-        self.lidars = tuple(self._property["lidars"])
+        self.lidars = tuple(self._property.get("lidars") or ())
 
     @property
     def name(self) -> str:
@@ -85,7 +85,7 @@ class SavedRun:
 
     @property
     def scene(self) -> Scene:
-        lidar = self.lidars[0] if len(self.lidars) == 1 else "lidars"
+        lidar = "lidars" if len(self.lidars) > 1 else "".join(self.lidars)
         return Scene(self._property["source"][0], lidar, self.lidars, self.cameras)
 
     @property

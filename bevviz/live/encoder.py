@@ -9,7 +9,7 @@ import os
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from types import MappingProxyType
 
 import rerun as rr
@@ -20,8 +20,8 @@ from bevviz.compare.log import DifferenceLogger
 from bevviz.config import Config
 from bevviz.frame import FrameResult, LateResult, Scene
 from bevviz.live.against import AgainstRobot, Compared
+from bevviz.live.thinning import is_cloud, thin_cloud
 from bevviz.logging import blueprints
-from bevviz.logging.keep import is_whole
 from bevviz.logging.logger import Context, Logger
 from bevviz.logging.sinks import APPLICATION
 
@@ -36,6 +36,12 @@ class Packet:
     whole: bool
     context: Context
     time: float  # seconds, monotonic
+    thinned: bytes | None = None  # with fewer points, for viewers; None: they get the same
+
+    @property
+    def shown(self) -> bytes:
+        """For viewers."""
+        return self.data if self.thinned is None else self.thinned
 
 
 class _Stream(Closing):
@@ -64,6 +70,23 @@ class _Stream(Closing):
         data = os.pread(self._file, end - start, start)
         os.ftruncate(self._file, 0)
         return data
+
+
+class _FrameLogger(Logger):
+    """Sets clouds that viewers shall not have whole aside, to be written once so and once thinned."""
+
+    def __init__(self, recording: rr.RecordingStream, config: Config, scene: Scene, network: str) -> None:
+        super().__init__(recording, config, scene, network=network)
+        self.limit: int | None = None  # points
+        self.clouds: list[tuple[str, rr.AsComponents]] = []  # by path, set aside
+
+    def write(self, path: str, *archetypes: rr.AsComponents) -> None:
+        if self.limit is not None:
+            clouds = [one for one in archetypes if is_cloud(one, self.limit)]
+            self.clouds += [(path, one) for one in clouds]
+            archetypes = tuple(one for one in archetypes if not is_cloud(one, self.limit))
+        if archetypes:
+            super().write(path, *archetypes)
 
 
 class Encoder:
@@ -99,7 +122,7 @@ class Encoder:
         blueprints.load(blueprint, scene)  # what is wrong with it is said at the start
         self._config, self._scene = config, scene
         self._stream = _Stream()
-        self._logger = Logger(self._stream.recording, config, scene, network=network)
+        self._logger = _FrameLogger(self._stream.recording, config, scene, network=network)
         self._whole = float("-inf")
         self._lock = threading.Lock()
         self.recording_id: str = self._stream.recording.get_recording_id() or ""
@@ -133,9 +156,28 @@ class Encoder:
             if whole:
                 self._whole = now
                 self._logger.refresh()
+            self._logger.limit = result.config.live.viewer_points
             self._logger.log(result, health, notes, late, states)
+            self._logger.limit = None
             self._log_differences(compared, whole)
-            return Packet(self._stream.read(), whole, self._logger.context, now)
+            data, thinned = self._stream.read(), None
+            if self._logger.clouds:
+                everything, few = self._encode_clouds(result)
+                data, thinned = data + everything, data + few
+            return Packet(data, whole, self._logger.context, now, thinned)
+
+    def _encode_clouds(self, result: FrameResult) -> tuple[bytes, bytes]:
+        """Those of the frame that were set aside: as they are, and thinned."""
+        frame, points = result.frame, result.config.live.viewer_points
+        assert points is not None
+        clouds, self._logger.clouds = self._logger.clouds, []
+        self._logger.set_time(frame.index, frame.stamp, frame.received)
+        for path, cloud in clouds:
+            self._logger.write(path, cloud)
+        everything = self._stream.read()
+        for path, cloud in clouds:
+            self._stream.recording.log(path, thin_cloud(cloud, points, frame.index))
+        return everything, self._stream.read()
 
     def encode_meanwhile(
         self, seconds: float, notes: Sequence[tuple[str, str]], states: Mapping[str, str]
@@ -150,8 +192,7 @@ class Encoder:
         if (config, scene) == (self._config, self._scene):
             return
         if scene != self._scene:
-            layout = blueprints.load(self._blueprint, replace(scene, raw=is_whole(config)))
-            self._stream.recording.send_blueprint(layout)
+            self._stream.recording.send_blueprint(blueprints.load(self._blueprint, scene, config))
         self._config, self._scene = config, scene
         self._logger.reconfigure(config, scene)
 
@@ -167,8 +208,7 @@ class Encoder:
 
     def prelude(self, context: Context, *, blueprint: bool = True) -> bytes:
         """The beginning of a recording whose first packet has this context. From any thread."""
-        scene = replace(context.scene, raw=is_whole(context.config))
-        layout = blueprints.load(self._blueprint, scene) if blueprint else None
+        layout = blueprints.load(self._blueprint, context.scene, context.config) if blueprint else None
         with _Stream(self.recording_id, layout) as stream:
             logger = Logger(stream.recording, context.config, context.scene, network=self._network)
             logger.log_context(context)

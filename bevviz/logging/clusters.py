@@ -21,7 +21,7 @@ def log_clusters_looks(to: Writer, lidars: Iterable[str]) -> None:
         to.static(
             entities.clusters(lidar),
             rr.Points3D.from_fields(radii=rr.Radius.ui_points(2.0), show_labels=False),
-            rr.Boxes3D.from_fields(radii=rr.Radius.ui_points(1.0), fill_mode=OUTLINE),
+            rr.Boxes3D.from_fields(radii=rr.Radius.ui_points(1.0), fill_mode=OUTLINE, show_labels=False),
         )
         to.static(entities.set_aside(lidar), rr.Boxes3D.from_fields(show_labels=False))
 

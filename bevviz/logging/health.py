@@ -57,7 +57,8 @@ def health(result: FrameResult, last: Frame | None, rates: Rates) -> Iterator[tu
         yield entities.rate(what), rate
     for what, number in counts_of(result, last).items():
         yield entities.count(what), number
-    yield entities.tf_age(frame.lidar), frame.tf_age * 1e3
+    if frame.lidar:
+        yield entities.tf_age(frame.lidar), frame.tf_age * 1e3
     for camera in result.cameras:
         yield entities.sync_error(camera.camera.name), camera.camera.sync_error * 1e3
         yield entities.tf_age(camera.camera.name), camera.camera.tf_age * 1e3

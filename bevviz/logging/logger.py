@@ -11,11 +11,19 @@ import rerun as rr
 
 from bevviz.anomalies import Onsets
 from bevviz.config import Config
-from bevviz.frame import CameraResult, Frame, FrameResult, Intrinsics, LateResult, Scene
+from bevviz.frame import Frame, FrameResult, Intrinsics, LateResult, Scene
 from bevviz.logging import entities
 from bevviz.logging.annotations import log_world
 from bevviz.logging.anomalies import log_anomalies, log_anomalies_looks
-from bevviz.logging.around import AroundLog, diagnostic_states, log_shapes, marks
+from bevviz.logging.around import (
+    AroundLog,
+    Fixed,
+    diagnostic_states,
+    fixed_parts,
+    log_motions,
+    log_shapes,
+    marks,
+)
 from bevviz.logging.bev import log_bev, log_grid
 from bevviz.logging.camera import (
     Videos,
@@ -60,6 +68,9 @@ class Context:
     clock: tuple[int, int, int] = (0, 0, 0)  # index, stamp and received of the frame
     intrinsics: Mapping[str, Intrinsics] = field(default_factory=dict)
     lanes: Mapping[str, str] = field(default_factory=dict)  # state lane -> its state
+    fixed: Mapping[str, Fixed] = field(
+        default_factory=dict
+    )  # entity -> what holds at all times since it came
 
 
 class Logger(Writer):
@@ -93,10 +104,12 @@ class Logger(Writer):
         self._inputs = not root if inputs is None else inputs
         self._brought: set[str] = set()  # entities of the sensors and the robot
         self._config = config
+        self.streams_video = config.logging.video == "stream"
         self._scene, self._network = scene, network
         self._intrinsics: dict[str, Intrinsics] = {}
+        self._fixed: dict[str, Fixed] = {}
         self._track_lanes = Lanes()
-        self._state_lanes = StateLanes(COLORS)
+        self._state_lanes = StateLanes(COLORS, plain_lanes=entities.ANOMALY_STATES)
         self._around = AroundLog()
         self._onsets = Onsets()
         self._last: Frame | None = None
@@ -113,7 +126,9 @@ class Logger(Writer):
         """What the frame that was logged last relies on."""
         last = self._last
         clock = (0, 0, 0) if last is None else (last.index, last.stamp, last.received)
-        return Context(self._config, self._scene, clock, self._intrinsics, self._state_lanes.states)
+        return Context(
+            self._config, self._scene, clock, self._intrinsics, self._state_lanes.states, self._fixed
+        )
 
     @property
     def results(self) -> frozenset[str]:
@@ -132,7 +147,7 @@ class Logger(Writer):
 
     def log_static(self) -> None:
         """How the recording was made, the axes, the classes and the looks: what no frame changes."""
-        lidars = list(dict.fromkeys((self._scene.lidar, *self._scene.lidars)))
+        lidars = list(dict.fromkeys(filter(None, (self._scene.lidar, *self._scene.lidars))))
         log_origin(self, self._config, self._scene, self._network)
         log_world(self)
         log_cloud_looks(self, lidars)
@@ -148,6 +163,8 @@ class Logger(Writer):
         self.log_static()
         for name, intrinsics in context.intrinsics.items():
             self._log_intrinsics(name, intrinsics)
+        for path, fixed in context.fixed.items():
+            self.static(path, *fixed)
         if context.lanes:
             self.set_time(*context.clock)
             self._state_lanes.log(self, context.lanes)
@@ -156,6 +173,7 @@ class Logger(Writer):
         """From here on the results are made in another way, or of other sensors."""
         same, self._config, self._scene = scene == self._scene, config, scene
         self._changed = True
+        self.streams_video = config.logging.video == "stream"
         if same:  # the viewer loses class colours that are logged twice
             log_origin(self, config, scene, self._network)
         else:
@@ -218,7 +236,8 @@ class Logger(Writer):
 
     def _log_alone(self, result: FrameResult, *, cloud: bool = False, colored: bool = True) -> None:
         frame = result.frame
-        self.put(entities.sensor(frame.lidar), transform(frame.pose))
+        if frame.lidar:
+            self.put(entities.sensor(frame.lidar), transform(frame.pose))
         before = set(self._now)
         if self._inputs:
             self._log_input(result)
@@ -227,14 +246,18 @@ class Logger(Writer):
         self._brought |= self._now - before
         self._log_lidar_results(result, colored)
         for camera in result.cameras:
-            self._log_camera_results(camera)
+            log_detections(self, camera, result.explanations)
+            if self._config.logging.projected_points and self._config.logging.keep != "report":
+                log_projected_points(self, camera, packed=not is_whole(self._config))
         log_frustums(self, frame, result.cameras)
         if result.bev is not None:
             log_bev(self, result.bev, self._config)
             if self._config.logging.keep != "report":
                 log_grid(self, result, result.bev)
         if not self.root:
+            self._log_fixed(frame)
             log_shapes(self, frame)
+            log_motions(self, frame)
 
     def _log_in_order(
         self,
@@ -290,6 +313,13 @@ class Logger(Writer):
                 del self._late[topic]
                 forget_late(self, topic)
 
+    def _log_fixed(self, frame: Frame) -> None:
+        """Where it is new."""
+        for path, make in fixed_parts(frame).items():
+            if path not in self._fixed and (fixed := make()) is not None:
+                self._fixed = {**self._fixed, path: fixed}  # a context may hold the one before
+                self.static(path, *fixed)
+
     def _log_intrinsics(self, name: str, intrinsics: Intrinsics) -> None:
         """Where they are new."""
         last = self._intrinsics.get(name)
@@ -333,13 +363,6 @@ class Logger(Writer):
             log_clusters(
                 self, frame, clusters, result.tracks, result.obstacles, config.clustering, colored, scale
             )
-
-    def _log_camera_results(self, result: CameraResult) -> None:
-        config = self._config
-        if result.detections is not None:
-            log_detections(self, result.camera.name, result.detections)
-        if config.logging.projected_points and config.logging.keep != "report":
-            log_projected_points(self, result, packed=not is_whole(config))
 
     def _log_some_clouds(self, result: FrameResult, *, strange: bool) -> None:
         """The raw clouds of this frame where they are wanted, and those before it that are wanted with it.

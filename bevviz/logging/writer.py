@@ -10,9 +10,18 @@ import numpy as np
 import rerun as rr
 
 from bevviz.closing import Closing
+from bevviz.frame import F64, I64, Clip, Codec
 from bevviz.logging import entities
 
 STAMPS = (entities.STAMP, entities.TRIED, entities.RECEIVED)  # timelines in nanoseconds; the others count
+STEP = 1_000  # nanoseconds between two packets of video that belong to the same frame, at least
+CODECS: Mapping[Codec, rr.VideoCodec] = {
+    "h264": rr.VideoCodec.H264,
+    "h265": rr.VideoCodec.H265,
+    "av1": rr.VideoCodec.AV1,
+    "vp8": rr.VideoCodec.VP8,
+    "vp9": rr.VideoCodec.VP9,
+}
 WAIT = 1.0  # seconds, for a recording rather than for a robot's operator
 
 
@@ -46,6 +55,9 @@ class Writer(Closing):
         self._known: set[str] = set()  # entities that any frame had
         self._shown: set[str] = set()  # entities with something of the frame before
         self._now: set[str] = set()
+        self.streams_video = True  # else each picture as an image
+        self._codecs: dict[str, Codec] = {}  # of entities that are video
+        self._reached: dict[str, tuple[tuple[int, int], dict[str, int]]] = {}  # last packet of each, and when
         self._versions: dict[str, int] = {}  # entity -> what ``keep`` was last called with
 
     def begin(self, index: int, stamp: int, received: int) -> None:
@@ -73,6 +85,7 @@ class Writer(Closing):
         """
         self._shown = self._known | known
         self._versions.clear()
+        self._reached.clear()
 
     @property
     def known(self) -> frozenset[str]:
@@ -102,6 +115,34 @@ class Writer(Closing):
         self.write(path, *archetypes)
         self._now.add(path)
 
+    def video(self, path: str, clip: Clip) -> None:
+        """The picture that a clip ends with, by those of its packets that are not there yet.
+
+        What belongs to no frame is earlier on the timelines that count nanoseconds, as its stamps are. Of a
+        clip that does not go on where the last one ended, all of it lies just before the frame.
+        """
+        if self._codecs.get(path) != clip.codec:
+            self._codecs[path] = clip.codec
+            self.static(path, rr.VideoStream(codec=CODECS[clip.codec]))
+        reached, clock = self._reached.get(path, (None, {}))
+        clock = clock if reached in clip.places else {}
+        begin = clip.places.index(reached) + 1 if reached in clip.places else clip.key
+        self._reached[path] = clip.places[-1], self._clock
+        end = len(clip.places) - 1
+        clocks = []
+        for row in range(begin, end):
+            early = clip.places[end][1] - clip.places[row][1] if clock else 0
+            times = dict(self._clock)
+            for name in self._clock.keys() & set(STAMPS):
+                times[name] -= max(early, STEP * (end - row))
+                if name in clock:
+                    times[name] = max(times[name], clock[name] + STEP * (row - begin + 1))
+            clocks.append(times)
+        if clocks:
+            self._write_columns(path, clocks, rr.VideoStream.columns(sample=clip.packets[begin:end]))
+        if begin <= end:
+            self.put(path, rr.VideoStream.from_fields(sample=clip.packets[end]))
+
     def keep(self, path: str, version: int) -> bool:
         """Keep what the frame before put there, if that was of this version; else False: put it anew."""
         kept = self._versions.get(path) == version and path in self._shown
@@ -119,6 +160,17 @@ class Writer(Closing):
             self._scalars[path].append((self._clock, value))
         else:
             self.write(path, rr.Scalars(value))
+
+    def samples(self, path: str, stamps: I64, received: I64, values: F64) -> None:
+        """Numbers to plot that came between the frames, each row at its own time: (N, D)."""
+        clocks = []
+        for stamp, received_at in zip(stamps.tolist(), received.tolist(), strict=True):
+            clock = self._clock | dict.fromkeys(self._stamps, stamp)
+            if entities.RECEIVED in clock:
+                clock[entities.RECEIVED] = received_at
+            clocks.append(clock)
+        columns = rr.Scalars.columns(scalars=values.ravel()).partition([values.shape[1]] * len(values))
+        self._write_columns(path, clocks, columns)
 
     def lines(self, path: str, lines: Sequence[tuple[str, str]]) -> None:
         """Lines of a log: level and text of each."""
@@ -154,4 +206,4 @@ class Writer(Closing):
                 times.append(rr.TimeColumn(name, timestamp=np.array(numbers, "datetime64[ns]")))
             else:
                 times.append(rr.TimeColumn(name, sequence=numbers))
-        rr.send_columns(self.root + path, times, columns, recording=self.recording)
+        self.recording.send_columns(self.root + path, times, columns)

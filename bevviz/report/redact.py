@@ -28,6 +28,7 @@ from bevviz.report.contents import (
     is_coloured,
     is_known,
 )
+from bevviz.ros.foxglove import short_of
 from bevviz.ros.messages import MessageError, decode_compressed_image, decode_image
 from bevviz.stages.detector import MAX_CANDIDATES, Detector
 
@@ -37,6 +38,7 @@ SMALLEST = 8  # pixels of a cell's edge, at least
 MARGIN = 0.15  # of a box's sides, on each side of it
 QUALITY = 95  # of JPEGs that are encoded anew
 
+PLAIN_FOXGLOVE = {"CameraCalibration", "FrameTransform", "FrameTransforms"}  # numbers and frames
 PEOPLE = re.compile(r"person|people|pedestrian|rider|cyclist|human|man\b|child|face|head")
 VEHICLES = re.compile(
     r"car\b|van\b|truck|bus\b|tram|train|motor|bike|bicycle|cycle|trailer|caravan|vehicle|taxi|scooter|plate"
@@ -111,7 +113,7 @@ class Redactor:
         msgtype = normalized(message.connection.msgtype)
         if msgtype in (IMAGE, COMPRESSED):
             return self._redacted(message, data, msgtype == COMPRESSED)
-        if message.topic in self._lidars:
+        if message.topic in self._lidars or short_of(msgtype) in PLAIN_FOXGLOVE:
             return data
         if PICTURES.search(msgtype):
             raise MessageError(f"a {msgtype} cannot be looked into")

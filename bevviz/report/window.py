@@ -43,7 +43,7 @@ class Cut:
 
 def find_window(source: BagSource, at: int, before: float, after: float) -> Window:
     """The window from the first scan to the last one within ``before`` and ``after`` seconds of ``at``."""
-    times = source.recording.times(source.roles.lidars[0])
+    times = source.recording.times(source.roles.driver)
     first, last = np.searchsorted(times, [at - round(before * SECOND), at + round(after * SECOND) + 1])
     low = int(times[first]) // MILLISECOND * MILLISECOND
     high = (int(times[last - 1]) // MILLISECOND + 1) * MILLISECOND
@@ -102,8 +102,9 @@ def cut(
     """Write the messages of a window to an MCAP file, byte for byte, with all that it needs to run again.
 
     That is: ``MARGIN`` on either side, as ``BagSource`` reads it, everything that was said on the
-    ``static`` topics, and of each topic that is silent in the window the last message before it, else the
-    first one after it (a calibration, a map or a robot's description that was published once).
+    ``static`` topics, of video what was before and is needed to decode it, and of each topic that is silent
+    in the window the last message before it, else the first one after it (a calibration, a map or a
+    robot's description that was published once).
 
     Args:
         recording: the whole bag.
@@ -133,10 +134,12 @@ def cut(
                 bag.write(message.connection, message.received, data)
                 counts[message.topic] += 1
 
-        silent = [_last(recording, name, low, high) for name in chosen]
+        videos = {topic.name for topic in recording.topics if topic.kind == "CompressedVideo"}
+        silent = [_last(recording, name, low, high) for name in chosen if name not in videos]
         early = [m for m in silent if m is not None and m.received < low]
         late = [m for m in silent if m is not None and m.received >= high]
         early += recording.messages(static, None, low)
+        early += [m for name in chosen if name in videos for m in _needed(recording, name, low)]
         for message in sorted(early, key=lambda m: m.received):
             put(message)
         for message in recording.messages(topics, low, high):
@@ -146,6 +149,12 @@ def cut(
             put(message)
     lost = [f"{n} damaged message(s) of {name} are left out" for name, n in damaged.items()]
     return Cut(counts, tuple(lost))
+
+
+def _needed(recording: Recording, topic: str, low: int) -> list[RawMessage]:
+    """The messages of a video before the window that its first pictures are decoded from."""
+    times = sorted({packet.received for packet in recording.packets(topic, low - 1)})
+    return [m for time in times for m in recording.messages([topic], time, time + 1)]
 
 
 def _last(recording: Recording, topic: str, low: int, high: int) -> RawMessage | None:

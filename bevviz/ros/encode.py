@@ -14,7 +14,7 @@ from rosbags.typesys.store import Typestore
 
 from bevviz import geometry
 from bevviz.frame import F32, F64, I64, Boxes3D, Cloud, Image, ImageLabels, Intrinsics
-from bevviz.ros import vision_msgs
+from bevviz.ros import grid_map_msgs, vision_msgs
 
 # A vision_msgs/Detection3DArray that also says what was labelled in an image, see frame.ImageLabels.
 _LABELLED = """std_msgs/Header header
@@ -28,9 +28,10 @@ float32[] dont_care
 
 @cache
 def typestore() -> Typestore:
-    """The definitions of ROS 2 Jazzy, of vision_msgs, and of what labelled data sets say beyond that."""
+    """The definitions of ROS 2 Jazzy, vision_msgs, grid_map_msgs, and what labelled data sets say beyond."""
     store = get_typestore(Stores.ROS2_JAZZY)
     vision_msgs.register(store)
+    grid_map_msgs.register(store)
     store.register(get_types_from_msg(_LABELLED, "bevviz_msgs/msg/Detection3DArray"))
     return store
 
@@ -52,7 +53,7 @@ def encode_points(stamp: int, frame_id: str, points: NDArray[np.void]) -> Any:
     """A sensor_msgs/PointCloud2 of (N,) points with fields of numbers, which is not copied."""
     layout = points.dtype
     fields = [
-        _make(
+        make(
             "sensor_msgs/msg/PointField",
             name=name,
             offset=int(layout.fields[name][1]),  # type: ignore[index]
@@ -61,7 +62,7 @@ def encode_points(stamp: int, frame_id: str, points: NDArray[np.void]) -> Any:
         )
         for name in layout.names or ()
     ]
-    return _make(
+    return make(
         "sensor_msgs/msg/PointCloud2",
         header=_header(stamp, frame_id),
         height=1,
@@ -81,7 +82,7 @@ _POINT_FIELD = {"i1": 1, "u1": 2, "i2": 3, "u2": 4, "i4": 5, "u4": 6, "f4": 7, "
 def encode_image(image: Image) -> Any:
     """A sensor_msgs/Image in bgr8."""
     height, width = image.bgr.shape[:2]
-    return _make(
+    return make(
         "sensor_msgs/msg/Image",
         header=_header(image.stamp, image.frame_id),
         height=height,
@@ -95,7 +96,7 @@ def encode_image(image: Image) -> Any:
 
 def encode_compressed_image(stamp: int, frame_id: str, encoded: bytes, kind: str) -> Any:
     """A sensor_msgs/CompressedImage of the bytes of a file; ``kind``: png, jpeg."""
-    return _make(
+    return make(
         "sensor_msgs/msg/CompressedImage",
         header=_header(stamp, frame_id),
         format=kind,
@@ -110,20 +111,27 @@ def encode_camera_info(image: Image, intrinsics: Intrinsics) -> Any:
 
 def encode_intrinsics(stamp: int, frame_id: str, intrinsics: Intrinsics) -> Any:
     """The same by stamp and frame."""
-    k = intrinsics.K
-    region = _make(
+    k, size = intrinsics.K, (intrinsics.width, intrinsics.height)
+    p = np.column_stack([k, np.zeros(3)]).reshape(-1)
+    d = np.asarray(intrinsics.D, np.float64)
+    return encode_camera(_header(stamp, frame_id), size, intrinsics.distortion_model, d, k.reshape(-1), p)
+
+
+def encode_camera(header: Any, size: tuple[int, int], model: str, d: F64, k: F64, p: F64) -> Any:
+    """A sensor_msgs/CameraInfo of numbers that are stated; ``size``: width and height."""
+    region = make(
         "sensor_msgs/msg/RegionOfInterest", x_offset=0, y_offset=0, height=0, width=0, do_rectify=False
     )
-    return _make(
+    return make(
         "sensor_msgs/msg/CameraInfo",
-        header=_header(stamp, frame_id),
-        height=intrinsics.height,
-        width=intrinsics.width,
-        distortion_model=intrinsics.distortion_model,
-        d=np.asarray(intrinsics.D, np.float64),
-        k=k.reshape(-1),
+        header=header,
+        width=size[0],
+        height=size[1],
+        distortion_model=model,
+        d=d,
+        k=k,
         r=np.eye(3).reshape(-1),
-        p=np.column_stack([k, np.zeros(3)]).reshape(-1),
+        p=p if p.size == 12 else np.zeros(12),
         binning_x=0,
         binning_y=0,
         roi=region,
@@ -156,9 +164,9 @@ def encode_boxes_3d(
     ):
         half = float(yaw) / 2
         place = _pose(turn @ geometry.transform(center, np.array([0, 0, np.sin(half), np.cos(half)])))
-        box = _make("vision_msgs/msg/BoundingBox3D", center=place, size=_vector("Vector3", size))
+        box = make("vision_msgs/msg/BoundingBox3D", center=place, size=_vector("Vector3", size))
         detections.append(
-            _make(
+            make(
                 "vision_msgs/msg/Detection3D",
                 header=about,
                 results=_results(hypotheses, place),
@@ -166,7 +174,7 @@ def encode_boxes_3d(
                 id=name,
             )
         )
-    return _make("vision_msgs/msg/Detection3DArray", header=about, detections=detections)
+    return make("vision_msgs/msg/Detection3DArray", header=about, detections=detections)
 
 
 def encode_labels(
@@ -182,7 +190,7 @@ def encode_labels(
     message = encode_boxes_3d(stamp, frame_id, boxes, results, ids=ids)
     if image is None:
         return message
-    return _make(
+    return make(
         "bevviz_msgs/msg/Detection3DArray",
         header=message.header,
         detections=message.detections,
@@ -202,7 +210,7 @@ def encode_markers(
     """
     turn, markers = np.eye(4) if pose is None else pose, []
     about = _header(stamp, frame_id)
-    lasting = _make("builtin_interfaces/msg/Duration", sec=0, nanosec=500_000_000)
+    lasting = make("builtin_interfaces/msg/Duration", sec=0, nanosec=500_000_000)
     for center, size, yaw, way, number, text in zip(
         boxes.center, boxes.size, boxes.yaw, velocity, ids.tolist(), texts, strict=True
     ):
@@ -220,7 +228,7 @@ def encode_markers(
             shapes.append(("ways", 0, _pose(np.eye(4)), np.array([0.1, 0.25, 0]), 1.0, points, ""))
         for space, kind, place, scale, alpha, points, words in shapes:
             markers.append(
-                _make(
+                make(
                     "visualization_msgs/msg/Marker",
                     header=about,
                     ns=space,
@@ -229,25 +237,25 @@ def encode_markers(
                     action=0,
                     pose=place,
                     scale=_vector("Vector3", scale),
-                    color=_make("std_msgs/msg/ColorRGBA", r=color[0], g=color[1], b=color[2], a=alpha),
+                    color=make("std_msgs/msg/ColorRGBA", r=color[0], g=color[1], b=color[2], a=alpha),
                     lifetime=lasting,
                     frame_locked=False,
                     points=points,
                     colors=[],
                     texture_resource="",
-                    texture=_make(
+                    texture=make(
                         "sensor_msgs/msg/CompressedImage", header=about, format="", data=np.zeros(0, np.uint8)
                     ),
                     uv_coordinates=[],
                     text=words,
                     mesh_resource="",
-                    mesh_file=_make(
+                    mesh_file=make(
                         "visualization_msgs/msg/MeshFile", filename="", data=np.zeros(0, np.uint8)
                     ),
                     mesh_use_embedded_materials=False,
                 )
             )
-    return _make("visualization_msgs/msg/MarkerArray", markers=markers)
+    return make("visualization_msgs/msg/MarkerArray", markers=markers)
 
 
 def _hue(number: int) -> tuple[float, float, float]:
@@ -260,15 +268,15 @@ def encode_boxes_2d(stamp: int, frame_id: str, xyxy: F32, results: Iterable[Hypo
     about, nowhere = _header(stamp, frame_id), _pose(np.eye(4))
     detections = []
     for (x0, y0, x1, y1), hypotheses in zip(xyxy.tolist(), results, strict=True):
-        middle = _make("vision_msgs/msg/Point2D", x=(x0 + x1) / 2, y=(y0 + y1) / 2)
-        box = _make(
+        middle = make("vision_msgs/msg/Point2D", x=(x0 + x1) / 2, y=(y0 + y1) / 2)
+        box = make(
             "vision_msgs/msg/BoundingBox2D",
-            center=_make("vision_msgs/msg/Pose2D", position=middle, theta=0.0),
+            center=make("vision_msgs/msg/Pose2D", position=middle, theta=0.0),
             size_x=x1 - x0,
             size_y=y1 - y0,
         )
         detections.append(
-            _make(
+            make(
                 "vision_msgs/msg/Detection2D",
                 header=about,
                 results=_results(hypotheses, nowhere),
@@ -276,15 +284,15 @@ def encode_boxes_2d(stamp: int, frame_id: str, xyxy: F32, results: Iterable[Hypo
                 id="",
             )
         )
-    return _make("vision_msgs/msg/Detection2DArray", header=about, detections=detections)
+    return make("vision_msgs/msg/Detection2DArray", header=about, detections=detections)
 
 
 def _results(hypotheses: Hypotheses, place: Any) -> list[Any]:
-    covered = _make("geometry_msgs/msg/PoseWithCovariance", pose=place, covariance=np.zeros(36))
+    covered = make("geometry_msgs/msg/PoseWithCovariance", pose=place, covariance=np.zeros(36))
     return [
-        _make(
+        make(
             "vision_msgs/msg/ObjectHypothesisWithPose",
-            hypothesis=_make("vision_msgs/msg/ObjectHypothesis", class_id=name, score=float(score)),
+            hypothesis=make("vision_msgs/msg/ObjectHypothesis", class_id=name, score=float(score)),
             pose=covered,
         )
         for name, score in hypotheses
@@ -293,20 +301,25 @@ def _results(hypotheses: Hypotheses, place: Any) -> list[Any]:
 
 def encode_transforms(stamp: int, edges: Iterable[tuple[str, str, F64]]) -> Any:
     """A tf2_msgs/TFMessage of (parent, child, parent_from_child)."""
-    return _make("tf2_msgs/msg/TFMessage", transforms=[_transform(stamp, *edge) for edge in edges])
+    return encode_pose_edges((_header(stamp, parent), child, pose) for parent, child, pose in edges)
 
 
-def _transform(stamp: int, parent: str, child: str, parent_from_child: F64) -> Any:
-    return _make(
-        "geometry_msgs/msg/TransformStamped",
-        header=_header(stamp, parent),
-        child_frame_id=child,
-        transform=_make(
-            "geometry_msgs/msg/Transform",
-            translation=_vector("Vector3", parent_from_child[:3, 3]),
-            rotation=_rotation(parent_from_child),
-        ),
-    )
+def encode_pose_edges(edges: Iterable[tuple[Any, str, F64]]) -> Any:
+    """The same of (header, child, header.frame_id from child)."""
+    transforms = [
+        make(
+            "geometry_msgs/msg/TransformStamped",
+            header=header,
+            child_frame_id=child,
+            transform=make(
+                "geometry_msgs/msg/Transform",
+                translation=_vector("Vector3", pose[:3, 3]),
+                rotation=_rotation(pose),
+            ),
+        )
+        for header, child, pose in edges
+    ]
+    return make("tf2_msgs/msg/TFMessage", transforms=transforms)
 
 
 def encode_odometry(
@@ -315,43 +328,44 @@ def encode_odometry(
     """A nav_msgs/Odometry, its velocities being those of the way to the pose ``dt`` seconds later."""
     step = geometry.inverse(parent_from_child) @ later
     turn = np.array([step[2, 1] - step[1, 2], step[0, 2] - step[2, 0], step[1, 0] - step[0, 1]]) / 2
-    twist = _make(
+    twist = make(
         "geometry_msgs/msg/Twist",
         linear=_vector("Vector3", step[:3, 3] / dt),
         angular=_vector("Vector3", turn / dt),
     )
     none = np.zeros(36)
-    return _make(
+    return make(
         "nav_msgs/msg/Odometry",
         header=_header(stamp, parent),
         child_frame_id=child,
-        pose=_make("geometry_msgs/msg/PoseWithCovariance", pose=_pose(parent_from_child), covariance=none),
-        twist=_make("geometry_msgs/msg/TwistWithCovariance", twist=twist, covariance=none),
+        pose=make("geometry_msgs/msg/PoseWithCovariance", pose=_pose(parent_from_child), covariance=none),
+        twist=make("geometry_msgs/msg/TwistWithCovariance", twist=twist, covariance=none),
     )
 
 
 # --- parts -------------------------------------------------------------------------------------
 
 
-def _make(kind: str, **values: Any) -> Any:
+def make(kind: str, **values: Any) -> Any:
+    """A message of a type that ``typestore`` has."""
     return typestore().types[kind](**values)
 
 
 def _header(stamp: int, frame_id: str) -> Any:
-    time = _make("builtin_interfaces/msg/Time", sec=stamp // 10**9, nanosec=stamp % 10**9)
-    return _make("std_msgs/msg/Header", stamp=time, frame_id=frame_id)
+    time = make("builtin_interfaces/msg/Time", sec=stamp // 10**9, nanosec=stamp % 10**9)
+    return make("std_msgs/msg/Header", stamp=time, frame_id=frame_id)
 
 
 def _vector(kind: str, xyz: Iterable[float]) -> Any:
     x, y, z = map(float, xyz)
-    return _make(f"geometry_msgs/msg/{kind}", x=x, y=y, z=z)
+    return make(f"geometry_msgs/msg/{kind}", x=x, y=y, z=z)
 
 
 def _rotation(a_from_b: F64) -> Any:
     x, y, z, w = map(float, geometry.quaternion(a_from_b))
-    return _make("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w)
+    return make("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w)
 
 
 def _pose(a_from_b: F64) -> Any:
     position = _vector("Point", a_from_b[:3, 3])
-    return _make("geometry_msgs/msg/Pose", position=position, orientation=_rotation(a_from_b))
+    return make("geometry_msgs/msg/Pose", position=position, orientation=_rotation(a_from_b))

@@ -13,7 +13,7 @@ import struct
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import wraps
-from typing import Any, NamedTuple, ParamSpec, TypeVar
+from typing import Any, NamedTuple, ParamSpec, TypeAlias, TypeVar
 
 import cv2
 import numpy as np
@@ -51,7 +51,7 @@ class MessageError(UserError):
     """A message that cannot be used: its topic, what is wrong with it, and what would be accepted."""
 
 
-def _guarded(decode: Callable[P, R]) -> Callable[P, R]:
+def guarded(decode: Callable[P, R]) -> Callable[P, R]:
     """Whatever else ``decode`` raises, as a MessageError: a message may hold anything, even other fields."""
 
     @wraps(decode)
@@ -98,12 +98,12 @@ def read_header(data: bytes | memoryview, order: str, topic: str) -> tuple[int, 
     try:
         sec, nanosec, size = struct.unpack_from(f"{order}iII", data, 4)
         (name,) = struct.unpack_from(f"{size}s", data, 16)
-        return sec * 1_000_000_000 + nanosec, _frame(name.rstrip(b"\0").decode())
+        return sec * 1_000_000_000 + nanosec, frame_name(name.rstrip(b"\0").decode())
     except (struct.error, UnicodeDecodeError):
         raise MessageError(f"{topic}: a message of {len(data)} bytes has no header") from None
 
 
-def _frame(name: str) -> str:
+def frame_name(name: str) -> str:
     return name.removeprefix("/")  # ROS 1 knew both spellings
 
 
@@ -113,7 +113,7 @@ _AXES = ("x", "y", "z")
 _POINT_FIELD = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 
 
-@_guarded
+@guarded
 def decode_cloud(msg: Any, topic: str, received: int) -> Cloud:
     """Points and extra fields of a sensor_msgs/PointCloud2.
 
@@ -152,7 +152,7 @@ def decode_cloud(msg: Any, topic: str, received: int) -> Cloud:
         xyz = xyz.take(kept, axis=0)
     return Cloud(
         stamp=stamp_ns(msg.header.stamp),
-        frame_id=_frame(msg.header.frame_id),
+        frame_id=frame_name(msg.header.frame_id),
         xyz=xyz,
         fields=fields,
         topic=topic,
@@ -267,7 +267,7 @@ _ENCODINGS: Mapping[str, _Encoding] = {
 }
 
 
-@_guarded
+@guarded
 def decode_image(msg: Any, topic: str, received: int) -> Image:
     """A sensor_msgs/Image as BGR; bgr8 without row padding is a view of the message's data.
 
@@ -308,7 +308,7 @@ def decode_image(msg: Any, topic: str, received: int) -> Image:
         ) from None
     return Image(
         stamp=stamp_ns(msg.header.stamp),
-        frame_id=_frame(msg.header.frame_id),
+        frame_id=frame_name(msg.header.frame_id),
         bgr=np.ascontiguousarray(bgr),
         topic=topic,
         received=received,
@@ -335,7 +335,7 @@ _MEDIA_TYPES = {  # by what the data begins with
 _ANNEX_B = (b"\0\0\0\1", b"\0\0\1")  # what every unit of an H.264 or H.265 stream begins with
 
 
-@_guarded
+@guarded
 def decode_compressed_image(msg: Any, topic: str, received: int) -> Image:
     """A JPEG, PNG or WebP in a sensor_msgs/CompressedImage, decoded.
 
@@ -379,7 +379,7 @@ def decode_compressed_image(msg: Any, topic: str, received: int) -> Image:
     kept = not deep and media_type != "image/webp"
     return Image(
         stamp=stamp_ns(msg.header.stamp),
-        frame_id=_frame(msg.header.frame_id),
+        frame_id=frame_name(msg.header.frame_id),
         bgr=to_8_bits(bgr) if deep else bgr,
         encoded=encoded if kept else None,
         media_type=media_type if kept else "",
@@ -438,7 +438,7 @@ _DISTORTION = {
 }
 
 
-@_guarded
+@guarded
 def decode_camera_info(msg: Any, rectified: bool, topic: str = "camera_info") -> Intrinsics:
     """The camera model of a sensor_msgs/CameraInfo, for images as they are published.
 
@@ -495,7 +495,7 @@ def _either(msg: Any, *names: str) -> Any:
 # --- transforms --------------------------------------------------------------------------------
 
 
-@_guarded
+@guarded
 def decode_transforms(msg: Any, topic: str = "/tf") -> list[StampedTransform]:
     """The transforms of a tf2_msgs/TFMessage; one that is no rigid transform is left out.
 
@@ -516,7 +516,7 @@ def decode_transforms(msg: Any, topic: str = "/tf") -> list[StampedTransform]:
     return transforms
 
 
-@_guarded
+@guarded
 def decode_odometry(msg: Any, topic: str = "odometry") -> StampedTransform:
     """The pose of a nav_msgs/Odometry: header.frame_id from child_frame_id.
 
@@ -525,6 +525,9 @@ def decode_odometry(msg: Any, topic: str = "odometry") -> StampedTransform:
     """
     pose = msg.pose.pose
     return _stamped(msg.header, msg.child_frame_id, pose.position, pose.orientation, topic)
+
+
+Vector: TypeAlias = tuple[float, float, float]
 
 
 @dataclass(frozen=True, slots=True)
@@ -546,12 +549,23 @@ def decode_acceleration(msg: Any, topic: str = "imu") -> Acceleration:
         raise MessageError(f"{topic}: its covariance says that no acceleration is measured")
     felt = msg.linear_acceleration
     return Acceleration(
-        stamp_ns(msg.header.stamp), _frame(msg.header.frame_id), np.array([felt.x, felt.y, felt.z])
+        stamp_ns(msg.header.stamp), frame_name(msg.header.frame_id), np.array([felt.x, felt.y, felt.z])
+    )
+
+
+def decode_motion(msg: Any) -> tuple[Vector, Vector, int]:
+    """Rotation rate and acceleration of a sensor_msgs/Imu, NaN where it says it has none, and its stamp."""
+    none = (math.nan, math.nan, math.nan)
+    turn, felt = msg.angular_velocity, msg.linear_acceleration
+    return (
+        none if msg.angular_velocity_covariance[0] == -1 else (turn.x, turn.y, turn.z),
+        none if msg.linear_acceleration_covariance[0] == -1 else (felt.x, felt.y, felt.z),
+        stamp_ns(msg.header.stamp),
     )
 
 
 def _stamped(header: Any, child: str, translation: Any, rotation: Any, topic: str) -> StampedTransform:
-    parent, child = _frame(header.frame_id), _frame(child)
+    parent, child = frame_name(header.frame_id), frame_name(child)
     if not parent or not child or parent == child:
         raise MessageError(f"{topic}: '{parent}' and '{child}' cannot be parent and child frame")
     xyz = translation.x, translation.y, translation.z
@@ -567,7 +581,7 @@ def _stamped(header: Any, child: str, translation: Any, rotation: Any, topic: st
 # --- detections --------------------------------------------------------------------------------
 
 
-@_guarded
+@guarded
 def decode_detections_2d(msg: Any, topic: str, received: int) -> LabelledBoxes2D:
     """The image boxes of a vision_msgs/Detection2DArray, of ROS 1 or any version of ROS 2.
 
@@ -589,7 +603,7 @@ def decode_detections_2d(msg: Any, topic: str, received: int) -> LabelledBoxes2D
     return LabelledBoxes2D(
         topic=topic,
         stamp=stamp_ns(msg.header.stamp),
-        frame_id=_frame(msg.header.frame_id),
+        frame_id=frame_name(msg.header.frame_id),
         xyxy=np.stack([x - dx, y - dy, x + dx, y + dy], axis=1).astype(np.float32),
         labels=labels,
         scores=scores,
@@ -597,7 +611,7 @@ def decode_detections_2d(msg: Any, topic: str, received: int) -> LabelledBoxes2D
     )
 
 
-@_guarded
+@guarded
 def decode_boxes(msg: Any, topic: str, received: int, stated: Mapping[str, str]) -> LabelledBoxes3D:
     """The boxes of a Detection3DArray, or of another message, see ``bevviz.ros.objects``.
 
@@ -612,7 +626,7 @@ def decode_boxes(msg: Any, topic: str, received: int, stated: Mapping[str, str])
         raise MessageError(f"{topic}: no boxes in a {type(msg).__name__}: {first_line(error)}") from None
 
 
-@_guarded
+@guarded
 def decode_detections_3d(msg: Any, topic: str, received: int) -> LabelledBoxes3D:
     """The boxes of a vision_msgs/Detection3DArray, of ROS 1 or any version of ROS 2, or of bevviz_msgs.
 
@@ -635,7 +649,7 @@ def decode_detections_3d(msg: Any, topic: str, received: int) -> LabelledBoxes3D
     return LabelledBoxes3D(
         topic=topic,
         stamp=stamp_ns(msg.header.stamp),
-        frame_id=_frame(msg.header.frame_id),
+        frame_id=frame_name(msg.header.frame_id),
         boxes=Boxes3D(center, size, yaw.astype(np.float32)),
         labels=labels,
         scores=scores,

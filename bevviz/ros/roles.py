@@ -15,6 +15,7 @@ from bevviz.config import SourceConfig
 from bevviz.errors import UserError
 from bevviz.frame import Scene
 from bevviz.logging.entities import RESERVED
+from bevviz.ros.foxglove import KINDS, short_of
 from bevviz.ros.livox import is_livox
 from bevviz.ros.objects import check, holds_boxes
 
@@ -30,12 +31,17 @@ class Topic:
     rate: float | None = None  # Hz
     aside: str = ""  # why it plays no role unless it is stated
     boxes: bool = False  # source.boxes says where in its messages they are
+    video: bool = False  # its messages are packets of video, whatever their type says
 
     @property
     def kind(self) -> str:
-        """What it is read as: the type without its package, but PointCloud2 for Livox's own clouds."""
+        """What it is read as: the type without its package, but for types that stand for others."""
         if is_livox(self.type):
             return "PointCloud2"
+        if short := short_of(self.type):
+            return KINDS[short]
+        if self.video or _VIDEO.search(self.type):
+            return "CompressedVideo"
         return "Detection3DArray" if self.boxes or holds_boxes(self.type) else self.type.rpartition("/")[2]
 
 
@@ -45,7 +51,7 @@ class CameraRole:
     topic: str
     info_topic: str  # "": there is none
     rectified: bool
-    compressed: bool
+    kind: str  # Image, CompressedImage or CompressedVideo
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,6 +63,7 @@ class Roles:
     cameras: tuple[CameraRole, ...] = ()
     tf: tuple[str, ...] = ()
     tf_static: tuple[str, ...] = ()
+    tf_held: tuple[str, ...] = ()  # of tf, those whose transforms hold until there are others, as Foxglove's
     odometry: str = ""
     imus: tuple[str, ...] = ()  # tell which way is up, where transforms do not
     robot_detections_2d: tuple[str, ...] = ()
@@ -71,6 +78,11 @@ class Roles:
     no_lidar: str = field(default="", compare=False)  # why there is none, and what would help
     no_camera: str = field(default="", compare=False)  # the same of cameras
     notes: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def driver(self) -> str:
+        """The topic whose messages make the frames: the first LiDAR's, without one the first camera's."""
+        return next(iter((*self.lidars, *(camera.topic for camera in self.cameras))), "")
 
     @property
     def settings(self) -> tuple[str, ...]:
@@ -89,16 +101,18 @@ class Roles:
         lidars = self.lidar_names
         return Scene(
             name=name,
-            lidar=lidars[0] if len(lidars) == 1 else "lidars",
+            lidar="lidars" if len(lidars) > 1 else "".join(lidars),
             lidars=lidars,
             cameras=tuple(camera.name for camera in self.cameras),
             robot=bool(self.robot_detections_2d or self.robot_detections_3d),
             truth=bool(self.truth),
+            imu=bool(self.imus),
         )
 
 
 MANY = 12  # topics; more are not listed in a sentence
-VIDEO = "video, which is not decoded here: republish it as images (image_transport) and record these"
+_VIDEO = re.compile(r"ffmpeg_image_transport_msgs/(msg/)?FFMPEGPacket$|theora_image_transport/(msg/)?Packet$")
+VIDEO = "video of a kind that is not decoded here: republish it as images (image_transport) and record these"
 _FOREIGN = (  # what holds points or pixels in a form that nothing here reads, and what would help
     ("camera", re.compile(r"video|ffmpeg|theora|h26[45]", re.IGNORECASE), VIDEO),
     (
@@ -131,7 +145,7 @@ _MARK = re.compile(rf"(^|/){MARK}$")
 
 Kind = Literal["mark", "status", "shape"]
 SHAPES = frozenset(
-    {"LaserScan", "Path", "PoseStamped", "OccupancyGrid", "MarkerArray", "Marker", "NavSatFix"}
+    {"LaserScan", "Path", "PoseStamped", "OccupancyGrid", "GridMap", "MarkerArray", "Marker", "NavSatFix"}
 )
 RESULTS = {  # of the robot's own pipeline, shown where nothing of ours is
     "PointCloud2": re.compile(r"(^|/)lidar/points_no_ground$"),
@@ -200,7 +214,7 @@ def find_roles(
     _note(notes, moving, "transforms")
     odometry = _find_odometry(topics, config, notes)
     imus = [topic for topic in _of(topics, "Imu") if topic.count != 0]
-    _note(notes, imus, "gravity, where the transforms have no upright frame")
+    _note(notes, imus, "plotted; gravity, where the transforms have no upright frame")
     boxes = _of(topics, "Detection3DArray")
     truth = [t for t in boxes if t.name.endswith("ground_truth")][:1]
     boxes = [t for t in boxes if t not in truth]
@@ -223,6 +237,7 @@ def find_roles(
         cameras=cameras,
         tf=_names(moving),
         tf_static=_names(static),
+        tf_held=_names(t for t in moving if short_of(t.type)),
         odometry=odometry,
         imus=_names(imus),
         robot_detections_2d=_names(detections),
@@ -352,8 +367,8 @@ def _one_a_frame(
 
 # --- cameras -----------------------------------------------------------------------------------
 
-_IMAGES = ("Image", "CompressedImage")
-_TRANSPORT = re.compile(r"/(compressed|compressedDepth|theora|ffmpeg|zstd)$")
+_IMAGES = ("Image", "CompressedImage", "CompressedVideo")
+_TRANSPORT = re.compile(r"/(compressed|compressedDepth|theora|ffmpeg|foxglove|zstd|h26[45]|video)$")
 _DERIVED_IMAGE = re.compile(
     r"depth(?!ai)|disparity|confidence|annotat|debug|dbg|bev|mask|overlay|detect|visuali[sz]|segment|semantic"
     r"|label|heat_?map|costmap|stereo(_raw)?/image|track|result|infra|normal|cloud|side_by_side"
@@ -381,13 +396,13 @@ def _find_images(topics: Sequence[Topic], config: SourceConfig, notes: dict[str,
         else:
             usable.append(topic)
 
-    def distance(topic: Topic) -> tuple[bool, bool, bool, bool, int, str]:
+    def distance(topic: Topic) -> tuple[bool, bool, bool, int, int, str]:
         name = topic.name.lower()
         return (
             not _RECTIFIED.search(name),
             "gray" in name or "mono" in name,
             not _info_topic(topic, topics),
-            topic.kind == "CompressedImage",  # what the robot's detector saw is mostly the other one
+            _IMAGES.index(topic.kind),  # what the robot's detector saw is mostly the first one
             len(name),
             name,
         )
@@ -414,7 +429,7 @@ def _camera(
     if config.rectified != "auto":
         rectified = config.rectified == "yes"
     notes[topic.name] += f", {'rectified' if rectified else 'not rectified'}, {info or 'without CameraInfo'}"
-    return CameraRole(name, topic.name, info, rectified, topic.kind == "CompressedImage")
+    return CameraRole(name, topic.name, info, rectified, topic.kind)
 
 
 def _info_topic(image: Topic, topics: Sequence[Topic]) -> str:
@@ -455,7 +470,7 @@ def _find_odometry(topics: Sequence[Topic], config: SourceConfig, notes: dict[st
 # --- names -------------------------------------------------------------------------------------
 
 _IMAGE_WORDS = re.compile(
-    r"(?:image|rgb|colou?r|raw|rect|gray|mono|rectified)(?:_(?:image|rgb|colou?r|raw|rect|gray|mono))*"
+    r"(?:image|rgb|colou?r|raw|rect|gray|mono|rectified)(?:_(?:image|rgb|colou?r|raw|rect|gray|mono|compressed))*"
 )
 _WEAK = {"left", "right", "front", "rear", "back", "center", "camera", "cam", "sensor", "driver", "points"}
 

@@ -36,6 +36,7 @@ from bevviz.sync.report import SyncReport
 from bevviz.sync.tf import Lookup, Origin, TransformError
 from bevviz.sync.track import JUMP, Track
 from bevviz.sync.upright import Upright
+from bevviz.sync.video import Video
 
 SECOND = 1_000_000_000
 LATENCY = 2 * SECOND  # the longest a cloud is expected to arrive after an image of the same stamp
@@ -53,6 +54,14 @@ class _Undecoded:
     stamp: int
     frame_id: str
     load: Callable[[], Image]
+
+
+@dataclass(frozen=True, slots=True)
+class _UndecodedBoxes:
+    """When boxes were, and how to get them."""
+
+    stamp: int
+    load: Callable[[], LabelledBoxes3D]
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,6 +127,7 @@ class Synchronizer:
         self._last: int | None = None  # stamp of the last frame
         self._step = math.inf  # nanoseconds between the last two clouds; a gap is much longer
         self._partners: dict[str, Track[Cloud]] = self._make_tracks(*roles.lidars[1:])
+        self.videos: dict[str, Video] = {}  # by topic
         self._images: dict[str, Track[_Undecoded]] = self._make_tracks(*(c.topic for c in roles.cameras))
         self._lidar_frames: dict[str, str] = {}  # cloud topic -> frame
         self._camera_frames: dict[str, str] = {}  # image topic -> optical frame
@@ -130,7 +140,7 @@ class Synchronizer:
         self._boxes: dict[str, Track[LabelledBoxes3D]] = self._make_tracks(*roles.robot_detections_3d)
         self._detections: dict[str, Track[LabelledBoxes2D]] = self._make_tracks(*roles.robot_detections_2d)
         self._robot_clouds: dict[str, Track[Cloud]] = self._make_tracks(*roles.robot_clouds)
-        self._truth: dict[str, Track[LabelledBoxes3D]] = self._make_tracks(*filter(None, [roles.truth]))
+        self._truth: dict[str, Track[_UndecodedBoxes]] = self._make_tracks(*filter(None, [roles.truth]))
         self._beside = frozenset(beside)
         self._overtaken: deque[LateResult] = deque(maxlen=OVERTAKEN)
         self._places: deque[tuple[_Place, F64]] = deque(
@@ -148,7 +158,7 @@ class Synchronizer:
         self.report, self.absent = former.report, former.absent
         self.report.clocked = clocked
         self.tf, self.upright, self.clocks = former.tf, former.upright, former.clocks
-        self.around = former.around
+        self.around, self.videos = former.around, former.videos
         self.intrinsics, self._infos = former.intrinsics, former._infos
         self._refused_infos = former._refused_infos
         self._odometry_frames = former._odometry_frames
@@ -168,6 +178,10 @@ class Synchronizer:
         if cloud.topic in self._partners:
             self._partners[cloud.topic].add(cloud.stamp, cloud)
             return
+        self._drive(cloud)
+
+    def _drive(self, cloud: Cloud) -> None:
+        """A frame for a cloud of the driving LiDAR."""
         self._watch_clock(cloud.stamp)
         stamps = [waiting.stamp for waiting in self._clouds]
         place = bisect_left(stamps, cloud.stamp)
@@ -191,6 +205,9 @@ class Synchronizer:
             self._camera_frames[topic] = frame_id
             self._image_counts[topic] += 1
             self._images[topic].add(stamp, _Undecoded(stamp, frame_id, load))
+            if topic == self._roles.driver:  # there is no LiDAR
+                self.report.clouds += 1
+                self._drive(Cloud(stamp, frame_id, np.zeros((0, 3), np.float32), {}, topic, received))
 
     def add_camera_info(self, topic: str, intrinsics: Intrinsics, stamp: int, received: int) -> None:
         """``topic`` is that of the CameraInfo; for an image the one that is nearest in stamp holds."""
@@ -204,12 +221,15 @@ class Synchronizer:
         self._refused_infos[topic] = reason
 
     def add_transform(
-        self, transform: StampedTransform, static: bool = False, fallback: bool = False
+        self, transform: StampedTransform, static: bool = False, fallback: bool = False, held: bool = False
     ) -> None:
-        """``fallback``: from Odometry, used only where nothing else states the child's parent."""
+        """``fallback``: from Odometry, used only where nothing else states the child's parent.
+
+        ``held``: what is stated once holds until there is more.
+        """
         if fallback:
             self._odometry_frames.add(transform.parent.lstrip("/"))
-        self.tf.add(transform, static, Origin.ODOMETRY if fallback else Origin.TF)
+        self.tf.add(transform, static, Origin.ODOMETRY if fallback else Origin.TF, held)
 
     def add_boxes(self, boxes: LabelledBoxes3D) -> None:
         """The robot's own 3D boxes."""
@@ -224,9 +244,13 @@ class Synchronizer:
         stamp = self._arrived(cloud.topic, cloud.stamp, cloud.received)
         self._robot_clouds[cloud.topic].add(stamp, replace(cloud, stamp=stamp))
 
-    def add_truth(self, truth: LabelledBoxes3D) -> None:
-        """Ground truth boxes."""
-        self._add_result(self._truth, truth)
+    def add_truth(self, topic: str, stamp: int, received: int, load: Callable[[], LabelledBoxes3D]) -> None:
+        """Ground truth not yet decoded: ``load`` is called only when a frame takes it.
+
+        ``load`` may raise a UserError: it is counted, and the boxes are as if they had not come.
+        """
+        stamp = self._arrived(topic, stamp, received)
+        self._truth.setdefault(topic, Track(self._horizon)).add(stamp, _UndecodedBoxes(stamp, load))
 
     def _add_result(self, tracks: dict[str, Track[Any]], result: LabelledBoxes2D | LabelledBoxes3D) -> None:
         stamp = self._arrived(result.topic, result.stamp, result.received)
@@ -356,7 +380,7 @@ class Synchronizer:
             yield self._done.popleft()
         yield from self._build_all()
         if self.report.clouds and not self.report.frames:
-            self.report.idle = self._roles.lidars[0]
+            self.report.idle = self._roles.driver
 
     def _build_all(self) -> Iterator[Frame]:
         while self._clouds:
@@ -436,9 +460,8 @@ class Synchronizer:
         cameras = tuple(self._camera(role, place) for role in self._roles.cameras)
         first, last = self._window(cloud.stamp)
         boxes = [track.take(cloud.stamp, first, last) for track in self._boxes.values()]
-        truths = [track.take(cloud.stamp, first, last) for track in self._truth.values()]
         placed = [self._placed(b, place, problems) for b in boxes if b is not None]
-        truth = [self._placed(t, place, problems) for t in truths if t is not None]
+        truth = self._taken_truth(cloud.stamp, first, last)
         frame = Frame(
             index=self._index,
             stamp=cloud.stamp,
@@ -456,7 +479,7 @@ class Synchronizer:
             robot_boxes=tuple(placed),
             robot_detections=self._robot_detections(cameras, cloud.stamp, first, last),
             robot_clouds=self._taken_clouds(place, first, last, problems),
-            truth=truth[0] if truth else None,
+            truth=None if truth is None else self._placed(truth, place, problems),
             tf_age=place.tf_age,
             problems=tuple(problems),
             around=self.around.take(lambda name: self._world_from(place, name)),
@@ -517,7 +540,7 @@ class Synchronizer:
         place = _Place(cloud.stamp, points_frame, world, inertial)
         if problems is None:
             return place
-        turn = self.upright.turn(cloud, world)
+        turn = self.upright.turn(cloud, world) if self._roles.lidars else None
         if points_frame == cloud.frame_id.lstrip("/"):
             place = replace(place, upright=turn)
         if self._partners and points_frame != base:
@@ -526,6 +549,8 @@ class Synchronizer:
                 f"no transform from '{points_frame}' to source.base_frame '{base}': "
                 f"the LiDARs are merged in '{points_frame}'",
             )
+        if not world and not self._roles.lidars:
+            return place
         if not world:
             self.report.problems[
                 f"no fixed frame (map, odom or the like) above '{points_frame}' in TF: motion is not "
@@ -606,7 +631,7 @@ class Synchronizer:
         camera = Camera(role.name, image, intrinsics, None, None, problems=tuple(problems))
         if image is not None:
             camera = replace(camera, sync_error=(stamp - place.stamp) * 1e-9)
-            off = self.clocks.apart(role.topic, self._roles.lidars[0])
+            off = self.clocks.apart(role.topic, self._roles.driver)
             if off:
                 self._complain(
                     problems,
@@ -769,6 +794,15 @@ class Synchronizer:
             self._complain(problems, f"{error}: the boxes of {boxes.topic} have no place in the world")
             return boxes
         return replace(boxes, world_from_boxes=(found if known else place.points_from(found)).matrix)
+
+    def _taken_truth(self, stamp: int, first: int, last: int) -> LabelledBoxes3D | None:
+        for topic, track in self._truth.items():
+            while (found := track.take(stamp, first, last)) is not None:
+                try:
+                    return replace(found.load(), stamp=found.stamp)
+                except UserError as error:
+                    self.report.damage.add(topic, str(error))
+        return None
 
     def _robot_detections(
         self, cameras: tuple[Camera, ...], stamp: int, first: int, last: int

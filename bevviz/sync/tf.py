@@ -49,6 +49,12 @@ class _Edge:
     static: bool
     stamps: list[int] = field(default_factory=list)
     poses: list[F64] = field(default_factory=list)  # parent_from_child
+    held: bool = False  # one sample holds until there are more
+
+    @property
+    def rests(self) -> bool:
+        """Whether one pose holds at any stamp."""
+        return self.static or (self.held and len(self.stamps) == 1)
 
     def put(self, stamp: int, pose: F64) -> None:
         if self.static:
@@ -68,7 +74,7 @@ class _Edge:
 
     def at(self, stamp: int) -> tuple[F64, float, int]:
         """The pose, the seconds to the nearest sample, and the nanoseconds past the ends (< 0: before)."""
-        if self.static:
+        if self.rests:
             return self.poses[0], 0.0, 0
         i = bisect_left(self.stamps, stamp)
         if i == len(self.stamps):
@@ -95,8 +101,13 @@ class TransformBuffer:
         self._edges: dict[str, _Edge] = {}
         self._problems: Counter[str] = Counter()
 
-    def add(self, t: StampedTransform, static: bool = False, origin: Origin = Origin.TF) -> None:
-        """Insert a sample. What cannot be used is left out and told in ``problems``."""
+    def add(
+        self, t: StampedTransform, static: bool = False, origin: Origin = Origin.TF, held: bool = False
+    ) -> None:
+        """Insert a sample. What cannot be used is left out and told in ``problems``.
+
+        ``held``: where it stays the only one of its frame, it holds at any stamp.
+        """
         parent, child = _name(t.parent), _name(t.child)
         about = f"'{parent}' -> '{child}'"
         if not parent or not child:
@@ -120,7 +131,7 @@ class TransformBuffer:
                 if origin is not Origin.ODOMETRY:  # which only fills in for what others leave open
                     self._problems[f"{about} is refused: '{child}' is above '{parent}' already"] += 1
                 return
-            edge = self._edges[child] = _Edge(parent, origin, static)
+            edge = self._edges[child] = _Edge(parent, origin, static, held=held)
         elif static and not edge.static:
             edge = self._edges[child] = _Edge(parent, origin, True)
         elif edge.stamps and t.stamp < edge.stamps[-1] - self._duration:
@@ -183,7 +194,7 @@ class TransformBuffer:
             TransformError: the frames are not connected.
         """
         up, down = self._chains(target, source)
-        ends = [self._edges[frame].stamps[-1] for frame in (*up, *down) if not self._edges[frame].static]
+        ends = [self._edges[frame].stamps[-1] for frame in (*up, *down) if not self._edges[frame].rests]
         return min(ends, default=None)
 
     def knows(self, target: str, source: str) -> bool:

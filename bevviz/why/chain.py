@@ -33,6 +33,9 @@ def chain(subject: Subject, e: Evidence, traces: Traces) -> Iterator[Step]:
     for failure in result.failures:
         yield Step("failure", f"{failure.stage}: {failure.reason}")
     yield from _clock(subject, traces)
+    if not result.frame.lidar:
+        yield from _detected(subject, e, traces)
+        return
     where = {"truth": "in its box", "point": "around it", "cell": "over it and around"}
     where |= dict.fromkeys(("object", "cluster", "track"), "in it")
     yield Step("raw cloud", f"{e.raw} points {where.get(subject.kind, 'in its frustum')}", {"points": e.raw})
@@ -62,6 +65,9 @@ def _clock(subject: Subject, traces: Traces) -> Iterator[Step]:
         if subject.camera and camera.name != subject.camera:
             continue
         said, numbers = [], {}
+        if not traces.result.frame.lidar:
+            yield Step(f"camera {camera.name}", ", ".join(camera.problems) or "its image makes the frame")
+            continue
         if np.isfinite(camera.sync_error):
             said.append(f"image {1e3 * camera.sync_error:+.0f} ms from the cloud")
             numbers["sync_error_ms"] = round(1e3 * camera.sync_error, 1)

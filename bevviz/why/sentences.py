@@ -107,6 +107,10 @@ class Because:
         return f"cluster {named.cluster} is named {named.name}"
 
     def _reported(self) -> str:
+        if not self.result.frame.lidar:
+            least = f"detector.conf_threshold is {self.config.detector.conf_threshold:g}"
+            whose = self._whose("detector", least)
+            return f"{label(self._best)} was kept {whose}; without a LiDAR nothing tells where it is"
         named, text = self.e.named, self._with()
         assert named is not None
         if not named.camera or self.result.objects is None:

@@ -75,6 +75,8 @@ def find_reason(subject: Subject, e: Evidence, traces: Traces) -> tuple[Reason, 
         reason: that stage.
         reported: whether it is an object of a right class all the same.
     """
+    if not traces.result.frame.lidar:
+        return _seen(subject, e, traces)
     if e.named is not None and subject.accepts(e.named.name):
         return _flaw(subject, e, e.named, traces), True
     if e.named is not None and not any(c.kept and subject.accepts(c.name) for c in e.candidates):
@@ -84,6 +86,16 @@ def find_reason(subject: Subject, e: Evidence, traces: Traces) -> tuple[Reason, 
     if traces.origin("objects").ours:
         return _loss(subject, e, traces), False
     return _loss_of_others(subject, e, traces), False
+
+
+def _seen(subject: Subject, e: Evidence, traces: Traces) -> tuple[Reason, bool]:
+    """By cameras alone: what the detector keeps is reported."""
+    best = e.best
+    if not detector_ran(traces.result, subject.camera):
+        return Reason.NOT_RUN, False
+    if best is None or not subject.accepts(best.name):
+        return Reason.NOT_DETECTED, False
+    return (Reason.REPORTED, True) if best.kept else (_weakness(best, traces), False)
 
 
 def _flaw(subject: Subject, e: Evidence, named: Named, traces: Traces) -> Reason:

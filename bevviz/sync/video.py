@@ -1,0 +1,251 @@
+"""Pictures of a video, each decoded when a frame takes it, from the key frame before it."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, cast
+
+import numpy as np
+
+from bevviz.errors import first_line
+from bevviz.frame import U8, Clip, Codec, Image
+from bevviz.ros.bitstream import Continuity
+from bevviz.ros.messages import MOST_PIXELS, MessageError
+from bevviz.ros.video import Packet
+
+if TYPE_CHECKING:
+    import av
+    from av.video.codeccontext import VideoCodecContext
+
+Rewind = Callable[[str, int], Iterable[Packet]]
+
+SHOWN = ("h264", "h265", "av1", "vp8", "vp9")  # which Rerun takes as they are
+HELD = 5_000_000_000  # nanoseconds of receipt that an image may be asked for after its packet
+MOST_BYTES = 64_000_000  # of packets that are held
+MOST_REORDERED = 20  # pictures that a decoder has made and nobody has asked for
+_DECODERS = {"h265": "hevc", "av1": "libdav1d"}
+LOW_DELAY = 0x80000  # AV_CODEC_FLAG_LOW_DELAY: a picture for each packet, at once
+
+
+@dataclass(frozen=True, slots=True)
+class VideoLoader:
+    """Decodes a picture when a frame takes it."""
+
+    video: Video
+    place: tuple[int, int]
+
+    def __call__(self) -> Image:
+        return self.video.image(self.place)
+
+
+class Video:
+    """The video of one topic. Packets are added in the order of receipt; bounded in memory.
+
+    Pictures that others are missing for, which the decoder would paint over, are not given.
+
+    Args:
+        topic: of the packets.
+        rewind: the packets from the last key frame at or before a time of receipt up to that time, out of the
+            recording; None: what has gone by is gone.
+    """
+
+    def __init__(self, topic: str, rewind: Rewind | None = None) -> None:
+        self.topic, self._rewind = topic, rewind
+        self._packets: list[Packet] = []
+        self._size = 0  # bytes of them
+        self._keyless = -1  # no key frame up to this time of receipt
+        self._headers: dict[bytes, None] = {}  # of Theora
+        self._decoder: _Decoder | None = None
+        self._next = 0  # packet that the decoder is to be given next
+        self._last: Image | None = None
+        self._last_place: tuple[int, int] | None = None
+
+    def add(self, packet: Packet) -> None:
+        if packet.is_header:
+            self._headers[packet.data] = None
+            return
+        if packet.is_key:
+            self._drop(before=packet.received - HELD)
+        self._packets.append(packet)
+        self._size += len(packet.data)
+        if self._size > MOST_BYTES:
+            self._drop(before=packet.received)
+        if self._size > MOST_BYTES:  # one group of pictures: of it the decoder has what it needs
+            self._forget(self._next or len(self._packets))
+
+    def image(self, place: tuple[int, int]) -> Image:
+        """The picture of the packet at that place.
+
+        Raises:
+            MessageError: it cannot be decoded, or only without pictures that are lost.
+        """
+        if place != self._last_place or self._last is None:
+            self._last = self._decode(place)
+            self._last_place = place
+        return self._last
+
+    def _decode(self, place: tuple[int, int]) -> Image:
+        row, key = self._find(place)
+        decoder = self._decoder
+        if decoder is None or not (key < self._next <= row or decoder.has(place)):
+            decoder = self._decoder = _Decoder(self._packets[key].codec, tuple(self._headers))
+            self._next = key
+        for packet in self._packets[self._next : row + 1]:
+            decoder.put(packet)
+        self._next = max(self._next, row + 1)
+        packet = self._packets[row]
+        while decoder.waits_for(place):
+            if self._next < len(self._packets):
+                decoder.put(self._packets[self._next])
+                self._next += 1
+            else:
+                decoder.finish()
+                self._decoder = None
+        picture = decoder.picture(place)
+        if picture is None:
+            why = decoder.failures.get(packet.place, "packets before it are lost or damaged")
+            raise MessageError(
+                f"{self.topic}: a picture of the {packet.codec.upper()} video cannot be decoded: {why}; "
+                "the next key frame sets it right"
+            )
+        streamed = packet.codec in SHOWN and not decoder.reorders and key >= 0
+        clip = self._clip(key, row) if streamed else None
+        return Image(
+            packet.stamp,
+            packet.frame_id,
+            picture,
+            media_type=f"video/{packet.codec}",
+            topic=self.topic,
+            received=packet.received,
+            clip=clip,
+        )
+
+    def _clip(self, key: int, row: int) -> Clip:
+        before = [earlier for earlier in range(key) if self._packets[earlier].is_key]
+        first = before[-1] if before else key
+        packets = self._packets[first : row + 1]
+        codec, places = cast("Codec", packets[0].codec), tuple(packet.place for packet in packets)
+        return Clip(codec, places, tuple(packet.data for packet in packets), key - first)
+
+    def _find(self, place: tuple[int, int]) -> tuple[int, int]:
+        """Where the packet is, and the key frame before it.
+
+        Raises:
+            MessageError: they are not there.
+        """
+        found = self._among(place)
+        if found is None and place[0] > self._keyless and self._rewind is not None:
+            earlier = list(self._rewind(self.topic, place[0]))
+            self._headers |= {packet.data: None for packet in earlier if packet.is_header}
+            earlier = [packet for packet in earlier if not packet.is_header]
+            self._packets = earlier + [p for p in self._packets if p.received > place[0]]
+            self._size = sum(len(packet.data) for packet in self._packets)
+            self._decoder = None
+            found = self._among(place)
+            if found is None:
+                self._keyless = place[0]
+        if found is None:
+            raise MessageError(
+                f"{self.topic}: the video begins between two key frames: what comes before the first one "
+                "cannot be decoded"
+            )
+        return found
+
+    def _among(self, place: tuple[int, int]) -> tuple[int, int] | None:
+        rows = [row for row, packet in enumerate(self._packets) if packet.place == place]
+        if not rows:
+            return None
+        # What was before the first one may be dropped, where the decoder has had it.
+        within = 0 < self._next <= rows[-1] and self._decoder is not None
+        keys = [row for row in range(rows[-1], -1, -1) if self._packets[row].is_key]
+        return (rows[-1], keys[0]) if keys else ((rows[-1], -1) if within else None)
+
+    def _drop(self, before: int) -> None:
+        """Forget the groups of pictures that end before a time of receipt."""
+        keys = [row for row, packet in enumerate(self._packets) if packet.is_key]
+        ends = [row for row in keys if row and self._packets[row - 1].received <= before]
+        self._forget(ends[-1] if ends else 0)
+
+    def _forget(self, count: int) -> None:
+        gone, self._packets = self._packets[:count], self._packets[count:]
+        self._size -= sum(len(packet.data) for packet in gone)
+        self._next -= count
+        if self._next < 0:
+            self._decoder, self._next = None, 0
+
+
+class _Decoder:
+    """Pictures of consecutive packets, from a key frame on."""
+
+    def __init__(self, codec: str, headers: tuple[bytes, ...]) -> None:
+        import av  # with its libraries it takes a tenth of a second
+
+        av.logging.set_level(None)
+        self._context = cast("VideoCodecContext", av.CodecContext.create(_DECODERS.get(codec, codec), "r"))
+        self._context.thread_count = 1
+        self._context.flags |= LOW_DELAY
+        self._context.options = {"max_pixels": str(MOST_PIXELS)}
+        if codec == "theora":
+            self._context.extradata = b"".join(len(h).to_bytes(2) + h for h in headers)
+        self._continuity = Continuity() if codec == "h264" else None
+        self._places: list[tuple[int, int]] = []
+        self._broken = ""  # why no picture is whole until the next key frame
+        self._finished = False
+        self._pictures: OrderedDict[tuple[int, int], av.VideoFrame] = OrderedDict()
+        self.failures: dict[tuple[int, int], str] = {}
+
+    @property
+    def reorders(self) -> bool:
+        """Whether pictures may need later ones."""
+        return bool(self._context.has_b_frames)
+
+    def put(self, packet: Packet) -> None:
+        import av
+
+        if packet.is_key:
+            self._broken = ""
+            self.failures.clear()
+        if self._continuity is not None and (lost := self._continuity.missing(packet.data)):
+            self._broken = f"{lost} packet(s) before it are lost"
+        given = av.Packet(packet.data)
+        given.pts = len(self._places)
+        self._places.append(packet.place)
+        self._take(given)
+
+    def finish(self) -> None:
+        """Have the pictures that wait for later ones."""
+        self._finished = True
+        self._take(None)
+
+    def _take(self, packet: av.Packet[Any] | None) -> None:
+        import av
+
+        try:
+            pictures = self._context.decode(packet)
+        except av.FFmpegError as error:
+            self.failures[self._places[-1]] = self._broken or first_line(error.strerror or error)
+            return
+        for picture in pictures:
+            place = self._places[picture.pts or 0]
+            if self._broken:
+                self.failures[place] = self._broken
+            else:
+                self._pictures[place] = picture
+        while len(self._pictures) > MOST_REORDERED:
+            self._pictures.popitem(last=False)
+
+    def has(self, place: tuple[int, int]) -> bool:
+        """Whether it has made this picture, and still has it."""
+        return place in self._pictures
+
+    def waits_for(self, place: tuple[int, int]) -> bool:
+        """Whether the picture may come with the next packet."""
+        there = place in self._pictures or place in self.failures
+        return self.reorders and not there and not self._finished
+
+    def picture(self, place: tuple[int, int]) -> U8 | None:
+        """(H, W, 3) BGR; None: it was not made."""
+        found = self._pictures.get(place)
+        return None if found is None else np.ascontiguousarray(found.to_ndarray(format="bgr24"))

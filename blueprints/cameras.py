@@ -1,0 +1,24 @@
+"""Cameras alone: what a layout becomes where there is no LiDAR."""
+
+from __future__ import annotations
+
+import rerun.blueprint as rrb
+
+from bevviz.frame import Scene
+from bevviz.logging import views
+
+
+def blueprint(scene: Scene) -> rrb.Blueprint:
+    images = [views.camera(scene, name, why=True) for name in scene.cameras]
+    said = [views.explain(), views.why(), views.log(), views.anomaly_log(), views.config()]
+    images = [views.camera(scene, name, why=True) for name in scene.cameras]
+    said = [views.explain(), views.why(), views.log(), views.anomaly_log(), views.config()]
+    return rrb.Blueprint(
+        rrb.Vertical(
+            rrb.Horizontal(rrb.Grid(*images), rrb.Tabs(*said, name="Decisions"), column_shares=[3, 1]),
+            rrb.Horizontal(views.stage_times(), views.counts(), views.over_time()),
+            row_shares=[4, 1],
+        ),
+        views.time_panel(),
+        *views.panels(),
+    )

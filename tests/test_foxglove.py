@@ -1,0 +1,262 @@
+"""Foxglove's messages in MCAP, written by Foxglove's own SDK: protobuf, and JSON."""
+
+from __future__ import annotations
+
+import base64
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+foxglove = pytest.importorskip("foxglove", reason="needs Foxglove's SDK")
+from foxglove import channels, messages  # noqa: E402
+
+from bevviz import geometry  # noqa: E402
+from bevviz.bags.source import BagSource  # noqa: E402
+from bevviz.cli import main  # noqa: E402
+from bevviz.config import load  # noqa: E402
+from bevviz.frame import F32, F64  # noqa: E402
+from bevviz.report.window import choose_topics, cut, find_window, open_window  # noqa: E402
+from tests import bags, videos  # noqa: E402
+
+SCANS = 6
+K = [60.0, 0, 32, 0, 60, 24, 0, 0, 1]
+CAMERA = geometry.transform(np.array([0.1, 0, -0.2]), np.array([-0.5, 0.5, -0.5, 0.5]))
+FLOAT32 = messages.PackedElementFieldNumericType.Float32
+
+
+def points(scan: int) -> F32:
+    return np.random.default_rng(scan).uniform(1, 20, (50, 4)).astype(np.float32)
+
+
+def picture(scan: int) -> Any:
+    return np.full((48, 64, 3), 40 * scan, np.uint8)
+
+
+def time(scan: int) -> Any:
+    stamp = bags.START + scan * bags.PERIOD
+    return messages.Timestamp(sec=stamp // 10**9, nsec=stamp % 10**9)
+
+
+def parts(matrix: F64) -> tuple[Any, Any]:
+    """Translation and rotation."""
+    place, turn = matrix[:3, 3].tolist(), geometry.quaternion(matrix).tolist()
+    axes = dict(zip("xyz", place, strict=True))
+    return messages.Vector3(**axes), messages.Quaternion(**dict(zip("xyzw", turn, strict=True)))
+
+
+def pose(matrix: F64) -> Any:
+    place, turn = parts(matrix)
+    return messages.Pose(position=place, orientation=turn)
+
+
+def edge(scan: int, parent: str, child: str, matrix: F64) -> Any:
+    translation, rotation = parts(matrix)
+    return messages.FrameTransform(
+        timestamp=time(scan),
+        parent_frame_id=parent,
+        child_frame_id=child,
+        translation=translation,
+        rotation=rotation,
+    )
+
+
+def write(path: Path, *, offset: F64 | None = None, image: str = "png") -> Path:
+    """As nuscenes2mcap has its topics; the camera's place is said once."""
+    context = foxglove.Context()
+    with foxglove.open_mcap(path, context=context):
+        cloud = channels.PointCloudChannel("/LIDAR_TOP", context=context)
+        raw = channels.RawImageChannel("/CAM_FRONT/image_raw", context=context)
+        packed = channels.CompressedImageChannel("/CAM_FRONT/image_rect_compressed", context=context)
+        video = channels.CompressedVideoChannel("/CAM_FRONT/video", context=context)
+        info = channels.CameraCalibrationChannel("/CAM_FRONT/camera_info", context=context)
+        tf = channels.FrameTransformsChannel("/tf", context=context)
+        single = channels.FrameTransformChannel("/tf_single", context=context)
+        scene = channels.SceneUpdateChannel("/markers/annotations", context=context)
+        fields = [
+            messages.PackedElementField(name=name, offset=4 * i, type=FLOAT32)
+            for i, name in enumerate(("x", "y", "z", "intensity"))
+        ]
+        packets = videos.encode([cv2.resize(picture(scan), (64, 64)) for scan in range(SCANS)])
+        for scan in range(SCANS):
+            at = bags.START + scan * bags.PERIOD
+            if scan == 0:
+                single.log(edge(scan, "lidar_top", "cam_front", CAMERA), log_time=at)
+            moved = geometry.transform(np.array([float(scan), 0, 0]), np.array([0.0, 0, 0, 1]))
+            tf.log(messages.FrameTransforms(transforms=[edge(scan, "map", "lidar_top", moved)]), log_time=at)
+            cloud.log(
+                messages.PointCloud(
+                    timestamp=time(scan),
+                    frame_id="lidar_top",
+                    pose=pose(np.eye(4) if offset is None else offset),
+                    point_stride=16,
+                    fields=fields,
+                    data=points(scan).tobytes(),
+                ),
+                log_time=at,
+            )
+            bgr, about = picture(scan), dict[str, Any](timestamp=time(scan), frame_id="cam_front")
+            if image == "png":
+                encoded = cv2.imencode(".png", bgr)[1].tobytes()
+                packed.log(messages.CompressedImage(format="png", data=encoded, **about), log_time=at)
+            elif image == "video":
+                video.log(messages.CompressedVideo(format="h264", data=packets[scan], **about), log_time=at)
+            else:
+                size = dict[str, Any](width=64, height=48, step=192, encoding="rgb8")
+                raw.log(messages.RawImage(data=bgr.tobytes(), **size, **about), log_time=at)
+            info.log(
+                messages.CameraCalibration(
+                    width=64,
+                    height=48,
+                    distortion_model="plumb_bob",
+                    D=[0.0] * 5,
+                    K=K,
+                    R=np.eye(3).ravel().tolist(),
+                    P=np.column_stack([np.reshape(K, (3, 3)), np.zeros(3)]).ravel().tolist(),
+                    **about,
+                ),
+                log_time=at,
+            )
+            cube = messages.CubePrimitive(
+                pose=pose(geometry.transform(np.array([10.0, 2, 1]), np.array([0, 0, 0.6, 0.8]))),
+                size=messages.Vector3(x=4, y=2, z=1.5),
+            )
+            entity = messages.SceneEntity(
+                timestamp=time(scan),
+                frame_id="map",
+                id="7",
+                metadata=[messages.KeyValuePair(key="category", value="vehicle.car")],
+                cubes=[cube],
+            )
+            scene.log(messages.SceneUpdate(entities=[entity]), log_time=at)
+    return path
+
+
+def check(path: Path, expected: Callable[[int], F32] = lambda scan: points(scan)[:, :3]) -> None:
+    with BagSource([path], load()) as source:
+        frames = list(source)
+        assert not source.warnings
+        assert [frame.stamp for frame in frames] == [bags.START + i * bags.PERIOD for i in range(SCANS)]
+        last = source.frame(SCANS - 1)
+        assert last is not None
+        frames[-1] = last
+        for scan, frame in enumerate(frames):
+            np.testing.assert_allclose(frame.points, expected(scan), atol=1e-5)
+            np.testing.assert_array_equal(frame.fields["intensity"], points(scan)[:, 3])
+            assert frame.world_from_points is not None
+            np.testing.assert_allclose(frame.world_from_points[:3, 3], [scan, 0, 0], atol=1e-9)
+            (camera,) = frame.cameras
+            assert camera.name == "CAM_FRONT"
+            assert camera.image is not None
+            assert camera.intrinsics is not None
+            assert camera.camera_from_points is not None
+            assert abs(int(camera.image.bgr[20, 30].mean()) - 40 * scan) <= 3
+            np.testing.assert_allclose(camera.intrinsics.K.ravel(), K)
+            np.testing.assert_allclose(camera.camera_from_points, geometry.inverse(CAMERA), atol=1e-6)
+            (boxes,) = frame.robot_boxes
+            assert (boxes.labels, boxes.ids, boxes.frame_id) == (("vehicle.car",), ("7",), "map")
+            np.testing.assert_allclose(boxes.boxes.center, [[10, 2, 1]])
+            np.testing.assert_allclose(boxes.boxes.size, [[4, 2, 1.5]])
+            np.testing.assert_allclose(boxes.boxes.yaw, [2 * np.arctan2(0.6, 0.8)], rtol=1e-5)
+
+
+@pytest.mark.parametrize("image", ["png", "raw"])
+def test_protobuf_by_foxgloves_sdk(image: str, tmp_path: Path) -> None:
+    check(write(tmp_path / "drive.mcap", image=image))
+
+
+def test_video_in_protobuf(tmp_path: Path) -> None:
+    with BagSource([write(tmp_path / "drive.mcap", image="video")], load()) as source:
+        images = [frame.cameras[0].image for frame in source]
+    assert [image is not None and image.media_type for image in images] == ["video/h264"] * SCANS
+
+
+def test_a_clouds_own_pose_is_applied(tmp_path: Path) -> None:
+    offset = geometry.transform(np.array([1.0, 2, 3]), np.array([0, 0, 0.6, 0.8]))
+    path = write(tmp_path / "drive.mcap", offset=offset)
+    check(path, lambda scan: geometry.apply(offset, points(scan)[:, :3]))
+
+
+def test_json_says_the_same(tmp_path: Path) -> None:
+    """What the SDK wrote as protobuf, by the SDK as JSON."""
+    from google.protobuf.json_format import MessageToDict
+    from mcap.reader import make_reader
+
+    from bevviz.ros.foxglove import parse
+
+    source, path, context = write(tmp_path / "protobuf.mcap"), tmp_path / "json.mcap", foxglove.Context()
+    made: dict[str, Any] = {}
+    with source.open("rb") as file, foxglove.open_mcap(path, context=context):
+        for schema, channel, message in make_reader(file).iter_messages():
+            assert schema is not None
+            if channel.topic not in made:
+                about = foxglove.Schema(name=schema.name, encoding="jsonschema", data=b'{"type": "object"}')
+                made[channel.topic] = foxglove.Channel(
+                    channel.topic, message_encoding="json", schema=about, context=context
+                )
+            parsed = parse(message.data, schema.name, "protobuf", schema.data.decode("latin-1"))
+            fields = MessageToDict(parsed, preserving_proto_field_name=True, use_integers_for_enums=True)
+            made[channel.topic].log(json.dumps(_times(fields)).encode(), log_time=message.log_time)
+    check(path)
+
+
+def _times(value: Any) -> Any:
+    """Times as Foxglove's JSON schemas have them."""
+    if isinstance(value, dict):
+        return {key: _time(item) if key == "timestamp" else _times(item) for key, item in value.items()}
+    return [_times(item) for item in value] if isinstance(value, list) else value
+
+
+def _time(text: str) -> dict[str, int]:
+    stamp = int(np.datetime64(text.removesuffix("Z"), "ns").astype(np.int64))
+    return {"sec": stamp // 10**9, "nsec": stamp % 10**9}
+
+
+def test_info_names_kinds_and_roles(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["info", str(write(tmp_path / "drive.mcap"))]) == 0
+    told = capsys.readouterr().out
+    for line in (
+        "/LIDAR_TOP: LiDAR, by type and name",
+        "/CAM_FRONT/camera_info: calibration of CAM_FRONT",
+        "/markers/annotations: the robot's own result",
+        "foxglove.FrameTransforms",
+    ):
+        assert line in told
+
+
+def test_boxes_may_be_the_truth(tmp_path: Path) -> None:
+    path = write(tmp_path / "drive.mcap")
+    assert main(["evaluate", str(path), "--truth", "/markers/annotations", "--quiet"]) == 0
+
+
+def test_a_part_cut_out_runs_again(tmp_path: Path) -> None:
+    path, target = write(tmp_path / "drive.mcap"), tmp_path / "cut.mcap"
+    with BagSource([path], load()) as source:
+        window = find_window(source, int(source.scans[3]), 0.1, 0.1)
+        topics = choose_topics(source.recording, source.roles, None)
+        cut(source.recording, window, topics, source.roles.tf_static, target)
+        expected = [frame.points for frame in source][2:5]
+    with open_window([target], load(), window.low, window.high) as source:
+        for frame, there in zip(source, expected, strict=True):
+            np.testing.assert_array_equal(frame.points, there)
+            assert frame.cameras[0].camera_from_points is not None
+
+
+def test_what_is_no_message_is_one_line(tmp_path: Path) -> None:
+    context, path = foxglove.Context(), tmp_path / "drive.mcap"
+    good = base64.b64encode(points(0).tobytes()).decode()
+    fields = [{"name": name, "offset": 4 * i, "type": 7} for i, name in enumerate("xyz")]
+    cloud = {"frame_id": "l", "point_stride": 16, "fields": fields, "data": good}
+    about = foxglove.Schema(name="foxglove.PointCloud", encoding="jsonschema", data=b"{}")
+    with foxglove.open_mcap(path, context=context):
+        channel = foxglove.Channel("/points", message_encoding="json", schema=about, context=context)
+        broken = [b"{not json", b"[]", json.dumps(cloud | {"data": "?"}).encode(), b"{}"]
+        for i, data in enumerate([json.dumps(cloud).encode(), *broken]):
+            channel.log(data, log_time=bags.START + i * bags.PERIOD)
+    with BagSource([path], load()) as source:
+        assert [len(frame.points) for frame in source][:1] == [50]
+        assert any("of /points could not be used, the first: /points: not a" in w for w in source.warnings)

@@ -1,0 +1,84 @@
+"""What Rerun's viewer runs on the files that it opens."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from bevviz.importer import NOT_OURS, run
+from tests import bags
+from tests.recordings import Recording, verify
+
+COMMAND = [sys.executable, "-c", "from bevviz.importer import main; main()"]
+
+
+@pytest.fixture(scope="module")
+def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("importer") / "drive"
+    return bags.write(folder, bags.small_items(scans=3), form="sqlite3")
+
+
+def test_a_bag_is_a_recording_on_standard_output(drive: Path, tmp_path: Path) -> None:
+    (bag,) = drive.glob("*.db3")
+    about = [
+        "--application-id",
+        "drive",
+        "--recording-id",
+        "one",
+        "--opened-recording-id",
+        "other",
+        "--static",
+    ]
+    done = subprocess.run([*COMMAND, str(bag), *about], capture_output=True, check=False, timeout=200)
+    assert done.returncode == 0, done.stderr.decode()
+    saved = tmp_path / "out.rrd"
+    saved.write_bytes(done.stdout)
+    verify(saved)
+    recording = Recording(saved)
+    assert sorted(recording.at["/world/velodyne/points"]["Points3D:positions"]) == [0, 1, 2]
+    assert recording.blueprints == 1
+
+
+def test_what_is_none_of_ours_is_said_so(drive: Path, tmp_path: Path) -> None:
+    other = tmp_path / "picture.png"
+    other.touch()
+    assert run([str(other)]) == NOT_OURS
+    assert run([str(tmp_path)]) == NOT_OURS
+    loaded = "import sys; from bevviz.importer import run; run(['x.png']); print('numpy' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", loaded], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "False"
+
+
+def test_mcap_is_taken_where_a_project_file_is(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    bag = tmp_path / "drive.mcap"
+    bag.write_bytes(b"")
+    assert run([str(bag)]) == NOT_OURS
+    (tmp_path / "bevviz.toml").touch()
+    assert run([str(bag)]) == 1
+    assert "drive.mcap: the file is empty" in capsys.readouterr().err
+
+
+@pytest.mark.skipif(
+    shutil.which("rerun-importer-bevviz") is None, reason="bevviz is not installed on the path"
+)
+def test_reruns_own_command_finds_it(drive: Path, tmp_path: Path) -> None:
+    (bag,) = drive.glob("*.db3")
+    saved = tmp_path / "out.rrd"
+    command = [
+        sys.executable,
+        "-m",
+        "rerun",
+        str(bag),
+        "--save",
+        str(saved),
+        "--bind",
+        "127.0.0.1",
+        "--port",
+        "0",
+    ]
+    subprocess.run(command, capture_output=True, check=True, timeout=200)
+    assert "/world/velodyne/points" in Recording(saved).at
