@@ -35,7 +35,6 @@ NEUTRAL = {
     "pydantic_core": "the configuration's types",
     "annotated-types": "the configuration's types",
     "tqdm": "progress bars",
-    "av": "encodes images for recordings, after all that is made of them",
     "argcomplete": "completion in a shell",
     "motmetrics": "scores of results",
     "jinja2": "pages about results",
