@@ -22,6 +22,7 @@ from bevviz.plugins import TOPIC
 
 PACKAGES = (  # those that are not installed do not count: some libraries come as one of several
     *("rerun-sdk", "rosbags", "numpy"),
+    "protobuf",  # decodes Foxglove's messages
     *("numba", "llvmlite"),  # compile every LiDAR stage
     *(
         "opencv-python-headless",
