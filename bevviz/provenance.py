@@ -22,8 +22,14 @@ from bevviz.plugins import TOPIC
 
 PACKAGES = (  # those that are not installed do not count: some libraries come as one of several
     *("rerun-sdk", "rosbags", "numpy"),
+    "protobuf",  # decodes Foxglove's messages
     *("numba", "llvmlite"),  # compile every LiDAR stage
-    *("opencv-python-headless", "opencv-python", "pillow"),  # decode images, and prepare them for the network
+    *(
+        "opencv-python-headless",
+        "opencv-python",
+        "pillow",
+        "av",
+    ),  # decode images, and prepare them for the network
     *("onnxruntime", "onnxruntime-gpu"),
 )
 

@@ -19,6 +19,7 @@ from bevviz.frame import F32, U8
 from bevviz.logging import entities
 from bevviz.logging.keep import Around, Held
 from bevviz.logging.recorder import OrderedRecorder
+from bevviz.logging.shown import too_large_for_web
 from bevviz.logging.sinks import open_recording
 from bevviz.logging.video import GOP, VideoEncoder, decode
 from bevviz.parallel.run import run_windows
@@ -221,3 +222,11 @@ def test_windows_keep_what_one_process_keeps(bag: Path, read: dict[str, Recordin
     assert samples(one).keys() == samples(other).keys()
     shown = [bytes(sample[0]) for _, sample in sorted(samples(other).items())]
     assert len(decode(shown)) == SCANS - 1
+
+
+def test_a_browser_is_told_what_it_cannot_hold(tmp_path: Path) -> None:
+    path = tmp_path / "drive.rrd"
+    assert too_large_for_web(path, 2_000_000_000) == ""
+    said = too_large_for_web(path, 10_600_000_000)
+    assert "drive.rrd has 10.6 GB" in said
+    assert f"rerun {path}" in said

@@ -387,10 +387,11 @@ def test_grid_lies_on_the_ground_the_right_way_round(record: Callable[..., Recor
         np.array(grid["GridMap:data"][0][0], np.uint8).view(np.int8),
         result.bev.channels["occupancy"].ravel(),
     )
-    (origin,) = grid["GridMap:translation"][0]
-    ((*axis, angle),) = [(*r["axis"], r["angle"]) for r in grid["GridMap:rotation_axis_angle"][0]]
-    assert axis == [0, 0, 1]
-    c, s = np.cos(angle), np.sin(angle)
+    (translation,), (turn,) = grid["GridMap:translation"][0], grid["GridMap:quaternion"][0]
+    assert not any(name.startswith("Transform3D") for name in grid), "the viewer would hold all grids"
+    pose = geometry.inverse(result.frame.pose) @ geometry.transform(translation, turn)
+    origin, (c, s) = pose[:3, 3], pose[:2, 0]
+    assert pose[2, 2] == pytest.approx(1)
     rows, columns = result.bev.channels["occupancy"].shape
     v, u = np.argwhere(result.bev.channels["occupancy"] == 100).T
     right, up = (u + 0.5) * result.bev.resolution, (rows - v - 0.5) * result.bev.resolution

@@ -93,6 +93,10 @@ class Outputs(NamedTuple):
     def keep_serving(self, sinks: Sinks, what: str = "") -> None:
         """Until the user ends it, where a server was asked for."""
         if self.serve is not None:
+            from bevviz.logging.shown import too_large_for_web
+
+            if self.save is not None and sinks.file is not None and sinks.file.exists():
+                warn(filter(None, [too_large_for_web(self.save, sinks.file.stat().st_size)]))
             say(f"{what}serving until Ctrl-C")
             sinks.check()
             wait_for_interrupt()

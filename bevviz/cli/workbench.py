@@ -114,6 +114,8 @@ def _show(recording: Path, options: argparse.Namespace) -> int:
     if has_display():
         shown.in_viewer(recording)
         return 0
+    if larger := shown.too_large_for_web(recording, recording.stat().st_size):
+        warn([larger])
     with shown.in_browser(recording, options.port) as address:
         tell_of_browser(address)
         wait_for_interrupt()

@@ -11,8 +11,10 @@ from bevviz import geometry
 from bevviz.config import BevConfig, Config
 from bevviz.frame import F32, F64, Bev, FrameResult
 from bevviz.logging import entities, keep
-from bevviz.logging.pieces import blob, jpeg, png, transform
+from bevviz.logging.pieces import blob, jpeg, png
 from bevviz.logging.writer import Writer
+
+_TURNED = np.array([0.0, 0.0, -np.sqrt(0.5), np.sqrt(0.5)])  # by -90 degrees about z, as x, y, z, w
 
 
 def log_bev(to: Writer, bev: Bev, config: Config) -> None:
@@ -26,7 +28,11 @@ def log_bev(to: Writer, bev: Bev, config: Config) -> None:
 
 
 def log_grid(to: Writer, result: FrameResult, bev: Bev) -> None:
-    """The occupancy on the ground. The pose of a grid map is that of its lower left corner."""
+    """The occupancy on the ground. The pose of a grid map is that of its lower left corner.
+
+    It has no transform beside it: the viewer holds all transforms of a drive, and with one each grid, as what
+    is in one chunk is held as a whole.
+    """
     grid = bev.channels.get("occupancy")
     if grid is None:
         return
@@ -34,12 +40,15 @@ def log_grid(to: Writer, result: FrameResult, bev: Bev) -> None:
     if result.ground is not None and result.voxels is not None:
         heights = result.voxels.points[::32, 2].compress(result.ground.mask[::32])
         level = float(np.median(heights)) if len(heights) else 0.0
+    corner = np.array([-bev.range_x, bev.range_y, level - 0.05])
+    pose = result.frame.pose @ geometry.transform(corner, _TURNED)
     to.put(
         entities.GRID,
-        transform(result.frame.pose),
         _grid_looks(*grid.shape, bev.resolution),
         rr.GridMap.from_fields(
-            data=blob(grid.view(np.uint8).ravel()), translation=[-bev.range_x, bev.range_y, level - 0.05]
+            data=blob(grid.view(np.uint8).ravel()),
+            translation=pose[:3, 3],
+            quaternion=rr.Quaternion(xyzw=geometry.quaternion(pose)),
         ),
     )
 
@@ -49,7 +58,6 @@ def _grid_looks(rows: int, columns: int, resolution: float) -> rr.GridMap:
     return rr.GridMap.from_fields(
         format=rr.components.ImageFormat(width=columns, height=rows, color_model="L", channel_datatype="U8"),
         cell_size=resolution,
-        rotation_axis_angle=rr.RotationAxisAngle([0, 0, 1], radians=-np.pi / 2),
         opacity=0.2,
         colormap=rr.components.Colormap.RvizMap,
     )

@@ -10,6 +10,19 @@ from bevviz.logging import rerun_cli
 from bevviz.logging.ports import FIRST_DATA_PORT, LOOPBACK, check_port, free_port, viewer_address
 from bevviz.logging.sinks import MEMORY
 
+WEB = 2.3e9  # bytes that the web viewer can hold, of the 4 GiB that WebAssembly has
+
+
+def too_large_for_web(recording: Path, size: int) -> str:
+    """What to say of one that a browser cannot show whole; empty: it can. ``size`` in bytes."""
+    if size <= WEB:
+        return ""
+    return (
+        f"{recording.name} has {size / 1e9:.1f} GB, and a browser's viewer can hold {WEB / 1e9:.1f} GB: its "
+        f"beginning is missing; Rerun's own viewer reads what it shows from the file (rerun {recording}); "
+        "--keep inspect saves a fifth"
+    )
+
 
 def in_viewer(recording: Path) -> None:
     """The viewer stays open when we have ended.
