@@ -79,7 +79,7 @@ def _fitted(bag: Path, folder: Path, scans: int) -> list[str]:
     """Processor time of a frame, by who spends it, and what follows from that."""
     windows = 0.0
 
-    def here(jobs: Iterable[WindowJob], on_frame: Callable[[], None]) -> JobResults:
+    def here(jobs: Iterable[WindowJob], on_frame: Callable[[], None], tick: Callable[[], None]) -> JobResults:
         nonlocal windows
         for job in list(jobs):  # cut before: it has threads of its own
             start = time.process_time()
@@ -92,7 +92,7 @@ def _fitted(bag: Path, folder: Path, scans: int) -> list[str]:
         next(iter(warm))
     with Drive(BagSource([bag], config), config) as drive:
         start = time.process_time()
-        with open_recording(drive.scene, config, save=folder / "fitted.rrd") as sinks:
+        with open_recording(drive.scene, config, save=folder / "fitted.rrd", in_parts=True) as sinks:
             seen = [OrderedRecorder(sinks.recording, config)]
             run_windows(drive, drive.new_session(), sinks, seen, 2, here)
         total = time.process_time() - start

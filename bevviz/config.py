@@ -36,6 +36,7 @@ from bevviz.frame import AnomalyKind
 from bevviz.plugins import TOPIC
 
 Preset = Literal["default", "reference"]
+Keep = Literal["everything", "inspect", "report"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -236,7 +237,10 @@ class DetectorConfig(StageSection):
         100, ge=1, le=10_000, description="candidates kept for explanation, duplicates last"
     )
     classes: tuple[str, ...] = Field((), description="only these class names; empty: all")
-    provider: str = Field("auto", description="onnxruntime execution provider, e.g. CPU, CUDA, TensorRT")
+    provider: str = Field(
+        "auto",
+        description="onnxruntime's: auto (a GPU's, where it works), CPU, CUDA, TensorRT",
+    )
     threads: int = Field(0, ge=0, description="onnxruntime threads; 0: all cores")
 
 
@@ -376,6 +380,14 @@ class BevConfig(Section):
 
 
 class LoggingConfig(Section):
+    keep: Keep = Field(
+        "everything",
+        description="inspect: a fifth, with raw clouds now and then; report: less, without (docs/size.md)",
+    )
+    raw_every: int = Field(50, ge=1, description="keep=inspect: raw cloud of each N-th frame")
+    raw_around: Seconds = Field(
+        0.5, ge=0, le=5, description="keep=inspect: raw clouds before and after an anomaly or a change"
+    )
     jpeg_quality: int = Field(85, ge=1, le=100, description="for images that came uncompressed")
     video: Literal["stream", "images"] = Field(
         "stream", description="video as it came, or each picture as JPEG, which takes no decoder in a viewer"
@@ -398,6 +410,9 @@ class LiveConfig(Section):
     )
     viewer_rate: float | None = Field(
         None, ge=1, le=100, description="frames a second that viewers get at most, files get all; empty: all"
+    )
+    viewer_points: int | None = Field(
+        None, ge=1, description="points of each cloud that viewers get at most, files get all; empty: all"
     )
     split_size: Megabytes | None = Field(
         None, ge=1, description="--save: size that a part is closed at; empty: any"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol, overload
@@ -325,18 +326,34 @@ class Drive(Closing):
         from bevviz.progress import Progress
 
         target = Path(path)
-        with open_recording(self.scene, self.config, save=target, blueprint=blueprint) as sinks:
+        with ExitStack() as stack:
+            processes = None
+            session = self.new_session()
             if jobs > 1:
-                from bevviz.parallel.drive import obstacle
+                from bevviz.batch.local import Processes
+                from bevviz.parallel.drive import here, obstacle
                 from bevviz.parallel.run import run_windows
 
-                session = self.new_session()
                 if reason := obstacle(self, session):
                     raise UserError(f"jobs={jobs}: {reason}")
-                ordered = [OrderedRecorder(sinks.recording, self.config), DiskWatch(sinks)]
-                end = run_windows(self, session, sinks, ordered, jobs)
+                processes = stack.enter_context(Processes(jobs, ["bevviz.parallel.work"]))
+            sinks = stack.enter_context(
+                open_recording(self.scene, self.config, save=target, blueprint=blueprint, in_parts=jobs > 1)
+            )
+            if processes is not None:
+                ordered = [
+                    OrderedRecorder(sinks.recording, self.config, session.stages.provider),
+                    DiskWatch(sinks),
+                ]
+                end = run_windows(self, session, sinks, ordered, jobs, here(processes))
             else:
-                end = self.run([Recorder(sinks.recording, self.config), DiskWatch(sinks), Progress()])
+                end = self.run(
+                    [
+                        Recorder(sinks.recording, self.config, self.session.stages.provider),
+                        DiskWatch(sinks),
+                        Progress(),
+                    ]
+                )
             if end.interrupted:
                 raise KeyboardInterrupt
         return target
@@ -362,7 +379,7 @@ class Drive(Closing):
             self.run([self._shown])
             return
         with open_recording(self.scene, self.config, spawn=True, blueprint=blueprint or "debug") as sinks:
-            self.run([Recorder(sinks.recording, self.config)])
+            self.run([Recorder(sinks.recording, self.config, self.session.stages.provider)])
 
     def to_pandas(self) -> DataFrame:
         """Run the whole drive into a table: a row a frame, with counts, times and what went wrong."""

@@ -232,6 +232,35 @@ class Solids:
 
 
 @dataclass(frozen=True, slots=True)
+class Surface:
+    """A map of heights, or of other values on a plane: triangles between the centres of its known cells."""
+
+    vertices: F32  # (V, 3)
+    triangles: NDArray[np.uint32]  # (T, 3) rows of the vertices
+    values: F32  # (V,) that the colours are of
+
+
+@dataclass(frozen=True, slots=True)
+class MeshFile:
+    """A file with a mesh, and where it is in its frame."""
+
+    path: Path
+    pose: F64  # (4, 4)
+    scale: tuple[float, float, float] = (1.0, 1.0, 1.0)
+
+
+@dataclass(frozen=True, slots=True)
+class Motion:
+    """What an Imu has measured since the frame before, in its own frame; NaN where it measures none."""
+
+    topic: str
+    stamp: I64  # (N,)
+    received: I64  # (N,)
+    rotation: F64  # (N, 3) rad/s
+    acceleration: F64  # (N, 3) m/s^2, or in g: drivers differ
+
+
+@dataclass(frozen=True, slots=True)
 class Shape:
     """What has a place in the world, in the coordinates of ``frame_id``."""
 
@@ -243,6 +272,8 @@ class Shape:
     solids: Solids | None = None
     axes: F64 | None = None  # (4, 4) frame_id from a pose
     grid: Grid | None = None
+    surface: Surface | None = None
+    meshes: tuple[MeshFile, ...] = ()
     fix: tuple[float, float] | None = None  # degrees of latitude and longitude
     picture: U8 | None = None  # (H, W, 3) BGR
     color: U8 | None = None  # red, green, blue, alpha
@@ -257,6 +288,7 @@ class Around:
     marks: tuple[str, ...] = ()  # set by people, at this frame
     statuses: tuple[Status, ...] = ()
     shapes: tuple[Shape, ...] = ()
+    motions: tuple[Motion, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -327,8 +359,12 @@ class Scene:
     cameras: tuple[str, ...] = ()
     robot: bool = False  # the robot's own results come along
     truth: bool = False  # ground truth comes along
+    imu: bool = False  # rotation and acceleration come along
     bag: tuple[Path, ...] = ()  # files and folders that the frames are read from; (): none
     topics: tuple[str, ...] = ()  # key=value each, which give the same topics the same roles
+    focus: tuple[float, float, float] | None = None  # what is asked about, in metres of Frame.points_frame
+    above: tuple[float, float, float, float] | None = None  # u, v, u, v: where a look from above begins
+    raw: bool = True  # every raw cloud is logged
 
 
 class Source(Protocol):
@@ -660,6 +696,7 @@ class FrameResult:
     tracks: Tracks | None = None
     anomalies: tuple[Anomaly, ...] = ()
     splits: Splits | None = None  # None: clusters are as the LiDAR alone has them
+    ranges: F32 | None = None  # of ``visibility.range_image``, where it was made before it was asked for
 
     @staticmethod
     def unprocessed(

@@ -123,7 +123,7 @@ class NotebookViewer(Recorder):
     """
 
     def __init__(self, scene: Scene, config: Config, blueprint: str | Blueprint) -> None:
-        layout = blueprints.load(blueprint, scene) if isinstance(blueprint, str) else blueprint
+        layout = blueprints.load(blueprint, scene, config) if isinstance(blueprint, str) else blueprint
         recording = rr.RecordingStream(APPLICATION)
         recording.set_log_time_enabled(False)
         super().__init__(recording, config)

@@ -24,8 +24,7 @@ def blueprint(scene: Scene) -> rrb.Blueprint:
         rrb.Vertical(
             rrb.Horizontal(*sides, words, column_shares=[4, 4, 3]),
             rrb.Horizontal(
-                compare.difference_counts(),
-                compare.side_counts(),
+                compare.numbers(),
                 compare.difference_states(),
                 compare.difference_log(),
             ),

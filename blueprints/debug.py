@@ -14,11 +14,11 @@ def blueprint(scene: Scene) -> rrb.Blueprint:
         rrb.Vertical(
             rrb.Horizontal(
                 views.space(scene),
-                rrb.Vertical(*side, views.birds_eye(), row_shares=[*[2] * len(side), 3]),
+                rrb.Vertical(*side, views.birds_eye(scene), row_shares=[*[2] * len(side), 3]),
                 rrb.Tabs(views.explain(), views.log(), views.anomaly_log(), views.config(), name="Decisions"),
                 column_shares=[5, 4, 3],
             ),
-            rrb.Horizontal(views.stage_times(), views.clocks(), views.counts(), views.over_time()),
+            rrb.Horizontal(views.health(), views.over_time()),
             row_shares=[4, 1],
         ),
         views.time_panel(),

@@ -24,14 +24,14 @@ def blueprint(scene: Scene) -> rrb.Blueprint:
     return rrb.Blueprint(
         rrb.Vertical(
             rrb.Horizontal(
-                views.space(scene, raw=False, grid=False, beside=judged),
-                rrb.Vertical(*side, views.birds_eye(), row_shares=[*[2] * len(side), 3]),
+                views.space(scene, raw=False, beside=judged),
+                rrb.Vertical(*side, views.birds_eye(scene), row_shares=[*[2] * len(side), 3]),
                 words,
                 column_shares=[5, 4, 3],
             ),
             rrb.Horizontal(
                 views.plot("True, missed, false", entities.EVALUATE, counts),
-                rrb.TextLogView(name="Missed and false", origin=entities.EVALUATE_LOG),
+                views.text_log("Missed and false", entities.EVALUATE_LOG),
             ),
             row_shares=[4, 1],
         ),

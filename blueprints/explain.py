@@ -15,8 +15,8 @@ def blueprint(scene: Scene) -> rrb.Blueprint:
             rrb.Vertical(
                 views.why(), rrb.Tabs(views.explain(), views.log(), views.config()), row_shares=[3, 2]
             ),
-            views.space(scene, grid=False, why=True),
-            rrb.Vertical(*side, views.birds_eye(), row_shares=[*[3] * len(side), 2]),
+            views.space(scene, why=True),
+            rrb.Vertical(*side, views.birds_eye(scene), row_shares=[*[3] * len(side), 2]),
             column_shares=[4, 4, 5],
         ),
         views.time_panel(),

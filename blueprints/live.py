@@ -13,10 +13,12 @@ def blueprint(scene: Scene) -> rrb.Blueprint:
     side: list[rrb.Container | rrb.View] = [views.cameras(scene)] if scene.cameras else []
     return rrb.Blueprint(
         rrb.Horizontal(
-            views.space(scene, raw=False, grid=False),
+            views.space(scene, raw=False),
             rrb.Vertical(
                 *side,
-                rrb.Tabs(views.birds_eye(), views.robots_birds_eye()) if scene.robot else views.birds_eye(),
+                rrb.Tabs(views.birds_eye(scene), views.robots_birds_eye())
+                if scene.robot
+                else views.birds_eye(scene),
                 rrb.Tabs(
                     views.rates(),
                     views.stage_times(),
@@ -27,6 +29,7 @@ def blueprint(scene: Scene) -> rrb.Blueprint:
                     views.tracks(),
                     views.diagnostics(),
                     *([compare.difference_counts(), compare.difference_states()] if scene.robot else []),
+                    *views.motion(scene),
                     views.log(),
                 ),
                 row_shares=[*[2] * len(side), 3, 2],

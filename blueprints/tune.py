@@ -16,7 +16,7 @@ def blueprint(scene: Scene) -> rrb.Blueprint:
         rrb.Vertical(
             rrb.Horizontal(
                 views.space(scene, beside=[f"{entities.ROBOT}/**", *compare.changes()]),
-                rrb.Vertical(*side, views.birds_eye(), row_shares=[*[2] * len(side), 3]),
+                rrb.Vertical(*side, views.birds_eye(scene), row_shares=[*[2] * len(side), 3]),
                 rrb.Vertical(compare.version(), compare.differences(), words, row_shares=[1, 3, 2]),
                 column_shares=[5, 4, 3],
             ),

@@ -13,8 +13,8 @@ def blueprint(scene: Scene) -> rrb.Blueprint:
     beside = (f"{entities.ROBOT}/**", f"{entities.WHY}/**")
     return rrb.Blueprint(
         rrb.Horizontal(
-            views.space(scene, grid=False, frustums=False, beside=beside),
-            rrb.Vertical(*side, views.birds_eye(), row_shares=[*[3] * len(side), 2]),
+            views.space(scene, frustums=False, beside=beside),
+            rrb.Vertical(*side, views.birds_eye(scene), row_shares=[*[3] * len(side), 2]),
             column_shares=[4, 4],
         ),
         views.time_panel(play=rrb.components.PlayState.Following),

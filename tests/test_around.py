@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,10 +15,11 @@ from bevviz.config import SourceConfig, load
 from bevviz.frame import Frame, FrameResult, Image, Scene, Shape, Status
 from bevviz.logging.logger import Logger
 from bevviz.ros.around import decode_shapes, decode_statuses
+from bevviz.ros.description import mesh_file
 from bevviz.ros.encode import encode_cloud, encode_image, typestore
 from bevviz.ros.messages import MessageError
 from bevviz.ros.roles import Topic, find_roles, kind_of
-from bevviz.sync.around import MANY, Surroundings
+from bevviz.sync.around import MANY, SAMPLES, Surroundings
 from bevviz.synthetic import SyntheticSource
 from bevviz.synthetic.sensors import Lidar, PinholeCamera
 from tests.recordings import Recording
@@ -255,3 +257,156 @@ def test_the_robots_own_picture_and_obstacles_are_shown_where_nothing_of_ours_is
     points = shown["/robot/lidar/points_no_ground"]["Points3D:positions"][0]
     assert len(points) == len(frame.points)
     assert "Image:buffer" in shown["/robot/visualization/bev_image"]
+
+
+def height_map(values: np.ndarray[Any, Any], start: tuple[int, int] = (0, 0), **more: Any) -> Any:
+    """Of (rows, columns), stored by columns and beginning anywhere, as grid_map does."""
+    rows, columns = values.shape
+    stored = np.roll(values, start, axis=(0, 1)).T
+    dims = [
+        make("std_msgs/msg/MultiArrayDimension", label="column_index", size=columns, stride=rows * columns),
+        make("std_msgs/msg/MultiArrayDimension", label="row_index", size=rows, stride=rows),
+    ]
+    layout = make("std_msgs/msg/MultiArrayLayout", dim=dims, data_offset=0)
+    layer = make("std_msgs/msg/Float32MultiArray", layout=layout, data=stored.astype(np.float32).ravel())
+    info = make(
+        "grid_map_msgs/msg/GridMapInfo",
+        resolution=0.5,
+        length_x=rows / 2,
+        length_y=columns / 2,
+        pose=pose(10.0),
+    )
+    given = {"layers": ["elevation"], "basic_layers": [], "data": [layer]} | more
+    return make(
+        "grid_map_msgs/msg/GridMap",
+        header=header("odom"),
+        info=info,
+        outer_start_index=start[0],
+        inner_start_index=start[1],
+        **given,
+    )
+
+
+@pytest.mark.parametrize("start", [(0, 0), (2, 1)])
+def test_a_height_map_lies_where_it_is_measured(start: tuple[int, int]) -> None:
+    values = np.arange(12, dtype=np.float32).reshape(4, 3)
+    values[0, 0] = np.nan
+    (shape,) = decode_shapes(height_map(values, start), "GridMap", "/heights")
+    assert shape.frame_id == "odom" and shape.stamp == 7 and shape.surface is not None
+    surface = shape.surface
+    places = {float(z): (float(x), float(y)) for x, y, z in surface.vertices}
+    assert len(places) == 11 and places[1.0] == (10.75, 0.0) and places[11.0] == (9.25, -0.5)
+    assert len(surface.triangles) == 2 * 5, "the unknown corner has no triangles"
+    edges = surface.vertices[surface.triangles] - np.roll(surface.vertices[surface.triangles], 1, axis=1)
+    assert np.abs(edges[..., :2]).max() == 0.5, "of neighbours alone"
+
+
+def test_what_is_no_height_is_a_coloured_plane() -> None:
+    values = np.arange(4, dtype=np.float32).reshape(2, 2)
+    (shape,) = decode_shapes(height_map(values, layers=["cost"]), "GridMap", "/costs")
+    assert shape.surface is not None
+    assert (shape.surface.vertices[:, 2] == 0).all() and sorted(shape.surface.values) == [0, 1, 2, 3]
+    assert decode_shapes(height_map(np.full((2, 2), np.nan)), "GridMap", "/empty") == []
+    large = np.zeros((1500, 1000), np.float32)
+    (shape,) = decode_shapes(height_map(large), "GridMap", "/large")
+    assert shape.surface is not None and 100_000 < len(shape.surface.vertices) <= 250_000
+
+
+@pytest.mark.parametrize(
+    ("more", "why"),
+    [
+        ({"layers": ["a", "b"]}, "2 names of 1 layers"),
+        ({"layers": ["a"], "basic_layers": ["b"]}, "basic layer 'b' is not among"),
+        ({"data": [make("std_msgs/msg/Float32MultiArray", layout=make("std_msgs/msg/MultiArrayLayout", dim=[],
+          data_offset=0), data=np.zeros(3, np.float32))]}, "3 values in no cells"),
+    ],
+)  # fmt: skip
+def test_a_height_map_that_contradicts_itself(more: dict[str, Any], why: str) -> None:
+    with pytest.raises(MessageError, match=why):
+        decode_shapes(height_map(np.zeros((2, 2)), **more), "GridMap", "/heights")
+
+
+STL = b"""solid s
+facet normal 0 0 1
+outer loop
+vertex 0 0 0
+vertex 1 0 0
+vertex 0 1 0
+endloop
+endfacet
+endsolid s
+"""
+
+
+def test_meshes_that_are_here_are_shown(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, frame: Frame
+) -> None:
+    roof = tmp_path / "prefix/share/van/roof.stl"
+    roof.parent.mkdir(parents=True)
+    roof.write_bytes(STL)
+    monkeypatch.setenv("AMENT_PREFIX_PATH", f"{tmp_path / 'none'}:{tmp_path / 'prefix'}")
+    (tmp_path / "secret.txt").write_text("no mesh")
+    text = URDF.replace(
+        '<link name="mast"/>',
+        f"""<link name="mast"><visual><origin xyz="0 0 1"/><geometry>
+        <mesh filename="file://{roof}" scale="0.001 0.001 0.001"/></geometry></visual>
+        <visual><geometry><mesh filename="file://{tmp_path}/secret.txt"/></geometry></visual></link>""",
+    )
+    base, mast, _ = shapes = decode_shapes(
+        make("std_msgs/msg/String", data=text), "String", "/robot_description"
+    )
+    assert [mesh.path for mesh in base.meshes] == [roof] and base.solids is not None
+    (mesh,) = mast.meshes
+    assert mast.solids is None and mesh.scale == (0.001, 0.001, 0.001) and mesh.pose[2, 3] == 1
+    monkeypatch.delenv("AMENT_PREFIX_PATH")
+    monkeypatch.setenv("ROS_PACKAGE_PATH", str(roof.parent))
+    assert mesh_file("package://van/roof.stl") == roof
+    assert mesh_file("package://van/none.stl") is None and mesh_file("http://host/roof.stl") is None
+
+    def place(name: str, gone: str) -> Any:
+        return None if name == gone else np.eye(4)
+
+    around, path = Surroundings(), tmp_path / "meshes.rrd"
+    around.add_shapes("/robot_description", shapes)
+    with rr.RecordingStream("test") as recording:
+        recording.save(path)
+        logger = Logger(recording, load(), Scene("test", frame.lidar))
+        logger.log_static()
+        for index in range(3):
+            known = around.take(partial(place, gone="mast" if index else ""))
+            now = replace(frame, index=index, stamp=frame.stamp + index, around=known)
+            logger.log(FrameResult.unprocessed(now, load()))
+        later = logger.context
+    logged, asset = Recording(path), "/robot/robot_description/mast/mesh_0"
+    assert bytes(logged.static[asset]["Asset3D:blob"][0]) == STL
+    assert logged.static[asset]["InstancePoses3D:scales"] == [pytest.approx([0.001] * 3)]
+    scale = logged.at["/robot/robot_description/mast"]["Transform3D:scale"]
+    assert {number: value for number, value in scale.items() if value} == {1: [[0, 0, 0]], 2: [[0, 0, 0]]}
+    assert asset in later.fixed, "a recording that begins later has it, too"
+
+
+def test_samples_of_an_imu_go_with_the_frame_that_comes_next(frame: Frame, tmp_path: Path) -> None:
+    around, path = Surroundings(), tmp_path / "imu.rrd"
+    none = (np.nan, np.nan, np.nan)
+    with rr.RecordingStream("test") as recording:
+        recording.save(path)
+        logger = Logger(recording, load(), Scene("test", frame.lidar))
+        logger.log_static()
+        for index in range(2):
+            for k in range(3):
+                sample = frame.stamp + 10 * index + k
+                around.add_motion("/imu", sample, sample + 5, (index, k, 0.5), (0, 0, 9.8) if k else none)
+            now = replace(
+                frame, index=index, stamp=frame.stamp + 10 * index + 3, around=around.take(lambda _: None)
+            )
+            logger.log(FrameResult.unprocessed(now, load()))
+    assert around.take(lambda _: None) is None
+    rows = Recording(path).rows
+    turns, felt = rows["/motion/rotation_rad_s/imu"], rows["/motion/acceleration_m_s2/imu"]
+    assert [row["Scalars:scalars"] for row in turns] == [[i, k, 0.5] for i in range(2) for k in range(3)]
+    assert [row["frame"] for row in turns] == [0, 0, 0, 1, 1, 1] and len(felt) == 4
+    assert [row["stamp"] - frame.stamp for row in turns] == [0, 1, 2, 10, 11, 12]
+    for k in range(2 * SAMPLES):
+        around.add_motion("/imu", k, k, none, none)
+    taken = around.take(lambda _: None)
+    assert taken is not None and len(taken.motions[0].stamp) == SAMPLES

@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import importlib
 import textwrap
+from collections import defaultdict
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 import rerun.blueprint as rrb
 from rerun.chunk import RrdReader
 
+from bevviz.config import load
 from bevviz.errors import UserError
 from bevviz.frame import Scene
 from bevviz.logging import blueprints
@@ -23,8 +27,14 @@ SCENES = {
 
 def views(path: Path) -> dict[str, list[str]]:
     """Name -> contents of each view of a .rbl file."""
+    return {name: contents for name, (contents, _) in properties(path).items()}
+
+
+def properties(path: Path) -> dict[str, tuple[list[str], dict[str, Any]]]:
+    """Name -> contents and properties of each view of a .rbl file."""
     names: dict[str, str] = {}
     contents: dict[str, list[str]] = {}
+    others: dict[str, dict[str, Any]] = defaultdict(dict)
     reader = RrdReader(path)
     for chunk in reader.stream(store=reader.blueprints()[0]):
         parts = chunk.entity_path.strip("/").split("/")
@@ -37,7 +47,8 @@ def views(path: Path) -> dict[str, list[str]]:
                 names[parts[1]] = row["ViewBlueprint:display_name"][0]
             if row.get("ViewContents:query"):
                 contents[parts[1]] = row["ViewContents:query"]
-    return {names[key]: contents[key] for key in names}
+            others[parts[1]].update(row)
+    return {names[key]: (contents[key], others[key]) for key in names}
 
 
 def save(layout: rrb.Blueprint, path: Path) -> Path:
@@ -55,6 +66,33 @@ def test_every_layout_fits_every_scene(name: str, scene: Scene, tmp_path: Path) 
     found = views(save(blueprints.load(name, scene), tmp_path / "layout.rbl"))
     assert {"3D", "Bird's-eye view", *scene.cameras} <= set(found)
     assert found["3D"][:2] == ["/world/**", "/robot/**"]
+
+
+def test_the_eye_stays_with_the_robot_and_looks_at_what_is_explained(tmp_path: Path) -> None:
+    scene = replace(SCENES["one camera"], focus=(10.0, 0.0, -1.0))
+    _, debug = properties(save(blueprints.load("debug", scene), tmp_path / "debug.rbl"))["3D"]
+    assert debug["EyeControls3D:position"] == [[-16, 5, 11]]
+    assert debug["SpatialInformation:target_frame"] == ["tf#/world/lidar"]
+    _, near = properties(save(blueprints.load("explain", scene), tmp_path / "explain.rbl"))["3D"]
+    assert near["EyeControls3D:look_target"] == [[10, 0, -1]]
+    assert near["EyeControls3D:position"] == [[4, 2, 1.5]]
+
+
+def test_the_look_from_above_begins_ahead(tmp_path: Path) -> None:
+    scene = SCENES["one camera"]
+    path = save(blueprints.load("debug", scene, load()), tmp_path / "layout.rbl")
+    _, above = properties(path)["Bird's-eye view"]
+    assert above["VisualBounds2D:range"] == [{"x_range": [200, 600], "y_range": [40, 500]}]
+    _, all_of_it = properties(save(blueprints.load("debug", scene), tmp_path / "all.rbl"))["Bird's-eye view"]
+    assert not all_of_it.get("VisualBounds2D:range")
+
+
+def test_logs_show_frame_time_and_text(tmp_path: Path) -> None:
+    _, log = properties(save(blueprints.load("debug", SCENES["one camera"]), tmp_path / "layout.rbl"))["Log"]
+    (columns,) = (value for name, value in log.items() if name.endswith("timeline_columns"))
+    assert [column["timeline"] for column in columns] == ["frame", "stamp"]
+    (parts,) = (value for name, value in log.items() if name.endswith("text_log_columns"))
+    assert len(parts) == 1
 
 
 def test_the_explained_chain_is_in_its_layout_alone(tmp_path: Path) -> None:

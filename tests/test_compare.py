@@ -450,8 +450,12 @@ def test_the_truth_says_which_side_is_right(demo: str, capsys: Capture) -> None:
     assert sum(there.values()) > 10
     for name, counts in tables["broke"]["classes"].items():
         assert counts["B"] == counts.get("fixed", 0) == tables["fixed"]["classes"][name].get("broke", 0)
-    (page,) = Recording(Path("c.rrd")).at["/compare"]["TextDocument:text"][0]
-    assert "#### Fixed by B: " in page and "found of" in page
+    recording = Recording(Path("c.rrd"))
+    (page,) = recording.at["/compare"]["TextDocument:text"][0]
+    labels = recording.at["/compare/objects/fixed"]["Boxes3D:labels"][0]
+    assert f"#### Fixed by B: {len(labels)}\n" in page and "found of" in page
+    assert sum(map(bool, labels)) == min(len(labels), 6) and "/compare/objects/broken" not in recording.at
+    assert all(label.startswith("fixed: ") for label in labels if label)
 
 
 def test_without_a_detector_it_is_not_said_that_nothing_differs(demo: str, capsys: Capture) -> None:
@@ -467,6 +471,9 @@ def test_both_views_follow_the_robot(demo: str) -> None:
     one, other = side_space(scene, ""), side_space(scene, entities.B)
     origins = [str(view.origin) for view in (one, other)]
     assert origins == ["/world/rslidar", "/b/world/rslidar"]
+    for view, origin in zip((one, other), origins, strict=True):
+        (target, *_) = view.properties["SpatialInformation"].as_component_batches()
+        assert target.as_arrow_array().to_pylist() == [f"tf#{origin}"]
     eyes = [
         [batch.as_arrow_array() for batch in view.properties["EyeControls3D"].as_component_batches()]
         for view in (one, other)

@@ -114,3 +114,24 @@ def test_several_topics_are_told_and_nothing_grows(first: Frame) -> None:
     for index in range(1, 3 * WAITING):
         against.see(result(first, index), [(index, theirs(first, 1, "/a"))])
     assert len(against._waiting) == WAITING and len(against._late) <= WAITING
+
+
+def test_a_frame_that_ours_made_nothing_of_is_not_compared(first: Frame) -> None:
+    """Nothing was found and nothing was looked for are two things: a failed stage is no difference."""
+    against = AgainstRobot("", CONFIG.live)
+    (before,) = against.see(result(first, 0, robot=11.0))
+    assert before.found.counts[Change.MOVED] == 1
+    for index in range(1, 9):
+        failed = replace(result(first, index, robot=11.0), objects=None)
+        assert against.see(failed) == []
+        assert against.reason() is None
+    assert (against.frames, against.differing, against.without_ours) == (1, 1, 8)
+    assert against.see(result(first, 9)) == []
+    late = [(result(first, 9).frame.stamp, theirs(first, 10.0))]
+    (after,) = against.see(replace(result(first, 10), objects=None), late)
+    assert after.found.index == 9 and after.found.counts == {Change.SAME: 1}
+    nobody = Objects(
+        Boxes3D.empty(), (), np.zeros(0, np.float32), np.zeros(0, np.int32), (), np.zeros(0, np.int32)
+    )
+    (nothing,) = against.see(replace(result(first, 11, robot=10.0), objects=nobody))
+    assert nothing.found.counts == {Change.ONLY_B: 1}

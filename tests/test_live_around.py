@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from bevviz.bags.source import BagSource
@@ -92,7 +93,48 @@ class Robot:
             detection.bbox.center.position.x += 1.0
         self.say("/detection/fused_3d", BOXES, message)
 
+    def height_map(self) -> None:
+        layout = make(
+            "std_msgs/msg/MultiArrayLayout",
+            dim=[
+                make("std_msgs/msg/MultiArrayDimension", label="column_index", size=2, stride=4),
+                make("std_msgs/msg/MultiArrayDimension", label="row_index", size=2, stride=2),
+            ],
+            data_offset=0,
+        )
+        heights = np.array([0, 2, 1, 3], np.float32)
+        info = make(
+            "grid_map_msgs/msg/GridMapInfo", resolution=0.5, length_x=1.0, length_y=1.0, pose=pose(0.0)
+        )
+        message = make(
+            "grid_map_msgs/msg/GridMap",
+            header=header("map"),
+            info=info,
+            layers=["elevation"],
+            basic_layers=["elevation"],
+            data=[make("std_msgs/msg/Float32MultiArray", layout=layout, data=heights)],
+            outer_start_index=0,
+            inner_start_index=0,
+        )
+        self.say("/heights", "grid_map_msgs/msg/GridMap", message)
+
+    def imu(self) -> None:
+        known, x = np.zeros(9), "geometry_msgs/msg/Vector3"
+        message = make(
+            "sensor_msgs/msg/Imu",
+            header=header("imu"),
+            orientation=pose(0.0).orientation,
+            orientation_covariance=known,
+            angular_velocity=make(x, x=0.1, y=0.2, z=0.3),
+            angular_velocity_covariance=known,
+            linear_acceleration=make(x, x=0.0, y=0.0, z=9.8),
+            linear_acceleration_covariance=known,
+        )
+        self.say("/imu", "sensor_msgs/msg/Imu", message)
+
     def path(self) -> None:
+        self.imu()
+        self.height_map()
         poses = [
             make("geometry_msgs/msg/PoseStamped", header=header("map"), pose=pose(x)) for x in (0.0, 1.0, 2.0)
         ]
@@ -182,6 +224,18 @@ def fly(folder: Path) -> Flight:
 PARTS = ("pipeline", "anomalies", "sources")
 
 
+def test_heights_are_a_surface_and_an_imu_is_plotted(flight: Flight) -> None:
+    recording = Recording(flight.folder / "snap.rrd")
+    vertices = recording.column("/robot/heights", "Mesh3D:vertex_positions")[-1]
+    assert [vertex[2] for vertex in vertices] == [0.0, 1.0, 2.0, 3.0]
+    assert len(recording.column("/robot/heights", "Mesh3D:triangle_indices")[-1]) == 2
+    turns = recording.rows["/motion/rotation_rad_s/imu"]
+    assert len(turns) >= 2 and turns[-1]["Scalars:scalars"] == [0.1, 0.2, 0.3]
+    felt = [row["Scalars:scalars"] for row in recording.rows["/motion/acceleration_m_s2/imu"]]
+    assert felt[-1] == [0.0, 0.0, 9.8]
+    assert recording.static["/motion/rotation_rad_s/imu"]["SeriesLines:names"] == ["x", "y", "z"]
+
+
 def test_a_mark_is_a_note_at_one_frame(flight: Flight) -> None:
     recording = Recording(flight.folder / "snap.rrd")
     (logged,) = (row for row in recording.rows["/explain/log"] if MARK in str(row["TextLog:text"]))
@@ -228,7 +282,8 @@ def test_a_plan_is_shown_where_it_is(flight: Flight) -> None:
     recording = Recording(flight.folder / "snap.rrd")
     (strip,) = recording.column("/robot/plan", "LineStrips3D:strips")[-1]
     assert [point[0] for point in strip] == [0.0, 1.0, 2.0]
-    (shape,) = flight.frames[-1].around.shapes if flight.frames[-1].around else ()
+    assert flight.frames[-1].around is not None
+    (shape,) = (shape for shape in flight.frames[-1].around.shapes if shape.topic == "/plan")
     assert shape.world_from_shape is not None and shape.frame_id == "map"
 
 
@@ -238,5 +293,6 @@ def test_the_bag_tells_the_same(flight: Flight) -> None:
         assert source.roles.notes["/plan"] == "shown: around perception"
     assert [f.around.marks for f in frames if f.around and f.around.marks] == [(MARK,)]
     last = frames[-1].around
-    assert last is not None and len(last.shapes) == 1
+    assert last is not None and {shape.topic for shape in last.shapes} == {"/plan", "/heights"}
+    assert sum(len(f.around.motions) for f in frames if f.around) >= 2
     assert {(s.name, s.level) for s in last.statuses if s.name == "lidar/fan"} == {("lidar/fan", "warning")}

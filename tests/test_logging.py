@@ -53,6 +53,7 @@ from bevviz.frame import (
     Voxels,
 )
 from bevviz.logging.cloud import quantised
+from bevviz.logging.decisions import page
 from bevviz.logging.entities import DEPTH_BINS, DEPTH_RANGE, TRACK_COLORS, ClassId
 from bevviz.logging.health import Rates
 from bevviz.logging.logger import Logger
@@ -497,7 +498,7 @@ def test_explanations_in_words_and_as_states(record: Callable[..., Recording]) -
         listed = explanation.text in page
         assert listed or explanation.state == "out_of_view", explanation
     assert "1 out of view: 1" in page
-    assert page.index("person 0.90") < page.index("car 0.50") < page.index("car 0.10")
+    assert page.index("car 0.50") < page.index("person 0.90") < page.index("car 0.10")
 
     lines = [row for row in found.rows["/explain/log"] if row["frame"] == 0]
     assert [row["TextLog:level"] for row in lines] == [["INFO"]]
@@ -680,7 +681,7 @@ def test_tracks(record: Callable[..., Recording]) -> None:
     assert len(trail) == 4
     (trail,) = found.at["/bev/overlay/trails"]["LineStrips2D:strips"][3]
     np.testing.assert_allclose(trail, [[395.0, 320.0]] * 4, atol=0.1)
-    assert found.at["/bev/overlay/tracks"]["LineStrips2D:labels"][3] == ["#0 0.0 m/s"]
+    assert found.at["/bev/overlay/tracks"]["LineStrips2D:labels"][3] == ["person #0 0.0 m/s"]
     assert found.column("/tracks/states/00", "StateChange:state") == [["person #0"]]
     speeds = found.column("/tracks/speed_m_s", "Scalars:scalars")
     assert [np.isfinite(lanes).sum() for lanes in speeds] == [0, 0, 1, 1]
@@ -701,6 +702,71 @@ def test_lanes_are_few_and_are_kept() -> None:
     assert lanes.update(None) == {}
 
 
+def test_what_is_hovered_over_says_what_it_is(record: Callable[..., Recording]) -> None:
+    """The viewer's tooltip shows what differs from row to row, three values at most."""
+    result = make()
+    found = record([result, dataclasses.replace(make(1), objects=None)])
+    for boxes, sentences, names in (
+        ("/world/fused", ["person 0.90, 8.0 m away: 14 points"] * 2, ["person 0.90"] * 2),
+        (
+            "/world/zed/image/detections",
+            ["person 0.90: 14 points", "car 0.50: no cluster"],
+            ["person 0.90", "car 0.50"],
+        ),
+    ):
+        for child, columns in (("outlines", ("strips", "colors")), ("names", ("positions", "labels"))):
+            rows = found.at[f"{boxes}/{child}"]
+            perrow = {key: value[0] for key, value in rows.items() if len(value.get(0, ())) > 1}
+            assert {key.rpartition(":")[2] for key in perrow} == {*columns, "says"}
+            for says, sentence in zip(perrow["says"], sentences, strict=True):
+                assert says.startswith(sentence)
+        assert found.at[f"{boxes}/names"][f"Points{'3' if 'fused' in boxes else '2'}D:labels"][0] == names
+    assert found.cleared("/world/fused/outlines") == found.cleared("/world/fused/names") == {1}
+    (corner, *_), _ = found.at["/world/zed/image/detections/outlines"]["LineStrips2D:strips"][0]
+    assert list(corner) == [20.5, 10.5]
+
+
+def test_few_names_are_shown(record: Callable[..., Recording]) -> None:
+    """Those of the six nearest, and of what has an anomaly."""
+    frames = [make(i) for i in range(4)]
+    many = Boxes3D(
+        f32(*([10.0 * k + 5, 0, 0] for k in range(9))), f32(*[[1, 1, 1]] * 9), np.zeros(9, np.float32)
+    )
+    last = frames[-1].objects
+    assert last is not None
+    rows = np.zeros(9, np.int32)
+    objects = Objects(many, ("car",) * 9, np.full(9, 0.5, np.float32), rows, ("zed",) * 9, rows)
+    frames[-1] = dataclasses.replace(frames[-1], objects=objects, anomalies=())
+    (labels,) = record(frames[-1:]).column("/world/fused/names", "Points3D:labels")
+    assert labels == ["car 0.50"] * 6 + [""] * 3
+    tracked_last = list(tracked(make(i) for i in range(4)))[-1]
+    assert tracked_last.tracks is not None
+    tracks = dataclasses.replace(tracked_last.tracks, object=np.array([8]))
+    odd = Anomaly("jump", "person #0", "person #0 moved")
+    frame = dataclasses.replace(tracked_last, objects=objects, tracks=tracks, anomalies=(odd,))
+    (labels,) = record([frame]).column("/world/fused/names", "Points3D:labels")
+    assert [bool(label) for label in labels] == [True] * 6 + [False, False, True]
+    assert labels[8].startswith("person #0 ")
+
+
+def test_suppressed_detections_are_counted() -> None:
+    result = make()
+    detections = Detections(
+        f32(*[[20, 10, 30, 30]] * 5),
+        f32(0.9, 0.8, 0.7, 0.6, 0.2),
+        np.array([2, 2, 7, 2, 2], np.int32),
+        ("car", "car", "truck", "car", "car"),
+        np.array([DetectionState.KEPT, *[DetectionState.SUPPRESSED] * 3, DetectionState.BELOW_THRESHOLD]),
+        np.array([-1, 0, 0, 0, -1], np.int32),
+        f32(0, 0.9, 0.9, 0.9, 0),
+    )
+    camera = dataclasses.replace(result.cameras[0], detections=detections, fusion=None)
+    explanations = explain([camera], None, load())
+    text = page(dataclasses.replace(result, cameras=(camera,), explanations=explanations))
+    assert "- 3 (2 car, 1 truck) suppressed by car 0.90\n- car 0.20: below" in text
+    assert text.count("suppressed") == 1
+
+
 def test_anomalies(record: Callable[..., Recording]) -> None:
     stamps = [make(i).frame.stamp for i in range(4)]
     late = Anomaly("sync", "zed", "zed is +60 ms off the cloud", since=stamps[1])
@@ -716,6 +782,8 @@ def test_anomalies(record: Callable[..., Recording]) -> None:
         ["tf: zed is lost"],
         ["tf: lidar is lost"],
     ]
+    colors = found.static["/anomalies/states/tf"]
+    assert colors["StateConfiguration:values"] == ["zed +1"]
     counts = np.array(found.column("/anomalies/count", "Scalars:scalars"))
     assert counts[:, KINDS.index("tf")].tolist() == [0, 0, 2, 0]
 

@@ -20,7 +20,9 @@ from bevviz.bags.source import BagSource, FrameSelection
 from bevviz.batch.task import JobResults
 from bevviz.cli import main
 from bevviz.config import load
+from bevviz.errors import UserError
 from bevviz.logging import entities
+from bevviz.logging.parts import PartsWriter
 from bevviz.logging.recorder import OrderedRecorder
 from bevviz.logging.sinks import open_recording
 from bevviz.parallel.run import run_windows
@@ -72,7 +74,7 @@ def check_windows(bag: Path, selection: FrameSelection, length: int) -> int:
 
         def in_windows() -> Iterator[Any]:
             nonlocal count
-            for window in cutter.windows(length):
+            for window in cutter.windows(lambda left: length):
                 count += 1
                 with selection.source([bag], config) as other:
                     yield from (frame for frame, mine in other.window(window) if mine)
@@ -136,7 +138,9 @@ def plain(value: Any) -> Any:
     return "nan" if isinstance(value, float) and math.isnan(value) else value
 
 
-def serially(jobs: Iterable[WindowJob], on_frame: Callable[[], None]) -> JobResults:
+def serially(
+    jobs: Iterable[WindowJob], on_frame: Callable[[], None], tick: Callable[[], None] = lambda: None
+) -> JobResults:
     """An engine without processes, for what does not depend on them."""
     for job in jobs:
         yield job.run(1, on_frame)
@@ -181,7 +185,9 @@ def test_an_interrupted_run_leaves_a_recording_of_whole_windows(tmp_path: Path, 
     with bevviz.open(bag, set=SETTINGS) as drive:
         assert isinstance(drive.frames, BagSource)
 
-        def until(jobs: Iterable[WindowJob], on_frame: Callable[[], None]) -> JobResults:
+        def until(
+            jobs: Iterable[WindowJob], on_frame: Callable[[], None], tick: Callable[[], None]
+        ) -> JobResults:
             nonlocal made
             for result in serially(jobs, on_frame):
                 yield result
@@ -189,10 +195,10 @@ def test_an_interrupted_run_leaves_a_recording_of_whole_windows(tmp_path: Path, 
                 if made == 2:
                     stop.set()
 
-        with open_recording(drive.scene, drive.config, save=saved) as sinks:
+        with open_recording(drive.scene, drive.config, save=saved, in_parts=True) as sinks:
             seen = [OrderedRecorder(sinks.recording, drive.config)]
             end = run_windows(drive, drive.new_session(), sinks, seen, 2, until, stop)
-    assert end.frames == 16
+    assert end.frames == 9 + 8
     recording = Recording(saved)
     assert sorted(recording.times["stamp"]) == list(range(end.frames))
     assert not any(tmp_path.glob(".bevviz-windows-*"))
@@ -211,3 +217,21 @@ def test_what_may_remember_is_run_in_one_process(
     said = capsys.readouterr().err
     assert "in one process: mine:flat may remember what it saw" in said
     assert len(Recording(saved).times["stamp"]) == 2
+
+
+def test_the_address_of_a_cluster_reaches_it(
+    tmp_path: Path, bag: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    saved = tmp_path / "saved.rrd"
+    assert main(["bag", str(bag), "--dask", "tcp://127.0.0.1:9", "--save", str(saved)]) == 2
+    assert "--dask tcp://127.0.0.1:9: nobody answers there" in capsys.readouterr().err
+    assert [path.name for path in tmp_path.iterdir() if path.suffix != ".rrd"] == []
+
+
+def test_a_part_that_cannot_be_written_any_more_is_said(tmp_path: Path, bag: Path) -> None:
+    writer = PartsWriter(tmp_path / "no" / "such.rrd")
+    (tmp_path / "part.rrd").write_bytes(bytes(1 << 22))
+    writer.add(tmp_path / "part.rrd")
+    writer.close()
+    with pytest.raises(UserError, match="the recording ends early: rerun rrd route"):
+        writer.check()

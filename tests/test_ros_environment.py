@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from bevviz.errors import UserError
-from bevviz.ros.environment import load_rclpy
+from bevviz.ros.environment import load_rclpy, middlewares
 
 
 def _install(folder: Path, code: str, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -60,3 +60,16 @@ def test_rclpy_of_a_sourced_ros_for_another_python(
     monkeypatch.setenv("AMENT_PREFIX_PATH", "/opt/ros/jazzy:/elsewhere")
     with pytest.raises(UserError, match=r"sourced ROS in /opt/ros/jazzy .* without `source"):
         load_rclpy()
+
+
+def test_middlewares_are_told_from_their_libraries(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "lib").mkdir()
+    for name in (
+        "rmw_zenoh_cpp",
+        "rmw_dds_common__rosidl_typesupport_fastrtps_cpp",
+        "rmw_fastrtps_shared_cpp",
+    ):
+        (tmp_path / f"lib/lib{name}.so").touch()
+    monkeypatch.setenv("AMENT_PREFIX_PATH", str(tmp_path))
+    there = middlewares()
+    assert "rmw_zenoh_cpp" in there and not any("__" in name or "shared" in name for name in there)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from functools import partial
 from types import SimpleNamespace
 from typing import Any
 
@@ -26,7 +27,7 @@ from bevviz.frame import (
     LabelledBoxes2D,
     LabelledBoxes3D,
 )
-from bevviz.ros.messages import StampedTransform
+from bevviz.ros.messages import MessageError, StampedTransform
 from bevviz.ros.roles import CameraRole, Roles
 from bevviz.sync.clocks import Clocks
 from bevviz.sync.feed import make_handlers
@@ -553,6 +554,23 @@ def test_world_is_the_map_and_never_the_globe() -> None:
     assert stated.clouds(0.0)[0].world_frame == "odom"
 
 
+def test_truth_that_cannot_be_decoded_is_as_if_it_had_not_come() -> None:
+    feed = Feed(replace(ONE, cameras=(), truth="/ground_truth"))
+    feed.calibration()
+    feed.odometry(turning, -0.1, 1.0)
+
+    def broken() -> LabelledBoxes3D:
+        raise MessageError("/ground_truth: not a Detection3DArray: cut")
+
+    near = boxes(0.02, "/ground_truth", "base_link")
+    feed.sync.add_truth("/ground_truth", ns(0.0), 0, broken)
+    feed.sync.add_truth("/ground_truth", near.stamp, 0, partial(replace, near))
+    feed.sync.add_cloud(cloud(0.0))
+    (frame,) = feed.sync.flush()
+    assert frame.truth is not None and frame.truth.stamp == near.stamp
+    assert "1 message(s) of /ground_truth could not be used" in " ".join(feed.sync.report.warnings())
+
+
 def test_results_of_the_robot_go_to_the_one_nearest_frame() -> None:
     feed = Feed(replace(ONE, cameras=(), robot_detections_3d=("/detection/fused_3d",), truth="/ground_truth"))
     feed.calibration()
@@ -563,7 +581,8 @@ def test_results_of_the_robot_go_to_the_one_nearest_frame() -> None:
         frames += feed.sync.ready()
     for t in (0.0, 0.12, 0.14, 0.3):  # that of 0.14 belongs to a cloud that has a nearer one
         feed.sync.add_boxes(boxes(t))
-        feed.sync.add_truth(boxes(t, "/ground_truth", "base_link"))
+        truth = boxes(t, "/ground_truth", "base_link")
+        feed.sync.add_truth(truth.topic, truth.stamp, 0, partial(replace, truth))
         frames += feed.sync.ready()
     frames += feed.sync.flush()
     assert [[b.stamp for b in f.robot_boxes] for f in frames] == [[ns(0.0)], [ns(0.12)], [], [ns(0.3)]]

@@ -199,7 +199,7 @@ def test_a_recording_has_every_packet_untouched_also_in_windows(tmp_path: Path) 
 
     made = []
     with BagSource([path], load()) as source:
-        for window in source.windows(13):
+        for window in source.windows(lambda _: 13):
             job = WindowJob(window, (path,), load(), source.selection, tmp_path, "id")
             assert not job.run(1).error
             made += samples(job.recording)

@@ -534,6 +534,9 @@ def test_the_command_answers_and_draws(bag: Path, tmp_path: Path, capsys: Captur
     assert recording.column("/explain/why/place", "LineStrips3D:strips")
     assert recording.column("/explain/why/zed/place", "Boxes2D:half_sizes")
     assert recording.column("/explain", "TextDocument:text"), "the frame itself is there, too"
+    (lines,) = recording.column("/explain/why/legend", "Points3D:labels")
+    assert lines[0] == f"{len(points)} taken for ground" and lines[1] == "the car at 10.1 m"
+    assert recording.column("/bev/overlay/why", "LineStrips2D:strips")
 
 
 def test_the_command_for_machines(bag: Path, capsys: Capture) -> None:

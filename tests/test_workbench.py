@@ -687,6 +687,10 @@ def test_rows_of_what_is_drawn_are_rows_of_the_result(result: FrameResult) -> No
     )
     assert pick(result, None, entities.weak(name), 0, ()) == Pick("detection", weak[0], name)
     assert pick(result, None, entities.FUSED, 0, (1, 2, 3)) == Pick("object", 0)
+    assert pick(result, None, entities.outlines(entities.FUSED), 0, (1, 2, 3)) == Pick("object", 0)
+    assert pick(result, None, entities.names(entities.detections(name)), 0, ()) == pick(
+        result, None, entities.detections(name), 0, ()
+    )
     assert pick(result, None, entities.TRUTH, 2, ()) == Pick("truth", 2)
     lidar = result.frame.lidar
     assert pick(result, None, entities.set_aside(lidar), 0, ()) == Pick("cluster", aside[0])

@@ -97,6 +97,7 @@ class Channel:
     def piece(self) -> bytes:
         data = self._socket.recv(timeout=WAIT)
         assert isinstance(data, bytes)
+        self._socket.send("")  # it is drawn
         return data
 
     def until(self, kind: str, number: int | None = None) -> dict[str, Any]:

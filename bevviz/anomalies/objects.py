@@ -255,7 +255,8 @@ def _sight(result: FrameResult, tracks: Tracks) -> _Sight:
     detected = np.zeros(n, bool)
     asked = np.flatnonzero(tracks.confirmed)
     if len(asked):
-        open_[asked] = visible(range_image(result.frame.points), boxes.chosen(asked))
+        image = range_image(result.frame.points) if result.ranges is None else result.ranges
+        open_[asked] = visible(image, boxes.chosen(asked))
     for camera in result.cameras:
         places = _in_image(camera, boxes.chosen(asked))
         if places is None or camera.detections is None:

@@ -18,6 +18,7 @@ from bevviz.bags.source import SECOND, BagSource, iso
 from bevviz.config import Config, stage_topics, stated_lines
 from bevviz.errors import UserError
 from bevviz.frame import Camera, Frame
+from bevviz.provenance import model_path
 from bevviz.ros.roles import Roles, Topic, find_roles
 from bevviz.text import printable
 
@@ -50,6 +51,7 @@ class Contents:
     tree: Mapping[str, str] = field(default_factory=dict)  # child frame -> parent frame
     points_frame: str = ""
     world_frame: str = ""  # "": the fixed frame is not connected
+    network: str = ""  # what the detector's runs on; "": there is none
     configured: tuple[str, ...] = ()  # where parameters are stated, and which
     missing: tuple[str, ...] = ()  # for a full run, with the option that gives it
     warnings: tuple[str, ...] = ()
@@ -113,10 +115,21 @@ def _describe(
         tree=dict(source.tree) if source else {},
         points_frame=frame.points_frame if frame else "",
         world_frame=frame.world_frame if frame and frame.world_from_points is not None else "",
+        network=network_of(config),
         configured=tuple(stated_lines(config)),
         missing=tuple(missing),
         warnings=(*recording.warnings, *(source.doubts if source else ())),
     )
+
+
+def network_of(config: Config) -> str:
+    """What the detector's network runs on here, or why it does not; empty: there is none."""
+    path = model_path(config)
+    if path is None:
+        return ""
+    from bevviz.stages.detector.providers import network
+
+    return network(path, config.detector.provider)
 
 
 def _topic(recording: Recording, topic: Topic, roles: Roles) -> TopicInfo:
@@ -229,6 +242,7 @@ def render_contents(about: Mapping[str, str], info: Contents) -> str:
         *_section("roles", [f"{t.name}: {t.role}" for t in info.topics if t.role]),
         *_section("cameras", [_camera(camera) for camera in info.cameras]),
         *_section("transforms", list(_tree(info))),
+        *_section("network runs on", [info.network] if info.network else []),
         *_section("configured by", info.configured),
         *_section("missing for a full run", info.missing or ["nothing"]),
         *_section("warnings", info.warnings),

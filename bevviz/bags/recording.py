@@ -47,7 +47,7 @@ from bevviz.datasets.reader import DatasetReader
 from bevviz.errors import UserError, first_line
 from bevviz.files import Scratch, bag_files, drive_files
 from bevviz.frame import I64
-from bevviz.ros import foxglove, video, vision_msgs
+from bevviz.ros import foxglove, grid_map_msgs, video, vision_msgs
 from bevviz.ros.livox import fields_of, is_livox, read_custom
 from bevviz.ros.messages import MessageError, read_header
 from bevviz.ros.roles import Topic
@@ -354,6 +354,7 @@ class Recording(Closing):
             if store is None:
                 store = get_typestore(Stores.ROS1_NOETIC if ros1 else self._default)
                 vision_msgs.register(store)
+                grid_map_msgs.register(store)
                 video.register(store)
             self._stores[key] = store
         return self._stores[key]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from functools import cached_property
@@ -180,20 +180,24 @@ class BagSource(Closing):
     def __iter__(self) -> Iterator[Frame]:
         return self._frames(self._low, self._high, self._first, self._chosen)
 
-    def windows(self, length: int) -> Iterator[Window]:
-        """The same frames in windows of so many, two at least, each to be read by another source.
+    def windows(self, length: Callable[[int], int]) -> Iterator[Window]:
+        """The same frames in windows, each to be read by another source.
 
-        All messages are read for it, but no image is decoded and no frame made: what frames lack is not among
-        the warnings then, see ``add_losses``.
+        ``length`` tells how many frames one has, two at least, by how many there are left. All messages are
+        read for it, but no image is decoded and no frame made: what frames lack is not among the warnings
+        then, see ``add_losses``.
         """
         state = self._begin(self._low)
         state.sync.skims = True
         content, again = dumps(state), 0
+        number, first, end = 0, 0, length(self.total)
         for n, _ in enumerate(self._deliver(state, self._low, self._high, self._first, self._chosen)):
-            if n % length == 0:
-                yield Window(n // length, length, again, content)
-            if n % length == length - 2:
+            if n == first:
+                yield Window(number, end - first, again, content)
+            if n == end - 2:
                 content, again = dumps(state), 1
+            if n == end - 1:
+                number, first, end = number + 1, end, end + length(max(self.total - end, 0))
 
     def window(self, window: Window) -> Iterator[tuple[Frame, bool]]:
         """Its frames, and before them, told by False, the last one of the window before."""

@@ -5,14 +5,14 @@ from __future__ import annotations
 import io
 import pickle
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
 from bevviz.bags.recording import RawMessage, Recording
-from bevviz.frame import Image
-from bevviz.ros.messages import MessageError, decode_compressed_image, decode_image
+from bevviz.ros.messages import MessageError
 from bevviz.sync.damage import Damage
-from bevviz.sync.feed import ImageLoader
+from bevviz.sync.feed import Loader
 from bevviz.sync.synchronizer import Synchronizer
 from bevviz.sync.video import Video
 
@@ -48,13 +48,15 @@ class Losses:
     without_image: Counter[str]
     undecodable: Counter[str]
     first_undecodable: dict[str, str]
+    damage: Damage
     problems: Counter[str]
     oddities: dict[str, str]
 
     @staticmethod
     def of(sync: Synchronizer) -> Losses:
         r = sync.report
-        return Losses(r.images, r.without_image, r.undecodable, r.first_undecodable, r.problems, r.oddities)
+        decoded = r.images, r.without_image, r.undecodable, r.first_undecodable, r.damage
+        return Losses(*decoded, r.problems, r.oddities)
 
     @staticmethod
     def forget(sync: Synchronizer) -> None:
@@ -62,7 +64,7 @@ class Losses:
         r = sync.report
         r.images = 0
         r.without_image, r.undecodable, r.problems = Counter(), Counter(), Counter()
-        r.first_undecodable = {}
+        r.first_undecodable, r.damage = {}, Damage()
 
     def add_to(self, sync: Synchronizer) -> None:
         """Those of a window, to the report of who skimmed it."""
@@ -71,13 +73,14 @@ class Losses:
         r.without_image += self.without_image
         r.undecodable += self.undecodable
         r.problems += self.problems
+        r.damage.extend(self.damage)
         for mine, others in ((r.first_undecodable, self.first_undecodable), (r.oddities, self.oddities)):
             for key, text in others.items():
                 mine.setdefault(key, text)
 
 
 def dumps(state: ReadingState) -> bytes:
-    """As bytes. Images that wait are told by where they are in the recording, and so is video."""
+    """As bytes. Messages that wait to be decoded, and video, are told by where they are in the recording."""
     file = io.BytesIO()
     _Pickler(file, pickle.HIGHEST_PROTOCOL).dump(state)
     return file.getvalue()
@@ -105,28 +108,27 @@ class _Place:
 
 
 @dataclass(frozen=True, slots=True)
-class _PlacedImage:
-    """As ``ImageLoader``, of a message that is looked up when the image is needed."""
+class _Placed:
+    """As ``Loader``, of a message that is looked up when it is needed."""
 
     place: _Place
-    compressed: bool
+    read: Callable[[Any, str, int], Any]
     recording: Recording
 
-    def __call__(self) -> Image:
+    def __call__(self) -> Any:
         place = self.place
         for message in self.recording.messages([place.topic], place.received, place.received + 1):
             if _Place.of(message) == place:
-                decode_pixels = decode_compressed_image if self.compressed else decode_image
-                return decode_pixels(self.recording.decode(message), place.topic, place.received)
-        raise MessageError(f"{place.topic}: an image is gone from the recording")
+                return self.read(self.recording.decode(message), place.topic, place.received)
+        raise MessageError(f"{place.topic}: a message is gone from the recording")
 
 
 class _Pickler(pickle.Pickler):
     def persistent_id(self, obj: object) -> tuple[object, ...] | None:
-        if isinstance(obj, ImageLoader):
-            return "image", _Place.of(obj.message), obj.compressed
-        if isinstance(obj, _PlacedImage):
-            return "image", obj.place, obj.compressed
+        if isinstance(obj, Loader):
+            return "message", _Place.of(obj.message), obj.read
+        if isinstance(obj, _Placed):
+            return "message", obj.place, obj.read
         if isinstance(obj, Video):
             return "video", obj.topic
         return None
@@ -138,8 +140,8 @@ class _Unpickler(pickle.Unpickler):
         self._recording = recording
         self._videos: dict[str, Video] = {}
 
-    def persistent_load(self, pid: Any) -> _PlacedImage | Video:
+    def persistent_load(self, pid: Any) -> _Placed | Video:
         if pid[0] == "video":
             return self._videos.setdefault(pid[1], Video(pid[1], self._recording.packets))
-        _, place, compressed = pid
-        return _PlacedImage(place, compressed, self._recording)
+        _, place, read = pid
+        return _Placed(place, read, self._recording)

@@ -5,138 +5,175 @@ from __future__ import annotations
 import os
 import signal
 from collections import Counter, deque
-from collections.abc import Callable, Iterable, Sized
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from importlib import import_module
 from multiprocessing import get_context
 from multiprocessing.connection import Connection, wait
 from multiprocessing.context import SpawnProcess
 
 from bevviz.batch.task import JobResult, JobResults, Task
+from bevviz.closing import Closing
 
 # concurrent.futures is of no use here: a worker that dies breaks the pool and every job that was on its way.
 
 SIGNALS = {signal.SIGINT, signal.SIGTERM, signal.SIGHUP}
+TICK = 0.2  # seconds
 
 
 @dataclass
 class _Worker:
     process: SpawnProcess
     pipe: Connection
-    job: Task
+    job: Task | None = None
 
 
-def run_local(jobs: Iterable[Task], workers: int, retries: int, on_frame: Callable[[], None]) -> JobResults:
-    """Run the jobs, each once, and yield how they ended, as they end.
+class Processes(Closing):
+    """Worker processes. They start at once, and load what their jobs need while these are being found.
 
     Args:
-        jobs: what to do; the first ones first. Each is asked for when a worker is free.
-        workers: processes at the same time.
-        retries: how often a job is run again whose process died, or that failed for no fault of its bag.
-        on_frame: called for each frame of any of them.
+        count: processes at the same time.
+        modules: that they import meanwhile.
     """
-    if isinstance(jobs, Sized):
-        workers = min(workers, len(jobs))
-    threads = max(1, (os.cpu_count() or 1) // max(workers, 1))
-    coming = iter(jobs)
-    again: deque[Task] = deque()
-    attempts: Counter[str] = Counter()
-    busy: list[_Worker] = []
 
-    def following() -> Task | None:
-        return again.popleft() if again else next(coming, None)
+    def __init__(self, count: int, modules: Sequence[str] = ()) -> None:
+        self.count = count
+        self._threads = max(1, (os.cpu_count() or 1) // max(count, 1))
+        self._modules = tuple(modules)
+        self._idle: list[_Worker] = []
+        try:
+            while len(self._idle) < count:
+                self._idle.append(self._start())
+        except BaseException:
+            self.close()
+            raise
 
-    try:
-        while len(busy) < workers and (job := following()) is not None:
-            busy.append(_start(job, threads))
-        while busy:
-            ready = wait([worker.pipe for worker in busy])
-            for worker in [w for w in busy if w.pipe in ready]:
-                try:
-                    message = worker.pipe.recv()
-                except (EOFError, OSError):
-                    message = None
-                if message == _FRAME:
-                    on_frame()
-                    continue
-                busy.remove(worker)
-                retry, result = _judge(worker, message)
-                retry = retry and attempts[worker.job.name] < retries
-                if retry:
-                    attempts[worker.job.name] += 1
-                    again.append(worker.job)
-                if (job := following()) is not None:
-                    busy.append(_next(worker, job, threads))
-                else:
-                    _end(worker)
-                if not retry:
-                    yield result
-    finally:
-        for worker in busy:
-            worker.process.terminate()
-        for worker in busy:
-            _end(worker)
+    def close(self) -> None:
+        """Those without a job end."""
+        while self._idle:
+            _end(self._idle.pop())
+
+    def run(
+        self,
+        jobs: Iterable[Task],
+        retries: int,
+        on_frame: Callable[[], None],
+        tick: Callable[[], None] = lambda: None,
+    ) -> JobResults:
+        """Run the jobs, each once, and yield how they ended, as they end. Whoever is left then is ended.
+
+        Args:
+            jobs: what to do; the first ones first. Each is asked for when a worker is free.
+            retries: how often a job is run again whose process died, or that failed for no fault of its bag.
+            on_frame: called for each frame of any of them.
+            tick: called every ``TICK`` seconds and oftener.
+        """
+        coming = iter(jobs)
+        again: deque[Task] = deque()
+        attempts: Counter[str] = Counter()
+        busy: list[_Worker] = []
+
+        def following() -> Task | None:
+            return again.popleft() if again else next(coming, None)
+
+        try:
+            while len(busy) < self.count and (job := following()) is not None:
+                busy.append(self._given(self._idle.pop() if self._idle else self._start(), job))
+            self.close()  # there are fewer jobs than processes
+            while busy:
+                ready = wait([worker.pipe for worker in busy], TICK)
+                tick()
+                for worker in [w for w in busy if w.pipe in ready]:
+                    try:
+                        message = worker.pipe.recv()
+                    except (EOFError, OSError):
+                        message = None
+                    if message == _FRAME:
+                        on_frame()
+                        continue
+                    busy.remove(worker)
+                    done = worker.job
+                    assert done is not None
+                    retry, result = _judge(worker.process, done, message)
+                    retry = retry and attempts[done.name] < retries
+                    if retry:
+                        attempts[done.name] += 1
+                        again.append(done)
+                    if (job := following()) is not None:
+                        busy.append(self._given(worker, job))
+                    else:
+                        _end(worker)
+                    if not retry:
+                        yield result
+        finally:
+            for worker in busy:
+                worker.process.kill()
+            for worker in busy:
+                _end(worker)
+            self.close()
+
+    def _start(self) -> _Worker:
+        context = get_context("spawn")  # a fork would copy threads of Rerun and onnxruntime in midst of work
+        ours, theirs = context.Pipe()
+        given = (theirs, self._threads, self._modules)
+        process = context.Process(target=_work, args=given, name="bevviz batch", daemon=True)
+        # Inherited: signals of the terminal are for the batch alone, which ends its workers. It must not be
+        # interrupted itself between a worker's start and its name.
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)
+        try:
+            process.start()
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        theirs.close()  # so that its end is seen as soon as the process has gone
+        return _Worker(process, ours)
+
+    def _given(self, worker: _Worker, job: Task) -> _Worker:
+        """The same process with a job; a new one where it has gone."""
+        if worker.process.exitcode is None:
+            try:
+                worker.pipe.send(job)
+            except OSError:
+                pass
+            else:
+                return _Worker(worker.process, worker.pipe, job)
+        _end(worker)
+        fresh = self._start()
+        fresh.pipe.send(job)
+        return _Worker(fresh.process, fresh.pipe, job)
 
 
 _FRAME = "frame"
 
 
-def _judge(worker: _Worker, message: JobResult | str | None) -> tuple[bool, JobResult]:
-    """Whether the job may go better another time, and how it ended."""
+def _judge(process: SpawnProcess, job: Task, message: JobResult | str | None) -> tuple[bool, JobResult]:
+    """Whether a job may go better another time, and how it ended."""
     if isinstance(message, JobResult):
         return False, message
     if message is not None:
-        return True, JobResult(worker.job.name, error=message)
-    worker.process.join()
-    code = worker.process.exitcode or 0
+        return True, JobResult(job.name, error=message)
+    process.join()
+    code = process.exitcode or 0
     why = f"by {signal.Signals(-code).name}" if code < 0 else f"with status {code}"
     hint = "; out of memory?" if code == -signal.SIGKILL else ""
-    return True, JobResult(worker.job.name, error=f"its process ended {why}{hint}")
-
-
-def _start(job: Task, threads: int) -> _Worker:
-    context = get_context("spawn")  # a fork would copy threads of Rerun and onnxruntime in the midst of work
-    ours, theirs = context.Pipe()
-    process = context.Process(target=_work, args=(theirs, threads), name="bevviz batch", daemon=True)
-    # Inherited: signals of the terminal are for the batch alone, which ends its workers. It must not be
-    # interrupted itself between a worker's start and its name.
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)
-    try:
-        process.start()
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
-    theirs.close()  # so that its end is seen as soon as the process has gone
-    ours.send(job)
-    return _Worker(process, ours, job)
-
-
-def _next(worker: _Worker, job: Task, threads: int) -> _Worker:
-    """The same process goes on with another job; a new one where it has gone."""
-    if worker.process.exitcode is None:
-        try:
-            worker.pipe.send(job)
-        except OSError:
-            pass
-        else:
-            return _Worker(worker.process, worker.pipe, job)
-    _end(worker)
-    return _start(job, threads)
+    return True, JobResult(job.name, error=f"its process ended {why}{hint}")
 
 
 def _end(worker: _Worker) -> None:
-    worker.pipe.close()  # it ends when there is nothing more to receive
-    worker.process.join(10)
-    if worker.process.exitcode is None:
-        worker.process.kill()
-        worker.process.join()
+    """At once: what it was to make is made, or not wanted."""
+    worker.pipe.close()
+    worker.process.kill()
+    worker.process.join()
 
 
-def _work(pipe: Connection, threads: int) -> None:
+def _work(pipe: Connection, threads: int, modules: Sequence[str]) -> None:
     """The process: one job after another, until the other end of the pipe is closed."""
     signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGTERM})
     os.environ["OMP_NUM_THREADS"] = str(threads)  # before Open3D is loaded
     import cv2
 
     cv2.setNumThreads(threads)
+    for module in modules:
+        import_module(module)
     while True:
         try:
             job: Task = pipe.recv()

@@ -70,7 +70,9 @@ def run(job: Job, threads: int, on_frame: Callable[[], None] = lambda: None) -> 
             ) as sinks:
                 assert sinks.file is not None
                 evaluation = None
-                observers: list[Observer[FrameResult]] = [Recorder(sinks.recording, config)]
+                observers: list[Observer[FrameResult]] = [
+                    Recorder(sinks.recording, config, session.stages.provider)
+                ]
                 if job.truth is not None:
                     evaluation = Evaluation(truth_in(source, job.truth or None))
                     observers += [evaluation, EvaluationRecorder(sinks.recording, evaluation)]

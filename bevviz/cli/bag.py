@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import argparse
+from contextlib import ExitStack
 from pathlib import Path
 
 from bevviz.cli.options import (
     Commands,
     add_bag,
     add_config,
+    add_keep,
     add_output,
     add_selection,
     load_config,
@@ -41,15 +43,21 @@ def add(commands: Commands) -> None:
         help="windows for the workers of a Dask cluster instead, e.g. tcp://host:8786; with --save",
     )
     add_config(bag)
-    add_output(bag)
+    add_keep(add_output(bag))
     bag.set_defaults(run=_bag)
 
 
 def _bag(options: argparse.Namespace) -> int:
-    from bevviz.drive import Drive
+    with ExitStack() as stack:
+        processes = None
+        if options.jobs > 1 and not options.dask:
+            from bevviz.batch.local import Processes
 
-    config = load_config(options)
-    with open_bag(options, config) as source:
-        return process(
-            Drive(source, config), Outputs.of(options), Path(options.paths[0].stem + ".rrd"), options.jobs
-        )
+            # They start while this one does.
+            processes = stack.enter_context(Processes(options.jobs, ["bevviz.parallel.work"]))
+        from bevviz.drive import Drive
+
+        config = load_config(options)
+        source = stack.enter_context(open_bag(options, config))
+        default = Path(options.paths[0].stem + ".rrd")
+        return process(Drive(source, config), Outputs.of(options), default, processes, options.dask)

@@ -17,6 +17,7 @@ from bevviz.cli.options import (
     Commands,
     add_bind,
     add_config,
+    add_keep,
     add_limits,
     add_selection,
     load_config,
@@ -60,6 +61,7 @@ def add(commands: Commands) -> None:
         "--retries", type=int, default=2, metavar="N", help="again, where a process dies (default: 2)"
     )
     results = batch.add_argument_group("results")
+    add_keep(results)
     results.add_argument("--blueprint", default="debug", metavar="NAME|FILE", help="layout (default: debug)")
     results.add_argument(
         "--top", type=positive, default=30, metavar="N", help="worst frames shown (default: 30)"
@@ -155,10 +157,13 @@ def _run(jobs: list[Job], options: argparse.Namespace, failed: list[tuple[str, s
                 frames += 1
                 bar.set_postfix_str(f"{frames} frames", False)
                 bar.update(0)
+                tick()
+
+            def tick() -> None:
                 if ended.is_set():
                     raise KeyboardInterrupt
 
-            with closing(_execute(todo, options, on_frame)) as outcomes:
+            with closing(_execute(todo, options, on_frame, tick)) as outcomes:
                 for outcome in outcomes:
                     bar.update()
                     if outcome.error:
@@ -169,15 +174,17 @@ def _run(jobs: list[Job], options: argparse.Namespace, failed: list[tuple[str, s
     return False
 
 
-def _execute(todo: list[Job], options: argparse.Namespace, on_frame: Callable[[], None]) -> JobResults:
+def _execute(
+    todo: list[Job], options: argparse.Namespace, on_frame: Callable[[], None], tick: Callable[[], None]
+) -> JobResults:
     if options.dask:
         from bevviz.batch.dask import run_dask
 
         return run_dask(todo, options.dask, options.retries, on_frame)
-    from bevviz.batch.local import run_local
+    from bevviz.batch.local import Processes
 
     workers = options.jobs or max(1, (os.cpu_count() or 1) // 2)
-    return run_local(todo, workers, options.retries, on_frame)
+    return Processes(min(workers, len(todo))).run(todo, options.retries, on_frame, tick)
 
 
 def _sum_up(

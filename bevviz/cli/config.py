@@ -23,7 +23,7 @@ def add(commands: Commands) -> None:
     )
     config.add_argument("key", nargs="?", metavar="KEY", help="one parameter, or a section, to be explained")
     add_config(config)
-    config.set_defaults(run=_config)
+    config.set_defaults(run=_config, keep=None)  # as a run has it
 
 
 def _config(options: argparse.Namespace) -> int:

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 from bevviz import announce
-from bevviz.cli.options import Commands, add_config, add_output, positive
+from bevviz.cli.options import Commands, add_config, add_keep, add_output, positive
 from bevviz.cli.outputs import Outputs
 from bevviz.cli.run import process
 
@@ -53,7 +53,7 @@ def add(commands: Commands) -> None:
     demo.formatter_class = argparse.RawDescriptionHelpFormatter
     demo.epilog = PLANTS
     add_config(demo)
-    add_output(demo)
+    add_keep(add_output(demo))
     demo.set_defaults(run=_demo)
 
 

@@ -10,6 +10,7 @@ from bevviz.cli.options import (
     Commands,
     add_bag,
     add_config,
+    add_keep,
     add_limits,
     add_output,
     add_selection,
@@ -55,6 +56,7 @@ def add(commands: Commands) -> None:
     add_limits(evaluate)
     add_config(evaluate)
     output = add_output(evaluate, blueprint="evaluate")
+    add_keep(output)
     output.description = "None, but the table. Several can be given at once."
     add_json(output)
     evaluate.set_defaults(run=_evaluate)
@@ -93,7 +95,11 @@ def _run(frames: Frames, config: Config, evaluation: Evaluation, outputs: Output
 
     def observers(recording: RecordingStream) -> list[Observer[FrameResult]]:
         hint(frames.scene, config)
-        return [Recorder(recording, config), evaluation, EvaluationRecorder(recording, evaluation)]
+        return [
+            Recorder(recording, config, session.stages.provider),
+            evaluation,
+            EvaluationRecorder(recording, evaluation),
+        ]
 
     def finish() -> None:
         if table:

@@ -13,7 +13,16 @@ from typing import TYPE_CHECKING
 
 from bevviz import announce
 from bevviz.cli.interrupts import terminable
-from bevviz.cli.options import Commands, add_config, add_output, add_ros_args, port, positive, project_layers
+from bevviz.cli.options import (
+    Commands,
+    add_config,
+    add_keep,
+    add_output,
+    add_ros_args,
+    port,
+    positive,
+    project_layers,
+)
 from bevviz.cli.outputs import has_display, say, warn
 from bevviz.errors import UserError
 
@@ -70,6 +79,7 @@ def add(commands: Commands) -> None:
     )
     add_config(live)
     output = add_output(live, blueprint="live", raw=True)
+    add_keep(output)
     output.add_argument(
         "--split", type=_split, metavar="SIZE|TIME", help="--save in parts, e.g. 500MB or 10min"
     )
@@ -116,6 +126,7 @@ def _live(options: argparse.Namespace) -> int:
         "live.max_rate": options.max_rate,
         "live.points": options.points,
         "live.nice": options.nice,
+        "logging.keep": options.keep,
         "live.flight_time": options.flight,
     }
     more = [f"{key}={value}" for key, value in given.items() if value is not None]
@@ -294,6 +305,8 @@ def _watch(
     if (against := live.against) is not None:
         text = f"{against.differing} of {against.frames} compared frames differ from {against.names[1]}"
         say(text if against.frames else f"the robot published nothing on {against.names[1]}")
+        if against.without_ours:
+            say(f"{against.without_ours} frames are not compared: no objects of ours were made of them")
         if against.late_images:
             late = f"{against.late_images} of the robot's detections in images"
             say(f"{late} came when their frames were compared already: not compared")

@@ -178,6 +178,15 @@ def add_output(
     return group
 
 
+def add_keep(group: argparse._ActionsContainer) -> None:
+    """How much of a run is saved; a command without it always has everything."""
+    group.add_argument(
+        "--keep",
+        choices=("everything", "inspect", "report"),
+        help="inspect: a fifth of everything, with raw clouds now and then; report: less (docs/size.md)",
+    )
+
+
 def add_bind(group: argparse._ArgumentGroup, option: str) -> None:
     """For whom a server is open."""
     group.add_argument(
@@ -206,7 +215,17 @@ def load_config(options: argparse.Namespace) -> Config:
 def given_settings(options: argparse.Namespace) -> list[str]:
     """``key=value`` each, of ``--set``, ``--model`` and the data set."""
     model = getattr(options, "model", None)
-    return [*options.set, *([f"detector.model={model}"] if model else []), *_dataset(options)]
+    return [
+        *options.set,
+        *([f"detector.model={model}"] if model else []),
+        *_dataset(options),
+        *_keep(options),
+    ]
+
+
+def _keep(options: argparse.Namespace) -> list[str]:
+    given = getattr(options, "keep", None)
+    return [f"logging.keep={given}"] if given else []
 
 
 def _dataset(options: argparse.Namespace) -> list[str]:
@@ -226,8 +245,14 @@ def loaded(
     recorded: Recorded | None = getattr(options, "recorded", None)
     settings = [*settings, *_dataset(options)]
     if recorded is not None:
-        return recorded.load(file, settings, preset)
-    return load(file, settings, preset, layers=project_layers(options))
+        found = recorded.load(file, settings, preset)
+    else:
+        found = load(file, settings, preset, layers=project_layers(options))
+    if hasattr(options, "keep"):
+        return found
+    # What is looked at once, whole, is read from the bag again: whatever a recording or a project keeps.
+    logging = found.logging.model_copy(update={"keep": "everything"})
+    return found.model_copy(update={"logging": logging})
 
 
 def project_layers(options: argparse.Namespace) -> list[Layer]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from bevviz.cli.options import Commands, add_bag, add_config, load_config
+from bevviz.cli.options import Commands, add_bag, add_config, add_keep, load_config
 from bevviz.cli.outputs import say, warn
 from bevviz.errors import UserError
 
@@ -50,6 +50,7 @@ def add(commands: Commands) -> None:
         help="with --redact: topics that are kept although nobody can tell what they show",
     )
     content.add_argument("--include-model", action="store_true", help="copy the detector's file beside it")
+    add_keep(content)
     content.add_argument("--force", action="store_true", help="overwrite an older report")
     report.add_argument(
         "--check", action="store_true", help="PATH is a report's .rrd: run its bag again and compare"

@@ -13,6 +13,7 @@ from bevviz.cli.outputs import Outputs, hint, program, say, warn
 if TYPE_CHECKING:
     from rerun import RecordingStream
 
+    from bevviz.batch.local import Processes
     from bevviz.config import Config
     from bevviz.drive import Drive
     from bevviz.frame import FrameResult
@@ -33,14 +34,16 @@ def through(items: Items[T], processor: Processor[T, R], observers: Sequence[Obs
         return run(items, processor, [*observers, Progress()], stop=ended)
 
 
-def process(drive: Drive, outputs: Outputs, default: Path, jobs: int = 1, dask: str = "") -> int:
+def process(
+    drive: Drive, outputs: Outputs, default: Path, processes: Processes | None = None, dask: str = ""
+) -> int:
     """Every stage on every frame, logged to every output that is asked for.
 
     Args:
         drive: the frames.
         outputs: where to.
         default: file where there is no display.
-        jobs: processes that the drive is cut for.
+        processes: that the drive is cut for.
         dask: address of a cluster that it is cut for instead.
     """
     from bevviz.anomalies import AnomalySummary, FailureSummary
@@ -48,24 +51,28 @@ def process(drive: Drive, outputs: Outputs, default: Path, jobs: int = 1, dask: 
 
     anomalies, failures = AnomalySummary(), FailureSummary()
     session = drive.new_session()
-    windows = (jobs > 1 or bool(dask)) and _can_be_cut(drive, session)
+    windows = (processes is not None or bool(dask)) and _can_be_cut(drive, session)
+    if processes is not None and not windows:
+        processes.close()
 
     def observers(recording: RecordingStream) -> list[Observer[FrameResult]]:
         hint(drive.scene, drive.config)
         recorder = OrderedRecorder if windows else Recorder
-        return [recorder(recording, drive.config), anomalies, failures]
+        return [recorder(recording, drive.config, session.stages.provider), anomalies, failures]
 
     def finish() -> None:
         warn(failures.warnings)
         say(f"anomalies: {anomalies}")
 
     def in_windows(sinks: Sinks, seen: Sequence[Observer[FrameResult]]) -> RunEnd:
-        from bevviz.parallel.drive import cluster
+        from bevviz.parallel.drive import cluster, here
         from bevviz.parallel.run import run_windows
 
-        engine = cluster(dask) if dask else None
+        engine, workers = cluster(dask), 1
+        if processes is not None:
+            engine, workers = here(processes), processes.count
         with terminable() as ended:
-            return run_windows(drive, session, sinks, seen, jobs, engine, ended)
+            return run_windows(drive, session, sinks, seen, workers, engine, ended)
 
     return logged(
         drive.frames,
@@ -106,14 +113,14 @@ def logged(
         outputs: where what is logged goes.
         observers: of the recording.
         finish: called after the last one, before what was made is served.
-        otherwise: shows the results to observers in another way than ``through`` does.
+        otherwise: shows the results to observers in another way than ``through`` does, in parts.
 
     Returns:
         The exit status.
     """
     from bevviz.logging.recorder import DiskWatch
 
-    with outputs.opened(items.scene, config) as sinks:
+    with outputs.opened(items.scene, config, in_parts=otherwise is not None) as sinks:
         seen = [*observers(sinks.recording), DiskWatch(sinks)]
         early = list(items.warnings)  # known before an hour's work, and said before it
         warn(early)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from bevviz import announce
@@ -196,13 +197,16 @@ def _tree(
 
 def _show(result: FrameResult, answers: Sequence[Answer], scene: Scene, outputs: Outputs, limit: int) -> None:
     from bevviz.logging.logger import Logger
-    from bevviz.why.log import log_answers
+    from bevviz.why.log import focus, log_answers
 
+    if answers and (place := focus(result.frame, answers[0])) is not None:
+        x, y, z = place.tolist()
+        scene = replace(scene, focus=(x, y, z))
     with outputs.opened(scene, result.config) as sinks:
         logger = Logger(sinks.recording, result.config, scene)
         logger.log_static()
         logger.log(result)
-        log_answers(sinks.recording, result.frame, answers, limit)
+        log_answers(sinks.recording, result.frame, answers, limit, result.config.bev)
         if outputs.save is not None:
             say(f"saved in {outputs.save}")
         outputs.keep_serving(sinks)

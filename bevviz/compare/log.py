@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Set
+from collections.abc import Iterator, Mapping, Sequence, Set
 
 import numpy as np
 import rerun as rr
 
 from bevviz import table
-from bevviz.colors import SIDES
+from bevviz.colors import SIDES, State
 from bevviz.compare.differences import DIFFERENT, WORST_FIRST, Change, Difference, FrameDifferences
+from bevviz.compare.truth import Judged
 from bevviz.frame import F64
 from bevviz.logging import entities
 from bevviz.logging.camera import over_image
-from bevviz.logging.pieces import boxes2d, boxes3d, document, transform
+from bevviz.logging.pieces import OUTLINE, boxes2d, boxes3d, document, transform
+from bevviz.logging.spoken import near
 from bevviz.logging.states import StateLanes
 from bevviz.logging.writer import Writer
 from bevviz.text import markdown
@@ -54,6 +56,13 @@ class DifferenceLogger(Writer):
                 entities.difference_count(change),
                 rr.SeriesLines(colors=[COLORS[change]], names=[change], widths=[2]),
             )
+        for judged, state in (("broken", State.BAD), ("fixed", State.GOOD)):
+            self.static(
+                entities.difference(judged),
+                rr.Boxes3D.from_fields(
+                    colors=[state.value], radii=rr.Radius.ui_points(3.5), show_labels=True, fill_mode=OUTLINE
+                ),
+            )
         for what, color in (("a", COLORS[Change.ONLY_A]), ("b", COLORS[Change.ONLY_B])):
             for series in ("objects", "clusters"):
                 self.static(
@@ -72,6 +81,9 @@ class DifferenceLogger(Writer):
             mine = [d for d in found.objects if d.change is change]
             if mine:
                 self._log_boxes(change, mine, found, world_from_points)
+        if found.judged is not None:
+            for what, rows in (("broken", found.judged.broken), ("fixed", found.judged.fixed)):
+                self._log_judged(what, found.judged, rows, world_from_points)
         for camera, pairs in found.images.items():
             self._log_image(camera, pairs, found)
         for name, value in _counts(found).items():
@@ -90,13 +102,24 @@ class DifferenceLogger(Writer):
         if change is not Change.ONLY_A:
             side, rows = (found.b, [d.row_b for d in mine])
         path = entities.difference(change)
-        what = boxes3d(side.boxes, np.array(rows), [_label(d) for d in mine])
+        # What is better and worse is more than what differs: where that is known, its names alone are shown.
+        is_near = near(side.boxes.center[rows])
+        labels = [_label(d) if found.judged is None and is_near[i] else "" for i, d in enumerate(mine)]
+        what = boxes3d(side.boxes, np.array(rows), labels)
         self.put(path, transform(world_from_points), what)
         if change is Change.MOVED:
             start = found.a.boxes.center[[d.row_a for d in mine]]
             end = found.b.boxes.center[rows]
             arrows = rr.Arrows3D(origins=start, vectors=end - start, colors=[COLORS[change]])
             self.put(f"{path}/from_a", arrows)
+
+    def _log_judged(self, what: str, judged: Judged, rows: Sequence[int], world_from_points: F64) -> None:
+        if rows:
+            chosen = np.array(rows)
+            is_near = near(judged.boxes.center[chosen])
+            labels = [f"{what}: {judged.labels[row]}" if is_near[i] else "" for i, row in enumerate(rows)]
+            path = entities.difference(what)
+            self.put(path, transform(world_from_points), boxes3d(judged.boxes, chosen, labels))
 
     def _log_image(self, camera: str, pairs: tuple[Difference, ...], found: FrameDifferences) -> None:
         for change in (Change.CLASS, Change.ONLY_A, Change.ONLY_B):

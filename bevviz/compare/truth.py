@@ -9,7 +9,7 @@ import numpy as np
 
 from bevviz.evaluate import Truth
 from bevviz.evaluate import judge as judge_objects
-from bevviz.frame import Bool, FrameResult, Objects
+from bevviz.frame import Bool, Boxes3D, FrameResult, Objects
 
 
 @dataclass(frozen=True, slots=True)
@@ -17,7 +17,7 @@ class Judged:
     """A frame of both sides against the truth. Row i is the i-th object that had to be found."""
 
     labels: tuple[str, ...]
-    places: tuple[tuple[float, float], ...]  # x, y of each, metres in the frame of the points
+    boxes: Boxes3D  # in the frame of the points
     a: Bool  # found by A
     b: Bool
     wrong_a: tuple[str, ...]  # names of A's objects that are none
@@ -38,7 +38,7 @@ class Judged:
 
     def text(self, row: int) -> str:
         """``person at 12.3 m``."""
-        return f"{self.labels[row].lower()} at {np.hypot(*self.places[row]):.1f} m"
+        return f"{self.labels[row].lower()} at {np.hypot(*self.boxes.center[row, :2]):.1f} m"
 
 
 def judge(a: FrameResult, b: FrameResult, truth: Truth) -> Judged:
@@ -47,7 +47,7 @@ def judge(a: FrameResult, b: FrameResult, truth: Truth) -> Judged:
     (found_a, wrong_a), (found_b, wrong_b) = (_side(side.objects, truth) for side in (a, b))
     return Judged(
         labels=tuple(truth.labels[k] for k in must),
-        places=tuple((float(x), float(y)) for x, y in truth.boxes.center[must, :2]),
+        boxes=truth.boxes.chosen(must),
         a=found_a[must],
         b=found_b[must],
         wrong_a=wrong_a,

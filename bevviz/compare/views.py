@@ -7,7 +7,7 @@ import rerun.blueprint as rrb
 from bevviz.compare.differences import DIFFERENT, Change
 from bevviz.frame import Scene
 from bevviz.logging import entities
-from bevviz.logging.views import HIDDEN, LINKED, birds_eye, plot, space
+from bevviz.logging.views import HIDDEN, LINKED, birds_eye, plot, space, text_log
 
 _SIDES = {"": ("A", Change.ONLY_A), entities.B: ("B", Change.ONLY_B)}
 
@@ -16,19 +16,19 @@ def side_space(scene: Scene, root: str) -> rrb.Spatial3DView:
     """What one run has found, with the differences that concern it: obstacles, clusters, objects."""
     name, only = _SIDES[root]
     beside = [entities.TRUTH, *changes(only, Change.MOVED, Change.CLASS)]
-    return space(scene, raw=False, grid=False, name=f"3D {name}", root=root, beside=beside)
+    return space(scene, raw=False, names=False, name=f"3D {name}", root=root, beside=beside)
 
 
 def side_camera(camera_name: str, root: str) -> rrb.Spatial2DView:
     """The one image, with the detections of one run and those that the other one has not."""
     name, only = _SIDES[root]
-    image = entities.image(camera_name)
+    image, own = entities.image(camera_name), entities.detections(camera_name)
     different = [entities.image_difference(camera_name, change) for change in (only, Change.CLASS)]
     return rrb.Spatial2DView(
         name=f"{camera_name} {name}",
         origin=entities.sensor(camera_name),
         contents=[image, f"{root}{image}/**", *different],
-        overrides={root + entities.weak(camera_name): HIDDEN},
+        overrides=dict.fromkeys((root + entities.weak(camera_name), root + entities.names(own)), HIDDEN),
     )
 
 
@@ -36,7 +36,7 @@ def side_pictures(scene: Scene, root: str) -> rrb.Tabs:
     """The cameras and the bird's-eye view of one run."""
     name = _SIDES[root][0]
     cameras = [side_camera(camera_name, root) for camera_name in scene.cameras]
-    return rrb.Tabs(*cameras, birds_eye(root, f"Bird's-eye view {name}"))
+    return rrb.Tabs(*cameras, birds_eye(scene, root, f"Bird's-eye view {name}"))
 
 
 def differences() -> rrb.TextDocumentView:
@@ -45,8 +45,8 @@ def differences() -> rrb.TextDocumentView:
 
 
 def changes(*which: Change) -> list[str]:
-    """Contents: objects that differ, in these ways or in any, to be shown beside a run."""
-    return [f"{entities.difference(change)}/**" for change in which or DIFFERENT]
+    """Contents: objects that differ, in these ways or in any, and that one run alone is right about."""
+    return [f"{entities.difference(change)}/**" for change in (*(which or DIFFERENT), "broken", "fixed")]
 
 
 def compared() -> rrb.TextDocumentView:
@@ -55,7 +55,12 @@ def compared() -> rrb.TextDocumentView:
 
 
 def difference_log() -> rrb.TextLogView:
-    return rrb.TextLogView(name="Log of differences", origin=entities.COMPARE_LOG)
+    return text_log("Log of differences", entities.COMPARE_LOG)
+
+
+def numbers() -> rrb.Tabs:
+    """In tabs: side by side, their legends would hide the curves."""
+    return rrb.Tabs(difference_counts(), side_counts(), name="Numbers")
 
 
 def difference_counts() -> rrb.TimeSeriesView:

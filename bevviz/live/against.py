@@ -55,8 +55,9 @@ class Compared:
 class AgainstRobot:
     """Compares each frame with what the robot published of it, when it did.
 
-    A frame that the robot says nothing of is left out and counted. Its boxes in the images are compared where
-    they come before its boxes in space do, else counted. For one thread, but for ``reason``.
+    A frame that the robot says nothing of is left out, and so is one that a failed stage of ours made no
+    objects of: that says nothing of what is there. The robot's boxes in the images are compared where they
+    come before its boxes in space do, else counted. For one thread, but for ``reason``.
 
     Args:
         asked: the robot's Detection3DArray topic; empty: the one whose name says so.
@@ -67,6 +68,7 @@ class AgainstRobot:
         self.config = config
         self.topic = ""  # known when the robot has said something
         self.frames = self.differing = 0
+        self.without_ours = 0  # frames that are left out as there are no objects of ours
         self.problem = ""  # why nothing is compared
         self.late_images = 0  # of the robot's image boxes that came when their frame was compared already
         self._asked = asked
@@ -102,16 +104,18 @@ class AgainstRobot:
         for labelled in (*frame.robot_boxes, *in_space.values()):
             self._choose(labelled.topic)
         images = {found.camera: _image_boxes(found) for found in frame.robot_detections if found.camera}
-        pose = frame.pose
-        self._waiting[frame.stamp] = Ours(
-            frame.index, frame.stamp, frame.received, pose, seen(result), images
-        )
+        if result.objects is None:
+            self.without_ours += 1
+        else:
+            about = frame.index, frame.stamp, frame.received, frame.pose
+            self._waiting[frame.stamp] = Ours(*about, seen(result), images)
         for stamp, found in late:
             if isinstance(found, LabelledBoxes2D):
                 self._add_images(stamp, found)
         self._late |= {stamp: boxes for stamp, boxes in in_space.items() if boxes.topic == self.topic}
         compared = []
-        if self.topic and (theirs := published(frame, self.topic, result.config)) is not None:
+        theirs = published(frame, self.topic, result.config) if self.topic else None
+        if theirs is not None and frame.stamp in self._waiting:
             compared.append(self._compare(self._waiting.pop(frame.stamp), seen(theirs)))
         for stamp in sorted(self._late.keys() & self._waiting.keys()):
             ours, boxes = self._waiting.pop(stamp), self._late.pop(stamp)

@@ -20,6 +20,7 @@ from bevviz.compare.log import DifferenceLogger
 from bevviz.config import Config
 from bevviz.frame import FrameResult, LateResult, Scene
 from bevviz.live.against import AgainstRobot, Compared
+from bevviz.live.thinning import is_cloud, thin_cloud
 from bevviz.logging import blueprints
 from bevviz.logging.logger import Context, Logger
 from bevviz.logging.sinks import APPLICATION
@@ -35,6 +36,12 @@ class Packet:
     whole: bool
     context: Context
     time: float  # seconds, monotonic
+    thinned: bytes | None = None  # with fewer points, for viewers; None: they get the same
+
+    @property
+    def shown(self) -> bytes:
+        """For viewers."""
+        return self.data if self.thinned is None else self.thinned
 
 
 class _Stream(Closing):
@@ -65,6 +72,23 @@ class _Stream(Closing):
         return data
 
 
+class _FrameLogger(Logger):
+    """Sets clouds that viewers shall not have whole aside, to be written once so and once thinned."""
+
+    def __init__(self, recording: rr.RecordingStream, config: Config, scene: Scene, network: str) -> None:
+        super().__init__(recording, config, scene, network=network)
+        self.limit: int | None = None  # points
+        self.clouds: list[tuple[str, rr.AsComponents]] = []  # by path, set aside
+
+    def write(self, path: str, *archetypes: rr.AsComponents) -> None:
+        if self.limit is not None:
+            clouds = [one for one in archetypes if is_cloud(one, self.limit)]
+            self.clouds += [(path, one) for one in clouds]
+            archetypes = tuple(one for one in archetypes if not is_cloud(one, self.limit))
+        if archetypes:
+            super().write(path, *archetypes)
+
+
 class Encoder:
     """Turns results into packets. From any thread.
 
@@ -75,6 +99,7 @@ class Encoder:
         whole: seconds from one whole packet to the next, at most.
         against: compares with the robot; None: nobody does.
         clock: seconds, for tests.
+        network: what the detector's runs on; stored in recordings.
 
     Raises:
         UserError: no such blueprint.
@@ -88,15 +113,16 @@ class Encoder:
         whole: float = WHOLE,
         against: AgainstRobot | None = None,
         clock: Callable[[], float] = time.monotonic,
+        network: str = "",
     ) -> None:
-        self._against, self.clock = against, clock
+        self._against, self.clock, self._network = against, clock, network
         self._differences: DifferenceLogger | None = None
         self._blueprint = blueprint
         self._step = whole
         blueprints.load(blueprint, scene)  # what is wrong with it is said at the start
         self._config, self._scene = config, scene
         self._stream = _Stream()
-        self._logger = Logger(self._stream.recording, config, scene)
+        self._logger = _FrameLogger(self._stream.recording, config, scene, network=network)
         self._whole = float("-inf")
         self._lock = threading.Lock()
         self.recording_id: str = self._stream.recording.get_recording_id() or ""
@@ -130,9 +156,28 @@ class Encoder:
             if whole:
                 self._whole = now
                 self._logger.refresh()
+            self._logger.limit = result.config.live.viewer_points
             self._logger.log(result, health, notes, late, states)
+            self._logger.limit = None
             self._log_differences(compared, whole)
-            return Packet(self._stream.read(), whole, self._logger.context, now)
+            data, thinned = self._stream.read(), None
+            if self._logger.clouds:
+                everything, few = self._encode_clouds(result)
+                data, thinned = data + everything, data + few
+            return Packet(data, whole, self._logger.context, now, thinned)
+
+    def _encode_clouds(self, result: FrameResult) -> tuple[bytes, bytes]:
+        """Those of the frame that were set aside: as they are, and thinned."""
+        frame, points = result.frame, result.config.live.viewer_points
+        assert points is not None
+        clouds, self._logger.clouds = self._logger.clouds, []
+        self._logger.set_time(frame.index, frame.stamp, frame.received)
+        for path, cloud in clouds:
+            self._logger.write(path, cloud)
+        everything = self._stream.read()
+        for path, cloud in clouds:
+            self._stream.recording.log(path, thin_cloud(cloud, points, frame.index))
+        return everything, self._stream.read()
 
     def encode_meanwhile(
         self, seconds: float, notes: Sequence[tuple[str, str]], states: Mapping[str, str]
@@ -147,7 +192,7 @@ class Encoder:
         if (config, scene) == (self._config, self._scene):
             return
         if scene != self._scene:
-            self._stream.recording.send_blueprint(blueprints.load(self._blueprint, scene))
+            self._stream.recording.send_blueprint(blueprints.load(self._blueprint, scene, config))
         self._config, self._scene = config, scene
         self._logger.reconfigure(config, scene)
 
@@ -163,9 +208,10 @@ class Encoder:
 
     def prelude(self, context: Context, *, blueprint: bool = True) -> bytes:
         """The beginning of a recording whose first packet has this context. From any thread."""
-        layout = blueprints.load(self._blueprint, context.scene) if blueprint else None
+        layout = blueprints.load(self._blueprint, context.scene, context.config) if blueprint else None
         with _Stream(self.recording_id, layout) as stream:
-            Logger(stream.recording, context.config, context.scene).log_context(context)
+            logger = Logger(stream.recording, context.config, context.scene, network=self._network)
+            logger.log_context(context)
             if self._against is not None:
                 DifferenceLogger(stream.recording, self._against.names, "")
             return stream.read()

@@ -6,6 +6,7 @@ import os
 import threading
 import time
 from collections import deque
+from dataclasses import replace
 from pathlib import Path
 
 from bevviz.config import LiveConfig
@@ -39,7 +40,7 @@ class FlightRecorder:
         with self._held:
             if self.config.flight_time == 0 or not (self._packets or packet.whole):
                 return
-            self._packets.append(packet)
+            self._packets.append(replace(packet, thinned=None))
             self._size += len(packet.data)
             self._forget(packet.time - self.config.flight_time)
 

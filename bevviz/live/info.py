@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 
-from bevviz.bags.info import Contents, TopicInfo, find_missing, render_contents
+from bevviz.bags.info import Contents, TopicInfo, find_missing, network_of, render_contents
 from bevviz.config import Config, stated_lines
 from bevviz.frame import Frame
 from bevviz.live.source import LiveSource
@@ -67,6 +67,7 @@ def describe(
             tree=source.tree,
             points_frame=frame.points_frame if frame else "",
             world_frame=frame.world_frame if frame and frame.world_from_points is not None else "",
+            network=network_of(config),
             configured=tuple(stated_lines(config)),
             missing=tuple(missing),
             warnings=tuple(source.warnings),

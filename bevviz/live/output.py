@@ -27,6 +27,11 @@ class Output(ABC):
     def dropped(self) -> int:
         return self._packets.dropped
 
+    @property
+    def lag(self) -> float | None:
+        """Seconds that who watches is behind; None: nobody does, or there is no way to know."""
+        return None
+
     def put(self, packet: Packet) -> None:
         """Never waits."""
         self._packets.put(packet)

@@ -121,7 +121,10 @@ class Live:
         self._robot_problem = ""
         self.against = None if robot is None else AgainstRobot(robot, live)
         whole = WHOLE if live.viewer_rate is None else 1 / live.viewer_rate
-        self.encoder = Encoder(self.config, source.scene, outputs.blueprint, whole, self.against)
+        network = "" if observe else self._session.stages.provider
+        self.encoder = Encoder(
+            self.config, source.scene, outputs.blueprint, whole, self.against, network=network
+        )
         self._indexer = Indexer()
         self._watchers: list[Callable[[FrameResult], None]] = []
         self.flight = FlightRecorder(live, self.encoder, self._indexer)
@@ -208,7 +211,7 @@ class Live:
             "memory, MB": status.memory,
         }
         numbers |= {f"dropped: {where}": float(count) for where, count in status.drops.items()}
-        numbers |= {f"lag of the {viewer.name} viewer, ms": 1e3 * viewer.lag for viewer in self._viewers}
+        numbers |= {f"lag of the {name} viewer, ms": 1e3 * lag for name, (_, lag) in self._lags.items()}
         return numbers | {path.rpartition("/")[2]: n for path, n in self._snapshots.scalars.items()}
 
     def save(self, path: Path | None = None) -> Path:
@@ -305,7 +308,7 @@ class Live:
     def log(self, result: FrameResult) -> None:
         """Encode a frame once, for every output."""
         drops = {entities.drops(where): float(count) for where, count in self._drops().items()}
-        lags = {entities.viewer_lag(viewer.name): 1e3 * viewer.lag for viewer in self._viewers}
+        lags = {entities.viewer_lag(name): 1e3 * lag for name, (_, lag) in self._lags.items()}
         health = self.health.scalars() | drops | lags | self._snapshots.scalars
         result = self._with_marks(result)
         late, states = self._source.overtaken(), self._topic_states()
@@ -345,21 +348,22 @@ class Live:
             self._snapshots.save_soon(reason, self.config.live.trigger_after)
 
     @property
-    def _viewers(self) -> list[Viewer]:
-        return [output for output in self._outputs if isinstance(output, Viewer)]
+    def _lags(self) -> dict[str, tuple[Output, float]]:
+        """Viewers by name, and how many seconds each is behind."""
+        return {output.name: (output, lag) for output in self._outputs if (lag := output.lag) is not None}
 
     def _watch_viewers(self) -> None:
-        for viewer in self._viewers:
-            if viewer.lag > BEHIND and viewer.name not in self._behind:
-                self._behind.add(viewer.name)
+        for name, (viewer, lag) in self._lags.items():
+            if lag > BEHIND and name not in self._behind:
+                self._behind.add(name)
                 self.notes.warn(
-                    f"the {viewer.name} viewer is {viewer.lag:.0f} s behind: it gets the newest frames, the "
-                    f"others it misses; --set live.viewer_rate=2 sends it less"
+                    f"the {name} viewer is {lag:.0f} s behind: it gets the newest frames, the others it "
+                    f"misses; --set live.viewer_points=20000 and --set live.viewer_rate=2 send it less"
                 )
-            elif viewer.lag < LATE and viewer.name in self._behind:
-                self._behind.remove(viewer.name)
+            elif lag < LATE and name in self._behind:
+                self._behind.remove(name)
                 missed = f"{viewer.dropped} frames" if viewer.dropped != 1 else "1 frame"
-                self.notes.info(f"the {viewer.name} viewer keeps up again; it has missed {missed} so far")
+                self.notes.info(f"the {name} viewer keeps up again; it has missed {missed} so far")
 
     def _log_meanwhile(self) -> None:
         """What is said while no frame comes is in the log and in the lanes all the same."""

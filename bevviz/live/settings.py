@@ -13,7 +13,8 @@ AT_START = (
     "live.log_queue",
     "live.output_queue",
     "live.held",
-    "live.viewer_",
+    "live.viewer_memory",
+    "live.viewer_rate",
     "live.split_",
 )  # fixed once it runs
 

@@ -7,9 +7,11 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
+import pyarrow as pa
+import rerun as rr
 
 from bevviz.config import Config
-from bevviz.frame import Frame, LateResult, Mark, Scene, Source
+from bevviz.frame import I64, Frame, LateResult, Mark, Scene, Source
 
 
 class Thinned:
@@ -85,9 +87,7 @@ def thin(frame: Frame, points: int | None) -> Frame:
     count = len(frame.points)
     if points is None or count <= points:
         return frame
-    rng = np.random.default_rng(frame.index)
-    edges = np.arange(points + 1) * count // points
-    rows = rng.integers(edges[:-1], edges[1:])
+    rows = chosen(count, points, frame.index)
     ends = np.cumsum([len(cloud.xyz) for cloud in frame.clouds])
     clouds = []
     for cloud, end in zip(frame.clouds, ends.tolist(), strict=True):
@@ -100,3 +100,46 @@ def thin(frame: Frame, points: int | None) -> Frame:
         fields={name: values[rows] for name, values in frame.fields.items()},
         clouds=tuple(clouds),
     )
+
+
+def chosen(count: int, points: int, seed: int) -> I64:
+    """Rows in order, one at random out of each of so many equal runs; all of them where there are no more.
+
+    The same of the same seed.
+    """
+    if count <= points:
+        return np.arange(count)
+    edges = np.arange(points + 1) * count // points
+    rows: I64 = np.random.default_rng(seed).integers(edges[:-1], edges[1:])
+    return rows
+
+
+def is_cloud(logged: rr.AsComponents, points: int) -> bool:
+    """Whether it has more points than that."""
+    return isinstance(logged, rr.Points3D | rr.Points2D) and _count(logged) > points
+
+
+def thin_cloud(cloud: rr.AsComponents, points: int, seed: int) -> list[rr.DescribedComponentBatch]:
+    """Its ``chosen`` points, with all that is said of each."""
+    count = _count(cloud)
+    rows = pa.array(chosen(count, points, seed))
+    thinned = []
+    for batch in cloud.as_component_batches():
+        values = batch.as_arrow_array()
+        kept = _Values(values.take(rows) if len(values) == count else values)
+        thinned.append(rr.DescribedComponentBatch(kept, batch.component_descriptor()))
+    return thinned
+
+
+def _count(cloud: rr.AsComponents) -> int:
+    return max((len(batch.as_arrow_array()) for batch in cloud.as_component_batches()), default=0)
+
+
+class _Values:
+    """What Rerun takes for a component."""
+
+    def __init__(self, values: pa.Array) -> None:
+        self._values = values
+
+    def as_arrow_array(self) -> pa.Array:
+        return self._values

@@ -154,7 +154,7 @@ class Viewer(Output):
     def _show(self, packet: Packet, fresh: bool) -> bool:
         if fresh and not self._send(self._encoder.prelude(packet.context, blueprint=False)):
             return self._recover(packet.context)
-        return self._send(packet.data) or self._recover(packet.context)
+        return self._send(packet.shown) or self._recover(packet.context)
 
     def _begin(self, context: Context) -> bool:
         if self._program.framed and not self._send(self._encoder.header):

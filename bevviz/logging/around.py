@@ -2,19 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
+from pathlib import Path
+from typing import TypeAlias
 
+import numpy as np
 import rerun as rr
 
 from bevviz import geometry
-from bevviz.frame import Around, Frame, Grid, Shape, Status
+from bevviz.colors import bins, turbo
+from bevviz.frame import Around, Frame, Grid, MeshFile, Shape, Status, Surface
 from bevviz.logging import entities
 from bevviz.logging.pieces import transform
 from bevviz.logging.writer import Writer
 
 LANES = 40  # of the robot's diagnostics; the worst
 _WORST = ("error", "stale", "warning", "ok")
-_PARTS = ("points", "strips", "solids", "axes", "grid", "fix", "picture")
+_PARTS = ("points", "strips", "solids", "axes", "grid", "surface", "fix", "picture")
+_TYPES = {".dae": "model/vnd.collada+xml"}  # that Rerun does not know by the name of the file
+_AXES = {"x": (225, 75, 60), "y": (110, 190, 90), "z": (86, 150, 233)}
+
+Fixed: TypeAlias = Sequence[rr.AsComponents]
 _COLOR = (120, 200, 255)
 
 
@@ -24,6 +33,31 @@ def log_shapes(to: Writer, frame: Frame) -> None:
         flat = shape.fix is not None or shape.picture is not None
         if flat or shape.world_from_shape is not None:
             _log_shape(to, shape)
+        elif shape.meshes:  # which are static, and cannot be cleared
+            to.put(entities.robot(shape.topic), rr.Transform3D(scale=0.0))
+
+
+def fixed_parts(frame: Frame) -> dict[str, Callable[[], Fixed | None]]:
+    """What holds at all times, by entity, and how it is made: meshes of the robot's, the axes of its Imus."""
+    around, found = frame.around or Around(), dict[str, Callable[[], Fixed | None]]()
+    for shape in around.shapes:
+        for number, mesh in enumerate(shape.meshes):
+            found[f"{entities.robot(shape.topic)}/mesh_{number}"] = partial(_mesh, mesh)
+    for motion in around.motions:
+        found[entities.rotation(motion.topic)] = found[entities.acceleration(motion.topic)] = _axes
+    return found
+
+
+def log_motions(to: Writer, frame: Frame) -> None:
+    """What Imus measured since the frame before, each sample at its own time."""
+    for motion in (frame.around or Around()).motions:
+        for path, values in (
+            (entities.rotation(motion.topic), motion.rotation),
+            (entities.acceleration(motion.topic), motion.acceleration),
+        ):
+            rows = np.isfinite(values).all(axis=1)
+            if rows.any():
+                to.samples(path, motion.stamp[rows], motion.received[rows], values[rows])
 
 
 class AroundLog:
@@ -78,6 +112,8 @@ def _log_shape(to: Writer, shape: Shape) -> None:
         to.put(path, rr.Arrows3D(origins=[place], vectors=[turn[:, 0]], colors=color))
     if shape.grid is not None:
         to.put(path, _grid(shape.grid))
+    if shape.surface is not None:
+        to.put(path, _surface(shape.surface))
     if shape.picture is not None:
         to.put(path, rr.Image(shape.picture, color_model="BGR"))
     if shape.fix is not None:
@@ -96,6 +132,38 @@ def _log_shape(to: Writer, shape: Shape) -> None:
                 show_labels=bool(labels),
             ),
         )
+
+
+def _surface(surface: Surface) -> rr.AsComponents:
+    """In colours from its least to its greatest value; single cells as points."""
+    low, high = np.percentile(surface.values, (1, 99)).tolist()
+    rows = bins(surface.values, low, max(high, low + 1e-6), len(turbo()))
+    colors = turbo()[rows]
+    if len(surface.triangles) == 0:
+        return rr.Points3D(surface.vertices, colors=colors, radii=rr.Radius.ui_points(3))
+    return rr.Mesh3D(
+        vertex_positions=surface.vertices, triangle_indices=surface.triangles, vertex_colors=colors
+    )
+
+
+def _mesh(mesh: MeshFile) -> Fixed | None:
+    try:
+        contents = mesh.path.read_bytes()
+    except OSError:
+        return None
+    asset = rr.Asset3D(contents=contents, media_type=_media_type(mesh.path))
+    quaternion = rr.Quaternion(xyzw=geometry.quaternion(mesh.pose))
+    place = rr.InstancePoses3D(translations=[mesh.pose[:3, 3]], quaternions=[quaternion], scales=[mesh.scale])
+    return asset, place
+
+
+def _media_type(path: Path) -> str | rr.components.MediaType | None:
+    suffix = path.suffix.lower()
+    return _TYPES.get(suffix) or rr.components.MediaType.guess_from_path(path.with_suffix(suffix))
+
+
+def _axes() -> Fixed:
+    return (rr.SeriesLines(names=list(_AXES), colors=list(_AXES.values())),)
 
 
 def _grid(grid: Grid) -> rr.GridMap:

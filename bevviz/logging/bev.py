@@ -10,15 +10,16 @@ import rerun as rr
 from bevviz import geometry
 from bevviz.config import BevConfig, Config
 from bevviz.frame import F32, F64, Bev, FrameResult
-from bevviz.logging import entities
+from bevviz.logging import entities, keep
 from bevviz.logging.pieces import blob, jpeg, png, transform
 from bevviz.logging.writer import Writer
 
 
 def log_bev(to: Writer, bev: Bev, config: Config) -> None:
     """The image, pixel for pixel where it is to be that of the tutorial, and its channels."""
+    quality = config.logging.jpeg_quality if keep.is_whole(config) else keep.BEV_QUALITY
     is_reference = config.bev.style == "reference"
-    to.put(entities.BEV, png(bev.image) if is_reference else jpeg(bev.image, config.logging.jpeg_quality))
+    to.put(entities.BEV, png(bev.image) if is_reference else jpeg(bev.image, quality))
     for name, grid in bev.channels.items():
         if name != "occupancy":
             to.put(entities.channel(name), rr.Image(grid, color_model="L"))

@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import difflib
 import importlib.util
+from dataclasses import replace
 from pathlib import Path
 
 import rerun.blueprint as rrb
 from rerun.recording_stream import RecordingStream
 
 import bevviz
+from bevviz.config import BevConfig, Config
 from bevviz.errors import UserError
 from bevviz.frame import Scene
+from bevviz.logging.keep import is_whole
 from bevviz.logging.reading import check_decodes
 
 
@@ -27,17 +30,21 @@ def names() -> list[str]:
     return sorted(path.stem for path in _folder().glob("*.py") if not path.stem.startswith("_"))
 
 
-def load(name_or_path: str, scene: Scene) -> rrb.Blueprint:
+def load(name_or_path: str, scene: Scene, config: Config | None = None) -> rrb.Blueprint:
     """A layout for the scene.
 
     Args:
         name_or_path: one of ``names()``, a .py file with a function ``blueprint(scene)`` that returns an
             ``rrb.Blueprint``, or a .rbl file that was saved in the viewer.
         scene: names of the sensors.
+        config: of the run: which raw clouds there are, and where the look from above begins, which is where
+            objects can be expected; None: all of both.
 
     Raises:
         UserError: unknown name, no such file, or a file that makes no layout.
     """
+    if config is not None:
+        scene = replace(scene, above=_ahead(config.bev), raw=is_whole(config))
     if name_or_path in names():
         if not scene.lidar and scene.cameras:
             name_or_path = "cameras"
@@ -53,6 +60,12 @@ def load(name_or_path: str, scene: Scene) -> rrb.Blueprint:
         return _from_python(path, scene)
     check_decodes(path)
     return Saved(path)
+
+
+def _ahead(config: BevConfig) -> tuple[float, float, float, float]:
+    """Pixels of what is ahead and not far to the sides."""
+    rows, columns = config.range_x / config.resolution, config.range_y / config.resolution
+    return 0.5 * columns, 0.1 * rows, 1.5 * columns, 1.25 * rows
 
 
 def _from_python(path: Path, scene: Scene) -> rrb.Blueprint:

@@ -3,17 +3,35 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import rerun as rr
 
 from bevviz import geometry
 from bevviz.colors import bins, class_color
-from bevviz.frame import F64, CameraResult, Detections, DetectionState, Frame, Image, Intrinsics
-from bevviz.logging import entities
+from bevviz.frame import (
+    F32,
+    F64,
+    I64,
+    Bool,
+    CameraResult,
+    Decision,
+    Detections,
+    DetectionState,
+    Explanation,
+    Frame,
+    Image,
+    Intrinsics,
+)
+from bevviz.logging import entities, keep
 from bevviz.logging.annotations import FAINT, depth_annotations
 from bevviz.logging.pieces import CORNER, boxes2d, encode_image, scored, transform
+from bevviz.logging.spoken import NEAR, log_spoken_in_image, log_spoken_looks_in_image
 from bevviz.logging.writer import Writer
+
+if TYPE_CHECKING:
+    from bevviz.logging.video import VideoEncoder
 
 
 def log_camera_looks(to: Writer, cameras: Iterable[str]) -> None:
@@ -23,7 +41,8 @@ def log_camera_looks(to: Writer, cameras: Iterable[str]) -> None:
             depth_annotations(),
             rr.Points2D.from_fields(radii=rr.Radius.ui_points(1.5), show_labels=False, draw_order=10.0),
         )
-        to.static(entities.detections(camera), rr.Boxes2D.from_fields(draw_order=30.0))
+        to.static(entities.detections(camera), rr.Boxes2D.from_fields(draw_order=30.0, show_labels=False))
+        log_spoken_looks_in_image(to, entities.detections(camera), 31.0)
         if to.root:
             log_shared_image(to, camera)
         to.static(
@@ -36,7 +55,9 @@ def log_camera_looks(to: Writer, cameras: Iterable[str]) -> None:
 
 def log_shared_image(to: Writer, camera: str) -> None:
     """What is under a root is drawn over the one image that there is."""
-    for path in (entities.projected(camera), entities.detections(camera), entities.weak(camera)):
+    boxes = entities.detections(camera)
+    over = (entities.projected(camera), boxes, entities.outlines(boxes), entities.names(boxes))
+    for path in (*over, entities.weak(camera)):
         to.static(path, over_image(camera))
 
 
@@ -55,13 +76,22 @@ def camera_pose(frame: Frame, result: CameraResult) -> F64 | None:
     return None
 
 
-def log_camera(to: Writer, frame: Frame, result: CameraResult, quality: int) -> None:
-    """Pose and image; the intrinsics are static, see ``log_intrinsics``."""
+def log_camera(
+    to: Writer, frame: Frame, result: CameraResult, quality: int, videos: Videos | None = None
+) -> None:
+    """Pose and image; the intrinsics are static, see ``log_intrinsics``.
+
+    ``videos``: take what came raw or without loss.
+    """
     camera, world_from_camera = result.camera, camera_pose(frame, result)
     if world_from_camera is not None:
         to.put(entities.sensor(camera.name), transform(world_from_camera))
     if camera.image is not None:
-        log_image(to, camera.name, camera.image, quality)
+        is_video = camera.image.clip is not None and to.streams_video
+        if videos is not None and not is_video and camera.image.media_type not in keep.LOSSY:
+            videos.log(to, camera.name, camera.image)
+        else:
+            log_image(to, camera.name, camera.image, quality)
 
 
 def log_intrinsics(to: Writer, name: str, intrinsics: Intrinsics) -> None:
@@ -88,32 +118,93 @@ def log_image(to: Writer, name: str, image: Image, quality: int) -> None:
         to.put(path, encode_image(image, quality))
 
 
-def log_detections(to: Writer, name: str, detections: Detections) -> None:
-    """Those that went on to the fusion in the colour of their class, the others faint."""
-    is_kept = detections.kept
-    for path, rows in (
-        (entities.detections(name), np.flatnonzero(is_kept)),
-        (entities.weak(name), np.flatnonzero(~is_kept)),
-    ):
-        if len(rows) == 0:
-            continue
-        names = [detections.names[d] for d in rows]
-        to.put(
-            path,
-            boxes2d(
-                detections.xyxy[rows],
-                scored(names, detections.score[rows]),
-                colors=[class_color(n) for n in names] if path == entities.detections(name) else None,
-                class_ids=[entities.DETECTION_CLASS[DetectionState(s)] for s in detections.state[rows]],
-            ),
+class Videos:
+    """Images of cameras as H.264."""
+
+    def __init__(self) -> None:
+        self._encoders: dict[str, VideoEncoder] = {}
+        self._recording: object = None
+
+    def restart(self) -> None:
+        """What comes next needs nothing before it."""
+        for encoder in self._encoders.values():
+            encoder.restart()
+
+    def log(self, to: Writer, name: str, image: Image) -> None:
+        """Once for each image, as ``log_image``."""
+        if self._recording is not to.recording:
+            self._recording = to.recording
+            self.restart()
+        path = entities.image(name)
+        if to.keep(path, image.stamp):
+            return
+        if name not in self._encoders:
+            from bevviz.logging.video import VideoEncoder  # takes its time, and few need it
+
+            self._encoders[name] = VideoEncoder()
+        sample = self._encoders[name](image.bgr, image.stamp)
+        if sample.key:
+            to.put(path, rr.VideoStream.from_fields(codec=rr.VideoCodec.H264, sample=sample.data))
+        else:
+            to.put(path, rr.VideoStream.from_fields(sample=sample.data))
+
+
+def log_detections(to: Writer, result: CameraResult, explanations: Iterable[Explanation]) -> None:
+    """Those that went on to the fusion in the colour of their class, the others faint.
+
+    The names of those that stand large in the image are written beside them, and of those that have no match;
+    what became of any is said by its outline, see ``spoken``.
+    """
+    name, detections = result.camera.name, result.detections
+    if detections is None:
+        return
+    kept, others = np.flatnonzero(detections.kept), np.flatnonzero(~detections.kept)
+    if len(others):
+        to.put(entities.weak(name), _boxes(detections, others))
+    if len(kept):
+        colors = [class_color(detections.names[d]) for d in kept]
+        to.put(entities.detections(name), _boxes(detections, kept, colors=colors))
+        texts = {e.row: e.text for e in explanations if e.subject == "detection" and e.camera == name}
+        xyxy = detections.xyxy[kept]
+        labels = scored((detections.names[d] for d in kept), detections.score[kept])
+        named = _large(xyxy)
+        if result.fusion is not None:
+            named |= result.fusion.detection_decision[kept] != Decision.MATCHED
+        log_spoken_in_image(
+            to,
+            entities.detections(name),
+            xyxy,
+            [label if is_named else "" for label, is_named in zip(labels, named, strict=True)],
+            [texts.get(d, label) for d, label in zip(kept.tolist(), labels, strict=True)],
+            colors,
         )
 
 
-def log_projected_points(to: Writer, result: CameraResult) -> None:
-    """The obstacle points in the image, by depth."""
+def _boxes(detections: Detections, rows: I64, **looks: Any) -> rr.Boxes2D:
+    return boxes2d(
+        detections.xyxy[rows],
+        scored((detections.names[d] for d in rows), detections.score[rows]),
+        class_ids=[entities.DETECTION_CLASS[DetectionState(s)] for s in detections.state[rows]],
+        **looks,
+    )
+
+
+def _large(xyxy: F32) -> Bool:
+    """(K,) the few tallest boxes, which are what is near."""
+    height = xyxy[:, 3] - xyxy[:, 1]
+    large: Bool = height >= (np.sort(height)[-NEAR] if len(height) > NEAR else 0)
+    return large
+
+
+def log_projected_points(to: Writer, result: CameraResult, *, packed: bool = False) -> None:
+    """The obstacle points in the image, by depth. ``packed``: rounded and sorted as where less is kept."""
     if result.uv is None or result.depth is None:
         return
     seen = np.isfinite(result.uv[:, 0])
     if seen.any():
         depth = bins(result.depth[seen], 0, entities.DEPTH_RANGE, entities.DEPTH_BINS)
-        to.put(entities.projected(result.camera.name), rr.Points2D(result.uv[seen] + CORNER, class_ids=depth))
+        uv = result.uv[seen] + CORNER
+        if packed:
+            rows = keep.sorted_rows(uv, keep.PIXEL)
+            uv, depth = np.rint(uv[rows] * keep.PIXEL) / np.float32(keep.PIXEL), depth[rows]
+        to.put(entities.projected(result.camera.name), rr.Points2D(uv, class_ids=depth))

@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from typing import TypeAlias
 
 import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
 from bevviz.frame import F32, Frame, FrameResult
-from bevviz.logging import entities
+from bevviz.logging import entities, keep
 from bevviz.logging.entities import ClassId
 from bevviz.logging.pieces import rounded, transform
 from bevviz.logging.writer import Writer
 from bevviz.stages.voxel import of_points
+
+RawCloud: TypeAlias = tuple[str, F32, NDArray[np.uint16]]  # entity, points, class id of each
 
 
 def log_cloud_looks(to: Writer, lidars: Iterable[str]) -> None:
@@ -25,30 +28,45 @@ def log_cloud_looks(to: Writer, lidars: Iterable[str]) -> None:
 
 def log_cloud(to: Writer, result: FrameResult) -> None:
     """Every raw point, exact, of several LiDARs each in its own frame."""
+    log_cloud_poses(to, result.frame)
+    for path, points, class_ids in raw_clouds(result):
+        to.put(path, rr.Points3D(points, class_ids=class_ids))
+
+
+def log_cloud_poses(to: Writer, frame: Frame) -> None:
+    """Where the LiDARs are, where there are several."""
+    if len(frame.clouds) > 1:
+        for cloud, points_from_cloud in zip(frame.clouds, frame.points_from_clouds, strict=True):
+            to.put(entities.sensor(cloud.name), transform(frame.pose @ points_from_cloud))
+
+
+def raw_clouds(result: FrameResult) -> list[RawCloud]:
+    """Those that have points."""
     frame = result.frame
     class_ids = np.zeros(len(frame.points), np.uint16)
     if result.voxels is not None and result.ground is not None:
         of_voxels = np.where(result.ground.mask, ClassId.GROUND, ClassId.OBSTACLE).astype(np.uint16)
         class_ids = of_points(of_voxels, result.voxels.inverse)
-    if len(frame.clouds) > 1:
-        _log_merged(to, frame, class_ids)
-    elif len(frame.points):
-        to.put(entities.points(frame.lidar), rr.Points3D(frame.points, class_ids=class_ids))
-
-
-def _log_merged(to: Writer, frame: Frame, class_ids: NDArray[np.uint16]) -> None:
-    end = 0
-    for cloud, points_from_cloud in zip(frame.clouds, frame.points_from_clouds, strict=True):
+    if len(frame.clouds) <= 1:
+        return [(entities.points(frame.lidar), frame.points, class_ids)] if len(frame.points) else []
+    found, end = [], 0
+    for cloud in frame.clouds:
         start, end = end, end + len(cloud.xyz)
-        to.put(entities.sensor(cloud.name), transform(frame.pose @ points_from_cloud))
         if len(cloud.xyz):
-            to.put(entities.points(cloud.name), rr.Points3D(cloud.xyz, class_ids=class_ids[start:end]))
+            found.append((entities.points(cloud.name), cloud.xyz, class_ids[start:end]))
+    return found
 
 
-def log_ground(to: Writer, result: FrameResult, voxel_size: float) -> None:
+def log_ground(to: Writer, result: FrameResult, voxel_size: float, *, packed: bool = False) -> None:
+    """``packed``: rounded and sorted as where less is kept."""
     if result.voxels is None or result.ground is None:
         return
-    ground = quantised(result.voxels.points.compress(result.ground.mask, axis=0), voxel_size)
+    ground = result.voxels.points.compress(result.ground.mask, axis=0)
+    if packed:
+        scale = keep.step(voxel_size, keep.COARSE)
+        ground = coarse(ground.take(keep.sorted_rows(ground, scale), axis=0), scale)
+    else:
+        ground = quantised(ground, voxel_size)
     _log_class(to, entities.ground(result.frame.lidar), ground, ClassId.GROUND)
 
 
@@ -71,3 +89,8 @@ def quantised(points: F32, voxel_size: float) -> F32:
     if voxel_size == 0:
         return points
     return rounded(points, 2.0 ** np.floor(np.log2(8 / voxel_size)))
+
+
+def coarse(points: F32, scale: float) -> F32:
+    """Rounded to the nearest 1 / scale; 0: as they are."""
+    return rounded(points, scale) if scale else points

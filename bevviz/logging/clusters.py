@@ -9,8 +9,9 @@ import rerun as rr
 from numpy.typing import NDArray
 
 from bevviz.config import ClusteringConfig
-from bevviz.frame import F32, I64, Bool, Clusters, ClusterState, Frame, Tracks
-from bevviz.logging import entities, tracks
+from bevviz.frame import F32, I32, I64, Bool, Clusters, ClusterState, Frame, Tracks
+from bevviz.logging import entities, keep, tracks
+from bevviz.logging.cloud import coarse
 from bevviz.logging.pieces import OUTLINE, boxes3d
 from bevviz.logging.writer import Writer
 
@@ -20,7 +21,7 @@ def log_clusters_looks(to: Writer, lidars: Iterable[str]) -> None:
         to.static(
             entities.clusters(lidar),
             rr.Points3D.from_fields(radii=rr.Radius.ui_points(2.0), show_labels=False),
-            rr.Boxes3D.from_fields(radii=rr.Radius.ui_points(1.0), fill_mode=OUTLINE),
+            rr.Boxes3D.from_fields(radii=rr.Radius.ui_points(1.0), fill_mode=OUTLINE, show_labels=False),
         )
         to.static(entities.set_aside(lidar), rr.Boxes3D.from_fields(show_labels=False))
 
@@ -33,19 +34,25 @@ def log_clusters(
     obstacles: F32,
     config: ClusteringConfig,
     colored: bool = True,
+    packed: float | None = None,
 ) -> None:
     """In the colours of their tracks. ``obstacles``: (P, 3), as of ``clusters.labels``.
 
-    Without colours, they are for ``log_cluster_colors`` to log.
+    Without colours, they are for ``log_cluster_colors`` to log. ``packed``: cluster by cluster, rounded to so
+    many steps in a metre (0: not), as where less is kept.
     """
     boxes = clusters.boxes(config)
     kept, others = np.flatnonzero(clusters.kept), np.flatnonzero(~clusters.kept)
     if len(kept):
-        member = _member(clusters)
-        of_points, of_boxes = _colors(clusters, tracked, member, kept) if colored else (None, None)
+        member = in_kept(clusters)
+        points, labels = obstacles.compress(member, axis=0), clusters.labels.compress(member)
+        if packed is not None:
+            rows = keep.sorted_rows(points, packed, labels)
+            points, labels = coarse(points.take(rows, axis=0), packed), labels.take(rows)
+        of_points, of_boxes = _colors(clusters, tracked, labels, kept) if colored else (None, None)
         to.put(
             entities.clusters(frame.lidar),
-            rr.Points3D(obstacles.compress(member, axis=0), class_ids=of_points),
+            rr.Points3D(points, class_ids=of_points),
             boxes3d(boxes, kept, [f"{k}" for k in kept], class_ids=of_boxes),
         )
     if len(others):
@@ -61,11 +68,14 @@ def log_clusters(
         )
 
 
-def log_cluster_colors(to: Writer, frame: Frame, clusters: Clusters, tracked: Tracks | None) -> None:
+def log_cluster_colors(
+    to: Writer, frame: Frame, clusters: Clusters, tracked: Tracks | None, *, packed: bool = False
+) -> None:
     """Of a frame that ``log_clusters`` logged without."""
     kept = np.flatnonzero(clusters.kept)
     if len(kept):
-        of_points, of_boxes = _colors(clusters, tracked, _member(clusters), kept)
+        labels = clusters.labels.compress(in_kept(clusters))
+        of_points, of_boxes = _colors(clusters, tracked, np.sort(labels) if packed else labels, kept)
         to.write(
             entities.clusters(frame.lidar),
             rr.Points3D.from_fields(class_ids=of_points),
@@ -73,14 +83,14 @@ def log_cluster_colors(to: Writer, frame: Frame, clusters: Clusters, tracked: Tr
         )
 
 
-def _member(clusters: Clusters) -> Bool:
+def in_kept(clusters: Clusters) -> Bool:
     """(P,) obstacle points of the clusters that were kept."""
     return np.append(clusters.kept, False).take(clusters.labels)  # -1 is noise
 
 
 def _colors(
-    clusters: Clusters, tracked: Tracks | None, member: Bool, kept: I64
+    clusters: Clusters, tracked: Tracks | None, labels: I32, kept: I64
 ) -> tuple[NDArray[np.uint16], NDArray[np.uint16]]:
-    """Class ids of those points, and of the boxes of the clusters that were kept."""
+    """Class ids of points of these clusters, and of the boxes of the clusters that were kept."""
     colors = tracks.class_ids(tracks.of_clusters(tracked, len(clusters)))
-    return colors.take(clusters.labels.compress(member)), colors[kept]
+    return colors.take(labels), colors[kept]

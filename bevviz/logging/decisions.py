@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 
-from bevviz.frame import Explanation, FrameResult
+import numpy as np
+
+from bevviz.frame import Detections, DetectionState, Explanation, FrameResult
 from bevviz.logging import entities
-from bevviz.logging.pieces import document
+from bevviz.logging.pieces import document, scored
 from bevviz.logging.writer import Writer
 from bevviz.text import markdown
 
@@ -21,7 +24,7 @@ def log_decisions(to: Writer, result: FrameResult, notes: Sequence[tuple[str, st
 
 
 def page(result: FrameResult) -> str:
-    """What went wrong first, then each camera's detections, best decision first, then the clusters."""
+    """What went wrong, each camera's detections, those without a match first, then the clusters."""
     return "\n".join(_lines(result))
 
 
@@ -52,10 +55,10 @@ def _lines(result: FrameResult) -> Iterator[str]:
     for camera in result.cameras:
         name = camera.camera.name
         mine = [e for e in result.explanations if e.subject == "detection" and e.camera == name]
-        kept = sorted((e for e in mine if e.state not in _WEAK), key=lambda e: e.state != "matched")
+        kept = sorted((e for e in mine if e.state not in _WEAK), key=lambda e: e.state == "matched")
         if camera.detections is not None:
             yield from _section(f"{name}: detections", map(_item, kept) if kept else ["none"])
-        yield from _section(f"{name}: not kept", (markdown(e.text) for e in mine if e.state in _WEAK))
+            yield from _section(f"{name}: not kept", map(markdown, _not_kept(mine, camera.detections)))
         yield from _clusters(
             [e for e in result.explanations if e.subject == "cluster" and e.camera == name], name
         )
@@ -64,13 +67,31 @@ def _lines(result: FrameResult) -> Iterator[str]:
     yield from _clusters([e for e in result.explanations if e.subject == "cluster" and not e.camera], "")
 
 
+def _not_kept(explanations: Sequence[Explanation], found: Detections) -> Iterator[str]:
+    """A line for each that suppresses others, and one for those below the threshold."""
+    for d in np.unique(found.suppressed_by[found.state == DetectionState.SUPPRESSED]).tolist():
+        names = Counter(found.names[s] for s in np.flatnonzero(found.suppressed_by == d).tolist())
+        [label] = scored([found.names[d]], [found.score[d]])
+        yield f"{_counted(names)} suppressed by {label}"
+    below = [e for e in explanations if e.state == "below_threshold"]
+    if below:
+        best = max(below, key=lambda e: found.score[e.row])
+        yield f"{len(below)} more, the best {best.text}" if below[1:] else best.text
+
+
+def _counted(names: Counter[str]) -> str:
+    """``3``, or ``3 (2 car, 1 truck)``."""
+    if len(names) == 1:
+        return str(names.total())
+    return f"{names.total()} ({', '.join(f'{count} {name}' for name, count in names.most_common())})"
+
+
 def _clusters(explanations: list[Explanation], camera: str) -> Iterator[str]:
     if not explanations:
         return
     title = f"{camera}: clusters" if camera else "Clusters"
-    items = [
-        _item(e) for e in sorted(explanations, key=lambda e: e.state != "matched") if e.state not in _MANY
-    ]
+    told = [e for e in explanations if e.state not in _MANY]
+    items = [_item(e) for e in sorted(told, key=lambda e: e.state == "matched")]
     for state in sorted(_MANY):
         rows = [e.row for e in explanations if e.state == state]
         if rows:

@@ -29,6 +29,8 @@ GRID = "/world/bev"
 TRUTH = "/world/ground_truth"
 BEV = "/bev"
 ROBOT = "/robot"
+ROTATION = "/motion/rotation_rad_s"
+ACCELERATION = "/motion/acceleration_m_s2"
 TRACKS = "/world/tracks"
 UNSEEN = "/world/tracks/unseen"
 TRAILS = "/world/tracks/trails"
@@ -108,6 +110,21 @@ def weak(camera: str) -> str:
     return f"{WORLD}/{camera}/image/detections/weak"
 
 
+def outlines(boxes: str) -> str:
+    """Over these boxes, a sentence for each; see ``bevviz.logging.spoken``."""
+    return f"{boxes}/outlines"
+
+
+def names(boxes: str) -> str:
+    """Beside these boxes."""
+    return f"{boxes}/names"
+
+
+def boxes_of(path: str) -> str:
+    """The boxes that these outlines or names belong to; other entities are their own."""
+    return path.removesuffix("/outlines").removesuffix("/names")
+
+
 def projected(camera: str) -> str:
     return f"{WORLD}/{camera}/image/points"
 
@@ -123,6 +140,16 @@ def overlay(what: str) -> str:
 
 def robot(topic: str) -> str:
     return f"{ROBOT}{_topic(topic)}"
+
+
+def rotation(topic: str) -> str:
+    """Of an Imu."""
+    return f"{ROTATION}{_topic(topic)}"
+
+
+def acceleration(topic: str) -> str:
+    """Of an Imu."""
+    return f"{ACCELERATION}{_topic(topic)}"
 
 
 def robot_overlay(topic: str) -> str:

@@ -11,24 +11,43 @@ import rerun as rr
 
 from bevviz.anomalies import Onsets
 from bevviz.config import Config
-from bevviz.frame import CameraResult, Frame, FrameResult, Intrinsics, LateResult, Scene
+from bevviz.frame import Frame, FrameResult, Intrinsics, LateResult, Scene
 from bevviz.logging import entities
 from bevviz.logging.annotations import log_world
 from bevviz.logging.anomalies import log_anomalies, log_anomalies_looks
-from bevviz.logging.around import AroundLog, diagnostic_states, log_shapes, marks
+from bevviz.logging.around import (
+    AroundLog,
+    Fixed,
+    diagnostic_states,
+    fixed_parts,
+    log_motions,
+    log_shapes,
+    marks,
+)
 from bevviz.logging.bev import log_bev, log_grid
 from bevviz.logging.camera import (
+    Videos,
     log_camera,
     log_camera_looks,
     log_detections,
     log_intrinsics,
     log_projected_points,
 )
-from bevviz.logging.cloud import log_cloud, log_cloud_looks, log_ground, log_obstacles, quantised
-from bevviz.logging.clusters import log_cluster_colors, log_clusters, log_clusters_looks
+from bevviz.logging.cloud import (
+    coarse,
+    log_cloud,
+    log_cloud_looks,
+    log_cloud_poses,
+    log_ground,
+    log_obstacles,
+    quantised,
+    raw_clouds,
+)
+from bevviz.logging.clusters import in_kept, log_cluster_colors, log_clusters, log_clusters_looks
 from bevviz.logging.decisions import log_decisions
 from bevviz.logging.frustums import log_frustums
 from bevviz.logging.health import Rates, log_health
+from bevviz.logging.keep import COARSE, FINE, Around, Held, is_whole, sorted_rows, step
 from bevviz.logging.labelled import forget_late, log_late, log_robot, log_truth, log_truth_looks
 from bevviz.logging.objects import log_objects, log_objects_looks
 from bevviz.logging.origin import log_origin
@@ -49,6 +68,9 @@ class Context:
     clock: tuple[int, int, int] = (0, 0, 0)  # index, stamp and received of the frame
     intrinsics: Mapping[str, Intrinsics] = field(default_factory=dict)
     lanes: Mapping[str, str] = field(default_factory=dict)  # state lane -> its state
+    fixed: Mapping[str, Fixed] = field(
+        default_factory=dict
+    )  # entity -> what holds at all times since it came
 
 
 class Logger(Writer):
@@ -64,6 +86,7 @@ class Logger(Writer):
             another logger writes: what the sensors and the robot brought is not written twice.
         wait, stamps: as of ``Writer``.
         inputs: write what the sensors and the robot brought; default: without a root.
+        network: what the detector's runs on; stored in the recording.
     """
 
     def __init__(
@@ -75,20 +98,27 @@ class Logger(Writer):
         wait: float = 0.0,
         stamps: Sequence[str] = (entities.STAMP,),
         inputs: bool | None = None,
+        network: str = "",
     ) -> None:
         super().__init__(recording, root, wait, stamps)
         self._inputs = not root if inputs is None else inputs
         self._brought: set[str] = set()  # entities of the sensors and the robot
         self._config = config
         self.streams_video = config.logging.video == "stream"
-        self._scene = scene
+        self._scene, self._network = scene, network
         self._intrinsics: dict[str, Intrinsics] = {}
+        self._fixed: dict[str, Fixed] = {}
         self._track_lanes = Lanes()
-        self._state_lanes = StateLanes(COLORS)
+        self._state_lanes = StateLanes(COLORS, plain_lanes=entities.ANOMALY_STATES)
         self._around = AroundLog()
         self._onsets = Onsets()
         self._last: Frame | None = None
         self._rates = Rates()
+        self._videos, self._around_raw = Videos(), Around()
+        self._raw_shown: set[str] = set()  # entities with the raw clouds of the frame before
+        self._raw_known: set[str] = set()
+        self._watched: dict[str, str] = {}  # state lane of the pipeline or a camera -> its state
+        self._changed = False  # the configuration, before this frame
         self._late: dict[str, int] = {}  # topic of the robot's results that come late -> stamp of the newest
 
     @property
@@ -96,7 +126,9 @@ class Logger(Writer):
         """What the frame that was logged last relies on."""
         last = self._last
         clock = (0, 0, 0) if last is None else (last.index, last.stamp, last.received)
-        return Context(self._config, self._scene, clock, self._intrinsics, self._state_lanes.states)
+        return Context(
+            self._config, self._scene, clock, self._intrinsics, self._state_lanes.states, self._fixed
+        )
 
     @property
     def results(self) -> frozenset[str]:
@@ -106,6 +138,8 @@ class Logger(Writer):
     def refresh(self, known: Set[str] = frozenset()) -> None:
         """As a ``Writer``; inputs that are not written here are not cleared here either."""
         super().refresh(known)
+        self._videos.restart()
+        self._raw_shown = set(self._raw_known)
         if not self._inputs:
             self._shown -= self._brought
 
@@ -114,7 +148,7 @@ class Logger(Writer):
     def log_static(self) -> None:
         """How the recording was made, the axes, the classes and the looks: what no frame changes."""
         lidars = list(dict.fromkeys(filter(None, (self._scene.lidar, *self._scene.lidars))))
-        log_origin(self, self._config, self._scene)
+        log_origin(self, self._config, self._scene, self._network)
         log_world(self)
         log_cloud_looks(self, lidars)
         log_clusters_looks(self, lidars)
@@ -129,6 +163,8 @@ class Logger(Writer):
         self.log_static()
         for name, intrinsics in context.intrinsics.items():
             self._log_intrinsics(name, intrinsics)
+        for path, fixed in context.fixed.items():
+            self.static(path, *fixed)
         if context.lanes:
             self.set_time(*context.clock)
             self._state_lanes.log(self, context.lanes)
@@ -136,9 +172,10 @@ class Logger(Writer):
     def reconfigure(self, config: Config, scene: Scene) -> None:
         """From here on the results are made in another way, or of other sensors."""
         same, self._config, self._scene = scene == self._scene, config, scene
+        self._changed = True
         self.streams_video = config.logging.video == "stream"
         if same:  # the viewer loses class colours that are logged twice
-            log_origin(self, config, scene)
+            log_origin(self, config, scene, self._network)
         else:
             self.log_static()
 
@@ -192,7 +229,8 @@ class Logger(Writer):
         frame = result.frame
         self.begin(frame.index, frame.stamp, frame.received)
         if result.clusters is not None:
-            log_cluster_colors(self, frame, result.clusters, result.tracks)
+            packed = not is_whole(self._config)
+            log_cluster_colors(self, frame, result.clusters, result.tracks, packed=packed)
         self._log_in_order(result)
         self.end()
 
@@ -208,13 +246,18 @@ class Logger(Writer):
         self._brought |= self._now - before
         self._log_lidar_results(result, colored)
         for camera in result.cameras:
-            self._log_camera_results(camera)
+            log_detections(self, camera, result.explanations)
+            if self._config.logging.projected_points and self._config.logging.keep != "report":
+                log_projected_points(self, camera, packed=not is_whole(self._config))
         log_frustums(self, frame, result.cameras)
         if result.bev is not None:
             log_bev(self, result.bev, self._config)
-            log_grid(self, result, result.bev)
+            if self._config.logging.keep != "report":
+                log_grid(self, result, result.bev)
         if not self.root:
+            self._log_fixed(frame)
             log_shapes(self, frame)
+            log_motions(self, frame)
 
     def _log_in_order(
         self,
@@ -229,8 +272,12 @@ class Logger(Writer):
             log_tracks(self, frame, result.tracks, self._config.bev)
         lines = marks(frame) if self.root else self._around.lines(frame)
         log_decisions(self, result, [*notes, *lines])
-        log_anomalies(self, result, self._onsets.of(result.anomalies))
+        started = self._onsets.of(result.anomalies)
+        log_anomalies(self, result, started)
         self._log_states(result, states)
+        kept = self._config.logging
+        if self._inputs and kept.keep == "inspect" and kept.raw_cloud:
+            self._log_some_clouds(result, strange=bool(started))
         self._rates.add(frame)
         log_health(self, result, self._last, self._rates, health)
         self._last = frame
@@ -250,10 +297,13 @@ class Logger(Writer):
     def _log_input(self, result: FrameResult) -> None:
         """What the sensors and the robot brought."""
         frame, config = result.frame, self._config
-        if config.logging.raw_cloud:
+        if config.logging.raw_cloud and is_whole(config):
             log_cloud(self, result)
+        else:
+            log_cloud_poses(self, frame)
+        videos = None if is_whole(config) else self._videos
         for camera in result.cameras:
-            log_camera(self, frame, camera, config.logging.jpeg_quality)
+            log_camera(self, frame, camera, config.logging.jpeg_quality, videos)
             if camera.camera.intrinsics is not None:
                 self._log_intrinsics(camera.camera.name, camera.camera.intrinsics)
         log_truth(self, frame, config.bev)
@@ -262,6 +312,13 @@ class Logger(Writer):
             if frame.stamp - stamp > STALE:
                 del self._late[topic]
                 forget_late(self, topic)
+
+    def _log_fixed(self, frame: Frame) -> None:
+        """Where it is new."""
+        for path, make in fixed_parts(frame).items():
+            if path not in self._fixed and (fixed := make()) is not None:
+                self._fixed = {**self._fixed, path: fixed}  # a context may hold the one before
+                self.static(path, *fixed)
 
     def _log_intrinsics(self, name: str, intrinsics: Intrinsics) -> None:
         """Where they are new."""
@@ -274,20 +331,68 @@ class Logger(Writer):
             log_intrinsics(self, name, intrinsics)
 
     def _log_lidar_results(self, result: FrameResult, colored: bool) -> None:
-        frame, config = result.frame, self._config
+        frame, config, clusters = result.frame, self._config, result.clusters
+        if not is_whole(config):
+            self._log_packed_results(result, colored)
+            return
         log_ground(self, result, config.voxel.size)
         if result.obstacles is None:
             return
         obstacles = quantised(result.obstacles, config.voxel.size)
         log_obstacles(self, frame, obstacles)
-        if result.clusters is not None:
-            log_clusters(self, frame, result.clusters, result.tracks, obstacles, config.clustering, colored)
+        if clusters is not None:
+            log_clusters(self, frame, clusters, result.tracks, obstacles, config.clustering, colored)
 
-    def _log_camera_results(self, result: CameraResult) -> None:
-        if result.detections is not None:
-            log_detections(self, result.camera.name, result.detections)
-        if self._config.logging.projected_points:
-            log_projected_points(self, result)
+    def _log_packed_results(self, result: FrameResult, colored: bool) -> None:
+        """Each voxel once: those of clusters with these."""
+        frame, config, clusters = result.frame, self._config, result.clusters
+        size, ground_too = config.voxel.size, config.logging.keep != "report"
+        if ground_too:
+            log_ground(self, result, size, packed=True)
+        if result.obstacles is None:
+            return
+        if ground_too:
+            others = result.obstacles
+            if clusters is not None:
+                others = others.compress(~in_kept(clusters), axis=0)
+            scale = step(size, COARSE)
+            others = coarse(others.take(sorted_rows(others, scale), axis=0), scale)
+            log_obstacles(self, frame, others)
+        if clusters is not None:
+            scale = step(size, FINE)
+            log_clusters(
+                self, frame, clusters, result.tracks, result.obstacles, config.clustering, colored, scale
+            )
+
+    def _log_some_clouds(self, result: FrameResult, *, strange: bool) -> None:
+        """The raw clouds of this frame where they are wanted, and those before it that are wanted with it.
+
+        Needs what the frames before have a part in: anomalies, and states that change.
+        """
+        frame, clouds = result.frame, raw_clouds(result)
+        lanes = [
+            entities.state("pipeline"),
+            *(entities.state(camera.camera.name) for camera in result.cameras),
+        ]
+        watched = {lane: self._state_lanes.states.get(lane, "") for lane in lanes}
+        strange |= (
+            bool(marks(frame))
+            or self._changed
+            or any(self._watched.get(lane, state) != state for lane, state in watched.items())
+        )
+        self._watched, self._changed = watched, False
+        now = frame.index, frame.stamp, frame.received
+        wanted = self._around_raw.see(Held(now, clouds), self._config.logging, strange=strange)
+        for one in wanted:
+            self.set_time(*one.clock)
+            for path, points, class_ids in one.clouds:
+                self.write(path, rr.Points3D(points, class_ids=class_ids))
+        self.set_time(*now)
+        shown = {path for path, _, _ in clouds} if wanted else set()
+        for path in sorted(self._raw_shown - shown):
+            self.write(path, rr.Clear(recursive=False))
+        self._raw_shown = shown
+        self._raw_known |= shown
 
     def _log_states(self, result: FrameResult, more: Mapping[str, str]) -> None:
         states = {**states_of(result), **more}

@@ -5,15 +5,18 @@ from __future__ import annotations
 import numpy as np
 import rerun as rr
 
+from bevviz import anomalies
 from bevviz.colors import class_color
 from bevviz.frame import SIDES, FrameResult, Objects
 from bevviz.logging import entities, tracks
 from bevviz.logging.pieces import boxes3d, scored, transform
+from bevviz.logging.spoken import log_spoken, log_spoken_looks, near
 from bevviz.logging.writer import Writer
 
 
 def log_objects_looks(to: Writer) -> None:
-    to.static(entities.FUSED, rr.Boxes3D.from_fields(radii=rr.Radius.ui_points(2.0), show_labels=True))
+    to.static(entities.FUSED, rr.Boxes3D.from_fields(radii=rr.Radius.ui_points(0.5), show_labels=False))
+    log_spoken_looks(to, entities.FUSED)
     to.static(entities.MEASURED, rr.Boxes3D.from_fields(radii=rr.Radius.ui_points(1.0), show_labels=False))
 
 
@@ -24,18 +27,20 @@ def log_objects(to: Writer, result: FrameResult) -> None:
         return
     reasons = {(e.camera, e.row): e.text for e in result.explanations if e.subject == "detection"}
     labels = scored(objects.names, objects.score)
+    odd, is_odd = {anomaly.subject for anomaly in result.anomalies}, np.zeros(len(objects), bool)
     ids, speeds = np.full(len(objects), -1), np.full(len(objects), np.nan, np.float32)
     for j, row in enumerate(tracks.of_objects(tracked, len(objects))):
         if row is not None and tracked is not None:
             labels[j] = tracks.label(tracked, row)
+            is_odd[j] = anomalies.label(tracked, row) in odd
             ids[j], speeds[j] = tracked.id[row], tracked.speed[row]
     matches = zip(objects.camera, objects.detection.tolist(), strict=True)
+    why = [reasons.get(match, "") for match in matches]
+    colors = [class_color(name) for name in objects.names]
     to.put(
         entities.FUSED,
         transform(result.frame.pose),
-        boxes3d(
-            objects.boxes, np.arange(len(objects)), labels, colors=[class_color(n) for n in objects.names]
-        ),
+        boxes3d(objects.boxes, np.arange(len(objects)), labels, colors=colors),
         rr.AnyValues(
             class_name=list(objects.names),
             score=objects.score,
@@ -44,18 +49,29 @@ def log_objects(to: Writer, result: FrameResult) -> None:
             cluster=objects.cluster,
             camera=list(objects.camera),
             seen=sides(objects),
-            reason=[reasons.get(match, "") for match in matches],
+            reason=why,
         ),
+    )
+    away = np.hypot(*objects.boxes.center[:, :2].T)
+    is_named = near(objects.boxes.center) | is_odd
+    log_spoken(
+        to,
+        entities.FUSED,
+        objects.boxes,
+        [label if named else "" for label, named in zip(labels, is_named, strict=True)],
+        [
+            f"{label}, {metres:.1f} m away: {reason.partition(': ')[2] or 'an object'}"
+            for label, metres, reason in zip(labels, away, why, strict=True)
+        ],
+        colors,
     )
     if objects.measured is not None:
         rows = np.flatnonzero((objects.measured.size != objects.boxes.size).any(axis=1))
         if len(rows):
-            colors = [class_color(objects.names[j]) for j in rows]
-            to.put(
-                entities.MEASURED,
-                transform(result.frame.pose),
-                boxes3d(objects.measured, rows, [labels[j] for j in rows], colors=colors),
+            measured = boxes3d(
+                objects.measured, rows, [labels[j] for j in rows], colors=[colors[j] for j in rows]
             )
+            to.put(entities.MEASURED, transform(result.frame.pose), measured)
 
 
 def sides(objects: Objects) -> list[str]:

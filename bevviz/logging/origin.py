@@ -7,24 +7,28 @@ import rerun as rr
 from bevviz.config import Config, dump, stated_lines
 from bevviz.frame import Scene
 from bevviz.logging import entities
+from bevviz.logging.keep import left_out
 from bevviz.logging.pieces import document
 from bevviz.logging.writer import Writer
 from bevviz.provenance import versions
 from bevviz.text import fenced, markdown
 
 
-def log_origin(to: Writer, config: Config, scene: Scene) -> None:
-    """Source, configuration and versions."""
+def log_origin(to: Writer, config: Config, scene: Scene, network: str = "") -> None:
+    """Source, configuration, versions, and what the detector's network runs on."""
     settings = dump(config)
     stated = stated_lines(config, folders=False)
     packages = [f"{name} {version}" for name, version in versions().items()]
-    lines = [*map(markdown, stated), *packages]
+    lines = [*map(markdown, stated), *packages, *([f"network on {markdown(network)}"] if network else [])]
+    lacking = list(left_out(config.logging))
+    lacks = "".join(f"- {line}\n" for line in lacking)
+    lacks = f"## Not in this recording (keep: {config.logging.keep})\n\n{lacks}\n" if lacks else ""
     to.static(
         entities.CONFIG,
         document(
             "# How this recording was made\n\n"
             f"Source: **{markdown(scene.name)}**, preset: **{config.preset}**\n\n"
-            f"{fenced(settings, 'yaml')}\n\n" + "\n".join(f"- {line}" for line in lines)
+            f"{lacks}{fenced(settings, 'yaml')}\n\n" + "\n".join(f"- {line}" for line in lines)
         ),
     )
     if not to.root:
@@ -39,5 +43,8 @@ def log_origin(to: Writer, config: Config, scene: Scene) -> None:
             versions=packages,
             lidars=[name for name in scene.lidars or (scene.lidar,) if name] or None,
             cameras=list(scene.cameras) or None,
+            keep=config.logging.keep,
+            left_out=lacking or None,
+            network=network or None,
         ),
     )

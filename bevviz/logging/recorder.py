@@ -20,13 +20,14 @@ class Recorder(Observer[FrameResult]):
     Args:
         recording: where to.
         config: that is stored as that of the run.
+        network: what the detector's runs on; stored, too.
     """
 
-    def __init__(self, recording: rr.RecordingStream, config: Config) -> None:
-        self.recording, self._config = recording, config
+    def __init__(self, recording: rr.RecordingStream, config: Config, network: str = "") -> None:
+        self.recording, self._config, self._network = recording, config, network
 
     def begin(self, items: Items[object]) -> None:
-        self.logger = Logger(self.recording, self._config, items.scene, wait=WAIT)
+        self.logger = Logger(self.recording, self._config, items.scene, wait=WAIT, network=self._network)
         self.logger.log_static()
 
     def see(self, result: FrameResult) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import socket
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -12,7 +12,6 @@ from urllib.parse import urlsplit
 
 import rerun as rr
 import rerun.blueprint as rrb
-from rerun.chunk import RrdReader
 
 from bevviz.config import Config
 from bevviz.errors import UserError
@@ -20,6 +19,8 @@ from bevviz.files import Unfinished, written
 from bevviz.frame import Scene
 from bevviz.logging import blueprints, rerun_cli
 from bevviz.logging.file_writer import FileWriter
+from bevviz.logging.keep import is_whole
+from bevviz.logging.parts import Parts, PartsWriter
 from bevviz.logging.ports import (
     FIRST_DATA_PORT,
     LOOPBACK,
@@ -30,10 +31,11 @@ from bevviz.logging.ports import (
     own_address,
     viewer_address,
 )
-from bevviz.logging.reading import readable
 from bevviz.recorded import Origin
 
 APPLICATION = "bevviz"
+TICK = 2.0  # seconds that a frame may wait for others to go into a file with
+CHUNK = 1 << 24  # bytes that may wait
 MEMORY = "25%"  # of the machine's, for what a server keeps for those who join late, and for the viewer
 
 
@@ -45,13 +47,15 @@ class Sinks:
         urls: what to open in a browser or viewer, one for each server.
         warnings: one sentence each.
         file: where the recording is until it is whole; None: in no file.
+        parts: between which others have theirs; None: nobody has.
     """
 
     recording: rr.RecordingStream
     urls: list[str] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
     file: Path | None = None
-    writer: FileWriter | None = None
+    writer: FileWriter | PartsWriter | None = None
+    parts: Parts | None = None
 
     @property
     def recording_id(self) -> str:
@@ -60,13 +64,13 @@ class Sinks:
         return str(found)
 
     def add(self, part: Path) -> None:
-        """What another process has logged of the same recording.
+        """What another process has logged of the same recording, which is open ``in_parts``.
 
         Raises:
             UserError: the file cannot be read.
         """
-        with readable(part):
-            rr.send_chunks(RrdReader(part).stream(), recording=self.recording)
+        assert self.parts is not None
+        self.parts.add(part)
 
     def check(self) -> None:
         """Raises UserError where the file cannot be written any more."""
@@ -88,6 +92,7 @@ def open_recording(
     recording_id: str | None = None,
     place: Path | None = None,
     origin: Origin | None = None,
+    in_parts: bool = False,
 ) -> Iterator[Sinks]:
     """Open a recording that goes to everything that is asked for, with the blueprint.
 
@@ -107,24 +112,30 @@ def open_recording(
             random one, the same for all recordings of a process.
         place: where ``save`` is going to lie, if elsewhere.
         origin: what it says of what it was made from; None: everything.
+        in_parts: other processes make parts of it. What is logged reaches the outputs with the next part.
 
     Raises:
         UserError: unknown blueprint, file that cannot be written or that another
             process writes, port in use, no viewer found or reached;
             on leaving, when not everything could be written.
     """
-    layout = blueprints.load(blueprint, scene) if isinstance(blueprint, str) else blueprint
+    layout = blueprints.load(blueprint, scene, config) if isinstance(blueprint, str) else blueprint
     sinks: list[rr.FileSink | rr.GrpcSink | rr.GrpcServerSink] = []
     urls: list[str] = []
     warnings: list[str] = []
-    file = writer = None
+    file: Path | None = None
+    writer: FileWriter | None = None
+    joined: PartsWriter | None = None
+    parts: Parts | None = None
     with ExitStack() as stack:
         if save is not None:
             given = stack.enter_context(_file(save))
             file = given.path
-            writer = FileWriter(file)
-            stack.callback(writer.close)
-            sinks.append(writer.sink)
+            if in_parts:
+                joined = stack.enter_context(PartsWriter(file))
+            else:
+                writer = stack.enter_context(FileWriter(file))
+                sinks.append(writer.sink)
             if given.leftover:
                 warnings.append(f"{file.name}, which a run that did not end had left, is overwritten")
         if connect is not None:
@@ -135,10 +146,13 @@ def open_recording(
             server, address = stack.enter_context(_served(serve, bind))
             sinks.append(server)
             urls.append(address)
-        recording = rr.RecordingStream(APPLICATION, recording_id=recording_id)
-        recording.set_log_time_enabled(False)  # frames have their own clocks
+        watched = connect is not None or spawn or serve is not None
+        recording = _stream(recording_id, batcher=None if watched else batches(config))
         try:
-            recording.set_sinks(*sinks, default_blueprint=layout)
+            if in_parts:
+                parts = stack.enter_context(_parts(recording, sinks, layout, joined, file))
+            else:
+                recording.set_sinks(*sinks, default_blueprint=layout)
         except (RuntimeError, ValueError) as error:
             raise UserError(f"cannot open the outputs: {error}") from None
         if writer is not None:
@@ -147,14 +161,65 @@ def open_recording(
             origin = Origin.of(scene, config, place or save)
         if origin is not None:
             origin.log(recording)
+        into = joined or writer
         try:
-            yield Sinks(recording, urls, warnings, file, writer)
+            yield Sinks(recording, urls, warnings, file, into, parts)
         finally:
             _close(recording)
-            if writer is not None:
-                writer.close()
+            if parts is not None:
+                parts.close()
+            if into is not None:
+                into.close()
+        if into is not None:
+            into.check()
+
+
+def _stream(
+    recording_id: str | None, *, properties: bool = True, batcher: rr.ChunkBatcherConfig | None = None
+) -> rr.RecordingStream:
+    recording = rr.RecordingStream(
+        APPLICATION, recording_id=recording_id, send_properties=properties, batcher_config=batcher
+    )
+    recording.set_log_time_enabled(False)  # frames have their own clocks
+    return recording
+
+
+@contextmanager
+def _parts(
+    recording: rr.RecordingStream,
+    sinks: Sequence[rr.FileSink | rr.GrpcSink | rr.GrpcServerSink],
+    layout: rrb.Blueprint,
+    writer: PartsWriter | None,
+    file: Path | None,
+) -> Iterator[Parts]:
+    """The layout in a part of its own: Rerun indexes parts that hold one store."""
+    recording_id = str(rr.get_recording_id(recording))
+    shown = None
+    if sinks:
+        shown = _stream(recording_id, properties=False)
+        shown.set_sinks(*sinks, default_blueprint=layout)
+    parts = Parts(recording, writer, shown, None if file is None else file.parent)
+    try:
         if writer is not None:
-            writer.check()
+            first = parts.folder / "layout.rrd"
+            alone = _stream(recording_id, properties=False)
+            alone.set_sinks(rr.FileSink(first), default_blueprint=layout)
+            alone.disconnect()
+            writer.add(first)
+        yield parts
+    finally:
+        parts.close()
+        if shown is not None:
+            _close(shown)
+
+
+def batches(config: Config) -> rr.ChunkBatcherConfig | None:
+    """How many rows a file's chunks have: of small frames more, which packs better. None: as Rerun does."""
+    if is_whole(config):
+        return None
+    found = rr.ChunkBatcherConfig()
+    found.flush_tick, found.flush_num_bytes = TICK, CHUNK
+    return found
 
 
 def _close(recording: rr.RecordingStream) -> None:

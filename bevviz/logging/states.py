@@ -41,21 +41,37 @@ class StateLanes:
 
     Args:
         colors: of the states, which are text; others get the viewer's own.
+        plain: color of every state of the lanes that begin with ``plain_lanes``, whatever it is.
+        plain_lanes: entity.
     """
 
-    def __init__(self, colors: Mapping[Any, Color]) -> None:
-        self._values, self._colors = list(colors), list(colors.values())
+    def __init__(
+        self, colors: Mapping[Any, Color], plain: Color = State.DOUBTFUL.value, plain_lanes: str = ""
+    ) -> None:
+        self._colors, self._plain, self._plain_lanes = dict(colors), plain, plain_lanes
+        self._known: dict[str, dict[str, Color]] = {}  # lane of one colour -> its states so far
         self.states: Mapping[str, str] = {}  # lane -> its latest state
 
     def log(self, to: Writer, states: Mapping[str, str]) -> None:
         """The states of a frame, by the entity of their lane."""
         states = dict.fromkeys(self.states, "") | dict(states)
         for lane, state in states.items():
-            if lane not in self.states:
-                to.static(lane, rr.StateConfiguration(values=self._values, colors=self._colors))
+            self._log_colors(to, lane, state)
             if self.states.get(lane) != state:
                 to.write(lane, rr.StateChange(state=state))
         self.states = states
+
+    def _log_colors(self, to: Writer, lane: str, state: str) -> None:
+        if self._plain_lanes and lane.startswith(self._plain_lanes):
+            known = self._known.setdefault(lane, {})
+            if state in known or not state:
+                return
+            known[state] = self._plain
+            to.static(lane, rr.StateConfiguration(values=list(known), colors=list(known.values())))
+        elif lane not in self.states:
+            to.static(
+                lane, rr.StateConfiguration(values=list(self._colors), colors=list(self._colors.values()))
+            )
 
 
 def states_of(result: FrameResult) -> dict[str, str]:
@@ -73,7 +89,8 @@ def states_of(result: FrameResult) -> dict[str, str]:
         for class_name, decision in _best_decisions(camera):
             states[entities.class_state(name, class_name)] = decision
     for kind in KINDS:
-        subjects = [anomaly.subject for anomaly in result.anomalies if anomaly.kind == kind]
+        # Without the numbers of tracks, which the log has: each state has to be given its colour.
+        subjects = [a.subject.partition(" #")[0] for a in result.anomalies if a.kind == kind]
         more = f" +{len(subjects) - 1}" if subjects[1:] else ""
         states[entities.anomaly_state(kind)] = f"{subjects[0]}{more}" if subjects else ""
     return states

@@ -15,17 +15,16 @@ from bevviz.logging.annotations import class_annotations
 from bevviz.logging.bev import footprints, seen_from_above
 from bevviz.logging.entities import TRACK_COLORS, ClassId
 from bevviz.logging.pieces import OUTLINE, boxes3d, strips
+from bevviz.logging.spoken import near
 from bevviz.logging.writer import Writer
 
 LANES = 12  # tracks with a state lane and a speed of their own: entities that come and go are never freed
 
 
 def log_tracks_looks(to: Writer) -> None:
-    for path, labelled in ((entities.TRACKS, False), (entities.UNSEEN, True)):
-        to.static(
-            path,
-            rr.Boxes3D.from_fields(radii=rr.Radius.ui_points(0.75), show_labels=labelled, fill_mode=OUTLINE),
-        )
+    looks = rr.Boxes3D.from_fields(radii=rr.Radius.ui_points(0.75), show_labels=False, fill_mode=OUTLINE)
+    for path in (entities.TRACKS, entities.UNSEEN):
+        to.static(path, looks)
     to.static(entities.TRAILS, rr.LineStrips3D.from_fields(radii=rr.Radius.ui_points(1.5)))
     to.static(entities.TRACK_SPEEDS, rr.SeriesLines(names=[f"{n:02}" for n in range(LANES)]))
     for name, radius in (("tracks", 1.0), ("trails", 1.5)):
@@ -55,12 +54,13 @@ def log_tracks(to: Writer, frame: Frame, tracks: Tracks, config: BevConfig) -> N
     seen = seen_from_above(config, points_from_world, trail)
     to.put(entities.overlay("trails"), rr.LineStrips2D(strips(seen, lengths), class_ids=colors))
     outlines = footprints(geometry.corners(tracks.boxes)[rows])
+    is_near = near(tracks.boxes.center[rows, :2] - frame.pose[:2, 3].astype(np.float32))
     to.put(
         entities.overlay("tracks"),
         rr.LineStrips2D(
             seen_from_above(config, points_from_world, outlines),
             class_ids=colors,
-            labels=[f"#{tracks.id[row]} {tracks.speed[row]:.1f} m/s" for row in rows],
+            labels=[label(tracks, row) if shown else "" for row, shown in zip(rows, is_near, strict=True)],
             show_labels=True,
         ),
     )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import rerun.blueprint as rrb
@@ -18,49 +19,65 @@ def space(
     scene: Scene,
     *,
     raw: bool = True,
-    grid: bool = True,
     frustums: bool = True,
     why: bool = False,
+    names: bool = True,
     name: str = "3D",
     root: str = "",
     beside: Sequence[str] = (f"{entities.ROBOT}/**",),
 ) -> rrb.Spatial3DView:
     """Points, boxes, frusta and poses around the robot, seen from behind and above it.
 
-    The origin is the LiDAR: the robot stays where it is and the world moves, whichever way it drives.
+    The origin is the LiDAR: the robot stays where it is and the world moves, whichever way it drives. The
+    occupancy on the ground and tracks without an object in the frame are there to be switched on.
 
     Args:
         scene: names of the sensors.
         raw: with every raw point, coloured as ground or obstacle.
-        grid: with the occupancy on the ground.
         frustums: with what each detection sees.
         why: with the chain of what ``bevviz why`` explains.
+        names: of what was found and is near.
         name: of the view.
         root: entity that the run is logged under.
         beside: what else is shown.
     """
-    hidden = [entities.ground(scene.lidar), entities.set_aside(scene.lidar)]
+    hidden = [entities.set_aside(scene.lidar)]
     # The coloured points of the clusters and the raw cloud already show what is obstacle.
-    hidden += [entities.obstacles(scene.lidar)] if raw else []
+    hidden += [entities.ground(scene.lidar)] if scene.raw or why else []
+    hidden += [entities.obstacles(scene.lidar)] if raw and scene.raw else []
     hidden += [] if raw else [entities.points(lidar) for lidar in scene.lidars or (scene.lidar,)]
-    hidden += [] if grid else [entities.GRID]
+    hidden += [entities.GRID, entities.UNSEEN]
     hidden += [] if frustums else [entities.FRUSTUMS]
     # The points of what is explained stand out by their colours, which tell another story than the clusters'.
     hidden += [entities.clusters(scene.lidar), entities.FRUSTUMS] if why else []
+    hidden += [entities.names(entities.FUSED)] if why or not names else []
+    position, target = (-16.0, 5.0, 11.0), (10.0, 0.0, -1.0)
+    if why and scene.focus is not None:
+        position, target = _beside(scene.focus), scene.focus
     return rrb.Spatial3DView(
-        name=name,
+        name=name if scene.raw else f"{name}, voxels (raw clouds now and then, or none)",
         origin=root + entities.sensor(scene.lidar),
         contents=[f"{root}{entities.WORLD}/**", *beside, *([f"{entities.WHY}/**"] if why else [])],
         background=_DARK,
         line_grid=False,
+        # Said, as the viewer takes the fixed frame instead where contents lie outside of the origin's tree.
+        spatial_information=rrb.SpatialInformation(target_frame=f"tf#{root}{entities.sensor(scene.lidar)}"),
         eye_controls=rrb.EyeControls3D(
             kind=rrb.Eye3DKind.Orbital,
-            position=(-3.0, 2.0, 5.0) if why else (-16.0, 5.0, 11.0),
-            look_target=(10.0, -0.5, -1.0) if why else (10.0, 0.0, -1.0),
+            position=position,
+            look_target=target,
             eye_up=(0.0, 0.0, 1.0),
         ),
         overrides=dict.fromkeys((root + path for path in hidden), HIDDEN),
     )
+
+
+def _beside(place: tuple[float, float, float]) -> tuple[float, float, float]:
+    """Where to look at it from: the robot's side, a few metres before it, to the left and above."""
+    x, y, z = place
+    away = max(math.hypot(x, y), 1e-6)
+    back = min(away, 6.0)
+    return x - back * x / away - 2.0 * y / away, y - back * y / away + 2.0 * x / away, z + 2.5
 
 
 def camera(scene: Scene, name: str, *, why: bool = False) -> rrb.Spatial2DView:
@@ -69,11 +86,13 @@ def camera(scene: Scene, name: str, *, why: bool = False) -> rrb.Spatial2DView:
     ``why``: with the weak detections and what ``bevviz why`` explains instead of the points.
     """
     contents = ["$origin/**", *([f"{entities.ROBOT}/**"] if scene.robot else [])]
+    told = [entities.projected(name), entities.names(entities.detections(name))]
+    hidden = told if why else [entities.weak(name)]
     return rrb.Spatial2DView(
         name=name,
         origin=entities.sensor(name),
         contents=[*contents, *([f"{entities.why(name)}/**"] if why else [])],
-        overrides={entities.projected(name) if why else entities.weak(name): HIDDEN},
+        overrides=dict.fromkeys(hidden, HIDDEN),
     )
 
 
@@ -85,13 +104,18 @@ def cameras(scene: Scene, *, why: bool = False) -> rrb.Container | rrb.View:
     return rrb.Tabs(*views, name="Cameras") if len(views) > 2 else rrb.Vertical(*views, name="Cameras")
 
 
-def birds_eye(root: str = "", name: str = "Bird's-eye view") -> rrb.Spatial2DView:
+def birds_eye(scene: Scene, root: str = "", name: str = "Bird's-eye view") -> rrb.Spatial2DView:
     """The bird's-eye image with the outlines of ground truth and of the robot's own boxes."""
     bev = root + entities.BEV
     channels = [
         f"- {root}{entities.channel(name)}/**" for name in ("density", "height", "intensity", "occupancy")
     ]
-    return rrb.Spatial2DView(name=name, origin=bev, contents=["$origin/**", *channels], background=_DARK)
+    bounds = None
+    if scene.above is not None:
+        left, top, right, bottom = scene.above
+        bounds = rrb.VisualBounds2D(x_range=(left, right), y_range=(top, bottom))
+    contents = ["$origin/**", *channels]
+    return rrb.Spatial2DView(name=name, origin=bev, contents=contents, background=_DARK, visual_bounds=bounds)
 
 
 def robots_birds_eye() -> rrb.Spatial2DView:
@@ -110,9 +134,15 @@ def why() -> rrb.TextDocumentView:
     return rrb.TextDocumentView(name="Why", origin=entities.WHY, contents=["$origin"])
 
 
+def text_log(name: str, origin: str) -> rrb.TextLogView:
+    """Frame, time and text of each line."""
+    columns = rrb.TextLogColumns(timeline_columns=[entities.FRAME, entities.STAMP], text_log_columns=["body"])
+    return rrb.TextLogView(name=name, origin=origin, columns=columns)
+
+
 def log() -> rrb.TextLogView:
     """Failures, problems and rejected detections of all frames."""
-    return rrb.TextLogView(name="Log", origin=entities.EXPLAIN_LOG)
+    return text_log("Log", entities.EXPLAIN_LOG)
 
 
 def states() -> rrb.StateTimelineView:
@@ -132,7 +162,7 @@ def anomalies() -> rrb.StateTimelineView:
 
 def anomaly_log() -> rrb.TextLogView:
     """Each anomaly when it began, with its numbers."""
-    return rrb.TextLogView(name="Anomaly log", origin=entities.ANOMALY_LOG)
+    return text_log("Anomaly log", entities.ANOMALY_LOG)
 
 
 def tracks() -> rrb.StateTimelineView:
@@ -191,7 +221,15 @@ def latencies() -> rrb.TimeSeriesView:
     return plot("Latency and lag of viewers, ms", entities.HEALTH, contents)
 
 
+def motion(scene: Scene) -> list[rrb.View]:
+    """What Imus measure, where there are some."""
+    if not scene.imu:
+        return []
+    return [plot("Rotation, rad/s", entities.ROTATION), plot("Acceleration, m/s²", entities.ACCELERATION)]
+
+
 def health() -> rrb.Tabs:
+    """In tabs: side by side, their legends would hide the curves."""
     return rrb.Tabs(stage_times(), clocks(), counts(), rates(), name="Health")
 
 

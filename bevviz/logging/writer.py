@@ -10,7 +10,7 @@ import numpy as np
 import rerun as rr
 
 from bevviz.closing import Closing
-from bevviz.frame import Clip, Codec
+from bevviz.frame import F64, I64, Clip, Codec
 from bevviz.logging import entities
 
 STAMPS = (entities.STAMP, entities.TRIED, entities.RECEIVED)  # timelines in nanoseconds; the others count
@@ -161,6 +161,17 @@ class Writer(Closing):
         else:
             self.write(path, rr.Scalars(value))
 
+    def samples(self, path: str, stamps: I64, received: I64, values: F64) -> None:
+        """Numbers to plot that came between the frames, each row at its own time: (N, D)."""
+        clocks = []
+        for stamp, received_at in zip(stamps.tolist(), received.tolist(), strict=True):
+            clock = self._clock | dict.fromkeys(self._stamps, stamp)
+            if entities.RECEIVED in clock:
+                clock[entities.RECEIVED] = received_at
+            clocks.append(clock)
+        columns = rr.Scalars.columns(scalars=values.ravel()).partition([values.shape[1]] * len(values))
+        self._write_columns(path, clocks, columns)
+
     def lines(self, path: str, lines: Sequence[tuple[str, str]]) -> None:
         """Lines of a log: level and text of each."""
         if lines:
@@ -195,4 +206,4 @@ class Writer(Closing):
                 times.append(rr.TimeColumn(name, timestamp=np.array(numbers, "datetime64[ns]")))
             else:
                 times.append(rr.TimeColumn(name, sequence=numbers))
-        rr.send_columns(self.root + path, times, columns, recording=self.recording)
+        self.recording.send_columns(self.root + path, times, columns)

@@ -16,7 +16,7 @@ from typing import TypeVar
 from bevviz import remains
 from bevviz.bags.source import BagSource
 from bevviz.bags.state import Losses
-from bevviz.batch.local import run_local
+from bevviz.batch.local import Processes
 from bevviz.batch.task import JobResults
 from bevviz.closing import Closing
 from bevviz.config import Config
@@ -31,12 +31,12 @@ from bevviz.stages.foreign import Foreign
 
 LENGTH = 25  # frames of a window, at most
 SHORTEST = 8  # each begins with a frame that is made for nothing
-SHARE = 4  # windows that each process should have at least, so that none is left alone with one in the end
+SHARE = 2  # windows that each process should have of what is left
 AHEAD = 2  # windows that are cut before a process is free
 RETRIES = 2  # of a window whose process died
 
 T = TypeVar("T")
-Engine = Callable[[Iterable[WindowJob], Callable[[], None]], JobResults]
+Engine = Callable[[Iterable[WindowJob], Callable[[], None], Callable[[], None]], JobResults]
 
 
 def obstacle(drive: Drive, session: Session) -> str:
@@ -55,12 +55,12 @@ def cluster(address: str) -> Engine:
     """Workers of a Dask cluster, which see the bag and the recording's folder under the same paths."""
     from bevviz.batch.dask import run_dask
 
-    return lambda jobs, on_frame: run_dask(jobs, address, RETRIES, on_frame)
+    return lambda jobs, on_frame, tick: run_dask(jobs, address, RETRIES, on_frame)
 
 
-def here(workers: int) -> Engine:
+def here(processes: Processes) -> Engine:
     """Processes of this machine."""
-    return lambda jobs, on_frame: run_local(jobs, workers, RETRIES, on_frame)
+    return lambda jobs, on_frame, tick: processes.run(jobs, RETRIES, on_frame, tick)
 
 
 class Windows(Closing):
@@ -88,7 +88,7 @@ class Windows(Closing):
     ) -> None:
         self._source, self._config, self._id = source, config, recording_id
         self._engine, self._on_frame = engine, on_frame
-        self._length = min(LENGTH, max(SHORTEST, -(-source.total // (SHARE * workers))))
+        self._workers = workers
         self._stopped = Event()
         self._folder = Path(tempfile.mkdtemp(prefix=".bevviz-windows-", dir=place)).resolve()
         remains.remember(self, partial(shutil.rmtree, self._folder, ignore_errors=True))
@@ -111,8 +111,13 @@ class Windows(Closing):
         return self._source.warnings
 
     def stop(self) -> None:
-        """After the window at hand."""
+        """At once, but for the window at hand."""
         self._stopped.set()
+
+    def _length(self, left: int) -> int:
+        """Long windows first, short ones in the end, so that no process waits long for the last: guided
+        self-scheduling (Polychronopoulos and Kuck 1987)."""
+        return min(LENGTH, max(SHORTEST, -(-left // (SHARE * self._workers))))
 
     def add_losses(self, losses: Losses) -> None:
         """What the frames of a window lacked, for the warnings."""
@@ -130,13 +135,12 @@ class Windows(Closing):
                 waiting.append(job)
                 yield job
 
-        def on_frame() -> None:
-            self._on_frame()
+        def tick() -> None:
             if self._stopped.is_set():
                 raise _StoppedError
 
         try:
-            with closing(self._engine(jobs(), on_frame)) as ends:
+            with closing(self._engine(jobs(), self._on_frame, tick)) as ends:
                 for end in ends:
                     if end.error:
                         raise UserError(f"{end.name}: {end.error}")

@@ -11,7 +11,7 @@ from bevviz.bags.source import BagSource
 from bevviz.drive import Drive
 from bevviz.frame import FrameResult
 from bevviz.logging.sinks import Sinks
-from bevviz.parallel.drive import AsTheyAre, Engine, InOrder, Windows, here
+from bevviz.parallel.drive import AsTheyAre, Engine, InOrder, Windows
 from bevviz.run import Observer, RunEnd, run
 from bevviz.session import Session
 from bevviz.text import printable
@@ -23,7 +23,7 @@ def run_windows(
     sinks: Sinks,
     observers: Sequence[Observer[FrameResult]],
     jobs: int,
-    engine: Engine | None = None,
+    engine: Engine,
     stop: Event | None = None,
 ) -> RunEnd:
     """Make every frame in one of so many processes, and show the results in order to the observers.
@@ -34,16 +34,14 @@ def run_windows(
         sinks: where the recording goes.
         observers: of results without what only their frame needs, see ``InOrder``.
         jobs: windows that are made at the same time.
-        engine: what makes them; None: processes of this machine.
+        engine: what makes them.
         stop: ends the run after the window at hand.
     """
     source = drive.frames
     assert isinstance(source, BagSource)
     place = None if sinks.file is None else sinks.file.parent
     with tqdm(total=source.total, unit="frame", desc=printable(source.scene.name), disable=None) as bar:
-        windows = Windows(
-            source, drive.config, sinks.recording_id, jobs, engine or here(jobs), lambda: _count(bar), place
-        )
+        windows = Windows(source, drive.config, sinks.recording_id, jobs, engine, lambda: _count(bar), place)
         with windows:
             in_order = InOrder(windows, session, sinks, observers)
             end = run(windows, AsTheyAre(), [in_order], depth=0, stop=stop)

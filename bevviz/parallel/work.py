@@ -23,8 +23,9 @@ from bevviz.config import Config
 from bevviz.errors import UserError
 from bevviz.frame import Camera, Cloud, FrameResult, Ground, Voxels
 from bevviz.logging.logger import Logger
-from bevviz.logging.sinks import APPLICATION
+from bevviz.logging.sinks import APPLICATION, batches
 from bevviz.perceive import StageLoader, Stages, describe, perceive
+from bevviz.stages.visibility import range_image
 
 
 @dataclass(frozen=True)
@@ -63,7 +64,12 @@ class WindowJob:
         results = recording.with_suffix(".results")
         try:
             source, stages = _opened(self.paths, self.config.model_dump_json(), self.selection, threads)
-            stream = rr.RecordingStream(APPLICATION, recording_id=self.recording_id, send_properties=False)
+            stream = rr.RecordingStream(
+                APPLICATION,
+                recording_id=self.recording_id,
+                send_properties=False,
+                batcher_config=batches(self.config),
+            )
             stream.set_log_time_enabled(False)
             stream.save(recording)
             logger = Logger(cast("rr.RecordingStream", _Nowhere()), self.config, source.scene)
@@ -113,6 +119,8 @@ class _Nowhere:
 
     def log(self, *args: object, **more: object) -> None: ...
 
+    def send_columns(self, *args: object, **more: object) -> None: ...
+
     def set_time(self, *args: object, **more: object) -> None: ...
 
     def reset_time(self) -> None: ...
@@ -143,17 +151,23 @@ def _kept(result: FrameResult) -> FrameResult:
         cameras=tuple(cameras.values()),
     )
     voxels, ground = result.voxels, result.ground
+    # Which raw clouds are kept is known only when the anomalies are.
+    clouds_too = result.config.logging.keep == "inspect"
+    if clouds_too:
+        frame = replace(frame, clouds=tuple(replace(cloud, fields={}) for cloud in result.frame.clouds))
+    inverse = np.zeros(0, np.int32) if voxels is None or not clouds_too else voxels.inverse
     return replace(
         result,
         frame=frame,
         config=cast("Config", None),  # the reader has it
-        voxels=None if voxels is None else Voxels(_rows(len(voxels.points)), np.zeros(0, np.int32)),
+        voxels=None if voxels is None else Voxels(_rows(len(voxels.points)), inverse),
         ground=None if ground is None else Ground(ground.mask, np.zeros(0, np.float32)),
         cameras=tuple(
             replace(camera, camera=cameras[id(camera.camera)], uv=None, depth=None)
             for camera in result.cameras
         ),
         bev=None,
+        ranges=range_image(result.frame.points),  # half of what anomalies take, and needs no order
     )
 
 

@@ -153,7 +153,9 @@ def make(
         recording = sinks.recording
         written.files.insert(0, rrd)
         summary = WindowSummary(window.at, source.total, len(whole.scene.cameras))
-        recorder = _ReportRecorder(recording, public, summary, window.at, request.note, notes)
+        recorder = _ReportRecorder(
+            recording, public, summary, window.at, request.note, notes, session.stages.provider
+        )
         watchers = [recorder, DiskWatch(sinks), Progress("run"), *observers]
         ended = run(source, session, watchers, stop=stop)
         written.interrupted = ended.interrupted or (stop is not None and stop.is_set())
@@ -181,8 +183,9 @@ class _ReportRecorder(Recorder):
         at: int,
         note: str,
         notes: Sequence[Note],
+        network: str,
     ) -> None:
-        super().__init__(recording, config)
+        super().__init__(recording, config, network)
         self._summary, self._at, self._note, self._notes = summary, at, note, notes
 
     def see(self, result: FrameResult) -> None:

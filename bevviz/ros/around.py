@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import Any, Literal
-from xml.etree import ElementTree
 
 import numpy as np
 
 from bevviz import geometry
 from bevviz.frame import F32, F64, U8, Grid, Shape, Solids, Status
-from bevviz.ros.messages import MessageError, decode_cloud, decode_image
+from bevviz.ros.description import links
+from bevviz.ros.grid_map import decode_grid_map
+from bevviz.ros.messages import MessageError, decode_cloud, decode_image, stamp_ns
 
 LEVELS: tuple[Literal["ok", "warning", "error", "stale"], ...] = ("ok", "warning", "error", "stale")
 TYPES = frozenset(
@@ -21,6 +22,7 @@ TYPES = frozenset(
         "sensor_msgs/msg/NavSatFix",
         "nav_msgs/msg/Path",
         "nav_msgs/msg/OccupancyGrid",
+        "grid_map_msgs/msg/GridMap",
         "geometry_msgs/msg/PoseStamped",
         "visualization_msgs/msg/Marker",
         "visualization_msgs/msg/MarkerArray",
@@ -48,15 +50,18 @@ def decode_shapes(msg: Any, short: str, topic: str) -> list[Shape]:
     if short == "Marker":
         return _markers([msg], topic)
     if short == "String":
-        return list(_links(msg.data, topic))
+        return list(links(msg.data, topic))
     if short == "PointCloud2":
         cloud = decode_cloud(msg, topic, 0)
         return [Shape(topic, cloud.frame_id.lstrip("/"), cloud.stamp, points=cloud.xyz)]
     if short == "Image":
         image = decode_image(msg, topic, 0)
         return [Shape(topic, image.frame_id.lstrip("/"), image.stamp, picture=image.bgr)]
-    stamp = msg.header.stamp.sec * 10**9 + msg.header.stamp.nanosec
-    about = topic, msg.header.frame_id.lstrip("/"), stamp
+    header = msg.header if hasattr(msg, "header") else msg.info.header  # ROS 1 has the one of a GridMap there
+    about = topic, header.frame_id.lstrip("/"), stamp_ns(header.stamp)
+    if short == "GridMap":
+        surface = decode_grid_map(msg, _pose(msg.info.pose), topic)
+        return [] if surface is None else [Shape(*about, surface=surface)]
     if short == "LaserScan":
         ranges = np.asarray(msg.ranges, np.float32)
         angles = msg.angle_min + msg.angle_increment * np.arange(len(ranges))
@@ -82,55 +87,6 @@ def _grid(msg: Any, topic: str) -> Grid:
     return Grid(cells.reshape(about.height, about.width), float(about.resolution), _pose(about.origin))
 
 
-# --- the robot's description -------------------------------------------------------------------
-
-JOINT = 0.02  # metres, half of the mark of a link that has no simple geometry
-
-
-def _links(text: str, topic: str) -> Iterator[Shape]:
-    """Every link of a URDF where the transforms have it: its boxes, spheres and cylinders, or a small mark.
-
-    See http://wiki.ros.org/urdf/XML/link. Meshes are files of the robot's, which are not at hand here.
-    """
-    try:
-        root = ElementTree.fromstring(text)
-    except ElementTree.ParseError as error:
-        raise MessageError(f"{topic}: not a robot description: {error}") from None
-    for link in root.iterfind("link"):
-        name = link.get("name", "").lstrip("/")
-        try:
-            parts = [part for visual in link.iterfind("visual") if (part := _visual(visual)) is not None]
-        except ValueError as error:
-            raise MessageError(f"{topic}: link '{name}': {error}") from None
-        poses = np.stack([pose for pose, _ in parts]) if parts else np.eye(4)[None]
-        half = np.array([half for _, half in parts] or [(JOINT, JOINT, JOINT)], np.float32)
-        turns = np.stack([geometry.quaternion(pose) for pose in poses]).astype(np.float32)
-        solids = Solids(poses[:, :3, 3].astype(np.float32), half, turns, round=not parts)
-        yield Shape(f"{topic}/{name}", name, 0, solids=solids)
-
-
-def _visual(visual: ElementTree.Element) -> tuple[F64, tuple[float, ...]] | None:
-    """(4, 4) link from the geometry, and half of its size."""
-    origin = visual.find("origin")
-    place, angles = (_floats(origin, name) for name in ("xyz", "rpy"))
-    (cr, cp, cy), (sr, sp, sy) = np.cos(np.divide(angles, 2)), np.sin(np.divide(angles, 2))
-    x, y = sr * cp * cy - cr * sp * sy, cr * sp * cy + sr * cp * sy
-    z, w = cr * cp * sy - sr * sp * cy, cr * cp * cy + sr * sp * sy
-    pose = geometry.transform(place, (x, y, z, w))
-    for shape in visual.iterfind("geometry/*"):
-        if shape.tag == "box":
-            return pose, tuple(length / 2 for length in _floats(shape, "size"))
-        if shape.tag in ("sphere", "cylinder"):
-            radius = float(shape.get("radius", 0))
-            return pose, (radius, radius, float(shape.get("length", 2 * radius)) / 2)
-    return None
-
-
-def _floats(element: ElementTree.Element | None, name: str) -> tuple[float, float, float]:
-    x, y, z = (float(word) for word in ("0 0 0" if element is None else element.get(name, "0 0 0")).split())
-    return x, y, z
-
-
 # --- markers -----------------------------------------------------------------------------------
 
 _CUBE, _SPHERE, _CYLINDER, _STRIP, _LINES, _CUBES, _SPHERES, _POINTS, _TEXT = 1, 2, 3, 4, 5, 6, 7, 8, 9
@@ -141,7 +97,7 @@ def _markers(markers: Sequence[Any], topic: str) -> list[Shape]:
     found = []
     for marker in markers:
         if marker.action == 0:
-            stamp = marker.header.stamp.sec * 10**9 + marker.header.stamp.nanosec
+            stamp = stamp_ns(marker.header.stamp)
             shape = _marker(marker, f"{topic}/{marker.ns}/{marker.id}", marker.header.frame_id, stamp)
             found += [] if shape is None else [shape]
     return found

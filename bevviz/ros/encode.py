@@ -14,7 +14,7 @@ from rosbags.typesys.store import Typestore
 
 from bevviz import geometry
 from bevviz.frame import F32, F64, I64, Boxes3D, Cloud, Image, ImageLabels, Intrinsics
-from bevviz.ros import vision_msgs
+from bevviz.ros import grid_map_msgs, vision_msgs
 
 # A vision_msgs/Detection3DArray that also says what was labelled in an image, see frame.ImageLabels.
 _LABELLED = """std_msgs/Header header
@@ -28,9 +28,10 @@ float32[] dont_care
 
 @cache
 def typestore() -> Typestore:
-    """The definitions of ROS 2 Jazzy, of vision_msgs, and of what labelled data sets say beyond that."""
+    """The definitions of ROS 2 Jazzy, vision_msgs, grid_map_msgs, and what labelled data sets say beyond."""
     store = get_typestore(Stores.ROS2_JAZZY)
     vision_msgs.register(store)
+    grid_map_msgs.register(store)
     store.register(get_types_from_msg(_LABELLED, "bevviz_msgs/msg/Detection3DArray"))
     return store
 

@@ -75,7 +75,7 @@ def middlewares() -> set[str]:
     folders += map(Path, _paths("LD_LIBRARY_PATH"))
     names = {path.name[3:-3] for folder in folders for path in folder.glob("librmw_*_cpp.so")}
     return {
-        name for name in names if not name.endswith(("_shared_cpp", "_typesupport_cpp", "_fastrtps_cpp__"))
+        name for name in names if not name.endswith(("_shared_cpp", "_typesupport_cpp")) and "__" not in name
     }
 
 

@@ -13,7 +13,7 @@ import struct
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import wraps
-from typing import Any, NamedTuple, ParamSpec, TypeVar
+from typing import Any, NamedTuple, ParamSpec, TypeAlias, TypeVar
 
 import cv2
 import numpy as np
@@ -527,6 +527,9 @@ def decode_odometry(msg: Any, topic: str = "odometry") -> StampedTransform:
     return _stamped(msg.header, msg.child_frame_id, pose.position, pose.orientation, topic)
 
 
+Vector: TypeAlias = tuple[float, float, float]
+
+
 @dataclass(frozen=True, slots=True)
 class Acceleration:
     """What an Imu feels, in its own frame: at rest one g upwards."""
@@ -547,6 +550,17 @@ def decode_acceleration(msg: Any, topic: str = "imu") -> Acceleration:
     felt = msg.linear_acceleration
     return Acceleration(
         stamp_ns(msg.header.stamp), frame_name(msg.header.frame_id), np.array([felt.x, felt.y, felt.z])
+    )
+
+
+def decode_motion(msg: Any) -> tuple[Vector, Vector, int]:
+    """Rotation rate and acceleration of a sensor_msgs/Imu, NaN where it says it has none, and its stamp."""
+    none = (math.nan, math.nan, math.nan)
+    turn, felt = msg.angular_velocity, msg.linear_acceleration
+    return (
+        none if msg.angular_velocity_covariance[0] == -1 else (turn.x, turn.y, turn.z),
+        none if msg.linear_acceleration_covariance[0] == -1 else (felt.x, felt.y, felt.z),
+        stamp_ns(msg.header.stamp),
     )
 
 

@@ -106,6 +106,7 @@ class Roles:
             cameras=tuple(camera.name for camera in self.cameras),
             robot=bool(self.robot_detections_2d or self.robot_detections_3d),
             truth=bool(self.truth),
+            imu=bool(self.imus),
         )
 
 
@@ -144,7 +145,7 @@ _MARK = re.compile(rf"(^|/){MARK}$")
 
 Kind = Literal["mark", "status", "shape"]
 SHAPES = frozenset(
-    {"LaserScan", "Path", "PoseStamped", "OccupancyGrid", "MarkerArray", "Marker", "NavSatFix"}
+    {"LaserScan", "Path", "PoseStamped", "OccupancyGrid", "GridMap", "MarkerArray", "Marker", "NavSatFix"}
 )
 RESULTS = {  # of the robot's own pipeline, shown where nothing of ours is
     "PointCloud2": re.compile(r"(^|/)lidar/points_no_ground$"),
@@ -213,7 +214,7 @@ def find_roles(
     _note(notes, moving, "transforms")
     odometry = _find_odometry(topics, config, notes)
     imus = [topic for topic in _of(topics, "Imu") if topic.count != 0]
-    _note(notes, imus, "gravity, where the transforms have no upright frame")
+    _note(notes, imus, "plotted; gravity, where the transforms have no upright frame")
     boxes = _of(topics, "Detection3DArray")
     truth = [t for t in boxes if t.name.endswith("ground_truth")][:1]
     boxes = [t for t in boxes if t not in truth]

@@ -134,8 +134,9 @@ def sort_by_key(keys: I64) -> tuple[I32, I32]:
     """
     n = len(keys)
     order, other = np.arange(n).astype(np.int32), np.empty(n, np.int32)
-    highest = keys.max()
-    shift = 0
+    highest, shift = 0, 0
+    for key in keys:
+        highest = max(highest, key)
     while highest >> shift > 0:
         end = np.zeros((1 << DIGIT) + 1, np.int32)
         for i in range(n):

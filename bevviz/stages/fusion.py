@@ -223,9 +223,10 @@ def assign(cost: F64, unmatched: float) -> I32:
             done[sink] = True
             row = int(row_of[sink])
         u[start] += length
-        for passed in np.flatnonzero(done):
-            u[row_of[passed]] += length - shortest[passed]
-            v[passed] -= length - shortest[passed]
+        for passed in range(columns + rows):
+            if done[passed]:
+                u[row_of[passed]] += length - shortest[passed]
+                v[passed] -= length - shortest[passed]
         while True:
             row = int(before[sink])
             row_of[sink] = row

@@ -18,6 +18,11 @@ class Damage:
         self._first.setdefault(topic, reason)
         return self._counts[topic]
 
+    def extend(self, other: Damage) -> None:
+        """What another one has counted."""
+        self._counts += other._counts
+        self._first = {**other._first, **self._first}
+
     @property
     def sentences(self) -> list[str]:
         """One for each topic."""

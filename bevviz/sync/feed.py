@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, Generic, Protocol, TypeVar
 
-from bevviz.frame import Image, LabelledBoxes3D
+from bevviz.frame import LabelledBoxes3D
 from bevviz.ros.around import decode_shapes, decode_statuses
 from bevviz.ros.messages import (
     MessageError,
@@ -18,7 +18,9 @@ from bevviz.ros.messages import (
     decode_cloud,
     decode_compressed_image,
     decode_detections_2d,
+    decode_detections_3d,
     decode_image,
+    decode_motion,
     decode_odometry,
     decode_transforms,
 )
@@ -43,20 +45,24 @@ class Message(Protocol):
 
 
 M = TypeVar("M", bound=Message)
+T = TypeVar("T")
 Handler = Callable[[M], None]
 
 
 @dataclass(frozen=True, slots=True)
-class ImageLoader(Generic[M]):
-    """Decodes an image when a frame takes it."""
+class Loader(Generic[M, T]):
+    """Decodes a message when a frame takes it.
+
+    Attributes:
+        read: what is made of the decoded message, its topic and its time of receipt; can be pickled.
+    """
 
     message: M
-    compressed: bool
     decode: Callable[[M], Any]
+    read: Callable[[Any, str, int], T]
 
-    def __call__(self) -> Image:
-        decode_pixels = decode_compressed_image if self.compressed else decode_image
-        return decode_pixels(self.decode(self.message), self.message.topic, self.message.received)
+    def __call__(self) -> T:
+        return self.read(self.decode(self.message), self.message.topic, self.message.received)
 
 
 def make_handlers(
@@ -80,8 +86,8 @@ def make_handlers(
 
     def add_image(message: M, camera: CameraRole) -> None:
         stamp, frame_id = message.header()
-        load = ImageLoader(message, camera.kind == "CompressedImage", decode)
-        sync.add_image(message.topic, stamp, frame_id, message.received, load)
+        read = decode_compressed_image if camera.kind == "CompressedImage" else decode_image
+        sync.add_image(message.topic, stamp, frame_id, message.received, Loader(message, decode, read))
 
     def add_packet(message: M) -> None:
         packet = decode_packet(decode(message), message.topic, message.received)
@@ -107,8 +113,21 @@ def make_handlers(
         sync.add_transform(clocked(message, transform), fallback=True)
 
     def add_imu(message: M) -> None:
+        content = decode(message)
+        rotation, acceleration, stamp = decode_motion(content)
+        at = sync.clocks.stamp(message.topic, stamp, message.received)
+        sync.around.add_motion(message.topic, at, message.received, rotation, acceleration)
         if sync.upright.needs_gravity:
-            sync.upright.add_acceleration(decode_acceleration(decode(message), message.topic))
+            sync.upright.add_acceleration(decode_acceleration(content, message.topic))
+
+    def add_truth(message: M) -> None:
+        topic, received = message.topic, message.received
+        if roles.boxes.get("topic") == topic:  # nobody says that it begins with a header
+            boxes = read_boxes(message)
+            sync.add_truth(topic, boxes.stamp, received, partial(replace, boxes))
+        else:
+            stamp, _ = message.header()
+            sync.add_truth(topic, stamp, received, Loader(message, decode, decode_detections_3d))
 
     def read_boxes(message: M) -> LabelledBoxes3D:
         stated = roles.boxes if roles.boxes.get("topic") == message.topic else {}
@@ -140,7 +159,7 @@ def make_handlers(
     for topic in roles.robot_detections_3d:
         handlers[topic] = lambda m: sync.add_boxes(read_boxes(m))
     if roles.truth:
-        handlers[roles.truth] = lambda m: sync.add_truth(read_boxes(m))
+        handlers[roles.truth] = add_truth
     return handlers | make_around_handlers(sync, roles, decode)
 
 

@@ -10,6 +10,7 @@ from bevviz.config import Config
 from bevviz.plugins import TOPIC
 from bevviz.ros.roles import Roles
 from bevviz.sync.clocks import Clocks
+from bevviz.sync.damage import Damage
 from bevviz.sync.tf import TransformBuffer
 
 
@@ -32,6 +33,7 @@ class SyncReport:
     images: int = 0  # of all cameras, decoded
     undecodable: Counter[str] = field(default_factory=Counter)  # camera -> images
     first_undecodable: dict[str, str] = field(default_factory=dict)  # camera -> why the first was
+    damage: Damage = field(default_factory=Damage)  # ground truth that could not be decoded
     problems: Counter[str] = field(default_factory=Counter)  # missing transforms and CameraInfo -> frames
     tf: TransformBuffer = field(default_factory=TransformBuffer)  # for what looked wrong in the transforms
     upright: Mapping[str, str] = field(default_factory=dict)  # for what is doubtful about the vertical
@@ -72,15 +74,23 @@ class SyncReport:
         for topic, n in self.overtaken.items():
             found.append(
                 f"{topic}: {n} result{'' if n == 1 else 's'} came when the frame of that time had gone on, "
-                f"at worst {self.slowest[topic]:.2f} s after the stamp: shown at that stamp, and not compared"
+                f"{_after(self.slowest[topic])}: shown at that stamp, and not compared"
             )
         for camera, n in self.without_image.items():
             found.append(f"{n} of {self.frames} frames have no image of camera '{camera}'")
         for camera, n in self.undecodable.items():
             first = self.first_undecodable[camera]
             found.append(f"camera '{camera}': an image could not be decoded {_times(n)}, the first: {first}")
+        found += self.damage.sentences
         found += [f"{text} ({n} of {self.frames} frames)" for text, n in self.problems.items()]
         return (*self.doubts(), *found, *self.tf.problems)
+
+
+def _after(seconds: float) -> str:
+    """Of the latest one: stamps may be ahead of their receipt, too."""
+    if seconds < 0.005:
+        return "none of them later than its stamp"
+    return f"at worst {seconds:.2f} s after the stamp"
 
 
 def blindness(config: Config, roles: Roles, report: SyncReport | None) -> list[str]:

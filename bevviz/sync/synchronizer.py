@@ -57,6 +57,14 @@ class _Undecoded:
 
 
 @dataclass(frozen=True, slots=True)
+class _UndecodedBoxes:
+    """When boxes were, and how to get them."""
+
+    stamp: int
+    load: Callable[[], LabelledBoxes3D]
+
+
+@dataclass(frozen=True, slots=True)
 class _Place:
     """Where the points of a frame are, and how they hang together with the world."""
 
@@ -132,7 +140,7 @@ class Synchronizer:
         self._boxes: dict[str, Track[LabelledBoxes3D]] = self._make_tracks(*roles.robot_detections_3d)
         self._detections: dict[str, Track[LabelledBoxes2D]] = self._make_tracks(*roles.robot_detections_2d)
         self._robot_clouds: dict[str, Track[Cloud]] = self._make_tracks(*roles.robot_clouds)
-        self._truth: dict[str, Track[LabelledBoxes3D]] = self._make_tracks(*filter(None, [roles.truth]))
+        self._truth: dict[str, Track[_UndecodedBoxes]] = self._make_tracks(*filter(None, [roles.truth]))
         self._beside = frozenset(beside)
         self._overtaken: deque[LateResult] = deque(maxlen=OVERTAKEN)
         self._places: deque[tuple[_Place, F64]] = deque(
@@ -236,9 +244,13 @@ class Synchronizer:
         stamp = self._arrived(cloud.topic, cloud.stamp, cloud.received)
         self._robot_clouds[cloud.topic].add(stamp, replace(cloud, stamp=stamp))
 
-    def add_truth(self, truth: LabelledBoxes3D) -> None:
-        """Ground truth boxes."""
-        self._add_result(self._truth, truth)
+    def add_truth(self, topic: str, stamp: int, received: int, load: Callable[[], LabelledBoxes3D]) -> None:
+        """Ground truth not yet decoded: ``load`` is called only when a frame takes it.
+
+        ``load`` may raise a UserError: it is counted, and the boxes are as if they had not come.
+        """
+        stamp = self._arrived(topic, stamp, received)
+        self._truth.setdefault(topic, Track(self._horizon)).add(stamp, _UndecodedBoxes(stamp, load))
 
     def _add_result(self, tracks: dict[str, Track[Any]], result: LabelledBoxes2D | LabelledBoxes3D) -> None:
         stamp = self._arrived(result.topic, result.stamp, result.received)
@@ -448,9 +460,8 @@ class Synchronizer:
         cameras = tuple(self._camera(role, place) for role in self._roles.cameras)
         first, last = self._window(cloud.stamp)
         boxes = [track.take(cloud.stamp, first, last) for track in self._boxes.values()]
-        truths = [track.take(cloud.stamp, first, last) for track in self._truth.values()]
         placed = [self._placed(b, place, problems) for b in boxes if b is not None]
-        truth = [self._placed(t, place, problems) for t in truths if t is not None]
+        truth = self._taken_truth(cloud.stamp, first, last)
         frame = Frame(
             index=self._index,
             stamp=cloud.stamp,
@@ -468,7 +479,7 @@ class Synchronizer:
             robot_boxes=tuple(placed),
             robot_detections=self._robot_detections(cameras, cloud.stamp, first, last),
             robot_clouds=self._taken_clouds(place, first, last, problems),
-            truth=truth[0] if truth else None,
+            truth=None if truth is None else self._placed(truth, place, problems),
             tf_age=place.tf_age,
             problems=tuple(problems),
             around=self.around.take(lambda name: self._world_from(place, name)),
@@ -783,6 +794,15 @@ class Synchronizer:
             self._complain(problems, f"{error}: the boxes of {boxes.topic} have no place in the world")
             return boxes
         return replace(boxes, world_from_boxes=(found if known else place.points_from(found)).matrix)
+
+    def _taken_truth(self, stamp: int, first: int, last: int) -> LabelledBoxes3D | None:
+        for topic, track in self._truth.items():
+            while (found := track.take(stamp, first, last)) is not None:
+                try:
+                    return replace(found.load(), stamp=found.stamp)
+                except UserError as error:
+                    self.report.damage.add(topic, str(error))
+        return None
 
     def _robot_detections(
         self, cameras: tuple[Camera, ...], stamp: int, first: int, last: int

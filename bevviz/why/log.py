@@ -29,7 +29,16 @@ COLORS = {
     Fate.REPORTED: FATES["reported"],
     Fate.IN_FRONT: FATES["in front"],
 }
+NAMES = {
+    Fate.GROUND: "taken for ground",
+    Fate.NOISE: "noise",
+    Fate.SET_ASIDE: "set aside",
+    Fate.CLUSTERED: "in a cluster without a name",
+    Fate.REPORTED: "in an object",
+    Fate.IN_FRONT: "in front of it",
+}
 _SUBJECT = (255, 60, 200)
+_LINE = 0.35  # metres between the lines of the legend
 _DEPTH = 20.0  # metres that a frustum is drawn to where the distance is unknown
 
 
@@ -58,6 +67,8 @@ def log_answers(
     recording.log(entities.WHY, document(page(answers, shown)))
     pose = transform(frame.pose)
     drawn = answers[:shown]
+    if drawn:
+        _log_legend(recording, frame, drawn[0])
     fate = np.zeros(len(frame.points), np.uint8)
     for answer in reversed(drawn):
         fate = np.where(answer.fate > 0, answer.fate, fate).astype(np.uint8)
@@ -67,22 +78,40 @@ def log_answers(
         colors[list(COLORS)] = list(COLORS.values())
         points = rr.Points3D(frame.points[known], colors=colors[fate[known]], radii=rr.Radius.ui_points(4.0))
         recording.log(entities.why("points"), pose, points)
-    strips = [
-        (edges(geometry.corners(a.subject.box)[0]), a.subject.name)
-        for a in drawn
-        if a.subject.box is not None
-    ]
+    strips = [edges(geometry.corners(a.subject.box)[0]) for a in drawn if a.subject.box is not None]
     strips += [strip for camera in frame.cameras for strip in _frustums(camera, drawn)]
     if strips:
-        lines, names = zip(*strips, strict=True)
-        place = rr.LineStrips3D(
-            lines, colors=[_SUBJECT], radii=rr.Radius.ui_points(2.0), labels=names, show_labels=True
-        )
+        place = rr.LineStrips3D(strips, colors=[_SUBJECT], radii=rr.Radius.ui_points(2.0))
         recording.log(entities.why("place"), pose, place)
     for camera in frame.cameras:
         _log_image(recording, camera, drawn)
     if above is not None:
         _log_above(recording, frame, drawn, above, fate)
+
+
+def focus(frame: Frame, answer: Answer) -> F32 | None:
+    """(3,) where it is, in Frame.points_frame; None where nothing says."""
+    if answer.subject.box is not None:
+        return np.asarray(answer.subject.box.center[0], np.float32)
+    points = frame.points[(answer.fate > 0) & (answer.fate != Fate.IN_FRONT)]
+    return np.median(points, axis=0).astype(np.float32) if len(points) else None
+
+
+def _log_legend(recording: rr.RecordingStream, frame: Frame, answer: Answer) -> None:
+    """Over the worst one its name, and what the colours of its points mean."""
+    place = focus(frame, answer)
+    if place is None:
+        return
+    counts = np.bincount(answer.fate, minlength=len(Fate))
+    fates = [fate for fate in COLORS if counts[fate]]
+    lines = [f"{counts[fate]} {NAMES[fate]}" for fate in fates] + [answer.subject.name]
+    colors = [COLORS[fate] for fate in fates] + [_SUBJECT]
+    box = answer.subject.box
+    top = place[2] + (0.5 if box is None else box.size[0, 2] / 2)
+    places = np.tile(place, (len(lines), 1))
+    places[:, 2] = top + _LINE * (1 + np.arange(len(lines)))
+    legend = rr.Points3D(places, labels=lines, colors=colors, radii=rr.Radius.ui_points(0), show_labels=True)
+    recording.log(entities.why("legend"), transform(frame.pose), legend)
 
 
 def _log_above(
@@ -123,7 +152,7 @@ def mark_answers(to: Writer, frame: Frame, answers: Sequence[Answer], above: Bev
     clear_answers(to.recording)
 
 
-def _frustums(camera: Camera, answers: Sequence[Answer]) -> Iterator[tuple[F32, str]]:
+def _frustums(camera: Camera, answers: Sequence[Answer]) -> Iterator[F32]:
     """In Frame.points_frame."""
     if camera.intrinsics is None or camera.camera_from_points is None:
         return
@@ -133,17 +162,17 @@ def _frustums(camera: Camera, answers: Sequence[Answer]) -> Iterator[tuple[F32, 
         if s.xyxy is not None and s.camera == camera.name:
             far = _DEPTH if np.isnan(answer.distance) else answer.distance
             corners = geometry.frustum(s.xyxy[None], camera.intrinsics, 0.5, far)[0]
-            yield edges(geometry.apply(points_from_camera, corners)), s.name
+            yield edges(geometry.apply(points_from_camera, corners))
 
 
 def _log_image(recording: rr.RecordingStream, camera: Camera, answers: Sequence[Answer]) -> None:
     boxes, names = [], []
-    for s in (answer.subject for answer in answers):
+    for number, s in enumerate(answer.subject for answer in answers):
         own = s.xyxy if s.camera == camera.name else None
         box = projected(s.box, camera) if s.box is not None else own
         if box is not None:
             boxes.append(box)
-            names.append(s.name)
+            names.append("" if number else s.name)
     if boxes:
         recording.log(
             entities.why(f"{camera.name}/place"),

@@ -80,5 +80,5 @@ def _page(answers: Sequence[Answer], chains: int) -> Iterator[str]:
         yield ""
     yield (
         "Points: brown ground, red noise, orange set aside, yellow in a cluster without a name, "
-        "green in an object, blue in front of it"
+        "light blue in an object, dark blue in front of it"
     )

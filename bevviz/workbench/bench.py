@@ -111,7 +111,8 @@ class Bench(Closing):
         self.recording_id = f"bench-{time.time_ns()}"
         self._main, self._film_main = self.stream()
         self._desk, self._film_desk = self.stream()
-        self._main.send_blueprint(blueprints.load("workbench", drive.scene), make_active=True)
+        layout = blueprints.load("workbench", drive.scene, drive.config)
+        self._main.send_blueprint(layout, make_active=True)
         self._logger = Logger(self._main, drive.config, drive.scene, wait=WAIT, stamps=BOTH)
         self._logger.log_static()
         self._desk_logger = Logger(self._desk, drive.config, drive.scene, stamps=BOTH)

@@ -17,6 +17,8 @@ from bevviz.errors import UserError
 from bevviz.evaluate import Truth, truth_of
 from bevviz.frame import FrameResult, Scene
 from bevviz.live.runtime import Live
+from bevviz.live.thinning import chosen
+from bevviz.logging import entities
 from bevviz.logging.logger import Logger
 from bevviz.logging.sinks import APPLICATION
 from bevviz.perceive import describe
@@ -204,7 +206,12 @@ class LiveBench(Closing):
         self, number: int, settings: Settings, path: str, instance: int | None, position: Sequence[float]
     ) -> Pick | None:
         """What a click in the frame is on, see ``pick``."""
-        return pick(self.look(number), self.look(number).tracks, path, instance, position)
+        result = self.look(number)
+        points = result.config.live.viewer_points
+        if instance is not None and points is not None and path == entities.points(result.frame.lidar):
+            rows = chosen(len(result.frame.points), points, result.frame.index)
+            instance = int(rows[instance]) if instance < len(rows) else None
+        return pick(result, result.tracks, path, instance, position)
 
     def ask(self, number: int, settings: Settings, what: Pick) -> tuple[Answer, list[Answer]]:
         """Why it was reported, or was not, and what else is there; it is shown in every view.

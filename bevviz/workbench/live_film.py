@@ -4,19 +4,21 @@ from __future__ import annotations
 
 import threading
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 import rerun as rr
 
-from bevviz.frame import Scene
 from bevviz.live.encoder import Packet
 from bevviz.live.output import Output
 from bevviz.live.runtime import Live
 from bevviz.logging import blueprints
 from bevviz.logging.logger import Context
 from bevviz.logging.sinks import APPLICATION
+from bevviz.workbench.site import Heard
 
+AHEAD = 10  # pieces that a page is sent before its viewer has drawn the first of them
 WHOLE = 3  # packets that need none before them, from the oldest of which on all are kept for pages
 
 
@@ -25,6 +27,44 @@ class _Piece:
     number: int
     data: bytes  # with the header that every recording begins with
     context: Context | None  # of one that a page can begin with
+
+
+class Page:
+    """How far a page is with what it was sent.
+
+    Args:
+        heard: what it says of that, a word for each piece that its viewer has drawn.
+        clock: seconds.
+    """
+
+    def __init__(self, heard: Heard, clock: Callable[[], float]) -> None:
+        self._heard, self._clock = heard, clock
+        self._sent: deque[float] = deque()  # times, from the first one on that it has not drawn
+        self._drawn = 0
+        self._held = threading.Lock()
+
+    def send(self) -> None:
+        """A piece is on its way."""
+        with self._held:
+            self._sent.append(self._clock())
+
+    @property
+    def ready(self) -> bool:
+        """Whether there may be more."""
+        return self._oldest() is None or len(self._sent) < AHEAD
+
+    @property
+    def lag(self) -> float:
+        """Seconds since the first piece was sent that it has not drawn; 0 while nobody sees it."""
+        oldest = self._oldest()
+        return 0.0 if oldest is None or self._heard.hidden else self._clock() - oldest
+
+    def _oldest(self) -> float | None:
+        with self._held:
+            while self._sent and self._drawn < self._heard.count:
+                self._sent.popleft()
+                self._drawn += 1
+            return self._sent[0] if self._sent else None
 
 
 class LiveFilm(Output):
@@ -38,6 +78,9 @@ class LiveFilm(Output):
     def __init__(self, live: Live, queue: int) -> None:
         super().__init__("page", queue)
         self._encoder = live.encoder
+        self._sparse = live.config.live.viewer_rate is not None
+        self._pages: list[Page] = []
+        self._missed = 0  # pieces, by pages that were too slow
         self._pieces: deque[_Piece] = deque()
         self._next = 0
         self._held = threading.Lock()
@@ -47,6 +90,25 @@ class LiveFilm(Output):
     def close(self) -> None:
         self._end()
         self._thread.join(1.0)
+
+    @property
+    def dropped(self) -> int:
+        return super().dropped + self._missed
+
+    @property
+    def lag(self) -> float | None:
+        """Of the slowest page: what its browser has not drawn counts, too."""
+        return max((page.lag for page in self._pages.copy()), default=None)
+
+    @contextmanager
+    def shown(self, heard: Heard) -> Iterator[Page]:
+        """A page that is there meanwhile."""
+        page = Page(heard, self._encoder.clock)
+        self._pages.append(page)
+        try:
+            yield page
+        finally:
+            self._pages.remove(page)
 
     def listen(self, listener: Callable[[], None]) -> Callable[[], None]:
         """Call it, from some thread, whenever there is more. Returns what ends that."""
@@ -75,18 +137,23 @@ class LiveFilm(Output):
             return [piece.data for piece in pieces if piece.number >= number], following
         if begin is None or begin.context is None:
             return [], -1 if number is None else number
-        head = [] if number is not None else [self._layout(begin.context.scene)]
+        if number is not None:
+            self._missed += begin.number - number
+        head = [] if number is not None else [self._layout(begin.context)]
         head.append(self._encoder.prelude(begin.context, blueprint=False))
         return head + [piece.data for piece in pieces if piece.number >= begin.number], following
 
-    def _layout(self, scene: Scene) -> bytes:
+    def _layout(self, context: Context) -> bytes:
         recording = rr.RecordingStream(APPLICATION, recording_id=self._encoder.recording_id)
         stream = rr.binary_stream(recording)
-        recording.send_blueprint(blueprints.load("workbench_live", scene), make_active=True)
+        layout = blueprints.load("workbench_live", context.scene, context.config)
+        recording.send_blueprint(layout, make_active=True)
         return stream.read() or b""
 
     def _take(self, packet: Packet, fresh: bool) -> bool:
-        self._put(self._encoder.header + packet.data, packet.context if packet.whole else None)
+        if self._sparse and not packet.whole:
+            return True
+        self._put(self._encoder.header + packet.shown, packet.context if packet.whole else None)
         return True
 
     def _put(self, data: bytes, context: Context | None) -> None:

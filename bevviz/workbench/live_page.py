@@ -129,13 +129,22 @@ class LiveSite(Site):
             with contextlib.suppress(WebSocketDisconnect, RuntimeError):
                 await socket.receive_text()
             return
-        with listening(film.listen) as more, contextlib.suppress(WebSocketDisconnect, RuntimeError):
+        with (
+            contextlib.ExitStack() as there,
+            listening(film.listen) as more,
+            contextlib.suppress(WebSocketDisconnect, RuntimeError),
+        ):
             async with heard_on(socket, more) as heard:
+                page = there.enter_context(film.shown(heard))
                 while not heard.gone:
                     more.clear()
+                    if not page.ready:
+                        await more.wait()
+                        continue
                     pieces, following = await asyncio.to_thread(film.since, number)
                     number = None if following < 0 else following
                     for piece in pieces:
+                        page.send()
                         await socket.send_bytes(piece)
                     await more.wait()
 

@@ -73,7 +73,7 @@ def pick(
         instance: row of its boxes or points; None: the entity as a whole.
         position: where: 2 pixels in a view of an image, 3 metres of the fixed frame in one of space.
     """
-    row = -1 if instance is None else instance
+    row, path = -1 if instance is None else instance, entities.boxes_of(path)
     for camera in result.cameras:
         if found := _in_image(camera, path, row, position):
             return found

@@ -201,10 +201,11 @@ class Site:
 
 
 class Heard:
-    """What the page has said on a socket: a word for each piece that it has, and times that it wants."""
+    """What the page has said on a socket: a word for each piece that it has, times that it wants, and whether
+    anybody sees it."""
 
     def __init__(self) -> None:
-        self.count, self.gone = 0, False
+        self.count, self.gone, self.hidden = 0, False, False
         self.wanted: list[int] = []
 
 
@@ -218,6 +219,8 @@ async def heard_on(socket: WebSocket, more: asyncio.Event) -> AsyncIterator[Hear
                 text = await socket.receive_text()
                 if text.isdecimal():
                     heard.wanted.append(int(text))
+                elif text in ("hidden", "seen"):
+                    heard.hidden = text == "hidden"
                 else:
                     heard.count += 1
                 more.set()

@@ -17,6 +17,7 @@ from bevviz.frame import I32, U8, Detections, DetectionState
 from bevviz.stages.detector.image import Placement
 from bevviz.stages.detector.layouts import Facts, find_head
 from bevviz.stages.detector.names import literal, metadata_names, read_names
+from bevviz.stages.detector.providers import open_session
 from bevviz.stages.detector.suppression import nms
 
 DEMO_MODEL = Path(__file__).parents[2] / "data" / "demo_detector.onnx"
@@ -24,7 +25,6 @@ DEFAULT_SIZE = 640  # of models that leave their input size open, as most famili
 MAX_CANDIDATES = 30_000  # that enter the NMS, best first, as Ultralytics bounds what a nonsense model costs
 
 # From the fastest down. DirectML and others that are not named here are used when asked for.
-PREFERRED_PROVIDERS = ("Tensorrt", "CUDA", "MIGraphX", "ROCM", "OpenVINO", "CoreML", "CPU")
 TYPES = {"tensor(float)": np.float32, "tensor(float16)": np.float16, "tensor(uint8)": np.uint8}
 
 
@@ -254,27 +254,9 @@ def _open(path: Path, config: DetectorConfig) -> tuple[Any, str]:
         raise UserError(
             f"detector.model {path}: PyTorch weights; export them: yolo export model={path} format=onnx"
         )
-    available = {name.removesuffix("ExecutionProvider"): name for name in ort.get_available_providers()}
-    chosen = [name for name in PREFERRED_PROVIDERS if name in available]
-    if config.provider.lower() != "auto":
-        asked = config.provider.lower().removesuffix("executionprovider")
-        chosen = [name for name in available if name.lower() == asked]
-        if not chosen:
-            raise UserError(
-                f"detector.provider {config.provider}: not here; available: {', '.join(available)}"
-            )
     options = ort.SessionOptions()
     options.intra_op_num_threads = config.threads
     options.log_severity_level = 3
     # Threads that spin between runs cost as much processor time as the network, and the LiDAR stages need it.
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
-    try:
-        session = ort.InferenceSession(path, options, [available[name] for name in chosen])
-    except Exception as error:  # onnxruntime's errors have no common base class
-        raise UserError(f"detector.model {path}: onnxruntime cannot load it: {first_line(error)}") from None
-    used = session.get_providers()[0].removesuffix("ExecutionProvider")
-    if config.provider.lower() != "auto" and used != chosen[0]:
-        raise UserError(
-            f"detector.provider {config.provider}: could not be started, onnxruntime fell back to {used}"
-        )
-    return session, used
+    return open_session(path, config.provider, options)

@@ -33,8 +33,14 @@ function film(lane) {
     if (lanes.length === 1) lanes.push(film("desk")); // the layout has to be there first
     if (lane === "film") nextPicture(() => { if (socket.readyState === WebSocket.OPEN) socket.send(""); });
   };
+  if (lane === "film" && kind === "live") { // a page that nobody sees draws nothing, and is not late
+    socket.onopen = () => { if (document.hidden) socket.send("hidden"); };
+  }
   return socket;
 }
+document.addEventListener("visibilitychange", () => {
+  if (kind === "live" && lanes[0]?.readyState === WebSocket.OPEN) lanes[0].send(document.hidden ? "hidden" : "seen");
+});
 
 export function connect() {
   talk = socketAt("/talk");

@@ -1,0 +1,96 @@
+"""Boxes that say what they are: outlines and names whose tooltip in the viewer is one sentence.
+
+The viewer's tooltip shows the values of what is hovered over where at most three differ from row to row, and
+only counts them otherwise. A box has five. So over the boxes, which have all that is known, lie outlines and
+names that have no more than a shape, a colour or a name, and a sentence; their rows are those of the boxes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import rerun as rr
+
+from bevviz import geometry
+from bevviz.colors import Color
+from bevviz.frame import F32, Bool, Boxes3D
+from bevviz.logging import entities
+from bevviz.logging.pieces import CORNER, edges
+from bevviz.logging.writer import Writer
+
+NEAR = 6  # boxes that have their names beside them because they are near: with all, names cover the scene
+
+_POINT, _COLOR = rr.Radius.ui_points(0.0), (235, 238, 245)
+
+
+def log_spoken_looks(to: Writer, path: str) -> None:
+    """Of boxes in space."""
+    to.static(entities.outlines(path), rr.LineStrips3D.from_fields(radii=rr.Radius.ui_points(2.5)))
+    to.static(entities.names(path), rr.Points3D.from_fields(radii=_POINT, colors=[_COLOR], show_labels=True))
+
+
+def log_spoken_looks_in_image(to: Writer, path: str, draw_order: float) -> None:
+    lines = rr.LineStrips2D.from_fields(radii=rr.Radius.ui_points(1.5), draw_order=draw_order)
+    points = rr.Points2D.from_fields(
+        radii=_POINT, colors=[_COLOR], show_labels=True, draw_order=draw_order + 1
+    )
+    to.static(entities.outlines(path), lines)
+    to.static(entities.names(path), points)
+
+
+def log_spoken(
+    to: Writer,
+    path: str,
+    boxes: Boxes3D,
+    names: Sequence[str],
+    sentences: Sequence[str],
+    colors: Sequence[Color],
+) -> None:
+    """Outlines and names over the (K,) boxes at ``path``, in whose frame they are.
+
+    Args:
+        to: where to.
+        path: of the boxes.
+        boxes: that have rows there.
+        names: what is written beside them; empty: nothing.
+        sentences: of the tooltips.
+        colors: of the outlines.
+    """
+    rows, words = _rows(len(boxes)), rr.AnyValues(says=_filled(sentences))
+    lines = edges(geometry.corners(boxes))[rows]
+    to.put(entities.outlines(path), rr.LineStrips3D(lines, colors=[colors[row] for row in rows]), words)
+    if any(names):
+        tops = boxes.center + boxes.size * np.array([0, 0, 0.5], np.float32)
+        to.put(entities.names(path), rr.Points3D(tops[rows], labels=_filled(names)), words)
+
+
+def log_spoken_in_image(
+    to: Writer, path: str, xyxy: F32, names: Sequence[str], sentences: Sequence[str], colors: Sequence[Color]
+) -> None:
+    """The same in an image. ``xyxy``: (K, 4) in pixels as bevviz counts them."""
+    rows, words = _rows(len(xyxy)), rr.AnyValues(says=_filled(sentences))
+    corners = (xyxy + CORNER)[rows][:, [0, 1, 2, 1, 2, 3, 0, 3, 0, 1]].reshape(-1, 5, 2)
+    to.put(entities.outlines(path), rr.LineStrips2D(corners, colors=[colors[row] for row in rows]), words)
+    if any(names):
+        to.put(
+            entities.names(path),
+            rr.Points2D((corners[:, 2] + corners[:, 3]) / 2, labels=_filled(names)),
+            words,
+        )
+
+
+def near(places: F32) -> Bool:
+    """(K,) the ``NEAR`` nearest of (K, 2 or 3) places."""
+    away = np.hypot(places[:, 0], places[:, 1])
+    found: Bool = away <= (np.sort(away)[NEAR - 1] if len(away) > NEAR else np.inf)
+    return found
+
+
+def _rows(count: int) -> list[int]:
+    """A single one twice: the viewer takes what has one row for a value of all rows, and only counts it."""
+    return list(range(count)) if count > 1 else [0, 0]
+
+
+def _filled(texts: Sequence[str]) -> list[str]:
+    return [*texts] if len(texts) > 1 else [*texts, *texts]

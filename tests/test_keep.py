@@ -1,0 +1,223 @@
+"""Recordings that keep less: what they lack, what they must not lack, and the same by several processes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from rerun.chunk import RrdReader
+
+import bevviz
+from bevviz.bags.source import BagSource
+from bevviz.config import LoggingConfig
+from bevviz.frame import F32, U8
+from bevviz.logging import entities
+from bevviz.logging.keep import Around, Held
+from bevviz.logging.recorder import OrderedRecorder
+from bevviz.logging.sinks import open_recording
+from bevviz.logging.video import GOP, VideoEncoder, decode
+from bevviz.parallel.run import run_windows
+from tests import bags
+from tests.recordings import Recording, verify
+from tests.test_parallel import plain, serially
+
+SETTINGS = ("clustering.eps=2 m", "clustering.min_points=2", "tracking.min_hits=1", "logging.raw_every=21")
+SCANS, DARK = 24, 12  # scans, and the one without an image
+TENTH = 100_000_000  # nanoseconds
+
+
+# --- which raw clouds --------------------------------------------------------------------------
+
+
+@given(
+    steps=st.lists(st.integers(1, 4), min_size=1, max_size=60),
+    strange=st.sets(st.integers(0, 59)),
+    every=st.integers(1, 20),
+    around=st.integers(0, 10),
+)
+def test_raw_clouds_are_those_around_what_is_strange(
+    steps: list[int], strange: set[int], every: int, around: int
+) -> None:
+    """Each once, and no other but each n-th; no more are held than fit into that time."""
+    stamps = (np.cumsum(steps) * TENTH).tolist()
+    config = LoggingConfig(raw_every=every, raw_around=around / 10)
+    kept, found = Around(), []
+    for i, stamp in enumerate(stamps):
+        found += [one.clock[0] for one in kept.see(Held((i, stamp, 0), ()), config, strange=i in strange)]
+        assert kept.held <= around + 1
+    at = [stamps[i] for i in strange if i < len(stamps)]
+    wanted = [
+        i
+        for i, stamp in enumerate(stamps)
+        if i % every == 0 or any(abs(stamp - other) <= around * TENTH for other in at)
+    ]
+    assert sorted(found) == wanted
+
+
+# --- H.264 -------------------------------------------------------------------------------------
+
+
+def pictures(count: int, height: int = 95, width: int = 121) -> list[U8]:
+    """A disc that moves over a slope of colours."""
+    y, x = np.mgrid[:height, :width]
+    slope = np.stack([x * 2, y * 2, 255 - x], axis=-1).clip(0, 255).astype(np.uint8)
+    return [cv2.circle(slope.copy(), (10 + 4 * i, 40), 9, (0, 200, 255), -1) for i in range(count)]
+
+
+def test_a_picture_at_any_time_is_right() -> None:
+    encoder, shown = VideoEncoder(), pictures(25)
+    samples = [encoder(picture, i * TENTH) for i, picture in enumerate(shown)]
+    keys = [i for i, sample in enumerate(samples) if sample.key]
+    assert keys == [0, 10, 20], "one a second"
+    assert GOP == 10 * TENTH
+    for i in (0, 7, 10, 19, 24):
+        start = max(key for key in keys if key <= i)
+        *_, found = decode([sample.data for sample in samples[start : i + 1]])
+        assert found.shape == (96, 122, 3), "sides are even"
+        assert cv2.PSNR(found[:95, :121], shown[i]) > 30
+
+
+def test_key_frames_where_nothing_before_helps() -> None:
+    encoder = VideoEncoder()
+    small, large = pictures(2), pictures(2, 120, 160)
+    given = [
+        (small[0], 0),
+        (small[1], TENTH),
+        (large[0], 2 * TENTH),
+        (large[1], TENTH),
+        (large[0], 90 * TENTH),
+    ]
+    assert [encoder(*one).key for one in given] == [True, False, True, True, True]
+    assert not encoder(large[1], 91 * TENTH).key
+    encoder.restart()
+    assert encoder(large[1], 92 * TENTH).key
+
+
+# --- recordings --------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    items = bags.small_items(scans=SCANS, points=1500)
+    dark = [item for item in items if item.topic == bags.IMAGE][DARK]
+    return bags.write(tmp_path_factory.mktemp("drive") / "bag", [item for item in items if item is not dark])
+
+
+@pytest.fixture(scope="module")
+def saved(bag: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """A recording of each kind."""
+    folder = tmp_path_factory.mktemp("saved")
+    found = {keep: folder / f"{keep}.rrd" for keep in ("everything", "inspect", "report")}
+    for keep, path in found.items():
+        with bevviz.open(bag, set=[*SETTINGS, f"logging.keep={keep}"]) as drive:
+            drive.save(path)
+        verify(path)
+    return found
+
+
+@pytest.fixture(scope="module")
+def read(saved: dict[str, Path]) -> dict[str, Recording]:
+    return {keep: Recording(path) for keep, path in saved.items()}
+
+
+def points_at(recording: Recording, paths: list[str], frame: int) -> F32:
+    found = [p for path in paths for p in recording.at[path]["Points3D:positions"].get(frame, ())]
+    return np.array(found, np.float32)
+
+
+def test_every_decision_box_track_and_explanation_is_kept(read: dict[str, Recording]) -> None:
+    whole = read["everything"]
+    thinned = (entities.WORLD, entities.BEV, entities.HEALTH)
+    words = [entity for entity in whole.at if not entity.startswith(thinned)]
+    boxes = [entity for entity in whole.at if any("Boxes" in name for name in whole.at[entity])]
+    boxes += [entities.TRACKS, entities.TRAILS]
+    assert {entities.EXPLAIN, entities.ANOMALY_LOG} <= set(words)
+    for keep in ("inspect", "report"):
+        less = read[keep]
+        assert less.times == whole.times
+        for entity in words:
+            assert plain(less.at[entity]) == plain(whole.at[entity]), (keep, entity)
+        for entity in boxes:
+            for name in whole.at[entity]:
+                if not name.startswith("Points"):
+                    assert plain(less.at[entity][name]) == plain(whole.at[entity][name]), (keep, entity)
+
+
+def test_inspect_has_each_voxel_once_and_raw_clouds_where_something_begins(
+    saved: dict[str, Path], read: dict[str, Recording]
+) -> None:
+    whole, less = read["everything"], read["inspect"]
+    (raw,) = [
+        path
+        for path in whole.at
+        if path.endswith("/points") and path.startswith(entities.WORLD) and "/image/" not in path
+    ]
+    lidar = raw.split("/")[2]
+    kept = less.at[raw]["Points3D:positions"]
+    assert sorted(kept) == [0, *range(DARK - 5, DARK + 6), 21], "a camera is gone for a frame"
+    for frame in kept:
+        assert kept[frame] == whole.at[raw]["Points3D:positions"][frame], "exact"
+        assert less.at[raw]["Points3D:class_ids"][frame] == whole.at[raw]["Points3D:class_ids"][frame]
+    assert less.cleared(raw) == {1, DARK + 6, 22}, "nothing that is shown is older"
+    places = [entities.obstacles(lidar), entities.clusters(lidar)]
+    for frame in (0, 7, DARK):
+        before, after = points_at(whole, places[:1], frame), points_at(less, places, frame)
+        assert len(before) == len(after)
+        away = np.abs(before[:, None] - after[None]).max(axis=2)
+        assert max(away.min(axis=0).max(), away.min(axis=1).max()) <= 1 / 32 + 1 / 128, "half a step, twice"
+        for ids in (whole, less):
+            columns = ids.at[entities.clusters(lidar)]
+            assert len(columns["Points3D:class_ids"][frame]) == len(columns["Points3D:positions"][frame])
+    assert saved["inspect"].stat().st_size < saved["everything"].stat().st_size
+    assert saved["report"].stat().st_size < saved["inspect"].stat().st_size
+    report = read["report"]
+    assert raw not in report.at
+    assert entities.clusters(lidar) in report.at
+
+
+def test_the_recording_says_what_it_lacks(saved: dict[str, Path], read: dict[str, Recording]) -> None:
+    for keep, path in saved.items():
+        recording = read[keep]
+        page = recording.static[entities.CONFIG]["TextDocument:text"][0]
+        made = recording.static[f"/__properties/{entities.PROPERTY}"]
+        assert made["keep"] == [keep]
+        assert ("Not in this recording" in page) == (keep != "everything")
+        assert ("left_out" in made) == (keep != "everything")
+        names = " ".join(
+            str(value)
+            for store in RrdReader(path).blueprints()
+            for chunk in RrdReader(path).stream(store=store)
+            for value in chunk.to_record_batch().to_pydict().values()
+        )
+        assert ("raw clouds now and then" in names) == (keep != "everything")
+
+
+def samples(recording: Recording) -> dict[int, Any]:
+    (path,) = [path for path, columns in recording.at.items() if "VideoStream:sample" in columns]
+    return recording.at[path]["VideoStream:sample"]
+
+
+def test_windows_keep_what_one_process_keeps(bag: Path, read: dict[str, Recording], tmp_path: Path) -> None:
+    """But for images that are encoded: each window begins with one that needs none before it."""
+    path = tmp_path / "windows.rrd"
+    with bevviz.open(bag, set=[*SETTINGS, "logging.keep=inspect"]) as drive:
+        assert isinstance(drive.frames, BagSource)
+        with open_recording(drive.scene, drive.config, save=path, in_parts=True) as sinks:
+            seen = [OrderedRecorder(sinks.recording, drive.config)]
+            assert run_windows(drive, drive.new_session(), sinks, seen, 2, serially).frames == SCANS
+    one, other = read["inspect"], Recording(path)
+    assert one.times == other.times
+    assert one.at.keys() == other.at.keys()
+    for entity, columns in one.at.items():
+        if entity.startswith((entities.stage_time(""), entities.rate("pipeline"))):
+            continue
+        for name in columns.keys() - {"VideoStream:sample", "VideoStream:codec"}:
+            assert plain(columns[name]) == plain(other.at[entity][name]), (entity, name)
+    assert samples(one).keys() == samples(other).keys()
+    shown = [bytes(sample[0]) for _, sample in sorted(samples(other).items())]
+    assert len(decode(shown)) == SCANS - 1

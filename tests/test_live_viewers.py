@@ -1,0 +1,142 @@
+"""What viewers are given: fewer points than files, and never more than their browser has drawn."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import bevviz
+from bevviz.frame import FrameResult
+from bevviz.live.encoder import Packet
+from bevviz.live.flight import FlightRecorder
+from bevviz.live.notes import Notes
+from bevviz.live.replay import Replay
+from bevviz.live.runtime import Live, Outputs
+from bevviz.live.settings import Settings
+from bevviz.logging import entities
+from bevviz.synthetic import SyntheticSource
+from bevviz.workbench.live_bench import LiveBench
+from bevviz.workbench.live_film import AHEAD, WHOLE
+from bevviz.workbench.site import Heard
+from tests.recordings import Recording
+
+pytestmark = pytest.mark.filterwarnings("ignore:RRD file has no footer")
+LIMIT = 500  # points
+
+
+@pytest.fixture(scope="module")
+def results() -> list[FrameResult]:
+    with bevviz.simulate(frames=2, seed=1, set={"live.viewer_points": LIMIT}) as drive:
+        return list(drive)
+
+
+@pytest.fixture
+def bench(results: list[FrameResult]) -> Iterator[LiveBench]:
+    source = Replay([result.frame for result in results], SyntheticSource(frames=1).scene)
+    settings = Settings(None, ["detector.model=demo", f"live.viewer_points={LIMIT}"])
+    live = Live(source, settings, Outputs(), Notes(lambda line: None))
+    with LiveBench(live) as bench:
+        yield bench
+        live.encoder.close()
+
+
+def test_viewers_get_fewer_points_and_files_all(
+    bench: LiveBench, results: list[FrameResult], tmp_path: Path
+) -> None:
+    live, result = bench.live, results[0]
+    frame = result.frame
+    packet = live.encoder.encode(result, live.scene, {}, ())
+
+    def recording(name: str, data: bytes) -> Recording:
+        path = tmp_path / name
+        path.write_bytes(live.encoder.prelude(packet.context) + data)
+        return Recording(path)
+
+    whole, thinned = recording("file.rrd", packet.data), recording("viewer.rrd", packet.shown)
+    path = entities.points(frame.lidar)
+    (every,) = whole.column(path, "Points3D:positions")
+    (few,) = thinned.column(path, "Points3D:positions")
+    assert np.array_equal(np.array(every), frame.points) and len(few) == LIMIT
+    for entity in (path, entities.ground(frame.lidar), entities.clusters(frame.lidar)):
+        points, classes = (whole.column(entity, f"Points3D:{part}")[0] for part in ("positions", "class_ids"))
+        shown, of_shown = (
+            thinned.column(entity, f"Points3D:{part}")[0] for part in ("positions", "class_ids")
+        )
+        assert len(shown) == min(LIMIT, len(points))
+        if len(classes) > 1:
+            class_of = dict(zip(map(tuple, points), classes, strict=True))
+            assert [class_of[tuple(point)] for point in shown] == of_shown
+        else:
+            assert of_shown == classes
+    (boxes,) = thinned.column(entities.clusters(frame.lidar), "Boxes3D:centers")
+    assert [boxes] == whole.column(entities.clusters(frame.lidar), "Boxes3D:centers") and len(boxes) > 1
+    assert thinned.at.keys() == whole.at.keys()
+    assert all(thinned.at[path].keys() == whole.at[path].keys() for path in whole.at), (
+        "nothing else is left out"
+    )
+
+    bench._see(result)  # a click on a point is on that one
+    for row in (0, 7, LIMIT - 1):
+        found = bench.picked(frame.index, (), path, row, [])
+        assert found is not None and found.place == pytest.approx(few[row])
+    assert bench.picked(frame.index, (), path, LIMIT, []) is None
+
+
+def test_what_is_held_to_be_saved_has_all_points(bench: LiveBench, results: list[FrameResult]) -> None:
+    live = bench.live
+    packet = live.encoder.encode(results[0], live.scene, {}, ())
+    flight = FlightRecorder(live.config.live, live.encoder, live._indexer)
+    flight.put(packet)
+    assert flight.held()[0].data == packet.data and flight.held()[0].thinned is None
+    assert packet.thinned is not None and len(packet.thinned) < len(packet.data) / 2
+
+
+def test_a_page_is_sent_what_it_can_draw_and_its_lag_is_known(
+    bench: LiveBench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now = 100.0
+    monkeypatch.setattr(bench.live.encoder, "clock", lambda: now)
+    film = bench.film
+    assert film.lag is None, "nobody looks"
+    heard = Heard()
+    with film.shown(heard) as page:
+        assert film.lag == 0.0
+        for _ in range(AHEAD):
+            assert page.ready
+            page.send()
+            now += 0.5
+        assert not page.ready and film.lag == 0.5 * AHEAD
+        assert bench.live.numbers["lag of the page viewer, ms"] == 500.0 * AHEAD
+        heard.hidden = True
+        assert film.lag == 0.0, "a page that nobody sees draws nothing"
+        heard.hidden, heard.count = False, AHEAD - 1
+        assert page.ready and film.lag == 0.5
+        heard.count = AHEAD
+        assert film.lag == 0.0
+    assert film.lag is None
+
+
+def test_what_a_page_was_too_slow_for_is_counted(bench: LiveBench, results: list[FrameResult]) -> None:
+    film, encoder = bench.film, bench.live.encoder
+    packet = encoder.encode(results[0], bench.live.scene, {}, ())
+    film._take(packet, True)
+    _, number = film.since(None)
+    for _ in range(WHOLE + 2):
+        film._take(packet, False)
+    pieces, _ = film.since(number)
+    assert len(pieces) == 2 and film.dropped == WHOLE + 1, "the newest whole one, and what it relies on"
+
+
+def test_pages_get_as_many_frames_as_viewers(results: list[FrameResult]) -> None:
+    source = Replay([result.frame for result in results], SyntheticSource(frames=1).scene)
+    settings = Settings(None, ["detector.model=demo", "live.viewer_rate=1"])
+    live = Live(source, settings, Outputs(), Notes(lambda line: None))
+    with LiveBench(live) as bench:
+        whole = live.encoder.encode(results[0], live.scene, {}, ())
+        for packet in (whole, Packet(b"", False, whole.context, 0.0), whole):
+            bench.film._take(packet, False)
+        assert bench.film.since(None)[1] == 2
+        live.encoder.close()

@@ -1,0 +1,91 @@
+"""What a network runs on, where a better provider is installed that does not work."""
+
+from __future__ import annotations
+
+import ctypes
+from pathlib import Path
+from typing import Any
+
+import onnxruntime as ort
+import pytest
+
+from bevviz import announce
+from bevviz.bags.info import network_of
+from bevviz.config import load
+from bevviz.errors import UserError
+from bevviz.stages.detector import DEMO_MODEL, providers
+
+
+@pytest.fixture
+def gpu_package(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
+    """As onnxruntime-gpu is installed: it lists CUDA, whether or not that loads."""
+    folder = tmp_path / "onnxruntime"
+    (folder / "capi").mkdir(parents=True)
+    (folder / "__init__.py").touch()
+    (folder / "capi" / providers.LIBRARIES["CUDA"]).write_bytes(b"no library")
+    monkeypatch.setattr(ort, "__file__", str(folder / "__init__.py"))
+    names = ["TensorrtExecutionProvider", "CUDAExecutionProvider", "CPUExecutionProvider"]
+    monkeypatch.setattr(ort, "get_available_providers", lambda: names)
+    providers.obstacle.cache_clear()
+    providers.tell.cache_clear()
+    return folder
+
+
+def libraries(monkeypatch: pytest.MonkeyPatch, error: str) -> None:
+    """What the dynamic linker says."""
+
+    def load_library(*_: object) -> None:
+        if error:
+            raise OSError(error)
+
+    monkeypatch.setattr(ctypes, "CDLL", load_library)
+
+
+MISSING = "libcublasLt.so.13: cannot open shared object file: No such file or directory"
+
+
+def test_a_missing_library_is_told_once_and_the_processor_takes_over(
+    gpu_package: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    libraries(monkeypatch, MISSING)
+    said: list[str] = []
+    monkeypatch.setattr(announce, "_say", said.append)
+    for _ in range(2):
+        _, used = providers.open_session(DEMO_MODEL, "auto", ort.SessionOptions())
+        assert used == "CPU"
+    assert said == [
+        "the network runs on CPU: CUDA is installed, but libcublasLt.so.13 is missing "
+        "(pip install 'onnxruntime-gpu[cuda,cudnn]', and NVIDIA's driver)"
+    ]
+    assert "CPU; CUDA is installed, but libcublasLt.so.13 is missing" in network_of(
+        load(settings=["detector.model=demo"])
+    )
+    assert capfd.readouterr().out == "", "nothing of onnxruntime's own"
+    with pytest.raises(UserError, match=r"detector.provider CUDA: libcublasLt.so.13 is missing"):
+        providers.open_session(DEMO_MODEL, "CUDA", ort.SessionOptions())
+
+
+def test_a_gpu_that_does_not_start(gpu_package: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """All libraries are there, the driver is not."""
+    libraries(monkeypatch, "")
+    said: list[str] = []
+    monkeypatch.setattr(announce, "_say", said.append)
+    real = ort.InferenceSession
+
+    def session(path: Path, options: Any, chosen: list[str], **more: Any) -> Any:
+        if chosen[0].startswith("CUDA"):
+            raise RuntimeError("CUDA failure 35: CUDA driver version is insufficient\nat cuda_call.cc")
+        return real(path, options, chosen, **more)
+
+    monkeypatch.setattr(ort, "InferenceSession", session)
+    assert providers.open_session(DEMO_MODEL, "auto", ort.SessionOptions())[1] == "CPU"
+    (line,) = said
+    assert "CUDA failure 35" in line
+    assert "cuda_call" not in line
+    with pytest.raises(UserError, match="CUDA failure 35"):
+        providers.open_session(DEMO_MODEL, "cuda", ort.SessionOptions())
+
+
+def test_without_a_detector_nothing_is_said() -> None:
+    assert network_of(load()) == ""
+    assert network_of(load(settings=["detector.model=nowhere.onnx"]))
