@@ -162,6 +162,7 @@ class McapWriter:
     def _add_channel(self, connection: Connection, number: int) -> int:
         extra, definition = connection.ext, self._define(connection)
         form = extra.serialization_format if isinstance(extra, ConnectionExtRosbag2) else "ros1"
+        form = form if form in ("ros1", *_SCHEMAS) else "cdr"
         schema = self._schemas.get((connection.msgtype, definition)) or self._add_schema(
             connection.msgtype, definition, form
         )

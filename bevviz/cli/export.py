@@ -1,0 +1,50 @@
+"""``bevviz export``."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from bevviz.cli.options import Commands, add_bag, add_config, add_selection, load_config, open_bag
+from bevviz.cli.outputs import hint, say, warn
+from bevviz.cli.run import through
+
+DESCRIPTION = """Write a drive, or a part of it, as a data set: the folders of KITTI's object benchmark
+(velodyne, image_2, calib, label_2), with the objects that were found as labels to be corrected. bevviz, and
+what else reads KITTI, opens it."""
+
+EPILOG = """examples:
+  bevviz export drive.mcap --model yolo11n.onnx -o training --start 10 --end 20 --every 5
+  bevviz evaluate training --model other.onnx        another detector against the corrected labels"""
+
+
+def add(commands: Commands) -> None:
+    export = commands.add_parser(
+        "export",
+        help="write frames as KITTI, with what was found as labels",
+        description=DESCRIPTION,
+        epilog=EPILOG,
+    )
+    group = add_bag(export)
+    add_selection(group)
+    add_config(export)
+    output = export.add_argument_group("what to write")
+    output.add_argument("-o", "--out", type=Path, required=True, metavar="FOLDER", help="that is made")
+    output.add_argument("--camera", default="", metavar="NAME", help="whose images (default: the first one)")
+    export.set_defaults(run=_export)
+
+
+def _export(options: argparse.Namespace) -> int:
+    from bevviz.drive import Drive
+    from bevviz.export.kitti import KittiExport
+
+    config = load_config(options)
+    with open_bag(options, config) as source:
+        drive = Drive(source, config)
+        hint(drive.scene, config)
+        export = KittiExport(options.out, options.camera)
+        end = through(drive.frames, drive.new_session(), [export])
+        warn(source.warnings)
+    warn(f"{count} frame(s) left out: {why}" for why, count in export.skipped.items())
+    say(f"{export.frames} frames with {export.labels} labels in {options.out}")
+    return 130 if end.interrupted else 0 if export.frames else 1

@@ -1,0 +1,155 @@
+"""The folders of KITTI's object benchmark: velodyne, image_2, calib and label_2 (Geiger et al. 2012)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from bevviz import geometry
+from bevviz.errors import UserError
+from bevviz.frame import F32, F64, U8, Camera, FrameResult, Intrinsics, Objects
+from bevviz.run import Items, Observer
+
+KINDS = {  # of a detector, as KITTI calls them; what is not here is Misc
+    "car": "Car",
+    "van": "Van",
+    "truck": "Truck",
+    "bus": "Truck",
+    "person": "Pedestrian",
+    "pedestrian": "Pedestrian",
+    "bicycle": "Cyclist",
+    "motorcycle": "Cyclist",
+    "cyclist": "Cyclist",
+    "train": "Tram",
+    "tram": "Tram",
+}
+UNKNOWN = 0  # occlusion: what was found is taken as seen
+
+
+class KittiExport(Observer[FrameResult]):
+    """Writes each frame; those without the camera's image, calibration or place are counted and left out.
+
+    Points are those that bevviz works on: upright, z up, several LiDARs merged. Images are rectified, so that
+    P2 projects into them.
+
+    Args:
+        folder: to be made; it must not hold an export yet.
+        camera: name of the one whose images these are; empty: the first.
+
+    Attributes:
+        frames: written.
+        labels: written.
+        skipped: frames that were left out, by the reason.
+
+    Raises:
+        UserError: the folder holds something.
+    """
+
+    def __init__(self, folder: Path, camera: str = "") -> None:
+        if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+            raise UserError(f"{folder}: is there already; give another folder")
+        self._folder, self._camera = folder, camera
+        self.frames = self.labels = 0
+        self.skipped: dict[str, int] = {}
+
+    def begin(self, items: Items[object]) -> None:
+        cameras = items.scene.cameras
+        if self._camera and self._camera not in cameras:
+            raise UserError(f"--camera {self._camera}: there is none of that name but {', '.join(cameras)}")
+        try:
+            for name in ("velodyne", "image_2", "calib", "label_2"):
+                (self._folder / name).mkdir(parents=True)
+        except OSError as error:
+            raise UserError(f"{self._folder}: cannot be made: {error.strerror}") from None
+
+    def see(self, result: FrameResult) -> None:
+        frame = result.frame
+        camera = next((c for c in frame.cameras if self._camera in ("", c.name)), None)
+        if camera is None or camera.image is None or camera.intrinsics is None:
+            self._skip("no image, or no CameraInfo")
+        elif camera.camera_from_points is None:
+            self._skip("no transform to the camera")
+        else:
+            self._write(result, camera, camera.image.bgr, camera.intrinsics, camera.camera_from_points)
+
+    def _skip(self, why: str) -> None:
+        self.skipped[why] = self.skipped.get(why, 0) + 1
+
+    def _write(
+        self, result: FrameResult, camera: Camera, bgr: U8, intrinsics: Intrinsics, camera_from_points: F64
+    ) -> None:
+        frame, name = result.frame, f"{self.frames:06}"
+        intensity = frame.fields.get("intensity")
+        points = np.zeros((len(frame.points), 4), np.float32)
+        points[:, :3] = frame.points
+        if intensity is not None:
+            points[:, 3] = intensity
+        lines = [] if result.objects is None else labels(result.objects, intrinsics, camera_from_points)
+        try:
+            points.tofile(self._folder / "velodyne" / f"{name}.bin")
+            if not cv2.imwrite(str(self._folder / "image_2" / f"{name}.png"), rectified(bgr, intrinsics)):
+                raise OSError(0, "the image cannot be written")
+            (self._folder / "calib" / f"{name}.txt").write_text(calibration(intrinsics.K, camera_from_points))
+            (self._folder / "label_2" / f"{name}.txt").write_text("".join(f"{line}\n" for line in lines))
+        except OSError as error:
+            raise UserError(f"{self._folder}: cannot be written: {error.strerror}") from None
+        self.frames += 1
+        self.labels += len(lines)
+
+
+def calibration(K: F64, camera_from_points: F64) -> str:
+    """The text of a calibration: the one camera is the reference, and P0 to P3 are its own."""
+    projection = np.column_stack([K, np.zeros(3)])
+    rows = {f"P{number}": projection for number in range(4)}
+    rows |= {"R0_rect": np.eye(3), "Tr_velo_to_cam": camera_from_points[:3], "Tr_imu_to_velo": np.eye(4)[:3]}
+    lines = (f"{name}: {' '.join(f'{v:.12e}' for v in matrix.ravel())}" for name, matrix in rows.items())
+    return "".join(f"{line}\n" for line in lines)
+
+
+def rectified(bgr: U8, intrinsics: Intrinsics) -> U8:
+    """The (H, W, 3) image as a camera of the same K without distortion has it."""
+    if not intrinsics.distortion_model:
+        return bgr
+    if intrinsics.distortion_model == "equidistant":
+        straight = cv2.fisheye.undistortImage(bgr, intrinsics.K, intrinsics.D[:4], Knew=intrinsics.K)
+    else:
+        straight = cv2.undistort(bgr, intrinsics.K, intrinsics.D[:8])
+    return np.asarray(straight, np.uint8)
+
+
+def labels(objects: Objects, intrinsics: Intrinsics, camera_from_points: F64) -> list[str]:
+    """A line for each object in the image: KITTI's fifteen columns, and the score as the sixteenth.
+
+    How much of it is hidden is not known and stated as 0.
+    """
+    flat = Intrinsics(intrinsics.width, intrinsics.height, intrinsics.K)
+    width, height = intrinsics.width, intrinsics.height
+    found = []
+    every = geometry.corners(objects.boxes)
+    for row, name in enumerate(objects.names):
+        uv, _ = geometry.project(geometry.apply(camera_from_points, every[row]), flat)
+        if not np.isfinite(uv).all():
+            continue  # partly behind the camera
+        low, high = uv.min(axis=0), uv.max(axis=0)
+        inside = np.clip(np.concatenate([low, high]), 0, [width - 1, height - 1] * 2)
+        area, whole = _area(inside), _area(np.concatenate([low, high]))
+        if area <= 0 or whole <= 0:
+            continue
+        center, size = objects.boxes.center[row].astype(np.float64), objects.boxes.size[row]
+        # A location is the middle of the bottom, in a frame where boxes stand upright: the camera's.
+        x, y, z = camera_from_points[:3, :3] @ center + camera_from_points[:3, 3] + [0, size[2] / 2, 0]
+        yaw = float(objects.boxes.yaw[row])
+        ahead = camera_from_points[:3, :3] @ [np.cos(yaw), np.sin(yaw), 0]
+        turn = float(np.arctan2(-ahead[2], ahead[0]))
+        alpha = (turn - np.arctan2(x, z) + np.pi) % (2 * np.pi) - np.pi
+        length, broad, tall = map(float, size)
+        numbers = [alpha, *inside, tall, broad, length, x, y, z, turn, float(objects.score[row])]
+        stated = " ".join(f"{value:.4f}" for value in numbers)
+        found.append(f"{KINDS.get(name.lower(), 'Misc')} {max(0, 1 - area / whole):.2f} {UNKNOWN} {stated}")
+    return found
+
+
+def _area(box: F32) -> float:
+    return float(np.prod(np.maximum(box[2:] - box[:2], 0)))
