@@ -16,6 +16,8 @@ from pathlib import Path
 from threading import Event, Thread
 from typing import Any
 
+import cv2
+import numpy as np
 import pyarrow.parquet as pq
 import pytest
 import rerun as rr
@@ -282,22 +284,45 @@ def test_badness_weighs_what_went_wrong(batch: Batch) -> None:
 def test_the_page_stands_on_its_own(batch: Batch) -> None:
     text = (batch.folder / "summary.html").read_text()
     page = Page(text)
-    assert not {"script", "link", "img", "iframe", "b>", "object"} & {tag for tag, _ in page.tags}
-    assert not [attrs for _, attrs in page.tags if {"src", "href", "onclick"} & set(attrs)]
+    assert not {"script", "link", "iframe", "b>", "object"} & {tag for tag, _ in page.tags}
+    assert not [attrs for _, attrs in page.tags if {"href", "onclick"} & set(attrs)]
+    sources = [tag["src"] for _, tag in page.tags if tag.get("src")]
+    assert all(str(source).startswith("data:image/jpeg;base64,") for source in sources)
     assert "url(" not in text and "@import" not in text
     assert str(batch.root / "bags/two<b>/drive") in [attrs.get("title") for _, attrs in page.tags]
     assert "not a bag" in page.text
     worst = pq.read_table(batch.folder / "summary.parquet", columns=["remarks", "recording"]).to_pylist()[0]
     assert worst["remarks"][0] in page.text
     assert page.text.index(worst["remarks"][0]) > page.text.index("Worst frames")
-    assert f"rerun {worst['recording']}.rrd" in page.text
+    assert f"bevviz open {worst['recording']}.rrd --at 20" in page.text
+
+
+def test_the_worst_frames_have_pictures(batch: Batch) -> None:
+    for path in batch.folder.glob("*.parquet"):
+        rows = sorted(pq.read_table(path).to_pylist(), key=lambda row: -row["badness"])
+        pictured = [row for row in rows if row["above"] is not None]
+        if path.stem == "summary" or not pictured:
+            continue
+        assert len(pictured) == min(12, len(rows))
+        assert pictured[-1]["badness"] >= rows[len(pictured) - 1]["badness"]
+        above = cv2.imdecode(np.frombuffer(pictured[0]["above"], np.uint8), cv2.IMREAD_COLOR)
+        assert above is not None and above.shape[1] == 150
+    shown = (batch.folder / "summary.html").read_text().count("-eye view, frame ")
+    assert (
+        shown
+        == sum(
+            row["above"] is not None
+            for row in pq.read_table(batch.folder / "summary.parquet").to_pylist()[:30]
+        )
+        > 0
+    )
 
 
 def test_frames_are_counted_and_filtered_by_the_gravest_thing_in_them(batch: Batch) -> None:
     text = (batch.folder / "summary.html").read_text()
     frames = pq.read_table(batch.folder / "summary.parquet").to_pylist()
     kinds = Counter(severity(row) for row in frames)
-    counted = re.findall(r'<li class="(\w+)"><b>(\d+)</b>', text)
+    counted = re.findall(r'<li class="(\w+)(?: none)?"><b>(\d+)</b>', text)
     assert dict(counted) == {kind: str(kinds[kind]) for kind in SEVERITIES}
     assert sum(int(number) for _, number in counted) == len(frames)
     nothing: dict[str, Any] = dict.fromkeys(("failures", "problems", "missed", "false", "anomalies"), 0)

@@ -48,6 +48,8 @@ class WorstFrame:
     more: int  # further remarks
     address: str
     command: str
+    picture: bytes | None  # JPEG, of its first camera
+    above: bytes | None  # JPEG, of its bird's-eye view
 
 
 def page(
@@ -82,25 +84,28 @@ def page(
 
 
 def _worst_frame(row: Mapping[str, Any], viewer: str) -> WorstFrame:
-    address, command = _opened_by(row["link"], row["recording"], viewer)
+    stamp = iso(row["stamp"])
+    address, command = _opened_by(row["link"], row["recording"], stamp, viewer)
     return WorstFrame(
         kind=severity(row),
         badness=row["badness"],
         recording=row["recording"],
         number=row["frame"],
-        stamp=iso(row["stamp"]),
+        stamp=stamp,
         clocks=f"sync {_ms(row['sync_error_ms'])}, TF {_ms(row['tf_age_ms'])}",
         remarks=row["remarks"][:SHOWN],
         more=max(0, len(row["remarks"]) - SHOWN),
         address=address,
         command=command,
+        picture=row["picture"],
+        above=row["above"],
     )
 
 
-def _opened_by(link: str | None, recording: str, viewer: str) -> tuple[str, str]:
+def _opened_by(link: str | None, recording: str, stamp: str, viewer: str) -> tuple[str, str]:
     """Address and command; empty where there is none."""
     if not link:
-        return "", f"rerun {recording}.rrd"
+        return "", f"bevviz open {recording}.rrd --at {stamp}"
     if urlsplit(link).scheme not in ("rerun", "rerun+http", "rerun+https"):
         raise ValueError(f"{link}: no address of a recording")
     if viewer:

@@ -54,6 +54,11 @@ SCHEMA = pa.schema(
         ("badness", pa.float64()),
         ("missed", pa.int64()),
         ("false", pa.int64()),
+        (
+            "picture",
+            pa.binary(),
+        ),  # JPEG, of the worst frames alone: the first camera's image with what was found
+        ("above", pa.binary()),  # JPEG, of these too: the bird's-eye view
     ]
 )
 

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import heapq
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -21,6 +22,7 @@ from bevviz.files import unfinished
 from bevviz.frame import FrameResult
 from bevviz.logging.recorder import DiskWatch, Recorder
 from bevviz.logging.sinks import open_recording
+from bevviz.report.pictures import ahead, camera_picture, jpeg, shrink
 from bevviz.run import Observer
 from bevviz.run import run as run_frames
 from bevviz.session import Session
@@ -107,6 +109,37 @@ def run(job: Job, threads: int, on_frame: Callable[[], None] = lambda: None) -> 
     return JobResult(job.name, len(rows), seconds)
 
 
+class _Pictures:
+    """Of the worst frames so far, two each."""
+
+    COUNT, WIDTH, ABOVE = 12, 240, 150  # frames, pixels of a camera's picture, of the bird's-eye view's
+
+    def __init__(self) -> None:
+        self._worst: list[tuple[float, int, dict[str, bytes]]] = []  # a heap: badness, row, pictures
+
+    def see(self, badness: float, row: int, result: FrameResult) -> None:
+        place = (badness, -row)
+        if len(self._worst) == self.COUNT and place <= self._worst[0][:2]:
+            return
+        entry = (*place, self._of(result))
+        if len(self._worst) == self.COUNT:
+            heapq.heapreplace(self._worst, entry)
+        else:
+            heapq.heappush(self._worst, entry)
+
+    def __iter__(self) -> Iterator[tuple[int, dict[str, bytes]]]:
+        return ((-row, pictures) for _, row, pictures in self._worst)
+
+    def _of(self, result: FrameResult) -> dict[str, bytes]:
+        found = {}
+        cameras = (camera_picture(camera, self.WIDTH) for camera in result.cameras)
+        if (picture := next((c for c in cameras if c is not None), None)) is not None:
+            found["picture"] = jpeg(picture)
+        if result.bev is not None:
+            found["above"] = jpeg(shrink(ahead(result.bev), self.ABOVE)[0])
+        return found
+
+
 class _Rows(Observer[FrameResult]):
     """A row of the table for each frame; ends the run where its recording was removed."""
 
@@ -116,13 +149,19 @@ class _Rows(Observer[FrameResult]):
         self.rows: list[dict[str, Any]] = []
         self._job, self._recording, self._on_frame = job, recording, on_frame
         self._evaluation = evaluation
+        self._pictures = _Pictures()
 
     def see(self, result: FrameResult) -> None:
         found = row(result, result.config)
         if self._evaluation is not None and self._evaluation.last is not None:
             wrong = self._evaluation.now
             found = judged(found, wrong["missed"], wrong["false"])
+        self._pictures.see(found["badness"], len(self.rows), result)
         self.rows.append({**found, "bag": path_text(self._job.bag), "recording": self._job.name})
         self._on_frame()
         if not self._recording.exists():
             raise WithdrawnError
+
+    def end(self) -> None:
+        for place, pictures in self._pictures:
+            self.rows[place] |= pictures

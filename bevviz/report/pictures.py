@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 
 from bevviz.colors import bins, class_color, turbo
-from bevviz.frame import U8, Bool, CameraResult, Decision
+from bevviz.frame import U8, Bev, Bool, CameraResult, Decision
 from bevviz.logging.entities import DEPTH_BINS, DEPTH_RANGE
 
 
@@ -59,6 +59,12 @@ def shrink(bgr: U8, width: int) -> tuple[U8, float]:
     size = max(1, round(bgr.shape[1] * scale)), max(1, round(bgr.shape[0] * scale))
     small: U8 = cv2.resize(bgr, size, interpolation=cv2.INTER_AREA)
     return small, scale
+
+
+def ahead(bev: Bev) -> U8:
+    """What of a bird's-eye image lies ahead and not far to the sides."""
+    rows, columns = bev.image.shape[:2]
+    return bev.image[rows // 20 : 5 * rows // 8, columns // 4 : 3 * columns // 4]
 
 
 def jpeg(bgr: U8, quality: int = 80) -> bytes:
