@@ -403,7 +403,7 @@ class LiveConfig(Section):
     max_rate: float | None = Field(None, gt=0, le=1000, description="frames a second at most; empty: all")
     every: int = Field(1, ge=1, description="run each N-th scan only")
     points: int | None = Field(None, ge=1, description="points kept of each scan; empty: all")
-    log_queue: int = Field(2, ge=1, le=100, description="results that may wait to be logged; the oldest goes")
+    log_queue: int = Field(3, ge=1, le=100, description="results that may wait to be logged; the oldest goes")
     output_queue: int = Field(20, ge=1, le=1000, description="frames that may wait for a slow disk or viewer")
     viewer_memory: Megabytes = Field(
         500.0, ge=10, description="recent past kept for a viewer that comes late (--serve)"

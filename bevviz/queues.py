@@ -17,8 +17,8 @@ class NewestQueue(Generic[T]):
 
     Args:
         size: items that wait at most.
-        catch_up: items wait only where they came together. Who finds more than one waiting time and again
-            is too slow, and gets the newest alone.
+        catch_up: items wait only where they came together. Who finds several waiting, and no fewer the next
+            time, is too slow, and gets the newest alone.
     """
 
     def __init__(self, size: int = 1, *, catch_up: bool = False) -> None:
@@ -61,16 +61,16 @@ class NewestQueue(Generic[T]):
             self._changed.notify_all()
 
     def __iter__(self) -> Iterator[T]:
-        behind = False
+        before = 1  # that were waiting the last time
         while True:
             with self._changed:
                 self._changed.wait_for(lambda: self._items or self._closed)
                 if not self._items:
                     return
-                several = len(self._items) > 1
-                if self._catch_up and behind and several:
-                    self.dropped += len(self._items) - 1
+                waiting = len(self._items)
+                if self._catch_up and waiting >= before > 1:
+                    self.dropped += waiting - 1
                     self._items = deque([self._items[-1]])
-                behind = several
+                before = waiting
                 item = self._items.popleft()
             yield item

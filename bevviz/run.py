@@ -84,7 +84,7 @@ class Dropping:
         results: results that may wait for the observers.
     """
 
-    def __init__(self, incoming: int = BURST, results: int = 2) -> None:
+    def __init__(self, incoming: int = BURST, results: int = BURST) -> None:
         self.incoming_size, self.results_size = incoming, results
         self._queues: dict[str, NewestQueue[Any]] = {}
 
@@ -145,25 +145,33 @@ def run(
     loop = _Loop(items, processor, observers, dropping, depth, stop)
     thread = threading.Thread(target=loop.work, name="run", daemon=True)
     interrupted = False
+
+    def end() -> None:
+        """What comes from now on is neither waited for nor counted as left out."""
+        _stop(items)
+        if dropping is not None:
+            dropping.close()
+
     thread.start()
     while not loop.over.is_set():
         try:
             # Not ``thread.join``, which takes a thread for ended that an interrupt comes beside.
             loop.over.wait(TICK)
-            tick()
             if stop.is_set():
-                _stop(items)
-                if dropping is not None:
-                    dropping.close()
+                end()
+            tick()
         except KeyboardInterrupt:
             if interrupted:
                 raise
             interrupted = True
             stop.set()
+            end()
         except BaseException:  # of ``tick``
             stop.set()
+            end()
             loop.over.wait()
             raise
+    end()  # however it ended: nobody comes for more
     thread.join()
     if loop.error is not None:
         if interrupt_in(loop.error):

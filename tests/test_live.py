@@ -200,13 +200,17 @@ def test_what_comes_together_waits_and_who_is_behind_gets_the_newest() -> None:
         queue.put(number)
         queue.put(number + 1)
         assert (next(items), next(items)) == (number, number + 1)
+    for number in range(10, 40, 3):  # three, all there before the first is taken
+        for i in range(3):
+            queue.put(number + i)
+        assert [next(items) for _ in range(3)] == [number, number + 1, number + 2]
     assert queue.dropped == 0
     taken = []
-    for number in range(10, 40):  # three come while one is worked on
+    for number in range(40, 70):  # three come while one is worked on
         queue.put(number)
         if number % 3 == 0:
             taken.append(next(items))
-    assert taken[1:] == [15, 18, 21, 24, 27, 30, 33, 36, 39]
+    assert taken[1:] == [45, 48, 51, 54, 57, 60, 63, 66, 69][-len(taken[1:]) :] and len(taken) == 10
     assert queue.dropped == 30 - len(taken) - len(queue)
 
 

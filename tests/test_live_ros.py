@@ -6,6 +6,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections import Counter
 from collections.abc import Iterator
@@ -29,6 +30,7 @@ from bevviz.ros.messages import (
     decode_image,
     read_header,
 )
+from bevviz.run import Dropping, run
 from bevviz.session import Session
 from bevviz.synthetic import SyntheticSource
 from bevviz.synthetic.bag import TOPICS
@@ -247,6 +249,60 @@ def test_what_stops_or_cannot_be_used_is_told_at_once_and_when_it_is_over() -> N
         with Node(name="bevviz") as twin:
             twin.start()
             until_told("another node is called /bevviz")
+
+
+def test_clouds_that_come_together_are_all_taken_and_none_is_missed_once_it_is_over() -> None:
+    kind = "sensor_msgs/msg/PointCloud2"
+    whole = encode_cloud(SyntheticSource(frames=1).snapshot(0).frame.clouds[0])
+    with Node(name="driver") as driver, LiveSource(load()) as source:
+        driver.start()
+        points = driver.node.create_publisher(typesupport.message_type(kind), "/points", 10)
+        sent: list[int] = []
+
+        def publish(clouds: int) -> bool:
+            now = time.time_ns()
+            sent[:] = [now + 1_000_000 * i for i in range(clouds)]
+            for at in sent:
+                stamp = replace(whole.header.stamp, sec=at // 10**9, nanosec=at % 10**9)
+                cloud = replace(whole, header=replace(whole.header, stamp=stamp))
+                points.publish(bytes(typestore().serialize_cdr(cloud, kind)))
+            return True
+
+        until(lambda: publish(1) and source.wait(0), "a scene")
+        seen: list[int] = []
+        over = threading.Event()
+
+        class Frames:
+            def perceive(self, frame: Frame, network: object = None) -> Frame:
+                return frame
+
+            def finish(self, frame: Frame) -> Frame:
+                seen.append(frame.stamp)
+                return frame
+
+        def tick() -> None:
+            """Ctrl-C, noticed when the loop has ended already."""
+            if over.is_set():
+                stop.set()
+                until(lambda: all(thread.name != "run" for thread in threading.enumerate()), "the end")
+                raise KeyboardInterrupt
+
+        def work() -> None:
+            run(source, Frames(), dropping=dropping, stop=stop, tick=tick)
+
+        dropping, stop = Dropping(), threading.Event()
+        thread = threading.Thread(target=work, daemon=True)
+        thread.start()
+        for clouds in (1, 2, 3, 1, 3, 2, 3):
+            publish(clouds)
+            until(lambda: seen and seen[-1] == sent[-1], "the last of those that came together")
+            assert seen[-clouds:] == sent
+        assert source.dropped == sum(dropping.dropped.values()) == 0
+        over.set()
+        until(lambda: publish(1) and not thread.is_alive(), "the end of the run")
+        before = source.received["/points"]
+        until(lambda: publish(1) and source.received["/points"] > before + 10, "clouds that nobody takes")
+        assert source.dropped == sum(dropping.dropped.values()) == 0
 
 
 def test_the_first_frame_waits_for_its_calibration(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -9,6 +9,7 @@ import threading
 import time
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Executor
+from contextlib import suppress
 from typing import Any
 
 import pytest
@@ -219,6 +220,15 @@ def test_who_is_slow_beside_holds_nobody_up() -> None:
 def test_an_error_beside_ends_the_run() -> None:
     with pytest.raises(RuntimeError, match="full"):
         run(Numbers(10_000, pause=0.01), Squares(), [Seen(fails_at=2, beside=1)], dropping=Dropping())
+
+
+@pytest.mark.parametrize("dropping", [None, Dropping()], ids=["waited for", "dropping"])
+@pytest.mark.parametrize("fails_at", [-1, 2], ids=["whole", "failed"])
+def test_a_source_is_told_the_end_however_it_ended(dropping: Dropping | None, fails_at: int) -> None:
+    source = Numbers(5)
+    with suppress(RuntimeError):
+        run(source, Squares(), [Seen(fails_at=fails_at)], dropping=dropping)
+    assert source.stopped.is_set()
 
 
 def test_a_source_that_waits_for_good_can_be_ended() -> None:

@@ -10,7 +10,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
@@ -198,12 +198,22 @@ def test_what_the_ground_alone_tells_is_said(scan: Cloud) -> None:
 
 
 @given(hnp.arrays(np.float64, 3, elements=st.floats(-1, 1)).filter(lambda v: np.linalg.norm(v) > 1e-3))
+@example(np.array([2e-9, 0.0, -1.0]))
+@example(np.array([1e-9, -1.0, 2e-9]))
+@example(np.array([1e-170, 0.0, -1.0]))
+@example(np.array([1e-170, 1e-200, 1.0]))
 def test_a_least_turn_points_up(direction: F64) -> None:
     up = direction / np.linalg.norm(direction)
     for frame in (LIDAR, "camera_optical_frame"):
         turn = _least_turn(frame, up)
         assert np.allclose(turn @ up, [0, 0, 1], atol=1e-9)
         assert np.allclose(turn @ turn.T, np.eye(3), atol=1e-9) and np.linalg.det(turn) > 0
+
+
+@pytest.mark.parametrize("tilt", [0.0, 1e-16, 1e-9, 1e-7])
+def test_what_is_upside_down_but_for_rounding_stays_ahead(tilt: float) -> None:
+    for up in ([tilt, 0.0, -1.0], [-tilt, tilt, -1.0]):
+        assert _least_turn(LIDAR, np.array(up)) == pytest.approx(np.diag([1.0, -1.0, -1.0]), abs=1e-6)
 
 
 @given(hnp.arrays(np.float64, 3, elements=st.floats(-np.pi, np.pi)))

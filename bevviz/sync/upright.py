@@ -192,11 +192,13 @@ def _least_turn(frame: str, up: F64) -> F64:
     The optical frame of a depth camera looks along z; it is made to look along x first.
     """
     start = _OPTICAL if "optical" in frame.lower() else np.eye(3)
+    x, y, z = start @ up
+    if z < 0 and math.hypot(x, y) < 1e-6:
+        # Upside down every axis is as good: about x, ahead stays ahead. What is left is turned as ever.
+        start = np.diag([1.0, -1.0, -1.0]) @ start
     axis = np.cross(start @ up, _Z)
     sine, cosine = float(np.linalg.norm(axis)), float((start @ up)[2])
-    # Upside down every axis is as good: about x, ahead stays ahead.
-    axis = axis / sine if sine > 1e-6 else np.array([1.0, 0.0, 0.0])
-    turn, _ = cv2.Rodrigues(axis * math.atan2(sine, cosine))
+    turn, _ = cv2.Rodrigues(axis * (math.atan2(sine, cosine) / sine if sine else 1.0))
     return np.asarray(turn @ start)
 
 
