@@ -317,10 +317,11 @@ def read(recording: Path) -> tuple[str, Origin | None]:
     origin: Origin | None = None
     try:
         for path, chunk in _properties(recording):
-            if path == entities.PROPERTY:
-                how = str(_column(chunk, "config")[-1][0])
-            elif path == entities.BAG:
-                origin = Origin.load(_column(chunk, "about")[-1][0])
+            # A property may be in several chunks, with some of its fields each.
+            if path == entities.PROPERTY and (found := _column(chunk, "config")):
+                how = str(found[-1][0])
+            elif path == entities.BAG and (found := _column(chunk, "about")):
+                origin = Origin.load(found[-1][0])
             if how is not None and origin is not None:
                 break
     except (OSError, ValueError, KeyError, TypeError, RuntimeError) as error:
@@ -349,8 +350,9 @@ def _properties(recording: Path) -> Iterator[tuple[str, Any]]:
 
 
 def _column(chunk: Any, name: str) -> list[Any]:
-    found: list[Any] = chunk.to_record_batch().column(name).to_pylist()
-    return found
+    """Its values; none where the chunk has no such column."""
+    batch = chunk.to_record_batch()
+    return list(batch.column(name).to_pylist()) if name in batch.schema.names else []
 
 
 def check_functions(

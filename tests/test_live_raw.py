@@ -26,6 +26,7 @@ from bevviz.config import load
 from bevviz.errors import UserError
 from bevviz.files import write_all
 from bevviz.frame import FrameResult
+from bevviz.recorded import read
 from bevviz.report.digest import compare, digest
 from bevviz.run import Observer
 from bevviz.run import run as run_frames
@@ -181,6 +182,8 @@ def test_a_recording_stands_for_the_bag_beside_it(flight: Flight, tmp_path: Path
     info = describe([flight.folder / "snap.rrd"], load())
     assert info.size == (flight.folder / "snap.mcap").stat().st_size
     assert info.missing == ("no detector: --model FILE.onnx",) and info.cameras[0].image is not None
+    how, _ = read(flight.folder / "snap.rrd")
+    assert "flight_time" in how
     alone = tmp_path / "snap.rrd"
     alone.write_bytes((flight.folder / "snap.rrd").read_bytes())
     with pytest.raises(UserError, match=r"snap\.mcap, which 'bevviz live' saves with it, is not beside it"):

@@ -42,7 +42,7 @@ from tests.ros_player import Play
 pytest.importorskip("rclpy", reason="needs rclpy: pip install 'bevviz[ros]'")
 
 from bevviz.live import info
-from bevviz.live.source import LiveSource
+from bevviz.live.source import LiveSource, remedy
 from bevviz.ros import typesupport
 from bevviz.ros.node import Node
 from bevviz.ros.orders import Orders
@@ -357,6 +357,11 @@ def test_what_cannot_be_received_is_told_and_not_waited_for(
     unheard = [text for text in said if "is not received" in text]
     assert unheard == [f"{TRUTH_TOPIC} is not received: vision_msgs is not installed"]
     assert heard[-1].truth is None and heard[-1].cameras[0].image is not None
+
+
+def test_what_helps_against_losses_depends_on_the_size() -> None:
+    assert "segment" in remedy(1.9e6) and "docs/live.md" in remedy(1.9e6)
+    assert "segment" not in remedy(300) and "queue" in remedy(300)
 
 
 def test_refused_arguments() -> None:

@@ -37,7 +37,7 @@ SETTLE = 1.0  # seconds without a change of roles after which the scene is taken
 PATIENCE = 3.0  # seconds that what is lacking may delay the scene
 FIRST = 1.0  # seconds of a subscription in which messages are lost as publishers are met
 CHANGING = "the topics are still changing"
-REMEDY = "a larger segment of the publisher's helps, see 'Clouds were lost on the way' in docs/live.md"
+PIECE = 65_000  # bytes that DDS sends at once; what is larger goes in pieces
 
 KINDS = {
     "sensor_msgs/msg/PointCloud2",
@@ -387,7 +387,8 @@ class LiveSource(Closing):
         mixed = f"{name} has several publishers, taken for one sensor: {names}; remap all but one"
         watch.note(f"{name} publishers", mixed if several else "", f"{name} has one publisher")
         if self.lost[name]:
-            watch.once(f"messages of {name} are lost on the way: {REMEDY}")
+            size = watch.volume[name] / max(1, watch.received[name])
+            watch.once(f"messages of {name} are lost on the way: {remedy(size)}")
 
     def _look_at_frames(self) -> None:
         """At what the synchroniser found odd."""
@@ -491,6 +492,13 @@ class LiveSource(Closing):
             kind, topic.name, receive, qos, event_callbacks=events, raw=True
         )
         self._subscriptions[topic.name] = _Subscription(handle, topic.type, qos)
+
+
+def remedy(size: float) -> str:
+    """What helps where messages of so many bytes are lost on the way."""
+    if size > PIECE:
+        return "a larger segment of the publisher's helps, see 'Clouds were lost on the way' in docs/live.md"
+    return "small ones are where a machine is too busy; a longer queue (depth) of the publisher's helps"
 
 
 def _concerns(topic: PublishedTopic) -> bool:
