@@ -10,7 +10,7 @@ import pytest
 from bevviz import geometry
 from bevviz.bags.source import BagSource
 from bevviz.config import load
-from bevviz.frame import F64, Decision, FrameResult
+from bevviz.frame import F64, Decision, DetectionState, FrameResult
 from bevviz.session import Session
 from tests import bags
 from tests.recordings import Recording
@@ -163,7 +163,10 @@ def test_the_recording_holds_what_was_decided(
     assert len(texts) == 2
     for text, result in zip(texts, results, strict=True):
         for explanation in result.explanations:
-            if explanation.subject == "detection":
+            if explanation.subject == "detection" and explanation.state != "suppressed":
                 assert explanation.text.split(": ", 1)[1] in text
+        (found,) = (c.detections for c in result.cameras if c.detections is not None)
+        for d in set(found.suppressed_by[found.state == DetectionState.SUPPRESSED].tolist()):
+            assert f" suppressed by {found.names[d]} {found.score[d]:.2f}" in text
     points = recording.column("/world/velodyne/points", "Points3D:positions")
     np.testing.assert_array_equal(np.array(points[0], np.float32), results[0].frame.points)

@@ -208,8 +208,9 @@ def fly(folder: Path) -> Flight:
                         lambda: {s.name for s in heard} >= {f"bevviz: {p}" for p in PARTS}, "our diagnostics"
                     )
                     until(lambda: any("robot and ours differ" in text for text in said), "a save for that")
-                    count = live.frames
-                    until(lambda: live.frames > count + 3, "more frames")
+                    # What was seen in results is logged in a thread of its own, a slow one may be far behind.
+                    newest = frames[-1].index
+                    until(lambda: live.encoder.context.clock[0] > newest + 6, "the log")
                     live.save(Path("snap.rrd"))
                 finally:
                     live.stop()
