@@ -708,6 +708,18 @@ def save(path: Path, encoder: Encoder, packets: list[Packet], *settings: str) ->
     return saver.paths
 
 
+def test_without_a_frame_there_is_no_file(results: list[FrameResult], drive: SyntheticSource) -> None:
+    said: list[str] = []
+    config = load()
+    saver = Saver(
+        Path("none.rrd"), config.live, Encoder(config, drive.scene, "live"), NoIndexer(), Notes(said.append)
+    )
+    assert Path("none.rrd").exists()
+    saver.close()
+    assert not Path("none.rrd").exists() and saver.paths == []
+    assert said == ["none.rrd: no frame came, so there is no recording"]
+
+
 def test_parts_open_on_their_own_and_lack_nothing_together(
     results: list[FrameResult], drive: SyntheticSource, tmp_path: Path
 ) -> None:

@@ -311,7 +311,7 @@ def _watch(
             late = f"{against.late_images} of the robot's detections in images"
             say(f"{late} came when their frames were compared already: not compared")
     warn(source.warnings)
-    written = [saver.paths for saver in (live.saver, live.raw_saver) if saver is not None]
+    written = [saver.paths for saver in (live.saver, live.raw_saver) if saver is not None and saver.paths]
     targets = [f"{where[0]}" + (f" and {len(where) - 1} more" if where[1:] else "") for where in written]
     target = f" in {', '.join(targets)}" if targets else ""
     drops = [f"{count} ({place})" for place, count in live.status.drops.items() if count]

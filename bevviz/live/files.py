@@ -181,6 +181,13 @@ class Saver(Output):
         self._written += len(data)
 
     def _finish(self) -> None:
-        os.close(self._file)
         if self._written:
+            os.close(self._file)
             self._indexer.add(self.paths[-1])
+            return
+        if self.paths[-1].is_file():  # and no device
+            path = self.paths.pop()
+            with suppress(OSError):
+                path.unlink()
+            self._notes.info(f"{path}: no frame came, so there is no recording")
+        os.close(self._file)
