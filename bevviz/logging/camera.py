@@ -11,10 +11,8 @@ import rerun as rr
 from bevviz import geometry
 from bevviz.colors import bins, class_color
 from bevviz.frame import (
-    F32,
     F64,
     I64,
-    Bool,
     CameraResult,
     Decision,
     Detections,
@@ -27,7 +25,7 @@ from bevviz.frame import (
 from bevviz.logging import entities, keep
 from bevviz.logging.annotations import FAINT, depth_annotations
 from bevviz.logging.pieces import CORNER, boxes2d, encode_image, scored, transform
-from bevviz.logging.spoken import NEAR, log_spoken_in_image, log_spoken_looks_in_image
+from bevviz.logging.spoken import first_few, log_spoken_in_image, log_spoken_looks_in_image
 from bevviz.logging.writer import Writer
 
 if TYPE_CHECKING:
@@ -63,7 +61,7 @@ def log_shared_image(to: Writer, camera: str) -> None:
 
 def over_image(camera: str) -> rr.CoordinateFrame:
     """In the space of the camera's image, wherever the entity is."""
-    return rr.CoordinateFrame(f"tf#{entities.image(camera)}")
+    return rr.CoordinateFrame(entities.space(entities.image(camera)))
 
 
 def camera_pose(frame: Frame, result: CameraResult) -> F64 | None:
@@ -167,7 +165,7 @@ def log_detections(to: Writer, result: CameraResult, explanations: Iterable[Expl
         texts = {e.row: e.text for e in explanations if e.subject == "detection" and e.camera == name}
         xyxy = detections.xyxy[kept]
         labels = scored((detections.names[d] for d in kept), detections.score[kept])
-        named = _large(xyxy)
+        named = first_few(xyxy[:, 1] - xyxy[:, 3])  # the tallest, which are what is near
         if result.fusion is not None:
             named |= result.fusion.detection_decision[kept] != Decision.MATCHED
         log_spoken_in_image(
@@ -187,13 +185,6 @@ def _boxes(detections: Detections, rows: I64, **looks: Any) -> rr.Boxes2D:
         class_ids=[entities.DETECTION_CLASS[DetectionState(s)] for s in detections.state[rows]],
         **looks,
     )
-
-
-def _large(xyxy: F32) -> Bool:
-    """(K,) the few tallest boxes, which are what is near."""
-    height = xyxy[:, 3] - xyxy[:, 1]
-    large: Bool = height >= (np.sort(height)[-NEAR] if len(height) > NEAR else 0)
-    return large
 
 
 def log_projected_points(to: Writer, result: CameraResult, *, packed: bool = False) -> None:

@@ -76,6 +76,11 @@ def sensor(name: str) -> str:
     return f"{WORLD}/{name}"
 
 
+def space(path: str) -> str:
+    """The coordinate frame that Rerun gives an entity."""
+    return f"tf#{path}"
+
+
 def points(lidar: str) -> str:
     return f"{WORLD}/{lidar}/points"
 

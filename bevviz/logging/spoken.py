@@ -82,8 +82,12 @@ def log_spoken_in_image(
 
 def near(places: F32) -> Bool:
     """(K,) the ``NEAR`` nearest of (K, 2 or 3) places."""
-    away = np.hypot(places[:, 0], places[:, 1])
-    found: Bool = away <= (np.sort(away)[NEAR - 1] if len(away) > NEAR else np.inf)
+    return first_few(np.hypot(places[:, 0], places[:, 1]))
+
+
+def first_few(values: F32) -> Bool:
+    """(K,) the ``NEAR`` least of them."""
+    found: Bool = values <= (np.sort(values)[NEAR - 1] if len(values) > NEAR else np.inf)
     return found
 
 

@@ -41,15 +41,12 @@ class StateLanes:
 
     Args:
         colors: of the states, which are text; others get the viewer's own.
-        plain: color of every state of the lanes that begin with ``plain_lanes``, whatever it is.
-        plain_lanes: entity.
+        plain_lanes: entity of lanes that have one colour for all their states, whatever these are.
     """
 
-    def __init__(
-        self, colors: Mapping[Any, Color], plain: Color = State.DOUBTFUL.value, plain_lanes: str = ""
-    ) -> None:
-        self._colors, self._plain, self._plain_lanes = dict(colors), plain, plain_lanes
-        self._known: dict[str, dict[str, Color]] = {}  # lane of one colour -> its states so far
+    def __init__(self, colors: Mapping[Any, Color], plain_lanes: str = "") -> None:
+        self._values, self._colors, self._plain_lanes = list(colors), list(colors.values()), plain_lanes
+        self._known: dict[str, list[str]] = {}  # lane of one colour -> its states so far
         self.states: Mapping[str, str] = {}  # lane -> its latest state
 
     def log(self, to: Writer, states: Mapping[str, str]) -> None:
@@ -63,15 +60,13 @@ class StateLanes:
 
     def _log_colors(self, to: Writer, lane: str, state: str) -> None:
         if self._plain_lanes and lane.startswith(self._plain_lanes):
-            known = self._known.setdefault(lane, {})
-            if state in known or not state:
-                return
-            known[state] = self._plain
-            to.static(lane, rr.StateConfiguration(values=list(known), colors=list(known.values())))
+            known = self._known.setdefault(lane, [])
+            if state and state not in known:
+                known.append(state)
+                colors = [State.DOUBTFUL.value] * len(known)
+                to.static(lane, rr.StateConfiguration(values=known, colors=colors))
         elif lane not in self.states:
-            to.static(
-                lane, rr.StateConfiguration(values=list(self._colors), colors=list(self._colors.values()))
-            )
+            to.static(lane, rr.StateConfiguration(values=self._values, colors=self._colors))
 
 
 def states_of(result: FrameResult) -> dict[str, str]:

@@ -61,7 +61,9 @@ def space(
         background=_DARK,
         line_grid=False,
         # Said, as the viewer takes the fixed frame instead where contents lie outside of the origin's tree.
-        spatial_information=rrb.SpatialInformation(target_frame=f"tf#{root}{entities.sensor(scene.lidar)}"),
+        spatial_information=rrb.SpatialInformation(
+            target_frame=entities.space(root + entities.sensor(scene.lidar))
+        ),
         eye_controls=rrb.EyeControls3D(
             kind=rrb.Eye3DKind.Orbital,
             position=position,
