@@ -26,6 +26,8 @@ COUNTED: dict[str, object] = {
     "false": None,
     "anomalies": 0,
     "unmatched": [],
+    "picture": b"\xff\xd8",
+    "above": None,
 }
 
 
