@@ -63,7 +63,7 @@ class Batch:
 
 @contextmanager
 def killing(folder: Path, pattern: str) -> Iterator[list[Path]]:
-    """Kill the first process that writes such a recording, when it has got under way. Yields which that was."""
+    """Kill the first process that writes such a recording, when it has got under way. Yields which it was."""
     killed: list[Path] = []
     stopped = Event()
 

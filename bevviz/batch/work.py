@@ -54,13 +54,13 @@ def run(job: Job, threads: int, on_frame: Callable[[], None] = lambda: None) -> 
         return JobResult(job.name, info.frames, info.seconds)
     detector = job.config.detector
     detector = detector.model_copy(update={"threads": detector.threads or threads})
-    config = job.config.model_copy(update={"detector": detector})
+    config = job.config.model_copy(update={"detector": detector})  # of the stages alone
     with Output(job) as output:
         try:
-            with job.selection.source([job.bag], config) as source:
+            with job.selection.source([job.bag], job.config) as source:
                 session = Session(config)
                 with output.opened(source) as sinks:
-                    recorder = Recorder(sinks.recording, config, session.stages.provider)
+                    recorder = Recorder(sinks.recording, job.config, session.stages.provider)
                     observers = output.observers(source, sinks, recorder, on_frame, pictures)
                     if run_frames(source, session, observers).interrupted:
                         raise KeyboardInterrupt
