@@ -20,6 +20,7 @@ from bevviz.cli.options import (
 )
 from bevviz.cli.outputs import Outputs
 from bevviz.cli.run import process
+from bevviz.closing import without_collections
 
 if TYPE_CHECKING:
     from bevviz.engine.task import Engine
@@ -51,6 +52,7 @@ def add(commands: Commands) -> None:
     bag.set_defaults(run=_bag)
 
 
+@without_collections()
 def _bag(options: argparse.Namespace) -> int:
     with ExitStack() as stack:
         engine: Engine | None = None
