@@ -138,7 +138,7 @@ def decode(packets: Packets, angles: Path | None = None) -> Any:
     for first in range(returns - 1):
         same = (grouped[:, :, first, None] == grouped[:, :, first + 1 :]).any(axis=2)
         grouped[:, :, first][same] = 0
-    met = grouped.any(axis=2)
+    met = np.asarray(grouped.any(axis=2))
     packet, group, which, channel = np.nonzero(grouped)
     block = group * returns + which
 
