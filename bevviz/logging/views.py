@@ -9,6 +9,8 @@ import rerun.blueprint as rrb
 
 from bevviz.frame import Scene
 from bevviz.logging import entities
+from bevviz.logging.health import COUNTS
+from bevviz.logging.spoken import EYE, LOOK
 
 _DARK = (13, 14, 18)
 HIDDEN = rrb.EntityBehavior(visible=False)
@@ -51,7 +53,7 @@ def space(
     # The points of what is explained stand out by their colours, which tell another story than the clusters'.
     hidden += [entities.clusters(scene.lidar), entities.FRUSTUMS] if why else []
     hidden += [entities.names(entities.FUSED)] if why or not names else []
-    position, target = (-16.0, 5.0, 11.0), (10.0, 0.0, -1.0)
+    position, target = EYE, LOOK
     if why and scene.focus is not None:
         position, target = _beside(scene.focus), scene.focus
     return rrb.Spatial3DView(
@@ -82,14 +84,15 @@ def _beside(place: tuple[float, float, float]) -> tuple[float, float, float]:
     return x - back * x / away - 2.0 * y / away, y - back * y / away + 2.0 * x / away, z + 2.5
 
 
-def camera(scene: Scene, name: str, *, why: bool = False) -> rrb.Spatial2DView:
+def camera(scene: Scene, name: str, *, why: bool = False, weak: bool = False) -> rrb.Spatial2DView:
     """The image with detections and the projected points; what the robot itself detected there, too.
 
-    ``why``: with the weak detections and what ``bevviz why`` explains instead of the points.
+    ``why``: with the weak detections and what ``bevviz why`` explains instead of the points and names;
+    ``weak``: with the weak detections, too.
     """
     contents = ["$origin/**", *([f"{entities.ROBOT}/**"] if scene.robot else [])]
     told = [entities.projected(name), entities.names(entities.detections(name))]
-    hidden = told if why else [entities.weak(name)]
+    hidden = told if why else [] if weak else [entities.weak(name)]
     return rrb.Spatial2DView(
         name=name,
         origin=entities.sensor(name),
@@ -209,8 +212,7 @@ def clocks() -> rrb.TimeSeriesView:
 
 def counts() -> rrb.TimeSeriesView:
     """Clusters, detections and matches: the numbers of the same size."""
-    shown = ("clusters", "detections", "matches", "problems", "failures")
-    return plot("Counts", entities.HEALTH, [entities.count(what) for what in shown])
+    return plot("Counts", entities.HEALTH, [entities.count(what) for what in COUNTS])
 
 
 def rates() -> rrb.TimeSeriesView:
