@@ -150,14 +150,15 @@ def _cells(numbers: F64) -> U8:
     """(up, across, 3) a cell a block of pixels; where there is no number the colour of the ground."""
     known = numbers[np.isfinite(numbers)]
     low, high = float(known.min(initial=math.inf)), float(known.max(initial=-math.inf))
-    grey = 60.0 + 150.0 * (numbers - low) / ((high - low) or 1.0)
+    grey = 35.0 + 105.0 * (numbers - low) / ((high - low) or 1.0)
     picture = np.where(np.isfinite(numbers), grey, 13.0).astype(np.uint8).T[::-1]
     cells: U8 = np.repeat(np.kron(picture, np.ones((_CELL, _CELL), np.uint8))[:, :, None], 3, axis=2)
     return cells
 
 
-def chart_view(name: str, path: str) -> rrb.Spatial2DView:
-    bounds = rrb.VisualBounds2D(x_range=(-_LEFT, WIDTH + _RIGHT), y_range=(-_TOP, HEIGHT + _BOTTOM))
+def chart_view(name: str, path: str, right: float = _RIGHT) -> rrb.Spatial2DView:
+    """``right``: the room for names beside it."""
+    bounds = rrb.VisualBounds2D(x_range=(-_LEFT, WIDTH + right), y_range=(-_TOP, HEIGHT + _BOTTOM))
     return rrb.Spatial2DView(name=name, origin=path, visual_bounds=bounds)
 
 

@@ -97,7 +97,8 @@ def layout(sweep: Sweep) -> rrb.Blueprint:
         if len(sweep.parameters) == 2:
             across, up = (parameter.key for parameter in sweep.parameters)
             plots += [
-                chart_view(f"{metric}: {across} across, {up} up", entities.sweep(metric)) for metric in series
+                chart_view(f"{metric}: {across} across, {up} up", entities.sweep(metric), right=20.0)
+                for metric in series
             ]
         else:
             plots.append(chart_view(f"{name}, over {sweep.parameters[0].key}", entities.sweep(name)))
