@@ -161,8 +161,9 @@ def diagnostics() -> rrb.StateTimelineView:
 
 
 def anomalies() -> rrb.StateTimelineView:
-    """What was worth a look, by kind, over time."""
-    return rrb.StateTimelineView(name="Anomalies", origin=entities.ANOMALY_STATES)
+    """What was worth a look, by kind, over time; over it how the pipeline is, which no drive lacks."""
+    contents = [entities.state("pipeline"), "$origin/**"]
+    return rrb.StateTimelineView(name="Anomalies", origin=entities.ANOMALY_STATES, contents=contents)
 
 
 def anomaly_log() -> rrb.TextLogView:
