@@ -9,15 +9,13 @@ from bevviz.logging import views
 
 
 def blueprint(scene: Scene) -> rrb.Blueprint:
-    images = [views.camera(scene, name, why=True) for name in scene.cameras]
-    said = [views.explain(), views.why(), views.log(), views.anomaly_log(), views.config()]
-    images = [views.camera(scene, name, why=True) for name in scene.cameras]
+    images = [views.camera(scene, name, weak=True) for name in scene.cameras]
     said = [views.explain(), views.why(), views.log(), views.anomaly_log(), views.config()]
     return rrb.Blueprint(
         rrb.Vertical(
             rrb.Horizontal(rrb.Grid(*images), rrb.Tabs(*said, name="Decisions"), column_shares=[3, 1]),
-            rrb.Horizontal(views.stage_times(), views.counts(), views.over_time()),
-            row_shares=[4, 1],
+            rrb.Horizontal(views.stage_times(), views.counts(), rrb.Tabs(views.anomalies(), views.states())),
+            row_shares=[3, 1],
         ),
         views.time_panel(),
         *views.panels(),

@@ -28,7 +28,7 @@ def blueprint(scene: Scene) -> rrb.Blueprint:
                 compare.difference_states(),
                 compare.difference_log(),
             ),
-            row_shares=[4, 1],
+            row_shares=[3, 1],
         ),
         views.time_panel(),
         *views.panels(),

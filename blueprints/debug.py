@@ -19,7 +19,7 @@ def blueprint(scene: Scene) -> rrb.Blueprint:
                 column_shares=[5, 4, 3],
             ),
             rrb.Horizontal(views.health(), views.over_time()),
-            row_shares=[4, 1],
+            row_shares=[3, 1],
         ),
         views.time_panel(),
         *views.panels(),

@@ -33,7 +33,7 @@ def blueprint(scene: Scene) -> rrb.Blueprint:
                 views.plot("True, missed, false", entities.EVALUATE, counts),
                 views.text_log("Missed and false", entities.EVALUATE_LOG),
             ),
-            row_shares=[4, 1],
+            row_shares=[3, 1],
         ),
         views.time_panel(),
         *views.panels(),

@@ -11,19 +11,22 @@ from bevviz.logging import entities, views
 
 def blueprint(scene: Scene) -> rrb.Blueprint:
     side: list[rrb.Container | rrb.View] = [views.cameras(scene)] if scene.cameras else []
-    words = rrb.Tabs(views.explain(), compare.difference_log(), views.log(), views.config())
+    words = rrb.Tabs(
+        compare.differences(), views.explain(), compare.difference_log(), views.log(), views.config()
+    )
     return rrb.Blueprint(
         rrb.Vertical(
             rrb.Horizontal(
                 views.space(scene, beside=[f"{entities.ROBOT}/**", *compare.changes()]),
                 rrb.Vertical(*side, views.birds_eye(scene), row_shares=[*[2] * len(side), 3]),
-                rrb.Vertical(compare.version(), compare.differences(), words, row_shares=[1, 3, 2]),
+                rrb.Vertical(compare.version(), words, row_shares=[1, 2]),
                 column_shares=[5, 4, 3],
             ),
             rrb.Horizontal(
-                compare.difference_counts(), compare.side_counts(), views.counts(), views.stage_times()
+                rrb.Tabs(compare.difference_counts(), compare.side_counts()),
+                rrb.Tabs(views.stage_times(), views.counts()),
             ),
-            row_shares=[4, 1],
+            row_shares=[3, 1],
         ),
         views.time_panel(play=rrb.components.PlayState.Following, timeline=entities.VERSION),
         *views.panels(),

@@ -261,12 +261,16 @@ def test_a_sweep_of_the_synthetic_drive(drive: str, capsys: Capture) -> None:
 def test_a_grid_is_a_heat_map(drive: str) -> None:
     swept = ["--set", "clustering.eps=0.4,0.6", "--set", "fusion.min_points=1,3,5"]
     assert main(["sweep", drive, "--model", "demo", "--frames", ":1", *swept, "--save", "s.rrd"]) == 0
-    logged = Recording(Path("s.rrd")).static["/sweep/clusters"]
-    low, high = logged["Tensor:value_range"][0]
-    assert 0 < low < high
-    tensor = logged["Tensor:data"][0]
-    assert tensor["shape"] == [2, 3]
-    assert tensor["names"] == ["clustering.eps: 0.4 ... 0.6", "fusion.min_points: 1 ... 5"]
+    static = Recording(Path("s.rrd")).static
+    said = static["/sweep/clusters/numbers"]["says"]
+    assert [text.partition(" at ")[2] for text in said] == [
+        f"{eps}, {points}" for eps in ("0.4", "0.6") for points in ("1", "3", "5")
+    ]
+    assert static["/sweep/clusters/mark_0/word"]["Points2D:labels"] == ["best: 0.4, 1"]
+    assert static["/sweep/clusters/mark_1/word"]["Points2D:labels"] == ["now: 0.5, 3"]
+    # Between the two columns, in the row of its own.
+    frame = np.array(static["/sweep/clusters/mark_1"]["LineStrips2D:strips"][0])
+    assert frame[:-1].mean(axis=0) == pytest.approx([WIDTH / 2, HEIGHT / 2])
 
 
 def test_kitti_as_truth(shared: Path, capsys: Capture) -> None:

@@ -15,7 +15,7 @@ from bevviz.frame import F64
 from bevviz.logging import entities
 from bevviz.logging.camera import over_image
 from bevviz.logging.pieces import OUTLINE, boxes2d, boxes3d, document, transform
-from bevviz.logging.spoken import near
+from bevviz.logging.spoken import named_in_space
 from bevviz.logging.states import StateLanes
 from bevviz.logging.writer import Writer
 from bevviz.text import markdown
@@ -103,8 +103,8 @@ class DifferenceLogger(Writer):
             side, rows = (found.b, [d.row_b for d in mine])
         path = entities.difference(change)
         # What is better and worse is more than what differs: where that is known, its names alone are shown.
-        is_near = near(side.boxes.center[rows])
-        labels = [_label(d) if found.judged is None and is_near[i] else "" for i, d in enumerate(mine)]
+        is_named = named_in_space(side.boxes.center[rows])
+        labels = [_label(d) if found.judged is None and is_named[i] else "" for i, d in enumerate(mine)]
         what = boxes3d(side.boxes, np.array(rows), labels)
         self.put(path, transform(world_from_points), what)
         if change is Change.MOVED:
@@ -116,8 +116,8 @@ class DifferenceLogger(Writer):
     def _log_judged(self, what: str, judged: Judged, rows: Sequence[int], world_from_points: F64) -> None:
         if rows:
             chosen = np.array(rows)
-            is_near = near(judged.boxes.center[chosen])
-            labels = [f"{what}: {judged.labels[row]}" if is_near[i] else "" for i, row in enumerate(rows)]
+            is_named = named_in_space(judged.boxes.center[chosen])
+            labels = [f"{what}: {judged.labels[row]}" if is_named[i] else "" for i, row in enumerate(rows)]
             path = entities.difference(what)
             self.put(path, transform(world_from_points), boxes3d(judged.boxes, chosen, labels))
 

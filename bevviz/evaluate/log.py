@@ -14,6 +14,7 @@ from bevviz.evaluate.truth import Truth
 from bevviz.frame import Boxes3D, FrameResult
 from bevviz.logging import entities
 from bevviz.logging.pieces import boxes3d, document, transform
+from bevviz.logging.spoken import log_spoken, log_spoken_looks, named_in_space
 from bevviz.logging.writer import WAIT, Writer
 from bevviz.run import Items, Observer
 from bevviz.text import markdown
@@ -33,8 +34,9 @@ class EvaluationRecorder(Observer[FrameResult]):
 
     def begin(self, items: Items[object]) -> None:
         for what, color in TRUTH.items():
-            looks = rr.Boxes3D.from_fields(colors=[color], radii=rr.Radius.ui_points(2.5), show_labels=True)
+            looks = rr.Boxes3D.from_fields(colors=[color], radii=rr.Radius.ui_points(0.5), show_labels=False)
             self._writer.static(entities.judged(what), looks)
+            log_spoken_looks(self._writer, entities.judged(what))
             series = rr.SeriesLines(colors=[color], names=[what], widths=[2])
             self._writer.static(entities.judged_count(what), series)
 
@@ -67,10 +69,18 @@ class EvaluationRecorder(Observer[FrameResult]):
         rows: Sequence[int],
         names: Sequence[str],
     ) -> None:
-        if rows:
-            labels = [f"{what}: {names[row]}" for row in rows]
-            logged = boxes3d(boxes, np.asarray(rows), labels)
-            self._writer.put(entities.judged(what), transform(result.frame.pose), logged)
+        if not rows:
+            return
+        chosen = np.asarray(rows)
+        labels = [f"{what}: {names[row]}" for row in rows]
+        logged, path = boxes3d(boxes, chosen, labels), entities.judged(what)
+        self._writer.put(path, transform(result.frame.pose), logged)
+        # What is right is named where the pointer is.
+        named = named_in_space(boxes.center[chosen]) & (what != "true")
+        shown = [label if is_named else "" for label, is_named in zip(labels, named, strict=True)]
+        away = np.hypot(*boxes.center[chosen, :2].T).tolist()
+        said = [f"{label}, {metres:.1f} m away" for label, metres in zip(labels, away, strict=True)]
+        log_spoken(self._writer, path, boxes.chosen(chosen), shown, said, [TRUTH[what]] * len(rows))
 
     def end(self) -> None:
         self._writer.static(entities.EVALUATE_ABOUT, document(f"# Evaluation\n\n{page(self._evaluation)}"))

@@ -11,8 +11,10 @@ import rerun as rr
 from bevviz import geometry
 from bevviz.colors import bins, class_color
 from bevviz.frame import (
+    F32,
     F64,
     I64,
+    Camera,
     CameraResult,
     Decision,
     Detections,
@@ -25,7 +27,7 @@ from bevviz.frame import (
 from bevviz.logging import entities, keep
 from bevviz.logging.annotations import FAINT, depth_annotations
 from bevviz.logging.pieces import CORNER, boxes2d, encode_image, scored, transform
-from bevviz.logging.spoken import first_few, log_spoken_in_image, log_spoken_looks_in_image
+from bevviz.logging.spoken import IN_IMAGE, apart, log_spoken_in_image, log_spoken_looks_in_image
 from bevviz.logging.writer import Writer
 
 if TYPE_CHECKING:
@@ -165,9 +167,12 @@ def log_detections(to: Writer, result: CameraResult, explanations: Iterable[Expl
         texts = {e.row: e.text for e in explanations if e.subject == "detection" and e.camera == name}
         xyxy = detections.xyxy[kept]
         labels = scored((detections.names[d] for d in kept), detections.score[kept])
-        named = first_few(xyxy[:, 1] - xyxy[:, 3])  # the tallest, which are what is near
+        lost = np.zeros(len(kept), bool)
         if result.fusion is not None:
-            named |= result.fusion.detection_decision[kept] != Decision.MATCHED
+            lost = result.fusion.detection_decision[kept] != Decision.MATCHED
+        size = _size(result.camera)
+        below = np.stack([xyxy[:, ::2].mean(axis=1), xyxy[:, 3]], axis=1) / size
+        named = lost | apart(below, xyxy[:, 1] - xyxy[:, 3], IN_IMAGE, lost)  # the tallest are what is near
         log_spoken_in_image(
             to,
             entities.detections(name),
@@ -176,6 +181,15 @@ def log_detections(to: Writer, result: CameraResult, explanations: Iterable[Expl
             [texts.get(d, label) for d, label in zip(kept.tolist(), labels, strict=True)],
             colors,
         )
+
+
+def _size(camera: Camera) -> F32:
+    """(2,) width and height of the image, in pixels; endless where nothing says, so that names meet."""
+    if camera.intrinsics is not None:
+        return np.array([camera.intrinsics.width, camera.intrinsics.height], np.float32)
+    if camera.image is not None:
+        return np.array(camera.image.bgr.shape[1::-1], np.float32)
+    return np.full(2, np.inf, np.float32)
 
 
 def _boxes(detections: Detections, rows: I64, **looks: Any) -> rr.Boxes2D:

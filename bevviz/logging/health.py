@@ -6,11 +6,20 @@ from collections import deque
 from collections.abc import Iterator, Mapping
 
 import numpy as np
+import rerun as rr
 
+from bevviz.colors import SERIES
 from bevviz.counts import counts_of
 from bevviz.frame import Frame, FrameResult
 from bevviz.logging import entities
 from bevviz.logging.writer import Writer
+
+# Curves of one plot, in the order of their colours: the viewer's own may be the same twice.
+STAGES = (
+    *("detector", "clustering", "bev", "ground", "fusion", "tracking", "projection", "voxel", "explain"),
+    "total",
+)
+COUNTS = ("detections", "clusters", "matches", "problems", "failures")
 
 WINDOW = 1_000_000_000  # nanoseconds that a rate is counted over
 LEAST = 250_000_000  # nanoseconds that say something about a rate
@@ -35,6 +44,12 @@ class Rates:
         for what, times in self._times.items():
             if len(times) > 1 and times[-1] - times[0] >= LEAST:
                 yield what, (len(times) - 1) * 1e9 / (times[-1] - times[0])
+
+
+def log_health_looks(to: Writer) -> None:
+    for paths in (map(entities.stage_time, STAGES), map(entities.count, COUNTS)):
+        for path, color in zip(paths, SERIES, strict=False):
+            to.static(path, rr.SeriesLines(colors=[color], widths=[1.5]))
 
 
 def log_health(

@@ -46,7 +46,7 @@ from bevviz.logging.cloud import (
 from bevviz.logging.clusters import in_kept, log_cluster_colors, log_clusters, log_clusters_looks
 from bevviz.logging.decisions import log_decisions
 from bevviz.logging.frustums import log_frustums
-from bevviz.logging.health import Rates, log_health
+from bevviz.logging.health import Rates, log_health, log_health_looks
 from bevviz.logging.keep import COARSE, FINE, Around, Held, is_whole, sorted_rows, step
 from bevviz.logging.labelled import forget_late, log_late, log_robot, log_truth, log_truth_looks
 from bevviz.logging.objects import log_objects, log_objects_looks
@@ -157,6 +157,7 @@ class Logger(Writer):
         log_tracks_looks(self)
         log_truth_looks(self)
         log_anomalies_looks(self)
+        log_health_looks(self)
 
     def log_context(self, context: Context) -> None:
         """Static data, calibration and states of a frame, for a recording that starts with it."""

@@ -10,7 +10,7 @@ from bevviz.colors import class_color
 from bevviz.frame import SIDES, FrameResult, Objects
 from bevviz.logging import entities, tracks
 from bevviz.logging.pieces import boxes3d, scored, transform
-from bevviz.logging.spoken import first_few, log_spoken, log_spoken_looks
+from bevviz.logging.spoken import log_spoken, log_spoken_looks, named_in_space
 from bevviz.logging.writer import Writer
 
 
@@ -53,7 +53,7 @@ def log_objects(to: Writer, result: FrameResult) -> None:
         ),
     )
     away = np.hypot(*objects.boxes.center[:, :2].T)
-    is_named = first_few(away) | is_odd
+    is_named = named_in_space(objects.boxes.center, is_odd)
     log_spoken(
         to,
         entities.FUSED,

@@ -20,6 +20,10 @@ from bevviz.logging.pieces import CORNER, edges
 from bevviz.logging.writer import Writer
 
 NEAR = 6  # boxes that have their names beside them because they are near: with all, names cover the scene
+EYE, LOOK = (-16.0, 5.0, 11.0), (10.0, 0.0, -1.0)  # from where the layouts look into space, and whereto
+# The room of a name, across and up: in space as the eye sees it (tangents), from above in metres, in an image
+# in parts of its width and height. What is named must be further apart than one of the two.
+IN_SPACE, FROM_ABOVE, IN_IMAGE = (0.24, 0.035), (20.0, 3.5), (0.21, 0.09)
 
 _POINT, _COLOR = rr.Radius.ui_points(0.0), (235, 238, 245)
 
@@ -80,15 +84,51 @@ def log_spoken_in_image(
         )
 
 
-def near(places: F32) -> Bool:
-    """(K,) the ``NEAR`` nearest of (K, 2 or 3) places."""
-    return first_few(np.hypot(places[:, 0], places[:, 1]))
+def named_in_space(places: F32, first: Bool | None = None) -> Bool:
+    """(K,) those of (K, 3) places around the robot that are named: the nearest, as far as names do not meet.
+
+    ``first``: (K,) come before what is near.
+    """
+    ahead = np.subtract(LOOK, EYE)
+    ahead /= np.linalg.norm(ahead)
+    right = np.cross(ahead, (0.0, 0.0, 1.0))
+    right /= np.linalg.norm(right)
+    seen = (places - np.array(EYE)) @ np.stack([right, np.cross(right, ahead), ahead], axis=1)
+    at = seen[:, :2] / np.maximum(seen[:, 2:], 0.1)
+    return apart(at, _away(places), IN_SPACE, first)
 
 
-def first_few(values: F32) -> Bool:
-    """(K,) the ``NEAR`` least of them."""
-    found: Bool = values <= (np.sort(values)[NEAR - 1] if len(values) > NEAR else np.inf)
+def named_from_above(places: F32) -> Bool:
+    """The same, seen from above; (K, 2 or 3) places around the robot, x ahead."""
+    return apart(places[:, 1::-1], _away(places), FROM_ABOVE)
+
+
+def apart(at: geometry.FloatArray, order: F32, room: tuple[float, float], first: Bool | None = None) -> Bool:
+    """(K,) the first ``NEAR`` whose names do not meet.
+
+    Args:
+        at: (K, 2) where the names are, across and up.
+        order: (K,) the least comes first.
+        room: of a name, across and up.
+        first: (K,) come before all others.
+    """
+    chosen: list[tuple[float, float]] = []
+    found: Bool = np.zeros(len(at), bool)
+    rows = np.lexsort((order, ~first)) if first is not None else np.argsort(order, kind="stable")
+    places = at.tolist()
+    for row in rows.tolist():
+        x, y = places[row]
+        if all(abs(x - u) >= room[0] or abs(y - v) >= room[1] for u, v in chosen):
+            found[row] = True
+            chosen.append((x, y))
+            if len(chosen) == NEAR:
+                break
     return found
+
+
+def _away(places: F32) -> F32:
+    away: F32 = np.hypot(places[:, 0], places[:, 1])
+    return away
 
 
 def _rows(count: int) -> list[int]:

@@ -51,10 +51,11 @@ class StateLanes:
 
     def log(self, to: Writer, states: Mapping[str, str]) -> None:
         """The states of a frame, by the entity of their lane."""
-        states = dict.fromkeys(self.states, "") | dict(states)
+        now = {lane: state for lane, state in states.items() if state or lane in self.states}
+        states = dict.fromkeys(self.states, "") | now
         for lane, state in states.items():
             self._log_colors(to, lane, state)
-            if self.states.get(lane) != state:
+            if self.states.get(lane, "") != state:  # a lane is there from its first state on
                 to.write(lane, rr.StateChange(state=state))
         self.states = states
 
@@ -65,7 +66,7 @@ class StateLanes:
                 known.append(state)
                 colors = [State.DOUBTFUL.value] * len(known)
                 to.static(lane, rr.StateConfiguration(values=known, colors=colors))
-        elif lane not in self.states:
+        elif state and lane not in self.states:
             to.static(lane, rr.StateConfiguration(values=self._values, colors=self._colors))
 
 

@@ -15,7 +15,7 @@ from bevviz.logging.annotations import class_annotations
 from bevviz.logging.bev import footprints, seen_from_above
 from bevviz.logging.entities import TRACK_COLORS, ClassId
 from bevviz.logging.pieces import OUTLINE, boxes3d, strips
-from bevviz.logging.spoken import near
+from bevviz.logging.spoken import named_from_above
 from bevviz.logging.writer import Writer
 
 LANES = 12  # tracks with a state lane and a speed of their own: entities that come and go are never freed
@@ -54,13 +54,13 @@ def log_tracks(to: Writer, frame: Frame, tracks: Tracks, config: BevConfig) -> N
     seen = seen_from_above(config, points_from_world, trail)
     to.put(entities.overlay("trails"), rr.LineStrips2D(strips(seen, lengths), class_ids=colors))
     outlines = footprints(geometry.corners(tracks.boxes)[rows])
-    is_near = near(tracks.boxes.center[rows, :2] - frame.pose[:2, 3].astype(np.float32))
+    is_named = named_from_above(geometry.apply(points_from_world, tracks.boxes.center[rows]))
     to.put(
         entities.overlay("tracks"),
         rr.LineStrips2D(
             seen_from_above(config, points_from_world, outlines),
             class_ids=colors,
-            labels=[label(tracks, row) if shown else "" for row, shown in zip(rows, is_near, strict=True)],
+            labels=[label(tracks, row) if shown else "" for row, shown in zip(rows, is_named, strict=True)],
             show_labels=True,
         ),
     )

@@ -10,6 +10,8 @@ import rerun.blueprint as rrb
 
 from bevviz.frame import Quantity, Scene
 from bevviz.logging import color_by, entities
+from bevviz.logging.health import COUNTS
+from bevviz.logging.spoken import EYE, LOOK
 
 _DARK = (13, 14, 18)
 HIDDEN = rrb.EntityBehavior(visible=False)
@@ -59,7 +61,7 @@ def space(
     overrides: dict[Any, Any] = dict.fromkeys((root + path for path in hidden), HIDDEN)
     if by is not None:
         overrides |= {root + path: color_by.visualizer(by) for path in clouds}
-    position, target = (-16.0, 5.0, 11.0), (10.0, 0.0, -1.0)
+    position, target = EYE, LOOK
     if why and scene.focus is not None:
         position, target = _beside(scene.focus), scene.focus
     return rrb.Spatial3DView(
@@ -99,14 +101,15 @@ def _beside(place: tuple[float, float, float]) -> tuple[float, float, float]:
     return x - back * x / away - 2.0 * y / away, y - back * y / away + 2.0 * x / away, z + 2.5
 
 
-def camera(scene: Scene, name: str, *, why: bool = False) -> rrb.Spatial2DView:
+def camera(scene: Scene, name: str, *, why: bool = False, weak: bool = False) -> rrb.Spatial2DView:
     """The image with detections and the projected points; what the robot itself detected there, too.
 
-    ``why``: with the weak detections and what ``bevviz why`` explains instead of the points.
+    ``why``: with the weak detections and what ``bevviz why`` explains instead of the points and names;
+    ``weak``: with the weak detections, too.
     """
     contents = ["$origin/**", *([f"{entities.ROBOT}/**"] if scene.robot else [])]
     told = [entities.projected(name), entities.names(entities.detections(name))]
-    hidden = told if why else [entities.weak(name)]
+    hidden = told if why else [] if weak else [entities.weak(name)]
     return rrb.Spatial2DView(
         name=name,
         origin=entities.sensor(name),
@@ -175,8 +178,9 @@ def diagnostics() -> rrb.StateTimelineView:
 
 
 def anomalies() -> rrb.StateTimelineView:
-    """What was worth a look, by kind, over time."""
-    return rrb.StateTimelineView(name="Anomalies", origin=entities.ANOMALY_STATES)
+    """What was worth a look, by kind, over time; over it how the pipeline is, which no drive lacks."""
+    contents = [entities.state("pipeline"), "$origin/**"]
+    return rrb.StateTimelineView(name="Anomalies", origin=entities.ANOMALY_STATES, contents=contents)
 
 
 def anomaly_log() -> rrb.TextLogView:
@@ -226,8 +230,7 @@ def clocks() -> rrb.TimeSeriesView:
 
 def counts() -> rrb.TimeSeriesView:
     """Clusters, detections and matches: the numbers of the same size."""
-    shown = ("clusters", "detections", "matches", "problems", "failures")
-    return plot("Counts", entities.HEALTH, [entities.count(what) for what in shown])
+    return plot("Counts", entities.HEALTH, [entities.count(what) for what in COUNTS])
 
 
 def rates() -> rrb.TimeSeriesView:

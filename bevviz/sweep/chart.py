@@ -1,6 +1,6 @@
-"""Curves over the values of a parameter, drawn in the plane.
+"""Curves over the values of a parameter, and maps over those of two, drawn in the plane.
 
-The viewer's own plots are over time alone, and its bars do not say values that are no whole numbers.
+The viewer's own plots are over time alone, and its bars and tensors do not say which values they are of.
 """
 
 from __future__ import annotations
@@ -13,7 +13,8 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from bevviz.colors import SERIES, Color, State
-from bevviz.frame import F64
+from bevviz.frame import F64, U8
+from bevviz.logging.pieces import png
 
 Log = Callable[..., None]  # name below the chart, archetypes
 
@@ -24,6 +25,8 @@ _AXIS, _GRID, _TEXT = (150, 155, 165), (48, 50, 58), (200, 204, 212)
 _LINE = 46.0  # between names that would cover one another
 _TICKS = 5  # about so many on the upright axis
 _LABELS = 9  # so many values at most are written below
+_CELL = 8  # pixels of a cell of a map, each way
+_NUMBERED = 42  # cells at most that have their numbers written on them; of others the pointer says it
 
 
 def log_chart(
@@ -89,8 +92,73 @@ def log_chart(
         _log_words(log, f"mark_{number}/word", [(across, above)], [word], color)
 
 
-def chart_view(name: str, path: str) -> rrb.Spatial2DView:
-    bounds = rrb.VisualBounds2D(x_range=(-_LEFT, WIDTH + _RIGHT), y_range=(-_TOP, HEIGHT + _BOTTOM))
+def log_map(
+    recording: rr.RecordingStream,
+    path: str,
+    values: tuple[Sequence[str], Sequence[str]],
+    numbers: F64,
+    marks: Mapping[str, tuple[float, float]],
+) -> None:
+    """Cells from dark, the least, to light, each with its number, and frames around those that are marked.
+
+    Args:
+        recording: where to; static.
+        path: entity of the map.
+        values: of the parameters across, from left to right, and up, from below, as they are written.
+        numbers: (across, up); NaN where there is none.
+        marks: word -> place of a cell, counted from 0 across and up; two at most.
+    """
+    across, up = numbers.shape
+    width, height = WIDTH / across, HEIGHT / up
+
+    def log(name: str, *what: rr.AsComponents) -> None:
+        recording.log(f"{path}/{name}", *what, static=True)
+
+    def middle(i: float, j: float) -> tuple[float, float]:
+        return (i + 0.5) * width, HEIGHT - (j + 0.5) * height
+
+    log("cells", rr.Transform3D(scale=[width / _CELL, height / _CELL, 1.0]), png(_cells(numbers)))
+    cells = [(i, j) for i in range(across) for j in range(up)]
+    texts = ["-" if math.isnan(number) else f"{number:.3g}" for number in numbers.ravel().tolist()]
+    said = [f"{text} at {values[0][i]}, {values[1][j]}" for (i, j), text in zip(cells, texts, strict=True)]
+    dots = rr.Points2D(
+        [middle(i, j) for i, j in cells],
+        labels=texts,
+        colors=[_TEXT],
+        radii=rr.Radius.ui_points(1.0),
+        show_labels=len(cells) <= _NUMBERED,
+        draw_order=11.0,
+    )
+    log("numbers", dots, rr.AnyValues(says=said if len(said) > 1 else said * 2))
+    for name, words, places in (
+        ("values_across", values[0], [(middle(i, 0)[0], HEIGHT + 2) for i in range(across)]),
+        ("values_up", values[1], [(-36, middle(0, j)[1] - 14) for j in range(up)]),
+    ):
+        shown = range(0, len(words), math.ceil(len(words) / _LABELS))
+        _log_words(log, name, [places[i] for i in shown], [words[i] for i in shown])
+    for number, (word, at) in enumerate(marks.items()):
+        color, (x, y) = _MARKS[number], middle(*at)
+        # One cell may have both.
+        half = np.array([width, height]) / 2 - 6.0 * number
+        corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1], [-1, -1]]) * half + (x, y)
+        frame = rr.LineStrips2D([corners], colors=[color], radii=rr.Radius.ui_points(2.0), draw_order=10.0)
+        log(f"mark_{number}", frame)
+        _log_words(log, f"mark_{number}/word", [(x, -_LINE * (number + 1))], [word], color)
+
+
+def _cells(numbers: F64) -> U8:
+    """(up, across, 3) a cell a block of pixels; where there is no number the colour of the ground."""
+    known = numbers[np.isfinite(numbers)]
+    low, high = float(known.min(initial=math.inf)), float(known.max(initial=-math.inf))
+    grey = 35.0 + 105.0 * (numbers - low) / ((high - low) or 1.0)
+    picture = np.where(np.isfinite(numbers), grey, 13.0).astype(np.uint8).T[::-1]
+    cells: U8 = np.repeat(np.kron(picture, np.ones((_CELL, _CELL), np.uint8))[:, :, None], 3, axis=2)
+    return cells
+
+
+def chart_view(name: str, path: str, right: float = _RIGHT) -> rrb.Spatial2DView:
+    """``right``: the room for names beside it."""
+    bounds = rrb.VisualBounds2D(x_range=(-_LEFT, WIDTH + right), y_range=(-_TOP, HEIGHT + _BOTTOM))
     return rrb.Spatial2DView(name=name, origin=path, visual_bounds=bounds)
 
 
@@ -118,7 +186,7 @@ def _log_names(log: Log, ends: Sequence[tuple[str, Color, float]]) -> None:
 def scale(low: float, high: float) -> tuple[float, float, float]:
     """From, to and by what an axis goes: from 0 where that wastes no more than about half of it."""
     low = 0.0 if low >= 0 and low < 0.6 * high else low
-    if high <= low:
+    if high - low < 1e-300:  # whose logarithm is none
         low, high = low - 0.5, high + 0.5
     raw = (high - low) / _TICKS
     power = 10.0 ** math.floor(math.log10(raw))

@@ -13,8 +13,8 @@ from bevviz import table
 from bevviz.frame import F64
 from bevviz.logging import entities
 from bevviz.logging.pieces import document
-from bevviz.sweep.chart import chart_view, log_chart
-from bevviz.sweep.parameters import Parameter
+from bevviz.sweep.chart import chart_view, log_chart, log_map
+from bevviz.sweep.parameters import Parameter, Values
 from bevviz.sweep.run import COUNTS, SCORES, STAGES, Sweep
 from bevviz.text import markdown
 
@@ -38,16 +38,38 @@ def log_sweep(recording: rr.RecordingStream, sweep: Sweep, name: str, present: M
             _log_curves(recording, entities.sweep(title), sweep, found, present)
             continue
         for metric, values in found.items():
-            recording.log(entities.sweep(metric), _heat_map(sweep.parameters, values), static=True)
+            _log_map(recording, entities.sweep(metric), sweep, values, present)
 
 
-def _heat_map(parameters: Sequence[Parameter], values: F64) -> rr.Tensor:
-    shape = [len(parameter.values) for parameter in parameters]
-    names = [f"{p.key}: {p.values[0]} ... {p.values[-1]}" for p in parameters]
-    known = values[np.isfinite(values)]
-    low, high = (float(known.min()), float(known.max())) if len(known) else (0.0, 1.0)
-    span = [low, high if high > low else low + 1.0]
-    return rr.Tensor(values.reshape(shape), dim_names=names, value_range=span)
+def _log_map(
+    recording: rr.RecordingStream, path: str, sweep: Sweep, values: F64, present: Mapping[str, str]
+) -> None:
+    across, up = sweep.parameters
+    orders = [np.argsort(parameter.numbers, kind="stable") for parameter in (across, up)]
+    written = [[parameter.values[i] for i in o] for parameter, o in zip((across, up), orders, strict=True)]
+    marks = {}
+    for word, chosen in _marked(sweep, present).items():
+        marks[word] = (_cell(across, chosen[0]), _cell(up, chosen[1]))
+    numbers = values.reshape(len(across.values), len(up.values))[np.ix_(*orders)]
+    log_map(recording, path, (written[0], written[1]), numbers, marks)
+
+
+def _cell(parameter: Parameter, value: str) -> float:
+    """Which cell has the value, counted from the least; between two where no cell has."""
+    place = parameter.place(value)
+    numbers = np.sort(parameter.numbers)
+    return float(np.interp(math.nan if place is None else place, numbers, np.arange(len(numbers))))
+
+
+def _marked(sweep: Sweep, present: Mapping[str, str]) -> Mapping[str, Values]:
+    """Word -> the values that it marks, one for each parameter: the best, and those without the sweep."""
+    marks = {}
+    if sweep.best is not None:
+        marks[f"best: {', '.join(sweep.best)}"] = sweep.best
+    now = tuple(present.get(parameter.key, "") for parameter in sweep.parameters)
+    if all(p.place(value) is not None for p, value in zip(sweep.parameters, now, strict=True)):
+        marks[f"now: {', '.join(now)}"] = now
+    return marks
 
 
 def _log_curves(
@@ -61,11 +83,9 @@ def _log_curves(
     at = parameter.numbers
     order = np.argsort(at, kind="stable")
     marks: dict[str, float] = {}
-    if sweep.best is not None:
-        marks[f"best: {sweep.best[0]}"] = float(at[parameter.values.index(sweep.best[0])])
-    now = present.get(parameter.key, "")
-    if (place := parameter.place(now)) is not None:
-        marks[f"now: {now}"] = place
+    for word, (value,) in _marked(sweep, present).items():
+        if (place := parameter.place(value)) is not None:
+            marks[word] = place
     values = [parameter.values[i] for i in order]
     log_chart(recording, path, at[order], values, {m: c[order] for m, c in curves.items()}, marks)
 
@@ -75,13 +95,9 @@ def layout(sweep: Sweep) -> rrb.Blueprint:
     plots: list[rrb.View] = []
     for name, series in _plots(sweep).items():
         if len(sweep.parameters) == 2:
+            across, up = (parameter.key for parameter in sweep.parameters)
             plots += [
-                rrb.TensorView(
-                    name=metric,
-                    origin=entities.sweep(metric),
-                    scalar_mapping=rrb.TensorScalarMapping(colormap="viridis", mag_filter="nearest"),
-                    view_fit="fill",
-                )
+                chart_view(f"{metric}: {across} across, {up} up", entities.sweep(metric), right=20.0)
                 for metric in series
             ]
         else:

@@ -1,0 +1,62 @@
+"""Names beside what is near: few, and none over another."""
+
+from __future__ import annotations
+
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as arrays
+
+from bevviz.frame import F32
+from bevviz.logging.spoken import NEAR, apart, named_from_above, named_in_space
+from bevviz.logging.states import COLORS, StateLanes
+from bevviz.logging.writer import Writer
+
+NUMBERS = st.floats(-50, 50, width=32)
+PLACES = arrays.arrays(np.float32, st.tuples(st.integers(0, 20), st.just(3)), elements=NUMBERS)
+
+
+@given(places=PLACES)
+def test_names_do_not_meet_and_the_nearest_has_one(places: F32) -> None:
+    at, order = places[:, :2], places[:, 2]
+    named = apart(at, order, (4.0, 2.0))
+    assert named.sum() <= NEAR
+    chosen = at[named]
+    beside = np.abs(chosen[:, None] - chosen[None]) >= (4.0, 2.0)
+    assert (beside.any(axis=2) | np.eye(len(chosen), dtype=bool)).all()
+    if len(places):
+        assert order[named].min() == order.min()
+    if named.sum() < NEAR:  # whoever has none would meet one
+        for place in at[~named]:
+            assert (np.abs(chosen - place) < (4.0, 2.0)).all(axis=1).any()
+
+
+def test_who_comes_first_is_named_before_the_nearest() -> None:
+    places = np.array([[10, 0, 0], [10.5, 0.2, 0], [10, 9, 0]], np.float32)
+    assert named_in_space(places).tolist() == [True, False, True]
+    assert named_in_space(places, np.array([False, True, False])).tolist() == [False, True, True]
+
+
+def test_from_above_a_name_is_wide_and_low() -> None:
+    places = np.array([[5, 0], [5, 8], [10, 0]], np.float32)
+    assert named_from_above(places).tolist() == [True, False, True]
+
+
+def test_a_lane_is_there_from_its_first_state_on() -> None:
+    class Lanes(Writer):
+        def __init__(self) -> None:
+            self.written: list[tuple[str, str]] = []
+
+        def write(self, path: str, *archetypes: object) -> None:
+            [change] = archetypes
+            self.written.append((path, change.state.as_arrow_array()[0].as_py()))  # type: ignore[attr-defined]
+
+        def static(self, path: str, *archetypes: object) -> None:
+            self.written.append((path, "colours"))
+
+    to, lanes = Lanes(), StateLanes(COLORS)
+    for states in ({"/a": "", "/b": "ok"}, {"/a": "failed", "/b": "ok"}, {"/b": "ok"}):
+        lanes.log(to, states)
+    assert to.written == [
+        *[("/b", "colours"), ("/b", "ok"), ("/a", "colours"), ("/a", "failed"), ("/a", "")],
+    ]
