@@ -9,6 +9,7 @@ from rosbags.serde.cdr import generate_deserialize_cdr
 from rosbags.serde.ros1 import generate_deserialize_ros1
 from rosbags.typesys.base import normalize_fieldname
 from rosbags.typesys.store import Typestore
+from rosbags.typesys.stores import empty
 
 _MADE: Mapping[str, Callable[[Any, Typestore], Any]] = {
     "deserialize_cdr_le": lambda fields, store: generate_deserialize_cdr(fields, store, "le"),
@@ -19,6 +20,9 @@ _MADE: Mapping[str, Callable[[Any, Typestore], Any]] = {
 
 class ReadTypes(Typestore):
     """As rosbags' own, which compiles twelve functions for each type: here one is, when it is wanted."""
+
+    def __init__(self) -> None:
+        super().__init__(empty)
 
     def get_msgdef(self, typename: str) -> Any:
         if typename not in self.cache:

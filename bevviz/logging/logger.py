@@ -231,6 +231,8 @@ class Logger(Writer):
         if result.clusters is not None:
             packed = not is_whole(self._config)
             log_cluster_colors(self, frame, result.clusters, result.tracks, packed=packed)
+        if any(failure.stage == "tracking" for failure in result.failures):
+            log_decisions(self, result)  # once more, as ``log_alone`` did not know
         self._log_in_order(result)
         self.end()
 
@@ -250,6 +252,7 @@ class Logger(Writer):
             if self._config.logging.projected_points and self._config.logging.keep != "report":
                 log_projected_points(self, camera, packed=not is_whole(self._config))
         log_frustums(self, frame, result.cameras)
+        log_decisions(self, result)
         if result.bev is not None:
             log_bev(self, result.bev, self._config)
             if self._config.logging.keep != "report":
@@ -271,7 +274,7 @@ class Logger(Writer):
         if result.tracks is not None:
             log_tracks(self, frame, result.tracks, self._config.bev)
         lines = marks(frame) if self.root else self._around.lines(frame)
-        log_decisions(self, result, [*notes, *lines])
+        self.lines(entities.EXPLAIN_LOG, [*notes, *lines])
         started = self._onsets.of(result.anomalies)
         log_anomalies(self, result, started)
         self._log_states(result, states)

@@ -225,7 +225,10 @@ class InOrder(Observer[WindowJob]):
                 self._windows.add_losses(found)
                 continue
             self.extras = found.extras
-            whole = self._session.watch(self._session.track(found.result))
+            tracked = self._session.track(found.result)
+            if len(tracked.failures) > len(found.result.failures):
+                tracked = found.explained(tracked)
+            whole = self._session.watch(tracked)
             for observer in self._observers:
                 observer.see(whole)
             self.frames += 1
