@@ -131,6 +131,11 @@ class Logger(Writer):
         )
 
     @property
+    def clouds_left_out(self) -> int:
+        """Times that something began and raw clouds around it were not kept, as there were many already."""
+        return self._around_raw.left_out
+
+    @property
     def results(self) -> frozenset[str]:
         """Entities that any frame had, but for what the sensors and the robot brought."""
         return self.known - self._brought
@@ -378,14 +383,16 @@ class Logger(Writer):
             *(entities.state(camera.camera.name) for camera in result.cameras),
         ]
         watched = {lane: self._state_lanes.states.get(lane, "") for lane in lanes}
-        strange |= (
-            bool(marks(frame))
-            or self._changed
-            or any(self._watched.get(lane, state) != state for lane, state in watched.items())
-        )
+        strange |= any(self._watched.get(lane, state) != state for lane, state in watched.items())
+        asked_for = bool(marks(frame)) or self._changed
         self._watched, self._changed = watched, False
-        now = frame.index, frame.stamp, frame.received
-        wanted = self._around_raw.see(Held(now, clouds), self._config.logging, strange=strange)
+        now, left_out = (frame.index, frame.stamp, frame.received), self._around_raw.left_out
+        wanted = self._around_raw.see(
+            Held(now, clouds), self._config.logging, strange=strange, wanted=asked_for
+        )
+        if self._around_raw.left_out > left_out:
+            often = f"logging.raw_share is reached; {self._around_raw.left_out} times so far"
+            self.lines(entities.EXPLAIN_LOG, [("INFO", f"no raw clouds around what begins here: {often}")])
         for one in wanted:
             self.set_time(*one.clock)
             for path, points, class_ids in one.clouds:
