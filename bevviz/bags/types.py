@@ -22,7 +22,7 @@ class ReadTypes(Typestore):
     """As rosbags' own, which compiles twelve functions for each type: here one is, when it is wanted."""
 
     def __init__(self) -> None:
-        super().__init__(empty)
+        super().__init__(empty)  # time and duration, which no ROS 1 definition says
 
     def get_msgdef(self, typename: str) -> Any:
         if typename not in self.cache:

@@ -7,6 +7,7 @@ import time
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from types import MappingProxyType
 from typing import Any
 
 from bevviz.closing import Closing
@@ -23,6 +24,7 @@ from bevviz.ros.graph import PublishedTopic, full_name, matched_qos, mismatches,
 from bevviz.ros.livox import is_livox, read_custom
 from bevviz.ros.messages import MessageError, read_header
 from bevviz.ros.node import Node
+from bevviz.ros.packets import is_packets, read_scan
 from bevviz.ros.roles import MARK, STAGE_KINDS, Roles, Topic, find_roles, foreign
 from bevviz.ros.typesupport import message_type
 from bevviz.run import BURST
@@ -63,8 +65,10 @@ class LiveMessage:
     def header(self) -> tuple[int, str]:
         return read_header(self.data, "<" if self.data[1:2] != b"\0" else ">", self.topic)
 
-    def decode(self) -> Any:
+    def decode(self, calibration: Mapping[str, str] = MappingProxyType({})) -> Any:
         """The message as an object with the fields of its definition.
+
+        ``calibration`` is that of the LiDARs, by topic, as ``source.lidar_calibration`` has it.
 
         Raises:
             MessageError: the data does not fit the definition.
@@ -72,6 +76,10 @@ class LiveMessage:
         try:
             if is_livox(self.type):
                 return read_custom(self.data, ros1=False)
+            if is_packets(self.type):
+                return read_scan(
+                    self.data, self.type, ros1=False, calibration=calibration.get(self.topic, "")
+                )
             return typestore().deserialize_cdr(self.data, self.type)
         except Exception as error:  # generated decoders raise whatever the bytes lead them to
             reason = str(error) or type(error).__name__
@@ -316,7 +324,7 @@ class LiveSource(Closing):
         if self._raw is not None:
             self._raw.put(self._known[topic], message.received, info, data)
         first = self._watch.add(topic, len(data))
-        before = self._sync.intrinsics.get(topic)
+        before = self._sync.cameras.intrinsics.get(topic)
         try:
             if first and kind.endswith(("PointCloud2", "Image")):
                 self.frame_ids[topic] = message.header()[1]
@@ -327,7 +335,7 @@ class LiveSource(Closing):
         except MessageError as error:
             self._watch.unusable(topic, str(error))
         if before is not None:
-            self._compare(topic, before, self._sync.intrinsics[topic])
+            self._compare(topic, before, self._sync.cameras.intrinsics[topic])
         if topic in self.roles.lidars:
             self._last_cloud = time.monotonic()
         self._deliver(self._sync.ready(message.received))
@@ -444,7 +452,7 @@ class LiveSource(Closing):
             results = {*roles.robot_detections_2d, *roles.robot_detections_3d} - set(stages.values())
             former, self._sync = self._sync, Synchronizer(roles, self.config, beside=results)
             self._sync.take_over(former)
-            self._handlers = make_handlers(self._sync, roles, LiveMessage.decode)
+            self._handlers = make_handlers(self._sync, roles, self._decode)
         elif roles.around != self.roles.around:
             others = self._handlers.keys() - {topic for topic, _, _ in self.roles.around}
             self._handlers = {topic: self._handlers[topic] for topic in others}
@@ -454,6 +462,9 @@ class LiveSource(Closing):
             self._node.input.destroy_subscription(self._subscriptions.pop(name).handle)
         for name in self._handlers:
             self._listen(self._known[name])
+
+    def _decode(self, message: LiveMessage) -> Any:
+        return message.decode(_resolved(self.config.source, self._node.resolve).lidar_calibration)
 
     def _listen(self, topic: PublishedTopic) -> None:
         """Subscribe, or again where the publishers now offer something else."""
@@ -504,7 +515,10 @@ def remedy(size: float) -> str:
 def _concerns(topic: PublishedTopic) -> bool:
     """Whether a topic can play a role, or holds what could, in a form that nothing here reads."""
     return (
-        topic.type in KINDS or is_livox(topic.type) or bool(foreign(Topic(topic.name, topic.type, None, "")))
+        topic.type in KINDS
+        or is_livox(topic.type)
+        or is_packets(topic.type)
+        or bool(foreign(Topic(topic.name, topic.type, None, "")))
     )
 
 
@@ -533,6 +547,7 @@ def _resolved(config: SourceConfig, resolve: Callable[[str], str]) -> SourceConf
             "camera_topics": tuple(map(resolve, config.camera_topics)),
             "camera_info_topics": {resolve(image): resolve(info) for image, info in infos.items()},
             "odometry_topic": config.odometry_topic and resolve(config.odometry_topic),
+            "lidar_calibration": {resolve(name): file for name, file in config.lidar_calibration.items()},
         }
     )
 
@@ -548,6 +563,9 @@ def _without_absent(topics: list[Topic], config: SourceConfig) -> tuple[list[Top
             topics = [topic for topic in topics if topic.kind not in kinds]
     changes["camera_info_topics"] = {
         image: info for image, info in config.camera_info_topics.items() if {image, info} <= names
+    }
+    changes["lidar_calibration"] = {
+        name: file for name, file in config.lidar_calibration.items() if name in names
     }
     if config.odometry_topic and config.odometry_topic not in names:
         changes["odometry_topic"] = ""
