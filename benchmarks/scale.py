@@ -113,11 +113,12 @@ class _Here:
         on_frame: Callable[[], None],
         tick: Callable[[], None] = lambda: None,
     ) -> JobResults:
-        for job in list(jobs):  # cut before: it has threads of its own
+        made = []
+        for job in list(jobs):  # one thing after the other: each has threads of its own
             start = time.process_time()
-            result = job.run(1, on_frame)
+            made.append(job.run(1, on_frame))
             self.seconds += time.process_time() - start
-            yield result
+        yield from made
 
 
 def _processor(who: int) -> float:

@@ -391,6 +391,12 @@ class LoggingConfig(Section):
     raw_around: Seconds = Field(
         0.5, ge=0, le=5, description="keep=inspect: raw clouds before and after an anomaly or a change"
     )
+    raw_share: float = Field(
+        0.02,
+        ge=0,
+        le=1,
+        description="keep=inspect: of all frames, those with raw clouds for that reason, at most",
+    )
     jpeg_quality: int = Field(85, ge=1, le=100, description="for images that came uncompressed")
     video: Literal["stream", "images"] = Field(
         "stream", description="video as it came, or each picture as JPEG, which takes no decoder in a viewer"

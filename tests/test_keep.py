@@ -38,26 +38,36 @@ TENTH = 100_000_000  # nanoseconds
 @given(
     steps=st.lists(st.integers(1, 4), min_size=1, max_size=60),
     strange=st.sets(st.integers(0, 59)),
+    asked_for=st.sets(st.integers(0, 59), max_size=3),
     every=st.integers(1, 20),
     around=st.integers(0, 10),
+    share=st.sampled_from((0.0, 0.1, 1.0)),
 )
 def test_raw_clouds_are_those_around_what_is_strange(
-    steps: list[int], strange: set[int], every: int, around: int
+    steps: list[int], strange: set[int], asked_for: set[int], every: int, around: int, share: float
 ) -> None:
-    """Each once, and no other but each n-th; no more are held than fit into that time."""
+    """Each once, and no other but each n-th; no more are held than fit into that time. What is asked for has
+    all, what begins of itself up to a share of the frames, and the first time."""
     stamps = (np.cumsum(steps) * TENTH).tolist()
-    config = LoggingConfig(raw_every=every, raw_around=around / 10)
-    kept, found = Around(), []
+    config = LoggingConfig(raw_every=every, raw_around=around / 10, raw_share=share)
+    kept, found, at, left_out = Around(), list[int](), list[int](), 0
     for i, stamp in enumerate(stamps):
-        found += [one.clock[0] for one in kept.see(Held((i, stamp, 0), ()), config, strange=i in strange)]
+        for_reason = sum(one % every != 0 for one in found)
+        given = Held((i, stamp, 0), ())
+        more = kept.see(given, config, strange=i in strange, wanted=i in asked_for)
+        found += [one.clock[0] for one in more]
         assert kept.held <= around + 1
-    at = [stamps[i] for i in strange if i < len(stamps)]
+        if i in asked_for or (i in strange and (not for_reason or for_reason < share * (i + 1))):
+            at.append(stamp)
+        elif i in strange:
+            left_out += 1
     wanted = [
         i
         for i, stamp in enumerate(stamps)
         if i % every == 0 or any(abs(stamp - other) <= around * TENTH for other in at)
     ]
     assert sorted(found) == wanted
+    assert kept.left_out == left_out
 
 
 # --- H.264 -------------------------------------------------------------------------------------

@@ -21,11 +21,13 @@ from bevviz.cli import main
 from bevviz.config import load
 from bevviz.engine.task import JobResults, Task
 from bevviz.errors import UserError
+from bevviz.frame import FrameResult
 from bevviz.logging import entities
 from bevviz.logging.parts import PartsWriter
 from bevviz.logging.recorder import OrderedRecorder
 from bevviz.logging.sinks import open_recording
 from bevviz.parallel.run import run_windows
+from bevviz.run import Observer
 from tests import bags
 from tests.recordings import Recording, verify
 
@@ -190,28 +192,18 @@ def test_a_recording_in_windows_is_that_of_one_process_though_a_worker_dies(
 
 
 def test_an_interrupted_run_leaves_a_recording_of_whole_windows(tmp_path: Path, bag: Path) -> None:
-    saved, stop, made = tmp_path / "cut.rrd", Event(), 0
+    saved, stop = tmp_path / "cut.rrd", Event()
+
+    class Until(Observer[FrameResult]):
+        def see(self, result: FrameResult) -> None:
+            if result.frame.index == 10:
+                stop.set()
+
     with bevviz.open(bag, set=SETTINGS) as drive:
         assert isinstance(drive.frames, BagSource)
-
-        class Until(Serial):
-            def run(
-                self,
-                jobs: Iterable[Task],
-                retries: int,
-                on_frame: Callable[[], None],
-                tick: Callable[[], None] = lambda: None,
-            ) -> JobResults:
-                nonlocal made
-                for result in super().run(jobs, retries, on_frame):
-                    yield result
-                    made += 1
-                    if made == 2:
-                        stop.set()
-
         with open_recording(drive.scene, drive.config, save=saved, in_parts=True) as sinks:
-            seen = [OrderedRecorder(sinks.recording, drive.config)]
-            end = run_windows(drive, drive.new_session(), sinks, seen, Until(), stop)
+            seen = [OrderedRecorder(sinks.recording, drive.config), Until()]
+            end = run_windows(drive, drive.new_session(), sinks, seen, Serial(), stop)
     assert end.frames == 9 + 8
     recording = Recording(saved)
     assert sorted(recording.times["stamp"]) == list(range(end.frames))

@@ -170,6 +170,31 @@ def test_commands_take_a_recording_for_its_bag(folder: Path, capsys: pytest.Capt
         assert len(drive) == 3
 
 
+def test_what_keeps_less_is_asked_and_checked_all_the_same(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bag, model, bug = str(folder / "demo.mcap"), str(folder / "net.onnx"), folder / "bug.rrd"
+
+    def answers(path: str | Path, *arguments: str) -> object:
+        capsys.readouterr()
+        assert main(["why", str(path), "--at-frame", "1", "--json", *arguments]) == 0
+        return json.loads(capsys.readouterr().out)
+
+    wanted = answers(bag, "--model", model)
+    for keep in ("inspect", "report"):
+        less = folder / f"{keep}.rrd"
+        run = ["bag", bag, "--model", model, "--frames", ":2", "--keep", keep, "--save", str(less)]
+        assert main(run) == 0
+        assert answers(less) == wanted
+    report = ["report", bag, "--at", "0.1", "--model", model, "--keep", "report", "-o", str(bug)]
+    assert main(report) == 0
+    assert answers(bug) == wanted
+    assert main(["report", "--check", str(bug)]) == 0
+    assert "3 frames: the same in every bit" in capsys.readouterr().out
+    with bevviz.open(bug) as drive:
+        assert drive.config.logging.keep == "report"
+
+
 def test_a_report_stands_for_the_bag_that_comes_with_it(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -52,13 +52,17 @@ def process(drive: Drive, outputs: Outputs, default: Path, engine: Engine | None
     if engine is not None and not windows:
         engine.close()
 
+    recorders: list[Recorder] = []
+
     def observers(recording: RecordingStream) -> list[Observer[FrameResult]]:
         hint(drive.scene, drive.config)
-        recorder = OrderedRecorder if windows else Recorder
-        return [recorder(recording, drive.config, session.stages.provider), anomalies, failures]
+        kind = OrderedRecorder if windows else Recorder
+        recorders.append(kind(recording, drive.config, session.stages.provider))
+        return [*recorders, anomalies, failures]
 
     def finish() -> None:
         warn(failures.warnings)
+        warn(text for recorder in recorders for text in recorder.warnings)
         say(f"anomalies: {anomalies}")
 
     def in_windows(sinks: Sinks, seen: Sequence[Observer[FrameResult]]) -> RunEnd:

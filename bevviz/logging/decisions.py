@@ -17,10 +17,9 @@ _WEAK = {"not_kept", "below_threshold", "suppressed"}
 _MANY = {"out_of_view", "too_small", "too_large"}  # clusters that are only counted and numbered
 
 
-def log_decisions(to: Writer, result: FrameResult, notes: Sequence[tuple[str, str]] = ()) -> None:
-    """``notes``: level and text of further lines of the log."""
+def log_decisions(to: Writer, result: FrameResult) -> None:
     to.put(entities.EXPLAIN, document(page(result)))
-    to.lines(entities.EXPLAIN_LOG, [*notes, *remarks(result)])
+    to.lines(entities.EXPLAIN_LOG, remarks(result))
 
 
 def page(result: FrameResult) -> str:

@@ -29,7 +29,8 @@ def left_out(config: LoggingConfig) -> tuple[str, ...]:
     raw = (
         f"raw clouds: there is that of each {config.raw_every}th frame, and those within "
         f"{config.raw_around:g} s of where an anomaly begins, a person's mark, or where the state of the "
-        "pipeline, of a camera or the configuration changes"
+        "pipeline, of a camera or the configuration changes; where anomalies and states come thick, of "
+        f"{100 * config.raw_share:g} % of all frames"
         if config.keep == "inspect"
         else "raw clouds, the voxels of the ground and of what is in no cluster, the obstacle points over "
         "the images and the grid on the ground"
@@ -81,27 +82,38 @@ class Held:
 
 
 class Around:
-    """Which frames' raw clouds are kept: so many are held as fit into ``around`` seconds, and no more."""
+    """Which frames' raw clouds are kept: so many are held as fit into ``raw_around`` seconds, and no more.
+
+    What begins of itself, again and again where a sensor fails, has those around it only while all that were
+    kept for that reason are fewer than ``raw_share`` of the frames so far; the first time it has them.
+
+    Attributes:
+        left_out: times that something began and did not have them.
+    """
 
     LONGEST = 100  # frames that are held at most, however fast they come
 
     def __init__(self) -> None:
+        self.left_out = 0
         self._held: list[Held] = []
         self._until = -1
-        self._count = 0
+        self._count = self._spent = 0
 
     @property
     def held(self) -> int:
         """Frames that may be wanted yet."""
         return len(self._held)
 
-    def see(self, frame: Held, config: LoggingConfig, *, strange: bool) -> Sequence[Held]:
+    def see(
+        self, frame: Held, config: LoggingConfig, *, strange: bool, wanted: bool = False
+    ) -> Sequence[Held]:
         """Those to be logged now, oldest first.
 
         Args:
             frame: the next one.
             config: how many.
             strange: whether something begins here.
+            wanted: whether somebody has seen to it that it does.
         """
         stamp, around = frame.clock[1], round(config.raw_around * 1e9)
         if self._held and stamp < self._held[-1].clock[1]:
@@ -109,11 +121,16 @@ class Around:
         self._held = [one for one in self._held[-self.LONGEST :] if stamp - one.clock[1] <= around]
         nth = self._count % config.raw_every == 0
         self._count += 1
-        if strange:
+        if strange and not wanted:
+            strange = not self._spent or self._spent < config.raw_share * self._count
+            self.left_out += not strange
+        if strange or wanted:
             self._until = stamp + around
             found, self._held = [*self._held, frame], []
+            self._spent += len(found) - nth
             return found
         if nth or stamp <= self._until:
+            self._spent += not nth
             return [frame]
         self._held.append(frame)
         return []

@@ -131,6 +131,11 @@ class Logger(Writer):
         )
 
     @property
+    def clouds_left_out(self) -> int:
+        """Times that something began and raw clouds around it were not kept, as there were many already."""
+        return self._around_raw.left_out
+
+    @property
     def results(self) -> frozenset[str]:
         """Entities that any frame had, but for what the sensors and the robot brought."""
         return self.known - self._brought
@@ -232,6 +237,8 @@ class Logger(Writer):
         if result.clusters is not None:
             packed = not is_whole(self._config)
             log_cluster_colors(self, frame, result.clusters, result.tracks, packed=packed)
+        if any(failure.stage == "tracking" for failure in result.failures):
+            log_decisions(self, result)  # once more, as ``log_alone`` did not know
         self._log_in_order(result)
         self.end()
 
@@ -251,6 +258,7 @@ class Logger(Writer):
             if self._config.logging.projected_points and self._config.logging.keep != "report":
                 log_projected_points(self, camera, packed=not is_whole(self._config))
         log_frustums(self, frame, result.cameras)
+        log_decisions(self, result)
         if result.bev is not None:
             log_bev(self, result.bev, self._config)
             if self._config.logging.keep != "report":
@@ -272,7 +280,7 @@ class Logger(Writer):
         if result.tracks is not None:
             log_tracks(self, frame, result.tracks, self._config.bev)
         lines = marks(frame) if self.root else self._around.lines(frame)
-        log_decisions(self, result, [*notes, *lines])
+        self.lines(entities.EXPLAIN_LOG, [*notes, *lines])
         started = self._onsets.of(result.anomalies)
         log_anomalies(self, result, started)
         self._log_states(result, states)
@@ -376,14 +384,16 @@ class Logger(Writer):
             *(entities.state(camera.camera.name) for camera in result.cameras),
         ]
         watched = {lane: self._state_lanes.states.get(lane, "") for lane in lanes}
-        strange |= (
-            bool(marks(frame))
-            or self._changed
-            or any(self._watched.get(lane, state) != state for lane, state in watched.items())
-        )
+        strange |= any(self._watched.get(lane, state) != state for lane, state in watched.items())
+        asked_for = bool(marks(frame)) or self._changed
         self._watched, self._changed = watched, False
-        now = frame.index, frame.stamp, frame.received
-        wanted = self._around_raw.see(Held(now, clouds), self._config.logging, strange=strange)
+        now, left_out = (frame.index, frame.stamp, frame.received), self._around_raw.left_out
+        wanted = self._around_raw.see(
+            Held(now, clouds), self._config.logging, strange=strange, wanted=asked_for
+        )
+        if self._around_raw.left_out > left_out:
+            often = f"logging.raw_share is reached; {self._around_raw.left_out} times so far"
+            self.lines(entities.EXPLAIN_LOG, [("INFO", f"no raw clouds around what begins here: {often}")])
         for one in wanted:
             self.set_time(*one.clock)
             for path, points, class_ids in one.clouds:

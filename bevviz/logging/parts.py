@@ -7,9 +7,12 @@ import shutil
 import subprocess
 import sys
 import tempfile
+from collections import deque
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
+from typing import IO
 
 import rerun as rr
 from rerun.chunk import RrdReader
@@ -21,6 +24,7 @@ from bevviz.logging import rerun_cli
 from bevviz.logging.reading import readable
 
 PIECE = 1 << 20  # bytes
+AHEAD = 4  # parts that wait to be written, which takes no time of Python's
 
 
 class PartsWriter(Closing):
@@ -35,6 +39,8 @@ class PartsWriter(Closing):
 
     def __init__(self, file: Path) -> None:
         self._failure = ""
+        self._thread = ThreadPoolExecutor(1, "parts")
+        self._coming: deque[Future[None]] = deque()
         self._said = tempfile.TemporaryFile()  # noqa: SIM115
         command = [rerun_cli.program(), "rrd", "route", "--output", str(file)]
         self._process = subprocess.Popen(
@@ -48,13 +54,16 @@ class PartsWriter(Closing):
         )
 
     def add(self, part: Path) -> None:
-        """The next part. Where the disk takes no more, it goes nowhere, see ``check``."""
+        """The next part; it may be removed then. On a full disk it goes nowhere, see ``check``."""
+        file = part.open("rb")
+        while len(self._coming) >= AHEAD:
+            self._coming.popleft().result()
+        self._coming.append(self._thread.submit(self._write, file))
+
+    def _write(self, file: IO[bytes]) -> None:
         assert self._process.stdin is not None
-        try:
-            with part.open("rb") as file:
-                _copy(file.fileno(), self._process.stdin.fileno())
-        except BrokenPipeError:
-            self._ended()
+        with file, suppress(BrokenPipeError):
+            _copy(file.fileno(), self._process.stdin.fileno())
 
     def check(self) -> None:
         """Raises UserError where the file cannot be written any more."""
@@ -68,6 +77,7 @@ class PartsWriter(Closing):
         assert self._process.stdin is not None
         if self._process.stdin.closed:
             return
+        self._thread.shutdown()
         self._process.stdin.close()
         if self._process.wait():
             self._ended()

@@ -36,6 +36,14 @@ class Recorder(Observer[FrameResult]):
     def end(self) -> None:
         self.logger.flush()
 
+    @property
+    def warnings(self) -> list[str]:
+        """What the recording lacks that it was to have, one sentence each."""
+        if not (times := self.logger.clouds_left_out):
+            return []
+        share = f"logging.raw_share={self._config.logging.raw_share:g}"
+        return [f"raw clouds around what begins were left out {times} times: there are {share} of all frames"]
+
 
 class OrderedRecorder(Recorder):
     """Writes of a run what the frames before have a part in, where others have written the rest."""

@@ -31,7 +31,7 @@ from bevviz.stages.foreign import Foreign
 LENGTH = 25  # frames of a window, at most
 SHORTEST = 8  # each begins with a frame that is made for nothing
 SHARE = 2  # windows that each process should have of what is left
-AHEAD = 2  # windows that are cut before a process is free
+AHEAD = 2  # windows that are cut before a process is free, and made before they are put in order
 RETRIES = 2  # of a window whose process died
 
 T = TypeVar("T")
@@ -163,19 +163,26 @@ class MadeWindows:
         self._stopped.set()
 
     def __iter__(self) -> Iterator[WindowJob]:
+        # Workers get their next window while others are put in order.
+        with closing(self._in_order()) as windows, closing(ahead(windows, AHEAD)) as drawn:
+            try:
+                yield from drawn
+            except _StoppedError:
+                return
+            finally:
+                self._stopped.set()
+
+    def _in_order(self) -> Generator[WindowJob, None, None]:
         def tick() -> None:
             if self._stopped.is_set():
                 raise _StoppedError
 
-        try:
-            with (
-                closing(self._windows.jobs()) as jobs,
-                closing(self._engine.run(jobs, RETRIES, self._on_frame, tick)) as ends,
-            ):
-                for end in ends:
-                    yield from self._windows.ended(end)
-        except _StoppedError:
-            return
+        with (
+            closing(self._windows.jobs()) as jobs,
+            closing(self._engine.run(jobs, RETRIES, self._on_frame, tick)) as ends,
+        ):
+            for end in ends:
+                yield from self._windows.ended(end)
 
 
 class AsTheyAre:
@@ -225,7 +232,10 @@ class InOrder(Observer[WindowJob]):
                 self._windows.add_losses(found)
                 continue
             self.extras = found.extras
-            whole = self._session.watch(self._session.track(found.result))
+            tracked = self._session.track(found.result)
+            if len(tracked.failures) > len(found.result.failures):
+                tracked = found.explained(tracked)
+            whole = self._session.watch(tracked)
             for observer in self._observers:
                 observer.see(whole)
             self.frames += 1

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import IO, cast
+from typing import cast
 from uuid import uuid4
 
 import numpy as np
@@ -24,6 +24,7 @@ from bevviz.errors import UserError
 from bevviz.frame import Camera, Cloud, FrameResult, Ground, Voxels
 from bevviz.logging.logger import Logger
 from bevviz.logging.sinks import APPLICATION, batches
+from bevviz.parallel import handed
 from bevviz.perceive import StageLoader, Stages, describe, perceive
 from bevviz.stages.visibility import range_image
 
@@ -50,7 +51,12 @@ class Found:
     """A frame, as a worker hands it on."""
 
     result: FrameResult  # without what only its frame needs
+    explanations: bytes  # all of them, pickled; the result has those of detections
     extras: Mapping[str, bytes]  # see ``Batched``
+
+    def explained(self, result: FrameResult) -> FrameResult:
+        """What was made of the result, with all of them."""
+        return replace(result, explanations=pickle.loads(self.explanations))
 
 
 @dataclass(frozen=True)
@@ -107,10 +113,10 @@ class WindowJob:
                         logger.recording = stream
                     logger.log_alone(result)
                     if mine:
-                        pickle.dump(self._found(result), file, pickle.HIGHEST_PROTOCOL)
+                        handed.put(file, self._found(result))
                         frames += 1
                         on_frame()
-                pickle.dump(source.losses, file, pickle.HIGHEST_PROTOCOL)
+                handed.put(file, source.losses)
             logger.close()
             stream.disconnect()
             recording.replace(self.recording)
@@ -124,26 +130,21 @@ class WindowJob:
         return JobResult(self.name, frames, time.perf_counter() - start)
 
     def _found(self, result: FrameResult) -> Found:
+        explanations = pickle.dumps(result.explanations, pickle.HIGHEST_PROTOCOL)
         if self.batch is None:
-            return Found(_kept(result), {})
-        return Found(_kept(result, judged=self.batch.judged), self.batch.extras(result))
+            return Found(_kept(result), explanations, {})
+        return Found(_kept(result, judged=self.batch.judged), explanations, self.batch.extras(result))
 
 
 def results_in(path: Path, config: Config) -> Iterator[Found | Losses]:
     """The results of a window, and what its frames lacked."""
-    with path.open("rb") as file:
-        while True:
-            found = _load(file)
-            if isinstance(found, Losses):
-                yield found
-                return
-            yield replace(found, result=replace(found.result, config=config))
-
-
-def _load(file: IO[bytes]) -> Found | Losses:
-    found = pickle.load(file)
-    assert isinstance(found, Found | Losses)
-    return found
+    for found in handed.take(path):
+        assert isinstance(found, Found | Losses)
+        yield (
+            found
+            if isinstance(found, Losses)
+            else replace(found, result=replace(found.result, config=config))
+        )
 
 
 class _Nowhere:
@@ -215,6 +216,7 @@ def _kept(result: FrameResult, *, judged: bool = False) -> FrameResult:
             for camera in result.cameras
         ),
         bev=None,
+        explanations=tuple(e for e in result.explanations if e.subject == "detection"),
         ranges=range_image(result.frame.points),  # half of what anomalies take, and needs no order
     )
 

@@ -256,7 +256,8 @@ class Synchronizer:
     def _check_units(self, cloud: Cloud) -> None:
         """In millimetres nothing is within the reach of any stage, and nothing would be said."""
         if cloud.topic not in self.report.oddities and len(cloud.xyz):
-            middle = float(np.median(np.abs(cloud.xyz[::16]).max(axis=1)))
+            x, y, z = np.abs(cloud.xyz[::16]).T  # their maximum, faster than by row
+            middle = float(np.median(np.maximum(np.maximum(x, y), z)))
             if middle > FAR:
                 self.report.oddities[cloud.topic] = (
                     f"{cloud.topic}: half of its points are farther than {middle:,.0f} m, as coordinates in "
