@@ -469,15 +469,21 @@ class Masks:
         cells: Bool = bits.reshape(self.place[d, 3], self.place[d, 2]).astype(bool)
         return cells
 
-    def cover(self, d: int, uv: F32) -> Bool:
-        """(N,) which of these pixels of the image a detection's object covers; NaN is none."""
+    def cover(self, d: int, uv: F32, margin: float = 0.0) -> Bool:
+        """(N,) which of these pixels of the image a detection's object covers; NaN is none.
+
+        ``margin``: pixels to the left, right, above and below it that count, too.
+        """
         column, row, columns, rows = self.place[d].tolist()
-        with np.errstate(invalid="ignore"):
-            at = np.floor((uv + np.float32(0.5)) * self.grid[:2] + self.grid[2:]) - (column, row)
-            there = ((at >= 0) & (at < (columns, rows))).all(axis=1)
-        covered = np.zeros(len(uv), bool)
-        i, j = at[there].astype(np.int64).T
-        covered[there] = self.cells(d)[j, i]
+        cells, covered = self.cells(d), np.zeros(len(uv), bool)
+        beside = [(0.0, 0.0), (margin, 0.0), (-margin, 0.0), (0.0, margin), (0.0, -margin)]
+        for shift in beside if margin else beside[:1]:
+            with np.errstate(invalid="ignore"):
+                moved = uv + np.array(shift, np.float32) + np.float32(0.5)
+                at = np.floor(moved * self.grid[:2] + self.grid[2:]) - (column, row)
+                there = ((at >= 0) & (at < (columns, rows))).all(axis=1)
+            i, j = at[there].astype(np.int64).T
+            covered[there] |= cells[j, i]
         return covered
 
 
