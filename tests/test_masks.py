@@ -3,16 +3,25 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
+import rerun as rr
 from hypothesis import given
 from hypothesis import strategies as st
 
 from bevviz.config import FusionConfig, load
 from bevviz.explain import in_mask
-from bevviz.frame import F32, Bool, Detections, Fusion, Masks
+from bevviz.frame import F32, Bool, Detections, FrameResult, Fusion, Masks
+from bevviz.logging import entities
+from bevviz.logging.camera import log_detections
+from bevviz.logging.writer import Writer
+from bevviz.report.digest import detections_of as recorded
+from bevviz.report.digest import digest, pack, unpack
 from bevviz.stages.clustering import cluster
 from bevviz.stages.fusion import fuse
+from bevviz.synthetic import SyntheticSource
+from tests.recordings import Recording
 from tests.test_frustum import CLUSTERING, claimed, looked
 from tests.test_fusion import CAMERA, CAMERA_FROM_LIDAR, detections_of, silhouette, slab
 
@@ -72,6 +81,33 @@ def test_a_mask_without_points_is_left_aside() -> None:
     assert f"only 0 of {len(POINTS)} points in the frustum in the mask, which is left aside" in in_mask(
         fusion, 0, load()
     )
+
+
+def test_outlines_are_where_the_masks_are(tmp_path: Path) -> None:
+    recording = rr.RecordingStream("test")
+    recording.save(tmp_path / "masks.rrd")
+    result = looked(POINTS, SEGMENTED)
+    with Writer(recording) as to:
+        to.begin(0, 1, 0)
+        log_detections(to, result, [])
+        to.end()
+    recording.disconnect()
+    (strips,) = Recording(tmp_path / "masks.rrd").column(entities.masks("front"), "LineStrips2D:strips")
+    outline = np.concatenate([np.array(strip) for strip in strips])
+    box = silhouette(PERSON) + 0.5  # counted from the corner of the first pixel
+    np.testing.assert_allclose([*outline.min(axis=0), *outline.max(axis=0)], box, atol=2.0)  # a cell
+
+
+def test_a_report_has_the_masks() -> None:
+    frame = SyntheticSource(frames=1).snapshot(0).frame
+    image = frame.cameras[0].image
+    result = replace(looked(POINTS, SEGMENTED), camera=replace(frame.cameras[0], name="front"))
+    assert image is not None
+    whole = FrameResult.unprocessed(frame, load(), (result,))
+    found = recorded(unpack(*pack(digest(whole))))["front", image.stamp]
+    assert found.masks is not None and SEGMENTED.masks is not None
+    np.testing.assert_array_equal(found.masks.cells(0), SEGMENTED.masks.cells(0))
+    np.testing.assert_array_equal(found.masks.place, SEGMENTED.masks.place)
 
 
 @given(st.integers(0, 2**32 - 1), st.sampled_from([0.0, 3.0]))
