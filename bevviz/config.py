@@ -133,6 +133,9 @@ class SourceConfig(Section):
     )
     camera_topics: tuple[str, ...] = Field((), description="Image or CompressedImage topics")
     camera_info_topics: Mapping[str, str] = Field({}, description="camera topic -> its CameraInfo topic")
+    lidar_calibration: Mapping[str, str] = Field(
+        {}, description="topic with a LiDAR's packets -> file with its angles: CSV of a Hesai"
+    )
     boxes: Mapping[str, str] = Field(
         {},
         description="topic with the robot's boxes in messages of its own, and where in them: topic, objects, "

@@ -187,7 +187,7 @@ def test_a_derived_cloud_plays_where_there_is_no_other() -> None:
 @pytest.mark.parametrize(
     ("kind", "helps"),
     [
-        ("velodyne_msgs/msg/VelodyneScan", "play them through its driver and record its PointCloud2"),
+        ("rslidar_msgs/msg/RslidarScan", "play them through its driver and record its PointCloud2"),
         ("ouster_sensor_msgs/msg/PacketMsg", "play them through its driver"),
         ("nebula_msgs/msg/NebulaPackets", "play them through its driver"),
         ("sensor_msgs/msg/LaserScan", "laserscan_to_pointcloud makes a PointCloud2 of it"),

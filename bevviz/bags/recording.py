@@ -40,6 +40,7 @@ from bevviz.bags.reader import (
     normalized,
 )
 from bevviz.bags.sqlite import SoundSqlite, SqliteRescuer
+from bevviz.bags.types import ReadTypes
 from bevviz.closing import Closing
 from bevviz.config import SourceConfig
 from bevviz.datasets import open_dataset
@@ -50,6 +51,7 @@ from bevviz.frame import I64
 from bevviz.ros import foxglove, grid_map_msgs, video, vision_msgs
 from bevviz.ros.livox import fields_of, is_livox, read_custom
 from bevviz.ros.messages import MessageError, read_header
+from bevviz.ros.packets import is_packets, read_scan
 from bevviz.ros.roles import Topic
 from bevviz.ros.video import Packet, decode_packet, is_video
 from bevviz.text import path_text
@@ -284,10 +286,11 @@ class Recording(Closing):
                 yield decode_packet(self.decode(message), topic, message.received)
 
     def decode(self, message: RawMessage) -> Any:
-        """The message as an object with the fields of its definition; Livox's clouds as a PointCloud2.
+        """The message as an object with the fields of its definition; LiDAR drivers' own as a PointCloud2.
 
         Raises:
             MessageError: the data does not fit the definition, or there is none.
+            UserError: a file that the configuration names for the topic cannot be used.
         """
         connection = message.connection
         msgtype = normalized(connection.msgtype)
@@ -299,6 +302,9 @@ class Recording(Closing):
             if is_livox(msgtype):
                 fields = fields_of(store.fielddefs, msgtype)
                 return read_custom(data, ros1=is_ros1(connection), fields=fields)
+            if is_packets(msgtype):
+                calibration = self._config.lidar_calibration.get(message.topic, "")
+                return read_scan(data, msgtype, ros1=is_ros1(connection), calibration=calibration)
             if is_ros1(connection):
                 found = store.deserialize_ros1(data, msgtype)
             else:
@@ -308,7 +314,7 @@ class Recording(Closing):
             raise MessageError(
                 f"{message.topic}: the bag does not say what a {msgtype} is made of, and neither does bevviz"
             ) from None
-        except MessageError:
+        except UserError:
             raise
         except Exception as error:  # generated decoders raise whatever the bytes lead them to
             reason = str(error) or type(error).__name__
@@ -365,7 +371,7 @@ class Recording(Closing):
         try:
             _, fields = self._store(connection).fielddefs[normalized(connection.msgtype)]
         except KeyError:
-            return is_livox(connection.msgtype)
+            return is_livox(connection.msgtype) or is_packets(connection.msgtype)
         names = [name for name, _ in fields[:2]]
         return bool(fields) and (fields[0][1][1] == "std_msgs/msg/Header" or names == STAMPED)
 
@@ -581,6 +587,6 @@ def _defined(connection: Connection) -> Typestore:
         types = {}
         for part in text.split("=" * 80 + "\n"):
             types.update(get_types_from_idl(part.partition("\n")[2] if part.startswith("IDL: ") else part))
-    store = get_typestore(Stores.EMPTY)
+    store = ReadTypes()
     store.register(types)
     return store

@@ -120,7 +120,8 @@ def _main(arguments: Sequence[str] | None) -> int:
     finally:
         if arguments is None:
             interrupts.ignore()
-            gc.freeze()  # the process ends: looking through all that it has takes a third of a second
+            if "velodyne_decoder" not in sys.modules:  # it would complain that it is not cleared
+                gc.freeze()  # the process ends: looking through all that it has takes a third of a second
 
 
 def _parser() -> tuple[argparse.ArgumentParser, Collection[str]]:

@@ -7,6 +7,7 @@ import time
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from types import MappingProxyType
 from typing import Any
 
 from bevviz.closing import Closing
@@ -24,6 +25,7 @@ from bevviz.ros.livox import is_livox, read_custom
 from bevviz.ros.messages import MessageError, read_header
 from bevviz.ros.node import Node
 from bevviz.ros.objects import holds_boxes
+from bevviz.ros.packets import is_packets, read_scan
 from bevviz.ros.roles import MARK, STAGE_KINDS, Roles, Topic, find_roles, foreign
 from bevviz.ros.typesupport import message_type
 from bevviz.run import BURST
@@ -64,8 +66,10 @@ class LiveMessage:
     def header(self) -> tuple[int, str]:
         return read_header(self.data, "<" if self.data[1:2] != b"\0" else ">", self.topic)
 
-    def decode(self) -> Any:
+    def decode(self, calibration: Mapping[str, str] = MappingProxyType({})) -> Any:
         """The message as an object with the fields of its definition.
+
+        ``calibration`` is that of the LiDARs, by topic, as ``source.lidar_calibration`` has it.
 
         Raises:
             MessageError: the data does not fit the definition.
@@ -73,6 +77,10 @@ class LiveMessage:
         try:
             if is_livox(self.type):
                 return read_custom(self.data, ros1=False)
+            if is_packets(self.type):
+                return read_scan(
+                    self.data, self.type, ros1=False, calibration=calibration.get(self.topic, "")
+                )
             return store_of(self.type).deserialize_cdr(self.data, self.type)
         except Exception as error:  # generated decoders raise whatever the bytes lead them to
             reason = str(error) or type(error).__name__
@@ -318,7 +326,7 @@ class LiveSource(Closing):
         if self._raw is not None:
             self._raw.put(self._known[topic], message.received, info, data)
         first = self._watch.add(topic, len(data))
-        before = self._sync.intrinsics.get(topic)
+        before = self._sync.cameras.intrinsics.get(topic)
         try:
             if first and kind.endswith(("PointCloud2", "Image")):
                 self.frame_ids[topic] = message.header()[1]
@@ -329,7 +337,7 @@ class LiveSource(Closing):
         except MessageError as error:
             self._watch.unusable(topic, str(error))
         if before is not None:
-            self._compare(topic, before, self._sync.intrinsics[topic])
+            self._compare(topic, before, self._sync.cameras.intrinsics[topic])
         if topic in self.roles.lidars:
             self._last_cloud = time.monotonic()
         self._deliver(self._sync.ready(message.received))
@@ -449,7 +457,7 @@ class LiveSource(Closing):
             results = {*roles.robot_detections_2d, *roles.robot_detections_3d} - set(stages.values())
             former, self._sync = self._sync, Synchronizer(roles, self.config, beside=results)
             self._sync.take_over(former)
-            self._handlers = make_handlers(self._sync, roles, LiveMessage.decode)
+            self._handlers = make_handlers(self._sync, roles, self._decode)
         elif roles.around != self.roles.around:
             others = self._handlers.keys() - {topic for topic, _, _ in self.roles.around}
             self._handlers = {topic: self._handlers[topic] for topic in others}
@@ -460,13 +468,17 @@ class LiveSource(Closing):
         for name in self._handlers:
             self._listen(self._known[name])
 
+    def _decode(self, message: LiveMessage) -> Any:
+        return message.decode(_resolved(self.config.source, self._node.resolve).lidar_calibration)
+
     def _listen(self, topic: PublishedTopic) -> None:
         """Subscribe, or again where the publishers now offer something else."""
         from rclpy.event_handler import SubscriptionEventCallbacks
 
         try:
             kind = message_type(topic.type)
-            store_of(topic.type)
+            if not (is_livox(topic.type) or is_packets(topic.type)):
+                store_of(topic.type)
         except UserError as error:
             self._watch.note(f"{topic.name} type", f"{topic.name} is not received: {error}")
             return
@@ -512,6 +524,7 @@ def _concerns(topic: PublishedTopic) -> bool:
     return (
         topic.type in KINDS
         or is_livox(topic.type)
+        or is_packets(topic.type)
         or holds_boxes(topic.type)
         or bool(foreign(Topic(topic.name, topic.type, None, "")))
     )
@@ -544,6 +557,7 @@ def _resolved(config: SourceConfig, resolve: Callable[[str], str]) -> SourceConf
             "camera_info_topics": {resolve(image): resolve(info) for image, info in infos.items()},
             "odometry_topic": config.odometry_topic and resolve(config.odometry_topic),
             "boxes": {key: resolve(path) if key == "topic" else path for key, path in boxes.items()},
+            "lidar_calibration": {resolve(name): file for name, file in config.lidar_calibration.items()},
         }
     )
 
@@ -562,6 +576,9 @@ def _without_absent(topics: list[Topic], config: SourceConfig) -> tuple[list[Top
     }
     if config.boxes.get("topic", "") not in names:
         changes["boxes"] = {}
+    changes["lidar_calibration"] = {
+        name: file for name, file in config.lidar_calibration.items() if name in names
+    }
     if config.odometry_topic and config.odometry_topic not in names:
         changes["odometry_topic"] = ""
         topics = [topic for topic in topics if topic.kind != "Odometry"]

@@ -18,6 +18,7 @@ from bevviz.logging.entities import RESERVED
 from bevviz.ros.foxglove import KINDS, short_of
 from bevviz.ros.livox import is_livox
 from bevviz.ros.objects import check, holds_boxes
+from bevviz.ros.packets import is_packets, lacks
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,7 +37,7 @@ class Topic:
     @property
     def kind(self) -> str:
         """What it is read as: the type without its package, but for types that stand for others."""
-        if is_livox(self.type):
+        if is_livox(self.type) or is_packets(self.type):
             return "PointCloud2"
         if short := short_of(self.type):
             return KINDS[short]
@@ -137,6 +138,10 @@ _FOREIGN = (  # what holds points or pixels in a form that nothing here reads, a
 
 def foreign(topic: Topic, sensor: str = "") -> str:
     """What a topic that nothing here reads holds and what would help; empty where it is not known."""
+    if topic.kind == "PointCloud2":
+        return ""
+    if sensor in ("", "LiDAR") and (why := lacks(topic.type)):
+        return why
     return next((why for of, kind, why in _FOREIGN if sensor in ("", of) and kind.search(topic.type)), "")
 
 
@@ -193,6 +198,8 @@ def find_roles(
     notes = {t.name: f"not used: {foreign(t) or f'nothing here reads {t.type}'}" for t in topics}
     staged = {key: _stated(name, topics, key, STAGE_KINDS[key]) for key, name in stages.items()}
     obstacles = [topic for key, topic in staged.items() if key == "ground.method"]
+    for name in config.lidar_calibration:
+        _stated(name, topics, "source.lidar_calibration", "PointCloud2")
     lidars = _find_lidars([t for t in topics if t not in obstacles], config, notes)
     images = _find_images(topics, config, notes)
     names = _unique_names(
