@@ -263,6 +263,11 @@ class FusionConfig(Section):
     split: bool = Field(
         True, description="frustum: detections split and merge clusters; false: they name whole ones"
     )
+    masks: bool = Field(
+        True,
+        description="split: points in the mask instead of the whole 2D box, where the network gives masks",
+    )
+    mask_margin: Pixels = Field(2.0, ge=0, le=50, description="masks: what is so near counts, too")
     max_depth: Metres = Field(120.0, gt=0, description="frustum: farther clusters are out of range")
 
 

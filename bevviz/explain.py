@@ -109,6 +109,7 @@ def _detection(
     else:
         evidence = (
             f"{_points(pair.points)} of cluster {k} in its frustum at {pair.depth:.1f} m, IoU {pair.iou:.2f}"
+            + in_mask(fusion, d, config)
         )
     if decision is Decision.MATCHED:
         named = (fusion.cluster_decision == Decision.MATCHED) & (fusion.cluster_detection == d)
@@ -120,6 +121,17 @@ def _detection(
     if decision is Decision.TAKEN:
         return f"no match: {evidence}, taken by {_label(detections, int(fusion.cluster_detection[k]))}"
     return f"no match: {evidence}, {_rule(decision, d, fusion, detections, config)}"
+
+
+def in_mask(fusion: Fusion, d: int, config: Config) -> str:
+    """How many of the points in a detection's frustum its mask covers, to be added; empty without a mask."""
+    if fusion.detection_covered is None or (covered := int(fusion.detection_covered[d])) < 0:
+        return ""
+    points = f"{covered} of {_points(fusion.detection_points[d])} in the frustum"
+    least = max(config.fusion.min_points, config.clustering.min_cluster_points)
+    if covered < least:
+        return f", only {points} in the mask, which is left aside below {least}"
+    return f", {points} lie in the mask"
 
 
 def _unclustered(

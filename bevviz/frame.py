@@ -451,6 +451,43 @@ class DetectionState(IntEnum):
 
 
 @dataclass(frozen=True, slots=True)
+class Masks:
+    """Which pixels each detection's object covers, in the grid of the network's input, within its box."""
+
+    packed: U8  # bits, as of np.packbits: row by row of one detection's cells after the other's
+    place: I32  # (D, 4) first column, first row, columns, rows of each one's cells; 0 columns: it has none
+    grid: F32  # (4,) columns and rows for each pixel of the image, column and row of its upper left corner
+
+    def has(self, d: int) -> bool:
+        return bool(self.place[d, 2])
+
+    def cells(self, d: int) -> Bool:
+        """(rows, columns) those of a detection."""
+        sizes = self.place[:, 2].astype(np.int64) * self.place[:, 3]
+        start, size = int(sizes[:d].sum()), int(sizes[d])
+        bits = np.unpackbits(self.packed[start // 8 : -(-(start + size) // 8)])[start % 8 :][:size]
+        cells: Bool = bits.reshape(self.place[d, 3], self.place[d, 2]).astype(bool)
+        return cells
+
+    def cover(self, d: int, uv: F32, margin: float = 0.0) -> Bool:
+        """(N,) which of these pixels of the image a detection's object covers; NaN is none.
+
+        ``margin``: pixels to the left, right, above and below it that count, too.
+        """
+        column, row, columns, rows = self.place[d].tolist()
+        cells, covered = self.cells(d), np.zeros(len(uv), bool)
+        beside = [(0.0, 0.0), (margin, 0.0), (-margin, 0.0), (0.0, margin), (0.0, -margin)]
+        for shift in beside if margin else beside[:1]:
+            with np.errstate(invalid="ignore"):
+                moved = uv + np.array(shift, np.float32) + np.float32(0.5)
+                at = np.floor(moved * self.grid[:2] + self.grid[2:]) - (column, row)
+                there = ((at >= 0) & (at < (columns, rows))).all(axis=1)
+            i, j = at[there].astype(np.int64).T
+            covered[there] |= cells[j, i]
+        return covered
+
+
+@dataclass(frozen=True, slots=True)
 class Detections:
     """2D detections in pixels of the camera's image, best score first, however weak.
 
@@ -464,6 +501,7 @@ class Detections:
     state: I32  # (D,) DetectionState
     suppressed_by: I32  # (D,) row of the detection that suppressed it, else -1
     overlap: F32  # (D,) IoU with that one, else 0
+    masks: Masks | None = None  # of those that are kept, where the network gives some
 
     def __len__(self) -> int:
         return len(self.score)
@@ -579,6 +617,7 @@ class Fusion:
     pairs: Pairs
     cluster_uv: F32  # (K, 4) x0, y0, x1, y1 around the projected cluster, NaN where not in view
     claims: Claims | None = None  # None: clusters are matched as they are
+    detection_covered: I32 | None = None  # (D,) of detection_points those in the mask, -1: not by a mask
 
     def pair(self, detection: int, cluster: int) -> Pair | None:
         """The evidence of a detection and a cluster; None: the fusion did not look at them together."""

@@ -34,6 +34,7 @@ class Reference:
         with np.load(FOLDER / f"{name}.npz") as file:
             self.about: dict[str, Any] = json.loads(str(file["about"]))
             self.image, self.input, self.boxes = file["image"], file["input"], file["boxes"]
+            self.masks = file.get("masks", np.zeros((0, 0, 0), np.uint8))
             self.outputs = {k.removeprefix("output_"): file[k] for k in file if k.startswith("output_")}
 
     def detector(self, folder: Path, metadata: bool = True) -> Detector:
@@ -113,3 +114,27 @@ def test_oriented_boxes_are_refused(name: str, metadata: bool, tmp_path: Path) -
     said = "a model for the task 'obb': export one for detect" if metadata else "read as|no detector"
     with pytest.raises(UserError, match=said):
         Reference(name).detector(tmp_path, metadata)
+
+
+@pytest.mark.parametrize("name", [name for name in NAMES if "_masks" in name])
+def test_masks_are_those_of_the_exporter(name: str, tmp_path: Path) -> None:
+    reference = Reference(name)
+    found = reference.detector(tmp_path)(reference.image)
+    assert found.masks is not None
+    height, width = reference.about["inputs"][0][1][2:]
+    theirs = np.unpackbits(reference.masks, axis=-1)[..., :width].astype(bool)
+    kept = np.flatnonzero(found.kept)
+    covered = 0
+    for box, expected in zip(reference.boxes, theirs, strict=True):
+        ours_all = np.column_stack([found.xyxy[kept] + 0.5, 1e3 * found.score[kept], found.class_id[kept]])
+        away = np.abs(ours_all - box * [1, 1, 1, 1, 1e3, 1]).max(axis=1)
+        d = int(kept[away.argmin()])
+        if away.min() > 1e-3:  # what lies outside of the image
+            continue
+        column, row, columns, rows = found.masks.place[d]
+        ours = np.zeros((height, width), bool)
+        if found.masks.has(d):
+            ours[row : row + rows, column : column + columns] = found.masks.cells(d)
+        np.testing.assert_array_equal(ours, expected)
+        covered += int(expected.sum())
+    assert covered > 500

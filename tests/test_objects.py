@@ -174,8 +174,7 @@ def test_a_polygon_of_autoware_is_the_box_around_it(tmp_path: Path) -> None:
     np.testing.assert_allclose(found.boxes.center, [[10 + c, 2 + s, 0.5]], rtol=1e-6)
 
 
-def test_tracks_of_a_radar(tmp_path: Path) -> None:
-    m = made("radar_msgs", RADAR)
+def radar(m: bags.Messages) -> Any:
     none = np.zeros(6, np.float32)
     track = m.make(
         "radar_msgs/msg/RadarTrack",
@@ -188,8 +187,12 @@ def test_tracks_of_a_radar(tmp_path: Path) -> None:
         **{f"{name}_covariance": none for name in ("position", "velocity", "acceleration", "size")},
     )
     header = m.header(bags.START, bags.LIDAR_FRAME)
-    message = m.make("radar_msgs/msg/RadarTracks", header=header, tracks=[track])
-    found = boxes(bag(tmp_path, m, "radar_msgs/msg/RadarTracks", message))
+    return m.make("radar_msgs/msg/RadarTracks", header=header, tracks=[track])
+
+
+def test_tracks_of_a_radar(tmp_path: Path) -> None:
+    m = made("radar_msgs", RADAR)
+    found = boxes(bag(tmp_path, m, "radar_msgs/msg/RadarTracks", radar(m)))
     assert_is_box(found, yaw=0.0)
     assert found.labels == ("dynamic",)
 

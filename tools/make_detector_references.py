@@ -50,6 +50,7 @@ class Reference:
     input: Array  # of the network
     outputs: dict[str, Array]
     boxes: Array  # (N, 6) corners in pixels of the image, score, class
+    masks: Array | None = None  # (N, height, width) of the input, where they are kept
 
 
 def picture() -> NDArray[np.uint8]:
@@ -81,6 +82,8 @@ def save(name: str, exporter: str, model: Path, image: NDArray[np.uint8], refere
     }
     FOLDER.mkdir(exist_ok=True)
     arrays: dict[str, Any] = {f"output_{key}": value for key, value in reference.outputs.items()}
+    if reference.masks is not None:
+        arrays["masks"] = np.packbits(reference.masks.astype(bool), axis=-1)
     np.savez_compressed(
         FOLDER / f"{name}.npz",
         about=json.dumps(about),
@@ -146,8 +149,15 @@ def noise(count: int, seed: int) -> Tensor:
 
 
 def ultralytics(
-    name: str, plan: str, work: Path, classes: int = CLASSES, size: Sequence[int] = SIZE, **options: Any
+    name: str,
+    plan: str,
+    work: Path,
+    classes: int = CLASSES,
+    size: Sequence[int] = SIZE,
+    masks: bool = False,
+    **options: Any,
 ) -> None:
+    """``masks``: with the prototypes that they are made of, and what is made of them."""
     import ultralytics
     from ultralytics import RTDETR, YOLO
     from ultralytics.cfg import ROOT
@@ -199,20 +209,27 @@ def ultralytics(
         return outputs
 
     # Boxes whose mask is empty are dropped where masks are wanted; here they are not.
-    ops.process_mask = lambda _, weights, *__, **___: torch.ones(len(weights), 1, 1)
+    made: list[Array] = []
+    process_mask = ops.process_mask
+
+    def watched_masks(prototypes: Tensor, weights: Tensor, *args: Any, **options: Any) -> Tensor:
+        made.append(process_mask(prototypes, weights, *args, **options).numpy())
+        return torch.ones(len(weights), 1, 1)
+
+    ops.process_mask = watched_masks
     ONNXBackend.forward = watched
     score, iou = THRESHOLDS
     predictor = (RTDETR if is_detr else YOLO)(exported)
     result = predictor.predict(
         picture(), imgsz=list(size), conf=score, iou=iou, device="cpu", verbose=False, save=False
     )[0]
-    ONNXBackend.forward = forward
+    ONNXBackend.forward, ops.process_mask = forward, process_mask
     boxes = result.boxes.data if result.obb is None else result.obb.data[:, [0, 1, 2, 3, 5, 6]]
     blob, outputs = seen[-1]
     names = [o.name for o in ort.InferenceSession(exported).get_outputs()]
-    # Of prototypes of masks only the shape matters.
-    kept = {n: o if o.ndim == 3 else np.zeros_like(o) for n, o in zip(names, outputs, strict=True)}
-    reference = Reference(blob, kept, boxes.cpu().numpy())
+    # Of prototypes only the shape matters to the boxes.
+    kept = {n: o if masks or o.ndim == 3 else np.zeros_like(o) for n, o in zip(names, outputs, strict=True)}
+    reference = Reference(blob, kept, boxes.cpu().numpy(), made[-1] if masks else None)
     save(name, f"ultralytics {ultralytics.__version__}", exported, picture(), reference)
 
 
@@ -390,6 +407,13 @@ def main() -> None:
             name, plan, work, nms=True, max_det=60
         )
     makers |= {
+        "yolo11n-seg_masks": lambda name: ultralytics(name, "yolo11n-seg", work, masks=True),
+        "yolov8n-seg_masks_nms": lambda name: ultralytics(
+            name, "yolov8n-seg", work, masks=True, nms=True, max_det=60
+        ),
+        "yolo26n-seg_masks_e2e": lambda name: ultralytics(
+            name, "yolo26n-seg", work, masks=True, nms=False, max_det=60
+        ),
         "yolov8n_80": lambda name: ultralytics(name, "yolov8n", work, classes=80),
         "yolov8n_half": lambda name: ultralytics(name, "yolov8n", work, quantize=16),
         "yolo11n_dynamic": lambda name: ultralytics(name, "yolo11n", work, dynamic=True),

@@ -21,7 +21,7 @@ from rosbags.interfaces import (
 
 from bevviz.errors import UserError
 from bevviz.live.raw import BULKY, RawMessage, RawRecorder
-from bevviz.ros.encode import typestore
+from bevviz.ros.definitions import store_of
 from bevviz.ros.graph import PublishedTopic, matched_qos
 from bevviz.ros.node import Node
 from bevviz.ros.typesupport import message_type
@@ -127,8 +127,10 @@ class RawTopics:
 
 def connection_of(topic: PublishedTopic) -> Connection:
     """As rosbags describes a topic of a bag."""
-    store = typestore()
-    digest = store.hash_rihs01(topic.type) if topic.type in store.types else ""
+    try:
+        digest = store_of(topic.type).hash_rihs01(topic.type)
+    except UserError:
+        digest = ""
     extra = ConnectionExtRosbag2("cdr", [_qos(publisher.qos_profile) for publisher in topic.publishers])
     nothing = MessageDefinition(MessageDefinitionFormat.NONE, "")
     return Connection(0, topic.name, topic.type, nothing, digest, 0, extra, None)

@@ -19,11 +19,12 @@ from bevviz.live.rawtopics import RawTopics
 from bevviz.live.watch import SILENCE, Watch
 from bevviz.queues import NewestQueue
 from bevviz.ros import around
-from bevviz.ros.encode import typestore
+from bevviz.ros.definitions import store_of
 from bevviz.ros.graph import PublishedTopic, full_name, matched_qos, mismatches, published_topics
 from bevviz.ros.livox import is_livox, read_custom
 from bevviz.ros.messages import MessageError, read_header
 from bevviz.ros.node import Node
+from bevviz.ros.objects import holds_boxes
 from bevviz.ros.packets import is_packets, read_scan
 from bevviz.ros.roles import MARK, STAGE_KINDS, Roles, Topic, find_roles, foreign
 from bevviz.ros.typesupport import message_type
@@ -80,7 +81,7 @@ class LiveMessage:
                 return read_scan(
                     self.data, self.type, ros1=False, calibration=calibration.get(self.topic, "")
                 )
-            return typestore().deserialize_cdr(self.data, self.type)
+            return store_of(self.type).deserialize_cdr(self.data, self.type)
         except Exception as error:  # generated decoders raise whatever the bytes lead them to
             reason = str(error) or type(error).__name__
             raise MessageError(f"{self.topic}: not a {self.type}: {reason}") from None
@@ -222,11 +223,12 @@ class LiveSource(Closing):
     def _misstated(self) -> dict[str, str]:
         """Topics that the configuration states and that nobody publishes, or with another type."""
         found = {}
+        of_boxes = _resolved(self.config.source, self._node.resolve).boxes.get("topic")
         for name, (key, kinds) in _stated(self.config, self._node.resolve).items():
             topic = self.topics.get(name)
             if topic is None:
                 found[name] = f"nobody publishes {name}, which {key} states"
-            elif topic.type.rpartition("/")[2] not in kinds:
+            elif kinds and Topic(name, topic.type, boxes=name == of_boxes).kind not in kinds:
                 found[name] = f"{name} is a {topic.type}, but {key} takes {' or '.join(kinds)}"
         return found
 
@@ -365,7 +367,10 @@ class LiveSource(Closing):
         received = self.received
         known = {name: topic for name, topic in self._known.items() if received[name]}
         known.setdefault(self._mark.name, self._mark)
-        self._known = known | {name: topic for name, topic in self.topics.items() if _concerns(topic)}
+        of_boxes = _resolved(self.config.source, self._node.resolve).boxes.get("topic")
+        self._known = known | {
+            name: topic for name, topic in self.topics.items() if _concerns(topic) or name == of_boxes
+        }
         self._assign()
         if self._raw is not None:
             self._raw.look(self.topics, self._subscriptions.keys())
@@ -472,6 +477,8 @@ class LiveSource(Closing):
 
         try:
             kind = message_type(topic.type)
+            if not (is_livox(topic.type) or is_packets(topic.type)):
+                store_of(topic.type)
         except UserError as error:
             self._watch.note(f"{topic.name} type", f"{topic.name} is not received: {error}")
             return
@@ -518,12 +525,13 @@ def _concerns(topic: PublishedTopic) -> bool:
         topic.type in KINDS
         or is_livox(topic.type)
         or is_packets(topic.type)
+        or holds_boxes(topic.type)
         or bool(foreign(Topic(topic.name, topic.type, None, "")))
     )
 
 
 def _stated(config: Config, resolve: Callable[[str], str]) -> dict[str, tuple[str, tuple[str, ...]]]:
-    """The topics that the configuration names: where, and which types they may have."""
+    """The topics that the configuration names: where, and which types they may have; none: any."""
     source, images = _resolved(config.source, resolve), ("Image", "CompressedImage")
     found: dict[str, tuple[str, tuple[str, ...]]] = {}
     for key, names, kinds in (
@@ -532,6 +540,7 @@ def _stated(config: Config, resolve: Callable[[str], str]) -> dict[str, tuple[st
         ("source.camera_info_topics", source.camera_info_topics, images),
         ("source.camera_info_topics", source.camera_info_topics.values(), ("CameraInfo",)),
         ("source.odometry_topic", filter(None, [source.odometry_topic]), ("Odometry",)),
+        ("source.boxes", filter(None, [source.boxes.get("topic", "")]), ()),
     ):
         found |= dict.fromkeys(names, (key, kinds))
     stages = stage_topics(config)
@@ -540,13 +549,14 @@ def _stated(config: Config, resolve: Callable[[str], str]) -> dict[str, tuple[st
 
 def _resolved(config: SourceConfig, resolve: Callable[[str], str]) -> SourceConfig:
     """The configuration with the topics' names on the graph."""
-    infos = config.camera_info_topics
+    infos, boxes = config.camera_info_topics, config.boxes
     return config.model_copy(
         update={
             "lidar_topics": tuple(map(resolve, config.lidar_topics)),
             "camera_topics": tuple(map(resolve, config.camera_topics)),
             "camera_info_topics": {resolve(image): resolve(info) for image, info in infos.items()},
             "odometry_topic": config.odometry_topic and resolve(config.odometry_topic),
+            "boxes": {key: resolve(path) if key == "topic" else path for key, path in boxes.items()},
             "lidar_calibration": {resolve(name): file for name, file in config.lidar_calibration.items()},
         }
     )
@@ -564,6 +574,8 @@ def _without_absent(topics: list[Topic], config: SourceConfig) -> tuple[list[Top
     changes["camera_info_topics"] = {
         image: info for image, info in config.camera_info_topics.items() if {image, info} <= names
     }
+    if config.boxes.get("topic", "") not in names:
+        changes["boxes"] = {}
     changes["lidar_calibration"] = {
         name: file for name, file in config.lidar_calibration.items() if name in names
     }

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
 
+import cv2
 import numpy as np
 import rerun as rr
 
@@ -23,6 +24,7 @@ from bevviz.frame import (
     Frame,
     Image,
     Intrinsics,
+    Masks,
 )
 from bevviz.logging import entities, keep
 from bevviz.logging.annotations import FAINT, depth_annotations
@@ -165,6 +167,8 @@ def log_detections(to: Writer, result: CameraResult, explanations: Iterable[Expl
         colors = [class_color(detections.names[d]) for d in kept]
         to.put(entities.detections(name), _boxes(detections, kept, colors=colors))
         texts = {e.row: e.text for e in explanations if e.subject == "detection" and e.camera == name}
+        if detections.masks is not None:
+            _log_masks(to, name, detections, detections.masks, kept)
         xyxy = detections.xyxy[kept]
         labels = scored((detections.names[d] for d in kept), detections.score[kept])
         lost = np.zeros(len(kept), bool)
@@ -190,6 +194,22 @@ def _size(camera: Camera) -> F32:
     if camera.image is not None:
         return np.array(camera.image.bgr.shape[1::-1], np.float32)
     return np.full(2, np.inf, np.float32)
+
+
+def _log_masks(to: Writer, name: str, detections: Detections, masks: Masks, rows: I64) -> None:
+    """Their outlines."""
+    lines, colors = [], []
+    for d in rows.tolist():
+        if not masks.has(d):
+            continue
+        found, _ = cv2.findContours(masks.cells(d).astype(np.uint8), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_SIMPLE)
+        corner = masks.place[d, :2] + np.float32(0.5) - masks.grid[2:]
+        for outline in found:
+            closed = np.concatenate([outline[:, 0], outline[:1, 0]])
+            lines.append((closed + corner) / masks.grid[:2])
+            colors.append(class_color(detections.names[d]))
+    if lines:
+        to.put(entities.masks(name), rr.LineStrips2D(lines, colors=colors))
 
 
 def _boxes(detections: Detections, rows: I64, **looks: Any) -> rr.Boxes2D:

@@ -106,6 +106,10 @@ def image(camera: str) -> str:
     return f"{WORLD}/{camera}/image"
 
 
+def masks(camera: str) -> str:
+    return f"{WORLD}/{camera}/image/detections/masks"
+
+
 def detections(camera: str) -> str:
     return f"{WORLD}/{camera}/image/detections"
 

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from bevviz.frame import U8, Detections, FrameResult
+from bevviz.frame import U8, Detections, FrameResult, Masks
 
 Arrays = Mapping[str, NDArray[Any]]
 
@@ -113,6 +113,9 @@ def detections_of(stages: tuple[StageDigest, ...]) -> dict[tuple[str, int], Dete
         kind, _, camera = name.partition(" ")
         if kind == "detector" and values:
             boxes: dict[str, Any] = {**values, "names": tuple(values["names"].tolist())}
+            masks = {key.removeprefix("masks."): boxes.pop(key) for key in values if key.startswith("masks.")}
+            if masks:
+                boxes["masks"] = Masks(**masks)
             found[camera, int(arrays[f"image {camera}"]["stamp"][0])] = Detections(**boxes)
     return found
 
@@ -174,7 +177,7 @@ def _stage(name: str, arrays: Arrays) -> StageDigest:
         own = sha256(data).hexdigest()
         kind = "text" if array.dtype.kind == "U" else array.dtype.str
         content.update(f"{key} {kind} {array.shape} {own}\n".encode())
-        if array.size <= WHOLE:
+        if array.size <= WHOLE or key == "masks.packed":  # the network need not run again to check the rest
             whole[key] = array
         else:
             large[key] = LargeArray(own, str(len(array)), f"{np.sum(array, dtype=np.float64):.17g}")

@@ -1,29 +1,54 @@
-"""What a message type is made of, as a bag states it: rosbags' definitions, else the installed package's."""
+"""What a message type is made of: rosbags' definitions and those known here, else the installed package's."""
 
 from __future__ import annotations
 
 import os
 import sys
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 from rosbags.typesys import TypesysError, get_types_from_msg
 from rosbags.typesys.store import Typestore
 
+from bevviz.errors import UserError
 from bevviz.ros.encode import typestore
 
 
 def definition(name: str) -> str | None:
     """Of ``package/msg/Name`` and all that it contains (``ros2msg``); None: nobody knows it here."""
-    store = typestore()
     try:
-        if name not in store.types:
-            store = Typestore()
-            store.fielddefs.update(typestore().fielddefs)
-            store.register(_installed(name, {}))
-        return str(store.generate_msgdef(name, ros_version=2)[0])
-    except (OSError, UnicodeDecodeError, TypesysError, KeyError):
+        return str(store_of(name).generate_msgdef(name, ros_version=2)[0])
+    except (UserError, TypesysError, KeyError):
         return None
+
+
+@cache
+def store_of(name: str) -> Typestore:
+    """One that has ``package/msg/Name`` and all that it contains.
+
+    Raises:
+        UserError: it is neither among those known here nor in an installed package.
+    """
+    known = typestore()
+    if name in known.types:
+        return known
+    package = name.partition("/")[0]
+    try:
+        found = _installed(name, {})
+        store = Typestore()
+        store.fielddefs.update(known.fielddefs)
+        store.types.update(known.types)
+        store.register(found)
+    except FileNotFoundError as error:
+        place = Path(error.filename)
+        raise UserError(
+            f"{name} is not known without its package, and no {place.parent.parent.name}/msg/{place.name} is "
+            "in AMENT_PREFIX_PATH: source the workspace that has it"
+        ) from None
+    except (OSError, UnicodeDecodeError, TypesysError, KeyError, ValueError) as error:
+        raise UserError(f"the definition of {name} in {package} cannot be read: {error}") from None
+    return store
 
 
 def _installed(name: str, found: dict[str, Any]) -> dict[str, Any]:

@@ -15,7 +15,7 @@ from functools import cache
 from typing import Any
 
 from bevviz.errors import UserError
-from bevviz.ros.encode import typestore
+from bevviz.ros.definitions import store_of
 
 FAST_DDS = "rmw_fastrtps_cpp"
 _UNBOUNDED = b"\x00"
@@ -44,8 +44,7 @@ def _from_definition(name: str) -> Any:
     from std_msgs.msg import Empty
 
     package = name.partition("/")[0]
-    if name not in typestore().types:
-        raise UserError(f"{package} is not installed, and {name} is not known without it: install {package}")
+    store_of(name)
     if (middleware := get_rmw_implementation_identifier()) != FAST_DDS:
         raise UserError(
             f"{package} is not installed, and the middleware is {middleware}: install {package}, "
@@ -137,7 +136,7 @@ class _TypeSupport:
         fast = installed.func(base, b"rosidl_typesupport_fastrtps_c")
         introspection = installed.func(base, b"rosidl_typesupport_introspection_c")
 
-        version, digest = typestore().hash_rihs01(name).removeprefix("RIHS").split("_")
+        version, digest = store_of(name).hash_rihs01(name).removeprefix("RIHS").split("_")
         self._hash = _Hash(int(version), (ctypes.c_uint8 * 32)(*bytes.fromhex(digest)))
         text = name.encode()
         self._description = _TypeDescription(_Sequence(text, len(text), len(text) + 1))

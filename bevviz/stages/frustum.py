@@ -72,6 +72,9 @@ def claim(
     in the box of the class's size that is fitted (``boxfit.fit``) to the candidate: that joins what something
     in front has parted, and leaves out what stands too near.
 
+    Of a detection with a mask (``fusion.masks``) only what this covers is in the frustum; what is beside it
+    in the box is as if it were not there. Where too few points are in it, it is left aside.
+
     Noise can be taken, clusters outside the size limits cannot, nor is anything made that is smaller. A
     cluster that an earlier camera has shaped is not shaped again, but can be taken as it is.
 
@@ -255,6 +258,11 @@ class _View:
         # (D, 2) sigma of the left and right edge for each metre of distance
         self._edge = np.where(self._cut[:, [0, 2]], NO_EDGE, np.maximum(with_sigma, 1e-6)[:, None])
         self._boxes = detections.xyxy.astype(np.float64)
+        self._barred = {
+            d: barred
+            for d in np.flatnonzero(detections.kept).tolist()
+            if (barred := _beside_mask(uv, self._seen, detections, d, work.config, work.fewest)) is not None
+        }
         sizes = [work.sizes.get(name.lower()) for name in detections.names]
         self._size = np.array([size or (np.nan,) * 6 for size in sizes], np.float64).reshape(-1, 6)
 
@@ -265,7 +273,7 @@ class _View:
             self._work.points,
             self._place,
             self._uv,
-            self._seen,
+            self._allowed(d, self._seen),
             self.taker,
             self._boxes[d],
             config.max_gap,
@@ -280,6 +288,10 @@ class _View:
         )
         return _Candidate(rating, rows, depth)
 
+    def _allowed(self, d: int, rows: I64) -> I64:
+        """Without what is beside a detection's mask."""
+        return rows[~self._barred[d][rows]] if d in self._barred else rows
+
     def settled(self, d: int, candidate: _Candidate, grow: bool) -> tuple[I64, F64, Bool]:
         """The object's points, its box (centre, size, heading), and which of its sides were seen."""
         work, rows = self._work, candidate.rows
@@ -288,7 +300,7 @@ class _View:
         # Its clusters are its own beyond the image that cuts it off, and beside a box that is too tight.
         counts = np.bincount(work.clusters.labels[rows] + 1)
         own = [work.free_of(k) for k in np.flatnonzero(counts[1:] > KIN * len(rows)).tolist()]
-        kin = np.concatenate([*own, np.zeros(0, np.int64)])
+        kin = self._allowed(d, np.concatenate([*own, np.zeros(0, np.int64)]))
         cut = self._cut[d]
         if cut[0] or cut[2]:
             beyond = kin[np.isnan(self._uv[kin, 0])]
@@ -297,7 +309,15 @@ class _View:
             rows = np.concatenate([rows, beyond[np.hypot(away[:, 0], away[:, 1]) <= long]])
         flat, _ = self._fitted(d, rows, candidate.depth)
         inside = _inside(
-            work.points, self._uv, self._seen, kin, self.taker, work.owner, self._boxes[d], flat, cut.any()
+            work.points,
+            self._uv,
+            self._allowed(d, self._seen),
+            kin,
+            self.taker,
+            work.owner,
+            self._boxes[d],
+            flat,
+            cut.any(),
         )
         rows = inside if len(inside) >= work.fewest else candidate.rows
         flat, facing = self._fitted(d, rows, candidate.depth, about=flat[4])
@@ -332,6 +352,25 @@ class _View:
             high = max(high, low + self._size[d, 2] - self._size[d, 5])
         length, width, tall = (max(side, MIN_SIZE) for side in (length, width, high - low))
         return np.array([x, y, (low + high) / 2, length, width, tall, heading]), np.array(seen)
+
+
+def _beside_mask(
+    uv: F32, seen: I64, detections: Detections, d: int, config: FusionConfig, fewest: int
+) -> Bool | None:
+    """(P,) points in a detection's box beside its mask; None: it has none, or too few points are in it."""
+    masks = detections.masks
+    if masks is None or not config.masks or not masks.has(d):
+        return None
+    x0, y0, x1, y1 = detections.xyxy[d].tolist()
+    margin = MARGIN * (x1 - x0)
+    u, v = uv[seen].T
+    inside = seen[(u >= x0 - margin) & (u <= x1 + margin) & (v >= y0) & (v <= y1)]
+    covered = masks.cover(d, uv[inside], config.mask_margin)
+    if np.count_nonzero(covered) < fewest:
+        return None
+    barred = np.zeros(len(uv), np.bool_)
+    barred[inside] = ~covered
+    return barred
 
 
 @kernel

@@ -132,7 +132,19 @@ def fuse(
         pairs=pairs,
         cluster_uv=cluster_uv,
         claims=claims,
+        detection_covered=None if claims is None else _covered(uv, inside, detections, config),
     )
+
+
+def _covered(uv: F32, inside: list[I64], detections: Detections, config: FusionConfig) -> I32 | None:
+    """How many of the points in each box are in its mask, -1 without one; None: there are no masks."""
+    masks = detections.masks
+    if masks is None or not config.masks:
+        return None
+    counts = np.full(len(detections), -1, np.int32)
+    for d in np.flatnonzero(detections.kept & (masks.place[:, 2] > 0)).tolist():
+        counts[d] = np.count_nonzero(masks.cover(d, uv[inside[d]], config.mask_margin))
+    return counts
 
 
 def merge(clusters: Clusters, cameras: Sequence[CameraResult], config: ClusteringConfig) -> Objects:

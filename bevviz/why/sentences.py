@@ -7,6 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from bevviz.config import Config
+from bevviz.explain import in_mask
 from bevviz.frame import ClusterState, Decision, FrameResult
 from bevviz.why.evidence import Candidate, Evidence, fusion_of
 from bevviz.why.origin import StageOrigin
@@ -320,7 +321,8 @@ class Because:
             return "no point of it is in its frustum"
         if self.config.fusion.method == "centroid":
             return f"{pair.distance:.0f} px, {pair.depth:.1f} m"
-        return f"{count(pair.points, 'point')} in its frustum, IoU {pair.iou:.2f}"
+        in_frustum = f"{count(pair.points, 'point')} in its frustum, IoU {pair.iou:.2f}"
+        return in_frustum + in_mask(fusion, row, self.config)
 
     def _pair(self) -> str:
         return self._pair_text(self._best.row, self._best.camera, self._cluster)

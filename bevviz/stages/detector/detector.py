@@ -16,6 +16,7 @@ from bevviz.errors import UserError, first_line
 from bevviz.frame import I32, U8, Detections, DetectionState
 from bevviz.stages.detector.image import Placement
 from bevviz.stages.detector.layouts import Facts, find_head
+from bevviz.stages.detector.masks import masks as make_masks
 from bevviz.stages.detector.names import literal, metadata_names, read_names
 from bevviz.stages.detector.providers import open_session
 from bevviz.stages.detector.suppression import nms
@@ -134,7 +135,7 @@ class Detector:
     def infer(self, bgr: U8) -> Inference:
         """Run the network alone, on an image that is not empty."""
         blob, where = self.prepare(bgr)
-        return Inference(tuple(self._run(list(self._head.outputs), blob)), where)
+        return Inference(tuple(self._run(self._head.wanted, blob)), where)
 
     def interpret(self, found: Inference) -> Detections:
         """What the thresholds make of the network's output; ``__call__`` says what.
@@ -144,7 +145,7 @@ class Detector:
         """
         config, where = self._config, found.where
         try:
-            xyxy, score, class_id = self._head.candidates(
+            xyxy, score, class_id, table_row = self._head.candidates(
                 found.outputs, where.input_size, config.explain_threshold
             )
         except ValueError as error:
@@ -155,6 +156,7 @@ class Detector:
         order = np.flatnonzero(sound)
         order = order[np.argsort(-score[order], kind="stable")[:MAX_CANDIDATES]]
         xyxy, score, class_id = xyxy[order], score[order], class_id[order]
+        inner = xyxy
 
         offset = self.layout.class_offset
         if offset is None:
@@ -171,6 +173,11 @@ class Detector:
 
         row = _best(np.flatnonzero(seen), state, config.max_candidates)
         suppressor = np.where(suppressor[row] >= 0, np.searchsorted(row, suppressor[row]), -1)
+        masks = None
+        if self._head.prototypes:
+            kept = np.flatnonzero(state[row] == DetectionState.KEPT)
+            weights = self._head.coefficients(found.outputs, table_row[order[row[kept]]])
+            masks = make_masks(weights, found.outputs[-1][0], inner[row[kept]], kept, len(row), where)
         return Detections(
             xyxy=xyxy[row] - np.float32(0.5),  # networks count from the corner of the first pixel
             score=score[row],
@@ -179,6 +186,7 @@ class Detector:
             state=state[row].astype(np.int32),
             suppressed_by=suppressor.astype(np.int32),
             overlap=overlap[row],
+            masks=masks,
         )
 
     def _check_inputs(self, image: Any, others: list[Any]) -> None:

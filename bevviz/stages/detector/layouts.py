@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from bevviz.frame import I64
 from bevviz.stages.detector import outputs as read
 from bevviz.stages.detector.image import Feed, Fit, Resampling
 from bevviz.stages.detector.names import COCO, COCO_CATEGORIES, default_names
@@ -103,6 +104,12 @@ class Head:
     outputs: tuple[str, ...]
     classes: int | None
     names: tuple[str, ...]  # of the classes, empty where nobody tells
+    prototypes: str = ""  # output that masks are made of; empty: there are none
+
+    @property
+    def wanted(self) -> list[str]:
+        """Every output that is read."""
+        return [*self.outputs, *filter(None, [self.prototypes])]
 
     def split(self, outputs: Sequence[Any]) -> Scored | Listed:
         batch = self.layout.batch
@@ -112,20 +119,25 @@ class Head:
         """What a run found with a score of ``least`` or more.
 
         Args:
-            outputs: those that are named, of one image.
+            outputs: those that are wanted, of one image.
             size: height and width of the input.
             least: score.
 
         Raises:
             ValueError: the numbers cannot be what they are taken for.
         """
-        split = self.split(outputs)
+        split = self.split(outputs[: len(self.outputs)])
         found = read.candidates(split, self.layout.boxes, size, least)
         class_id = split.class_id[split.score >= least] if isinstance(split, Listed) else found.class_id
         wrong = read.wrong_list(found.score, class_id, self.names)
         if wrong:
             raise ValueError(f"read as {self.layout}, {wrong}")
         return found
+
+    def coefficients(self, outputs: Sequence[Any], rows: I64) -> Any:
+        """(K, C) weights of the prototypes in these rows: the last columns."""
+        table = outputs[0][0].T if self.layout.split is read.columns else outputs[0][0]
+        return table[rows, -outputs[-1].shape[1] :]
 
     def doubt(self, facts: Facts) -> str:
         """Why the outputs for an image that shows nothing cannot be what they are taken for, else empty."""
@@ -344,7 +356,8 @@ def find_head(facts: Facts) -> Head:
     for layout in LAYOUTS:
         found = layout.find(facts)
         if isinstance(found, Found):
-            head = Head(layout, found.outputs, found.classes, _names(layout, found, facts))
+            names = _names(layout, found, facts)
+            head = Head(layout, found.outputs, found.classes, names, _prototypes(layout, found, facts))
             doubt = _bytes(layout, facts) or head.doubt(facts)
             if not doubt:
                 return head
@@ -354,6 +367,18 @@ def find_head(facts: Facts) -> Head:
             break
     shapes = ", ".join(f"{name} {list(np.shape(output))}" for name, output in facts.outputs.items())
     raise ValueError(f"{reason}; its outputs: {shapes}; supported: {SUPPORTED}")
+
+
+def _prototypes(layout: Layout, found: Found, facts: Facts) -> str:
+    """The output that masks are made of, where the table has weights for it beyond all else; else empty."""
+    by_columns, listed = layout.split is read.columns, found.classes is None
+    if len(found.outputs) > 1 or found.outputs[0] not in facts.tables or not facts.masks:
+        return ""
+    table = facts.tables[found.outputs[0]]
+    known = 6 if listed else (4 if by_columns else 5) + (found.classes or 0)
+    if table.shape[0 if by_columns else 1] - known != facts.masks:
+        return ""
+    return next(name for name, o in facts.outputs.items() if o.ndim == 4 and o.shape[1] == facts.masks)
 
 
 def _names(layout: Layout, found: Found, facts: Facts) -> tuple[str, ...]:

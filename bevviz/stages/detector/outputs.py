@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from bevviz.frame import F32, I32
+from bevviz.frame import F32, I32, I64
 
 SLACK = 0.01  # by which half precision and quantisation may take a score above 1 ...
 NEGATIVE = -1e-3  # ... and below 0
@@ -47,6 +47,7 @@ class Candidates(NamedTuple):
     xyxy: F32  # (N, 4)
     score: F32  # (N,)
     class_id: I32  # (N,)
+    row: I64  # (N,) of the network's table
 
 
 # --- which columns -----------------------------------------------------------------------------
@@ -105,7 +106,7 @@ def candidates(found: Scored | Listed, boxes: Boxes, size: tuple[int, int], leas
     else:
         row, score, class_id = _best_classes(found, least)
     xyxy = _corners(boxes, found.boxes[row], row, len(found.boxes), size)
-    return Candidates(xyxy, score.astype(np.float32), class_id.astype(np.int32))
+    return Candidates(xyxy, score.astype(np.float32), class_id.astype(np.int32), row)
 
 
 def _best_classes(found: Scored, least: float) -> tuple[Any, Any, Any]:
