@@ -47,7 +47,8 @@ from bevviz.datasets.reader import DatasetReader
 from bevviz.errors import UserError, first_line
 from bevviz.files import Scratch, bag_files, drive_files
 from bevviz.frame import I64
-from bevviz.ros import foxglove, grid_map_msgs, ouster, video, vision_msgs
+from bevviz.ros import foxglove, grid_map_msgs, ouster, point_cloud_interfaces, video, vision_msgs
+from bevviz.ros.compressed import decompress, is_compressed
 from bevviz.ros.livox import fields_of, is_livox, read_custom
 from bevviz.ros.messages import MessageError, read_header
 from bevviz.ros.packets import is_packets, read_scan
@@ -404,6 +405,8 @@ class Recording(Closing):
                 found = store.deserialize_ros1(data, msgtype)
             else:
                 found = store.deserialize_cdr(data, msgtype)
+            if is_compressed(msgtype):
+                return decompress(found)
             return foxglove.as_ros(found, msgtype) if foxglove.short_of(msgtype) else found
         except KeyError:
             raise MessageError(
@@ -457,6 +460,7 @@ class Recording(Closing):
                 vision_msgs.register(store)
                 grid_map_msgs.register(store)
                 video.register(store)
+                point_cloud_interfaces.register(store)
             self._stores[key] = store
         return self._stores[key]
 

@@ -16,6 +16,7 @@ from bevviz.errors import UserError
 from bevviz.frame import Scene
 from bevviz.logging.entities import RESERVED
 from bevviz.ros import ouster
+from bevviz.ros.compressed import is_compressed
 from bevviz.ros.foxglove import KINDS, short_of
 from bevviz.ros.livox import is_livox
 from bevviz.ros.objects import check, holds_boxes
@@ -40,7 +41,7 @@ class Topic:
     @property
     def kind(self) -> str:
         """What it is read as: the type without its package, but for types that stand for others."""
-        if self.scans or is_livox(self.type) or is_packets(self.type):
+        if self.scans or is_livox(self.type) or is_packets(self.type) or is_compressed(self.type):
             return "PointCloud2"
         if short := short_of(self.type):
             return KINDS[short]
