@@ -23,8 +23,8 @@ from bevviz.ros.point_cloud_interfaces import COMPRESSED
 from tests import bags
 
 # Twelve points, (4 + i, i % 4 - 1.5, -1.5 + i / 16), intensity 10 i, ring i % 3, rgb 0x102030 + i, encoded by
-# Google's draco 1.5.5 with the calls of draco_point_cloud_transport, an attribute a field: as they are, and as
-# a k-d tree of 14 bits.
+# Google's draco 1.5.5 with the calls of draco_point_cloud_transport, an attribute a field: as they are, and
+# as a k-d tree of 14 bits.
 DRACO = (
     "RFJBQ08CAwAAAIAAAQtkZWR1cGxpY2F0ZQQBAAAAAAwAAAABBgAJAQAAAAkBAAEACQEAAgQJAQADBAQBAAQCAgQABQAAAAABAQAAgEAA"
     "AKBAAADAQAAA4EAAAABBAAAQQQAAIEEAADBBAABAQQAAUEEAAGBBAABwQQAAwL8AAAC/AAAAPwAAwD8AAMC/AAAAvwAAAD8AAMA/AADA"
