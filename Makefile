@@ -9,7 +9,7 @@ demo: $(VENV)/.installed
 	$(BIN)/bevviz demo
 
 test: $(VENV)/.tested
-	$(BIN)/python -m pytest -n 2 --dist loadfile --max-worker-restart 0
+	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder --max-worker-restart 0
 
 # The parts that are not ours to choose: data classes, pydantic, compiled kernels, ONNX, readers, the command line.
 FAST = config perceive run exchanged_stages clustering ground fusion tracking messages drive info

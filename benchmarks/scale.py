@@ -21,13 +21,12 @@ from tqdm import tqdm
 from benchmarks import bags
 from benchmarks.measure import machine, run
 from bevviz.bags.source import BagSource
-from bevviz.batch.task import JobResults
 from bevviz.config import load
 from bevviz.drive import Drive
+from bevviz.engine.task import JobResults, Task
 from bevviz.logging.recorder import OrderedRecorder
 from bevviz.logging.sinks import open_recording
 from bevviz.parallel.run import run_windows
-from bevviz.parallel.work import WindowJob
 
 
 def main() -> None:
@@ -77,16 +76,7 @@ def _measured(bag: Path, folder: Path, cores: int, repetitions: int) -> list[str
 
 def _fitted(bag: Path, folder: Path, scans: int) -> list[str]:
     """Processor time of a frame, by who spends it, and what follows from that."""
-    windows = 0.0
-
-    def here(jobs: Iterable[WindowJob], on_frame: Callable[[], None], tick: Callable[[], None]) -> JobResults:
-        nonlocal windows
-        for job in list(jobs):  # cut before: it has threads of its own
-            start = time.process_time()
-            result = job.run(1, on_frame)
-            windows += time.process_time() - start
-            yield result
-
+    engine = _Here()
     config = load(None, ["detector.model=demo"])
     with Drive(BagSource([bag], config), config) as warm:
         next(iter(warm))
@@ -94,9 +84,9 @@ def _fitted(bag: Path, folder: Path, scans: int) -> list[str]:
         start = time.process_time()
         with open_recording(drive.scene, config, save=folder / "fitted.rrd", in_parts=True) as sinks:
             seen = [OrderedRecorder(sinks.recording, config)]
-            run_windows(drive, drive.new_session(), sinks, seen, 2, here)
+            run_windows(drive, drive.new_session(), sinks, seen, engine)
         total = time.process_time() - start
-    serial = total - windows
+    serial = total - engine.seconds
     share = serial / total
     reach = ", ".join(f"{n}: {1 / (share + (1 - share) / n):.1f} x" for n in (2, 4, 8, 16))
     return [
@@ -104,6 +94,30 @@ def _fitted(bag: Path, folder: Path, scans: int) -> list[str]:
         f"of which in order {1e3 * serial / scans:.1f} ms ({100 * share:.0f} %)",
         f"speed-up that this allows, by processes: {reach}",
     ]
+
+
+class _Here:
+    """Runs windows in this process, and counts what they take of its time."""
+
+    count = 2
+
+    def __init__(self) -> None:
+        self.seconds = 0.0
+
+    def close(self) -> None: ...
+
+    def run(
+        self,
+        jobs: Iterable[Task],
+        retries: int,
+        on_frame: Callable[[], None],
+        tick: Callable[[], None] = lambda: None,
+    ) -> JobResults:
+        for job in list(jobs):  # cut before: it has threads of its own
+            start = time.process_time()
+            result = job.run(1, on_frame)
+            self.seconds += time.process_time() - start
+            yield result
 
 
 def _processor(who: int) -> float:

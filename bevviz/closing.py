@@ -1,8 +1,11 @@
-"""One way to be a context manager for what has nothing more to do at its end than to be closed."""
+"""Context managers: of what has nothing more to do at its end than to be closed, and of a start."""
 
 from __future__ import annotations
 
+import gc
 from abc import ABC, abstractmethod
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Self
 
 
@@ -17,3 +20,15 @@ class Closing(ABC):
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+
+@contextmanager
+def without_collections() -> Iterator[None]:
+    """Within, nobody looks for cycles, but a run: imports make many objects and none to be found."""
+    enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if enabled:
+            gc.enable()

@@ -32,7 +32,7 @@ from pydantic_core import PydanticCustomError
 
 from bevviz import plugins
 from bevviz.errors import UserError
-from bevviz.frame import AnomalyKind
+from bevviz.frame import AnomalyKind, Quantity
 from bevviz.plugins import TOPIC
 
 Preset = Literal["default", "reference"]
@@ -397,6 +397,11 @@ class LoggingConfig(Section):
         "stream", description="video as it came, or each picture as JPEG, which takes no decoder in a viewer"
     )
     raw_cloud: bool = Field(True, description="log every raw point")
+    color_by: tuple[Quantity, ...] = Field(
+        get_args(Quantity),
+        description="with every raw point, so that the 3D view has a tab for each: "
+        + ", ".join(get_args(Quantity)),
+    )
     projected_points: bool = Field(True, description="log obstacle points over the image, coloured by depth")
 
 

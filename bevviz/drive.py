@@ -330,11 +330,11 @@ class Drive(Closing):
             processes = None
             session = self.new_session()
             if jobs > 1:
-                from bevviz.batch.local import Processes
-                from bevviz.parallel.drive import here, obstacle
+                from bevviz.engine.local import Processes
+                from bevviz.parallel.drive import obstacle
                 from bevviz.parallel.run import run_windows
 
-                if reason := obstacle(self, session):
+                if reason := obstacle(self.frames, session.stages):
                     raise UserError(f"jobs={jobs}: {reason}")
                 processes = stack.enter_context(Processes(jobs, ["bevviz.parallel.work"]))
             sinks = stack.enter_context(
@@ -345,7 +345,7 @@ class Drive(Closing):
                     OrderedRecorder(sinks.recording, self.config, session.stages.provider),
                     DiskWatch(sinks),
                 ]
-                end = run_windows(self, session, sinks, ordered, jobs, here(processes))
+                end = run_windows(self, session, sinks, ordered, processes)
             else:
                 end = self.run(
                     [

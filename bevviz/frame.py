@@ -53,6 +53,10 @@ def data_frame(columns: Mapping[str, Any] | Sequence[Mapping[str, Any]]) -> Data
 # --- input -------------------------------------------------------------------------------------
 
 
+RING_FIELDS = ("ring", "line", "channel")
+Quantity = Literal["height", "intensity", "ring", "time", "distance"]  # of a point
+
+
 @dataclass(frozen=True, slots=True)
 class Cloud:
     """One LiDAR scan as received: returns with finite coordinates; ``dropped`` counts the others."""
@@ -365,6 +369,7 @@ class Scene:
     focus: tuple[float, float, float] | None = None  # what is asked about, in metres of Frame.points_frame
     above: tuple[float, float, float, float] | None = None  # u, v, u, v: where a look from above begins
     raw: bool = True  # every raw cloud is logged
+    color_by: tuple[Quantity, ...] = ()  # that it can be coloured by
 
 
 class Source(Protocol):

@@ -66,7 +66,7 @@ def _import(path: Path, application_id: str, recording_id: str | None) -> None:
         hint(drive.scene, config)
         recording = rr.RecordingStream(application_id or "bevviz", recording_id=recording_id)
         recording.set_log_time_enabled(False)
-        recording.stdout(default_blueprint=blueprints.load("debug", drive.scene))
+        recording.stdout(default_blueprint=blueprints.load("debug", drive.scene, config))
         origin = Origin.of(drive.scene, config, None)
         if origin is not None:
             origin.log(recording)

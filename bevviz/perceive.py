@@ -303,15 +303,15 @@ def perceive(
     )
 
 
-def describe(result: FrameResult) -> FrameResult:
-    """The result with what makes it understood: the bird's-eye view and the explanations."""
+def describe(result: FrameResult, *, seen: bool = True) -> FrameResult:
+    """The result with what makes it understood: the bird's-eye view, where it is to be seen, and the
+    explanations."""
     config, frame, log = result.config, result.frame, StageLog()
     start = clock()
-    raw_ground = None
-    if result.voxels is not None and result.ground is not None:
+    raw_ground = image = None
+    if seen and result.voxels is not None and result.ground is not None:
         raw_ground = log.run("bev", of_points, result.ground.mask, result.voxels.inverse)
-    image = None
-    if frame.lidar:
+    if seen and frame.lidar:
         image = log.run(
             "bev",
             bev,

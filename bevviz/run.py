@@ -365,11 +365,14 @@ def few_collections() -> Iterator[None]:
 
     What is there by now, mostly what was imported, is not looked through again and again.
     """
-    before = gc.get_threshold()
+    before, enabled = gc.get_threshold(), gc.isenabled()
     gc.freeze()
     gc.set_threshold(50_000, 10, 10)
+    gc.enable()
     try:
         yield
     finally:
         gc.set_threshold(*before)
         gc.unfreeze()
+        if not enabled:
+            gc.disable()

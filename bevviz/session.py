@@ -71,6 +71,10 @@ class Session:
         config, stages = self._in_force
         return describe(perceive(frame, config, stages, self._memo))
 
+    def explained(self, frame: Frame) -> FrameResult:
+        """What is asked about the next frame needs: everything but its bird's-eye view and its anomalies."""
+        return describe(self.perceive(frame), seen=False)
+
     def perceive(self, frame: Frame, network: Executor | None = None) -> FrameResult:
         """What the stages make of the next frame, with its tracks."""
         config, stages = self._in_force

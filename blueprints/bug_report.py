@@ -15,7 +15,7 @@ def blueprint(scene: Scene) -> rrb.Blueprint:
             rrb.Vertical(
                 views.explain(), rrb.Tabs(views.log(), views.anomaly_log(), views.config()), row_shares=[3, 1]
             ),
-            rrb.Vertical(views.space(scene), views.over_time(), row_shares=[3, 1]),
+            rrb.Vertical(views.spaces(scene), views.over_time(), row_shares=[3, 1]),
             rrb.Vertical(*side, views.birds_eye(scene), row_shares=[*[2] * len(side), 3]),
             column_shares=[3, 5, 4],
         ),

@@ -13,7 +13,7 @@ def blueprint(scene: Scene) -> rrb.Blueprint:
     return rrb.Blueprint(
         rrb.Vertical(
             rrb.Horizontal(
-                views.space(scene),
+                views.spaces(scene),
                 rrb.Vertical(*side, views.birds_eye(scene), row_shares=[*[2] * len(side), 3]),
                 rrb.Tabs(views.explain(), views.log(), views.anomaly_log(), views.config(), name="Decisions"),
                 column_shares=[5, 4, 3],

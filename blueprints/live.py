@@ -13,7 +13,7 @@ def blueprint(scene: Scene) -> rrb.Blueprint:
     side: list[rrb.Container | rrb.View] = [views.cameras(scene)] if scene.cameras else []
     return rrb.Blueprint(
         rrb.Horizontal(
-            views.space(scene, raw=False),
+            views.spaces(scene, raw=False),
             rrb.Vertical(
                 *side,
                 rrb.Tabs(views.birds_eye(scene), views.robots_birds_eye())

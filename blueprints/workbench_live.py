@@ -13,7 +13,7 @@ def blueprint(scene: Scene) -> rrb.Blueprint:
     beside = (f"{entities.ROBOT}/**", f"{entities.WHY}/**")
     return rrb.Blueprint(
         rrb.Horizontal(
-            views.space(scene, frustums=False, beside=beside),
+            views.spaces(scene, frustums=False, beside=beside),
             rrb.Vertical(*side, views.birds_eye(scene), row_shares=[*[3] * len(side), 2]),
             column_shares=[4, 4],
         ),

@@ -21,9 +21,14 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
 # They run a robot, a viewer or a browser beside the clock on the wall.
 REAL_TIME = ("test_live", "test_workbench", "test_robot_examples", "test_control")
 
+# The longest files, so that no worker is left alone with one at the end; a browser not beside a robot.
+FIRST = ("test_workbench", "test_calib", "test_damage", "test_torture", "test_live_ros", "test_live")
+
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """What fails for the lack of a quiet machine is run once more, and told as a rerun."""
+    """The longest first. What fails for the lack of a quiet machine is run once more, and told as a rerun."""
+    rank = {f"{name}.py": place for place, name in enumerate(FIRST)}
+    items.sort(key=lambda item: rank.get(item.path.name, len(rank)))
     for item in items:
         if item.path.name.startswith(REAL_TIME):
             item.add_marker(pytest.mark.flaky(reruns=1))

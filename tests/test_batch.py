@@ -39,6 +39,7 @@ from tests.recordings import Recording, verify
 
 GOOD = ("kitti", "one-drive", "two_b_-drive")
 SCANS = 8
+WINDOWS = ".bevviz-windows-*/*-*-*.rrd"  # of a bag that is cut, as they are made
 WEAK = "detector.conf_threshold=0.05"  # so that KITTI has persons that match nothing
 
 
@@ -49,7 +50,7 @@ class Batch:
     root: Path
     status: int
     said: str
-    killed: list[int]
+    killed: list[Path]
 
     @property
     def folder(self) -> Path:
@@ -61,17 +62,17 @@ class Batch:
 
 
 @contextmanager
-def killing(folder: Path, name: str) -> Iterator[list[int]]:
-    """Kill the first process that works on the bag of this name, when it has got under way."""
-    killed: list[int] = []
+def killing(folder: Path, pattern: str) -> Iterator[list[Path]]:
+    """Kill the first process that writes such a recording, when it has got under way. Yields which it was."""
+    killed: list[Path] = []
     stopped = Event()
 
     def work() -> None:
         while not stopped.wait(0.005):
-            for path in (folder / PARTIAL).glob(f"{name}-*.rrd"):
+            for path in (folder / PARTIAL).glob(pattern):
                 if not killed and path.stat().st_size:
-                    killed.append(int(path.stem.split("-")[-2]))
-                    os.kill(killed[0], signal.SIGKILL)
+                    killed.append(path)
+                    os.kill(int(path.stem.split("-")[-2]), signal.SIGKILL)
 
     thread = Thread(target=work)
     thread.start()
@@ -102,7 +103,7 @@ def batch(shared: Path, model: str, tmp_path_factory: pytest.TempPathFactory) ->
     write_bags(root / "bags", shared)
     done = Batch(root, 0, "", [])
     said = StringIO()
-    with redirect_stderr(said), killing(done.folder, "one-drive") as done.killed:
+    with redirect_stderr(said), killing(done.folder, "one-drive-*.rrd") as done.killed:
         done.status = main([*done.arguments, "--jobs", "2", "--model", model, "--set", WEAK])
     done.said = said.getvalue()
     return done
@@ -202,17 +203,20 @@ def test_a_dask_worker_that_dies_loses_no_bag_and_does_none_twice(
     (tmp_path / "bags/bad.db3").write_text("not a bag")
     folder = tmp_path / "runs"
     written: dict[str, set[tuple[int, int]]] = {}  # each version of each table that was ever there
+    begun: dict[str, set[Path]] = {}  # by window of the long bag
 
     def watch() -> None:
         while not ended.wait(0.002):
             for table in folder.glob("*.parquet"):
                 stat = table.stat()
                 written.setdefault(table.stem, set()).add((stat.st_ino, stat.st_mtime_ns))
+            for path in (folder / PARTIAL).glob(WINDOWS):
+                begun.setdefault(path.stem.split("-")[0], set()).add(path)
 
     ended = Event()
     watcher = Thread(target=watch)
     watcher.start()
-    with killing(folder, "b") as killed:
+    with killing(folder, WINDOWS) as killed:
         status = main(
             ["batch", str(tmp_path / "bags"), "-o", str(folder), "--dask", cluster.scheduler_address]
         )
@@ -220,7 +224,8 @@ def test_a_dask_worker_that_dies_loses_no_bag_and_does_none_twice(
     watcher.join()
     assert status == 1
     said = capsys.readouterr().err
-    assert killed
+    assert {number for number, by in begun.items() if len(by) > 1} <= {killed[0].stem.split("-")[0]}
+    assert len(begun) > 3
     assert "bevviz: bad: " in said and "5 bags complete, 1 failed" in said
     tables = {name: len(versions) for name, versions in written.items() if "summary" not in name}
     assert tables == dict.fromkeys(scans, 1)

@@ -66,7 +66,7 @@ def test_one_process_at_a_time() -> None:
 def test_two_runs_into_one_recording(tmp_path: Path, capsys: Capture) -> None:
     """The second ends at once, the first is what it would have been."""
     bags.write(Path("drive"), bags.small_items(scans=3))
-    command = [sys.executable, "-m", "bevviz.cli", "demo", "--frames", "30", "--save", "out.rrd"]
+    command = [sys.executable, "-m", "bevviz.cli", "demo", "--frames", "12", "--save", "out.rrd"]
     with subprocess.Popen(command, env=environment(), stderr=subprocess.DEVNULL) as first:
         try:
             deadline = time.monotonic() + 60
@@ -78,7 +78,7 @@ def test_two_runs_into_one_recording(tmp_path: Path, capsys: Capture) -> None:
         finally:
             first.kill()
     verify(tmp_path / "out.rrd")
-    assert len(Recording(tmp_path / "out.rrd").rows["/bev"]) == 30
+    assert len(Recording(tmp_path / "out.rrd").rows["/bev"]) == 12
 
 
 def test_a_link_and_what_is_no_file() -> None:

@@ -25,7 +25,7 @@ from bevviz.logging.video import GOP, VideoEncoder, decode
 from bevviz.parallel.run import run_windows
 from tests import bags
 from tests.recordings import Recording, verify
-from tests.test_parallel import plain, serially
+from tests.test_parallel import Serial, plain
 
 SETTINGS = ("clustering.eps=2 m", "clustering.min_points=2", "tracking.min_hits=1", "logging.raw_every=21")
 SCANS, DARK = 24, 12  # scans, and the one without an image
@@ -210,7 +210,7 @@ def test_windows_keep_what_one_process_keeps(bag: Path, read: dict[str, Recordin
         assert isinstance(drive.frames, BagSource)
         with open_recording(drive.scene, drive.config, save=path, in_parts=True) as sinks:
             seen = [OrderedRecorder(sinks.recording, drive.config)]
-            assert run_windows(drive, drive.new_session(), sinks, seen, 2, serially).frames == SCANS
+            assert run_windows(drive, drive.new_session(), sinks, seen, Serial()).frames == SCANS
     one, other = read["inspect"], Recording(path)
     assert one.times == other.times
     assert one.at.keys() == other.at.keys()

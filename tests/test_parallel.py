@@ -17,16 +17,15 @@ import pytest
 
 import bevviz
 from bevviz.bags.source import BagSource, FrameSelection
-from bevviz.batch.task import JobResults
 from bevviz.cli import main
 from bevviz.config import load
+from bevviz.engine.task import JobResults, Task
 from bevviz.errors import UserError
 from bevviz.logging import entities
 from bevviz.logging.parts import PartsWriter
 from bevviz.logging.recorder import OrderedRecorder
 from bevviz.logging.sinks import open_recording
 from bevviz.parallel.run import run_windows
-from bevviz.parallel.work import WindowJob
 from tests import bags
 from tests.recordings import Recording, verify
 
@@ -138,12 +137,22 @@ def plain(value: Any) -> Any:
     return "nan" if isinstance(value, float) and math.isnan(value) else value
 
 
-def serially(
-    jobs: Iterable[WindowJob], on_frame: Callable[[], None], tick: Callable[[], None] = lambda: None
-) -> JobResults:
+class Serial:
     """An engine without processes, for what does not depend on them."""
-    for job in jobs:
-        yield job.run(1, on_frame)
+
+    count = 2
+
+    def close(self) -> None: ...
+
+    def run(
+        self,
+        jobs: Iterable[Task],
+        retries: int,
+        on_frame: Callable[[], None],
+        tick: Callable[[], None] = lambda: None,
+    ) -> JobResults:
+        for job in jobs:
+            yield job.run(1, on_frame)
 
 
 @pytest.fixture(scope="module")
@@ -185,19 +194,24 @@ def test_an_interrupted_run_leaves_a_recording_of_whole_windows(tmp_path: Path, 
     with bevviz.open(bag, set=SETTINGS) as drive:
         assert isinstance(drive.frames, BagSource)
 
-        def until(
-            jobs: Iterable[WindowJob], on_frame: Callable[[], None], tick: Callable[[], None]
-        ) -> JobResults:
-            nonlocal made
-            for result in serially(jobs, on_frame):
-                yield result
-                made += 1
-                if made == 2:
-                    stop.set()
+        class Until(Serial):
+            def run(
+                self,
+                jobs: Iterable[Task],
+                retries: int,
+                on_frame: Callable[[], None],
+                tick: Callable[[], None] = lambda: None,
+            ) -> JobResults:
+                nonlocal made
+                for result in super().run(jobs, retries, on_frame):
+                    yield result
+                    made += 1
+                    if made == 2:
+                        stop.set()
 
         with open_recording(drive.scene, drive.config, save=saved, in_parts=True) as sinks:
             seen = [OrderedRecorder(sinks.recording, drive.config)]
-            end = run_windows(drive, drive.new_session(), sinks, seen, 2, until, stop)
+            end = run_windows(drive, drive.new_session(), sinks, seen, Until(), stop)
     assert end.frames == 9 + 8
     recording = Recording(saved)
     assert sorted(recording.times["stamp"]) == list(range(end.frames))

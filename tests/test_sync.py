@@ -658,12 +658,12 @@ def test_memory_is_bounded() -> None:
             feed.sync.add_cloud(cloud(t, "/back"))
         frames += sum(1 for _ in feed.sync.ready())
         most = max(most, *held())
-        most_images = max(most_images, len(feed.sync._images[LEFT.topic]))
+        most_images = max(most_images, len(feed.sync.cameras.images[LEFT.topic]))
     assert frames >= 9_990 and most <= 376  # 30 s of transforms, a quarter of slack
     assert most_images <= 4  # those within the tolerance of a cloud, and one older
     for i in range(10_000):  # now only the camera is alive
         feed.image(1000 + i * 0.03)
-    assert len(feed.sync._images[LEFT.topic]) < 100
+    assert len(feed.sync.cameras.images[LEFT.topic]) < 100
 
 
 def test_odometry_is_decoded_only_while_tf_says_nothing() -> None:

@@ -152,7 +152,7 @@ def test_all_else_follows(scan: Cloud) -> None:
     assert np.allclose(
         geometry.apply(frame.pose, frame.points), geometry.apply(odom_from_lidar, own.xyz), atol=1e-3
     )
-    pose = sync.pose(frame, frame.stamp)
+    pose = sync.placing.pose(frame, frame.stamp)
     assert pose is not None and np.allclose(pose, frame.pose)
 
 

@@ -40,6 +40,7 @@ from bevviz.bags.reader import (
     normalized,
 )
 from bevviz.bags.sqlite import SoundSqlite, SqliteRescuer
+from bevviz.bags.types import ReadTypes
 from bevviz.closing import Closing
 from bevviz.config import SourceConfig
 from bevviz.datasets import open_dataset
@@ -686,6 +687,6 @@ def _defined(connection: Connection) -> Typestore:
         types = {}
         for part in text.split("=" * 80 + "\n"):
             types.update(get_types_from_idl(part.partition("\n")[2] if part.startswith("IDL: ") else part))
-    store = get_typestore(Stores.EMPTY)
+    store = ReadTypes()
     store.register(types)
     return store

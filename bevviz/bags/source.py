@@ -147,7 +147,7 @@ class BagSource(Closing):
 
         None: no fixed frame above the points, or the transforms read so far do not reach the stamp.
         """
-        return self._state.sync.pose(frame, stamp) if self._state else None
+        return self._state.sync.placing.pose(frame, stamp) if self._state else None
 
     @cached_property
     def scans(self) -> I64:

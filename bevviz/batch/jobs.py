@@ -16,9 +16,9 @@ from typing import Any
 from bevviz.bags.recording import METADATA
 from bevviz.bags.source import FrameSelection
 from bevviz.batch.table import RunInfo, read_info
-from bevviz.batch.task import JobResult
 from bevviz.config import Config
 from bevviz.datasets import find_loader
+from bevviz.engine.task import JobResult
 from bevviz.errors import UserError
 from bevviz.files import bag_files, sampled_files
 from bevviz.provenance import dependencies_of, file_hash, model_path

@@ -5,15 +5,18 @@ from __future__ import annotations
 import heapq
 import os
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import AbstractContextManager
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 from uuid import uuid4
 
+from bevviz.bags.source import BagSource
 from bevviz.batch.jobs import PARTIAL, Job
 from bevviz.batch.table import RunInfo, judged, row, write
-from bevviz.batch.task import JobResult
+from bevviz.closing import Closing
+from bevviz.engine.task import JobResult
 from bevviz.errors import UserError
 from bevviz.evaluate.evaluation import Evaluation
 from bevviz.evaluate.log import EvaluationRecorder
@@ -21,7 +24,7 @@ from bevviz.evaluate.truth import truth_in
 from bevviz.files import unfinished
 from bevviz.frame import FrameResult
 from bevviz.logging.recorder import DiskWatch, Recorder
-from bevviz.logging.sinks import open_recording
+from bevviz.logging.sinks import Sinks, open_recording
 from bevviz.report.pictures import ahead, camera_picture, jpeg, shrink
 from bevviz.run import Observer
 from bevviz.run import run as run_frames
@@ -39,8 +42,6 @@ class WithdrawnError(Exception):
 def run(job: Job, threads: int, on_frame: Callable[[], None] = lambda: None) -> JobResult:
     """Run the pipeline over a bag. Recording and table get their names when both are complete.
 
-    The unfinished recording is the worker's licence to go on: whoever removes it ends the job.
-
     Args:
         job: what to do.
         threads: at most so many for the network, where the configuration does not say.
@@ -51,117 +52,181 @@ def run(job: Job, threads: int, on_frame: Callable[[], None] = lambda: None) -> 
     """
     if info := job.complete():  # by a worker that died before it could say so
         return JobResult(job.name, info.frames, info.seconds)
-    start = time.perf_counter()
-    recording = job.folder / PARTIAL / f"{job.name}-{os.getpid()}-{uuid4().hex[:8]}.rrd"
-    table = recording.with_suffix(".parquet")
     detector = job.config.detector
     detector = detector.model_copy(update={"threads": detector.threads or threads})
-    config = job.config.model_copy(update={"detector": detector})
-    selection, rows = job.selection, list[dict[str, Any]]()
-    try:
-        recording.parent.mkdir(parents=True, exist_ok=True)
-        with selection.source([job.bag], config) as source:
-            session = Session(config)
-            with open_recording(
-                source.scene,
-                config,
-                save=recording,
-                blueprint=job.blueprint,
-                recording_id=job.recording_id,
-                place=job.recording,
-            ) as sinks:
-                assert sinks.file is not None
-                evaluation = None
-                observers: list[Observer[FrameResult]] = [
-                    Recorder(sinks.recording, config, session.stages.provider)
-                ]
-                if job.truth is not None:
-                    evaluation = Evaluation(truth_in(source, job.truth or None))
-                    observers += [evaluation, EvaluationRecorder(sinks.recording, evaluation)]
-                table_rows = _Rows(job, sinks.file, on_frame, evaluation)
-                observers += [table_rows, DiskWatch(sinks)]
-                if run_frames(source, session, observers).interrupted:
-                    raise KeyboardInterrupt
-            rows = table_rows.rows
-            scene, warnings = replace(source.scene, bag=(), topics=()), tuple(source.warnings)
-        if not rows:
+    config = job.config.model_copy(update={"detector": detector})  # of the stages alone
+    with Output(job) as output:
+        try:
+            with job.selection.source([job.bag], job.config) as source:
+                session = Session(config)
+                with output.opened(source) as sinks:
+                    recorder = Recorder(sinks.recording, job.config, session.stages.provider)
+                    observers = output.observers(source, sinks, recorder, on_frame, pictures)
+                    if run_frames(source, session, observers).interrupted:
+                        raise KeyboardInterrupt
+                return output.complete(source)
+        except UserError as error:
+            return output.failed(error)
+
+
+class Output(Closing):
+    """What is made of a bag: unfinished, until it is complete. It is removed where it does not come to that.
+
+    The unfinished recording is a licence to go on: whoever removes it ends the job.
+    """
+
+    def __init__(self, job: Job) -> None:
+        self._job, self._start = job, time.perf_counter()
+        self._recording = job.folder / PARTIAL / f"{job.name}-{os.getpid()}-{uuid4().hex[:8]}.rrd"
+        self._table = self._recording.with_suffix(".parquet")
+        self._rows: _Rows | None = None
+        self._evaluation: Evaluation | None = None
+
+    def close(self) -> None:
+        for path in (self._recording, unfinished(self._recording), self._table):
+            path.unlink(missing_ok=True)
+
+    def opened(self, source: BagSource, *, in_parts: bool = False) -> AbstractContextManager[Sinks]:
+        """The recording."""
+        self._recording.parent.mkdir(parents=True, exist_ok=True)
+        return open_recording(
+            source.scene,
+            source.config,
+            save=self._recording,
+            blueprint=self._job.blueprint,
+            recording_id=self._job.recording_id,
+            place=self._job.recording,
+            in_parts=in_parts,
+        )
+
+    def observers(
+        self,
+        source: BagSource,
+        sinks: Sinks,
+        recorder: Recorder,
+        on_frame: Callable[[], None],
+        pictures: Pictures,
+    ) -> list[Observer[FrameResult]]:
+        """Of every frame, in order.
+
+        Args:
+            source: the bag.
+            sinks: the recording.
+            recorder: what writes to it.
+            on_frame: called after each frame.
+            pictures: of a frame.
+        """
+        observers: list[Observer[FrameResult]] = [recorder]
+        if self._job.truth is not None:
+            self._evaluation = Evaluation(truth_in(source, self._job.truth or None))
+            observers += [self._evaluation, EvaluationRecorder(sinks.recording, self._evaluation)]
+        assert sinks.file is not None
+        self._rows = _Rows(self._job, sinks.file, on_frame, self._evaluation, pictures)
+        return [*observers, self._rows, DiskWatch(sinks)]
+
+    @property
+    def frames(self) -> int:
+        return 0 if self._rows is None else len(self._rows.rows)
+
+    @property
+    def seconds(self) -> float:
+        return time.perf_counter() - self._start
+
+    def failed(self, error: UserError) -> JobResult:
+        return JobResult(self._job.name, self.frames, self.seconds, str(error))
+
+    def complete(self, source: BagSource) -> JobResult:
+        """When all frames were observed and the recording is closed.
+
+        Raises:
+            UserError: there was no frame.
+        """
+        job, warnings = self._job, tuple(source.warnings)
+        if self._rows is None or not self._rows.rows:
             raise UserError("; ".join([f"{job.bag.name}: no frame in it", *warnings]))
-        seconds = time.perf_counter() - start
         info = RunInfo(
             job.key,
             path_text(job.bag),
             job.recording_id,
-            len(rows),
-            seconds,
-            scene,
+            self.frames,
+            self.seconds,
+            replace(source.scene, bag=(), topics=()),
             warnings,
-            None if evaluation is None else evaluation.as_tree()["metrics"],
+            None if self._evaluation is None else self._evaluation.as_tree()["metrics"],
         )
-        write(table, rows, info)
+        write(self._table, self._rows.rows, info)
         job.table.unlink(missing_ok=True)  # of an older result: it must not vouch for the new recording
-        recording.replace(job.recording)
-        table.replace(job.table)
-    except UserError as error:
-        return JobResult(job.name, len(rows), time.perf_counter() - start, str(error))
-    finally:
-        for path in (recording, unfinished(recording), table):
-            path.unlink(missing_ok=True)
-    return JobResult(job.name, len(rows), seconds)
+        self._recording.replace(job.recording)
+        self._table.replace(job.table)
+        return JobResult(job.name, info.frames, info.seconds)
 
 
-class _Pictures:
-    """Of the worst frames so far, two each."""
+Pictures: TypeAlias = Callable[[FrameResult], Mapping[str, bytes]]
 
-    COUNT, WIDTH, ABOVE = 12, 240, 150  # frames, pixels of a camera's picture, of the bird's-eye view's
+WIDTH, ABOVE = 240, 150  # pixels of a camera's picture, of the bird's-eye view's
 
-    def __init__(self) -> None:
-        self._worst: list[tuple[float, int, dict[str, bytes]]] = []  # a heap: badness, row, pictures
+
+def pictures(result: FrameResult) -> Mapping[str, bytes]:
+    """Two JPEGs of a frame, by column of the table: the first camera's, and the bird's-eye view."""
+    found = {}
+    cameras = (camera_picture(camera, WIDTH) for camera in result.cameras)
+    if (picture := next((c for c in cameras if c is not None), None)) is not None:
+        found["picture"] = jpeg(picture)
+    if result.bev is not None:
+        found["above"] = jpeg(shrink(ahead(result.bev), ABOVE)[0])
+    return found
+
+
+class _Worst:
+    """Pictures of the worst frames so far."""
+
+    COUNT = 12
+
+    def __init__(self, pictures: Pictures) -> None:
+        self._pictures = pictures
+        self._worst: list[tuple[float, int, Mapping[str, bytes]]] = []  # a heap: badness, row, pictures
 
     def see(self, badness: float, row: int, result: FrameResult) -> None:
         place = (badness, -row)
         if len(self._worst) == self.COUNT and place <= self._worst[0][:2]:
             return
-        entry = (*place, self._of(result))
+        entry = (*place, self._pictures(result))
         if len(self._worst) == self.COUNT:
             heapq.heapreplace(self._worst, entry)
         else:
             heapq.heappush(self._worst, entry)
 
-    def __iter__(self) -> Iterator[tuple[int, dict[str, bytes]]]:
+    def __iter__(self) -> Iterator[tuple[int, Mapping[str, bytes]]]:
         return ((-row, pictures) for _, row, pictures in self._worst)
-
-    def _of(self, result: FrameResult) -> dict[str, bytes]:
-        found = {}
-        cameras = (camera_picture(camera, self.WIDTH) for camera in result.cameras)
-        if (picture := next((c for c in cameras if c is not None), None)) is not None:
-            found["picture"] = jpeg(picture)
-        if result.bev is not None:
-            found["above"] = jpeg(shrink(ahead(result.bev), self.ABOVE)[0])
-        return found
 
 
 class _Rows(Observer[FrameResult]):
     """A row of the table for each frame; ends the run where its recording was removed."""
 
     def __init__(
-        self, job: Job, recording: Path, on_frame: Callable[[], None], evaluation: Evaluation | None
+        self,
+        job: Job,
+        recording: Path,
+        on_frame: Callable[[], None],
+        evaluation: Evaluation | None,
+        pictures: Pictures,
     ) -> None:
         self.rows: list[dict[str, Any]] = []
         self._job, self._recording, self._on_frame = job, recording, on_frame
         self._evaluation = evaluation
-        self._pictures = _Pictures()
+        self._worst = _Worst(pictures)
 
     def see(self, result: FrameResult) -> None:
         found = row(result, result.config)
         if self._evaluation is not None and self._evaluation.last is not None:
             wrong = self._evaluation.now
             found = judged(found, wrong["missed"], wrong["false"])
-        self._pictures.see(found["badness"], len(self.rows), result)
+        self._worst.see(found["badness"], len(self.rows), result)
         self.rows.append({**found, "bag": path_text(self._job.bag), "recording": self._job.name})
         self._on_frame()
         if not self._recording.exists():
             raise WithdrawnError
 
     def end(self) -> None:
-        for place, pictures in self._pictures:
+        for place, pictures in self._worst:
             self.rows[place] |= pictures

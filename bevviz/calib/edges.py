@@ -18,9 +18,8 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from bevviz.frame import F32, F64, I64, U8, Bool, Cloud
+from bevviz.frame import F32, F64, I64, RING_FIELDS, U8, Bool, Cloud
 
-RING_FIELDS = ("ring", "line", "channel")
 ROW = np.radians(0.4)  # height of a row of beams where the cloud does not tell its rings
 JUMP = 0.12  # least share by which the inverse range falls at a border
 STEP = 0.4  # metres, least jump of the range

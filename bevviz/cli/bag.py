@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from contextlib import ExitStack
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from bevviz.cli.options import (
     Commands,
@@ -19,6 +20,10 @@ from bevviz.cli.options import (
 )
 from bevviz.cli.outputs import Outputs
 from bevviz.cli.run import process
+from bevviz.closing import without_collections
+
+if TYPE_CHECKING:
+    from bevviz.engine.task import Engine
 
 
 def add(commands: Commands) -> None:
@@ -47,17 +52,22 @@ def add(commands: Commands) -> None:
     bag.set_defaults(run=_bag)
 
 
+@without_collections()
 def _bag(options: argparse.Namespace) -> int:
     with ExitStack() as stack:
-        processes = None
-        if options.jobs > 1 and not options.dask:
-            from bevviz.batch.local import Processes
+        engine: Engine | None = None
+        if options.dask:
+            from bevviz.engine.dask import Cluster
+
+            engine = stack.enter_context(Cluster(options.dask))
+        elif options.jobs > 1:
+            from bevviz.engine.local import Processes
 
             # They start while this one does.
-            processes = stack.enter_context(Processes(options.jobs, ["bevviz.parallel.work"]))
+            engine = stack.enter_context(Processes(options.jobs, ["bevviz.parallel.work"]))
         from bevviz.drive import Drive
 
         config = load_config(options)
         source = stack.enter_context(open_bag(options, config))
         default = Path(options.paths[0].stem + ".rrd")
-        return process(Drive(source, config), Outputs.of(options), default, processes, options.dask)
+        return process(Drive(source, config), Outputs.of(options), default, engine)

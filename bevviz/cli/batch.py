@@ -30,7 +30,7 @@ from bevviz.errors import UserError
 if TYPE_CHECKING:
     from bevviz.batch.jobs import Job
     from bevviz.batch.table import RunInfo
-    from bevviz.batch.task import JobResults
+    from bevviz.engine.task import Engine, JobResults
     from bevviz.evaluate.gate import Limit
 
 
@@ -177,14 +177,30 @@ def _run(jobs: list[Job], options: argparse.Namespace, failed: list[tuple[str, s
 def _execute(
     todo: list[Job], options: argparse.Namespace, on_frame: Callable[[], None], tick: Callable[[], None]
 ) -> JobResults:
-    if options.dask:
-        from bevviz.batch.dask import run_dask
+    from bevviz.batch.batch import long_ones
 
-        return run_dask(todo, options.dask, options.retries, on_frame)
-    from bevviz.batch.local import Processes
+    if not todo:
+        return
+    with ExitStack() as stack:
+        engine: Engine
+        if options.dask:
+            from bevviz.engine.dask import Cluster
 
-    workers = options.jobs or max(1, (os.cpu_count() or 1) // 2)
-    return Processes(min(workers, len(todo))).run(todo, options.retries, on_frame, tick)
+            engine = stack.enter_context(Cluster(options.dask))
+            long = long_ones(todo, engine.count)
+        else:
+            from bevviz.engine.local import Processes
+
+            workers = options.jobs or max(1, (os.cpu_count() or 1) // 2)
+            long = long_ones(todo, workers)
+            engine = stack.enter_context(Processes(workers if long else min(workers, len(todo))))
+        if not long:
+            ends = engine.run(todo, options.retries, on_frame, tick)
+        else:
+            from bevviz.batch.windows import run_jobs
+
+            ends = run_jobs(todo, long, engine, options.retries, on_frame, tick)
+        yield from stack.enter_context(closing(ends))
 
 
 def _sum_up(

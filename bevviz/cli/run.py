@@ -13,9 +13,9 @@ from bevviz.cli.outputs import Outputs, hint, program, say, warn
 if TYPE_CHECKING:
     from rerun import RecordingStream
 
-    from bevviz.batch.local import Processes
     from bevviz.config import Config
     from bevviz.drive import Drive
+    from bevviz.engine.task import Engine
     from bevviz.frame import FrameResult
     from bevviz.logging.sinks import Sinks
     from bevviz.run import Items, Observer, Processor, RunEnd
@@ -34,26 +34,23 @@ def through(items: Items[T], processor: Processor[T, R], observers: Sequence[Obs
         return run(items, processor, [*observers, Progress()], stop=ended)
 
 
-def process(
-    drive: Drive, outputs: Outputs, default: Path, processes: Processes | None = None, dask: str = ""
-) -> int:
+def process(drive: Drive, outputs: Outputs, default: Path, engine: Engine | None = None) -> int:
     """Every stage on every frame, logged to every output that is asked for.
 
     Args:
         drive: the frames.
         outputs: where to.
         default: file where there is no display.
-        processes: that the drive is cut for.
-        dask: address of a cluster that it is cut for instead.
+        engine: what the drive is cut for.
     """
     from bevviz.anomalies import AnomalySummary, FailureSummary
     from bevviz.logging.recorder import OrderedRecorder, Recorder
 
     anomalies, failures = AnomalySummary(), FailureSummary()
     session = drive.new_session()
-    windows = (processes is not None or bool(dask)) and _can_be_cut(drive, session)
-    if processes is not None and not windows:
-        processes.close()
+    windows = engine is not None and _can_be_cut(drive, session)
+    if engine is not None and not windows:
+        engine.close()
 
     def observers(recording: RecordingStream) -> list[Observer[FrameResult]]:
         hint(drive.scene, drive.config)
@@ -65,14 +62,11 @@ def process(
         say(f"anomalies: {anomalies}")
 
     def in_windows(sinks: Sinks, seen: Sequence[Observer[FrameResult]]) -> RunEnd:
-        from bevviz.parallel.drive import cluster, here
         from bevviz.parallel.run import run_windows
 
-        engine, workers = cluster(dask), 1
-        if processes is not None:
-            engine, workers = here(processes), processes.count
+        assert engine is not None
         with terminable() as ended:
-            return run_windows(drive, session, sinks, seen, workers, engine, ended)
+            return run_windows(drive, session, sinks, seen, engine, ended)
 
     return logged(
         drive.frames,
@@ -89,7 +83,7 @@ def _can_be_cut(drive: Drive, session: Session) -> bool:
     """Whether a drive can be made in windows; where it cannot, it is said why."""
     from bevviz.parallel.drive import obstacle
 
-    reason = obstacle(drive, session)
+    reason = obstacle(drive.frames, session.stages)
     if reason:
         say(f"in one process: {reason}")
     return not reason

@@ -11,6 +11,7 @@ from bevviz import announce
 from bevviz.cli.machine import add_json, give, on_stdout
 from bevviz.cli.options import Commands, add_bag, add_config, add_output, load_config, positive
 from bevviz.cli.outputs import Outputs, say, warn
+from bevviz.closing import without_collections
 from bevviz.errors import UserError
 
 if TYPE_CHECKING:
@@ -106,6 +107,7 @@ def _number(text: str) -> int:
     return int(text)
 
 
+@without_collections()
 def _why(options: argparse.Namespace) -> int:
     from bevviz.bags.source import BagSource
     from bevviz.perceive import StageLoader
@@ -124,7 +126,8 @@ def _why(options: argparse.Namespace) -> int:
         if frame is None:
             asked = f"--at {options.at}" if number is None else f"--at-frame {number}"
             raise UserError(f"{asked}: the scan there cannot be read")
-        result = session.run(frame)
+        outputs = Outputs.of(options)
+        result = session.run(frame) if outputs else session.explained(frame)
         questioner = Questioner(result, loader, session.stages.class_names)
         answers = questioner.explain(selection, options.limit, _progress, everything=options.all)
         beside = _beside(questioner, selection, answers)
@@ -134,7 +137,7 @@ def _why(options: argparse.Namespace) -> int:
             print(printable(f"frame {frame.index}, preset {config.preset}: {in_short}"))
             if answers:
                 print(f"\n{plain(answers, options.limit, beside)}")
-        if outputs := Outputs.of(options):
+        if outputs:
             _show(result, answers, source.scene, outputs, options.limit)
     return 0
 

@@ -328,7 +328,7 @@ class LiveSource(Closing):
         if self._raw is not None:
             self._raw.put(self._known[topic], message.received, info, data)
         first = self._watch.add(topic, len(data))
-        before = self._sync.intrinsics.get(topic)
+        before = self._sync.cameras.intrinsics.get(topic)
         try:
             if first and kind.endswith(("PointCloud2", "Image")):
                 self.frame_ids[topic] = message.header()[1]
@@ -339,7 +339,7 @@ class LiveSource(Closing):
         except MessageError as error:
             self._watch.unusable(topic, str(error))
         if before is not None:
-            self._compare(topic, before, self._sync.intrinsics[topic])
+            self._compare(topic, before, self._sync.cameras.intrinsics[topic])
         if topic in self.roles.lidars:
             self._last_cloud = time.monotonic()
         self._deliver(self._sync.ready(message.received))

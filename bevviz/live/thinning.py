@@ -12,6 +12,7 @@ import rerun as rr
 
 from bevviz.config import Config
 from bevviz.frame import I64, Frame, LateResult, Mark, Scene, Source
+from bevviz.logging.color_by import ColoredPoints
 
 
 class Thinned:
@@ -116,7 +117,7 @@ def chosen(count: int, points: int, seed: int) -> I64:
 
 def is_cloud(logged: rr.AsComponents, points: int) -> bool:
     """Whether it has more points than that."""
-    return isinstance(logged, rr.Points3D | rr.Points2D) and _count(logged) > points
+    return isinstance(logged, rr.Points3D | rr.Points2D | ColoredPoints) and _count(logged) > points
 
 
 def thin_cloud(cloud: rr.AsComponents, points: int, seed: int) -> list[rr.DescribedComponentBatch]:

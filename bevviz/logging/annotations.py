@@ -21,9 +21,6 @@ def log_world(to: Writer) -> None:
 def class_annotations() -> rr.AnnotationContext:
     """Of points and boxes."""
     classes: list[tuple[int, str, tuple[int, ...]]] = [
-        (ClassId.UNCLASSIFIED, "", (130, 130, 140)),
-        (ClassId.GROUND, "ground", (92, 84, 76)),
-        (ClassId.OBSTACLE, "obstacle", (170, 175, 190)),
         (entities.DETECTION_CLASS[DetectionState.KEPT], "kept", (255, 255, 255)),
         (entities.DETECTION_CLASS[DetectionState.BELOW_THRESHOLD], "below threshold", FAINT),
         (entities.DETECTION_CLASS[DetectionState.SUPPRESSED], "suppressed", FAINT),
@@ -33,10 +30,20 @@ def class_annotations() -> rr.AnnotationContext:
     colors = palette(entities.TRACK_COLORS).tolist()
     return rr.AnnotationContext(
         [
-            *(rr.AnnotationInfo(id=i, label=label or None, color=color) for i, label, color in classes),
+            *point_classes(),
+            *(rr.AnnotationInfo(id=i, label=label, color=color) for i, label, color in classes),
             *(rr.AnnotationInfo(id=ClassId.TRACK + i, color=color) for i, color in enumerate(colors)),
         ]
     )
+
+
+def point_classes() -> list[rr.AnnotationInfo]:
+    """Of raw points and voxels."""
+    return [
+        rr.AnnotationInfo(id=ClassId.UNCLASSIFIED, color=(130, 130, 140)),
+        rr.AnnotationInfo(id=ClassId.GROUND, label="ground", color=(92, 84, 76)),
+        rr.AnnotationInfo(id=ClassId.OBSTACLE, label="obstacle", color=(170, 175, 190)),
+    ]
 
 
 def depth_annotations() -> rr.AnnotationContext:

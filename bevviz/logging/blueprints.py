@@ -37,14 +37,17 @@ def load(name_or_path: str, scene: Scene, config: Config | None = None) -> rrb.B
         name_or_path: one of ``names()``, a .py file with a function ``blueprint(scene)`` that returns an
             ``rrb.Blueprint``, or a .rbl file that was saved in the viewer.
         scene: names of the sensors.
-        config: of the run: which raw clouds there are, and where the look from above begins, which is where
-            objects can be expected; None: all of both.
+        config: of the run: which raw clouds there are, what they can be coloured by, and where the look from
+            above begins, which is where objects can be expected; None: raw clouds, without colours, from
+            all over.
 
     Raises:
         UserError: unknown name, no such file, or a file that makes no layout.
     """
     if config is not None:
-        scene = replace(scene, above=_ahead(config.bev), raw=is_whole(config))
+        whole, log = is_whole(config), config.logging
+        color_by = log.color_by if whole and log.raw_cloud else ()
+        scene = replace(scene, above=_ahead(config.bev), raw=whole, color_by=color_by)
     if name_or_path in names():
         if not scene.lidar and scene.cameras:
             name_or_path = "cameras"

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import TypeAlias
 
 import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
-from bevviz.frame import F32, Frame, FrameResult
-from bevviz.logging import entities, keep
+from bevviz.frame import F32, Frame, FrameResult, Quantity
+from bevviz.logging import color_by, entities, keep
 from bevviz.logging.entities import ClassId
 from bevviz.logging.pieces import rounded, transform
 from bevviz.logging.writer import Writer
@@ -21,16 +21,25 @@ RawCloud: TypeAlias = tuple[str, F32, NDArray[np.uint16]]  # entity, points, cla
 
 def log_cloud_looks(to: Writer, lidars: Iterable[str]) -> None:
     for lidar in lidars:
-        to.static(entities.points(lidar), rr.Points3D.from_fields(radii=rr.Radius.ui_points(1.0)))
+        radii = rr.Points3D.from_fields(radii=rr.Radius.ui_points(1.0))
+        to.static(entities.points(lidar), radii, color_by.annotation_context())
         for path in (entities.ground(lidar), entities.obstacles(lidar)):
             to.static(path, rr.Points3D.from_fields(radii=rr.Radius.ui_points(1.5)))
 
 
-def log_cloud(to: Writer, result: FrameResult) -> None:
-    """Every raw point, exact, of several LiDARs each in its own frame."""
-    log_cloud_poses(to, result.frame)
+def log_cloud(to: Writer, result: FrameResult, wanted: Sequence[Quantity]) -> None:
+    """Every raw point, exact, of several LiDARs each in its own frame, with what it can be coloured by."""
+    frame = result.frame
+    log_cloud_poses(to, frame)
+    heights = color_by.height_ids(result) if "height" in wanted else np.zeros(len(frame.points), np.uint8)
+    fields = {entities.points(cloud.name): cloud.fields for cloud in frame.clouds}
+    start = 0
     for path, points, class_ids in raw_clouds(result):
-        to.put(path, rr.Points3D(points, class_ids=class_ids))
+        end = start + len(points)
+        own = fields[path] if len(frame.clouds) > 1 else frame.fields
+        further = color_by.class_ids(wanted, points, heights[start:end], own)
+        to.put(path, color_by.ColoredPoints(rr.Points3D(points, class_ids=class_ids), further))
+        start = end
 
 
 def log_cloud_poses(to: Writer, frame: Frame) -> None:

@@ -242,7 +242,7 @@ class Logger(Writer):
         if self._inputs:
             self._log_input(result)
         elif cloud:
-            log_cloud(self, result)
+            log_cloud(self, result, self._config.logging.color_by)
         self._brought |= self._now - before
         self._log_lidar_results(result, colored)
         for camera in result.cameras:
@@ -298,7 +298,7 @@ class Logger(Writer):
         """What the sensors and the robot brought."""
         frame, config = result.frame, self._config
         if config.logging.raw_cloud and is_whole(config):
-            log_cloud(self, result)
+            log_cloud(self, result, config.logging.color_by)
         else:
             log_cloud_poses(self, frame)
         videos = None if is_whole(config) else self._videos

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import rerun.blueprint as rrb
 
-from bevviz.frame import Scene
-from bevviz.logging import entities
+from bevviz.frame import Quantity, Scene
+from bevviz.logging import color_by, entities
 
 _DARK = (13, 14, 18)
 HIDDEN = rrb.EntityBehavior(visible=False)
@@ -25,6 +26,7 @@ def space(
     name: str = "3D",
     root: str = "",
     beside: Sequence[str] = (f"{entities.ROBOT}/**",),
+    by: Quantity | None = None,
 ) -> rrb.Spatial3DView:
     """Points, boxes, frusta and poses around the robot, seen from behind and above it.
 
@@ -40,17 +42,23 @@ def space(
         name: of the view.
         root: entity that the run is logged under.
         beside: what else is shown.
+        by: what the raw points are coloured by, where they are; None: ground or obstacle.
     """
     hidden = [entities.set_aside(scene.lidar)]
     # The coloured points of the clusters and the raw cloud already show what is obstacle.
     hidden += [entities.ground(scene.lidar)] if scene.raw or why else []
     hidden += [entities.obstacles(scene.lidar)] if raw and scene.raw else []
-    hidden += [] if raw else [entities.points(lidar) for lidar in scene.lidars or (scene.lidar,)]
+    clouds = [entities.points(lidar) for lidar in scene.lidars or (scene.lidar,)]
+    hidden += [] if raw else clouds
     hidden += [entities.GRID, entities.UNSEEN]
     hidden += [] if frustums else [entities.FRUSTUMS]
     # The points of what is explained stand out by their colours, which tell another story than the clusters'.
     hidden += [entities.clusters(scene.lidar), entities.FRUSTUMS] if why else []
+    hidden += [entities.clusters(scene.lidar), entities.FRUSTUMS] if by is not None else []
     hidden += [entities.names(entities.FUSED)] if why or not names else []
+    overrides: dict[Any, Any] = dict.fromkeys((root + path for path in hidden), HIDDEN)
+    if by is not None:
+        overrides |= {root + path: color_by.visualizer(by) for path in clouds}
     position, target = (-16.0, 5.0, 11.0), (10.0, 0.0, -1.0)
     if why and scene.focus is not None:
         position, target = _beside(scene.focus), scene.focus
@@ -70,8 +78,17 @@ def space(
             look_target=target,
             eye_up=(0.0, 0.0, 1.0),
         ),
-        overrides=dict.fromkeys((root + path for path in hidden), HIDDEN),
+        overrides=overrides,
     )
+
+
+def spaces(scene: Scene, **looks: Any) -> rrb.Container | rrb.View:
+    """``space``, with a further tab for each quantity that the raw points can be coloured by."""
+    first = space(scene, **looks)
+    if not scene.color_by:
+        return first
+    tabs = [space(scene, **looks | {"raw": True, "name": by.capitalize(), "by": by}) for by in scene.color_by]
+    return rrb.Tabs(first, *tabs, name="3D")
 
 
 def _beside(place: tuple[float, float, float]) -> tuple[float, float, float]:

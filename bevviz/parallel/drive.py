@@ -5,7 +5,7 @@ from __future__ import annotations
 import shutil
 import tempfile
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from contextlib import closing
 from functools import partial
@@ -16,15 +16,14 @@ from typing import TypeVar
 from bevviz import remains
 from bevviz.bags.source import BagSource
 from bevviz.bags.state import Losses
-from bevviz.batch.local import Processes
-from bevviz.batch.task import JobResults
 from bevviz.closing import Closing
 from bevviz.config import Config
-from bevviz.drive import Drive
+from bevviz.engine.task import Engine, JobResult
 from bevviz.errors import UserError
 from bevviz.frame import FrameResult, Scene
 from bevviz.logging.sinks import Sinks
-from bevviz.parallel.work import WindowJob, results_in
+from bevviz.parallel.work import Batched, WindowJob, results_in
+from bevviz.perceive import Stages
 from bevviz.run import Items, Observer
 from bevviz.session import Session
 from bevviz.stages.foreign import Foreign
@@ -36,14 +35,12 @@ AHEAD = 2  # windows that are cut before a process is free
 RETRIES = 2  # of a window whose process died
 
 T = TypeVar("T")
-Engine = Callable[[Iterable[WindowJob], Callable[[], None], Callable[[], None]], JobResults]
 
 
-def obstacle(drive: Drive, session: Session) -> str:
+def obstacle(frames: object, stages: Stages) -> str:
     """Why a drive cannot be cut, in one sentence; empty where it can."""
-    if not isinstance(drive.frames, BagSource):
+    if not isinstance(frames, BagSource):
         return "only the frames of a bag can be cut into windows"
-    stages = session.stages
     given = [f for f in (stages.ground, stages.clustering, stages.objects, stages.network) if f is not None]
     for stage in given:
         if isinstance(stage, Foreign):
@@ -51,29 +48,16 @@ def obstacle(drive: Drive, session: Session) -> str:
     return ""
 
 
-def cluster(address: str) -> Engine:
-    """Workers of a Dask cluster, which see the bag and the recording's folder under the same paths."""
-    from bevviz.batch.dask import run_dask
-
-    return lambda jobs, on_frame, tick: run_dask(jobs, address, RETRIES, on_frame)
-
-
-def here(processes: Processes) -> Engine:
-    """Processes of this machine."""
-    return lambda jobs, on_frame, tick: processes.run(jobs, RETRIES, on_frame, tick)
-
-
 class Windows(Closing):
-    """The windows of a drive, in order, each when it and all before it are made. Items of a run.
+    """The windows of a drive: cut here, made elsewhere, and put in order here.
 
     Args:
         source: is read for it, without making frames.
         config: how they are made.
         recording_id: of the recording that they become part of.
         workers: windows that are made at the same time.
-        engine: what makes them.
-        on_frame: called for each frame that is made, in the order in which they are.
         place: folder for what is on its way.
+        batch: what is made of them beside, where the drive is one of many.
     """
 
     def __init__(
@@ -82,14 +66,13 @@ class Windows(Closing):
         config: Config,
         recording_id: str,
         workers: int,
-        engine: Engine,
-        on_frame: Callable[[], None] = lambda: None,
         place: Path | None = None,
+        batch: Batched | None = None,
     ) -> None:
         self._source, self._config, self._id = source, config, recording_id
-        self._engine, self._on_frame = engine, on_frame
-        self._workers = workers
-        self._stopped = Event()
+        self._workers, self._batch = workers, batch
+        self._waiting: deque[WindowJob] = deque()
+        self._made: set[str] = set()
         self._folder = Path(tempfile.mkdtemp(prefix=".bevviz-windows-", dir=place)).resolve()
         remains.remember(self, partial(shutil.rmtree, self._folder, ignore_errors=True))
 
@@ -110,43 +93,87 @@ class Windows(Closing):
     def warnings(self) -> Sequence[str]:
         return self._source.warnings
 
-    def stop(self) -> None:
-        """At once, but for the window at hand."""
-        self._stopped.set()
+    def add_losses(self, losses: Losses) -> None:
+        """What the frames of a window lacked, for the warnings."""
+        self._source.add_losses(losses)
 
     def _length(self, left: int) -> int:
         """Long windows first, short ones in the end, so that no process waits long for the last: guided
         self-scheduling (Polychronopoulos and Kuck 1987)."""
         return min(LENGTH, max(SHORTEST, -(-left // (SHARE * self._workers))))
 
-    def add_losses(self, losses: Losses) -> None:
-        """What the frames of a window lacked, for the warnings."""
-        self._source.add_losses(losses)
-
-    def __iter__(self) -> Iterator[WindowJob]:
-        """Whoever takes a window removes its files."""
-        made: dict[str, WindowJob] = {}
-        waiting: deque[WindowJob] = deque()
-
-        def jobs() -> Iterator[WindowJob]:
-            for window in ahead(self._source.windows(self._length), AHEAD):
-                paths = tuple(path.resolve() for path in self._source.recording.paths)
-                job = WindowJob(window, paths, self._config, self._source.selection, self._folder, self._id)
-                waiting.append(job)
+    def jobs(self) -> Generator[WindowJob, None, None]:
+        """What is to be made."""
+        paths = tuple(path.resolve() for path in self._source.recording.paths)
+        with closing(ahead(self._source.windows(self._length), AHEAD)) as windows:
+            for window in windows:
+                job = WindowJob(
+                    window, paths, self._config, self._source.selection, self._folder, self._id, self._batch
+                )
+                self._waiting.append(job)
                 yield job
 
+    def ended(self, end: JobResult) -> Iterator[WindowJob]:
+        """The windows that are in order now that one of them has ended. Whoever takes one removes its files.
+
+        Raises:
+            UserError: it could not be made.
+        """
+        if end.error:
+            raise UserError(f"{end.name}: {end.error}")
+        self._made.add(end.name)
+        while self._waiting and self._waiting[0].name in self._made:
+            job = self._waiting.popleft()
+            self._made.remove(job.name)
+            yield job
+
+    @property
+    def on_their_way(self) -> int:
+        """Windows that were given out and did not come back in order."""
+        return len(self._waiting)
+
+
+class MadeWindows:
+    """The windows of one drive, in order, each when it and all before it are made. Items of a run.
+
+    Args:
+        windows: of the drive.
+        engine: what makes them.
+        on_frame: called for each frame that is made, in the order in which they are.
+    """
+
+    def __init__(self, windows: Windows, engine: Engine, on_frame: Callable[[], None] = lambda: None) -> None:
+        self._windows, self._engine, self._on_frame = windows, engine, on_frame
+        self._stopped = Event()
+
+    @property
+    def scene(self) -> Scene:
+        return self._windows.scene
+
+    @property
+    def total(self) -> int:
+        return self._windows.total
+
+    @property
+    def warnings(self) -> Sequence[str]:
+        return self._windows.warnings
+
+    def stop(self) -> None:
+        """At once, but for the window at hand."""
+        self._stopped.set()
+
+    def __iter__(self) -> Iterator[WindowJob]:
         def tick() -> None:
             if self._stopped.is_set():
                 raise _StoppedError
 
         try:
-            with closing(self._engine(jobs(), self._on_frame, tick)) as ends:
+            with (
+                closing(self._windows.jobs()) as jobs,
+                closing(self._engine.run(jobs, RETRIES, self._on_frame, tick)) as ends,
+            ):
                 for end in ends:
-                    if end.error:
-                        raise UserError(f"{end.name}: {end.error}")
-                    made |= {job.name: job for job in waiting if job.name == end.name}
-                    while waiting and waiting[0].name in made:
-                        yield made.pop(waiting.popleft().name)
+                    yield from self._windows.ended(end)
         except _StoppedError:
             return
 
@@ -169,6 +196,9 @@ class InOrder(Observer[WindowJob]):
         session: remembers the drive.
         sinks: where the part of the recording goes that each window has made.
         observers: of the results, which lack what only their frame needs: the points' fields, images, voxels.
+
+    Attributes:
+        extras: what a batch has of the frame that the observers see.
     """
 
     def __init__(
@@ -179,6 +209,7 @@ class InOrder(Observer[WindowJob]):
         observers: Sequence[Observer[FrameResult]],
     ) -> None:
         self.frames = 0
+        self.extras: Mapping[str, bytes] = {}
         self._windows, self._session, self._sinks, self._observers = windows, session, sinks, observers
         self._begun: list[Observer[FrameResult]] = []
 
@@ -193,7 +224,8 @@ class InOrder(Observer[WindowJob]):
             if isinstance(found, Losses):
                 self._windows.add_losses(found)
                 continue
-            whole = self._session.watch(self._session.track(found))
+            self.extras = found.extras
+            whole = self._session.watch(self._session.track(found.result))
             for observer in self._observers:
                 observer.see(whole)
             self.frames += 1
@@ -209,7 +241,7 @@ class _StoppedError(Exception):
     """The rest is not wanted."""
 
 
-def ahead(items: Iterable[T], count: int) -> Iterator[T]:
+def ahead(items: Iterable[T], count: int) -> Generator[T, None, None]:
     """The items, so many of them drawn before they are asked for, in a thread of its own."""
     source = iter(items)
     waiting: deque[Future[T | None]] = deque()

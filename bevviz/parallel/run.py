@@ -9,9 +9,10 @@ from tqdm import tqdm
 
 from bevviz.bags.source import BagSource
 from bevviz.drive import Drive
+from bevviz.engine.task import Engine
 from bevviz.frame import FrameResult
 from bevviz.logging.sinks import Sinks
-from bevviz.parallel.drive import AsTheyAre, Engine, InOrder, Windows
+from bevviz.parallel.drive import AsTheyAre, InOrder, MadeWindows, Windows
 from bevviz.run import Observer, RunEnd, run
 from bevviz.session import Session
 from bevviz.text import printable
@@ -22,29 +23,29 @@ def run_windows(
     session: Session,
     sinks: Sinks,
     observers: Sequence[Observer[FrameResult]],
-    jobs: int,
     engine: Engine,
     stop: Event | None = None,
 ) -> RunEnd:
-    """Make every frame in one of so many processes, and show the results in order to the observers.
+    """Make every frame in one of many processes, and show the results in order to the observers.
 
     Args:
         drive: of a bag.
         session: remembers the drive.
         sinks: where the recording goes.
         observers: of results without what only their frame needs, see ``InOrder``.
-        jobs: windows that are made at the same time.
         engine: what makes them.
         stop: ends the run after the window at hand.
     """
     source = drive.frames
     assert isinstance(source, BagSource)
     place = None if sinks.file is None else sinks.file.parent
-    with tqdm(total=source.total, unit="frame", desc=printable(source.scene.name), disable=None) as bar:
-        windows = Windows(source, drive.config, sinks.recording_id, jobs, engine, lambda: _count(bar), place)
-        with windows:
-            in_order = InOrder(windows, session, sinks, observers)
-            end = run(windows, AsTheyAre(), [in_order], depth=0, stop=stop)
+    with (
+        tqdm(total=source.total, unit="frame", desc=printable(source.scene.name), disable=None) as bar,
+        Windows(source, drive.config, sinks.recording_id, engine.count, place) as windows,
+    ):
+        made = MadeWindows(windows, engine, lambda: _count(bar))
+        in_order = InOrder(windows, session, sinks, observers)
+        end = run(made, AsTheyAre(), [in_order], depth=0, stop=stop)
     return RunEnd(in_order.frames, end.interrupted)
 
 

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import os
 import pickle
+import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import lru_cache
 from pathlib import Path
 from typing import IO, cast
 from uuid import uuid4
@@ -18,14 +18,39 @@ import rerun as rr
 
 from bevviz.bags.source import BagSource, FrameSelection, Window
 from bevviz.bags.state import Losses
-from bevviz.batch.task import JobResult
 from bevviz.config import Config
+from bevviz.engine.task import JobResult
 from bevviz.errors import UserError
 from bevviz.frame import Camera, Cloud, FrameResult, Ground, Voxels
 from bevviz.logging.logger import Logger
 from bevviz.logging.sinks import APPLICATION, batches
 from bevviz.perceive import StageLoader, Stages, describe, perceive
 from bevviz.stages.visibility import range_image
+
+LABEL = "label"  # field that says what each point is of, see ``evaluate.ground``
+
+
+@dataclass(frozen=True)
+class Batched:
+    """What is made of each frame for a batch, too.
+
+    Attributes:
+        name: of the drive.
+        extras: what is kept of it beside its result.
+        judged: it is held to the truth.
+    """
+
+    name: str
+    extras: Callable[[FrameResult], Mapping[str, bytes]]
+    judged: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Found:
+    """A frame, as a worker hands it on."""
+
+    result: FrameResult  # without what only its frame needs
+    extras: Mapping[str, bytes]  # see ``Batched``
 
 
 @dataclass(frozen=True)
@@ -38,10 +63,12 @@ class WindowJob:
     selection: FrameSelection
     folder: Path  # absolute, for what is made
     recording_id: str
+    batch: Batched | None = None
 
     @property
     def name(self) -> str:
-        return f"window {self.window.number}"
+        name = f"window {self.window.number}"
+        return name if self.batch is None else f"{self.batch.name}, {name}"
 
     @property
     def identity(self) -> str:
@@ -63,7 +90,7 @@ class WindowJob:
         recording = self.folder / f"{self.recording.stem}-{os.getpid()}-{uuid4().hex[:8]}.rrd"
         results = recording.with_suffix(".results")
         try:
-            source, stages = _opened(self.paths, self.config.model_dump_json(), self.selection, threads)
+            source, stages = _opened(self, threads)
             stream = rr.RecordingStream(
                 APPLICATION,
                 recording_id=self.recording_id,
@@ -80,7 +107,7 @@ class WindowJob:
                         logger.recording = stream
                     logger.log_alone(result)
                     if mine:
-                        pickle.dump(_kept(result), file, pickle.HIGHEST_PROTOCOL)
+                        pickle.dump(self._found(result), file, pickle.HIGHEST_PROTOCOL)
                         frames += 1
                         on_frame()
                 pickle.dump(source.losses, file, pickle.HIGHEST_PROTOCOL)
@@ -96,21 +123,26 @@ class WindowJob:
                     path.unlink(missing_ok=True)
         return JobResult(self.name, frames, time.perf_counter() - start)
 
+    def _found(self, result: FrameResult) -> Found:
+        if self.batch is None:
+            return Found(_kept(result), {})
+        return Found(_kept(result, judged=self.batch.judged), self.batch.extras(result))
 
-def results_in(path: Path, config: Config) -> Iterator[FrameResult | Losses]:
-    """The results of a window, without what only their frame needs, and what its frames lacked."""
+
+def results_in(path: Path, config: Config) -> Iterator[Found | Losses]:
+    """The results of a window, and what its frames lacked."""
     with path.open("rb") as file:
         while True:
             found = _load(file)
             if isinstance(found, Losses):
                 yield found
                 return
-            yield replace(found, config=config)
+            yield replace(found, result=replace(found.result, config=config))
 
 
-def _load(file: IO[bytes]) -> FrameResult | Losses:
+def _load(file: IO[bytes]) -> Found | Losses:
     found = pickle.load(file)
-    assert isinstance(found, FrameResult | Losses)
+    assert isinstance(found, Found | Losses)
     return found
 
 
@@ -126,26 +158,41 @@ class _Nowhere:
     def reset_time(self) -> None: ...
 
 
-@lru_cache(maxsize=1)
-def _opened(
-    paths: tuple[Path, ...], config: str, selection: FrameSelection, threads: int
-) -> tuple[BagSource, Stages]:
-    """Kept from window to window."""
-    found = Config.model_validate_json(config)
-    detector = found.detector.model_copy(update={"threads": found.detector.threads or threads})
-    stages = StageLoader().load(found.model_copy(update={"detector": detector}))
-    return selection.source(paths, found), stages
+class _Opened(threading.local):
+    """Kept by each thread from window to window: a bag, and the stages, which many bags have in common."""
+
+    source: tuple[object, BagSource] | None = None
+    stages: tuple[object, Stages] | None = None
+
+
+_kept_open = _Opened()
+
+
+def _opened(job: WindowJob, threads: int) -> tuple[BagSource, Stages]:
+    config = job.config.model_dump_json()
+    if _kept_open.stages is None or _kept_open.stages[0] != (config, threads):
+        found = Config.model_validate_json(config)
+        detector = found.detector.model_copy(update={"threads": found.detector.threads or threads})
+        stages = StageLoader().load(found.model_copy(update={"detector": detector}))
+        _kept_open.stages = (config, threads), stages
+    if _kept_open.source is None or _kept_open.source[0] != (job.paths, config, job.selection):
+        if _kept_open.source is not None:
+            _kept_open.source[1].close()
+        source = job.selection.source(job.paths, job.config)
+        _kept_open.source = (job.paths, config, job.selection), source
+    return _kept_open.source[1], _kept_open.stages[1]
 
 
 # --- what the ordered pass needs ---------------------------------------------------------------
 
 
-def _kept(result: FrameResult) -> FrameResult:
+def _kept(result: FrameResult, *, judged: bool = False) -> FrameResult:
     """Tracks, anomalies and counts are made of this. Of what is only counted, the rows are left."""
+    labels = {LABEL: result.frame.fields[LABEL]} if judged and LABEL in result.frame.fields else {}
     cameras = {id(camera): _without_pixels(camera) for camera in result.frame.cameras}
     frame = replace(
         result.frame,
-        fields={},
+        fields=labels,
         clouds=tuple(map(_without_points, result.frame.clouds)),
         robot_clouds=(),
         cameras=tuple(cameras.values()),
@@ -155,7 +202,8 @@ def _kept(result: FrameResult) -> FrameResult:
     clouds_too = result.config.logging.keep == "inspect"
     if clouds_too:
         frame = replace(frame, clouds=tuple(replace(cloud, fields={}) for cloud in result.frame.clouds))
-    inverse = np.zeros(0, np.int32) if voxels is None or not clouds_too else voxels.inverse
+    rows_too = voxels is not None and (clouds_too or bool(labels))
+    inverse = voxels.inverse if voxels is not None and rows_too else np.zeros(0, np.int32)
     return replace(
         result,
         frame=frame,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -42,6 +43,11 @@ class SyncReport:
     oddities: dict[str, str] = field(default_factory=dict)  # topic -> what its messages should not say
     overtaken: Counter[str] = field(default_factory=Counter)  # topic -> results whose frame had gone on
     slowest: dict[str, float] = field(default_factory=dict)  # topic -> seconds after its stamp, at worst
+
+    def complain(self, problems: list[str], text: str) -> None:
+        """Tell a frame, and count here, where sentences that differ in a number are one."""
+        problems.append(text)
+        self.problems[re.sub(r"\d+\.\d+ s ", "", text)] += 1
 
     def doubts(self) -> tuple[str, ...]:
         """One sentence for whatever may make every frame wrong: clocks, units, which way is up."""

@@ -68,3 +68,12 @@ class Track(Generic[T]):
     def keep(self, first: int, last: int) -> None:
         low, high = bisect_left(self._stamps, first), bisect_left(self._stamps, last + 1)
         self._stamps, self._items = self._stamps[low:high], self._items[low:high]
+
+
+def too_far(nearest: tuple[int, object] | None, stamp: int, tolerance: int) -> str:
+    """Of what is nearest to a stamp and not within the tolerance, both in nanoseconds."""
+    within = f"within {tolerance * 1e-9:.2f} s"
+    if nearest is None:
+        return f"{within}: none at all around this time"
+    away = (nearest[0] - stamp) * 1e-9
+    return f"{within}: nearest is {abs(away):.2f} s {'later' if away > 0 else 'earlier'}"

@@ -48,6 +48,7 @@ if TYPE_CHECKING:
 KEPT = 6  # results of frames that were looked at
 PATIENCE = 10.0  # seconds that the run may take to end
 FIRST = 6.0  # seconds that the run waits for a page to have drawn the first frame
+SLACK = 1000  # ns: pages count in doubles
 ASKED = 8  # answers that are kept for reports
 BOTH = (entities.STAMP, entities.TRIED)
 
@@ -96,6 +97,7 @@ class Bench(Closing):
         self.done, self.over, self.error = 0, False, ""
         self._listeners: list[Callable[[], None]] = []
         self._stamps: list[tuple[int, int]] = []  # stamp, number of each frame on the film, in order
+        self._reached = 0  # stamp that the run is at
         self._rows: dict[int, int] = {}  # on the film, of each stamp
         self._tracks: dict[int, Tracks] = {}
         self._objects: dict[int, Objects | None] = {}
@@ -196,6 +198,7 @@ class Bench(Closing):
             names = self.drive.session.stages.class_names
             found = with_reasons(found, result, Questioner(result, self.drive.session.loader, names))
         self._show(result, found)
+        self._reached = max(self._reached, frame.stamp)
         if result.tracks is not None:
             bare = np.zeros((len(result.tracks), 0, 3), np.float32)
             self._tracks[frame.index] = replace(result.tracks, trail=bare)
@@ -261,19 +264,39 @@ class Bench(Closing):
     # --- questions -----------------------------------------------------------------------------
 
     def number_at(self, stamp: int) -> int:
-        """Number of the frame that a viewer shows at that time.
+        """Number of the frame that a viewer shows at that time, whether it has been run yet or not.
 
         Raises:
             UserError: no frame is there yet.
         """
-        if not self._stamps:
+        stamps = list(self._stamps)
+        if not stamps:
             raise UserError("no frame has been run yet")
-        place = bisect.bisect_right(self._stamps, (stamp + 1000, 2**62)) - 1  # pages count in doubles
-        return self._stamps[max(place, 0)][1]
+        place = bisect.bisect_right(stamps, (stamp + SLACK, 2**62)) - 1
+        at, number = stamps[max(place, 0)]
+        if self.over or stamp <= self._reached or abs(stamp - at) <= SLACK:
+            return number
+        return self._sought(stamp, number)
+
+    def _sought(self, stamp: int, near: int) -> int:
+        """The last frame whose stamp is not behind that time, from where the log times say that it is."""
+        with self._looking:
+            scans, frame = self.drive.frames.scans, self.look(near).frame
+            number = int(np.abs(scans - (stamp + int(scans[near]) - frame.stamp)).argmin())
+            while number > 0 and self._stamp_of(number) > stamp + SLACK:
+                number -= 1
+            while number + 1 < len(scans) and self._stamp_of(number + 1) <= stamp + SLACK:
+                number += 1
+            return number
+
+    def _stamp_of(self, number: int) -> int:
+        """Its log time, where it cannot be read."""
+        frame = self.drive.frames.frame(number)
+        return int(self.drive.frames.scans[number]) if frame is None else frame.stamp
 
     def film_row(self, stamp: int) -> int | None:
         """Piece of the film that has the frame which a viewer shows at that time."""
-        place = bisect.bisect_right(self._stamps, (stamp + 1000, 2**62)) - 1
+        place = bisect.bisect_right(self._stamps, (stamp + SLACK, 2**62)) - 1
         return self._rows.get(self._stamps[place][0]) if place >= 0 else None
 
     def truth(self, frame: Frame) -> Truth | None:

@@ -146,7 +146,7 @@ class Visit:
         from bevviz.workbench.pick import Pick
 
         bench, settings = self._bench, _settings(message)
-        frame = self._frame(message)
+        frame = await self._frame(message)
 
         def what() -> Pick | None:
             if "pick" in message:
@@ -177,14 +177,14 @@ class Visit:
     async def _try(self, number: int, message: dict[str, Any]) -> None:
         from bevviz.workbench.pick import Pick
 
-        settings, frame = _settings(message), self._frame(message)
+        settings, frame = _settings(message), await self._frame(message)
         pick = Pick.parse(str(message["pick"])) if message.get("pick") else None
         told = await self._at_desk(number, lambda: self._bench.attempt(frame, settings, pick))
         await self._send({"type": "tried", "id": number, "frame": frame, **told})
 
     async def _settle(self, number: int, message: dict[str, Any]) -> None:
         """The page shows this frame for a while: questions about it are to come."""
-        frame = self._frame(message)
+        frame = await self._frame(message)
         await self._at_desk(number, lambda: self._bench.look(frame, _settings(message)), idle=True)
 
     async def _drive(self, number: int, message: dict[str, Any]) -> None:
@@ -197,14 +197,14 @@ class Visit:
         await asyncio.to_thread(what.end)
 
     async def _report(self, number: int, message: dict[str, Any]) -> None:
-        frame, settings, text = self._frame(message), _settings(message), str(message["text"])
+        frame, settings, text = await self._frame(message), _settings(message), str(message["text"])
         before, after = float(message["before"]), float(message["after"])
         await self._at_desk(number, lambda: self._bench.reports.begin(frame, settings, before, after, text))
 
     async def _note(self, number: int, message: dict[str, Any]) -> None:
         from bevviz.workbench.pick import Pick
 
-        frame, text = self._frame(message), str(message["text"])
+        frame, text = await self._frame(message), str(message["text"])
         pick = Pick.parse(str(message["pick"])) if message.get("pick") else None
         await self._at_desk(number, lambda: self._bench.note(frame, text, pick))
         await self._send({"type": "noted", "id": number, "file": self._bench.notes.path.name})
@@ -217,9 +217,9 @@ class Visit:
         """The page has drawn its first frame: the run may take the machine."""
         self._bench.go_on()
 
-    def _frame(self, message: dict[str, Any]) -> int:
-        """Number of the frame that the page shows."""
-        return self._bench.number_at(round(float(message["time"])))
+    async def _frame(self, message: dict[str, Any]) -> int:
+        """Number of the frame that the page shows; one that has not been run yet is looked for."""
+        return await asyncio.to_thread(self._bench.number_at, round(float(message["time"])))
 
 
 def _briefly(answers: Sequence[Answer]) -> Iterator[dict[str, Any]]:

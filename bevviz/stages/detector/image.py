@@ -8,7 +8,6 @@ from typing import Any
 
 import cv2
 import numpy as np
-from PIL import Image
 
 from bevviz.frame import F32, U8
 
@@ -93,6 +92,8 @@ class Feed:
             inner = bgr.astype(np.float32) / np.float32(self.divisor)
         if bgr.shape[:2] != where.inner:
             if self.resampling is Resampling.ALL:
+                from PIL import Image  # not every model needs it
+
                 small = Image.fromarray(bgr).resize((width, height), Image.Resampling.BILINEAR)
                 inner = np.asarray(small)
             else:

@@ -14,8 +14,8 @@ from multiprocessing.connection import Connection, wait
 from multiprocessing.context import SpawnProcess
 
 from bevviz import announce
-from bevviz.batch.task import JobResult, JobResults, Task
 from bevviz.closing import Closing
+from bevviz.engine.task import JobResult, JobResults, Task
 
 # concurrent.futures is of no use here: a worker that dies breaks the pool and every job that was on its way.
 

@@ -1,0 +1,221 @@
+"""Images and calibrations as they come, and the camera of each frame that they make."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Callable, Collection
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from bevviz import geometry
+from bevviz.config import Config
+from bevviz.errors import UserError
+from bevviz.frame import F64, Camera, Image, Intrinsics
+from bevviz.ros.roles import CameraRole, Roles
+from bevviz.sync.place import Place, Placing
+from bevviz.sync.report import SyncReport
+from bevviz.sync.tf import TransformError
+from bevviz.sync.track import Track, too_far
+
+TUTORIAL_K = np.array([[267.0, 0.0, 320.0], [0.0, 267.0, 180.0], [0.0, 0.0, 1.0]])
+
+
+@dataclass(frozen=True, slots=True)
+class Undecoded:
+    """The header of an image, and how to get the rest."""
+
+    stamp: int
+    frame_id: str
+    load: Callable[[], Image]
+
+
+class Cameras:
+    """What the cameras of a robot have sent within the horizon.
+
+    Args:
+        roles: which topic is what.
+        config: tolerances.
+        report: counts what is missing.
+        placing: knows where they are.
+        horizon: nanoseconds that images and calibrations are held for.
+
+    Attributes:
+        images: by topic.
+        frames: image topic -> optical frame.
+        intrinsics: CameraInfo topic -> the newest.
+    """
+
+    def __init__(
+        self, roles: Roles, config: Config, report: SyncReport, placing: Placing, horizon: int
+    ) -> None:
+        self._roles, self._config, self._report, self._placing = roles, config, report, placing
+        self._driver, self._horizon = roles.driver, horizon
+        self._tolerance = round(config.sync.tolerance * 1e9)
+        self._tf = report.tf
+        self.images: dict[str, Track[Undecoded]] = {c.topic: Track(horizon) for c in roles.cameras}
+        self.frames: dict[str, str] = {}
+        self.intrinsics: dict[str, Intrinsics] = {}
+        self._infos: dict[str, Track[Intrinsics]] = {}  # by topic
+        self._refused: dict[str, str] = {}  # topic -> why its calibration cannot be used
+        self._info_counts: Counter[str] = Counter()
+        self._image_counts: Counter[str] = Counter()
+
+    def take_over(self, former: Cameras) -> None:
+        """Go on with the calibrations of ``former``."""
+        self._report, self._tf = former._report, former._tf
+        self.intrinsics, self._infos, self._refused = former.intrinsics, former._infos, former._refused
+
+    def add_image(self, topic: str, stamp: int, frame_id: str, load: Callable[[], Image]) -> None:
+        """An image not yet decoded."""
+        self.frames[topic] = frame_id
+        self._image_counts[topic] += 1
+        self.images[topic].add(stamp, Undecoded(stamp, frame_id, load))
+
+    def add_info(self, topic: str, stamp: int, intrinsics: Intrinsics) -> None:
+        """A calibration; for an image the one that is nearest in stamp holds."""
+        self.intrinsics[topic] = intrinsics
+        self._info_counts[topic] += 1
+        self._infos.setdefault(topic, Track(self._horizon)).add(stamp, intrinsics)
+
+    def refuse_info(self, topic: str, reason: str) -> None:
+        """A calibration that cannot be used."""
+        self._refused[topic] = reason
+
+    def info_reaches(self, role: CameraRole, stamp: int, absent: Collection[str]) -> bool:
+        """Whether the calibration of the image of this time has come, where each image has one of its own."""
+        track, image = self._infos.get(role.info_topic), self.images[role.topic].nearest(stamp)
+        if track is None or track.newest is None or image is None or role.info_topic in absent:
+            return True
+        one_each = self._info_counts[role.info_topic] * 2 > self._image_counts[role.topic] > 1
+        return not one_each or track.newest >= image[0]
+
+    def at(self, role: CameraRole, place: Place) -> Camera:
+        problems: list[str] = []
+        image, stamp = self._image(role, place.stamp, problems)
+        intrinsics = self._camera_intrinsics(role, image, stamp, problems)
+        camera = Camera(role.name, image, intrinsics, None, None, problems=tuple(problems))
+        if image is not None:
+            camera = replace(camera, sync_error=(stamp - place.stamp) * 1e-9)
+            off = self._report.clocks.apart(role.topic, self._driver)
+            if off:
+                self._report.complain(
+                    problems,
+                    f"the clocks of camera '{role.name}' and the LiDAR are {abs(off):.2f} s apart: "
+                    f"its image is of another time",
+                )
+                camera = replace(camera, problems=tuple(problems))
+        frame = self.frames.get(role.topic)
+        if frame is None:
+            return camera
+        try:
+            found, compensated = self._placing.moved(place, stamp, frame)
+        except TransformError as error:
+            lacking = frame and place.points_frame and not self._tf.knows(place.points_frame, frame)
+            self._report.complain(
+                problems, f"{error}; source.extrinsics can state it" if lacking else str(error)
+            )
+            return replace(camera, problems=tuple(problems))
+        if image is not None and not compensated and self._placing.compensates(place):
+            self._report.complain(
+                problems, f"no motion compensation: '{place.inertial_frame}' is out of reach"
+            )
+        world = np.eye(4) if place.world_from_points is None else place.world_from_points
+        first_from_camera = self._second_of_stereo(role, intrinsics, frame)
+        points_from_camera = found.matrix @ first_from_camera
+        mounting = self._placing.mounting(place, frame) if compensated else None
+        return replace(
+            camera,
+            camera_from_points=geometry.inverse(points_from_camera),
+            world_from_camera=world @ points_from_camera,
+            tf_age=found.age,
+            motion_compensated=compensated,
+            mounting=None if mounting is None else geometry.inverse(first_from_camera) @ mounting,
+            problems=tuple(problems),
+        )
+
+    def _second_of_stereo(self, role: CameraRole, intrinsics: Intrinsics | None, frame: str) -> F64:
+        """(4, 4) frame of the image from its camera: the second of a stereo pair is in the first one's.
+
+        See P in sensor_msgs/CameraInfo. Many drivers give the second camera a frame of its own, and P all the
+        same; then it is where TF says.
+        """
+        pose = np.eye(4)
+        if intrinsics is None or intrinsics.baseline == (0.0, 0.0):
+            return pose
+        if any(there == frame for topic, there in self.frames.items() if topic != role.topic):
+            pose[:2, 3] = intrinsics.baseline
+        else:
+            self._report.oddities.setdefault(
+                role.info_topic,
+                f"{role.info_topic}: its P tells of a camera {math.hypot(*intrinsics.baseline):.3f} m beside "
+                f"another one's frame; '{frame}' is taken as its own, as no other camera is in it",
+            )
+        return pose
+
+    def _image(self, role: CameraRole, stamp: int, problems: list[str]) -> tuple[Image | None, int]:
+        """The decoded image nearest to ``stamp``, and its stamp; without one, ``stamp``."""
+        nearest = self.images[role.topic].nearest(stamp)
+        if nearest is None or abs(nearest[0] - stamp) > self._tolerance:
+            self._report.without_image[role.name] += 1
+            problems.append(f"no image of camera '{role.name}' {too_far(nearest, stamp, self._tolerance)}")
+            return None, stamp
+        try:
+            image = replace(nearest[1].load(), stamp=nearest[0])
+            self._report.images += 1
+            return image, nearest[0]
+        except UserError as error:
+            self._report.undecodable[role.name] += 1
+            self._report.first_undecodable.setdefault(role.name, str(error))
+            problems.append(str(error))
+            return None, stamp
+
+    def _camera_intrinsics(
+        self, role: CameraRole, image: Image | None, stamp: int, problems: list[str]
+    ) -> Intrinsics | None:
+        infos = self._infos.get(role.info_topic)
+        nearest = None if infos is None else infos.nearest(stamp)
+        intrinsics = None if nearest is None else nearest[1]
+        if intrinsics is not None and image is not None:
+            return self._fitted(role, intrinsics, image, problems)
+        if intrinsics is not None:
+            return intrinsics
+        missing = f"no CameraInfo on {role.info_topic}" if role.info_topic else "no CameraInfo topic"
+        if self._config.preset == "reference":
+            self._report.complain(
+                problems, f"{missing} yet: using fx = fy = 267, cx 320, cy 180 of the reference"
+            )
+            height, width = image.bgr.shape[:2] if image is not None else (360, 640)
+            return Intrinsics(width, height, TUTORIAL_K, assumed=True)
+        if role.info_topic in self._refused:
+            self._report.complain(problems, self._refused[role.info_topic])
+            return None
+        others = [topic for topic in self._roles.camera_infos if topic != role.info_topic]
+        setting = f"source.camera_info_topics='{{{role.topic}: {others[0]}}}'" if others else ""
+        helps = f"name the topic with --set {setting}" if setting else "record one"
+        self._report.complain(
+            problems, f"{missing} for camera '{role.name}': nothing can be projected into it; {helps}"
+        )
+        return None
+
+    def _fitted(
+        self, role: CameraRole, intrinsics: Intrinsics, image: Image, problems: list[str]
+    ) -> Intrinsics | None:
+        """The intrinsics for the image's own size."""
+        height, width = image.bgr.shape[:2]
+        if (width, height) == (intrinsics.width, intrinsics.height):
+            return intrinsics
+        if not intrinsics.width or not intrinsics.height:  # many drivers leave them empty
+            return replace(intrinsics, width=width, height=height)
+        sx, sy = width / intrinsics.width, height / intrinsics.height
+        if abs(sx / sy - 1) > 0.01:
+            self._report.complain(
+                problems,
+                f"CameraInfo on {role.info_topic} is for {intrinsics.width} x {intrinsics.height} pixels, "
+                f"the image has {width} x {height}: nothing can be projected into it",
+            )
+            return None
+        # Pixel (0, 0) is the centre of the corner pixel, so that the corner itself is at -0.5.
+        scale = np.array([[sx, 0, (sx - 1) / 2], [0, sy, (sy - 1) / 2], [0, 0, 1]])
+        return replace(intrinsics, width=width, height=height, K=scale @ intrinsics.K)
