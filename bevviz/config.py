@@ -134,7 +134,8 @@ class SourceConfig(Section):
     camera_topics: tuple[str, ...] = Field((), description="Image or CompressedImage topics")
     camera_info_topics: Mapping[str, str] = Field({}, description="camera topic -> its CameraInfo topic")
     lidar_calibration: Mapping[str, str] = Field(
-        {}, description="topic with a LiDAR's packets -> file with its angles: CSV of a Hesai"
+        {},
+        description="topic with a LiDAR's packets -> its angles: a Hesai's CSV, an Ouster's metadata",
     )
     boxes: Mapping[str, str] = Field(
         {},

@@ -23,6 +23,7 @@ from bevviz.plugins import TOPIC
 PACKAGES = (  # those that are not installed do not count: some libraries come as one of several
     *("rerun-sdk", "rosbags", "numpy"),
     "protobuf",  # decodes Foxglove's messages
+    *("velodyne-decoder", "dracopy"),  # make points of packets and of compressed clouds
     *("numba", "llvmlite"),  # compile every LiDAR stage
     *(
         "opencv-python-headless",

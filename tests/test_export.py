@@ -1,7 +1,8 @@
-"""A drive as KITTI's folders, held against the readers that there are of them."""
+"""A drive as KITTI's folders and as a scene of nuScenes, held against the readers that there are of them."""
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import cv2
@@ -14,6 +15,7 @@ from bevviz.cli import main
 from bevviz.datasets.kitti import read_labels
 from bevviz.errors import UserError
 from bevviz.export.kitti import KittiExport, labels, rectified
+from bevviz.export.nuscenes import TABLES, VERSION, NuScenesExport
 from bevviz.frame import Boxes3D, Intrinsics, Objects
 
 OPTICAL = geometry.inverse(geometry.transform(np.array([0.2, 0.1, -0.3]), np.array([-0.5, 0.5, -0.5, 0.5])))
@@ -23,7 +25,7 @@ OPTICAL = geometry.inverse(geometry.transform(np.array([0.2, 0.1, -0.3]), np.arr
 def exported(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, bevviz.Drive]:
     folder = tmp_path_factory.mktemp("export") / "training"
     drive = bevviz.simulate(8)
-    drive.run([KittiExport(folder)])
+    drive.run([KittiExport(folder), NuScenesExport(folder.parent / "scenes")])
     return folder, drive
 
 
@@ -115,3 +117,70 @@ def test_a_folder_that_holds_something_is_left_alone(
     assert main(["export", "nothing.mcap", "-o", str(tmp_path / "new")]) == 2
     assert "nothing.mcap: no such file" in capsys.readouterr().err
     assert not (tmp_path / "new").exists()
+
+
+def test_a_scene_of_nuscenes_has_the_same_frames(exported: tuple[Path, bevviz.Drive]) -> None:
+    folder, drive = exported
+    with bevviz.open(folder.parent / "scenes") as again:
+        assert len(again) == 8
+        for number in (0, 5):
+            result, frame = drive.at(frame=number), again.raw(number)
+            np.testing.assert_array_equal(frame.points, result.frame.points)
+            np.testing.assert_allclose(frame.pose, result.frame.pose, atol=1e-9)
+            (camera,), (there,) = result.frame.cameras, frame.cameras
+            assert camera.image is not None and there.image is not None
+            assert camera.intrinsics is not None and there.intrinsics is not None
+            assert camera.camera_from_points is not None and there.camera_from_points is not None
+            np.testing.assert_allclose(there.camera_from_points, camera.camera_from_points, atol=1e-9)
+            np.testing.assert_allclose(there.intrinsics.K, camera.intrinsics.K)
+            assert np.abs(there.image.bgr.astype(int) - camera.image.bgr).mean() < 3  # JPEG
+            objects, truth = result.objects, frame.truth
+            assert objects is not None and truth is not None
+            assert len(truth.labels) == len(objects) > 0
+            names = {"person": "pedestrian", "cyclist": "bicycle", "car": "car"}
+            assert list(truth.labels) == [names[name] for name in objects.names]
+            boxes = geometry.moved(objects.boxes, result.frame.pose)
+            np.testing.assert_allclose(truth.boxes.center, boxes.center, atol=1e-4)
+            np.testing.assert_allclose(truth.boxes.size, boxes.size, atol=1e-5)
+            assert np.abs(np.sin(truth.boxes.yaw - boxes.yaw)).max() < 1e-3  # the road is not level
+
+
+def test_the_tables_of_nuscenes_name_what_there_is(exported: tuple[Path, bevviz.Drive]) -> None:
+    """As the devkit goes through them: by tokens, from row to row, and from a track to its annotations."""
+    root = exported[0].parent / "scenes"
+    tables = {name: json.loads((root / VERSION / f"{name}.json").read_text()) for name in TABLES}
+    by_token = {name: {row["token"]: row for row in rows} for name, rows in tables.items()}
+    for name, rows in tables.items():
+        assert len(by_token[name]) == len(rows)
+        for key, value, token in ((*item, row["token"]) for row in rows for item in row.items()):
+            table = key.removesuffix("_token")
+            if table != key and table in by_token and value:
+                assert value in by_token[table], (name, key)
+            if key in ("prev", "next") and value:
+                assert by_token[name][value]["next" if key == "prev" else "prev"] == token
+    assert all((root / row["filename"]).is_file() for row in tables["sample_data"] + tables["map"])
+    (scene,) = tables["scene"]
+    token, seen = scene["first_sample_token"], 0
+    while token:
+        seen, last, token = seen + 1, token, by_token["sample"][token]["next"]
+    assert (seen, last) == (scene["nbr_samples"], scene["last_sample_token"])
+    for instance in tables["instance"]:
+        token, count = instance["first_annotation_token"], 0
+        while token:
+            row = by_token["sample_annotation"][token]
+            assert row["instance_token"] == instance["token"]
+            count, last, token = count + 1, token, row["next"]
+        assert (count, last) == (instance["nbr_annotations"], instance["last_annotation_token"])
+    assert len(tables["sample_annotation"]) > 3 * len(tables["instance"])  # they are tracks
+
+
+def test_a_scene_is_written_by_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    made = tmp_path / "bag.mcap"
+    assert main(["demo", "--bag", str(made), "--frames", "3"]) == 0
+    out = ["--format", "nuscenes", "-o", str(tmp_path / "scenes")]
+    assert main(["export", str(made), "--model", "demo", *out]) == 0
+    assert "3 frames with" in capsys.readouterr().err
+    assert main(["info", str(tmp_path / "scenes")]) == 0
+    assert "format  nuScenes" in capsys.readouterr().out
+    assert main(["export", str(made), *out]) == 2
+    assert "is there already" in capsys.readouterr().err

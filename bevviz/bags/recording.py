@@ -7,10 +7,10 @@ import re
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import islice
-from operator import itemgetter
+from operator import attrgetter, itemgetter
 from pathlib import Path, PurePath
 from typing import Any, Literal
 
@@ -48,7 +48,8 @@ from bevviz.datasets.reader import DatasetReader
 from bevviz.errors import UserError, first_line
 from bevviz.files import Scratch, bag_files, drive_files
 from bevviz.frame import I64
-from bevviz.ros import foxglove, grid_map_msgs, video, vision_msgs
+from bevviz.ros import foxglove, grid_map_msgs, ouster, point_cloud_interfaces, video, vision_msgs
+from bevviz.ros.compressed import decompress, is_compressed
 from bevviz.ros.livox import fields_of, is_livox, read_custom
 from bevviz.ros.messages import MessageError, read_header
 from bevviz.ros.packets import is_packets, read_scan
@@ -100,6 +101,7 @@ METADATA = "metadata.yaml"
 COMPRESSED = "sensor_msgs/msg/CompressedImage"
 STAMPED = ["timestamp", "frame_id"]  # what foxglove's messages begin with, which are laid out as a Header
 REWIND = 2_000_000_000  # nanoseconds that a key frame is looked for in first
+LONGEST_SCAN = 1_000_000_000  # nanoseconds from its first packet to its last
 MOST_HEADERS = 16  # messages that a video begins with and are no pictures
 
 
@@ -109,6 +111,7 @@ class RawMessage:
     received: int  # log time, nanoseconds
     data: bytes | memoryview
     connection: Connection
+    packets: tuple[tuple[int, bytes | memoryview], ...] = ()  # with the time of each: a scan, see ``scans``
 
     def content(self) -> bytes | memoryview:
         """The serialised message; a compressed one is unpacked.
@@ -173,6 +176,7 @@ class Recording(Closing):
         self.single_frames = False
         self._config = config or SourceConfig()
         self._aside: dict[str, str] = {}
+        self._scan_times: dict[str, I64] = {}
         self.files: list[BagFile] = []
         self._notes: list[str] = []
         self._stores: dict[tuple[object, ...], Typestore] = {}
@@ -235,15 +239,21 @@ class Recording(Closing):
                     "only the former is used"
                 )
         duration = (self.end - self.start) / 1e9
+        self._aside |= {name: why for name in first if (why := self._lacks(first[name]))}
         return tuple(
             Topic(
                 name,
                 normalized(first[name].msgtype),
                 counts[name],
-                self._frame_id(name) if counts[name] and self._has_header(first[name]) else "",
+                ouster.FRAME
+                if name in self._sensors
+                else self._frame_id(name)
+                if counts[name] and self._has_header(first[name])
+                else "",
                 (counts[name] - 1) / duration if counts[name] > 1 and duration else None,
                 self._aside.get(name, ""),
                 video=normalized(first[name].msgtype) == COMPRESSED and self._holds_video(name),
+                scans=name in self._sensors,
             )
             for name in sorted(first)
         )
@@ -256,6 +266,90 @@ class Recording(Closing):
         for _, message in heapq.merge(*sources, key=itemgetter(0)):
             if message is not None:
                 yield message
+
+    def scans(
+        self, topics: Collection[str], start: int | None = None, stop: int | None = None
+    ) -> Iterator[RawMessage]:
+        """As ``messages``, but of a LiDAR whose messages are single packets one for each scan.
+
+        It is received when its last packet is, and comes when the first one of the next scan does.
+        """
+        single = [topic for topic in topics if topic in self._sensors]
+        others = [topic for topic in topics if topic not in self._sensors]
+        parts = [self.messages(others, start, stop), *(self._scans(name, start, stop) for name in single)]
+        yield from heapq.merge(*parts, key=attrgetter("received"))
+
+    def _scans(self, topic: str, start: int | None, stop: int | None) -> Iterator[RawMessage]:
+        sensor = self._sensors[topic]
+        low = None if start is None else start - LONGEST_SCAN
+        high = None if stop is None else stop + LONGEST_SCAN
+        held = list[tuple[int, bytes | memoryview]]()
+        last: RawMessage | None = None
+        current = former = -1
+
+        def whole() -> Iterator[RawMessage]:
+            if last and (start is None or start <= last.received) and (stop is None or last.received < stop):
+                yield replace(last, data=b"", packets=tuple(held))
+
+        for message in self.messages([topic], low, high):
+            try:
+                packet = ouster.payload(message.content(), ros1=is_ros1(message.connection))
+            except zstd.ZstdError:
+                continue
+            if len(packet) != sensor.size:
+                continue  # it counts as lost
+            number = sensor.number(packet)
+            if number == former:
+                continue  # overtaken by one of the next scan
+            if number != current:
+                yield from whole()
+                former, current, held = current, number, []
+            held.append((message.received, packet))
+            last = message
+        yield from whole()
+
+    def scan_times(self, topic: str) -> I64:
+        """As ``times``, of what ``scans`` gives. Where messages are single packets, all are read, once."""
+        if topic not in self._sensors:
+            return self.times(topic)
+        if topic not in self._scan_times:
+            bar = announce.bar(self._scans(topic, None, None), desc=f"scans of {topic}", unit="scan", delay=1)
+            self._scan_times[topic] = np.array([scan.received for scan in bar], np.int64)
+        return self._scan_times[topic]
+
+    @cached_property
+    def _sensors(self) -> Mapping[str, ouster.Sensor]:
+        """The topics whose messages are single packets of a LiDAR, with the metadata to decode them."""
+        found = {}
+        for connection in {c.topic: c for f in self.files for c in f.connections}.values():
+            if (
+                ouster.is_packet(connection.msgtype)
+                and (text := self._metadata(connection.topic)) is not None
+            ):
+                sensor = ouster.read_sensor(*text)
+                message = self.first(connection.topic)
+                if message and len(message.data) > ouster.SMALLEST:
+                    found[connection.topic] = sensor
+        return found
+
+    def _metadata(self, topic: str) -> tuple[str, str] | None:
+        """The metadata of an Ouster and where they are; None: there are none."""
+        if file := self._config.lidar_calibration.get(topic, ""):
+            return ouster.read_text(Path(file)), f"source.lidar_calibration: {file}"
+        name = ouster.metadata_of(topic)
+        message = self.first(name)
+        try:
+            return (str(self.decode(message).data), name) if message else None
+        except (MessageError, AttributeError):
+            return None
+
+    def _lacks(self, connection: Connection) -> str:
+        """Why packets of an Ouster are not read; empty: they are, or it is another topic."""
+        if not ouster.is_packet(connection.msgtype) or connection.topic in self._sensors:
+            return ""
+        message = self.first(connection.topic)
+        small = message is not None and len(message.data) <= ouster.SMALLEST
+        return ouster.NOT_LIDAR if small else ouster.LACKS
 
     def first(self, topic: str) -> RawMessage | None:
         return next(self.messages([topic]), None)
@@ -294,6 +388,9 @@ class Recording(Closing):
         """
         connection = message.connection
         msgtype = normalized(connection.msgtype)
+        if message.packets:
+            times, packets = zip(*message.packets, strict=True)
+            return ouster.decode(self._sensors[message.topic], packets, np.array(times, np.int64))
         try:
             data = message.content()
             if form_of(connection):
@@ -309,6 +406,8 @@ class Recording(Closing):
                 found = store.deserialize_ros1(data, msgtype)
             else:
                 found = store.deserialize_cdr(data, msgtype)
+            if is_compressed(msgtype):
+                return decompress(found)
             return foxglove.as_ros(found, msgtype) if foxglove.short_of(msgtype) else found
         except KeyError:
             raise MessageError(
@@ -362,6 +461,7 @@ class Recording(Closing):
                 vision_msgs.register(store)
                 grid_map_msgs.register(store)
                 video.register(store)
+                point_cloud_interfaces.register(store)
             self._stores[key] = store
         return self._stores[key]
 

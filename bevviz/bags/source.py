@@ -152,7 +152,7 @@ class BagSource(Closing):
     @cached_property
     def scans(self) -> I64:
         """Log time of every scan of the recording in nanoseconds, in order; its place is its number."""
-        return self.recording.times(self._driver)
+        return self.recording.scan_times(self._driver)
 
     def number_at(self, time: str | float) -> int:
         """Number of the scan that is nearest to a time, see ``parse_time``.
@@ -267,7 +267,7 @@ class BagSource(Closing):
     ) -> Iterator[RawMessage]:
         """From where the state has come to."""
         reached, known = state.reached or (start, 0)
-        for message in self.recording.messages(topics, reached, stop):
+        for message in self.recording.scans(topics, reached, stop):
             if message.received != reached:
                 reached, count = message.received, 1
             elif known:

@@ -9,19 +9,20 @@ from bevviz.cli.options import Commands, add_bag, add_config, add_selection, loa
 from bevviz.cli.outputs import hint, say, warn
 from bevviz.cli.run import through
 
-DESCRIPTION = """Write a drive, or a part of it, as a data set: the folders of KITTI's object benchmark
-(velodyne, image_2, calib, label_2), with the objects that were found as labels to be corrected. bevviz, and
-what else reads KITTI, opens it."""
+DESCRIPTION = """Write a drive, or a part of it, as a data set, with the objects that were found as labels to
+be corrected: the folders of KITTI's object benchmark (velodyne, image_2, calib, label_2), or a scene with the
+tables of nuScenes, with all cameras, poses and tracks. bevviz, and what else reads these, opens it."""
 
 EPILOG = """examples:
   bevviz export drive.mcap --model yolo11n.onnx -o training --start 10 --end 20 --every 5
-  bevviz evaluate training --model other.onnx        another detector against the corrected labels"""
+  bevviz evaluate training --model other.onnx        another detector against the corrected labels
+  bevviz export drive.mcap --model yolo11n.onnx --format nuscenes -o scenes"""
 
 
 def add(commands: Commands) -> None:
     export = commands.add_parser(
         "export",
-        help="write frames as KITTI, with what was found as labels",
+        help="write frames as KITTI or nuScenes, with what was found as labels",
         description=DESCRIPTION,
         epilog=EPILOG,
     )
@@ -30,19 +31,27 @@ def add(commands: Commands) -> None:
     add_config(export)
     output = export.add_argument_group("what to write")
     output.add_argument("-o", "--out", type=Path, required=True, metavar="FOLDER", help="that is made")
-    output.add_argument("--camera", default="", metavar="NAME", help="whose images (default: the first one)")
+    output.add_argument("--format", choices=("kitti", "nuscenes"), default="kitti", help="default: kitti")
+    output.add_argument(
+        "--camera",
+        default="",
+        metavar="NAME",
+        help="whose images (default: the first one; of nuScenes all)",
+    )
     export.set_defaults(run=_export)
 
 
 def _export(options: argparse.Namespace) -> int:
     from bevviz.drive import Drive
     from bevviz.export.kitti import KittiExport
+    from bevviz.export.nuscenes import NuScenesExport
 
+    writer = NuScenesExport if options.format == "nuscenes" else KittiExport
     config = load_config(options)
     with open_bag(options, config) as source:
         drive = Drive(source, config)
         hint(drive.scene, config)
-        export = KittiExport(options.out, options.camera)
+        export = writer(options.out, options.camera)
         end = through(drive.frames, drive.new_session(), [export])
         warn(source.warnings)
     warn(f"{count} frame(s) left out: {why}" for why, count in export.skipped.items())

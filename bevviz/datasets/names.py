@@ -17,6 +17,8 @@ KITTI = {  # Geiger, Lenz and Urtasun 2012; the fourth as the raw drives have it
 }
 NUSCENES = {  # classes of its detection task (Caesar et al. 2020), where COCO has others
     "pedestrian": _PERSON,
+    "bicycle": frozenset({"bicycle", "cyclist"}),  # its boxes are around whoever rides it
+    "motorcycle": frozenset({"motorcycle", "motorcyclist"}),
     "trailer": frozenset({"trailer", "truck"}),
     "construction_vehicle": frozenset({"construction_vehicle", "truck"}),
     "traffic_cone": frozenset({"traffic_cone", "traffic cone"}),

@@ -19,6 +19,7 @@ from bevviz.live.rawtopics import RawTopics
 from bevviz.live.watch import SILENCE, Watch
 from bevviz.queues import NewestQueue
 from bevviz.ros import around
+from bevviz.ros.compressed import decompress, is_compressed
 from bevviz.ros.definitions import store_of
 from bevviz.ros.graph import PublishedTopic, full_name, matched_qos, mismatches, published_topics
 from bevviz.ros.livox import is_livox, read_custom
@@ -26,6 +27,7 @@ from bevviz.ros.messages import MessageError, read_header
 from bevviz.ros.node import Node
 from bevviz.ros.objects import holds_boxes
 from bevviz.ros.packets import is_packets, read_scan
+from bevviz.ros.point_cloud_interfaces import COMPRESSED
 from bevviz.ros.roles import MARK, STAGE_KINDS, Roles, Topic, find_roles, foreign
 from bevviz.ros.typesupport import message_type
 from bevviz.run import BURST
@@ -44,6 +46,7 @@ PIECE = 65_000  # bytes that DDS sends at once; what is larger goes in pieces
 
 KINDS = {
     "sensor_msgs/msg/PointCloud2",
+    COMPRESSED,
     "sensor_msgs/msg/Image",
     "sensor_msgs/msg/CompressedImage",
     "sensor_msgs/msg/CameraInfo",
@@ -81,7 +84,8 @@ class LiveMessage:
                 return read_scan(
                     self.data, self.type, ros1=False, calibration=calibration.get(self.topic, "")
                 )
-            return store_of(self.type).deserialize_cdr(self.data, self.type)
+            found = store_of(self.type).deserialize_cdr(self.data, self.type)
+            return decompress(found) if is_compressed(self.type) else found
         except Exception as error:  # generated decoders raise whatever the bytes lead them to
             reason = str(error) or type(error).__name__
             raise MessageError(f"{self.topic}: not a {self.type}: {reason}") from None

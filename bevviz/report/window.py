@@ -16,6 +16,7 @@ from bevviz.bags.recording import RawMessage, Recording, is_ros1
 from bevviz.bags.source import MARGIN, SECOND, BagSource, iso
 from bevviz.config import Config
 from bevviz.errors import UserError
+from bevviz.ros.ouster import metadata_of
 from bevviz.ros.roles import Roles
 
 MILLISECOND = 1_000_000
@@ -43,7 +44,7 @@ class Cut:
 
 def find_window(source: BagSource, at: int, before: float, after: float) -> Window:
     """The window from the first scan to the last one within ``before`` and ``after`` seconds of ``at``."""
-    times = source.recording.times(source.roles.driver)
+    times = source.recording.scan_times(source.roles.driver)
     first, last = np.searchsorted(times, [at - round(before * SECOND), at + round(after * SECOND) + 1])
     low = int(times[first]) // MILLISECOND * MILLISECOND
     high = (int(times[last - 1]) // MILLISECOND + 1) * MILLISECOND
@@ -65,7 +66,7 @@ def choose_topics(recording: Recording, roles: Roles, patterns: Sequence[str] | 
     if patterns is None:
         return there
     fits(recording, patterns, "--topics")
-    needed = set(_read(roles))
+    needed = {*_read(roles), *(metadata_of(topic.name) for topic in recording.topics if topic.scans)}
     return [n for n in there if n in needed or any(fnmatchcase(n, pattern) for pattern in patterns)]
 
 

@@ -14,7 +14,7 @@ from rosbags.typesys.store import Typestore
 
 from bevviz import geometry
 from bevviz.frame import F32, F64, I64, Boxes3D, Cloud, Image, ImageLabels, Intrinsics
-from bevviz.ros import grid_map_msgs, vision_msgs
+from bevviz.ros import grid_map_msgs, point_cloud_interfaces, vision_msgs
 
 # A vision_msgs/Detection3DArray that also says what was labelled in an image, see frame.ImageLabels.
 _LABELLED = """std_msgs/Header header
@@ -28,10 +28,11 @@ float32[] dont_care
 
 @cache
 def typestore() -> Typestore:
-    """The definitions of ROS 2 Jazzy, vision_msgs, grid_map_msgs, and what labelled data sets say beyond."""
+    """The definitions of ROS 2 Jazzy, those that it lacks, and what labelled data sets say beyond."""
     store = get_typestore(Stores.ROS2_JAZZY)
     vision_msgs.register(store)
     grid_map_msgs.register(store)
+    point_cloud_interfaces.register(store)
     store.register(get_types_from_msg(_LABELLED, "bevviz_msgs/msg/Detection3DArray"))
     return store
 

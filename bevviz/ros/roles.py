@@ -15,9 +15,12 @@ from bevviz.config import SourceConfig
 from bevviz.errors import UserError
 from bevviz.frame import Scene
 from bevviz.logging.entities import RESERVED
+from bevviz.ros import ouster
+from bevviz.ros.compressed import is_compressed
 from bevviz.ros.foxglove import KINDS, short_of
 from bevviz.ros.livox import is_livox
 from bevviz.ros.objects import check, holds_boxes
+from bevviz.ros.ouster import is_packet
 from bevviz.ros.packets import is_packets, lacks
 
 
@@ -33,11 +36,12 @@ class Topic:
     aside: str = ""  # why it plays no role unless it is stated
     boxes: bool = False  # source.boxes says where in its messages they are
     video: bool = False  # its messages are packets of video, whatever their type says
+    scans: bool = False  # its messages are packets of a LiDAR that scans can be made of
 
     @property
     def kind(self) -> str:
         """What it is read as: the type without its package, but for types that stand for others."""
-        if is_livox(self.type) or is_packets(self.type):
+        if self.scans or is_livox(self.type) or is_packets(self.type) or is_compressed(self.type):
             return "PointCloud2"
         if short := short_of(self.type):
             return KINDS[short]
@@ -140,6 +144,8 @@ def foreign(topic: Topic, sensor: str = "") -> str:
     """What a topic that nothing here reads holds and what would help; empty where it is not known."""
     if topic.kind == "PointCloud2":
         return ""
+    if is_packet(topic.type) and topic.aside:
+        return topic.aside if not sensor or (sensor, topic.aside) == ("LiDAR", ouster.LACKS) else ""
     if sensor in ("", "LiDAR") and (why := lacks(topic.type)):
         return why
     return next((why for of, kind, why in _FOREIGN if sensor in ("", of) and kind.search(topic.type)), "")
@@ -200,6 +206,8 @@ def find_roles(
     obstacles = [topic for key, topic in staged.items() if key == "ground.method"]
     for name in config.lidar_calibration:
         _stated(name, topics, "source.lidar_calibration", "PointCloud2")
+    told = {ouster.metadata_of(t.name) for t in topics if t.scans}
+    _note(notes, [t for t in topics if t.name in told], "metadata of the LiDAR")
     lidars = _find_lidars([t for t in topics if t not in obstacles], config, notes)
     images = _find_images(topics, config, notes)
     names = _unique_names(

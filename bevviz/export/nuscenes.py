@@ -1,0 +1,304 @@
+"""A scene with the tables of nuScenes (Caesar et al. 2020), as its devkit reads them."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+from collections import defaultdict
+from collections.abc import Sequence
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from bevviz import geometry
+from bevviz.errors import UserError
+from bevviz.export.kitti import rectified
+from bevviz.frame import F32, F64, Camera, Frame, FrameResult, Objects, Tracks
+from bevviz.run import Items, Observer
+
+VERSION = "v1.0-bevviz"
+TABLES = (
+    *("attribute", "calibrated_sensor", "category", "ego_pose", "instance", "log", "map", "sample"),
+    *("sample_annotation", "sample_data", "scene", "sensor", "visibility"),
+)
+LIDAR = "LIDAR_TOP"
+MAP = "maps/unknown.png"  # of a scene whose map nobody knows; the devkit asks for one
+JPEG_QUALITY = 95
+KINDS = {  # of a detector, as nuScenes calls them; what is not here becomes a category of its own
+    "car": "vehicle.car",
+    "van": "vehicle.car",
+    "truck": "vehicle.truck",
+    "bus": "vehicle.bus.rigid",
+    "trailer": "vehicle.trailer",
+    "construction_vehicle": "vehicle.construction",
+    "motorcycle": "vehicle.motorcycle",
+    "bicycle": "vehicle.bicycle",
+    "cyclist": "vehicle.bicycle",
+    "person": "human.pedestrian.adult",
+    "pedestrian": "human.pedestrian.adult",
+    "barrier": "movable_object.barrier",
+    "traffic_cone": "movable_object.trafficcone",
+    "traffic cone": "movable_object.trafficcone",
+}
+
+
+class NuScenesExport(Observer[FrameResult]):
+    """Writes each frame as a sample: the scan, the images of all cameras, and the objects as annotations.
+
+    The vehicle's frame is that of the points, which are upright, z up, several LiDARs merged. Images are
+    rectified, and each has the pose of the vehicle at its own time. An instance is a track. The tables are
+    written at the end, also where the run was interrupted.
+
+    Args:
+        folder: to be made; it must not hold an export yet.
+        camera: name of the only one whose images are written; empty: all.
+
+    Attributes:
+        frames: written.
+        labels: written.
+        skipped: frames that were left out, by the reason.
+
+    Raises:
+        UserError: the folder holds something.
+    """
+
+    def __init__(self, folder: Path, camera: str = "") -> None:
+        if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+            raise UserError(f"{folder}: is there already; give another folder")
+        self._folder, self._camera = folder, camera
+        self.frames = self.labels = 0
+        self.skipped: dict[str, int] = {}
+        self._rows: dict[str, list[dict[str, Any]]] = {name: [] for name in TABLES}
+        self._last: dict[tuple[str, str], dict[str, Any]] = {}  # row of a table, by what follows itself in it
+        self._channels: dict[str, str] = {}
+        self._known: dict[tuple[str, str], str] = {}  # tokens of rows that others refer to, by table and key
+        self._annotated: dict[str, list[str]] = defaultdict(list)
+        self._scene = ""
+
+    def begin(self, items: Items[object]) -> None:
+        scene = items.scene
+        if self._camera and self._camera not in scene.cameras:
+            raise UserError(
+                f"--camera {self._camera}: there is none of that name but {', '.join(scene.cameras)}"
+            )
+        self._scene = scene.name
+        channels = [self._channel(name) for name in scene.cameras if self._camera in ("", name)]
+        try:
+            for folder in (VERSION, "maps", "sweeps", *(f"samples/{name}" for name in (LIDAR, *channels))):
+                (self._folder / folder).mkdir(parents=True)
+            cv2.imwrite(str(self._folder / MAP), np.zeros((8, 8), np.uint8))
+        except OSError as error:
+            raise UserError(f"{self._folder}: cannot be made: {error.strerror}") from None
+        for token, level in (("1", "v0-40"), ("2", "v40-60"), ("3", "v60-80"), ("4", "v80-100")):
+            self._rows["visibility"].append({"token": token, "level": level, "description": ""})
+
+    def _channel(self, camera: str) -> str:
+        name = re.sub(r"[^A-Z0-9]+", "_", camera.upper()).strip("_").removeprefix("CAM_") or "CAMERA"
+        taken = {channel for other, channel in self._channels.items() if other != camera}
+        channel = f"CAM_{name}"
+        while channel in taken:
+            channel += "_"
+        return self._channels.setdefault(camera, channel)
+
+    def see(self, result: FrameResult) -> None:
+        frame = result.frame
+        if not frame.lidar:
+            self.skipped["no scan"] = self.skipped.get("no scan", 0) + 1
+            return
+        scene, token = _token("scene"), _token("sample", self.frames)
+        sample = self._follow("sample", "", token, timestamp=_micros(frame.stamp), scene_token=scene)
+        try:
+            name = self._write_points(frame)
+            mounted = self._calibrated(LIDAR, "lidar", np.eye(4), [])
+            self._data(LIDAR, sample["token"], mounted, frame.stamp, frame.pose, name, "pcd", (0, 0))
+            for camera in frame.cameras:
+                if self._camera in ("", camera.name):
+                    self._write_camera(frame, camera, sample["token"])
+        except OSError as error:
+            raise UserError(f"{self._folder}: cannot be written: {error.strerror}") from None
+        if result.objects is not None:
+            self._annotate(frame, sample["token"], result.objects, result.tracks)
+        self.frames += 1
+
+    def _write_points(self, frame: Frame) -> str:
+        points = np.zeros((len(frame.points), 5), np.float32)
+        points[:, :3] = frame.points
+        for column, field in ((3, "intensity"), (4, "ring")):
+            if field in frame.fields:
+                points[:, column] = frame.fields[field]
+        name = f"samples/{LIDAR}/{LIDAR}__{_micros(frame.stamp)}.pcd.bin"
+        points.tofile(self._folder / name)
+        return name
+
+    def _write_camera(self, frame: Frame, camera: Camera, sample: str) -> None:
+        image, intrinsics = camera.image, camera.intrinsics
+        if image is None or intrinsics is None or camera.camera_from_points is None:
+            return
+        mounting = camera.camera_from_points if camera.mounting is None else camera.mounting
+        channel = self._channel(camera.name)
+        name = f"samples/{channel}/{channel}__{_micros(image.stamp)}__{self.frames:06}.jpg"
+        if image.media_type == "image/jpeg" and image.encoded and not intrinsics.distortion_model:
+            data = image.encoded
+        else:
+            flat = rectified(image.bgr, intrinsics)
+            done, encoded = cv2.imencode(".jpg", flat, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
+            if not done:
+                raise OSError(0, "the image cannot be written")
+            data = encoded.tobytes()
+        (self._folder / name).write_bytes(data)
+        mounted = self._calibrated(
+            channel, "camera", geometry.inverse(mounting), np.asarray(intrinsics.K).tolist()
+        )
+        # Where the vehicle was when the image was taken, so that points project as they do here.
+        pose = frame.pose @ geometry.inverse(camera.camera_from_points) @ mounting
+        height, width = image.bgr.shape[:2]
+        self._data(channel, sample, mounted, image.stamp, pose, name, "jpg", (width, height))
+
+    def _calibrated(self, channel: str, modality: str, pose: F64, matrix: Sequence[Sequence[float]]) -> str:
+        """The token of a sensor as it is mounted: one for each time that this changes."""
+        sensor = self._once("sensor", channel, channel=channel, modality=modality)
+        placed = _placed(pose)
+        return self._once(
+            "calibrated_sensor",
+            json.dumps([channel, placed, matrix]),
+            sensor_token=sensor,
+            **placed,
+            camera_intrinsic=matrix,
+        )
+
+    def _data(
+        self,
+        channel: str,
+        sample: str,
+        mounted: str,
+        stamp: int,
+        pose: F64,
+        name: str,
+        form: str,
+        size: tuple[int, int],
+    ) -> None:
+        token = _token("sample_data", channel, self.frames)
+        self._rows["ego_pose"].append({"token": token, "timestamp": _micros(stamp), **_placed(pose)})
+        self._follow(
+            "sample_data",
+            channel,
+            token,
+            sample_token=sample,
+            ego_pose_token=token,
+            calibrated_sensor_token=mounted,
+            timestamp=_micros(stamp),
+            fileformat=form,
+            is_key_frame=True,
+            width=size[0],
+            height=size[1],
+            filename=name,
+        )
+
+    def _annotate(self, frame: Frame, sample: str, objects: Objects, tracks: Tracks | None) -> None:
+        tracked = {}
+        if tracks is not None:
+            tracked = {int(row): int(number) for number, row in zip(tracks.id, tracks.object, strict=True)}
+        boxes = objects.boxes
+        for row, name in enumerate(objects.names):
+            key = f"track {tracked[row]}" if row in tracked else f"object {self.frames} {row}"
+            kind = KINDS.get(name.lower(), f"other.{name}")
+            category = self._once("category", kind, name=kind, description="")
+            instance = self._once("instance", key, category_token=category)
+            turned = geometry.transform(
+                boxes.center[row], (0, 0, np.sin(boxes.yaw[row] / 2), np.cos(boxes.yaw[row] / 2))
+            )
+            annotation = self._follow(
+                "sample_annotation",
+                instance,
+                _token("sample_annotation", self.frames, row),
+                sample_token=sample,
+                instance_token=instance,
+                visibility_token="",  # not known
+                attribute_tokens=[],
+                **_placed(frame.pose @ turned),
+                size=[float(side) for side in _width_first(boxes.size[row])],
+                num_lidar_pts=int(geometry.inside(frame.points, boxes, row).sum()),
+                num_radar_pts=0,
+                score=float(objects.score[row]),
+            )
+            self._annotated[instance].append(annotation["token"])
+            self.labels += 1
+
+    def _once(self, table: str, key: str, **values: Any) -> str:
+        """The token of a row that is written when it is first named."""
+        if (table, key) not in self._known:
+            token = self._known[table, key] = _token(table, key)
+            self._rows[table].append({"token": token, **values})
+        return self._known[table, key]
+
+    def _follow(self, table: str, of: str, token: str, **values: Any) -> dict[str, Any]:
+        """A row that is chained to the one before it."""
+        former = self._last.get((table, of))
+        row = {"token": token, **values, "prev": former["token"] if former else "", "next": ""}
+        if former:
+            former["next"] = token
+        self._last[table, of] = row
+        self._rows[table].append(row)
+        return row
+
+    def end(self) -> None:
+        samples = self._rows["sample"]
+        if not samples:
+            return
+        captured = datetime.fromtimestamp(samples[0]["timestamp"] / 1e6, UTC)
+        log, scene = _token("log"), _token("scene")
+        self._rows["log"] = [
+            {
+                "token": log,
+                "logfile": self._scene,
+                "vehicle": "",
+                "date_captured": f"{captured:%Y-%m-%d}",
+                "location": "",
+            }
+        ]
+        self._rows["map"] = [
+            {"token": _token("map"), "log_tokens": [log], "category": "semantic_prior", "filename": MAP}
+        ]
+        self._rows["scene"] = [
+            {
+                "token": scene,
+                "log_token": log,
+                "name": self._scene,
+                "description": "written by bevviz; annotations are what it found",
+                "nbr_samples": len(samples),
+                "first_sample_token": samples[0]["token"],
+                "last_sample_token": samples[-1]["token"],
+            }
+        ]
+        for row in self._rows["instance"]:
+            found = self._annotated[row["token"]]
+            row["nbr_annotations"] = len(found)
+            row["first_annotation_token"], row["last_annotation_token"] = found[0], found[-1]
+        try:
+            for table, rows in self._rows.items():
+                (self._folder / VERSION / f"{table}.json").write_text(json.dumps(rows, indent=0))
+        except OSError as error:
+            raise UserError(f"{self._folder}: cannot be written: {error.strerror}") from None
+
+
+def _token(*of: object) -> str:
+    """As nuScenes has them, 32 hexadecimal digits; the same for the same."""
+    return hashlib.md5("\0".join(map(str, of)).encode(), usedforsecurity=False).hexdigest()
+
+
+def _micros(stamp: int) -> int:
+    return stamp // 1000
+
+
+def _placed(pose: F64) -> dict[str, list[float]]:
+    x, y, z, w = map(float, geometry.quaternion(pose))
+    return {"translation": [float(v) for v in pose[:3, 3]], "rotation": [w, x, y, z]}
+
+
+def _width_first(size: F32) -> F32:
+    """nuScenes has width, length and height."""
+    return size[[1, 0, 2]]

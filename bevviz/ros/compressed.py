@@ -1,0 +1,93 @@
+"""Clouds that point_cloud_transport compressed: CompressedPointCloud2 of its plugins zstd, zlib and draco."""
+
+from __future__ import annotations
+
+import re
+import zlib
+from typing import Any
+
+import numpy as np
+from backports import zstd
+
+from bevviz.errors import first_line
+from bevviz.ros.encode import make
+
+LONGEST = 1 << 30  # bytes of a cloud
+MOST_POINTS = 100_000_000
+DRACO = "which DracoPy reads: pip install 'bevviz[draco]'"
+_NAME = re.compile(r"point_cloud_interfaces/(msg/)?CompressedPointCloud2$")
+_SCALARS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
+
+
+def is_compressed(msgtype: str) -> bool:
+    return _NAME.search(msgtype) is not None
+
+
+def decompress(msg: Any) -> Any:
+    """The sensor_msgs/PointCloud2 that a CompressedPointCloud2 stands for.
+
+    Raises:
+        ValueError: a format that is not read here, or damaged data.
+    """
+    data = bytes(msg.compressed_data)
+    width, height = int(msg.width), int(msg.height)
+    if msg.format == "zstd":
+        unpacked = np.frombuffer(_unpacked(zstd.ZstdDecompressor(), data), np.uint8)
+    elif msg.format == "zlib":
+        unpacked = np.frombuffer(_unpacked(zlib.decompressobj(47), data), np.uint8)  # of zlib or of gzip
+    elif msg.format == "draco":
+        unpacked = _of_draco(msg, data)
+        width, height = len(unpacked) // max(int(msg.point_step), 1), 1
+    else:
+        raise ValueError(f"a cloud compressed by '{msg.format}' is not read: zstd, zlib and draco are")
+    return make(
+        "sensor_msgs/msg/PointCloud2",
+        header=msg.header,
+        height=height,
+        width=width,
+        fields=msg.fields,
+        is_bigendian=msg.is_bigendian,
+        point_step=msg.point_step,
+        row_step=width * int(msg.point_step) if msg.format == "draco" else msg.row_step,
+        data=unpacked,
+        is_dense=msg.is_dense,
+    )
+
+
+def _unpacked(stream: Any, data: bytes) -> bytes:
+    try:
+        found: bytes = stream.decompress(data, LONGEST)
+    except (zlib.error, zstd.ZstdError) as error:
+        raise ValueError(f"its compressed data is damaged ({first_line(error)})") from None
+    if not stream.eof:
+        raise ValueError("the end of its compressed data is missing, or it is too long")
+    return found
+
+
+def _of_draco(msg: Any, data: bytes) -> Any:
+    """(N * point_step,) bytes: the plugin makes an attribute of each field, in their order."""
+    try:
+        import DracoPy
+    except ImportError:
+        raise ValueError(f"it is compressed by draco, {DRACO}") from None
+    try:
+        attributes = DracoPy.decode(data).attributes
+    except Exception as error:  # the library's own, and what its extension makes of C++'s
+        raise ValueError(f"its draco data is damaged ({first_line(error)})") from None
+    step, count = int(msg.point_step), len(attributes[0]["data"]) if attributes else 0
+    if len(attributes) != len(msg.fields) or count > MOST_POINTS or not 0 < step < 1 << 16:
+        raise ValueError(
+            f"its draco data has {len(attributes)} attributes of {count} points, but {len(msg.fields)} fields"
+        )
+    points = np.zeros(count * step, np.uint8)
+    for field, attribute in zip(msg.fields, attributes, strict=True):
+        values = np.asarray(attribute["data"]).reshape(count, -1)
+        kind = np.dtype(_SCALARS.get(int(field.datatype), "u1"))
+        if values.dtype == np.uint8 and values.shape[1] == kind.itemsize:  # rgb, as its four bytes
+            kind = np.dtype(np.uint8)
+        end = int(field.offset) + values.shape[1] * kind.itemsize
+        if end > step:
+            raise ValueError(f"its field {field.name} ends at byte {end} of {step}")
+        shape, steps = values.shape, (step, kind.itemsize)
+        np.ndarray(shape, kind, points, int(field.offset), steps)[...] = values
+    return points

@@ -1,0 +1,158 @@
+"""Clouds as point_cloud_transport's plugins compress them."""
+
+from __future__ import annotations
+
+import builtins
+import zlib
+from base64 import b64decode
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from backports import zstd
+
+from bevviz.bags.source import BagSource
+from bevviz.cli import main
+from bevviz.config import Config
+from bevviz.frame import F32
+from bevviz.live.source import LiveMessage
+from bevviz.ros import point_cloud_interfaces
+from bevviz.ros.messages import MessageError, decode_cloud
+from bevviz.ros.point_cloud_interfaces import COMPRESSED
+from tests import bags
+
+# Twelve points, (4 + i, i % 4 - 1.5, -1.5 + i / 16), intensity 10 i, ring i % 3, rgb 0x102030 + i, encoded by
+# Google's draco 1.5.5 with the calls of draco_point_cloud_transport, an attribute a field: as they are, and
+# as a k-d tree of 14 bits.
+DRACO = (
+    "RFJBQ08CAwAAAIAAAQtkZWR1cGxpY2F0ZQQBAAAAAAwAAAABBgAJAQAAAAkBAAEACQEAAgQJAQADBAQBAAQCAgQABQAAAAABAQAAgEAA"
+    "AKBAAADAQAAA4EAAAABBAAAQQQAAIEEAADBBAABAQQAAUEEAAGBBAABwQQAAwL8AAAC/AAAAPwAAwD8AAMC/AAAAvwAAAD8AAMA/AADA"
+    "vwAAAL8AAAA/AADAPwAAwL8AALi/AACwvwAAqL8AAKC/AACYvwAAkL8AAIi/AACAvwAAcL8AAGC/AABQvwAAAAAAACBBAACgQQAA8EEA"
+    "ACBCAABIQgAAcEIAAIxCAACgQgAAtEIAAMhCAADcQgABAQEBA1UFA606AxAgiAAAAAACAAAAAAEBAQE4WS0DrQ5PVQEfVQFXVQEJC92c"
+    "iod80j1/AAAAADsAAAA=",
+    "RFJBQ08CAwABAIAAAQtkZWR1cGxpY2F0ZQQBAAAAAAwAAAABBgAJAQAAAAkBAAEACQEAAgQJAQADBAQBAAQCAgQABQMOAAAADAAAAJcH"
+    "JR0AXJtHhLQAAACALtJFEHADAggAQAD///+6QAD8/wQAATv//wEAi3bR/6ADAoAAQAAQoaouGgCgC3QAATYALgAABIwuqoqADCAAAEAA"
+    "IFTV6AIAXTS6AswAAAAABADx/9NFACy6dCAADiALAEAA6ADAogAAF70AAuQA0QAABFy0qnLARb/oEFADBB0AQADoUlUXIABElwQAATEV"
+    "XQAAAAAAVQADAAAAQAAQCwAAAAAU3aIAATQgdAEABAAAAFAEAAAAAAAAAAQAAAAAAADBAACAQAAAMEEOAADAvwAAQEAOAADAvwAAMD8O"
+    "AAAAAAAA3EIO",
+)
+FIELDS = (("x", 0, 7), ("y", 4, 7), ("z", 8, 7), ("intensity", 12, 7), ("ring", 16, 4), ("rgb", 18, 7))
+
+
+def messages(ros1: bool = False) -> bags.Messages:
+    made = bags.Messages(ros1)
+    point_cloud_interfaces.register(made.store)
+    return made
+
+
+def compressed(made: bags.Messages, cloud: Any, form: str, data: bytes) -> Any:
+    names = ("header", "height", "width", "fields", "is_bigendian", "point_step", "row_step", "is_dense")
+    values = {name: getattr(cloud, name) for name in names}
+    return made.make(COMPRESSED, **values, compressed_data=np.frombuffer(data, np.uint8), format=form)
+
+
+def packed(form: str, data: bytes) -> bytes:
+    if form == "zstd":
+        return zstd.compress(data)
+    stream = zlib.compressobj(wbits=31 if form == "gzip" else 15)
+    return stream.compress(data) + stream.flush()
+
+
+def points(seed: int) -> F32:
+    return np.random.default_rng(seed).uniform(-9, 9, (500, 4)).astype(np.float32)
+
+
+def draco(data: bytes) -> Any:
+    """The message of the twelve points."""
+    made = messages()
+    field = "sensor_msgs/msg/PointField"
+    fields = [made.make(field, name=n, offset=at, datatype=kind, count=1) for n, at, kind in FIELDS]
+    cloud = made.cloud(bags.START, np.zeros((12, 4), np.float32))
+    cloud.fields, cloud.point_step, cloud.row_step = fields, 22, 12 * 22
+    return compressed(made, cloud, "draco", data)
+
+
+def decoded(message: Any) -> Any:
+    raw = bytes(messages().store.serialize_cdr(message, COMPRESSED))
+    return decode_cloud(LiveMessage("/points", COMPRESSED, 0, raw).decode(), "/points", 0)
+
+
+@pytest.mark.parametrize("form", ["zstd", "zlib", "gzip"])
+@pytest.mark.parametrize("ros1", [False, True])
+def test_a_bag_has_the_points_that_were_compressed(tmp_path: Path, form: str, ros1: bool) -> None:
+    made = messages(ros1)
+    stamps = [bags.START + i * bags.PERIOD for i in range(3)]
+    clouds = [made.cloud(stamp, points(number)) for number, stamp in enumerate(stamps)]
+    name = "zlib" if form == "gzip" else form
+    items = [
+        bags.Item(
+            f"/lidar/{name}",
+            COMPRESSED,
+            stamp,
+            compressed(made, cloud, name, packed(form, cloud.data.tobytes())),
+        )
+        for stamp, cloud in zip(stamps, clouds, strict=True)
+    ]
+    path = bags.write(tmp_path / ("bag.bag" if ros1 else "bag"), items, made, form="ros1" if ros1 else "mcap")
+    with BagSource([path], Config()) as source:
+        assert source.roles.notes[f"/lidar/{name}"] == "LiDAR, by type and name"
+        frames = list(source)
+    assert [frame.stamp for frame in frames] == stamps
+    for number, frame in enumerate(frames):
+        np.testing.assert_array_equal(frame.points, points(number)[:, :3])
+        np.testing.assert_array_equal(frame.fields["intensity"], points(number)[:, 3])
+
+
+def test_beside_the_cloud_itself_it_is_not_taken(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    made = messages()
+    cloud = made.cloud(bags.START, points(0))
+    items = [
+        bags.Item("/points", "sensor_msgs/msg/PointCloud2", bags.START, cloud),
+        bags.Item("/points/zstd", COMPRESSED, bags.START, compressed(made, cloud, "zstd", b"")),
+    ]
+    assert main(["info", str(bags.write(tmp_path / "bag", items, made))]) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert "/points: LiDAR, by type and name" in said
+    assert "/points/zstd: not used: the sensor of /points, by its frame or name" in said
+
+
+@pytest.mark.parametrize(("number", "off"), [(0, 0.0), (1, 0.005)])
+def test_draco(number: int, off: float) -> None:
+    pytest.importorskip("DracoPy")
+    cloud = decoded(draco(b64decode(DRACO[number])))
+    assert cloud.dropped == 0
+    order = np.argsort(cloud.xyz[:, 0])
+    i = np.arange(12)
+    np.testing.assert_allclose(cloud.xyz[order], np.stack([4 + i, i % 4 - 1.5, i / 16 - 1.5], 1), atol=off)
+    np.testing.assert_allclose(cloud.fields["intensity"][order], 10 * i, atol=off)
+    np.testing.assert_array_equal(cloud.fields["ring"][order], i % 3)
+    np.testing.assert_array_equal(cloud.fields["rgb"].view(np.uint32)[order], 0x102030 + i)
+
+
+def test_what_cannot_be_unpacked_says_why(monkeypatch: pytest.MonkeyPatch) -> None:
+    made = messages()
+    cloud = made.cloud(bags.START, points(0))
+    whole = packed("zstd", cloud.data.tobytes())
+    some = draco(b64decode(DRACO[0]))
+    some.fields = some.fields[:5]
+    for message, said in (
+        (compressed(made, cloud, "cloudini", b"CLOUDINI"), "compressed by 'cloudini' is not read"),
+        (compressed(made, cloud, "zstd", b"nothing of the kind"), "its compressed data is damaged"),
+        (compressed(made, cloud, "zstd", whole[:-9]), "the end of its compressed data is missing"),
+        (compressed(made, cloud, "zlib", whole), "its compressed data is damaged"),
+        (draco(b"DRACO" + bytes(40)), "its draco data is damaged"),
+        (some, "its draco data has 6 attributes of 12 points, but 5 fields"),
+    ):
+        with pytest.raises(MessageError, match=f"/points: not a {COMPRESSED}: .*{said}"):
+            decoded(message)
+    real = builtins.__import__
+
+    def without(name: str, *given: Any, **named: Any) -> Any:
+        if name == "DracoPy":
+            raise ImportError(name)
+        return real(name, *given, **named)
+
+    monkeypatch.setattr(builtins, "__import__", without)
+    with pytest.raises(MessageError, match=r"which DracoPy reads: pip install 'bevviz\[draco\]'"):
+        decoded(draco(b64decode(DRACO[0])))

@@ -1,0 +1,192 @@
+"""Packets of an Ouster, byte by byte as its manual has them, in bags that rosbags writes."""
+
+from __future__ import annotations
+
+import json
+import struct
+from math import cos, pi, radians, sin
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from rosbags.typesys import get_types_from_msg
+
+from bevviz.bags.source import BagSource
+from bevviz.cli import main
+from bevviz.config import Config
+from bevviz.errors import UserError
+from bevviz.ros import ouster
+from tests import bags
+
+PIXELS, COLUMNS, PACKETS = 16, 64, 4  # of a scan, in packets of 16 columns
+KIND = "ouster_sensor_msgs/msg/PacketMsg"
+LIDAR, IMU, TOLD = "/ouster/lidar_packets", "/ouster/imu_packets", "/ouster/metadata"
+ALTITUDES = [15.0 - 2 * i for i in range(PIXELS)]
+AZIMUTHS = [(-4.2, -1.4, 1.4, 4.2)[i % 4] for i in range(PIXELS)]
+ORIGIN = 15.8
+PROFILES = ("LEGACY", "RNG19_RFL8_SIG16_NIR16", "RNG19_RFL8_SIG16_NIR16_DUAL", "RNG15_RFL8_NIR8")
+
+
+def metadata(profile: str, nested: bool = True) -> str:
+    beams = {
+        "beam_altitude_angles": ALTITUDES,
+        "beam_azimuth_angles": AZIMUTHS,
+        "lidar_origin_to_beam_origin_mm": ORIGIN,
+    }
+    form = {
+        "columns_per_frame": COLUMNS,
+        "columns_per_packet": COLUMNS // PACKETS,
+        "pixels_per_column": PIXELS,
+        "udp_profile_lidar": profile,
+    }
+    return json.dumps(
+        {"beam_intrinsics": beams, "lidar_data_format": form} if nested else {**beams, "data_format": form}
+    )
+
+
+def millimetres(column: int, pixel: int) -> int:
+    """Some 10 m, in steps of 8 mm; every seventh column of a pixel met nothing."""
+    return 0 if (column + pixel) % 7 == 0 else 8 * (1250 + column + 3 * pixel)
+
+
+def measured(profile: str, far: int, pixel: int) -> bytes:
+    if profile == "LEGACY":
+        return struct.pack("<IHHHH", far, 40 + pixel, 500 + pixel, 7, 0)
+    if profile == "RNG15_RFL8_NIR8":
+        return struct.pack("<HBB", far // 8 | 0x8000, 40 + pixel, 7)
+    if profile.endswith("DUAL"):
+        return struct.pack("<IIHHHH", far | (40 + pixel) << 24, 99, 500 + pixel, 1, 7, 0)
+    return struct.pack("<IHHHH", far | 0x80000, 40 + pixel, 500 + pixel, 7, 0)
+
+
+def packet(profile: str, scan: int, number: int, clock: int) -> bytes:
+    legacy = profile == "LEGACY"
+    data = b"" if legacy else struct.pack("<HH", 1, scan) + bytes(28)
+    for column in range(number * 16, number * 16 + 16):
+        data += struct.pack("<QH", clock + 1_000_000 * column, column)
+        data += struct.pack("<HI", scan, 0) if legacy else struct.pack("<H", 1)
+        data += b"".join(measured(profile, millimetres(column, p), p) for p in range(PIXELS))
+        data += b"\xff\xff\xff\xff" if legacy else b""
+    return data + (b"" if legacy else bytes(32))
+
+
+def where(column: int, pixel: int) -> tuple[float, float, float]:
+    """The manual's formula."""
+    around = 2 * pi * (1 - column / COLUMNS)
+    turn, tilt = around - radians(AZIMUTHS[pixel]), radians(ALTITUDES[pixel])
+    far = millimetres(column, pixel) - ORIGIN
+    x = far * cos(turn) * cos(tilt) + ORIGIN * cos(around)
+    y = far * sin(turn) * cos(tilt) + ORIGIN * sin(around)
+    return x / 1000, y / 1000, far * sin(tilt) / 1000
+
+
+def bag(
+    path: Path,
+    profile: str = "RNG15_RFL8_NIR8",
+    *,
+    told: str | None = None,
+    scans: int = 4,
+    form: str = "mcap",
+    clock: int = bags.START,
+    order: tuple[int, ...] = (),
+) -> Path:
+    """Scans of 64 ms each, 100 ms apart; ``order``: of all packets, other than in that of their time."""
+    made = bags.Messages(form == "ros1")
+    made.store.register(get_types_from_msg("uint8[] buf\n", KIND))
+
+    def held(data: bytes) -> Any:
+        return made.make(KIND, buf=np.frombuffer(data, np.uint8))
+
+    items = []
+    if told is not None:
+        text = made.make("std_msgs/msg/String", data=told)
+        items.append(bags.Item(TOLD, "std_msgs/msg/String", bags.START - 1, text))
+    for place, number in enumerate(order or range(scans * PACKETS)):
+        scan, part = divmod(number, PACKETS)
+        at = bags.START + place // PACKETS * bags.PERIOD + (place % PACKETS + 1) * 16_000_000
+        data = packet(profile, scan + 65534 & 0xFFFF, part, clock + scan * bags.PERIOD)
+        items.append(bags.Item(LIDAR, KIND, at, held(data)))
+        items.append(bags.Item(IMU, KIND, at, held(bytes(48))))
+    return bags.write(path, items, made, form=form)
+
+
+@pytest.mark.parametrize("profile", PROFILES)
+def test_scans_by_the_manual(tmp_path: Path, profile: str) -> None:
+    form = "ros1" if profile == "LEGACY" else "mcap"
+    path = bag(
+        tmp_path / ("bag.bag" if form == "ros1" else "bag"),
+        profile,
+        told=metadata(profile, nested=profile != "LEGACY"),
+        form=form,
+    )
+    with BagSource([path], Config()) as source:
+        assert source.roles.notes[LIDAR] == "LiDAR, by type and name"
+        assert source.roles.notes[TOLD] == "metadata of the LiDAR"
+        assert source.total == 4
+        frames = list(source)
+        again = source.frame(2)
+    there = [(c, p) for c in range(COLUMNS) for p in range(PIXELS) if millimetres(c, p)]
+    for number, frame in enumerate(frames):
+        assert frame.stamp == bags.START + number * bags.PERIOD
+        assert frame.points_frame == "os_lidar"
+        np.testing.assert_allclose(frame.points, [where(*beam) for beam in there], atol=1e-5)
+        np.testing.assert_array_equal(frame.fields["ring"], [pixel for _, pixel in there])
+        np.testing.assert_array_equal(frame.fields["reflectivity"], [40 + pixel for _, pixel in there])
+        signal = 40 if profile == "RNG15_RFL8_NIR8" else 500
+        np.testing.assert_array_equal(frame.fields["intensity"], [signal + pixel for _, pixel in there])
+        np.testing.assert_allclose(frame.fields["time"], [column * 1e-3 for column, _ in there], atol=1e-7)
+        assert frame.clouds[0].dropped == COLUMNS * PIXELS - len(there)
+    assert again is not None and again.stamp == frames[2].stamp
+    np.testing.assert_array_equal(again.points, frames[2].points)
+
+
+def test_lost_and_overtaken_packets_and_a_clock_from_its_start(tmp_path: Path) -> None:
+    told = metadata("RNG15_RFL8_NIR8")
+    # The second packet is lost, and the last one of the second scan comes after the third has begun.
+    path = bag(tmp_path / "bag", told=told, clock=5_000_000_000, order=(0, 2, 3, 4, 5, 6, 8, 7, 9, 10, 11))
+    with BagSource([path], Config()) as source:
+        frames = list(source)
+    sizes = [len(frame.points) for frame in frames]
+    assert sizes[0] < sizes[2] > sizes[1] and len(sizes) == 3
+    assert [frame.clouds[0].dropped for frame in frames] == [COLUMNS * PIXELS - size for size in sizes]
+    assert [frame.stamp for frame in frames] == [
+        bags.START + at for at in (16_000_000, 64_000_000, bags.PERIOD + 48_000_000)
+    ]
+
+
+def test_a_part_of_a_bag_has_the_same_scans(tmp_path: Path) -> None:
+    path = bag(tmp_path / "bag", told=metadata("RNG15_RFL8_NIR8"), scans=8)
+    with BagSource([path], Config()) as source:
+        stamps = [frame.stamp for frame in source]
+    with BagSource([path], Config(), start="0.2", end="0.6") as source:
+        assert [frame.stamp for frame in source] == stamps[2:6]
+    with BagSource([path], Config(), frames=(3, 5)) as source:
+        assert [frame.stamp for frame in source] == stamps[3:5]
+
+
+def test_metadata_may_be_a_file_and_are_asked_for(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path, file = bag(tmp_path / "bag"), tmp_path / "sensor.json"
+    assert main(["info", str(path)]) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert "packets of an Ouster without its metadata: record its metadata topic" in said
+    assert f"{IMU}: not used: packets of an Ouster's IMU" in said
+    option = f"source.lidar_calibration={{{LIDAR}: {file}}}"
+    for text, why in (
+        (None, "cannot be read: No such file"),
+        ("{}", "is not the metadata (JSON) of an Ouster"),
+        (metadata("RNG99"), "an Ouster with packets of the profile RNG99, which is not decoded here"),
+    ):
+        if text is not None:
+            file.write_text(text)
+        assert main(["info", str(path), "--set", option]) == 2
+        assert why in " ".join(capsys.readouterr().err.split())
+    file.write_text(metadata("RNG15_RFL8_NIR8"))
+    assert main(["info", str(path), "--set", option]) == 0
+    assert f"{LIDAR}: LiDAR, by type and name" in capsys.readouterr().out
+
+
+def test_other_jsons_are_no_metadata() -> None:
+    for text in ("", "[]", '"a"', '{"beam_intrinsics": 5}', metadata("LEGACY").replace("64", "0")):
+        with pytest.raises(UserError, match="here: is not the metadata"):
+            ouster.read_sensor(text, "here")
