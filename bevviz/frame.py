@@ -461,30 +461,16 @@ class Masks:
     def has(self, d: int) -> bool:
         return bool(self.place[d, 2])
 
+    def start(self, d: int) -> int:
+        """The bit that a detection's cells begin with."""
+        return int((self.place[:d, 2].astype(np.int64) * self.place[:d, 3]).sum())
+
     def cells(self, d: int) -> Bool:
         """(rows, columns) those of a detection."""
-        sizes = self.place[:, 2].astype(np.int64) * self.place[:, 3]
-        start, size = int(sizes[:d].sum()), int(sizes[d])
+        start, size = self.start(d), int(self.place[d, 2]) * int(self.place[d, 3])
         bits = np.unpackbits(self.packed[start // 8 : -(-(start + size) // 8)])[start % 8 :][:size]
         cells: Bool = bits.reshape(self.place[d, 3], self.place[d, 2]).astype(bool)
         return cells
-
-    def cover(self, d: int, uv: F32, margin: float = 0.0) -> Bool:
-        """(N,) which of these pixels of the image a detection's object covers; NaN is none.
-
-        ``margin``: pixels to the left, right, above and below it that count, too.
-        """
-        column, row, columns, rows = self.place[d].tolist()
-        cells, covered = self.cells(d), np.zeros(len(uv), bool)
-        beside = [(0.0, 0.0), (margin, 0.0), (-margin, 0.0), (0.0, margin), (0.0, -margin)]
-        for shift in beside if margin else beside[:1]:
-            with np.errstate(invalid="ignore"):
-                moved = uv + np.array(shift, np.float32) + np.float32(0.5)
-                at = np.floor(moved * self.grid[:2] + self.grid[2:]) - (column, row)
-                there = ((at >= 0) & (at < (columns, rows))).all(axis=1)
-            i, j = at[there].astype(np.int64).T
-            covered[there] |= cells[j, i]
-        return covered
 
 
 @dataclass(frozen=True, slots=True)

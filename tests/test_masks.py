@@ -19,6 +19,7 @@ from bevviz.logging.writer import Writer
 from bevviz.report.digest import detections_of as recorded
 from bevviz.report.digest import digest, pack, unpack
 from bevviz.stages.clustering import cluster
+from bevviz.stages.cover import cover
 from bevviz.stages.fusion import fuse
 from bevviz.synthetic import SyntheticSource
 from tests.recordings import Recording
@@ -132,7 +133,7 @@ def test_a_pixel_is_covered_where_its_cell_is(seed: int, margin: float) -> None:
 
         beside = [(0, 0), (margin, 0), (-margin, 0), (0, margin), (0, -margin)]
         expected = [any(at(u + du, v + dv) for du, dv in beside) for u, v in uv[1:].tolist()]
-        assert masks.cover(d, uv, margin).tolist() == [False, *expected]
+        assert cover(masks, d, uv, margin).tolist() == [False, *expected]
 
 
 def test_without_masks_nothing_is_said_of_them() -> None:

@@ -28,6 +28,7 @@ from bevviz.frame import (
 from bevviz.stages.boxfit import NO_EDGE, fit
 from bevviz.stages.cells import sort_by
 from bevviz.stages.clustering import MIN_SIZE, redescribe
+from bevviz.stages.cover import cover
 from bevviz.stages.kernel import kernel
 
 EDGE_PIXELS = 2.0  # one sigma of the edges of an image box,
@@ -365,7 +366,7 @@ def _beside_mask(
     margin = MARGIN * (x1 - x0)
     u, v = uv[seen].T
     inside = seen[(u >= x0 - margin) & (u <= x1 + margin) & (v >= y0) & (v <= y1)]
-    covered = masks.cover(d, uv[inside], config.mask_margin)
+    covered = cover(masks, d, uv[inside], config.mask_margin)
     if np.count_nonzero(covered) < fewest:
         return None
     barred = np.zeros(len(uv), np.bool_)

@@ -25,6 +25,7 @@ from bevviz.frame import (
     Pairs,
 )
 from bevviz.geometry import apply, iou
+from bevviz.stages.cover import cover
 from bevviz.stages.kernel import kernel
 
 # What makes a cluster look like a detection, each from 0 to 1 (see ``fuse``).
@@ -143,7 +144,7 @@ def _covered(uv: F32, inside: list[I64], detections: Detections, config: FusionC
         return None
     counts = np.full(len(detections), -1, np.int32)
     for d in np.flatnonzero(detections.kept & (masks.place[:, 2] > 0)).tolist():
-        counts[d] = np.count_nonzero(masks.cover(d, uv[inside[d]], config.mask_margin))
+        counts[d] = np.count_nonzero(cover(masks, d, uv[inside[d]], config.mask_margin))
     return counts
 
 
