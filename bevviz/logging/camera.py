@@ -152,8 +152,8 @@ class Videos:
 def log_detections(to: Writer, result: CameraResult, explanations: Iterable[Explanation]) -> None:
     """Those that went on to the fusion in the colour of their class, the others faint.
 
-    The names of those that have no match are written beside them, and of those that stand large in the image, as
-    far as names do not meet; what became of any is said by its outline, see ``spoken``.
+    The names of those that have no match are written beside them, and of those that stand large in the image,
+    as far as names do not meet; what became of any is said by its outline, see ``spoken``.
     """
     name, detections = result.camera.name, result.detections
     if detections is None:
