@@ -454,7 +454,7 @@ def test_the_truth_says_which_side_is_right(demo: str, capsys: Capture) -> None:
     (page,) = recording.at["/compare"]["TextDocument:text"][0]
     labels = recording.at["/compare/objects/fixed"]["Boxes3D:labels"][0]
     assert f"#### Fixed by B: {len(labels)}\n" in page and "found of" in page
-    assert sum(map(bool, labels)) == min(len(labels), 6) and "/compare/objects/broken" not in recording.at
+    assert 0 < sum(map(bool, labels)) <= 6 and "/compare/objects/broken" not in recording.at
     assert all(label.startswith("fixed: ") for label in labels if label)
 
 

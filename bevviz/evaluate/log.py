@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import TypeAlias
 
 import numpy as np
 import rerun as rr
@@ -18,6 +19,9 @@ from bevviz.logging.spoken import log_spoken, log_spoken_looks, named_in_space
 from bevviz.logging.writer import WAIT, Writer
 from bevviz.run import Items, Observer
 from bevviz.text import markdown
+
+# What became of them, boxes, the rows of these that are meant, and the names of all.
+Judged: TypeAlias = tuple[str, Boxes3D, Sequence[int], Sequence[str]]
 
 
 class EvaluationRecorder(Observer[FrameResult]):
@@ -47,11 +51,12 @@ class EvaluationRecorder(Observer[FrameResult]):
         writer.begin(frame.index, frame.stamp, frame.received)
         _, truth, matches = self._evaluation.last
         names = self._evaluation.names
+        parts: list[Judged] = [("missed", truth.boxes, np.flatnonzero(matches.missed).tolist(), truth.labels)]
         if (objects := result.objects) is not None:
             false = [j for j in np.flatnonzero(matches.false).tolist() if objects.names[j].lower() in names]
-            self._boxes(result, "true", objects.boxes, np.flatnonzero(matches.true).tolist(), objects.names)
-            self._boxes(result, "false", objects.boxes, false, objects.names)
-        self._boxes(result, "missed", truth.boxes, np.flatnonzero(matches.missed).tolist(), truth.labels)
+            parts.append(("false", objects.boxes, false, objects.names))
+            parts.append(("true", objects.boxes, np.flatnonzero(matches.true).tolist(), objects.names))
+        self._boxes(result, [part for part in parts if part[2]])
         said = self._evaluation.now
         words = {what: said[what] for what in ("missed", "false", "true")}
         for what, texts in words.items():
@@ -61,26 +66,20 @@ class EvaluationRecorder(Observer[FrameResult]):
         writer.lines(entities.EVALUATE_LOG, wrong)
         writer.end()
 
-    def _boxes(
-        self,
-        result: FrameResult,
-        what: str,
-        boxes: Boxes3D,
-        rows: Sequence[int],
-        names: Sequence[str],
-    ) -> None:
-        if not rows:
-            return
-        chosen = np.asarray(rows)
-        labels = [f"{what}: {names[row]}" for row in rows]
-        logged, path = boxes3d(boxes, chosen, labels), entities.judged(what)
-        self._writer.put(path, transform(result.frame.pose), logged)
-        # What is right is named where the pointer is.
-        named = named_in_space(boxes.center[chosen]) & (what != "true")
-        shown = [label if is_named else "" for label, is_named in zip(labels, named, strict=True)]
-        away = np.hypot(*boxes.center[chosen, :2].T).tolist()
-        said = [f"{label}, {metres:.1f} m away" for label, metres in zip(labels, away, strict=True)]
-        log_spoken(self._writer, path, boxes.chosen(chosen), shown, said, [TRUTH[what]] * len(rows))
+    def _boxes(self, result: FrameResult, parts: Sequence[Judged]) -> None:
+        """What is right has its name where the pointer is, as what is wrong and has no room for it."""
+        centers = np.concatenate([np.zeros((0, 3), np.float32), *(b.center[rows] for _, b, rows, _ in parts)])
+        wrong = np.repeat([what != "true" for what, *_ in parts], [len(rows) for *_, rows, _ in parts])
+        named = iter((named_in_space(centers, wrong) & wrong).tolist() if len(wrong) else [])
+        for what, boxes, rows, names in parts:
+            chosen, path = boxes.chosen(rows), entities.judged(what)
+            labels = [f"{what}: {names[row]}" for row in rows]
+            logged = boxes3d(boxes, np.asarray(rows), labels)
+            self._writer.put(path, transform(result.frame.pose), logged)
+            shown = [label if next(named) else "" for label in labels]
+            away = np.hypot(*chosen.center[:, :2].T).tolist()
+            said = [f"{label}, {metres:.1f} m away" for label, metres in zip(labels, away, strict=True)]
+            log_spoken(self._writer, path, chosen, shown, said, [TRUTH[what]] * len(rows))
 
     def end(self) -> None:
         self._writer.static(entities.EVALUATE_ABOUT, document(f"# Evaluation\n\n{page(self._evaluation)}"))

@@ -154,8 +154,8 @@ class Videos:
 def log_detections(to: Writer, result: CameraResult, explanations: Iterable[Explanation]) -> None:
     """Those that went on to the fusion in the colour of their class, the others faint.
 
-    The names of those that stand large in the image are written beside them, and of those that have no match;
-    what became of any is said by its outline, see ``spoken``.
+    The names of those that have no match are written beside them, and of those that stand large in the image,
+    as far as names do not meet; what became of any is said by its outline, see ``spoken``.
     """
     name, detections = result.camera.name, result.detections
     if detections is None:
@@ -176,7 +176,7 @@ def log_detections(to: Writer, result: CameraResult, explanations: Iterable[Expl
             lost = result.fusion.detection_decision[kept] != Decision.MATCHED
         size = _size(result.camera)
         below = np.stack([xyxy[:, ::2].mean(axis=1), xyxy[:, 3]], axis=1) / size
-        named = lost | apart(below, xyxy[:, 1] - xyxy[:, 3], IN_IMAGE, lost)  # the tallest are what is near
+        named = apart(below, xyxy[:, 1] - xyxy[:, 3], IN_IMAGE, lost)  # the tallest are what is near
         log_spoken_in_image(
             to,
             entities.detections(name),

@@ -178,7 +178,7 @@ def diagnostics() -> rrb.StateTimelineView:
 
 
 def anomalies() -> rrb.StateTimelineView:
-    """What was worth a look, by kind, over time; over it how the pipeline is, which no drive lacks."""
+    """What was worth a look, by kind, over time; below it how the pipeline is, which no drive lacks."""
     contents = [entities.state("pipeline"), "$origin/**"]
     return rrb.StateTimelineView(name="Anomalies", origin=entities.ANOMALY_STATES, contents=contents)
 
