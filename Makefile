@@ -12,7 +12,7 @@ test: $(VENV)/.tested
 	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder --max-worker-restart 0
 
 # The parts that are not ours to choose: data classes, pydantic, compiled kernels, ONNX, readers, the command line.
-FAST = config perceive run exchanged_stages clustering ground fusion tracking messages drive info
+FAST = config perceive run clustering fusion tracking messages detector info
 test-fast: $(VENV)/.tested
 	$(BIN)/python -m pytest -q -n 2 --dist loadfile $(FAST:%=tests/test_%.py)
 

@@ -346,8 +346,7 @@ def test_a_bag_cut_in_the_middle(tmp_path: Path, capsys: Capture) -> None:
     assert 10 < frames < 30
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_an_interrupted_run_leaves_a_readable_recording(tmp_path: Path, number: signal.Signals) -> None:
+def test_an_interrupted_run_leaves_a_readable_recording(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "bevviz.cli", "demo", "--frames", "500", "--save", "out.rrd"]
     saved = tmp_path / "out.rrd"
     deadline = time.monotonic() + 120
@@ -357,7 +356,7 @@ def test_an_interrupted_run_leaves_a_readable_recording(tmp_path: Path, number: 
                 if unfinished(saved).exists() and unfinished(saved).stat().st_size > 4_000_000:
                     break
                 time.sleep(0.1)
-            run.send_signal(number)
+            run.send_signal(signal.SIGINT)
             _, said = run.communicate(timeout=180)
         finally:
             run.kill()
