@@ -22,7 +22,10 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
 REAL_TIME = ("test_live", "test_workbench", "test_robot_examples", "test_control")
 
 # The longest files, so that no worker is left alone with one at the end; a browser not beside a robot.
-FIRST = ("test_workbench", "test_calib", "test_damage", "test_torture", "test_live_ros", "test_live")
+FIRST = (
+    *("test_workbench", "test_calib", "test_examples", "test_torture", "test_workbench_native"),
+    *("test_damage", "test_live_ros", "test_live"),
+)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
