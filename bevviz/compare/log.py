@@ -27,6 +27,7 @@ COLORS = {
     Change.ONLY_A: SIDES["only A"],
     Change.ONLY_B: SIDES["only B"],
 }
+HEIGHT = 0.57  # of a view of one side, of what a view of space has in other layouts
 
 
 class DifferenceLogger(Writer):
@@ -82,8 +83,7 @@ class DifferenceLogger(Writer):
             if mine:
                 self._log_boxes(change, mine, found, world_from_points)
         if found.judged is not None:
-            for what, rows in (("broken", found.judged.broken), ("fixed", found.judged.fixed)):
-                self._log_judged(what, found.judged, rows, world_from_points)
+            self._log_judged(found.judged, world_from_points)
         for camera, pairs in found.images.items():
             self._log_image(camera, pairs, found)
         for name, value in _counts(found).items():
@@ -103,7 +103,7 @@ class DifferenceLogger(Writer):
             side, rows = (found.b, [d.row_b for d in mine])
         path = entities.difference(change)
         # What is better and worse is more than what differs: where that is known, its names alone are shown.
-        is_named = named_in_space(side.boxes.center[rows])
+        is_named = named_in_space(side.boxes.center[rows], height=HEIGHT)
         labels = [_label(d) if found.judged is None and is_named[i] else "" for i, d in enumerate(mine)]
         what = boxes3d(side.boxes, np.array(rows), labels)
         self.put(path, transform(world_from_points), what)
@@ -113,13 +113,18 @@ class DifferenceLogger(Writer):
             arrows = rr.Arrows3D(origins=start, vectors=end - start, colors=[COLORS[change]])
             self.put(f"{path}/from_a", arrows)
 
-    def _log_judged(self, what: str, judged: Judged, rows: Sequence[int], world_from_points: F64) -> None:
-        if rows:
-            chosen = np.array(rows)
-            is_named = named_in_space(judged.boxes.center[chosen])
-            labels = [f"{what}: {judged.labels[row]}" if is_named[i] else "" for i, row in enumerate(rows)]
-            path = entities.difference(what)
-            self.put(path, transform(world_from_points), boxes3d(judged.boxes, chosen, labels))
+    def _log_judged(self, judged: Judged, world_from_points: F64) -> None:
+        rows = np.array([*judged.broken, *judged.fixed], np.int64)
+        is_broken = np.arange(len(rows)) < len(judged.broken)
+        is_named = named_in_space(judged.boxes.center[rows], is_broken, HEIGHT)
+        for what, mine in (("broken", is_broken), ("fixed", ~is_broken)):
+            if mine.any():
+                labels = [
+                    f"{what}: {judged.labels[row]}" if named else ""
+                    for row, named in zip(rows[mine].tolist(), is_named[mine], strict=True)
+                ]
+                boxes = boxes3d(judged.boxes, rows[mine], labels)
+                self.put(entities.difference(what), transform(world_from_points), boxes)
 
     def _log_image(self, camera: str, pairs: tuple[Difference, ...], found: FrameDifferences) -> None:
         for change in (Change.CLASS, Change.ONLY_A, Change.ONLY_B):

@@ -84,10 +84,10 @@ def log_spoken_in_image(
         )
 
 
-def named_in_space(places: F32, first: Bool | None = None) -> Bool:
+def named_in_space(places: F32, first: Bool | None = None, height: float = 1.0) -> Bool:
     """(K,) those of (K, 3) places around the robot that are named: the nearest, as far as names do not meet.
 
-    ``first``: (K,) come before what is near.
+    ``first``: (K,) come before what is near; ``height``: of the view, of what it has beside others usually.
     """
     ahead = np.subtract(LOOK, EYE)
     ahead /= np.linalg.norm(ahead)
@@ -95,7 +95,7 @@ def named_in_space(places: F32, first: Bool | None = None) -> Bool:
     right /= np.linalg.norm(right)
     seen = (places - np.array(EYE)) @ np.stack([right, np.cross(right, ahead), ahead], axis=1)
     at = seen[:, :2] / np.maximum(seen[:, 2:], 0.1)
-    return apart(at, _away(places), IN_SPACE, first)
+    return apart(at, _away(places), (IN_SPACE[0] / height, IN_SPACE[1] / height), first)
 
 
 def named_from_above(places: F32) -> Bool:
