@@ -43,10 +43,10 @@ class Parameter:
         if value in self.values:
             return float(self.numbers[self.values.index(value)])
         try:
-            number, [*_] = float(value), [float(one) for one in self.values]
-        except ValueError:
+            number, *others = (float(one) for one in (value, *self.values))
+        except ValueError:  # of names, a further one has no place
             return None
-        return number if self.numbers.min() <= number <= self.numbers.max() else None
+        return number if min(others) <= number <= max(others) else None
 
 
 def parse(settings: Sequence[str]) -> tuple[list[Parameter], list[str]]:

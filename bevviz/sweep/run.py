@@ -104,9 +104,12 @@ class Sweep:
 
     @property
     def best(self) -> Values | None:
-        """The values with the greatest F1; None where nothing could be judged."""
-        rated = {v: o.score.f1 for v, o in self.outcomes.items() if o.judged and not math.isnan(o.score.f1)}
-        return max(rated, key=lambda values: rated[values]) if rated else None
+        """With the greatest F1, of equal ones with the least error; None where nothing could be judged."""
+        rated = {v: o.score for v, o in self.outcomes.items() if o.judged and not math.isnan(o.score.f1)}
+        errors = {
+            v: float(np.median(score.errors)) if score.errors else math.inf for v, score in rated.items()
+        }
+        return min(rated, key=lambda values: (-rated[values].f1, errors[values]), default=None)
 
     @property
     def title(self) -> str:
@@ -119,7 +122,10 @@ class Sweep:
         lines += table.lines([*self.rows("time ms")])
         if self.best is not None:
             where = ", ".join(f"{p.key} = {v}" for p, v in zip(self.parameters, self.best, strict=True))
-            lines += ["", f"best F1: {self.outcomes[self.best].score.f1:.3f} at {printable(where)}"]
+            f1 = self.outcomes[self.best].score.f1
+            others = sum(o.judged and o.score.f1 == f1 for o in self.outcomes.values()) - 1
+            alike = f"; the same F1 at {others} more, with errors as large or larger" if others else ""
+            lines += ["", f"best F1: {f1:.3f} at {printable(where)}{alike}"]
         failures = sum(outcome.failures for outcome in self.outcomes.values())
         return "\n".join([*lines, *([f"{failures} stages failed"] if failures else [])])
 
