@@ -89,7 +89,7 @@ let settling = 0;
 function viewerEvent(event) {
   wake();
   window.dispatchEvent(new CustomEvent("viewer-event", { detail: event }));
-  if (event.type === "recording_open" && state.opening !== null) seek(state.opening);
+  if (event.type === "recording_open" && state.time !== null) seek(state.time); // somebody may have chosen another one
   if (event.type === "time_update" || event.type === "timeline_change") moved(event);
   if (event.type === "selection_change") {
     const item = event.items.find((one) => one.type === "entity");
