@@ -9,6 +9,7 @@ from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Se
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass
+from queue import SimpleQueue
 from typing import Any, Generic, Protocol, TypeVar
 
 from bevviz.errors import interrupt_in
@@ -152,14 +153,23 @@ def run(
         if dropping is not None:
             dropping.close()
 
-    thread.start()
-    while not loop.over.is_set():
+    try:
+        thread.start()
+    except BaseException:  # Ctrl-C beside the start: whether there is a thread by now cannot be told
+        loop.admission.put(False)
+        raise
+    while True:
         try:
-            # Not ``thread.join``, which takes a thread for ended that an interrupt comes beside.
-            loop.over.wait(TICK)
-            if stop.is_set():
-                end()
-            tick()
+            loop.admission.put(True)  # only the first one counts
+            while not loop.over.is_set():
+                # Not ``thread.join``, which takes a thread for ended that an interrupt comes beside.
+                loop.over.wait(TICK)
+                if stop.is_set():
+                    end()
+                tick()
+            end()  # however it ended: nobody comes for more
+            thread.join()
+            break
         except KeyboardInterrupt:
             if interrupted:
                 raise
@@ -171,8 +181,6 @@ def run(
             end()
             loop.over.wait()
             raise
-    end()  # however it ended: nobody comes for more
-    thread.join()
     if loop.error is not None:
         if interrupt_in(loop.error):
             return RunEnd(loop.frames, True)
@@ -209,11 +217,14 @@ class _Loop(Generic[T, R]):
     ) -> None:
         self.frames = 0
         self.error: BaseException | None = None
+        self.admission: SimpleQueue[bool] = SimpleQueue()  # whether it may begin; nothing interrupts a put
         self.over = threading.Event()
         self._items, self._processor, self._observers = items, processor, observers
         self._dropping, self._depth, self._stop = dropping, depth, stop
 
     def work(self) -> None:
+        if not self.admission.get():
+            return
         try:
             with few_collections(), ExitStack() as stack:
                 network = stack.enter_context(ThreadPoolExecutor(1, "network"))

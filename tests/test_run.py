@@ -14,8 +14,10 @@ from typing import Any
 
 import pytest
 
+import bevviz.run
 from bevviz.frame import Scene
 from bevviz.run import Dropping, Items, Observer, RunEnd, overlapped, results, run
+from tests.waiting import PATIENCE, until
 
 
 class Numbers:
@@ -153,6 +155,46 @@ def test_a_signal_ends_it_after_the_result_at_hand() -> None:
     assert seen.ended == 1
 
 
+def test_a_signal_between_two_looks_ends_it_after_the_result_at_hand(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It may come at any call of the thread that waits, and not only while it sleeps."""
+    seen = Seen()
+
+    class Asked(threading.Event):
+        asked = 0
+
+        def is_set(self) -> bool:
+            if threading.current_thread() is threading.main_thread() and len(seen.seen) > 2:
+                self.asked += 1
+                if self.asked == 1:
+                    raise KeyboardInterrupt
+            return super().is_set()
+
+    class Loop(bevviz.run._Loop[int, int]):
+        def __init__(self, *args: Any) -> None:
+            super().__init__(*args)
+            self.over = Asked()
+
+    monkeypatch.setattr(bevviz.run, "_Loop", Loop)
+    end = run(Numbers(100_000), Squares(0.01), [seen])
+    assert end.interrupted
+    assert seen.seen == finished(end.frames)
+    assert seen.ended == 1
+
+
+def test_a_signal_beside_the_start_leaves_nothing_begun(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Late(threading.Thread):
+        def start(self) -> None:
+            super().start()
+            raise KeyboardInterrupt
+
+    seen, numbers = Seen(), Numbers()
+    monkeypatch.setattr(threading, "Thread", Late)
+    with pytest.raises(KeyboardInterrupt):
+        run(numbers, Squares(), [seen])
+    assert until(lambda: not [thread for thread in threading.enumerate() if thread.name == "run"])
+    assert (seen.begun, seen.ended, numbers.drawn) == (0, 0, 0)
+
+
 def test_an_interrupt_that_became_another_error_is_one() -> None:
     class Kernel(Squares):
         def finish(self, result: int) -> int:
@@ -284,7 +326,7 @@ def test_the_work_goes_on_while_the_next_is_made() -> None:
 
     def items() -> Iterator[int]:
         yield 1
-        assert begun.wait(10)
+        assert begun.wait(PATIENCE)
         yield 2
 
     def work(item: int) -> int:
