@@ -18,8 +18,8 @@ from benchmarks import kitti
 from benchmarks.tracking import Tallies, TrackTally, add_tracks, truth_of
 from bevviz.config import Preset, load
 from bevviz.evaluate import MAX_DISTANCE, MIN_HITS, RANGE, pair_in_order
-from bevviz.frame import DetectionState, FrameResult
 from bevviz.geometry import iou
+from bevviz.results import DetectionState, FrameResult
 from bevviz.session import Session
 from bevviz.synthetic import Snapshot, SyntheticSource
 

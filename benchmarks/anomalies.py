@@ -21,9 +21,10 @@ from benchmarks.pages import write_section
 from bevviz import geometry
 from bevviz.anomalies import Onsets
 from bevviz.config import Config, load
-from bevviz.frame import Anomaly, Bool, Camera, Detections, Frame, FrameResult
-from bevviz.perceive import StageLoader
+from bevviz.frame import Bool, Camera, Frame
+from bevviz.results import Anomaly, Detections, FrameResult
 from bevviz.session import Session
+from bevviz.stage_loader import StageLoader
 from bevviz.synthetic import Snapshot, SyntheticSource
 
 CHOSEN_ON = (2000, 2001, 2011)  # seeds that rules and limits were looked at on

@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from bevviz.ros import ouster
-from bevviz.ros.messages import decode_cloud
+from bevviz.ros.clouds import decode_cloud
 
 FILES = (  # of packets, and of metadata
     ("OS-1-32-G_v2.1.1_1024x10", "OS-1-32-G_v2.1.1_1024x10"),
@@ -63,9 +63,8 @@ def _row(packets: Path, metadata: Path, python: Path) -> str:
     sensor = ouster.read_sensor(metadata.read_text(), str(metadata))
     found = [(at, data) for at, data in _captured(packets) if len(data) == sensor.size]
     first = [(at, data) for at, data in found if sensor.number(data) == sensor.number(found[0][1])]
-    received = np.array([at for at, _ in first], np.int64)
     started = time.perf_counter()
-    message = ouster.decode(sensor, [data for _, data in first], received)
+    message = ouster.decode(sensor, first)
     took = time.perf_counter() - started
     ours = decode_cloud(message, "packets", 0)
     with tempfile.TemporaryDirectory() as folder:

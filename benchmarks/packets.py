@@ -19,7 +19,7 @@ import open3d as o3d
 from bevviz.bags.recording import Recording
 from bevviz.config import SourceConfig
 from bevviz.frame import F32, F64
-from bevviz.ros.messages import decode_cloud
+from bevviz.ros.clouds import decode_cloud
 
 ANGLES = {  # of the folders, in nebula's calibration
     "40p": "Pandar40P",

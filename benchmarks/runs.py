@@ -11,7 +11,7 @@ from tqdm import tqdm
 from benchmarks.measure import Finished, Times, run
 from bevviz.bags.recording import Recording
 from bevviz.logging import entities
-from bevviz.ros.messages import decode_cloud
+from bevviz.ros.clouds import decode_cloud
 
 
 def compare(bag: Path, repetitions: int) -> list[str]:

@@ -19,10 +19,11 @@ from tqdm import tqdm
 from benchmarks import tutorial
 from benchmarks.measure import Times, interleaved
 from bevviz.config import load
-from bevviz.frame import F32, I32, Camera, Detections, Frame, Scene
+from bevviz.frame import F32, I32, Camera, Frame, Scene
 from bevviz.logging.logger import Logger
 from bevviz.logging.sinks import open_recording
-from bevviz.ros.messages import decode_cloud
+from bevviz.results import Detections
+from bevviz.ros.clouds import decode_cloud
 from bevviz.session import Session
 from bevviz.stages.bev import bev
 from bevviz.stages.clustering import cluster, dbscan

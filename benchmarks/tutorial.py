@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bevviz import o3d
-from bevviz.frame import Objects
+from bevviz.results import Objects
 
 
 def read_points(message: Any) -> Iterator[tuple[float, float, float]]:

@@ -16,7 +16,8 @@ if TYPE_CHECKING:
     from bevviz.drive import Drive, simulate
     from bevviz.drive import open_drive as open  # bevviz.open
     from bevviz.errors import UserError
-    from bevviz.frame import Frame, FrameResult
+    from bevviz.frame import Frame
+    from bevviz.results import FrameResult
 
 __version__ = "0.1.0"
 __all__ = ["Config", "Drive", "Frame", "FrameResult", "UserError", "open", "simulate"]
@@ -28,7 +29,7 @@ _HOMES = {
     "Config": ("bevviz.config", "Config"),
     "Drive": ("bevviz.drive", "Drive"),
     "Frame": ("bevviz.frame", "Frame"),
-    "FrameResult": ("bevviz.frame", "FrameResult"),
+    "FrameResult": ("bevviz.results", "FrameResult"),
     "UserError": ("bevviz.errors", "UserError"),
     "open": ("bevviz.drive", "open_drive"),
     "simulate": ("bevviz.drive", "simulate"),

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable
+from functools import cache
 from typing import Any
 
 _say: Callable[[str], None] | None = None
@@ -28,6 +30,16 @@ def say(text: str) -> None:
 
 def bar(*given: Any, **named: Any) -> Any:
     """``tqdm.tqdm`` of the same arguments, on a terminal alone."""
+    return _bar()(*given, **named, disable=None if _bars else True)
+
+
+@cache
+def _bar() -> Any:
     from tqdm import tqdm
 
-    return tqdm(*given, **named, disable=None if _bars else True)
+    class Bar(tqdm):  # type: ignore[misc]
+        """One process draws: tqdm's own lock is a semaphore, which a worker that is killed leaves behind."""
+
+        _lock = threading.RLock()
+
+    return Bar

@@ -40,7 +40,8 @@ class State(Enum):
     UNKNOWN = (120, 125, 135)
 
 
-# Of what is held to the truth, of the two sides of a comparison, and of where points are lost.
+# Of what is held to the truth, of the two sides of a comparison, of two opinions on an object, and of where
+# points are lost.
 TRUTH: dict[str, Color] = {
     "true": State.GOOD.value,
     "missed": State.DOUBTFUL.value,
@@ -53,6 +54,13 @@ SIDES: dict[str, Color] = {
     "only A": (230, 110, 30),
     "only B": (70, 170, 240),
 }
+OPINIONS: dict[str, Color] = {
+    "contradicted": State.BAD.value,
+    "named otherwise": State.OTHER.value,
+    "missed": State.DOUBTFUL.value,
+    "confirmed": State.GOOD.value,
+    "unseen": State.UNKNOWN.value,
+}
 FATES: dict[str, Color] = {
     "ground": (150, 120, 95),
     "noise": (215, 70, 40),
@@ -63,10 +71,11 @@ FATES: dict[str, Color] = {
 }
 
 
-# Of curves in one plot, the first ones furthest apart.
+# Of curves in one plot: the ten of Petroff (arXiv 2107.02270), red and purple lighter for a dark background.
+# Any two are 10 apart or more in CAM02-UCS, also for those who lack one of the three kinds of cones.
 SERIES: tuple[Color, ...] = (
-    *((86, 180, 233), (230, 159, 0), (0, 170, 130), (225, 140, 190), (240, 228, 66)),
-    *((225, 75, 60), (150, 120, 230), (190, 235, 250), (180, 140, 95), (120, 190, 60)),
+    *((63, 144, 218), (255, 169, 14), (205, 40, 15), (148, 164, 162), (150, 70, 205)),
+    *((169, 107, 89), (231, 99, 0), (185, 172, 112), (113, 117, 129), (146, 218, 221)),
 )
 
 

@@ -5,7 +5,10 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping
 
-from bevviz.frame import Decision, Frame, FrameResult
+from bevviz.frame import Frame
+from bevviz.results import Decision, FrameResult, Opinion
+
+OPINIONS = ("confirmed", "named_otherwise", "contradicted", "unseen", "missed")  # on somebody else's objects
 
 
 def counts_of(result: FrameResult, last: Frame | None = None) -> Mapping[str, int]:
@@ -34,4 +37,14 @@ def counts_of(result: FrameResult, last: Frame | None = None) -> Mapping[str, in
             counts["detections"] += int(camera.detections.kept.sum())
         if camera.fusion is not None:
             counts["matches"] += int((camera.fusion.detection_decision == Decision.MATCHED).sum())
+    counts.update(opinions_in(result))
     return counts
+
+
+def opinions_in(result: FrameResult) -> Mapping[str, int]:
+    """How many objects of somebody else's cameras say what of; empty: they are ours."""
+    if (opinions := result.opinions) is None:
+        return {}
+    said = Counter(Opinion(value).word.replace(" ", "_") for value in opinions.opinion.tolist())
+    said["missed"] = int(opinions.missed.sum())
+    return {what: said[what] for what in OPINIONS}

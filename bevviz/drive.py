@@ -14,7 +14,8 @@ import numpy as np
 from bevviz.closing import Closing
 from bevviz.config import Config, ParameterChange, Preset, load
 from bevviz.errors import UserError
-from bevviz.frame import F64, I64, Frame, FrameResult, Scene
+from bevviz.frame import F64, I64, Frame, Scene
+from bevviz.results import FrameResult
 from bevviz.run import Observer, RunEnd, results, run
 from bevviz.session import Session
 

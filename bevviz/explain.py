@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from pathlib import Path
 
 import numpy as np
 
 from bevviz.config import OURS, Config
-from bevviz.frame import (
+from bevviz.plugins import TOPIC
+from bevviz.results import (
     CameraResult,
     Clusters,
     ClusterState,
@@ -16,10 +18,12 @@ from bevviz.frame import (
     DetectionState,
     Explanation,
     Fusion,
+    Objects,
+    Opinion,
+    Opinions,
     Pair,
     Splits,
 )
-from bevviz.plugins import TOPIC
 
 SOME = 0.1  # share of an object's points from which noise is worth a word
 
@@ -30,6 +34,8 @@ def explain(
     config: Config,
     splits: Splits | None = None,
     lidar: bool = True,
+    objects: Objects | None = None,
+    opinions: Opinions | None = None,
 ) -> tuple[Explanation, ...]:
     """One self-contained sentence for each detection, each cluster, each split and each problem of a camera.
 
@@ -37,6 +43,8 @@ def explain(
     origin of its frame. A cluster is explained once for each camera that has it in view, otherwise once.
     Problems have the subject ``camera``, row -1 and the state ``problem``. What a camera made of clusters has
     the subject ``split``: what is left of one the state ``split``, what was made of several ``merged``.
+    Objects of somebody else's method have the subject ``object`` and the word of their ``Opinion``; those
+    that our fusion would have made the subject ``fused`` and the state ``missed`` or ``found``.
 
     Args:
         cameras: results of all cameras.
@@ -44,6 +52,8 @@ def explain(
         config: what the frame was run with.
         splits: where detections split and merged clusters.
         lidar: whether there is one, so that clusters are to be expected.
+        objects: of the frame.
+        opinions: what cameras say of them; None: they are our fusion's own.
     """
     found: list[Explanation] = []
     for result in cameras:
@@ -54,6 +64,9 @@ def explain(
         found.extend(_clusters(cameras, clusters, config))
     if splits is not None:
         found.extend(_splits(cameras, splits))
+    if objects is not None and opinions is not None:
+        found.extend(_objects(objects, opinions, cameras, config))
+        found.extend(_fused(objects, opinions, clusters, config))
     return tuple(found)
 
 
@@ -248,6 +261,105 @@ def _splits(cameras: Sequence[CameraResult], splits: Splits) -> Iterator[Explana
             )
 
 
+# --- two opinions ------------------------------------------------------------------------------
+
+
+def _objects(
+    objects: Objects, opinions: Opinions, cameras: Sequence[CameraResult], config: Config
+) -> Iterator[Explanation]:
+    by_name = {result.camera.name: result for result in cameras}
+    for k, name in enumerate(opinions.camera):
+        opinion = Opinion(int(opinions.opinion[k]))
+        text = _opinion(opinion, k, opinions, by_name.get(name), config)
+        if opinion is Opinion.NOT_ASKED:
+            problems = "; ".join(p for result in cameras for p in result.camera.problems)
+            text += f": {problems}" if problems else ""
+        yield Explanation("object", name, k, opinion.word, f"{_object(objects, k)}: {text}")
+
+
+def _opinion(
+    opinion: Opinion, k: int, opinions: Opinions, result: CameraResult | None, config: Config
+) -> str:
+    """What cameras say of an object, with the figure that it hung on."""
+    camera, least = "" if result is None else result.camera.name, config.opinions
+    if opinion is Opinion.NOT_ASKED:
+        return "unseen, no camera has detections"
+    if opinion is Opinion.OUT_OF_VIEW:
+        share = f"{opinions.shown[k]:.0%} of it in the image of {camera or 'any camera'}"
+        return f"unseen, {share}, opinions.min_shown is {least.min_shown:g}"
+    if opinion is Opinion.HIDDEN:
+        share = f"{opinions.visible[k]:.0%} of it is not hidden behind what is nearer"
+        return f"unseen, {share}, opinions.min_visible is {least.min_visible:g}"
+    if opinion is Opinion.TOO_SMALL:
+        height = f"{opinions.height[k]:.1f} px high in {camera}"
+        return f"unseen, {height}, opinions.min_height is {least.min_height:g} px"
+    if opinion is Opinion.NO_CLASS:
+        return f"unseen, the detector of {camera} knows no such class"
+    assert result is not None
+    d = int(opinions.detection[k])
+    if opinion is not Opinion.CONTRADICTED:
+        assert result.detections is not None
+        head = "confirmed by" if opinion is Opinion.CONFIRMED else "named otherwise by"
+        return f"{head} {_label(result.detections, d)} of {camera}, {_looks(k, d, opinions, result)}"
+    seen = f"{opinions.shown[k]:.0%} in its image, {opinions.visible[k]:.0%} not hidden"
+    return f"contradicted by {camera} ({seen}): {_nearest(k, d, opinions, result, config)}"
+
+
+def _looks(k: int, d: int, opinions: Opinions, result: CameraResult) -> str:
+    """How a detection looks at an object."""
+    overlap = f"IoU {opinions.iou[k]:.2f} in the image"
+    if np.isnan(opinions.held[k]) or result.fusion is None:
+        return f"{overlap}, without a cluster"
+    cluster = int(result.fusion.detection_cluster[d])
+    return f"{opinions.held[k]:.0%} of cluster {cluster} is in the box, {overlap}"
+
+
+def _nearest(k: int, d: int, opinions: Opinions, result: CameraResult, config: Config) -> str:
+    """What a camera has where nothing of its looks at an object."""
+    detections, fusion = result.detections, result.fusion
+    if d < 0 or detections is None:
+        ours = Path(config.detector.model).suffix == ".onnx"
+        least = f", not even with a score of {config.detector.explain_threshold:g}" if ours else ""
+        return f"no detection there{least}"
+    text = f"the nearest is {_label(detections, d)}, IoU {opinions.iou[k]:.2f}"
+    state = DetectionState(int(detections.state[d]))
+    if state is DetectionState.BELOW_THRESHOLD:
+        return f"{text}, below detector.conf_threshold {config.detector.conf_threshold:g}"
+    if fusion is not None and fusion.detection_decision[d] == Decision.MATCHED:
+        cluster = int(fusion.detection_cluster[d])
+        return f"{text}, which is cluster {cluster} at {_pair(fusion, d, cluster).depth:.1f} m"
+    if opinions.iou[k] < config.opinions.min_iou:
+        return f"{text}, opinions.min_iou is {config.opinions.min_iou:g}"
+    return f"{text}, which fits another box better"
+
+
+def _fused(
+    objects: Objects, opinions: Opinions, clusters: Clusters | None, config: Config
+) -> Iterator[Explanation]:
+    method, fused = _method(config), opinions.fused
+    for j, k in enumerate(opinions.partner.tolist()):
+        cluster, camera = int(fused.cluster[j]), fused.camera[j]
+        points = "" if clusters is None else f", {_points(clusters.count[cluster])}"
+        made = f"cluster {cluster}{points}, named by {_label(fused, j)} of {camera}"
+        if k < 0:
+            yield Explanation(
+                "fused", camera, j, "missed", f"{_object(fused, j)}: missed by {method}; {made}"
+            )
+        else:
+            there = f"{method} has {_label(objects, k)} there"
+            yield Explanation("fused", camera, j, "found", f"{_object(fused, j)}: {there}; {made}")
+
+
+def _method(config: Config) -> str:
+    """Whose objects they are."""
+    method = config.objects.method.removeprefix(TOPIC)
+    return method if method.startswith("/") and not method.endswith(".onnx") else Path(method).name
+
+
+def _object(objects: Objects, row: int) -> str:
+    return f"{_label(objects, row)} at {np.hypot(*objects.boxes.center[row, :2]):.1f} m"
+
+
 def _pair(fusion: Fusion, d: int, k: int) -> Pair:
     """Of a detection and a cluster of which the fusion says that they met."""
     pair = fusion.pair(d, k)
@@ -258,8 +370,8 @@ def _pair(fusion: Fusion, d: int, k: int) -> Pair:
 # --- words -------------------------------------------------------------------------------------
 
 
-def _label(detections: Detections, d: int) -> str:
-    return f"{detections.names[d]} {detections.score[d]:.2f}"
+def _label(found: Detections | Objects, row: int) -> str:
+    return f"{found.names[row]} {found.score[row]:.2f}"
 
 
 def _points(count: int | np.integer) -> str:

@@ -17,6 +17,9 @@ from pathlib import Path
 from bevviz import remains
 from bevviz.errors import UserError
 
+# How what stands for a file begins that Git LFS has not fetched; and what is said of it.
+LFS_POINTER = b"version https://git-lfs.github.com/"
+LFS_HINT = "a Git LFS pointer, not the file itself: 'git lfs pull' fetches it"
 YOUNG = 60.0  # seconds that a temporary folder may be without its lock: it is being made
 
 

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from typing import Any
 
 import numpy as np
 from numpy.polynomial import Polynomial
 from numpy.typing import NDArray
 
-from bevviz.frame import F32, F64, Bool, Boxes3D, Intrinsics
+from bevviz.frame import F32, F64, I64, Bool, Boxes3D, Intrinsics
 
 FloatArray = NDArray[Any]
 
@@ -120,13 +120,18 @@ def project(points: FloatArray, intrinsics: Intrinsics) -> tuple[F32, F32]:
     inv = np.full(len(p), np.nan, p.dtype if p.dtype.kind == "f" else np.float64)
     np.divide(1.0, p[:, 2], out=inv, where=p[:, 2] > MIN_DEPTH)
     x, y = p[:, 0] * inv, p[:, 1] * inv
-    if np.any(intrinsics.D):
+    if is_bent(intrinsics):
         x, y = _distort(x, y, intrinsics)
     k = intrinsics.K
     uv = np.empty((len(p), 2), np.float32)
     uv[:, 0] = float(k[0, 0]) * x + float(k[0, 2])
     uv[:, 1] = float(k[1, 1]) * y + float(k[1, 2])
     return uv, depth
+
+
+def is_bent(intrinsics: Intrinsics) -> bool:
+    """Whether straight lines are curved in the image: an equidistant lens needs no coefficients for it."""
+    return intrinsics.distortion_model in FISHEYE or bool(np.any(intrinsics.D))
 
 
 def rays(uv: FloatArray, intrinsics: Intrinsics) -> F64:
@@ -234,9 +239,10 @@ def corners(boxes: Boxes3D) -> F32:
 
 
 def moved(boxes: Boxes3D, b_from_a: F64) -> Boxes3D:
-    """Upright boxes of frame a in b, which is upright, too."""
+    """Upright boxes of frame a in b, which is upright, too; a may be a map with its origin far away."""
     turned = boxes.yaw + np.float32(yaw(b_from_a))
-    return Boxes3D(apply(b_from_a, boxes.center), boxes.size, turned)
+    center = np.asarray(boxes.center, np.float64) @ b_from_a[:3, :3].T + b_from_a[:3, 3]
+    return Boxes3D(center.astype(np.float32), boxes.size, turned)
 
 
 def inside(points: F32, boxes: Boxes3D, k: int) -> Bool:
@@ -249,6 +255,18 @@ def inside(points: F32, boxes: Boxes3D, k: int) -> Bool:
     local = np.column_stack([c * x + s * y, c * y - s * x, z])
     found[near] = (np.abs(local) <= boxes.size[k] / 2).all(axis=1)
     return found
+
+
+def inside_each(points: F32, boxes: Boxes3D) -> Iterator[tuple[int, I64]]:
+    """Each box that may have points in it, and the rows of those. Of use where boxes are many."""
+    order = np.argsort(points[:, 0])
+    points = points.take(order, axis=0)
+    reach = np.hypot(boxes.size[:, 0], boxes.size[:, 1]) / 2 + np.float32(1e-3)  # no less for being rounded
+    first = np.searchsorted(points[:, 0], boxes.center[:, 0] - reach)
+    last = np.searchsorted(points[:, 0], boxes.center[:, 0] + reach)
+    for k in np.flatnonzero(last > first).tolist():
+        near = slice(first[k], last[k])
+        yield k, order[near][inside(points[near], boxes, k)]
 
 
 def bev_iou(a: Boxes3D, b: Boxes3D) -> F32:

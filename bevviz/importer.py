@@ -13,7 +13,6 @@ from pathlib import Path
 
 NOT_OURS = 66
 BAGS = (".db3", ".bag")
-MCAP = ".mcap"  # which Rerun reads itself, message by message
 
 
 def main() -> None:
@@ -26,8 +25,8 @@ def run(arguments: list[str]) -> int:
     parser = argparse.ArgumentParser(
         prog="rerun-importer-bevviz",
         description="Rerun's viewer runs this on what it opens: 'rerun drive.db3', or a bag dropped on it. "
-        "Model and parameters are those of the bevviz.toml in the file's folder or above. MCAP, which Rerun "
-        "reads itself, is taken where there is such a file.",
+        "Model and parameters are those of the bevviz.toml in the file's folder or above. An MCAP file Rerun "
+        "reads itself, and asks nobody.",
     )
     parser.add_argument("path", type=Path, metavar="PATH", help="bag that the viewer opens")
     parser.add_argument("--application-id", default="", metavar="ID", help="that the viewer proposes")
@@ -77,14 +76,4 @@ def _import(path: Path, application_id: str, recording_id: str | None) -> None:
 
 
 def _is_ours(path: Path) -> bool:
-    if path.suffix in BAGS or (path / "metadata.yaml").is_file():
-        return True
-    if path.suffix != MCAP:
-        return False
-    from bevviz.errors import UserError
-    from bevviz.project import find
-
-    try:
-        return find(path.parent) is not None
-    except UserError:
-        return False
+    return path.suffix in BAGS or (path / "metadata.yaml").is_file()

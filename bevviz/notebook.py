@@ -11,11 +11,12 @@ import rerun as rr
 from rerun.blueprint import Blueprint
 
 from bevviz.errors import UserError
-from bevviz.frame import FrameResult, Scene, Tracks
+from bevviz.frame import Scene
 from bevviz.logging import blueprints, entities
 from bevviz.logging.logger import Logger
 from bevviz.logging.recorder import Recorder
 from bevviz.logging.sinks import APPLICATION
+from bevviz.results import FrameResult, Tracks
 from bevviz.why.log import mark_answers
 from bevviz.workbench.answers import selection
 from bevviz.workbench.pick import Pick, pick
@@ -99,7 +100,7 @@ class _Times:
     def number(self, timeline: str, time: float) -> int | None:
         """Of the frame that a viewer shows there; None: none."""
         values = np.array(self.at.get(timeline, ()), np.float64)
-        before = np.flatnonzero(values <= time + 1000 * (timeline != entities.FRAME))  # it counts in doubles
+        before = np.flatnonzero(values <= time + entities.SLACK * (timeline != entities.FRAME))
         if not len(values):
             return None
         row = int(before[values[before].argmax()]) if len(before) else int(values.argmin())

@@ -15,6 +15,7 @@ from bevviz.config import (
     Section,
     keys,
     load,
+    params_of,
     unit,
     unit_spellings,
     unknown_key,
@@ -26,9 +27,11 @@ from bevviz.text import printable
 WIDTH = 100
 
 
-def field_of(key: str) -> FieldInfo | None:
-    """Of a dotted key; None: it is a parameter of somebody's function, or there is none."""
+def field_of(key: str, config: Config | None = None) -> FieldInfo | None:
+    """Of a dotted key; None: there is none, or only with the stages that a configuration names."""
     section, _, name = key.partition(".")
+    if config is not None and name.startswith("params."):
+        return params_of(config, section).get(name.removeprefix("params."))
     model = Config.model_fields[section].annotation if section in Config.model_fields else None
     if not (isinstance(model, type) and issubclass(model, Section)):
         return Config.model_fields.get(key)
@@ -60,13 +63,13 @@ def _lines(key: str, config: Config, about: str) -> Iterator[str]:
     yield f"{key} = {_value(values(config)[key])}"
     if about:
         yield textwrap.fill(about, WIDTH, initial_indent="  ", subsequent_indent="  ")
-    info = field_of(key)
+    info, everywhere = field_of(key, config), field_of(key) is not None
     if spellings := unit_spellings(key):
         yield f"  unit       {unit(key)}; a unit can be given: {', '.join(spellings)}"
     if info is not None and (allowed := _allowed(info)):
         yield f"  allowed    {allowed}"
     presets = {name: values(load(preset=name)).get(key) for name in ("default", "reference")}
-    if info is not None and key != "preset":
+    if everywhere and key != "preset":
         yield "  presets    " + ", ".join(f"{name}: {_value(value)}" for name, value in presets.items())
     if names := [name for name, own in TUTORIAL_NAMES.items() if own == key]:
         yield f"  tutorial   {', '.join(names)}, which is accepted, too"
@@ -75,8 +78,13 @@ def _lines(key: str, config: Config, about: str) -> Iterator[str]:
         yield "  change it  --preset NAME, or in a file 'preset: NAME'"
         return
     section, _, name = key.partition(".")
-    in_yaml = f"{section}: {{{name}: VALUE}}"
-    yield f"  change it  --set {key}=VALUE, in YAML '{in_yaml}', in bevviz.toml under [{section}]"
+    in_yaml, table = f"{section}: {{{name}: VALUE}}", section
+    if name.startswith("params."):
+        in_yaml, table = (
+            f"{section}: {{params: {{{name.removeprefix('params.')}: VALUE}}}}",
+            f"{section}.params",
+        )
+    yield f"  change it  --set {key}=VALUE, in YAML '{in_yaml}', in bevviz.toml under [{table}]"
 
 
 def _allowed(info: FieldInfo) -> str:

@@ -2,221 +2,45 @@
 
 from __future__ import annotations
 
-import threading
-import traceback
-from collections import OrderedDict
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass, replace
-from typing import Any, TypeVar, TypeVarTuple, cast
+from dataclasses import replace
 
 import numpy as np
-from pydantic import BaseModel
 
 from bevviz import geometry
-from bevviz.config import Config, DetectorConfig, FusionConfig
-from bevviz.errors import StageError, UserError, interrupt_in
+from bevviz.config import Config, FusionConfig
 from bevviz.explain import explain
-from bevviz.frame import (
-    F32,
-    Camera,
+from bevviz.frame import F32, Camera, Frame
+from bevviz.plugins import TOPIC
+from bevviz.results import (
     CameraResult,
     Claims,
     Clusters,
     Detections,
     Failure,
-    Frame,
     FrameResult,
     Fusion,
     Ground,
     Objects,
+    Opinions,
     Splits,
     Voxels,
 )
-from bevviz.loggers import logger
-from bevviz.plugins import TOPIC
+from bevviz.stage_loader import Stages
+from bevviz.stage_log import Memo, StageLog
 from bevviz.stages import foreign, robot
 from bevviz.stages.bev import bev
 from bevviz.stages.clustering import cluster
-from bevviz.stages.detector import Detector
 from bevviz.stages.foreign import Foreign
 from bevviz.stages.frustum import claim
 from bevviz.stages.fusion import fuse, merge
 from bevviz.stages.ground import segment_ground
 from bevviz.stages.kernel import clock, common_clock
+from bevviz.stages.opinions import opinions
+from bevviz.stages.pillars import ObjectNetwork
+from bevviz.stages.visibility import range_image
 from bevviz.stages.voxel import of_points, voxel_grid
-
-T = TypeVar("T")
-Ts = TypeVarTuple("Ts")
-
-Detect = Callable[[Camera], Detections | None]
-
-_log = logger(__name__)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Stages:
-    """The functions and networks that a configuration names. None: the stage is ours, or there is none.
-
-    Attributes:
-        network: the detector's network, shared by configurations that only differ in thresholds.
-        detector: the same with this configuration's thresholds.
-        detect: what finds the objects in a camera's image instead of both.
-    """
-
-    ground: Foreign | None = None
-    clustering: Foreign | None = None
-    objects: Foreign | None = None
-    network: Detector | Foreign | None = None
-    detector: Detector | None = None
-    detect: Detect | None = None
-
-    @property
-    def class_names(self) -> tuple[str, ...]:
-        """That the detector knows, as far as that is known."""
-        return () if self.detector is None else tuple(self.detector.names)
-
-    @property
-    def provider(self) -> str:
-        """What the network runs on; empty: there is none of ours."""
-        return "" if self.detector is None else self.detector.provider
-
-
-class StageLoader:
-    """Loads what configurations name, each network and function once."""
-
-    def __init__(self) -> None:
-        self._networks: dict[tuple[str, str, str, int], Detector] = {}
-        self._foreign: dict[tuple[str, str], Foreign | None] = {}
-
-    def load(self, config: Config, detect: Detect | None = None) -> Stages:
-        """The stages of a configuration; with ``detect``, that instead of its detector.
-
-        Raises:
-            UserError: the detector's model or somebody's function cannot be used.
-        """
-        detector = None if detect is not None else self._function(config, "detector")
-        network = self._network(config.detector) if detect is None and detector is None else None
-        return Stages(
-            ground=self._function(config, "ground"),
-            clustering=self._function(config, "clustering"),
-            objects=self._function(config, "objects"),
-            network=network or detector,
-            detector=None if network is None else network.restated(config.detector),
-            detect=detect,
-        )
-
-    def _function(self, config: Config, section: str) -> Foreign | None:
-        key = section, getattr(config, section).model_dump_json()
-        if key not in self._foreign:
-            self._foreign[key] = foreign.foreign(config, section)
-        return self._foreign[key]
-
-    def _network(self, config: DetectorConfig) -> Detector | None:
-        if not config.model or config.model.startswith(TOPIC):
-            return None
-        key = config.model, config.names, config.provider, config.threads
-        if key not in self._networks:
-            self._networks[key] = Detector(config)
-        return self._networks[key]
-
-
-class Memo:
-    """What stages made of one frame, for runs of other configurations on the same frame.
-
-    A stage that gets the same arrays and equal parameters is not run again. To be cleared from one frame to
-    the next.
-
-    Args:
-        size: results that are kept; the one that was not asked for the longest goes.
-    """
-
-    def __init__(self, size: int = 200) -> None:
-        self._size = size
-        self._results: OrderedDict[tuple[object, ...], tuple[tuple[object, ...], Any, float]] = OrderedDict()
-        self._local = threading.local()
-
-    @property
-    def seconds_saved(self) -> float:
-        """By this thread so far."""
-        return getattr(self._local, "seconds_saved", 0.0)
-
-    def clear(self) -> None:
-        self._results.clear()
-
-    def call(self, function: Callable[[*Ts], T], *args: *Ts) -> T:
-        """The function's result, made now or before. A function may ask for others in turn."""
-        key = (function, *map(_identity, args))
-        if key in self._results:
-            _, known, seconds = self._results[key]
-            self._results.move_to_end(key)
-            self._local.seconds_saved = self.seconds_saved + seconds
-            return cast(T, known)
-        start, before = clock(), self.seconds_saved
-        result = function(*args)
-        seconds = clock() - start + self.seconds_saved - before
-        # The arguments are kept as well: nothing else can get their ids then.
-        self._results[key] = args, result, seconds
-        if len(self._results) > self._size:
-            self._results.popitem(last=False)
-        return result
-
-
-def _identity(argument: object) -> object:
-    """Parameters are the same when they are equal, arrays only when they are one."""
-    if isinstance(argument, BaseModel) and not isinstance(argument, Config):
-        return type(argument), argument.model_dump_json()
-    return argument if isinstance(argument, str | int | float) else id(argument)
-
-
-class StageLog:
-    """Runs stages; keeps how long each took and why it failed.
-
-    Args:
-        memo: where to look for results; a stage that need not be run counts with the time it once took.
-    """
-
-    def __init__(self, memo: Memo | None = None) -> None:
-        self.timings: dict[str, float] = {}
-        self.failures: list[Failure] = []
-        self.seconds_saved = 0.0
-        self._memo = memo
-
-    def run(self, stage: str, function: Callable[[*Ts], T], *args: *Ts) -> T | None:
-        """The function's result, or None where it failed: one bad stage must not take the frame with it.
-
-        Raises:
-            KeyboardInterrupt: the user wants to end, whatever the stage made of that.
-        """
-        return self.guard(stage, lambda: self.call(function, *args))
-
-    def guard(self, stage: str, work: Callable[[], T]) -> T | None:
-        """As ``run``, of what is not to be looked up itself."""
-        memo = self._memo
-        start, before = clock(), memo.seconds_saved if memo else 0.0
-        try:
-            return work()
-        except (UserError, StageError) as error:
-            self._failed(stage, str(error), error)
-        except Exception as error:
-            if interrupt_in(error):
-                raise KeyboardInterrupt from error
-            self._failed(stage, f"{type(error).__name__}: {error}", error)
-        finally:
-            saved = memo.seconds_saved - before if memo else 0.0
-            self.timings[stage] = self.timings.get(stage, 0.0) + clock() - start + saved
-            self.seconds_saved += saved
-        return None
-
-    def call(self, function: Callable[[*Ts], T], *args: *Ts) -> T:
-        """The function's result, from the memo where there is one."""
-        return function(*args) if self._memo is None else self._memo.call(function, *args)
-
-    def _failed(self, stage: str, reason: str, error: Exception) -> None:
-        unforeseen = not isinstance(error, UserError | StageError)
-        trace = "".join(traceback.format_exception(error)) if unforeseen else ""
-        _log.warning("stage %s failed: %s", stage, reason, exc_info=error if unforeseen else None)
-        self.failures.append(Failure(stage, reason, trace))
 
 
 def perceive(
@@ -283,7 +107,10 @@ def perceive(
     log.timings.update(detector_log.timings)
     log.failures.extend(detector_log.failures)
 
-    objects = _objects(log, frame, obstacles, clusters, cameras, config, stages)
+    objects, said, ranges = _objects(log, frame, obstacles, clusters, cameras, config, stages), None, None
+    if objects is not None and config.objects.method != "frustum" and _detects(config, stages):
+        ranges = log.run("opinions", range_image, frame.points)
+        said = _opinions(log, objects, obstacles, clusters, cameras, ranges, config, stages)
     wall = common_clock() - start + log.seconds_saved
     lidar = sum(log.timings.values()) - sum(detector_log.timings.values())
     log.timings["total"] = max(wall, lidar, sum(detector_log.timings.values()))
@@ -300,6 +127,8 @@ def perceive(
         bev=None,
         timings=log.timings,
         failures=tuple(log.failures),
+        opinions=said,
+        ranges=ranges,
     )
 
 
@@ -323,7 +152,15 @@ def describe(result: FrameResult, *, seen: bool = True) -> FrameResult:
             config.bev,
         )
     explanations = log.run(
-        "explain", explain, result.cameras, result.clusters, config, result.splits, bool(frame.lidar)
+        "explain",
+        explain,
+        result.cameras,
+        result.clusters,
+        config,
+        result.splits,
+        bool(frame.lidar),
+        result.objects,
+        result.opinions,
     )
     wall = clock() - start
     return replace(
@@ -434,12 +271,52 @@ def _objects(
 ) -> Objects | None:
     if topic := _topic(config.objects.method):
         return log.guard("objects", lambda: robot.find_objects(frame, topic, obstacles, clusters))
-    if (function := stages.objects) is not None:
-        if len(frame.points) == 0:
-            return None
+    if len(frame.points) == 0 and stages.objects is not None:
+        return None
+    if isinstance(network := stages.objects, ObjectNetwork):
+        intensity = frame.fields.get("intensity")
+
+        def detect() -> Objects:
+            answer = log.call(network.network.infer, frame.points, intensity)
+            boxes, score, names = network.interpret(answer)
+            return foreign.placed(boxes, names, score, obstacles, clusters)
+
+        return log.guard("objects", detect)
+    if isinstance(function := stages.objects, Foreign):
         cloud = foreign.with_intensity(frame.points, frame.fields.get("intensity"))
         return log.guard(
             "objects",
             lambda: foreign.objects_of(log.call(function, cloud), function.name, obstacles, clusters),
         )
     return None if clusters is None else log.run("fusion", merge, clusters, cameras, config.clustering)
+
+
+def _detects(config: Config, stages: Stages) -> bool:
+    """Whether cameras have anything to say."""
+    return stages.network is not None or stages.detect is not None or bool(_topic(config.detector.model))
+
+
+def _opinions(
+    log: StageLog,
+    objects: Objects,
+    obstacles: F32 | None,
+    clusters: Clusters | None,
+    cameras: list[CameraResult],
+    ranges: F32 | None,
+    config: Config,
+    stages: Stages,
+) -> Opinions | None:
+    """What cameras and clusters say of objects that our fusion did not make."""
+    if ranges is None:
+        return None
+    fused = Objects.empty()
+    if clusters is not None:
+        merged = log.run("opinions", merge, clusters, cameras, config.clustering)
+        if merged is None:
+            return None
+        fused = merged
+    known = stages.class_names
+    return log.guard(
+        "opinions",
+        lambda: opinions(objects, fused, obstacles, clusters, cameras, ranges, config.opinions, known),
+    )

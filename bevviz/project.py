@@ -24,6 +24,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationEr
 from bevviz import plugins
 from bevviz.config import OURS, TUTORIAL_NAMES, Config, Layer, Preset, flattened, read_layer
 from bevviz.errors import UserError
+from bevviz.pillar_params import is_network
 
 NAME = "bevviz.toml"
 MODEL = "BEVVIZ_MODEL"
@@ -106,6 +107,9 @@ def _of_file(path: Path) -> Iterator[Layer]:
     for key in ("detector.model", "detector.names"):
         if isinstance(own.get(key), str):
             own[key] = _from(path.parent, key, own[key])
+    for key in ("objects.method", "objects.encoder", "objects.params.encoder"):
+        if is_network(str(own.get(key, ""))):
+            own[key] = str(path.parent / own[key])
     yield Layer(str(path), own)
 
 

@@ -17,13 +17,13 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 from bevviz import __version__
-from bevviz.config import STAGES, Config, plugin_of
+from bevviz.config import STAGES, Config, object_files, plugin_of
 from bevviz.plugins import TOPIC
 
 PACKAGES = (  # those that are not installed do not count: some libraries come as one of several
     *("rerun-sdk", "rosbags", "numpy"),
     "protobuf",  # decodes Foxglove's messages
-    *("velodyne-decoder", "dracopy"),  # make points of packets and of compressed clouds
+    *("velodyne-decoder", "dracopy", "pypcd4"),  # make points of packets, compressed clouds and PCD files
     *("numba", "llvmlite"),  # compile every LiDAR stage
     *(
         "opencv-python-headless",
@@ -80,6 +80,8 @@ def dependencies_of(config: Config) -> dict[str, Dependency]:
     for key, path in (("detector.model", model_path(config)), ("detector.names", names_path(config))):
         if path is not None:
             found[key] = Dependency(sha256=file_hash(path), file=path.name)
+    for key, file in object_files(config).items():
+        found[key] = Dependency(sha256=file_hash(Path(file)), file=Path(file).name)
     for section, key in STAGES.items():
         plugin = plugin_of(config, section)
         if plugin is not None:

@@ -13,17 +13,19 @@ from typing import Any, Self
 
 import rerun as rr
 
-from bevviz.config import STAGES, Config, Preset, flat_yaml, load, values
+from bevviz.config import STAGES, Config, Preset, flat_yaml, load, object_files, values
 from bevviz.errors import UserError, first_line
 from bevviz.files import bag_files, sampled_files
 from bevviz.frame import Scene
 from bevviz.logging import entities
 from bevviz.logging.reading import check_decodes
+from bevviz.pillar_params import is_network
 from bevviz.plugins import is_foreign
 from bevviz.provenance import model_path, names_path
 from bevviz.text import path_text
 
 FRAMES = ("source.", "sync.")  # sections that say what a frame is made of
+OBJECTS = ("objects.method", "objects.params.encoder")  # files of a 3D detector
 BLOCK = 1 << 16  # bytes at the beginning, in the middle and at the end of a file that are looked at
 AFTER = 500  # chunks in which one property follows another
 MAGIC = b"RRF"  # and a digit, for the generation of the format
@@ -156,12 +158,15 @@ class Origin:
             redacted: see the attribute.
         """
         named = {"detector.model": model_path(config), "detector.names": names_path(config)}
+        if config.detector.model == "demo":
+            named = {}
+        named |= {key: Path(file) for key, file in object_files(config).items()}
         try:
             bag = [Place.of(path, recording, folders=folders) for path in scene.bag]
             files = {
                 key: Place.of(path, recording, folders=folders)
                 for key, path in named.items()
-                if path is not None and config.detector.model != "demo"
+                if path is not None
             }
         except OSError:
             return None
@@ -209,7 +214,8 @@ class Recorded:
         """The recording's configuration with other values.
 
         A file or a preset takes its place; what frames are made of, and the detector, are then the
-        recording's where these have nothing but the preset's own.
+        recording's where these have nothing but the preset's own; the objects' method is not, as nothing is
+        without its parameters.
 
         Raises:
             UserError: as ``bevviz.config.load``; it names somebody's function that ``settings`` do not.
@@ -230,7 +236,8 @@ class Recorded:
         model = str(there.get("detector.model") or "")
         detector = [f"detector.model={model}"] if model and not is_foreign(model) else []
         keys = [(one, one.partition("=")[0]) for one in (*frames, *detector, *self.settings)]
-        return [one for one, key in keys if key in own and stated[key] == own[key]]
+        stays = [(one, key) for one, key in keys if key in own and key not in OBJECTS]
+        return [one for one, key in stays if stated[key] == own[key]]
 
 
 def follow(recording: Path, bag: Sequence[Path] = (), settings: Sequence[str] = ()) -> Recorded:
@@ -270,17 +277,18 @@ def follow(recording: Path, bag: Sequence[Path] = (), settings: Sequence[str] = 
             f"the images in {paths[0].name} are redacted: what the detector finds in them is not what "
             f"{recording.name} holds"
         )
-    chosen = list(origin.topics) if origin is not None else []
-    own = {setting.partition("=")[0] for setting in settings}
+    chosen, files = list(origin.topics) if origin is not None else [], list[str]()
+    own = {key: value for key, _, value in (setting.partition("=") for setting in settings)}
+    named_otherwise = not is_network(own.get("objects.method", ".onnx"))
     for key, place in origin.files.items() if origin is not None else ():
-        if key in own:
+        if key in own or (key in OBJECTS and named_otherwise):
             continue
         path, where = place.found(recording)
         if path is None:
             option = "--model FILE" if key == "detector.model" else f"--set {key}=FILE"
             raise UserError(f"{recording}: it was made with {key} {place.name}; {where}: give {option}")
-        chosen.append(f"{key}={json.dumps(str(path))}")
-    stated = [one for one in chosen if one.startswith("detector.") or not given.get(one.partition("=")[0])]
+        files.append(f"{key}={json.dumps(str(path))}")
+    stated = [*(one for one in chosen if not given.get(one.partition("=")[0])), *files]
     return Recorded(recording, tuple(paths), tuple(stated), tuple(warnings), how)
 
 

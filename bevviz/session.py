@@ -7,8 +7,11 @@ from dataclasses import replace
 
 from bevviz.anomalies import AnomalyDetector
 from bevviz.config import Config, ParameterChange, changes
-from bevviz.frame import Frame, FrameResult
-from bevviz.perceive import Detect, Memo, StageLoader, StageLog, Stages, describe, perceive
+from bevviz.frame import Frame
+from bevviz.perceive import describe, perceive
+from bevviz.results import FrameResult
+from bevviz.stage_loader import Detect, StageLoader, Stages
+from bevviz.stage_log import Memo, StageLog
 from bevviz.stages.fusion import in_view
 from bevviz.stages.tracking import Tracker
 

@@ -16,12 +16,13 @@ from bevviz.compare.log import DifferenceLogger
 from bevviz.config import Config, ParameterChange, changes
 from bevviz.errors import UserError
 from bevviz.files import save
-from bevviz.frame import Frame, FrameResult, Scene
+from bevviz.frame import Frame, Scene
 from bevviz.live.settings import Settings
 from bevviz.logging import entities
 from bevviz.logging.logger import Logger
 from bevviz.logging.pieces import document
 from bevviz.perceive import describe
+from bevviz.results import FrameResult
 from bevviz.run import Items, Observer
 from bevviz.text import markdown, printable
 from bevviz.variants import Variants, check_same_frames

@@ -9,9 +9,12 @@ from dataclasses import replace
 from bevviz import geometry
 from bevviz.config import Config, changes
 from bevviz.errors import UserError
-from bevviz.frame import Camera, Frame, FrameResult
-from bevviz.perceive import Memo, StageLoader, perceive
+from bevviz.frame import Camera, Frame
+from bevviz.perceive import perceive
+from bevviz.results import FrameResult
 from bevviz.session import Session
+from bevviz.stage_loader import StageLoader
+from bevviz.stage_log import Memo
 
 MOTION = "sync.motion_compensation"  # the one thing in how frames are made that variants may differ in
 

@@ -45,3 +45,11 @@ def shared() -> Path:
     if not folder.is_dir():
         pytest.skip(f"needs real data: {folder} is not there (BEVVIZ_DATA, see tests/README.md)")
     return folder
+
+
+@pytest.fixture
+def elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is saved by default goes nowhere near the checkout, and no viewer opens."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)

@@ -7,11 +7,9 @@ import os
 import random
 import subprocess
 import tempfile
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -19,7 +17,6 @@ from tests.ros_player import Play
 
 ROOT = Path(__file__).parents[1]
 DOMAINS = range(1, 102)  # the ports of higher ones are taken by the system
-PATIENCE = 180.0  # seconds for what takes one or two on an idle machine
 
 
 @contextmanager
@@ -60,14 +57,6 @@ def playing(play: Play) -> Iterator[None]:
             yield
         finally:
             process.terminate()  # the graph learns of it at once, as of a node that is shut down
-
-
-def until(condition: Callable[[], Any], what: str) -> None:
-    """Wait for what is expected; how long it takes says nothing but how busy the machine is."""
-    end = time.monotonic() + PATIENCE
-    while not condition():
-        assert time.monotonic() < end, f"never: {what}"
-        time.sleep(0.05)
 
 
 def alone(folder: Path) -> dict[str, str]:

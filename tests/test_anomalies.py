@@ -11,21 +11,8 @@ import pytest
 from bevviz import geometry
 from bevviz.anomalies import AnomalyDetector, AnomalySummary, Onsets
 from bevviz.config import AnomaliesConfig, load
-from bevviz.frame import (
-    F32,
-    Anomaly,
-    Boxes3D,
-    Camera,
-    CameraResult,
-    Decision,
-    Detections,
-    Failure,
-    FrameResult,
-    Fusion,
-    Image,
-    Intrinsics,
-    Pairs,
-)
+from bevviz.frame import F32, Boxes3D, Camera, Image, Intrinsics
+from bevviz.results import Anomaly, CameraResult, Decision, Detections, Failure, FrameResult, Fusion, Pairs
 from bevviz.stages.fusion import in_view
 from bevviz.stages.tracking import Tracker
 from tests.test_tracking import CAR, PERSON, scene

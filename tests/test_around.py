@@ -12,8 +12,9 @@ import pytest
 import rerun as rr
 
 from bevviz.config import SourceConfig, load
-from bevviz.frame import Frame, FrameResult, Image, Scene, Shape, Status
+from bevviz.frame import Frame, Image, Scene, Shape, Status
 from bevviz.logging.logger import Logger
+from bevviz.results import FrameResult
 from bevviz.ros.around import decode_shapes, decode_statuses
 from bevviz.ros.description import mesh_file
 from bevviz.ros.encode import encode_cloud, encode_image, typestore

@@ -6,14 +6,13 @@ import os
 import re
 import shutil
 import signal
-import time
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager, redirect_stderr
 from dataclasses import dataclass, replace
 from io import StringIO
 from pathlib import Path
-from threading import Event, Thread
+from threading import Event
 from typing import Any
 
 import cv2
@@ -31,11 +30,12 @@ from bevviz.batch.table import SEVERITIES, row, severity
 from bevviz.cli import main
 from bevviz.config import Config, load
 from bevviz.errors import UserError
-from bevviz.frame import DetectionState
+from bevviz.results import DetectionState
 from bevviz.session import Session
 from tests import bags
 from tests.pages import Page
 from tests.recordings import Recording, verify
+from tests.waiting import meanwhile
 
 GOOD = ("kitti", "one-drive", "two_b_-drive")
 SCANS = 8
@@ -65,22 +65,15 @@ class Batch:
 def killing(folder: Path, pattern: str) -> Iterator[list[Path]]:
     """Kill the first process that writes such a recording, when it has got under way. Yields which it was."""
     killed: list[Path] = []
-    stopped = Event()
 
-    def work() -> None:
-        while not stopped.wait(0.005):
-            for path in (folder / PARTIAL).glob(pattern):
-                if not killed and path.stat().st_size:
-                    killed.append(path)
-                    os.kill(int(path.stem.split("-")[-2]), signal.SIGKILL)
+    def kill() -> None:
+        for path in (folder / PARTIAL).glob(pattern):
+            if not killed and path.stat().st_size:
+                os.kill(int(path.stem.split("-")[-2]), signal.SIGKILL)
+                killed.append(path)
 
-    thread = Thread(target=work)
-    thread.start()
-    try:
+    with meanwhile(kill):
         yield killed
-    finally:
-        stopped.set()
-        thread.join()
 
 
 def write_bags(root: Path, shared: Path) -> None:
@@ -165,15 +158,17 @@ def test_an_interrupted_batch_goes_on(tmp_path: Path, capsys: pytest.CaptureFixt
         bags.write(tmp_path / "bags" / name, bags.small_items(scans=scans))
     arguments = ["batch", str(tmp_path / "bags"), "-o", str(tmp_path / "runs"), "--jobs", "2"]
 
-    def interrupt() -> None:
-        while not (tmp_path / "runs/short.parquet").exists():
-            time.sleep(0.01)
-        os.kill(os.getpid(), signal.SIGINT)
+    interrupted = Event()
 
-    thread = Thread(target=interrupt)
-    thread.start()
-    assert main([*arguments, "--every", "2"]) == 130
-    thread.join()
+    def interrupt() -> None:
+        if not interrupted.is_set() and (tmp_path / "runs/short.parquet").exists():
+            interrupted.set()
+            os.kill(os.getpid(), signal.SIGINT)
+
+    with meanwhile(interrupt):
+        status = main([*arguments, "--every", "2"])
+        interrupted.set()
+    assert status == 130
     assert "1 bags are complete" in capsys.readouterr().err
     assert {path.name for path in (tmp_path / "runs").iterdir()} == {
         *("short.rrd", "short.parquet", "summary.html", "summary.parquet")
@@ -206,22 +201,16 @@ def test_a_dask_worker_that_dies_loses_no_bag_and_does_none_twice(
     begun: dict[str, set[Path]] = {}  # by window of the long bag
 
     def watch() -> None:
-        while not ended.wait(0.002):
-            for table in folder.glob("*.parquet"):
-                stat = table.stat()
-                written.setdefault(table.stem, set()).add((stat.st_ino, stat.st_mtime_ns))
-            for path in (folder / PARTIAL).glob(WINDOWS):
-                begun.setdefault(path.stem.split("-")[0], set()).add(path)
+        for table in folder.glob("*.parquet"):
+            stat = table.stat()
+            written.setdefault(table.stem, set()).add((stat.st_ino, stat.st_mtime_ns))
+        for path in (folder / PARTIAL).glob(WINDOWS):
+            begun.setdefault(path.stem.split("-")[0], set()).add(path)
 
-    ended = Event()
-    watcher = Thread(target=watch)
-    watcher.start()
-    with killing(folder, WINDOWS) as killed:
+    with meanwhile(watch, every=0.002), killing(folder, WINDOWS) as killed:
         status = main(
             ["batch", str(tmp_path / "bags"), "-o", str(folder), "--dask", cluster.scheduler_address]
         )
-    ended.set()
-    watcher.join()
     assert status == 1
     said = capsys.readouterr().err
     assert {number for number, by in begun.items() if len(by) > 1} <= {killed[0].stem.split("-")[0]}

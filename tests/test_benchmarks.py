@@ -16,7 +16,7 @@ from benchmarks.truth import Rule, scene_of
 from benchmarks.why import Bench, ask_all, configurations, section_of
 from bevviz.bags.recording import Recording
 from bevviz.cli import main
-from bevviz.perceive import StageLoader
+from bevviz.stage_loader import StageLoader
 from bevviz.stages.clustering import dbscan
 from bevviz.why.verdict import HOPELESS, Reason
 from tests import bags

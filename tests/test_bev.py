@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from bevviz.config import BevConfig, load
-from bevviz.frame import F32, I32, U8, Boxes3D, Clusters, Objects
+from bevviz.frame import F32, I32, U8, Boxes3D
+from bevviz.results import Clusters, Objects
 from bevviz.stages.bev import _ground_shades, _obstacle_shades, bev
 
 REFERENCE = load(preset="reference").bev
@@ -149,7 +150,7 @@ def test_values_for_other_points_are_refused() -> None:
 def clusters_of(b: Boxes3D) -> Clusters:
     k = len(b)
     zero: I32 = np.zeros(k, np.int32)
-    return Clusters(np.zeros(0, np.int32), zero, zero + 20, b.center, b, b)
+    return Clusters(np.zeros(0, np.int32), zero, zero + 20, b.center.astype(np.float32), b, b)
 
 
 def test_rich_style_turns_the_boxes() -> None:

@@ -27,6 +27,8 @@ from bevviz.synthetic.drive import PERIOD, START
 from tests import bags, forms
 from tests.recordings import Recording, verify
 
+pytestmark = pytest.mark.usefixtures("elsewhere")
+
 Capture = pytest.CaptureFixture[str]
 
 
@@ -365,13 +367,6 @@ def test_edges_of_a_wall_before_a_wall() -> None:
 
 
 # --- the command -------------------------------------------------------------------------------
-
-
-@pytest.fixture(autouse=True)
-def elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.delenv("DISPLAY", raising=False)
-    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
 
 
 @pytest.fixture(scope="module")

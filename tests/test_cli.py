@@ -21,20 +21,15 @@ from rosbags.typesys import get_types_from_msg
 from bevviz.cli import main
 from bevviz.cli.options import with_negatives
 from bevviz.files import unfinished
-from bevviz.frame import FrameResult
 from bevviz.logging.logger import Logger
+from bevviz.results import FrameResult
 from tests import bags
 from tests.recordings import Recording
+from tests.waiting import PATIENCE
+
+pytestmark = pytest.mark.usefixtures("elsewhere")
 
 Capture = pytest.CaptureFixture[str]
-
-
-@pytest.fixture(autouse=True)
-def elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """What is saved by default goes nowhere near the checkout, and no viewer opens."""
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.delenv("DISPLAY", raising=False)
-    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
 
 
 def error_of(capsys: Capture, *arguments: str | Path) -> str:
@@ -357,7 +352,7 @@ def test_an_interrupted_run_leaves_a_readable_recording(tmp_path: Path) -> None:
                     break
                 time.sleep(0.1)
             run.send_signal(signal.SIGINT)
-            _, said = run.communicate(timeout=180)
+            _, said = run.communicate(timeout=PATIENCE)
         finally:
             run.kill()
     assert run.returncode == 130

@@ -12,8 +12,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from bevviz.config import ClusteringConfig
-from bevviz.frame import F32, I32, Bool, ClusterState
+from bevviz.frame import F32, I32, Bool
 from bevviz.o3d import load
+from bevviz.results import ClusterState
 from bevviz.stages.clustering import MIN_SIZE, cluster, dbscan
 
 # --- DBSCAN ------------------------------------------------------------------------------------

@@ -16,6 +16,7 @@ from bevviz.cli import main
 from bevviz.cli.machine import with_json
 from bevviz.cli.outputs import program, speak
 from tests import bags, forms
+from tests.waiting import PATIENCE
 
 Capture = pytest.CaptureFixture[str]
 
@@ -123,7 +124,7 @@ def test_a_demo_without_a_display_ends_with_what_shows_it(
 
     def visit() -> None:
         (address,) = re.findall(r"viewer at (http://\S+)", capsys.readouterr().err)
-        with urlopen(address, timeout=60) as page:
+        with urlopen(address, timeout=PATIENCE) as page:
             pages.append(page.read().decode())
 
     monkeypatch.setattr("bevviz.cli.workbench.wait_for_interrupt", visit)
@@ -181,7 +182,9 @@ def completed(line: str) -> list[str]:
     given = {**os.environ, "_ARGCOMPLETE": "1", "COMP_LINE": line, "COMP_POINT": str(len(line))}
     given |= {"_ARGCOMPLETE_IFS": "\n", "_ARGCOMPLETE_STDOUT_FILENAME": str(Path("offered").resolve())}
     Path("offered").touch()
-    subprocess.run([sys.executable, "-m", "bevviz"], env=given, check=True, capture_output=True, timeout=120)
+    subprocess.run(
+        [sys.executable, "-m", "bevviz"], env=given, check=True, capture_output=True, timeout=PATIENCE
+    )
     return [word.strip() for word in Path("offered").read_text().split("\n")]
 
 

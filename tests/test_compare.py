@@ -28,16 +28,20 @@ from bevviz.compare.sides import published, robot_topic
 from bevviz.compare.views import side_space
 from bevviz.config import load
 from bevviz.errors import UserError
-from bevviz.frame import Boxes3D, Frame, FrameResult, LabelledBoxes3D
+from bevviz.frame import Boxes3D, Frame, LabelledBoxes3D
 from bevviz.geometry import transform
 from bevviz.logging import entities
-from bevviz.perceive import Memo, describe
+from bevviz.perceive import describe
+from bevviz.results import FrameResult
 from bevviz.session import Session
+from bevviz.stage_log import Memo
 from bevviz.stages import detector
 from bevviz.synthetic import SyntheticSource, write_bag
 from bevviz.variants import Variants, check_same_frames, without_motion
 from tests import bags, forms
 from tests.recordings import Recording, verify
+
+pytestmark = pytest.mark.usefixtures("elsewhere")
 
 Capture = pytest.CaptureFixture[str]
 DEFAULT, REFERENCE = (load(settings=["detector.model=demo"], preset=p) for p in ("default", "reference"))
@@ -271,13 +275,6 @@ def test_no_topic_of_the_robot(topics: tuple[str, ...], asked: str, message: str
 
 
 # --- as a user runs it -------------------------------------------------------------------------
-
-
-@pytest.fixture(autouse=True)
-def elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.delenv("DISPLAY", raising=False)
-    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
 
 
 @pytest.fixture(scope="module")

@@ -17,7 +17,7 @@ from bevviz.bags.info import describe, render
 from bevviz.bags.reader import DamageError
 from bevviz.bags.recording import Recording
 from bevviz.bags.source import BagSource
-from bevviz.bags.sqlite import checksum_of
+from bevviz.bags.sqlite_pages import checksum_of
 from bevviz.config import Config
 from bevviz.errors import UserError
 

@@ -260,6 +260,23 @@ def test_nuscenes_from_its_tables_folder_and_with_lost_files(tmp_path: Path, cap
     assert "ego_pose.json: is cut, or no table of nuScenes" in capsys.readouterr().err
 
 
+def test_a_part_of_nuscenes_is_used_and_what_is_absent_is_counted(tmp_path: Path, capsys: Capture) -> None:
+    root = datasets.nuscenes(tmp_path)
+    for file in root.glob("s*/*/*__153240298*"):  # of the second scene
+        file.unlink()
+    assert main(["info", str(root)]) == 0
+    assert "1 of 2 scenes have no LiDAR scan here: scene-0061 has" in capsys.readouterr().out
+    first = sorted(root.glob("samples/LIDAR_TOP/*"))[0]
+    first.unlink()
+    assert main(["evaluate", str(root)]) == 0
+    said = capsys.readouterr()
+    assert "1 of 6 files of scene-0061 are not there, 1 of its 2 samples lack one" in " ".join(
+        (said.out + said.err).split()
+    )
+    assert main(["info", str(root), "--sequence", "scene-0103"]) == 2
+    assert "1 of 2 scenes have scans here: scene-0061" in capsys.readouterr().err
+
+
 def test_nuscenes_is_evaluated(tmp_path: Path, capsys: Capture) -> None:
     root = datasets.nuscenes(tmp_path)
     report = tmp_path / "found.json"
@@ -380,7 +397,8 @@ def test_a_damaged_cloud_is_told_and_the_rest_goes_on(tmp_path: Path, capfd: Cap
     with bevviz.open(root) as drive:
         frames = list(drive.frames)
         assert len(frames) == 2
-        assert any("1700000000.300000000.pcd: cannot be read as a cloud" in w for w in drive.warnings)
+        (told,) = [w for w in drive.warnings if "1700000000.300000000.pcd" in w or "/top/points" in w]
+        assert "1700000000.300000000.pcd: cannot be read as a cloud" in told
     assert capfd.readouterr().out == ""
 
 

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from bevviz.config import DetectorConfig
 from bevviz.errors import UserError
-from bevviz.frame import Detections, DetectionState
 from bevviz.geometry import iou
+from bevviz.results import Detections, DetectionState
 from bevviz.stages.detector import COCO, Detector, nms
 from bevviz.stages.detector.names import COCO_CATEGORIES
 from tests import networks

@@ -13,7 +13,7 @@ import pytest
 
 import bevviz
 from bevviz.cli import main
-from bevviz.frame import FrameResult
+from bevviz.results import FrameResult
 from bevviz.synthetic import BagWriter, SyntheticSource
 from bevviz.why import Selection
 from tests.recordings import Recording, verify

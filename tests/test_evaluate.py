@@ -21,7 +21,8 @@ from bevviz.evaluate import Truth, judge, truth_in, truth_of
 from bevviz.evaluate.evaluation import Evaluation
 from bevviz.evaluate.identity import Identities
 from bevviz.evaluate.precision import DIFFICULTIES, AveragePrecision, Found
-from bevviz.frame import Boxes3D, ImageLabels, Objects
+from bevviz.frame import Boxes3D, ImageLabels
+from bevviz.results import Objects
 from bevviz.stages.robot import in_points_frame
 from bevviz.synthetic import SyntheticSource, write_bag
 from tests import bags, forms

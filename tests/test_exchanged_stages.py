@@ -23,8 +23,9 @@ from bevviz.bags.source import BagSource
 from bevviz.cli import main
 from bevviz.config import Config, changes, dump, keys, load
 from bevviz.errors import StageError, UserError
-from bevviz.frame import Boxes3D, ClusterState, DetectionState, Frame, FrameResult
+from bevviz.frame import Boxes3D, Frame
 from bevviz.geometry import inverse
+from bevviz.results import ClusterState, DetectionState, FrameResult
 from bevviz.ros.encode import (
     encode_boxes_2d,
     encode_boxes_3d,
@@ -37,6 +38,7 @@ from bevviz.session import Session
 from bevviz.stages import foreign
 from bevviz.synthetic import SyntheticSource
 from tests import bags
+from tests.waiting import PATIENCE
 
 MODULE = '''
 """Somebody's stages: nothing of bevviz is imported."""
@@ -354,7 +356,7 @@ def test_a_change_from_another_thread_meets_the_next_frame(here: Path, frame: Fr
     (here / "mine" / "slow.py").write_text(
         "import numpy as np, threading\n"
         "inside, go = threading.Event(), threading.Event()\n"
-        "def cluster(points):\n    inside.set()\n    assert go.wait(10)\n"
+        "def cluster(points):\n    inside.set()\n    assert go.wait(180)\n"
         "    return np.zeros(len(points), int)\n"
     )
     first = load(settings=["clustering.method=mine.slow:cluster", "detector.model=demo"])
@@ -365,7 +367,7 @@ def test_a_change_from_another_thread_meets_the_next_frame(here: Path, frame: Fr
     results: list[FrameResult] = []
     thread = threading.Thread(target=lambda: results.append(session.run(frame)))
     thread.start()
-    assert mine.slow.inside.wait(30)
+    assert mine.slow.inside.wait(PATIENCE)
     assert "clustering.method" in session.configure(second)
     mine.slow.go.set()
     thread.join()

@@ -9,19 +9,17 @@ import pytest
 
 from bevviz.config import Config, load
 from bevviz.explain import explain
-from bevviz.frame import (
-    F32,
-    Camera,
+from bevviz.frame import F32, Camera, Image
+from bevviz.geometry import apply, project
+from bevviz.results import (
     CameraResult,
     Clusters,
     ClusterState,
     Detections,
     DetectionState,
     Explanation,
-    Image,
     Splits,
 )
-from bevviz.geometry import apply, project
 from bevviz.stages.fusion import fuse
 from tests.test_fusion import CAMERA, CAMERA_FROM_LIDAR, PERSON, clusters_of, detections_of, silhouette, slab
 

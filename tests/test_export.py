@@ -14,9 +14,11 @@ from bevviz import geometry
 from bevviz.cli import main
 from bevviz.datasets.kitti import read_labels
 from bevviz.errors import UserError
-from bevviz.export.kitti import KittiExport, labels, rectified
+from bevviz.export.folder import rectified
+from bevviz.export.kitti import KittiExport, labels
 from bevviz.export.nuscenes import TABLES, VERSION, NuScenesExport
-from bevviz.frame import Boxes3D, Intrinsics, Objects
+from bevviz.frame import Boxes3D, Intrinsics
+from bevviz.results import Objects
 
 OPTICAL = geometry.inverse(geometry.transform(np.array([0.2, 0.1, -0.3]), np.array([-0.5, 0.5, -0.5, 0.5])))
 

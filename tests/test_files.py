@@ -18,13 +18,9 @@ from bevviz.files import Scratch, save, unfinished, written
 from tests import bags
 from tests.recordings import Recording, verify
 from tests.test_cli import Capture, environment, error_of
+from tests.waiting import PATIENCE
 
-
-@pytest.fixture(autouse=True)
-def elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.delenv("DISPLAY", raising=False)
-    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+pytestmark = pytest.mark.usefixtures("elsewhere")
 
 
 # --- whole or not at all -----------------------------------------------------------------------
@@ -74,7 +70,7 @@ def test_two_runs_into_one_recording(tmp_path: Path, capsys: Capture) -> None:
                 time.sleep(0.05)
             said = error_of(capsys, "bag", "drive", "--save", "out.rrd")
             assert "out.rrd: another process is writing it" in said
-            assert first.wait(120) == 0
+            assert first.wait(PATIENCE) == 0
         finally:
             first.kill()
     verify(tmp_path / "out.rrd")
@@ -198,7 +194,7 @@ def test_a_full_disk_ends_the_run_early(tmp_path: Path) -> None:
         env=environment(),
         capture_output=True,
         text=True,
-        timeout=120,
+        timeout=PATIENCE,
         preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit)),
     )
     errors = [line for line in done.stderr.splitlines() if line.startswith("bevviz: error")]
@@ -223,7 +219,7 @@ def test_a_temporary_folder_does_not_outlive_its_process_for_long(
         "from bevviz.files import Scratch\n"
         "s = Scratch(); s.new(); os.kill(os.getpid(), signal.SIGKILL)\n"
     )
-    done = subprocess.run([sys.executable, "-c", script], env=environment(), timeout=60)
+    done = subprocess.run([sys.executable, "-c", script], env=environment(), timeout=PATIENCE)
     assert done.returncode == -signal.SIGKILL
     (left,) = tmp_path.iterdir()
     mine = Scratch()

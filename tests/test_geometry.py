@@ -267,3 +267,20 @@ def test_bev_iou(a: tuple[float, ...], b: tuple[float, ...], expected: float) ->
 
 def test_bev_iou_of_none() -> None:
     assert geometry.bev_iou(Boxes3D.empty(), upright((0, 0, 1, 1, 0))).shape == (0, 1)
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.integers(0, 300), st.integers(0, 20))
+def test_points_in_many_boxes_are_those_in_each(seed: int, count: int, number: int) -> None:
+    rng = np.random.default_rng(seed)
+    points = rng.uniform(-5, 5, (count, 3)).astype(np.float32)
+    boxes = Boxes3D(
+        rng.uniform(-6, 6, (number, 3)).astype(np.float32),
+        rng.uniform(0.1, 6, (number, 3)).astype(np.float32),
+        rng.uniform(-np.pi, np.pi, number).astype(np.float32),
+    )
+    points = np.concatenate([points, geometry.corners(boxes)[:, 0]])  # on the edge, too
+    found = dict(geometry.inside_each(points, boxes))
+    for k in range(number):
+        rows = np.flatnonzero(geometry.inside(points, boxes, k))
+        np.testing.assert_array_equal(np.sort(found.get(k, rows[:0])), rows)

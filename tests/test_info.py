@@ -13,6 +13,8 @@ from bevviz.bags.info import WIDTH, describe, render
 from bevviz.bags.source import BagSource
 from bevviz.config import Config, load
 from bevviz.errors import UserError
+from bevviz.stage_loader import StageLoader
+from bevviz.stages.detector import DEMO_MODEL
 from tests import bags
 
 
@@ -25,7 +27,7 @@ def write(path: Path, *without: str, form: str = "mcap") -> Path:
 @pytest.mark.parametrize(("form", "name"), [("mcap", "MCAP"), ("sqlite3", "sqlite3"), ("ros1", "ROS 1 bag")])
 def test_a_whole_bag(tmp_path: Path, form: str, name: str) -> None:
     path = write(tmp_path / "drive.bag", form=form)
-    info = describe([path], load(settings=["detector.model=yolo.onnx"]))
+    info = describe([path], load(settings=["detector.model=demo"]))
     assert info.formats == (name,)
     assert info.messages == 121
     assert info.duration == pytest.approx(2.91)
@@ -164,3 +166,35 @@ def test_kitti(shared: Path, tmp_path: Path) -> None:
     assert "camera: 1242 x 375 image/png, fx 721.5" in text
     assert "velodyne\n    camera_optical" in text
     assert "fixed frame of 'velodyne': none" in text
+
+
+def test_networks_that_cannot_be_used_are_missing(tmp_path: Path) -> None:
+    """The detector's and the objects' alike: not there, no network, another kind of network."""
+    path, text = write(tmp_path / "drive"), tmp_path / "text.onnx"
+    text.write_text("hello")
+    params = ["objects.point_range=[0, -8, -3, 24, 8, 1]", "objects.voxel_size=[1, 1, 4]"]
+    params += ["objects.features=[x, y, z, intensity]", "objects.classes=[Car]"]
+    for file, reason in ((tmp_path / "none.onnx", "o such file"), (text, "onnxruntime cannot load it")):
+        info = describe([path], load(settings=[f"objects.method={file}", *params, f"detector.model={file}"]))
+        detector, objects = info.missing
+        assert detector.startswith(f"detector.model {file}: ") and objects.startswith(
+            f"objects.method {file}: "
+        )
+        assert reason in objects and info.object_network == objects
+        with pytest.raises(UserError, match=re.escape(objects)):  # as a run says before its first frame
+            StageLoader().load(load(settings=[f"objects.method={file}", *params]))
+    info = describe([path], load(settings=[f"objects.method={DEMO_MODEL}", *params, "detector.model=demo"]))
+    [foreign] = info.missing
+    assert "a network on pillars takes pillars [N, points, features]" in foreign
+    assert "3D detector runs on" in render(info)
+
+
+def test_a_3d_detector_lacks_its_file_before_its_parameters(tmp_path: Path) -> None:
+    file = tmp_path / "net.onnx"
+    with pytest.raises(UserError, match=r"^--set objects\.method=.*net\.onnx: no such file$"):
+        load(settings=[f"objects.method={file}"])
+    file.touch()
+    with pytest.raises(
+        UserError, match=r"net\.onnx: a 3D detector needs objects\.params\.point_range, in a YAML"
+    ):
+        load(settings=[f"objects.method={file}"])

@@ -11,6 +11,7 @@ import pytest
 
 from bevviz import remains
 from tests.test_cli import environment
+from tests.waiting import PATIENCE
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
@@ -22,7 +23,7 @@ def python(script: str, folder: Path) -> subprocess.CompletedProcess[str]:
         env=environment(),
         capture_output=True,
         text=True,
-        timeout=60,
+        timeout=PATIENCE,
         # A shell without job control starts what is in the background deaf to Ctrl-C.
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
     )
@@ -103,3 +104,13 @@ def test_what_remains_is_forgotten_in_time() -> None:
     with remains.unfinished(), remains.unfinished():
         assert remains.any_unfinished()
     assert not remains.any_unfinished()
+
+
+def test_a_bar_leaves_no_semaphore_where_its_process_is_killed() -> None:
+    code = (
+        "import multiprocessing, os, signal\nfrom bevviz import announce\n"
+        "multiprocessing.set_start_method('spawn')\n"  # as it is in a worker
+        "assert sum(announce.bar([1, 2])) == 3\nos.kill(os.getpid(), signal.SIGKILL)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (-signal.SIGKILL, "")

@@ -10,7 +10,8 @@ import pytest
 from bevviz import geometry
 from bevviz.bags.source import BagSource
 from bevviz.config import load
-from bevviz.frame import F64, Decision, DetectionState, FrameResult
+from bevviz.frame import F64
+from bevviz.results import Decision, DetectionState, FrameResult
 from bevviz.session import Session
 from tests import bags
 from tests.recordings import Recording

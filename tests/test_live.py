@@ -25,7 +25,7 @@ from bevviz.anomalies import AnomalyDetector
 from bevviz.config import load
 from bevviz.errors import UserError
 from bevviz.files import lock
-from bevviz.frame import CameraResult, Decision, Detections, Frame, FrameResult, Fusion, Mark, Pairs, Scene
+from bevviz.frame import Frame, Mark, Scene
 from bevviz.live.encoder import WHOLE, Encoder, Packet
 from bevviz.live.files import Indexer, Saver, remove_leftovers
 from bevviz.live.flight import FlightRecorder
@@ -37,11 +37,13 @@ from bevviz.live.thinning import Thinned, thin
 from bevviz.live.triggers import Triggers
 from bevviz.live.viewers import RETRY, Program, Viewer
 from bevviz.queues import NewestQueue
+from bevviz.results import CameraResult, Decision, Detections, FrameResult, Fusion, Pairs
 from bevviz.session import Session
 from bevviz.synthetic import SyntheticSource
 from bevviz.synthetic.sensors import Lidar, PinholeCamera
 from tests.graphs import alone
 from tests.recordings import Recording, verify
+from tests.waiting import until
 
 Run = Callable[..., "Outcome"]
 
@@ -134,7 +136,7 @@ def run(frames: list[Frame], drive: SyntheticSource, tmp_path: Path, monkeypatch
         def beside() -> None:
             assert during is not None
             try:
-                wait_for(lambda: live.frames > 0)
+                until(lambda: live.frames > 0)
                 during(live)
             except BaseException as error:
                 failed.append(error)
@@ -153,13 +155,6 @@ def run(frames: list[Frame], drive: SyntheticSource, tmp_path: Path, monkeypatch
         return Outcome(live, said)
 
     return play
-
-
-def wait_for(condition: Callable[[], object], seconds: float = 180.0) -> None:
-    deadline = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < deadline, "it did not happen"
-        time.sleep(0.02)
 
 
 def numbers(path: Path) -> list[int]:
@@ -310,7 +305,7 @@ def test_a_viewer_that_is_late_gets_the_newest_and_its_lag_is_known(
         log(*range(25))
         assert screen.lag == pytest.approx(2.4)
         program.let.set()
-        wait_for(lambda: screen._sending is None and not len(screen._packets))
+        until(lambda: screen._sending is None and not len(screen._packets))
         assert screen.lag < PERIOD * 6
         screen.close(180.0)
     program.thread.join()
@@ -340,10 +335,10 @@ def test_what_is_said_while_no_frame_comes_is_logged(
     source = Stalled(Paced(frames, drive.scene, 3))
 
     def stall(live: Live) -> None:
-        wait_for(lambda: live.frames == 3)
+        until(lambda: live.frames == 3)
         source.states = {"/points": "silent"}
         live.notes.warn("no cloud for 2 s on /points")
-        wait_for(lambda: not live.notes._waiting)
+        until(lambda: not live.notes._waiting)
         live.stop()
 
     run(source=source, during=stall, save=Path("out.rrd"))
@@ -748,7 +743,7 @@ def test_a_full_disk_is_said_once_and_nothing_else_ends(run: Run) -> None:
     saved: list[Path] = []
 
     def during(live: Live) -> None:
-        wait_for(lambda: live.frames > 10)
+        until(lambda: live.frames > 10)
         saved.append(live.flight.save())
         live.stop()
 
@@ -805,11 +800,11 @@ def test_the_configuration_is_reloaded_when_it_is_saved(run: Run) -> None:
     def during(live: Live) -> None:
         live.on_change = lambda config: applied.append(config.clustering.eps)
         file.write_text("clustering: {eps: 0.75}\n")
-        wait_for(lambda: live.config.clustering.eps == 0.75)
+        until(lambda: live.config.clustering.eps == 0.75)
         before = live.frames
-        wait_for(lambda: live.frames > before + 2)
+        until(lambda: live.frames > before + 2)
         file.write_text("clustering: {eps: -1}\n")
-        wait_for(lambda: any("stays as it was" in line for line in said))
+        until(lambda: any("stays as it was" in line for line in said))
         assert live.config.clustering.eps == 0.75
         live.stop()
 
@@ -834,7 +829,7 @@ def test_settings_from_outside(run: Run) -> None:
         assert live.config.voxel.size == 0.2
         live.update(["source.base_frame=base"])
         frames = live.frames
-        wait_for(lambda: live.frames > frames + 2)
+        until(lambda: live.frames > frames + 2)
         assert os.getpriority(os.PRIO_PROCESS, 0) == 1
         live.stop()
 
@@ -922,15 +917,15 @@ def test_a_late_viewer_sees_the_static_data_and_the_recent_past(
     def during(live: Live) -> None:
         (url,) = live.urls
         assert url.startswith(f"http://localhost:{port}/?url=")
-        wait_for(lambda: listens(port))
-        wait_for(lambda: live.frames == 30)
+        until(lambda: listens(port))
+        until(lambda: live.frames == 30)
         data_port = int(url.rpartition("localhost%3A")[2].partition("%2F")[0])
         found.append(received(data_port, Path("late.rrd"), lambda r: shown(r)[-1:] == [29]))
         live.stop()
 
     class Later(Stalled):
         def __iter__(self) -> Iterator[Frame]:
-            wait_for(lambda: listens(port))
+            until(lambda: listens(port))
             yield from super().__iter__()
 
     run(["live.output_queue=1000"], source=Later(Paced(frames, drive.scene, 30)), during=during, serve=port)
@@ -945,19 +940,19 @@ def test_viewers_that_hang_or_die_slow_nothing_down(run: Run) -> None:
     port = a_port()
     arguments = ("--serve-grpc", "--port", str(port), "--server-memory-limit", "1GB")
     viewers = [rerun(*arguments)]
-    wait_for(lambda: listens(port))
+    until(lambda: listens(port))
     found: list[Recording] = []
     said: list[str] = []
 
     def during(live: Live) -> None:
-        wait_for(lambda: live.frames > 5)
+        until(lambda: live.frames > 5)
         end(viewers[0], signal.SIGSTOP)
-        wait_for(lambda: live.status.drops["remote"] > 0)  # frames come, nobody waits
+        until(lambda: live.status.drops["remote"] > 0)  # frames come, nobody waits
         end(viewers[0])
-        wait_for(lambda: any("is gone" in line for line in said))
+        until(lambda: any("is gone" in line for line in said))
         time.sleep(RETRY + 1)
         viewers.append(rerun(*arguments))
-        wait_for(lambda: any("is back" in line for line in said))
+        until(lambda: any("is back" in line for line in said))
         found.append(received(port, Path("late.rrd"), lambda r: len(r.rows["/explain"]) > 20))
         live.stop()
 
@@ -1027,12 +1022,12 @@ def test_signals_and_snap_on_a_running_process(tmp_path: Path) -> None:
 
     saved = tmp_path / "all.rrd"
     try:
-        wait_for(lambda: saved.exists() and saved.stat().st_size > 10_000_000, 120)
+        until(lambda: saved.exists() and saved.stat().st_size > 10_000_000)
         snapped = ask("mine.rrd")
         again = ask("mine.rrd", "--pid", str(run.pid))
         other = ask("--pid", "1")
         run.send_signal(signal.SIGUSR1)
-        wait_for(lambda: list(tmp_path.glob("flight_*.rrd")))
+        until(lambda: list(tmp_path.glob("flight_*.rrd")))
     finally:
         run.send_signal(signal.SIGTERM)
         time.sleep(0.3)

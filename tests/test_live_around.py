@@ -13,14 +13,16 @@ import pytest
 
 from bevviz.bags.source import BagSource
 from bevviz.config import load
-from bevviz.frame import Frame, FrameResult
+from bevviz.frame import Frame
+from bevviz.results import FrameResult
 from bevviz.ros.encode import typestore
 from bevviz.session import Session
 from bevviz.synthetic import SyntheticSource
 from bevviz.synthetic.drive import TRUTH_TOPIC
-from tests.graphs import PATIENCE, own_graph, playing, until
+from tests.graphs import own_graph, playing
 from tests.recordings import Recording
 from tests.ros_player import Play
+from tests.waiting import PATIENCE, until
 
 pytest.importorskip("rclpy", reason="needs rclpy: pip install 'bevviz[ros]'")
 

@@ -2,22 +2,41 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 import time
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from rosbags.typesys.store import Typestore
 
 from bevviz.config import load
 from bevviz.errors import UserError
+from bevviz.ros import definitions
 from bevviz.ros.definitions import store_of
-from bevviz.ros.encode import encode_cloud
+from bevviz.ros.encode import encode_cloud, typestore
 from bevviz.synthetic import SyntheticSource
 from tests import bags
-from tests.graphs import own_graph, until
-from tests.test_objects import AUTOWARE, PRIVATE, RADAR, assert_is_box, autoware, made, private, radar
+from tests.graphs import own_graph
+from tests.test_objects import (
+    AUTOWARE,
+    BOX,
+    PRIVATE,
+    RADAR,
+    assert_is_box,
+    autoware,
+    made,
+    pose,
+    private,
+    radar,
+    vector,
+)
+from tests.waiting import until
 
 pytest.importorskip("rclpy", reason="needs rclpy: pip install 'bevviz[ros]'")
 
@@ -32,20 +51,53 @@ STATED = "source.boxes={topic: my/things, size: dimensions, yaw: heading, label:
 @pytest.fixture
 def packages(tmp_path: Path) -> Iterator[None]:
     """A workspace, as sourcing it would make it known; nothing of it can be imported."""
-    for package, definitions in (
+    for package, texts in (
         ("autoware_perception_msgs", AUTOWARE),
         ("radar_msgs", RADAR),
         ("my_msgs", PRIVATE),
     ):
         folder = tmp_path / "share" / package / "msg"
         folder.mkdir(parents=True)
-        for name, text in definitions.items():
+        for name, text in texts.items():
             (folder / f"{name}.msg").write_text(text)
     with own_graph() as patch:
         patch.setenv("AMENT_PREFIX_PATH", str(tmp_path))
         yield
     store_of.cache_clear()
     message_type.cache_clear()
+
+
+# As Foxy's package has them, of which nothing says that they are not today's.
+FOXY = {
+    "ObjectHypothesisWithPose": "string id\nfloat64 score\ngeometry_msgs/PoseWithCovariance pose\n",
+    "BoundingBox3D": "geometry_msgs/Pose center\ngeometry_msgs/Vector3 size\n",
+    "Detection3D": "std_msgs/Header header\nObjectHypothesisWithPose[] results\nBoundingBox3D bbox\n"
+    "sensor_msgs/PointCloud2 source_cloud\nbool is_tracking\nstring tracking_id\n",
+    "Detection3DArray": "std_msgs/Header header\nDetection3D[] detections\n",
+}
+
+
+def of_foxy() -> bags.Messages:
+    found = bags.Messages()
+    found.store = get_typestore(Stores.ROS2_FOXY)
+    for name, text in FOXY.items():
+        found.store.register(get_types_from_msg(text, f"vision_msgs/msg/{name}"))
+    return found
+
+
+def older(m: bags.Messages) -> Any:
+    where = m.make("geometry_msgs/msg/PoseWithCovariance", pose=pose(m), covariance=np.zeros(36))
+    about = m.header(bags.START, bags.LIDAR_FRAME)
+    one = m.make(
+        "vision_msgs/msg/Detection3D",
+        header=about,
+        results=[m.make("vision_msgs/msg/ObjectHypothesisWithPose", id="bus", score=0.5, pose=where)],
+        bbox=m.make("vision_msgs/msg/BoundingBox3D", center=pose(m), size=vector(m, "Vector3", BOX[3:6])),
+        source_cloud=m.cloud(bags.START, np.zeros((2, 4), np.float32)),
+        is_tracking=True,
+        tracking_id="7",
+    )
+    return m.make("vision_msgs/msg/Detection3DArray", header=about, detections=[one])
 
 
 def now(message: Any) -> Any:
@@ -60,10 +112,14 @@ def test_boxes_of_other_messages_are_received(packages: None) -> None:
         "autoware_perception_msgs": made("autoware_perception_msgs", AUTOWARE),
         "radar_msgs": made("radar_msgs", RADAR),
         "my_msgs": made("my_msgs", PRIVATE),
+        "vision_msgs": of_foxy(),
     }
-    kind = "autoware_perception_msgs/msg/TrackedObjects"
+    perception, about = stores["autoware_perception_msgs"], "autoware_perception_msgs"
     sent = {
-        "/perception/objects": (kind, autoware(stores["autoware_perception_msgs"], kind[:24], "Tracked")),
+        "/perception/objects": (f"{about}/msg/TrackedObjects", autoware(perception, about, "Tracked")),
+        "/perception/seen": (f"{about}/msg/DetectedObjects", autoware(perception, about, "Detected")),
+        "/perception/ahead": (f"{about}/msg/PredictedObjects", autoware(perception, about, "Predicted")),
+        "/older": ("vision_msgs/msg/Detection3DArray", older(stores["vision_msgs"])),
         "/radar/tracks": ("radar_msgs/msg/RadarTracks", radar(stores["radar_msgs"])),
         "/robot/my/things": ("my_msgs/msg/Things", private(stores["my_msgs"])),
     }
@@ -98,12 +154,86 @@ def test_boxes_of_other_messages_are_received(packages: None) -> None:
         until(all_came, "all boxes")
     assert {topic: one.labels for topic, one in boxes.items()} == {
         "/perception/objects": ("pedestrian",),
+        "/perception/seen": ("pedestrian",),
+        "/perception/ahead": ("pedestrian",),
+        "/older": ("bus",),
         "/radar/tracks": ("dynamic",),
         "/robot/my/things": ("van",),
     }
-    assert_is_box(boxes["/perception/objects"])
+    for topic in ("/perception/objects", "/perception/seen", "/perception/ahead", "/older"):
+        assert_is_box(boxes[topic])
+    assert boxes["/older"].ids == ("7",)
     assert_is_box(boxes["/radar/tracks"], yaw=0.0)
     assert_is_box(boxes["/robot/my/things"], yaw=-0.25)
+
+
+PLANNER = """
+import rclpy
+from geometry_msgs.msg import PoseStamped
+from nav_msgs.msg import Path
+
+rclpy.init()
+node = rclpy.create_node("planner", namespace="/robot")
+publisher = node.create_publisher(Path, "/things", 5)
+thing = PoseStamped()
+thing.header.frame_id = "tram"
+thing.pose.position.x, thing.pose.position.y, thing.pose.position.z = 10.0, 2.0, 1.5
+
+def publish():
+    path = Path(poses=[thing])
+    path.header.stamp, path.header.frame_id = node.get_clock().now().to_msg(), "rslidar"
+    publisher.publish(path)
+
+timer = node.create_timer(0.1, publish)
+print("playing", flush=True)
+rclpy.spin(node)
+"""
+STRANGE = "source.boxes={topic: /things, center: pose.position, size: pose.position, label: header.frame_id}"
+
+
+def test_who_publishes_a_type_is_asked_what_it_is_made_of(
+    packages: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = "nav_msgs/msg/Path"
+    known = Typestore()  # all but this one, whose package is hidden
+    known.fielddefs = {kind: fields for kind, fields in typestore().fielddefs.items() if kind != path}
+    known.types = {kind: made for kind, made in typestore().types.items() if kind != path}
+    monkeypatch.setattr(definitions, "typestore", lambda: known)
+    monkeypatch.setattr(definitions, "_learned", {})
+    monkeypatch.setitem(sys.modules, "nav_msgs.msg", None)
+    monkeypatch.setattr(sys, "prefix", str(tmp_path))
+    with pytest.raises(UserError, match=f"{path} is not known without its package"):
+        message_type(path)
+    cloud = encode_cloud(SyntheticSource(frames=1).snapshot(0).frame.clouds[0])
+    with (
+        subprocess.Popen([sys.executable, "-c", PLANNER], stdout=subprocess.PIPE, text=True) as planner,
+        Node(name="robot") as robot,
+        LiveSource(load(settings=[STRANGE])) as source,
+    ):
+        try:
+            assert planner.stdout is not None and planner.stdout.readline() == "playing\n"
+            robot.start()
+            points = robot.node.create_publisher(message_type(CLOUD), "/points", 5)
+
+            def publish() -> bool:
+                points.publish(bytes(known.serialize_cdr(now(cloud), CLOUD)))
+                return True
+
+            until(lambda: publish() and source.wait(0) and source.received["/things"], "a scene with things")
+            frames = iter(source)
+            found: list[Any] = []
+
+            def came() -> bool:
+                publish()
+                found.extend(next(frames).robot_boxes)
+                return bool(found)
+
+            until(came, "a thing")
+        finally:
+            planner.terminate()
+    assert (found[0].labels, found[0].boxes.center.tolist()) == (("tram",), [[10.0, 2.0, 1.5]])
+    text = definitions.definition(path)
+    assert text is not None and "geometry_msgs/PoseStamped[] poses" in text
 
 
 def test_what_is_not_known_is_said(packages: None, tmp_path: Path) -> None:
@@ -117,5 +247,6 @@ def test_what_is_not_known_is_said(packages: None, tmp_path: Path) -> None:
             until(lambda: any("is not received" in line for line in said), "what is not received")
     expected = "/my/things is not received: my_msgs/msg/Things is not known without its package, and no"
     assert any(line.startswith(f"{expected} my_msgs/msg/Thing.msg is in AMENT_PREFIX_PATH") for line in said)
+    assert any("; /robot, which publishes it, was asked" in line for line in said)
     with pytest.raises(UserError, match=r"no your_msgs/msg/Box\.msg is in AMENT_PREFIX_PATH"):
         message_type("your_msgs/msg/Box")

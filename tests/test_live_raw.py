@@ -25,18 +25,19 @@ from bevviz.bags.source import BagSource
 from bevviz.config import load
 from bevviz.errors import UserError
 from bevviz.files import write_all
-from bevviz.frame import FrameResult
 from bevviz.recorded import read
 from bevviz.report.digest import compare, digest
+from bevviz.results import FrameResult
 from bevviz.run import Observer
 from bevviz.run import run as run_frames
 from bevviz.session import Session
 from bevviz.synthetic import SyntheticSource
 from bevviz.synthetic.bag import TOPICS
 from bevviz.synthetic.drive import LIDAR_TOPIC
-from tests.graphs import PATIENCE, own_graph, playing
+from tests.graphs import own_graph, playing
 from tests.recordings import Recording, verify
 from tests.ros_player import Play
+from tests.waiting import PATIENCE
 
 pytest.importorskip("rclpy", reason="needs rclpy: pip install 'bevviz[ros]'")
 

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 import bevviz
-from bevviz.frame import FrameResult
 from bevviz.live.encoder import Packet
 from bevviz.live.flight import FlightRecorder
 from bevviz.live.notes import Notes
@@ -17,10 +16,12 @@ from bevviz.live.replay import Replay
 from bevviz.live.runtime import Live, Outputs
 from bevviz.live.settings import Settings
 from bevviz.logging import entities
+from bevviz.results import FrameResult
 from bevviz.synthetic import SyntheticSource
 from bevviz.workbench.live_bench import LiveBench
 from bevviz.workbench.live_film import AHEAD, WHOLE
 from bevviz.workbench.site import Heard
+from tests.live_bench import live_bench
 from tests.recordings import Recording
 
 pytestmark = pytest.mark.filterwarnings("ignore:RRD file has no footer")
@@ -35,12 +36,8 @@ def results() -> list[FrameResult]:
 
 @pytest.fixture
 def bench(results: list[FrameResult]) -> Iterator[LiveBench]:
-    source = Replay([result.frame for result in results], SyntheticSource(frames=1).scene)
-    settings = Settings(None, ["detector.model=demo", f"live.viewer_points={LIMIT}"])
-    live = Live(source, settings, Outputs(), Notes(lambda line: None))
-    with LiveBench(live) as bench:
+    with live_bench(results, f"live.viewer_points={LIMIT}") as bench:
         yield bench
-        live.encoder.close()
 
 
 def test_viewers_get_fewer_points_and_files_all(

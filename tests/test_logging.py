@@ -27,30 +27,16 @@ from bevviz.errors import UserError
 from bevviz.explain import explain
 from bevviz.files import unfinished
 from bevviz.frame import (
-    Anomaly,
     Boxes3D,
     Camera,
-    CameraResult,
     Cloud,
-    Clusters,
-    Decision,
-    Detections,
-    DetectionState,
-    Failure,
     Frame,
-    FrameResult,
-    Fusion,
-    Ground,
     Image,
     Intrinsics,
     LabelledBoxes2D,
     LabelledBoxes3D,
     LateResult,
-    Objects,
-    Pairs,
     Scene,
-    Tracks,
-    Voxels,
 )
 from bevviz.logging.cloud import quantised
 from bevviz.logging.decisions import page
@@ -59,10 +45,27 @@ from bevviz.logging.health import Rates
 from bevviz.logging.logger import Logger
 from bevviz.logging.sinks import open_recording
 from bevviz.logging.tracks import LANES, Lanes
+from bevviz.results import (
+    Anomaly,
+    CameraResult,
+    Clusters,
+    Decision,
+    Detections,
+    DetectionState,
+    Failure,
+    FrameResult,
+    Fusion,
+    Ground,
+    Objects,
+    Pairs,
+    Tracks,
+    Voxels,
+)
 from bevviz.stages.bev import bev
 from bevviz.stages.fusion import in_view
 from bevviz.stages.tracking import Tracker
 from tests.recordings import Recording, verify
+from tests.waiting import PATIENCE
 
 SCENE = Scene("drive", "lidar", ("lidar",), ("zed",), robot=True, truth=True)
 START = 1_700_000_000_123_456_789
@@ -93,7 +96,9 @@ def make(index: int = 0, **changes: Any) -> FrameResult:
     labels = np.repeat(np.array([0, 1, -1], np.int32), [20, 15, 1])
     boxes = Boxes3D(f32([8, 0.5, -0.8], [12, -6, -1]), f32([0.6, 0.5, 1.7], [2, 1, 1]), f32(0, 0.4))
     zero = np.zeros(2, np.int32)
-    clusters = Clusters(labels, zero, np.array([20, 15], np.int32), boxes.center, boxes, boxes)
+    clusters = Clusters(
+        labels, zero, np.array([20, 15], np.int32), boxes.center.astype(np.float32), boxes, boxes
+    )
     detections = Detections(
         f32([20, 10, 30, 30], [40, 15, 60, 25], [0, 0, 5, 5]),
         f32(0.9, 0.5, 0.1),
@@ -802,7 +807,7 @@ def test_several_outputs_at_once(tmp_path: Path) -> None:
     with open_recording(SCENE, load(), save=path, serve=port) as sinks:
         (url,) = sinks.urls
         assert url.startswith(f"http://localhost:{port}/?url=rerun%2Bhttp%3A%2F%2Flocalhost%3A")
-        with urllib.request.urlopen(url, timeout=10) as page:
+        with urllib.request.urlopen(url, timeout=PATIENCE) as page:
             assert b"rerun" in page.read().lower()
         Logger(sinks.recording, load(), SCENE).log(make())
     verify(path)
@@ -841,7 +846,9 @@ def test_a_killed_process_leaves_what_it_had_logged(tmp_path: Path) -> None:
     """
     root = Path(__file__).resolve().parents[1]
     env = {**os.environ, "PYTHONPATH": str(root)}
-    done = subprocess.run([sys.executable, "-c", textwrap.dedent(script)], cwd=root, env=env, timeout=120)
+    done = subprocess.run(
+        [sys.executable, "-c", textwrap.dedent(script)], cwd=root, env=env, timeout=PATIENCE
+    )
     assert done.returncode == -signal.SIGKILL
     left = tmp_path / "killed.partial.rrd"
     assert not path.exists()

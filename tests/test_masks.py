@@ -12,12 +12,13 @@ from hypothesis import strategies as st
 
 from bevviz.config import FusionConfig, load
 from bevviz.explain import in_mask
-from bevviz.frame import F32, Bool, Detections, FrameResult, Fusion, Masks
+from bevviz.frame import F32, Bool
 from bevviz.logging import entities
 from bevviz.logging.camera import log_detections
 from bevviz.logging.writer import Writer
 from bevviz.report.digest import detections_of as recorded
 from bevviz.report.digest import digest, pack, unpack
+from bevviz.results import Detections, FrameResult, Fusion, Masks
 from bevviz.stages.clustering import cluster
 from bevviz.stages.cover import cover
 from bevviz.stages.fusion import fuse

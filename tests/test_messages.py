@@ -20,7 +20,8 @@ from numpy.typing import NDArray
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
-from bevviz.ros import messages, vision_msgs
+from bevviz import geometry
+from bevviz.ros import cameras, clouds, detections, images, transforms, vision_msgs
 from bevviz.ros.messages import MessageError
 
 SEC, NANOSEC = 1_700_000_000, 123_456_789
@@ -142,7 +143,7 @@ def test_any_layout_equals_unpacking_point_by_point(msg: Message) -> None:
         for p in expected
         if all(math.isfinite(p[axis]) for axis in "xyz") and any(np.float32(p[axis]) for axis in "xyz")
     ]
-    cloud = messages.decode_cloud(msg, "/points", 7)
+    cloud = clouds.decode_cloud(msg, "/points", 7)
     assert cloud.dropped == len(expected) - len(kept)
     assert (
         cloud.xyz.dtype == np.float32 and cloud.xyz.shape == (len(kept), 3) and cloud.xyz.flags.c_contiguous
@@ -194,7 +195,7 @@ def test_a_kitti_scan_through_ros_is_the_scan(shared: Path, ros: str) -> None:
     scan = np.fromfile(shared / "kitti/velodyne/000000.bin", np.float32).reshape(-1, 4)
     points = np.ascontiguousarray(scan).view(XYZI).reshape(-1)
     msg = through(STORES[ros], "sensor_msgs/msg/PointCloud2", cloud_message(points))
-    cloud = messages.decode_cloud(msg, "/velodyne_points", 5)
+    cloud = clouds.decode_cloud(msg, "/velodyne_points", 5)
     assert (cloud.stamp, cloud.frame_id, cloud.topic, cloud.received) == (
         STAMP,
         "lidar",
@@ -209,18 +210,18 @@ def test_a_kitti_scan_through_ros_is_the_scan(shared: Path, ros: str) -> None:
 def test_what_rclpy_delivers_is_read_too() -> None:
     msg = cloud_message(random_points(50))
     msg.data = array.array("B", msg.data)
-    np.testing.assert_array_equal(messages.decode_cloud(msg, "/p", 0).xyz[:, 0], random_points(50)["x"])
+    np.testing.assert_array_equal(clouds.decode_cloud(msg, "/p", 0).xyz[:, 0], random_points(50)["x"])
 
 
 def test_a_cloud_of_nothing_but_nan_is_empty_and_counted() -> None:
     points = random_points(64)
     points["y"] = np.nan
-    cloud = messages.decode_cloud(cloud_message(points, height=4), "/p", 0)
+    cloud = clouds.decode_cloud(cloud_message(points, height=4), "/p", 0)
     assert cloud.xyz.shape == (0, 3) and cloud.fields["intensity"].shape == (0,) and cloud.dropped == 64
 
 
 def test_a_cloud_without_points_is_empty() -> None:
-    cloud = messages.decode_cloud(cloud_message(random_points(0)), "/p", 0)
+    cloud = clouds.decode_cloud(cloud_message(random_points(0)), "/p", 0)
     assert cloud.xyz.shape == (0, 3) and cloud.dropped == 0
 
 
@@ -229,7 +230,7 @@ def test_of_cut_data_the_whole_points_are_kept_and_the_others_counted(padding: i
     points = random_points(100)
     msg = cloud_message(points, height=4, row_padding=padding)
     msg.data = msg.data[: 2 * msg.row_step + 7 * msg.point_step + 3]
-    cloud = messages.decode_cloud(msg, "/p", 0)
+    cloud = clouds.decode_cloud(msg, "/p", 0)
     assert cloud.dropped == 100 - whole
     np.testing.assert_array_equal(cloud.xyz[:, 2], points["z"][:whole])
 
@@ -239,7 +240,7 @@ def test_cut_to_almost_nothing(size: int) -> None:
     for padding in (0, 8):
         msg = cloud_message(random_points(100), height=4, row_padding=padding)
         msg.data = msg.data[:size]
-        cloud = messages.decode_cloud(msg, "/p", 0)
+        cloud = clouds.decode_cloud(msg, "/p", 0)
         assert len(cloud.xyz) + cloud.dropped == 100
 
 
@@ -248,14 +249,14 @@ def test_row_step_and_count_that_old_drivers_leave_at_zero() -> None:
     msg.row_step = 0
     for field in msg.fields:
         field.count = 0
-    assert len(messages.decode_cloud(msg, "/p", 0).xyz) == 100
+    assert len(clouds.decode_cloud(msg, "/p", 0).xyz) == 100
 
 
 def test_coordinates_beyond_float32_are_dropped_without_a_warning() -> None:
     points = random_points(3, [("x", "<f8"), ("y", "<f8"), ("z", "<f8")])
     points["x"][1] = 1e300
     points["y"][0] = 4_500_000.25
-    cloud = messages.decode_cloud(cloud_message(points), "/p", 0)
+    cloud = clouds.decode_cloud(cloud_message(points), "/p", 0)
     assert cloud.dropped == 1 and cloud.xyz[0, 1] == np.float32(4_500_000.25)
 
 
@@ -265,21 +266,21 @@ def test_padding_fields_of_the_same_name_do_no_harm() -> None:
         Message(name="_", offset=0, datatype=2, count=1),
         Message(name="_", offset=4, datatype=2, count=1),
     ]
-    np.testing.assert_array_equal(messages.decode_cloud(msg, "/p", 0).xyz[:, 0], random_points(10)["x"])
+    np.testing.assert_array_equal(clouds.decode_cloud(msg, "/p", 0).xyz[:, 0], random_points(10)["x"])
 
 
 def test_bad_layouts_are_named() -> None:
     msg = cloud_message(random_points(10))
     msg.fields = msg.fields[:1] + msg.fields[3:]
     with pytest.raises(MessageError, match="/p: the cloud has no field y, z; its fields are x, intensity"):
-        messages.decode_cloud(msg, "/p", 0)
+        clouds.decode_cloud(msg, "/p", 0)
     msg = cloud_message(random_points(10))
     msg.fields[3].offset = 13
     with pytest.raises(MessageError, match=r"/p: field 'intensity' ends at byte 17 .* point_step is 16"):
-        messages.decode_cloud(msg, "/p", 0)
+        clouds.decode_cloud(msg, "/p", 0)
     msg.fields[3].datatype = 11
     with pytest.raises(MessageError, match="/p: field 'intensity' has the unknown datatype 11"):
-        messages.decode_cloud(msg, "/p", 0)
+        clouds.decode_cloud(msg, "/p", 0)
 
 
 # --- images ------------------------------------------------------------------------------------
@@ -314,7 +315,7 @@ ORDERS = {"bgr8": (0, 1, 2), "rgb8": (2, 1, 0), "bgra8": (0, 1, 2), "rgba8": (2,
 def test_8_bit_images(encoding: str, height: int, width: int, padding: int) -> None:
     channels = 4 if "a8" in encoding or encoding == "8UC4" else 1 if encoding in ("mono8", "8UC1") else 3
     pixels = random_pixels(height, width, channels)
-    image = messages.decode_image(image_message(pixels, encoding, padding), "/image", 3)
+    image = images.decode_image(image_message(pixels, encoding, padding), "/image", 3)
     order = (0, 0, 0) if channels == 1 else ORDERS.get(encoding, (0, 1, 2))
     np.testing.assert_array_equal(image.bgr, pixels[..., list(order)])
     assert image.bgr.dtype == np.uint8 and image.bgr.flags.c_contiguous
@@ -323,7 +324,7 @@ def test_8_bit_images(encoding: str, height: int, width: int, padding: int) -> N
 
 def test_bgr8_is_not_copied() -> None:
     msg = image_message(random_pixels(6, 8, 3), "bgr8")
-    assert np.shares_memory(messages.decode_image(msg, "/image", 0).bgr, msg.data)
+    assert np.shares_memory(images.decode_image(msg, "/image", 0).bgr, msg.data)
 
 
 @pytest.mark.parametrize("dtype", ["<u2", ">u2"])
@@ -332,7 +333,7 @@ def test_bgr8_is_not_copied() -> None:
 def test_16_bit_images_use_the_bits_that_they_need(encoding: str, bits: int, dtype: str) -> None:
     pixels = random_pixels(6, 8, dtype=dtype, high=1 << bits)
     pixels[0, 0] = (1 << bits) - 1
-    bgr = messages.decode_image(image_message(pixels, encoding, padding=2), "/image", 0).bgr
+    bgr = images.decode_image(image_message(pixels, encoding, padding=2), "/image", 0).bgr
     expected = np.rint(pixels.astype(float) * 255 / ((1 << bits) - 1))
     assert np.abs(bgr.astype(float) - expected[..., None]).max() <= 0.5
     assert bgr[0, 0].tolist() == [255, 255, 255]
@@ -349,7 +350,7 @@ def test_bayer_images_of_one_colour_show_that_colour(pattern: str, bits: int) ->
         pixels[0, 0] = 65535  # the brightest pixel tells the depth
     msg = image_message(pixels, f"bayer_{pattern}{bits}")
     np.testing.assert_array_equal(
-        messages.decode_image(msg, "/image", 0).bgr[4:7, 4:7], np.full((3, 3, 3), [20, 130, 250])
+        images.decode_image(msg, "/image", 0).bgr[4:7, 4:7], np.full((3, 3, 3), [20, 130, 250])
     )
 
 
@@ -364,7 +365,7 @@ def test_yuv422_images(encoding: str, luma: int) -> None:
     pixels = random_pixels(6, 8, 2)
     chroma = pixels[..., 1 - luma]
     expected = bt601(pixels[..., luma], np.repeat(chroma[:, ::2], 2, 1), np.repeat(chroma[:, 1::2], 2, 1))
-    bgr = messages.decode_image(image_message(pixels, encoding, padding=4), "/image", 0).bgr
+    bgr = images.decode_image(image_message(pixels, encoding, padding=4), "/image", 0).bgr
     assert np.abs(bgr - expected).max() <= 2
 
 
@@ -373,7 +374,7 @@ def test_yuv420_images(encoding: str, u: int) -> None:
     planes = random_pixels(9, 8)
     chroma = planes[6:].reshape(3, 4, 2).repeat(2, 0).repeat(2, 1)
     expected = bt601(planes[:6], chroma[..., u], chroma[..., 1 - u])
-    bgr = messages.decode_image(image_message(planes, encoding, height=6), "/image", 0).bgr
+    bgr = images.decode_image(image_message(planes, encoding, height=6), "/image", 0).bgr
     assert bgr.shape == (6, 8, 3) and np.abs(bgr - expected).max() <= 2
 
 
@@ -382,17 +383,17 @@ def test_bad_images_are_named() -> None:
     with pytest.raises(
         MessageError, match="/image: image encoding '32FC1' is not supported; supported are bgr8, rgb8"
     ):
-        messages.decode_image(image_message(pixels, "32FC1"), "/image", 0)
+        images.decode_image(image_message(pixels, "32FC1"), "/image", 0)
     with pytest.raises(
         MessageError, match=r"/image: a 8 x 7 bgr8 image needs 7 rows of 24 bytes, .* 144 bytes of data"
     ):
-        messages.decode_image(image_message(pixels, "bgr8", height=7), "/image", 0)
+        images.decode_image(image_message(pixels, "bgr8", height=7), "/image", 0)
     with pytest.raises(MessageError, match="but step is 8"):
-        messages.decode_image(image_message(pixels, "bgr8", step=8), "/image", 0)
+        images.decode_image(image_message(pixels, "bgr8", step=8), "/image", 0)
     with pytest.raises(MessageError, match="/image: the image is 0 x 6 and has no pixels"):
-        messages.decode_image(image_message(pixels, "bgr8", width=0), "/image", 0)
+        images.decode_image(image_message(pixels, "bgr8", width=0), "/image", 0)
     with pytest.raises(MessageError, match="/image: a 7 x 6 image cannot be yuv422"):
-        messages.decode_image(image_message(random_pixels(6, 7, 2), "yuv422"), "/image", 0)
+        images.decode_image(image_message(random_pixels(6, 7, 2), "yuv422"), "/image", 0)
 
 
 def compressed(data: bytes, kind: str) -> Message:
@@ -409,7 +410,7 @@ def test_a_kitti_image_as_png_stays_as_it_is(shared: Path, ros: str) -> None:
     msg = through(
         STORES[ros], "sensor_msgs/msg/CompressedImage", compressed(path.read_bytes(), "bgr8; png compressed")
     )
-    image = messages.decode_compressed_image(msg, "/image/compressed", 4)
+    image = images.decode_compressed_image(msg, "/image/compressed", 4)
     assert image.encoded == path.read_bytes() and image.media_type == "image/png"
     np.testing.assert_array_equal(image.bgr, cv2.imread(str(path)))
     assert (image.stamp, image.frame_id, image.received) == (STAMP, "cam", 4)
@@ -419,7 +420,7 @@ def test_the_kind_of_a_compressed_image_is_that_of_its_data() -> None:
     pixels = cv2.GaussianBlur(random_pixels(64, 48, 3), (0, 0), 5)
     data = encoded(".jpg", pixels)
     for kind in ("jpeg", "rgb8; png compressed bgr8", ""):
-        image = messages.decode_compressed_image(compressed(data, kind), "/image", 0)
+        image = images.decode_compressed_image(compressed(data, kind), "/image", 0)
         assert image.media_type == "image/jpeg" and image.encoded == data
         assert np.abs(image.bgr.astype(int) - pixels).mean() < 3
 
@@ -427,7 +428,7 @@ def test_the_kind_of_a_compressed_image_is_that_of_its_data() -> None:
 def test_a_grey_png_of_16_bits_is_shown_as_it_was_reduced() -> None:
     pixels = random_pixels(6, 8, dtype="u2", high=4096)
     pixels[0, 0] = 4095
-    image = messages.decode_compressed_image(compressed(encoded(".png", pixels), "mono16; png"), "/image", 0)
+    image = images.decode_compressed_image(compressed(encoded(".png", pixels), "mono16; png"), "/image", 0)
     assert image.encoded is None and not image.media_type
     assert np.abs(image.bgr[..., 1] - pixels * 255.0 / 4095).max() <= 0.5
 
@@ -439,7 +440,7 @@ def test_webp_is_decoded_and_goes_on_raw(channels: int, quality: int) -> None:
     pixels = cv2.GaussianBlur(random_pixels(48, 64, channels), (0, 0), 5)
     pixels[..., 3:] = 255 - np.arange(64)[None, :, None] // 32  # nearly opaque
     _, data = cv2.imencode(".webp", pixels, [cv2.IMWRITE_WEBP_QUALITY, quality])
-    image = messages.decode_compressed_image(compressed(data.tobytes(), "webp"), "/image", 0)
+    image = images.decode_compressed_image(compressed(data.tobytes(), "webp"), "/image", 0)
     assert image.bgr.shape == (48, 64, 3) and image.encoded is None and not image.media_type
     worst = 0 if quality > 100 and channels == 3 else 3
     assert np.abs(image.bgr.astype(int) - pixels[..., :3]).mean() <= worst
@@ -451,7 +452,7 @@ def test_a_webp_that_is_too_large_is_known_before_it_is_decoded() -> None:
     assert data[12:16] == b"VP8X"
     data[24:30] = b"\xff\xff\x00" * 2
     with pytest.raises(MessageError, match="an image of 65536 x 65536 pixels is not taken"):
-        messages.decode_compressed_image(compressed(bytes(data), "webp"), "/image", 0)
+        images.decode_compressed_image(compressed(bytes(data), "webp"), "/image", 0)
 
 
 def test_bad_compressed_images_are_named() -> None:
@@ -462,13 +463,13 @@ def test_bad_compressed_images_are_named() -> None:
         with pytest.raises(
             MessageError, match=r"/image: the image/(jpeg|png|webp) data \(\d+ bytes\) is damaged or cut"
         ):
-            messages.decode_compressed_image(compressed(data, ""), "/image", 0)
+            images.decode_compressed_image(compressed(data, ""), "/image", 0)
     with pytest.raises(MessageError, match=r"/image: .*'avif' holds neither JPEG, PNG nor WebP data"):
-        messages.decode_compressed_image(compressed(b"\0\0\0\x1cftypavif", "avif"), "/image", 0)
+        images.decode_compressed_image(compressed(b"\0\0\0\x1cftypavif", "avif"), "/image", 0)
     with pytest.raises(MessageError, match=r"/image: 'h264' is video of a kind that is not decoded"):
-        messages.decode_compressed_image(compressed(b"\0\0\0\1abc", "h264"), "/image", 0)
+        images.decode_compressed_image(compressed(b"\0\0\0\1abc", "h264"), "/image", 0)
     with pytest.raises(MessageError, match="/image: '16UC1; compressedDepth png' is a depth image"):
-        messages.decode_compressed_image(compressed(png, "16UC1; compressedDepth png"), "/image", 0)
+        images.decode_compressed_image(compressed(png, "16UC1; compressedDepth png"), "/image", 0)
 
 
 # --- camera models -----------------------------------------------------------------------------
@@ -495,17 +496,17 @@ def info_message(model: str = "plumb_bob", d: Any = (0.1, -0.2, 0.01, 0.02, 0.03
 @pytest.mark.parametrize("ros", STORES)
 def test_camera_info_of_both_ros_versions(ros: str) -> None:
     msg = through(STORES[ros], "sensor_msgs/msg/CameraInfo", info_message())
-    raw = messages.decode_camera_info(msg, rectified=False)
+    raw = cameras.decode_camera_info(msg, rectified=False)
     assert (raw.width, raw.height, raw.distortion_model) == (640, 360, "plumb_bob")
     np.testing.assert_array_equal(raw.K, np.reshape(K, (3, 3)))
     np.testing.assert_array_equal(raw.D, [0.1, -0.2, 0.01, 0.02, 0.03])
-    rectified = messages.decode_camera_info(msg, rectified=True)
+    rectified = cameras.decode_camera_info(msg, rectified=True)
     np.testing.assert_array_equal(rectified.K, [[450, 0, 310], [0, 455, 175], [0, 0, 1]])
     assert not rectified.D.size and not rectified.distortion_model
 
 
 def test_a_rectified_camera_without_p_keeps_k() -> None:
-    intrinsics = messages.decode_camera_info(info_message(p=np.zeros(12), P=np.zeros(12)), rectified=True)
+    intrinsics = cameras.decode_camera_info(info_message(p=np.zeros(12), P=np.zeros(12)), rectified=True)
     np.testing.assert_array_equal(intrinsics.K, np.reshape(K, (3, 3)))
 
 
@@ -515,26 +516,37 @@ def test_a_rectified_camera_without_p_keeps_k() -> None:
         ("rational_polynomial", 8, "rational_polynomial"),
         ("equidistant", 4, "equidistant"),
         ("fisheye", 4, "equidistant"),
+        ("kannala_brandt", 4, "equidistant"),
         ("", 5, "plumb_bob"),
     ],
 )
 def test_distortion_models(given_model: str, coefficients: int, model: str) -> None:
     d = np.linspace(0.01, 0.02, coefficients)
-    intrinsics = messages.decode_camera_info(info_message(given_model, d), rectified=False)
+    intrinsics = cameras.decode_camera_info(info_message(given_model, d), rectified=False)
     assert intrinsics.distortion_model == model
     np.testing.assert_array_equal(intrinsics.D, d)
 
 
 @pytest.mark.parametrize("model", ["", "plumb_bob", "whatever"])
 def test_coefficients_of_zero_are_no_distortion(model: str) -> None:
-    intrinsics = messages.decode_camera_info(info_message(model, np.zeros(5)), rectified=False)
+    intrinsics = cameras.decode_camera_info(info_message(model, np.zeros(5)), rectified=False)
     assert not intrinsics.distortion_model and not intrinsics.D.size
+
+
+def test_an_equidistant_lens_without_coefficients_is_no_pinhole() -> None:
+    intrinsics = cameras.decode_camera_info(info_message("equidistant", np.zeros(4)), rectified=False)
+    points = np.array([[3.0, 1.0, 2.0], [-1.0, 0.5, 4.0]])
+    expected, _ = cv2.fisheye.projectPoints(
+        points[:, None], np.zeros(3), np.zeros(3), intrinsics.K, np.zeros(4)
+    )
+    np.testing.assert_allclose(geometry.project(points, intrinsics)[0], expected[:, 0], atol=1e-3)
+    assert not cameras.decode_camera_info(info_message("equidistant", np.zeros(4)), True).distortion_model
 
 
 def test_region_of_interest_and_binning() -> None:
     roi = Message(x_offset=100, y_offset=60, width=320, height=200, do_rectify=False)
     msg = info_message(binning_x=2, binning_y=4, roi=roi)
-    intrinsics = messages.decode_camera_info(msg, rectified=False)
+    intrinsics = cameras.decode_camera_info(msg, rectified=False)
     assert (intrinsics.width, intrinsics.height) == (160, 50)
     np.testing.assert_allclose(intrinsics.K, np.array([[250, 0, 110], [0, 127.5, 30], [0, 0, 1]]))
     assert msg.k[2] == 320  # the message is another reader's too
@@ -543,14 +555,16 @@ def test_region_of_interest_and_binning() -> None:
 def test_bad_camera_infos_are_named() -> None:
     zero = np.zeros(9)
     with pytest.raises(MessageError, match="/cam/camera_info: the camera is uncalibrated"):
-        messages.decode_camera_info(info_message(k=zero, K=zero), False, "/cam/camera_info")
+        cameras.decode_camera_info(info_message(k=zero, K=zero), False, "/cam/camera_info")
     with pytest.raises(
         MessageError,
         match="/info: distortion model 'mei' is not supported; supported are equidistant, plumb_bob",
     ):
-        messages.decode_camera_info(info_message("mei"), False, "/info")
+        cameras.decode_camera_info(info_message("mei"), False, "/info")
+    with pytest.raises(MessageError, match=r"/info: coefficients after the eighth \(OpenCV's thin prism"):
+        cameras.decode_camera_info(info_message("rational_polynomial", np.full(14, 0.01)), False, "/info")
     with pytest.raises(MessageError, match=r"/info: .* are no coefficients"):
-        messages.decode_camera_info(info_message(d=[math.nan]), False, "/info")
+        cameras.decode_camera_info(info_message(d=[math.nan]), False, "/info")
 
 
 # --- transforms --------------------------------------------------------------------------------
@@ -570,7 +584,7 @@ def transform_message(parent: str, child: str, xyz: Any = (1, 2, 3), xyzw: Any =
 @pytest.mark.parametrize("ros", STORES)
 def test_transforms(ros: str) -> None:
     msg = Message(transforms=[transform_message("/map", "base"), transform_message("base", "lidar")])
-    first, second = messages.decode_transforms(through(STORES[ros], "tf2_msgs/msg/TFMessage", msg))
+    first, second = transforms.decode_transforms(through(STORES[ros], "tf2_msgs/msg/TFMessage", msg))
     assert (first.stamp, first.parent, first.child) == (STAMP, "map", "base")
     assert (second.parent, second.child) == ("base", "lidar")
     np.testing.assert_allclose(first.parent_from_child @ [1, 0, 0, 1], [1, 3, 3, 1], atol=1e-12)
@@ -587,20 +601,20 @@ BAD_TRANSFORMS = [
 @pytest.mark.parametrize(("bad", "text"), BAD_TRANSFORMS)
 def test_bad_transforms_are_named_and_spare_the_good_ones(bad: Message, text: str) -> None:
     with pytest.raises(MessageError, match=f"/tf: .*{text}"):
-        messages.decode_transforms(Message(transforms=[bad]))
+        transforms.decode_transforms(Message(transforms=[bad]))
     good = transform_message("base", "lidar")
-    assert [t.child for t in messages.decode_transforms(Message(transforms=[bad, good]))] == ["lidar"]
+    assert [t.child for t in transforms.decode_transforms(Message(transforms=[bad, good]))] == ["lidar"]
 
 
 def test_odometry() -> None:
     pose = Message(position=Message(x=1, y=2, z=3), orientation=Message(x=0, y=0, z=1, w=1))
     msg = Message(header=header("odom"), child_frame_id="base_link", pose=Message(pose=pose))
-    moved = messages.decode_odometry(msg)
+    moved = transforms.decode_odometry(msg)
     assert (moved.stamp, moved.parent, moved.child) == (STAMP, "odom", "base_link")
     np.testing.assert_allclose(moved.parent_from_child @ [1, 0, 0, 1], [1, 3, 3, 1], atol=1e-12)
     msg.child_frame_id = ""
     with pytest.raises(MessageError, match="/odom: 'odom' and '' cannot be parent and child"):
-        messages.decode_odometry(msg, "/odom")
+        transforms.decode_odometry(msg, "/odom")
 
 
 # --- detections --------------------------------------------------------------------------------
@@ -647,7 +661,7 @@ def test_2d_detections_through_ros() -> None:
         detection_2d(100, 50, 20, 10, theta=math.pi / 2),
     )
     msg = through(STORES["ros2"], "vision_msgs/msg/Detection2DArray", msg)
-    boxes = messages.decode_detections_2d(msg, "/detection/camera_2d", 9)
+    boxes = detections.decode_detections_2d(msg, "/detection/camera_2d", 9)
     np.testing.assert_allclose(boxes.xyxy, [[90, 45, 110, 55], [95, 40, 105, 60]], atol=1e-5)
     assert boxes.labels == ("person", "") and boxes.scores.tolist() == [0.5, 0]
     assert (boxes.topic, boxes.stamp, boxes.frame_id, boxes.received) == (
@@ -665,25 +679,26 @@ def test_3d_detections_through_ros() -> None:
         detection_3d((7, 8, 9), (1, 1, 2), result("cluster_1", 1.0)),
     )
     msg = through(STORES["ros2"], "vision_msgs/msg/Detection3DArray", msg)
-    found = messages.decode_detections_3d(msg, "/detection/fused_3d", 9)
+    found = detections.decode_detections_3d(msg, "/detection/fused_3d", 9)
     np.testing.assert_array_equal(found.boxes.center, [[1, 2, 3], [7, 8, 9]])
     np.testing.assert_array_equal(found.boxes.size, [[4, 5, 6], [1, 1, 2]])
     np.testing.assert_allclose(found.boxes.yaw, [math.radians(30), 0], atol=1e-6)
     assert found.labels == ("car", "cluster_1") and found.scores.tolist() == [0.75, 1]
-    assert found.boxes.center.dtype == found.boxes.size.dtype == found.boxes.yaw.dtype == np.float32
+    assert found.boxes.center.dtype == np.float64  # it may be in a map, far from its origin
+    assert found.boxes.size.dtype == found.boxes.yaw.dtype == np.float32
 
 
 def test_the_class_counts_more_than_the_name_of_the_cluster() -> None:
     fused = [result("cluster_3", 1.0), result("car", 0.4), result("person", 0.8), result("truck", math.nan)]
     msg = array_of(detection_3d((0, 0, 0), (1, 1, 1), *fused))
-    found = messages.decode_detections_3d(msg, "/fused", 0)
+    found = detections.decode_detections_3d(msg, "/fused", 0)
     assert found.labels == ("person",) and found.scores[0] == np.float32(0.8)
 
 
 def test_older_versions_of_vision_msgs() -> None:
     flat = Message(id=3, score=0.5, pose=POSE)
     box = Message(center=Message(x=100, y=50, theta=0), size_x=20, size_y=10)
-    boxes = messages.decode_detections_2d(array_of(Message(results=[flat], bbox=box)), "/boxes", 0)
+    boxes = detections.decode_detections_2d(array_of(Message(results=[flat], bbox=box)), "/boxes", 0)
     np.testing.assert_array_equal(boxes.xyxy, [[90, 45, 110, 55]])
     assert boxes.labels == ("3",) and boxes.scores.tolist() == [0.5]
 
@@ -691,15 +706,15 @@ def test_older_versions_of_vision_msgs() -> None:
 def test_detections_that_are_not_finite_are_left_out() -> None:
     good = detection_3d((1, 2, 3), (1, 1, 1), result("car", math.nan))
     bad = [detection_3d((1, math.nan, 3), (1, 1, 1)), detection_3d((1, 2, 3), (math.inf, 1, 1))]
-    found = messages.decode_detections_3d(array_of(bad[0], good, bad[1]), "/boxes", 0)
+    found = detections.decode_detections_3d(array_of(bad[0], good, bad[1]), "/boxes", 0)
     assert len(found.boxes) == 1 and found.labels == ("car",) and found.scores.tolist() == [0]
-    nothing = messages.decode_detections_2d(array_of(detection_2d(math.nan, 0, 1, 1)), "/boxes", 0)
+    nothing = detections.decode_detections_2d(array_of(detection_2d(math.nan, 0, 1, 1)), "/boxes", 0)
     assert nothing.xyxy.shape == (0, 4) and nothing.labels == () and nothing.scores.shape == (0,)
 
 
 def test_an_unknown_layout_of_a_detection_is_named() -> None:
     with pytest.raises(MessageError, match="/boxes: unknown version of vision_msgs"):
-        messages.decode_detections_3d(array_of(Message(results=[], box=None)), "/boxes", 0)
+        detections.decode_detections_3d(array_of(Message(results=[], box=None)), "/boxes", 0)
 
 
 # --- what a message may hold ---------------------------------------------------------------------
@@ -709,16 +724,16 @@ def test_a_cloud_beyond_the_limits_is_refused_in_one_line() -> None:
     msg = cloud_message(random_points(10))
     msg.height = msg.width = 2**32 - 1
     with pytest.raises(MessageError, match="/p: a cloud of 4294967295 x 4294967295 points is not taken"):
-        messages.decode_cloud(msg, "/p", 0)
+        clouds.decode_cloud(msg, "/p", 0)
     for step in (2**31, 2**32 - 1, 0):
         msg = cloud_message(random_points(10))
         msg.point_step = step
         with pytest.raises(MessageError, match=rf"/p: a point of {step} bytes cannot be"):
-            messages.decode_cloud(msg, "/p", 0)
+            clouds.decode_cloud(msg, "/p", 0)
     msg = cloud_message(random_points(10))
     msg.fields[3].count, msg.fields[3].datatype, msg.point_step = 10**6, 2, 2_000_000
     with pytest.raises(MessageError, match="/p: its points have more than 1024 fields, each element counted"):
-        messages.decode_cloud(msg, "/p", 0)
+        clouds.decode_cloud(msg, "/p", 0)
 
 
 def png_of(width: int, height: int) -> bytes:
@@ -740,9 +755,9 @@ def test_an_image_that_would_take_gigabytes_is_refused_by_its_header(monkeypatch
     monkeypatch.setattr(cv2, "imdecode", None)  # nothing is decoded
     for data in (bomb, jpeg[:at] + struct.pack(">HH", 32_000, 32_000) + jpeg[at + 4 :]):
         with pytest.raises(MessageError, match=r"/i: an image of 32000 x 32000 pixels is not taken: 1000000"):
-            messages.decode_compressed_image(compressed(data, ""), "/i", 0)
+            images.decode_compressed_image(compressed(data, ""), "/i", 0)
     monkeypatch.undo()
-    large = messages.decode_compressed_image(compressed(png_of(4000, 3000), ""), "/i", 0)
+    large = images.decode_compressed_image(compressed(png_of(4000, 3000), ""), "/i", 0)
     assert large.bgr.shape == (3000, 4000, 3)
 
 
@@ -752,7 +767,7 @@ def test_a_png_whose_parts_are_longer_than_it_is(monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr(cv2, "imdecode", None)  # which would take four gigabytes
     with pytest.raises(MessageError, match=r"/i: the image/png data \(\d+ bytes\) is damaged or cut"):
         bomb = png[:at] + struct.pack(">I", 2**31 - 1) + png[at + 4 :]
-        messages.decode_compressed_image(compressed(bomb, ""), "/i", 0)
+        images.decode_compressed_image(compressed(bomb, ""), "/i", 0)
 
 
 @given(
@@ -768,18 +783,18 @@ def test_the_size_in_a_header_is_that_of_the_image(width: int, height: int, grey
         ".webp": [cv2.IMWRITE_WEBP_QUALITY, 80 + 21 * (width % 2)],  # above 100: without loss
     }.get(form, [])
     data = bytes(cv2.imencode(form, pixels, options)[1].tobytes())
-    assert messages._size_of(data) == (width, height)
+    assert images._size_of(data) == (width, height)
 
 
 DECODERS: dict[str, Callable[[Any], object]] = {
-    "cloud": lambda m: messages.decode_cloud(m, "/t", 0),
-    "image": lambda m: messages.decode_image(m, "/t", 0),
-    "compressed": lambda m: messages.decode_compressed_image(m, "/t", 0),
-    "info": lambda m: messages.decode_camera_info(m, True, "/t"),
-    "transforms": lambda m: messages.decode_transforms(m, "/t"),
-    "odometry": lambda m: messages.decode_odometry(m, "/t"),
-    "boxes": lambda m: messages.decode_detections_2d(m, "/t", 0),
-    "boxes 3d": lambda m: messages.decode_detections_3d(m, "/t", 0),
+    "cloud": lambda m: clouds.decode_cloud(m, "/t", 0),
+    "image": lambda m: images.decode_image(m, "/t", 0),
+    "compressed": lambda m: images.decode_compressed_image(m, "/t", 0),
+    "info": lambda m: cameras.decode_camera_info(m, True, "/t"),
+    "transforms": lambda m: transforms.decode_transforms(m, "/t"),
+    "odometry": lambda m: transforms.decode_odometry(m, "/t"),
+    "boxes": lambda m: detections.decode_detections_2d(m, "/t", 0),
+    "boxes 3d": lambda m: detections.decode_detections_3d(m, "/t", 0),
 }
 
 

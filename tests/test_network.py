@@ -5,13 +5,11 @@ from __future__ import annotations
 import socket
 import subprocess
 import sys
-import time
 import urllib.error
 import urllib.request
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -19,6 +17,7 @@ from bevviz.errors import UserError
 from bevviz.logging import rerun_cli
 from bevviz.logging.ports import answers, host_for, origins, own_address
 from tests import bags
+from tests.waiting import PATIENCE, until
 
 LOOPBACK = "0100007F"  # as /proc/net/tcp has it
 OTHER = "127.0.0.2"  # of this machine, too, and another address: whoever listens on one does not hear it
@@ -67,14 +66,6 @@ def listening(pid: int) -> dict[int, str]:
     return found
 
 
-def wait_for(condition: Callable[[], Any], seconds: float = 90) -> Any:
-    deadline = time.monotonic() + seconds
-    while not (value := condition()):
-        assert time.monotonic() < deadline, "waited in vain"
-        time.sleep(0.1)
-    return value
-
-
 @contextmanager
 def running(*arguments: str) -> Iterator[subprocess.Popen[bytes]]:
     """A command, ended without a word at the end."""
@@ -96,7 +87,7 @@ def is_let_in(port: int, origin: str) -> bool:
     """Whether a browser gives a page from there the data: not, if it only happens to use the same port."""
     request = urllib.request.Request(f"http://127.0.0.1:{port}/proxy", headers={"Origin": origin})
     with pytest.raises(urllib.error.HTTPError) as answer:
-        urllib.request.urlopen(request, timeout=10)
+        urllib.request.urlopen(request, timeout=PATIENCE)
     return bool(answer.value.headers.get("access-control-allow-origin") == origin)
 
 
@@ -105,10 +96,10 @@ def test_a_command_that_serves_is_for_this_machine(name: str) -> None:
     bags.write(Path("drive"), bags.small_items(scans=2))
     port = a_port()
     with running(*COMMANDS[name], "--serve", str(port)) as process:
-        wait_for(lambda: port in listening(process.pid) and len(listening(process.pid)) >= 2)
+        until(lambda: port in listening(process.pid) and len(listening(process.pid)) >= 2)
         found = listening(process.pid)
         assert set(found.values()) == {LOOPBACK}
-        with urllib.request.urlopen(f"http://localhost:{port}/", timeout=10) as page:
+        with urllib.request.urlopen(f"http://localhost:{port}/", timeout=PATIENCE) as page:
             assert b"rerun" in page.read().lower()
         for other in found:
             assert answers("127.0.0.1", other)
@@ -117,7 +108,7 @@ def test_a_command_that_serves_is_for_this_machine(name: str) -> None:
             (data,) = set(found) - {port}
             assert is_let_in(data, f"http://localhost:{port}")
             assert not is_let_in(data, f"http://evil.example:{port}")
-    wait_for(lambda: not any(answers("127.0.0.1", p) for p in found), 20)  # nothing outlives a kill
+    until(lambda: not any(answers("127.0.0.1", p) for p in found))  # nothing outlives a kill
 
 
 def test_a_catalog_is_for_this_machine() -> None:
@@ -128,7 +119,7 @@ def test_a_catalog_is_for_this_machine() -> None:
     assert main(["batch", "drive", "-o", "runs", "--jobs", "1"]) == 0
     port = a_port()
     with running("batch", "-o", "runs", "--serve-catalog", str(port)) as process:
-        wait_for(lambda: len(listening(process.pid)) >= 2)
+        until(lambda: len(listening(process.pid)) >= 2)
         found = listening(process.pid)
         assert port in found and set(found.values()) == {LOOPBACK}
         assert not any(answers(OTHER, p) for p in found)
@@ -137,7 +128,7 @@ def test_a_catalog_is_for_this_machine() -> None:
 def test_bind_opens_it_at_one_address() -> None:
     port = a_port()
     with running("demo", "--frames", "2", "--serve", str(port), "--bind", OTHER) as process:
-        wait_for(lambda: len(listening(process.pid)) >= 2)
+        until(lambda: len(listening(process.pid)) >= 2)
         found = listening(process.pid)
         assert set(found.values()) == {"0200007F"}
         assert all(answers(OTHER, p) and not answers("127.0.0.1", p) for p in found)
@@ -179,7 +170,7 @@ def test_the_window_is_for_this_machine(start: str, tmp_path: Path, monkeypatch:
         command = list(window().command)
     with subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.DEVNULL) as process:
         try:
-            found = wait_for(lambda: listening(process.pid), 30)
+            found = until(lambda: listening(process.pid))
         finally:
             process.kill()
     assert set(found.values()) == {LOOPBACK}
@@ -209,5 +200,5 @@ import bevviz.stages.detector
 with open_recording(Scene("drive", "lidar"), load(), serve={a_port()}):
     time.sleep(1)
 """
-    subprocess.run([sys.executable, "-c", script], check=True, timeout=120)
+    subprocess.run([sys.executable, "-c", script], check=True, timeout=PATIENCE)
     assert stored(home) == []

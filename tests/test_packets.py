@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import shutil
 import struct
 from math import cos, radians, sin
 from pathlib import Path
@@ -10,15 +11,17 @@ from typing import Any
 
 import numpy as np
 import pytest
+from mcap.reader import make_reader
 from rosbags.typesys import get_types_from_msg
 
 from bevviz.bags.source import BagSource
 from bevviz.cli import main
 from bevviz.config import Config
-from bevviz.live.source import LiveMessage
+from bevviz.live.message import LiveMessage
 from bevviz.ros import packets
+from bevviz.ros.clouds import decode_cloud
 from bevviz.ros.hesai import MODELS, NOMINAL, Model
-from bevviz.ros.messages import MessageError, decode_cloud
+from bevviz.ros.messages import MessageError
 from tests import bags
 
 SCAN, PACKET = "pandar_msgs/msg/PandarScan", "pandar_msgs/msg/PandarPacket"
@@ -168,6 +171,37 @@ def test_the_sensors_own_angles(tmp_path: Path, capsys: pytest.CaptureFixture[st
     ):
         assert main(["info", str(path), "--set", f"source.lidar_calibration={wrong}"]) == 2
         assert said in " ".join(capsys.readouterr().err.split())
+
+
+def test_a_report_brings_the_sensors_own_angles(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    made, model = messages(), BY_NAME["PandarXT16"]
+    stamps = [bags.START + i * bags.PERIOD for i in range(3)]
+    found = [packet(model, n) for n in range(4)]
+    items = [bags.Item("/front/pandar", SCAN, stamp, scan(made, stamp, found)) for stamp in stamps]
+    path = bags.write(tmp_path / "bag", items, made)
+    file = tmp_path / "secret_folder" / "angles.csv"
+    file.parent.mkdir()
+    file.write_text("".join(f"{i},{i / 4},90\n" for i in range(1, 17)))
+    there = ["--set", f"source.lidar_calibration={{/front/pandar: {file}}}"]
+    report = tmp_path / "bug.rrd"
+    assert main(["report", str(path), "--at", "0.1", *there, "-o", str(report)]) == 0
+    config = Config.model_validate({"source": {"lidar_calibration": {"/front/pandar": str(file)}}})
+    with BagSource([path], config) as source:
+        points = next(iter(source)).points
+    bag = tmp_path / "bug.mcap"
+    with bag.open("rb") as data:  # as another library reads it
+        (attached,) = make_reader(data).iter_attachments()
+    assert (attached.name, attached.data) == ("lidar_calibration/front/pandar/angles.csv", file.read_bytes())
+
+    shutil.rmtree(file.parent)
+    monkeypatch.chdir(tmp_path)
+    assert main(["report", "--check", str(report)]) == 0
+    assert not any(b"secret_folder" in made.read_bytes() for made in tmp_path.glob("bug.*"))
+    whole = bag.read_bytes()
+    for end in (len(whole), -30):  # alone, and cut
+        bag.write_bytes(whole[:end])
+        with BagSource([bag], Config()) as source:
+            np.testing.assert_array_equal(next(iter(source)).points, points)
 
 
 def test_what_cannot_be_decoded_says_why() -> None:

@@ -9,7 +9,7 @@ import os
 import signal
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
-from threading import Event, Thread
+from threading import Event
 from typing import Any
 
 import numpy as np
@@ -21,15 +21,16 @@ from bevviz.cli import main
 from bevviz.config import load
 from bevviz.engine.task import JobResults, Task
 from bevviz.errors import UserError
-from bevviz.frame import FrameResult
 from bevviz.logging import entities
 from bevviz.logging.parts import PartsWriter
 from bevviz.logging.recorder import OrderedRecorder
 from bevviz.logging.sinks import open_recording
 from bevviz.parallel.run import run_windows
+from bevviz.results import FrameResult
 from bevviz.run import Observer
 from tests import bags
 from tests.recordings import Recording, verify
+from tests.waiting import meanwhile
 
 
 def check_same(a: Any, b: Any, path: str = "") -> None:
@@ -176,17 +177,14 @@ def test_a_recording_in_windows_is_that_of_one_process_though_a_worker_dies(
 
     def kill() -> None:
         """The first worker that is at work."""
-        while not killed.wait(0.01):
-            if any(tmp_path.glob(".bevviz-windows-*/*.results")):
-                os.kill(multiprocessing.active_children()[0].pid or 0, signal.SIGKILL)
-                killed.set()
+        if not killed.is_set() and any(tmp_path.glob(".bevviz-windows-*/*.results")):
+            os.kill(multiprocessing.active_children()[0].pid or 0, signal.SIGKILL)
+            killed.set()
 
-    killer = Thread(target=kill, daemon=True)
-    killer.start()
     settings = [argument for text in SETTINGS for argument in ("--set", text)]
-    assert main(["bag", str(bag), "--jobs", "2", "--save", str(two), *settings]) == 0
+    with meanwhile(kill):
+        assert main(["bag", str(bag), "--jobs", "2", "--save", str(two), *settings]) == 0
     assert killed.is_set()
-    killer.join()
     check_same_recording(one, two)
     assert [path.name for path in tmp_path.iterdir() if path.suffix != ".rrd"] == []
 

@@ -12,9 +12,12 @@ import pytest
 
 import bevviz
 from bevviz.bags.recording import Recording
+from bevviz.bags.source import BagSource
 from bevviz.cli import main
-from bevviz.config import load
+from bevviz.config import load, object_files
 from bevviz.errors import UserError
+from bevviz.logging.logger import Logger
+from bevviz.logging.sinks import open_recording
 from bevviz.recorded import fingerprint, follow, read
 from bevviz.ros.roles import find_roles
 from bevviz.stages.detector import DEMO_MODEL
@@ -265,3 +268,36 @@ def test_fingerprints_tell_content_apart(tmp_path: Path) -> None:
     assert fingerprint(folder) == before
     (folder / "two.mcap").write_bytes(b"more")
     assert fingerprint(folder) != before
+
+
+def test_the_files_of_a_3d_detector_are_found_again(folder: Path, made: Path) -> None:
+    """Beside the recording, moved with it; where they are gone they are asked for, but for others' sake."""
+    names = {"objects.method": "head.onnx", "objects.params.encoder": "encoder.onnx"}
+    for name in names.values():
+        (folder / name).write_bytes(name.encode())
+    stated = [f"{key}={folder / name}" for key, name in names.items()]
+    stated += ["objects.point_range=[0, -8, -3, 24, 8, 1]", "objects.voxel_size=[1, 1, 4]"]
+    stated += ["objects.features=[x, y, z, intensity]", "objects.classes=[Car]", "detector.model=demo"]
+    config = load(settings=stated)
+    with BagSource([folder / "demo.mcap"], config) as source:
+        rrd = folder / "objects.rrd"
+        with open_recording(source.scene, config, save=rrd) as sinks:
+            Logger(sinks.recording, config, source.scene).log_static()
+    away = folder.with_name("moved")
+    folder.rename(away)
+
+    recorded = follow(away / "objects.rrd")
+    found = recorded.load()
+    assert object_files(found) == {key: str(away / name) for key, name in names.items()}
+    assert found.objects.params["classes"] == ["Car"]
+    assert recorded.load(preset="reference").objects.method == "frustum"
+    assert recorded.load(settings=["objects.score_threshold=0.5"]).objects.params["score_threshold"] == 0.5
+    (away / "head.onnx").unlink()
+    lost = r"made with objects\.method head\.onnx; there is none at .*: give --set objects\.method=FILE"
+    with pytest.raises(UserError, match=lost):
+        follow(away / "objects.rrd")
+    for other, files in (("frustum", {}), (str(away / "demo.onnx"), {"encoder": str(away / "encoder.onnx")})):
+        settings = [f"objects.method={other}"]
+        there = follow(away / "objects.rrd", settings=settings).load(settings=settings)
+        assert there.objects.method == other
+        assert {k: v for k, v in there.objects.params.items() if k == "encoder"} == files

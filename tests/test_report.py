@@ -23,16 +23,17 @@ from hypothesis import strategies as st
 
 import bevviz
 from bevviz.bags.mcap_writer import McapWriter
-from bevviz.bags.recording import RawMessage
+from bevviz.bags.message import RawMessage
 from bevviz.bags.recording import Recording as Bag
 from bevviz.cli import main
 from bevviz.config import DetectorConfig
-from bevviz.frame import Detections, Frame, FrameResult
+from bevviz.frame import Frame
 from bevviz.provenance import Dependency, Provenance
 from bevviz.report.check import CheckResult
 from bevviz.report.digest import StageDigest, compare, detections_of, pack, unpack
 from bevviz.report.page import spans
 from bevviz.report.plots import ticks
+from bevviz.results import Detections, FrameResult
 from bevviz.session import Session
 from bevviz.stages.detector import Detector
 from tests import bags
@@ -101,7 +102,7 @@ def copied(report: Path, folder: Path) -> Path:
 
 def changed_bag(path: Path, change: Callable[[Bag, RawMessage], Any]) -> None:
     """Write a bag anew with other messages; None leaves one out."""
-    with Bag([path]) as old, McapWriter(path.with_name("new.mcap"), old.definition) as new:
+    with Bag([path]) as old, McapWriter(path.with_name("new.mcap"), old.types.definition) as new:
         for message in old.messages([t.name for t in old.topics]):
             if (data := change(old, message)) is not None:
                 new.write(message.connection, message.received, data)

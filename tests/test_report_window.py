@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import sqlite3
 import subprocess
 import sys
 from collections import defaultdict
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -17,10 +19,21 @@ from bevviz.bags.source import MARGIN, SECOND, BagSource
 from bevviz.config import Config, load
 from bevviz.errors import UserError
 from bevviz.report.digest import StageDigest, compare, digest
-from bevviz.report.window import Cut, Edit, Window, choose_topics, cut, find_window, open_window
+from bevviz.report.window import (
+    Cut,
+    Edit,
+    Edited,
+    Window,
+    as_it_is,
+    choose_topics,
+    cut,
+    find_window,
+    open_window,
+)
 from bevviz.session import Session
 from bevviz.synthetic.bag import _qos
 from tests import bags
+from tests.waiting import PATIENCE
 
 CONFIG = Config()
 
@@ -31,7 +44,7 @@ def cut_out(
     at: str = "4",
     before: float = 0.5,
     topics: list[str] | None = None,
-    edit: Edit = lambda message, data: data,
+    edit: Edit = as_it_is,
 ) -> tuple[Window, Cut]:
     with BagSource([path], CONFIG, at=at) as source:
         window = find_window(source, source.span[0], before, before)
@@ -118,7 +131,7 @@ def test_other_readers_understand_it(tmp_path: Path) -> None:
         assert kept["/tf_static"].offered_qos_profiles == qos
         assert sum(1 for _ in reader.messages()) == reader.message_count > 0
     command = [sys.executable, "-m", "rerun", "mcap", "check", str(folder / "bug.mcap")]
-    done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=120)
+    done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=PATIENCE)
     assert done.stdout.count("\nok ") == 5
 
 
@@ -136,6 +149,19 @@ def test_silent_topics_say_what_held(tmp_path: Path) -> None:
     found = contents(tmp_path / "bug.mcap")
     seconds = {topic: [(t - bags.START) // SECOND for t, _ in found[topic]] for topic in found}
     assert (seconds["/early"], seconds["/late"], seconds["/now"]) == ([1], [9], [5])
+
+
+def test_what_is_damaged_is_left_out_and_counted(tmp_path: Path) -> None:
+    path = bags.write(tmp_path / "drive", bags.small_items(), form="sqlite3", compression="message")
+    with closing(sqlite3.connect(next(path.glob("*.db3")))) as database, database:
+        images = "topic_id = (SELECT id FROM topics WHERE name = ?)"
+        torn = f"id IN (SELECT id FROM messages WHERE {images} ORDER BY id LIMIT 2)"
+        database.execute(f"UPDATE messages SET data = substr(data, 1, 20) WHERE {torn}", [bags.IMAGE])
+    whole = contents(bags.write(tmp_path / "whole", bags.small_items()))
+    _, made = cut_out(path, tmp_path / "bug.mcap", at="0", before=9)
+    said = "2 message(s) of {0} could not be used, the first: {0}: it is damaged, and left out"
+    assert made.left_out == (said.format(bags.IMAGE),)
+    assert contents(tmp_path / "bug.mcap")[bags.IMAGE] == whole[bags.IMAGE][2:]
 
 
 def test_topics_are_limited_to_what_is_needed_and_named(tmp_path: Path) -> None:
@@ -157,7 +183,7 @@ def test_topics_are_limited_to_what_is_needed_and_named(tmp_path: Path) -> None:
 def test_nothing_is_left_of_a_bag_that_fails(tmp_path: Path) -> None:
     path = bags.write(tmp_path / "drive", bags.small_items())
 
-    def fail(message: object, data: bytes | memoryview) -> bytes:
+    def fail(message: object, data: bytes | memoryview) -> Edited:
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):

@@ -17,15 +17,18 @@ from bevviz.config import load
 from bevviz.datasets.kitti import label_files, read_labels
 from bevviz.errors import UserError
 from bevviz.evaluate import Score, Truth, pair_in_order, truth_of
-from bevviz.frame import Boxes3D, Frame, LabelledBoxes3D, Objects
+from bevviz.frame import Boxes3D, Frame, LabelledBoxes3D
 from bevviz.geometry import apply as move
 from bevviz.geometry import corners, project
+from bevviz.results import Objects
 from bevviz.sweep import Parameter, Sweep, combine, parse
 from bevviz.sweep.chart import HEIGHT, WIDTH, scale
 from bevviz.synthetic import SyntheticSource, write_bag
 from tests import bags
 from tests.recordings import Recording, verify
 from tests.test_kitti import labels
+
+pytestmark = pytest.mark.usefixtures("elsewhere")
 
 Capture = pytest.CaptureFixture[str]
 SEED = 5
@@ -39,13 +42,6 @@ def source() -> SyntheticSource:
 @cache
 def frame() -> Frame:
     return source().snapshot(10).frame
-
-
-@pytest.fixture(autouse=True)
-def elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.delenv("DISPLAY", raising=False)
-    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
 
 
 # --- ranges and lists --------------------------------------------------------------------------

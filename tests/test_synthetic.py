@@ -17,7 +17,8 @@ from bevviz.bags.mcap_writer import McapWriter
 from bevviz.bags.source import BagSource
 from bevviz.config import Config, DetectorConfig, load
 from bevviz.errors import UserError
-from bevviz.frame import DetectionState, Source
+from bevviz.frame import Source
+from bevviz.results import DetectionState
 from bevviz.session import Session
 from bevviz.stages.detector import Detector
 from bevviz.synthetic import BagWriter, Snapshot, SyntheticSource, write_bag

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from bevviz import geometry
 from bevviz.frame import F64
-from bevviz.ros.messages import StampedTransform
+from bevviz.ros.transforms import StampedTransform
 from bevviz.sync.tf import Origin, TransformBuffer, TransformError
 
 SECOND = 1_000_000_000

@@ -27,6 +27,7 @@ from bevviz.synthetic import SyntheticSource
 from bevviz.tune import OneFrame, Saves, Version, VersionRecorder, create
 from tests import bags
 from tests.recordings import Recording, verify
+from tests.waiting import PATIENCE
 
 MODEL = "detector.model=demo"
 
@@ -73,12 +74,12 @@ class Tuned:
         self.file.write_text(text)
 
     def version(self) -> Version:
-        found = self.versions.get(timeout=60)
+        found = self.versions.get(timeout=PATIENCE)
         assert isinstance(found, Version), found
         return found
 
     def refusal(self) -> str:
-        found = self.versions.get(timeout=60)
+        found = self.versions.get(timeout=PATIENCE)
         assert isinstance(found, UserError), found
         return str(found)
 
@@ -189,7 +190,7 @@ def test_as_a_user_runs_it(tmp_path: Path) -> None:
         assert "clustering.eps must be greater than 0" in until("not taken")
     finally:
         process.send_signal(signal.SIGINT)
-        rest, _ = process.communicate(timeout=60)
+        rest, _ = process.communicate(timeout=PATIENCE)
     assert process.returncode == 0, rest
     assert "ended at version 1" in rest
     assert len(Recording(tmp_path / "t.rrd").rows["/tune"]) == 2

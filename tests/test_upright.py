@@ -16,11 +16,14 @@ from hypothesis.extra import numpy as hnp
 
 from bevviz import geometry
 from bevviz.config import load
-from bevviz.frame import F64, Cloud, Frame, FrameResult
-from bevviz.perceive import StageLoader, perceive
+from bevviz.frame import F64, Cloud, Frame
+from bevviz.perceive import perceive
+from bevviz.results import FrameResult
+from bevviz.ros.clouds import decode_cloud
 from bevviz.ros.encode import encode_boxes_3d, encode_cloud
-from bevviz.ros.messages import Acceleration, StampedTransform, decode_cloud
 from bevviz.ros.roles import Roles, Topic, find_roles
+from bevviz.ros.transforms import Acceleration, StampedTransform
+from bevviz.stage_loader import StageLoader
 from bevviz.sync.synchronizer import Synchronizer
 from bevviz.sync.upright import _least_turn, ground_normal
 from bevviz.synthetic import SyntheticSource

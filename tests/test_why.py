@@ -16,7 +16,8 @@ from bevviz.bags.source import BagSource
 from bevviz.cli import main
 from bevviz.config import Config, load
 from bevviz.errors import UserError
-from bevviz.frame import Boxes3D, DetectionState, FrameResult, LabelledBoxes3D
+from bevviz.frame import Boxes3D, LabelledBoxes3D
+from bevviz.results import DetectionState, FrameResult
 from bevviz.session import Session
 from bevviz.synthetic import BagWriter, SyntheticSource
 from bevviz.why import Answer, Questioner, Selection, why

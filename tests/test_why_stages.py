@@ -14,7 +14,8 @@ import pytest
 
 from bevviz import plugins
 from bevviz.config import load
-from bevviz.frame import Boxes3D, Frame, FrameResult, LabelledBoxes2D, LabelledBoxes3D
+from bevviz.frame import Boxes3D, Frame, LabelledBoxes2D, LabelledBoxes3D
+from bevviz.results import FrameResult
 from bevviz.session import Session
 from bevviz.why import Answer, Questioner, Selection
 from bevviz.why.verdict import Reason

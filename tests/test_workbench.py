@@ -14,6 +14,7 @@ import urllib.error
 import urllib.request
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from functools import partial
 from html import unescape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -26,9 +27,10 @@ from bevviz.cli import main
 from bevviz.config import revised
 from bevviz.errors import UserError
 from bevviz.evaluate import match, truth_of
-from bevviz.frame import Frame, FrameResult
+from bevviz.frame import Frame
 from bevviz.logging import entities
 from bevviz.notes import Note, Notes
+from bevviz.results import FrameResult
 from bevviz.session import Session
 from bevviz.stages.robot import in_points_frame
 from bevviz.why.subject import one_of, projected
@@ -38,13 +40,14 @@ from bevviz.workbench.missed import finds
 from bevviz.workbench.parameters import controls
 from bevviz.workbench.pick import Pick, pick
 from bevviz.workbench.token import kept_token
+from tests import waiting
+from tests.waiting import PATIENCE
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser, Page
 
 FRAMES = 6
 POLL = 0.5  # seconds: a page that draws without a graphics card has little time to be asked
-WAIT = 60.0  # seconds: a browser without a graphics card on a machine with other work
 CLICK = 20.0  # seconds that it has to say what was clicked, before it is clicked again
 SOFTWARE_GL = [
     "--no-sandbox",
@@ -84,7 +87,7 @@ def serving(*arguments: str, model: str = "demo") -> Iterator[tuple[str, subproc
                 pytest.fail("the server has said no address")
         finally:
             server.send_signal(signal.SIGINT)
-            server.communicate(timeout=60)
+            server.communicate(timeout=PATIENCE)
 
 
 @pytest.fixture(scope="module")
@@ -154,13 +157,7 @@ def events(page: Page, kind: str) -> list[dict[str, Any]]:
     return [event for event in found if event["type"] == kind]
 
 
-def until(done: Callable[[], Any], seconds: float = WAIT) -> Any:
-    """What it gives, once that is something. (The page's own policy forbids Playwright's way to wait.)"""
-    end = time.monotonic() + seconds
-    while not (found := done()):
-        assert time.monotonic() < end, "it has not come about"
-        time.sleep(POLL)
-    return found
+until = partial(waiting.until, every=POLL)
 
 
 def verdict(page: Page) -> str:
@@ -343,7 +340,7 @@ class Talk:
     def until(self, kind: str, wanted: Callable[[dict[str, Any]], Any] = bool) -> dict[str, Any]:
         """The next message of a kind that is so, or the next error."""
         while True:
-            message: dict[str, Any] = json.loads(self._channel.recv(timeout=WAIT))
+            message: dict[str, Any] = json.loads(self._channel.recv(timeout=PATIENCE))
             if message["type"] == "entries":
                 for number in message["gone"]:
                     del self.entries[number]
@@ -473,7 +470,7 @@ def test_a_report_has_what_was_asked_tried_and_noted(talk: Talk, address: str, b
     link = f"{site}/report/{made['number']}/{page}"
     assert answered(link) == 403
     assert answered(f"{site}/report/{made['number']}/..%2f..%2fetc%2fpasswd?{token}") == 404
-    with urllib.request.urlopen(f"{link}?{token}", timeout=20) as response:
+    with urllib.request.urlopen(f"{link}?{token}", timeout=PATIENCE) as response:
         text = response.read().decode()
     assert "it is plainly there" in text
     assert "a note of mine" in text
@@ -544,7 +541,7 @@ def answered(url: str, **headers: str) -> int:
     """Status of the answer."""
     request = urllib.request.Request(url, headers={k.replace("_", "-"): v for k, v in headers.items()})
     try:
-        with urllib.request.urlopen(request, timeout=20) as response:
+        with urllib.request.urlopen(request, timeout=PATIENCE) as response:
             return int(response.status)
     except urllib.error.HTTPError as error:
         return error.code
@@ -582,7 +579,7 @@ def test_channels_are_guarded(address: str, path: str) -> None:
     parts = urlsplit(address)
     url, own = f"ws://{parts.netloc}{path}?{parts.query}", f"http://{parts.netloc}"
     with connect(url, origin=Origin(own), max_size=None) as channel:
-        assert channel.recv(timeout=60)
+        assert channel.recv(timeout=PATIENCE)
     for bad in (
         {"uri": url, "origin": "http://evil.example"},
         {"uri": url, "origin": None},
@@ -604,7 +601,7 @@ def test_messages_that_are_none_are_answered(address: str) -> None:
         def answer(message: str) -> str:
             channel.send(message)
             while True:
-                found = json.loads(channel.recv(timeout=60))
+                found = json.loads(channel.recv(timeout=PATIENCE))
                 if found["type"] == "error":
                     return str(found["text"])
 

@@ -19,23 +19,19 @@ import pytest
 
 import bevviz
 from bevviz.errors import UserError
-from bevviz.frame import FrameResult
 from bevviz.live.encoder import Encoder
-from bevviz.live.notes import Notes
-from bevviz.live.replay import Replay
-from bevviz.live.runtime import Live, Outputs
-from bevviz.live.settings import Settings
 from bevviz.logging import entities
-from bevviz.synthetic import SyntheticSource
+from bevviz.results import FrameResult
 from bevviz.workbench.live_bench import KEPT, LiveBench
 from bevviz.workbench.live_film import WHOLE, LiveFilm
 from bevviz.workbench.pick import Pick
 from tests.graphs import own_graph, playing
+from tests.live_bench import live_bench
 from tests.ros_player import Play
+from tests.waiting import PATIENCE
 
 pytestmark = pytest.mark.filterwarnings("ignore:RRD file has no footer")
 HELD = 4
-WAIT = 90.0  # seconds for what takes one or two on an idle machine
 
 
 # --- on a real graph ----------------------------------------------------------------------------
@@ -59,14 +55,14 @@ def robot(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[str, Path]
                 yield _address(said, live), folder
             finally:
                 live.send_signal(signal.SIGINT)
-                live.wait(timeout=WAIT)
+                live.wait(timeout=PATIENCE)
 
 
 def _address(said: Path, live: subprocess.Popen[bytes]) -> str:
     """What it prints, once it can be reached."""
     from bevviz.logging.ports import answers
 
-    end = time.monotonic() + WAIT
+    end = time.monotonic() + PATIENCE
     while time.monotonic() < end and live.poll() is None:
         found = re.search(r"workbench at (http://([^:]+):(\d+)\S+)", said.read_text())
         if found and answers(found[2], int(found[3])):
@@ -95,16 +91,16 @@ class Channel:
         return self._number
 
     def piece(self) -> bytes:
-        data = self._socket.recv(timeout=WAIT)
+        data = self._socket.recv(timeout=PATIENCE)
         assert isinstance(data, bytes)
         self._socket.send("")  # it is drawn
         return data
 
     def until(self, kind: str, number: int | None = None) -> dict[str, Any]:
         """The next message of a kind, or an error."""
-        end = time.monotonic() + WAIT
+        end = time.monotonic() + PATIENCE
         while time.monotonic() < end:
-            message: dict[str, Any] = json.loads(self._socket.recv(timeout=WAIT))
+            message: dict[str, Any] = json.loads(self._socket.recv(timeout=PATIENCE))
             if message["type"] in (kind, "error") and number in (None, message.get("id")):
                 return message
         raise AssertionError(f"no {kind}")
@@ -121,7 +117,7 @@ class Shown:
         self.stamp, self.texts, self.marked = 0, list[str](), False
 
     def until(self, done: Callable[[], Any]) -> None:
-        end = time.monotonic() + WAIT
+        end = time.monotonic() + PATIENCE
         while not done():
             assert time.monotonic() < end
             self._take(self.channel.piece())
@@ -215,12 +211,8 @@ def results() -> list[FrameResult]:
 
 @pytest.fixture
 def bench(results: list[FrameResult]) -> Iterator[LiveBench]:
-    source = Replay([result.frame for result in results], SyntheticSource(frames=1).scene)
-    settings = Settings(None, ["detector.model=demo", f"live.held={HELD}"])
-    live = Live(source, settings, Outputs(), Notes(lambda line: None))
-    with LiveBench(live) as bench:
+    with live_bench(results, f"live.held={HELD}") as bench:
         yield bench
-        live.encoder.close()
 
 
 def test_only_the_newest_frames_and_those_held_are_there(
@@ -256,6 +248,45 @@ def test_a_held_frame_can_be_asked_with_other_values(bench: LiveBench, results: 
     tried = bench.look(1, ("clustering.min_cluster_points=100000",))
     assert tried.objects is not None and not len(tried.objects)
     assert bench.live.config == results[1].config.model_copy(update={"live": bench.live.config.live})
+
+
+NETWORK = """
+from pydantic import BaseModel, Field
+
+class Params(BaseModel):
+    ahead: float = Field(12.0, description="metres")
+
+def detect(points, params):
+    return [[params.ahead, 0, 0, 4, 1.8, 1.5, 0]], [0.9], ["car"]
+"""
+
+
+def test_the_objects_method_is_changed_there_and_back(
+    bench: LiveBench, results: list[FrameResult], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Ours, a function with parameters of its own, the robot's topic, and ours again."""
+    (tmp_path / "network.py").write_text(NETWORK)
+    monkeypatch.syspath_prepend(tmp_path)
+    bench._see(results[0])
+    theirs = ("objects.method=network:detect", "objects.params.ahead=14", "opinions.min_height=400")
+    told = bench.attempt(0, theirs)
+    assert told["changes"]["objects.params.ahead"] == "absent -> 14.0"
+    assert told["opinions"]["unseen"] == [None, 1] and told["opinions"]["missed"][1] > 0
+    assert bench.live.session.stages.objects is not None
+    said = [text for _, text in bench.live.notes.take()]
+    assert not [text for text in said if "absent" in text], "what comes with a method is not told one by one"
+    assert "configuration: objects.method frustum -> network:detect" in said
+    told = bench.attempt(0, ("objects.method=topic:/nobody",))
+    assert told["failures"] == ["objects: the robot published no boxes on /nobody at the time of this scan"]
+    assert bench.live.config.opinions.min_height == 25 and not bench.live.config.objects.params
+    with pytest.raises(UserError, match="no module 'nowhere'"):
+        bench.attempt(0, ("objects.method=nowhere:detect",))
+    assert bench.live.config.objects.method == "topic:/nobody"
+    told = bench.attempt(0, ())
+    assert not told["changes"] and not told["opinions"] and not any(told["effects"].values())
+    again = bench.live.session.alone(results[0].frame)
+    assert again.opinions is None and again.objects is not None and results[0].objects is not None
+    assert again.objects.names == results[0].objects.names
 
 
 def test_pages_begin_at_a_whole_frame_and_miss_none(bench: LiveBench, results: list[FrameResult]) -> None:

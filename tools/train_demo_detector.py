@@ -362,7 +362,7 @@ def export(network: Network, path: Path) -> None:
 def evaluate(path: Path, data: Sequence[tuple[U8, Labels]], threshold: float = 0.25) -> dict[str, Any]:
     """Precision and recall at IoU 0.5 through bevviz's own detector, for objects higher than 20 pixels."""
     from bevviz.config import DetectorConfig
-    from bevviz.frame import DetectionState
+    from bevviz.results import DetectionState
     from bevviz.stages.detector import Detector
 
     detector = Detector(DetectorConfig(model=str(path), conf_threshold=threshold))

@@ -14,9 +14,10 @@ import numpy as np
 
 from bevviz import geometry
 from bevviz.anomalies.objects import ObjectWatch
-from bevviz.config import AnomaliesConfig
-from bevviz.frame import F32, Anomaly, AnomalyKind, CameraResult, Decision, FrameResult
+from bevviz.config import AnomaliesConfig, AnomalyKind
+from bevviz.frame import F32
 from bevviz.geometry import iou
+from bevviz.results import Anomaly, CameraResult, Decision, FrameResult
 
 KINDS: tuple[AnomalyKind, ...] = get_args(AnomalyKind)
 UNMATCHED = (Decision.NO_CLUSTER, Decision.TOO_FEW_POINTS, Decision.LOW_OVERLAP, Decision.MISFIT)

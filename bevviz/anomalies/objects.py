@@ -18,7 +18,8 @@ import numpy as np
 
 from bevviz import geometry
 from bevviz.config import AnomaliesConfig
-from bevviz.frame import F32, Anomaly, Bool, Boxes3D, CameraResult, FrameResult, Tracks
+from bevviz.frame import F32, Bool, Boxes3D
+from bevviz.results import Anomaly, CameraResult, FrameResult, Tracks
 from bevviz.stages.fusion import in_view
 from bevviz.stages.visibility import range_image, visible
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 
-from bevviz.frame import Anomaly, FrameResult
+from bevviz.results import Anomaly, FrameResult
 from bevviz.run import Observer
 
 

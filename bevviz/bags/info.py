@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields
 from itertools import islice
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -15,12 +15,15 @@ from bevviz import table
 from bevviz.bags.reader import megabytes
 from bevviz.bags.recording import Recording
 from bevviz.bags.source import SECOND, BagSource, iso
-from bevviz.config import Config, stage_topics, stated_lines
+from bevviz.config import Config, DetectorConfig, ObjectsConfig, object_network, stage_topics, stated_lines
 from bevviz.errors import UserError
 from bevviz.frame import Camera, Frame
 from bevviz.provenance import model_path
 from bevviz.ros.roles import Roles, Topic, find_roles
 from bevviz.text import printable
+
+if TYPE_CHECKING:
+    from bevviz.stage_loader import Stages
 
 WIDTH = 100
 TRIAL = 5  # the scan that is tried out: at the first ones a camera or a transform may not have begun
@@ -52,6 +55,7 @@ class Contents:
     points_frame: str = ""
     world_frame: str = ""  # "": the fixed frame is not connected
     network: str = ""  # what the detector's runs on; "": there is none
+    object_network: str = ""  # the same of a 3D detector
     configured: tuple[str, ...] = ()  # where parameters are stated, and which
     missing: tuple[str, ...] = ()  # for a full run, with the option that gives it
     warnings: tuple[str, ...] = ()
@@ -100,8 +104,8 @@ def _describe(
     frame: Frame | None = None,
     source: BagSource | None = None,
 ) -> BagInfo:
-    if not config.detector.model:
-        missing = [*missing, "no detector: --model FILE.onnx"]
+    networks, lacking = networks_of(config)
+    missing = [*missing, *lacking]
     return BagInfo(
         paths=tuple(map(str, recording.paths)),
         formats=tuple(", ".join(filter(None, [f.format, f.compression])) for f in recording.files),
@@ -115,7 +119,8 @@ def _describe(
         tree=dict(source.tree) if source else {},
         points_frame=frame.points_frame if frame else "",
         world_frame=frame.world_frame if frame and frame.world_from_points is not None else "",
-        network=network_of(config),
+        network=networks["detector"],
+        object_network=networks["objects"],
         configured=tuple(stated_lines(config)),
         missing=tuple(missing),
         warnings=(*recording.warnings, *(source.doubts if source else ())),
@@ -130,6 +135,39 @@ def network_of(config: Config) -> str:
     from bevviz.stages.detector.providers import network
 
     return network(path, config.detector.provider)
+
+
+def networks_of(config: Config) -> tuple[dict[str, str], list[str]]:
+    """What the networks of the sections ``detector`` and ``objects`` run on here, or why they do not.
+
+    Returns:
+        That, empty where there is none, and what a full run lacks: a detector, or a file that can be used.
+    """
+    runs_on = {"detector": network_of(config), "objects": ""}
+    lacking = [] if config.detector.model else ["no detector: --model FILE.onnx"]
+    files = {"detector": model_path(config), "objects": object_network(config)}
+    for section in [section for section, file in files.items() if file is not None]:
+        try:
+            loaded = _alone(config, section).provider
+        except UserError as error:
+            loaded = str(error)
+            lacking.append(loaded)
+        runs_on[section] = runs_on[section] or loaded
+    return runs_on, lacking
+
+
+def _alone(config: Config, section: str) -> Stages:
+    """The stages with this one, and otherwise ours.
+
+    Raises:
+        UserError: it cannot be used.
+    """
+    from bevviz.stage_loader import StageLoader
+
+    runs_on = {"provider": config.detector.provider, "threads": config.detector.threads}
+    detector = config.detector if section == "detector" else DetectorConfig().model_copy(update=runs_on)
+    objects = config.objects if section == "objects" else ObjectsConfig()
+    return StageLoader().load(Config(detector=detector, objects=objects))
 
 
 def _topic(recording: Recording, topic: Topic, roles: Roles) -> TopicInfo:
@@ -243,6 +281,7 @@ def render_contents(about: Mapping[str, str], info: Contents) -> str:
         *_section("cameras", [_camera(camera) for camera in info.cameras]),
         *_section("transforms", list(_tree(info))),
         *_section("network runs on", [info.network] if info.network else []),
+        *_section("3D detector runs on", [info.object_network] if info.object_network else []),
         *_section("configured by", info.configured),
         *_section("missing for a full run", info.missing or ["nothing"]),
         *_section("warnings", info.warnings),

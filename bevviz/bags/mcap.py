@@ -6,6 +6,7 @@ import struct
 from binascii import crc32
 from collections import Counter
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -20,8 +21,9 @@ from bevviz.loggers import logger
 _log = logger(__name__)
 
 MAGIC = b"\x89MCAP0\r\n"
-HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX, CHUNK_INDEX = range(1, 9)
-STATISTICS, DATA_END = 0x0B, 0x0F
+HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX, CHUNK_INDEX, ATTACHMENT = range(1, 10)
+ATTACHMENT_INDEX, STATISTICS, DATA_END = 0x0A, 0x0B, 0x0F
+MOST_ATTACHED = 1 << 26  # bytes of one that is read
 FORMATS = {
     "ros2msg": MessageDefinitionFormat.MSG,
     "ros1msg": MessageDefinitionFormat.MSG,
@@ -111,6 +113,35 @@ def read_index(path: Path) -> Index:
         return index
     except (struct.error, IndexError, ValueError) as error:
         raise DamageError(f"its index is damaged ({error})") from None
+    finally:
+        file.close()
+
+
+def read_attachments(path: Path) -> dict[str, bytes]:
+    """Those that a file begins with, by name, as ``McapWriter.attach`` writes them; also of one that is cut.
+
+    One that is damaged is left out.
+    """
+    file, found = Bytes(path), dict[str, bytes]()
+    try:
+        if file.read(0, len(MAGIC)) != MAGIC:
+            return found
+        offset = len(MAGIC)
+        while len(head := file.read(offset, RECORD.size)) == RECORD.size:
+            opcode, length = RECORD.unpack(head)
+            if opcode == ATTACHMENT and length <= MOST_ATTACHED:
+                record = file.read(offset + RECORD.size, length)
+                with suppress(struct.error, UnicodeDecodeError):
+                    name, media = strings(record, 16, 2)
+                    at = 16 + 4 + len(name) + 4 + len(media)
+                    (size,) = struct.unpack_from("<Q", record, at)
+                    (crc,) = struct.unpack_from("<I", record, at + 8 + size)
+                    if crc in (0, crc32(record[: at + 8 + size])):
+                        found[name.decode()] = record[at + 8 : at + 8 + size]
+            elif opcode != HEADER:
+                break
+            offset += RECORD.size + length
+        return found
     finally:
         file.close()
 

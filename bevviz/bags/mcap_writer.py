@@ -26,6 +26,8 @@ from ruamel.yaml import YAML
 
 from bevviz import __version__, remains
 from bevviz.bags.mcap import (
+    ATTACHMENT,
+    ATTACHMENT_INDEX,
     CHANNEL,
     CHUNK,
     CHUNK_HEAD,
@@ -87,6 +89,7 @@ class McapWriter:
         self._chunks = BytesIO()  # their records of the summary
         self._chunk_count = 0
         self._counts: Counter[int] = Counter()
+        self._attachments = list[bytes]()  # their records of the summary
         self._span = (2**63 - 1, 0)
         self._end = 0
 
@@ -122,6 +125,24 @@ class McapWriter:
     def size(self) -> int:
         """Bytes so far, as far as they are in the file."""
         return self._end
+
+    def attach(self, name: str, data: bytes) -> None:
+        """A file that belongs to the messages; to be called before the first of them.
+
+        Raises:
+            UserError: the disk is full.
+        """
+        if self._end and (self._chunk.tell() or self._chunk_count):
+            raise ValueError("what is attached comes before the messages")
+        start, named = self._end, _text(name) + _text("application/octet-stream")
+        content = bytes(16) + named + struct.pack("<Q", len(data)) + data
+        record = _record(ATTACHMENT, content + struct.pack("<I", crc32(content)))
+        try:
+            self._put(record)
+        except OSError as error:
+            raise UserError(f"{self._path}: cannot write the bag: {error.strerror}") from None
+        about = struct.pack("<QQQQQ", start, len(record), 0, 0, len(data)) + named
+        self._attachments.append(_record(ATTACHMENT_INDEX, about))
 
     def write(
         self, connection: Connection, time: int, data: bytes | memoryview, sent: int | None = None
@@ -239,13 +260,13 @@ class McapWriter:
             self._counts.total(),
             len(self._schemas),
             len(self._channels),
-            0,  # attachments
+            len(self._attachments),
             0,  # metadata
             self._chunk_count,
             *(self._span if self._counts else (0, 0)),
         )
         self._put(self._declared.getvalue() + _record(STATISTICS, about + _bytes(counts)))
-        self._put(self._chunks.getvalue())
+        self._put(self._chunks.getvalue() + b"".join(self._attachments))
         self._put(_record(FOOTER, struct.pack("<QQI", summary, 0, 0)) + MAGIC)
 
 

@@ -29,6 +29,7 @@ _log = logger(__name__)
 Message = tuple[Connection, int, bytes | memoryview]
 """Where it was recorded, log time in nanoseconds, and the serialised message."""
 
+ZSTD = b"\x28\xb5\x2f\xfd"  # what its files and messages begin with
 LAST = 2**63 - 1  # a log time beyond it is damage: it fits no int64, and no date
 LEAST, LONGEST = 1 << 26, 1 << 30  # bytes that a chunk or a message may be unpacked to, whatever it says
 PIECE = 1 << 12  # compressed bytes that are unpacked at once where the next ones may be damaged

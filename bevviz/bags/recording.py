@@ -3,156 +3,53 @@
 from __future__ import annotations
 
 import heapq
-import re
 from collections import Counter
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 from itertools import islice
 from operator import attrgetter, itemgetter
 from pathlib import Path, PurePath
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from backports import zstd
-from rosbags.interfaces import (
-    Connection,
-    ConnectionExtRosbag1,
-    MessageDefinition,
-    MessageDefinitionFormat,
-)
-from rosbags.typesys import Stores, TypesysError, get_types_from_idl, get_types_from_msg, get_typestore
-from rosbags.typesys.store import Typestore
+from rosbags.interfaces import Connection
+from rosbags.typesys import Stores
 
 from bevviz import announce
-from bevviz.bags import mcap, mcap_scan, ros1, sqlite
+from bevviz.bags import mcap
 from bevviz.bags.beside import bag_beside
-from bevviz.bags.chunks import Form, SoundChunks, rescue
-from bevviz.bags.reader import (
-    LONGEST,
-    PIECE,
-    BagFile,
-    Bytes,
-    Reader,
-    SoundReader,
-    megabytes,
-    normalized,
-)
-from bevviz.bags.sqlite import SoundSqlite, SqliteRescuer
-from bevviz.bags.types import ReadTypes
+from bevviz.bags.message import RawMessage, form_of, is_ros1
+from bevviz.bags.opening import open_file
+from bevviz.bags.reader import BagFile, normalized
+from bevviz.bags.types import MessageTypes
 from bevviz.closing import Closing
 from bevviz.config import SourceConfig
 from bevviz.datasets import open_dataset
 from bevviz.datasets.reader import DatasetReader
-from bevviz.errors import UserError, first_line
+from bevviz.datasets.unread import unread
+from bevviz.errors import UserError
 from bevviz.files import Scratch, bag_files, drive_files
 from bevviz.frame import I64
-from bevviz.ros import foxglove, grid_map_msgs, ouster, point_cloud_interfaces, video, vision_msgs
+from bevviz.ros import foxglove, ouster, vision_msgs
 from bevviz.ros.compressed import decompress, is_compressed
 from bevviz.ros.livox import fields_of, is_livox, read_custom
-from bevviz.ros.messages import MessageError, read_header
+from bevviz.ros.messages import MessageError
 from bevviz.ros.packets import is_packets, read_scan
 from bevviz.ros.roles import Topic
+from bevviz.ros.stated import read_calibration
 from bevviz.ros.video import Packet, decode_packet, is_video
 from bevviz.text import path_text
 
-ZSTD = b"\x28\xb5\x2f\xfd"
-FRAME = re.compile(re.escape(ZSTD))
-
-
-@dataclass(frozen=True, slots=True)
-class Kind:
-    """A format of files."""
-
-    name: str
-    magic: bytes
-    suffix: str  # that rosbags knows it by
-    sound: Callable[[Path, Path], SoundReader]  # of the file, and of the same by a name with that suffix
-    rescue: Callable[[Path], Reader]
-
-
-def _of_chunks(name: str, magic: bytes, suffix: str, form: Form) -> Kind:
-    return Kind(
-        name,
-        magic,
-        suffix,
-        lambda path, public: SoundChunks(path, form, public),
-        lambda path: rescue(path, form),
-    )
-
-
-SQLITE = Kind("sqlite3", sqlite.MAGIC, ".db3", SoundSqlite, SqliteRescuer)
-KINDS = (
-    _of_chunks("MCAP", mcap.MAGIC, ".mcap", mcap_scan.FORM),
-    _of_chunks("ROS 1 bag", ros1.MAGIC, ".bag", ros1.FORM),
-    SQLITE,
-)
-OTHERS = {
-    b"RRF": "a Rerun recording: open it with 'rerun'",
-    b"PK\x03\x04": "a zip archive: unpack it first",
-    b"\x1f\x8b": "a gzip archive: unpack it first",
-    b"BZh": "a bzip2 archive: unpack it first",
-    b"\xfd7zXZ": "an xz archive: unpack it first",
-    b"\xd4\xc3\xb2\xa1": "a packet capture, not a bag: record the driver's topics instead",
-    b"#ROSBAG V1": "a bag of ROS before 1.2: 'rosbag fix' converts it",
-}
+ATTACHED = "lidar_calibration"  # then the topic and the file: what an attachment with one is called
 METADATA = "metadata.yaml"
 COMPRESSED = "sensor_msgs/msg/CompressedImage"
 STAMPED = ["timestamp", "frame_id"]  # what foxglove's messages begin with, which are laid out as a Header
 REWIND = 2_000_000_000  # nanoseconds that a key frame is looked for in first
 LONGEST_SCAN = 1_000_000_000  # nanoseconds from its first packet to its last
 MOST_HEADERS = 16  # messages that a video begins with and are no pictures
-
-
-@dataclass(frozen=True, slots=True)
-class RawMessage:
-    topic: str
-    received: int  # log time, nanoseconds
-    data: bytes | memoryview
-    connection: Connection
-    packets: tuple[tuple[int, bytes | memoryview], ...] = ()  # with the time of each: a scan, see ``scans``
-
-    def content(self) -> bytes | memoryview:
-        """The serialised message; a compressed one is unpacked.
-
-        Raises:
-            zstd.ZstdError: it cannot be, or has more than ``LONGEST`` bytes.
-        """
-        if self.data[:4] != ZSTD:
-            return self.data
-        stream = zstd.ZstdDecompressor()
-        data = stream.decompress(self.data, LONGEST)
-        if not stream.eof:
-            raise zstd.ZstdError("the end of the compressed message is missing, or it is too long")
-        return data
-
-    def header(self) -> tuple[int, str]:
-        """Stamp in nanoseconds and frame_id of a message that begins with a Header; the rest is not decoded.
-
-        Raises:
-            MessageError: there is no header.
-        """
-        try:
-            data = self.content()
-        except zstd.ZstdError:
-            raise MessageError(f"{self.topic}: a message of {len(self.data)} bytes is damaged") from None
-        if form_of(self.connection):
-            return foxglove.header(self.parsed(data), self.connection.msgtype)
-        little = is_ros1(self.connection) or data[1:2] != b"\0"
-        return read_header(data, "<" if little else ">", self.topic)
-
-    def parsed(self, data: bytes | memoryview) -> Any:
-        """The message of Foxglove's that these bytes are.
-
-        Raises:
-            MessageError: they are none.
-        """
-        about = self.connection
-        try:
-            return foxglove.parse(data, about.msgtype, form_of(about), about.msgdef.data)
-        except Exception as error:  # the parsers have errors of their own
-            raise MessageError(f"{self.topic}: not a {about.msgtype}: {first_line(error)}") from None
 
 
 class Recording(Closing):
@@ -164,6 +61,10 @@ class Recording(Closing):
 
     Attributes:
         single_frames: nothing in one scan is in the next, and their times are made up.
+        calibrations: files of LiDARs by their topics, as ``source.lidar_calibration`` states them, or as they
+            are in the bag.
+        is_dataset: messages are made of a data set's files; what cannot be is empty, and among ``warnings``.
+        types: of the messages.
 
     Raises:
         UserError: a path that does not exist, cannot be read, is empty or is neither.
@@ -173,18 +74,18 @@ class Recording(Closing):
         if not paths:
             raise UserError("no bag given")
         self.paths = tuple(map(bag_beside, paths))
-        self.single_frames = False
+        self.single_frames = self.is_dataset = False
         self._config = config or SourceConfig()
         self._aside: dict[str, str] = {}
         self._scan_times: dict[str, I64] = {}
         self.files: list[BagFile] = []
         self._notes: list[str] = []
-        self._stores: dict[tuple[object, ...], Typestore] = {}
-        self._default = Stores.ROS2_JAZZY
+        self.types = MessageTypes(self._notes.append)
         self._scratch = Scratch()
         try:
             for path in self.paths:
                 self._open(path)
+            self.calibrations = {**self._config.lidar_calibration, **self._attached()}
             if not self.message_count:
                 raise UserError("; ".join([f"{self.name}: there are no messages in it", *self.warnings]))
         except BaseException:
@@ -272,7 +173,7 @@ class Recording(Closing):
     ) -> Iterator[RawMessage]:
         """As ``messages``, but of a LiDAR whose messages are single packets one for each scan.
 
-        It is received when its last packet is, and comes when the first one of the next scan does.
+        It is received when its last packet is, see ``ouster.Scans``.
         """
         single = [topic for topic in topics if topic in self._sensors]
         others = [topic for topic in topics if topic not in self._sensors]
@@ -283,30 +184,23 @@ class Recording(Closing):
         sensor = self._sensors[topic]
         low = None if start is None else start - LONGEST_SCAN
         high = None if stop is None else stop + LONGEST_SCAN
-        held = list[tuple[int, bytes | memoryview]]()
-        last: RawMessage | None = None
-        current = former = -1
+        scans = ouster.Scans(sensor)
+        message: RawMessage | None = None
 
-        def whole() -> Iterator[RawMessage]:
-            if last and (start is None or start <= last.received) and (stop is None or last.received < stop):
-                yield replace(last, data=b"", packets=tuple(held))
+        def given(found: Iterator[tuple[ouster.Packet, ...]]) -> Iterator[RawMessage]:
+            for packets in found:
+                received = packets[-1][0]
+                if message and (start is None or start <= received) and (stop is None or received < stop):
+                    yield replace(message, data=b"", received=received, packets=packets)
 
         for message in self.messages([topic], low, high):
             try:
                 packet = ouster.payload(message.content(), ros1=is_ros1(message.connection))
             except zstd.ZstdError:
                 continue
-            if len(packet) != sensor.size:
-                continue  # it counts as lost
-            number = sensor.number(packet)
-            if number == former:
-                continue  # overtaken by one of the next scan
-            if number != current:
-                yield from whole()
-                former, current, held = current, number, []
-            held.append((message.received, packet))
-            last = message
-        yield from whole()
+            if len(packet) == sensor.size:  # else it counts as lost
+                yield from given(scans.add(message.received, packet))
+        yield from given(scans.rest())
 
     def scan_times(self, topic: str) -> I64:
         """As ``times``, of what ``scans`` gives. Where messages are single packets, all are read, once."""
@@ -334,8 +228,8 @@ class Recording(Closing):
 
     def _metadata(self, topic: str) -> tuple[str, str] | None:
         """The metadata of an Ouster and where they are; None: there are none."""
-        if file := self._config.lidar_calibration.get(topic, ""):
-            return ouster.read_text(Path(file)), f"source.lidar_calibration: {file}"
+        if file := self.calibrations.get(topic, ""):
+            return read_calibration(Path(file)), f"source.lidar_calibration: {file}"
         name = ouster.metadata_of(topic)
         message = self.first(name)
         try:
@@ -389,23 +283,22 @@ class Recording(Closing):
         connection = message.connection
         msgtype = normalized(connection.msgtype)
         if message.packets:
-            times, packets = zip(*message.packets, strict=True)
-            return ouster.decode(self._sensors[message.topic], packets, np.array(times, np.int64))
+            return ouster.decode(self._sensors[message.topic], message.packets)
         try:
             data = message.content()
             if form_of(connection):
                 return foxglove.as_ros(message.parsed(data), connection.msgtype)
-            store = self._store(connection)
+            store = self.types.store(connection)
             if is_livox(msgtype):
                 fields = fields_of(store.fielddefs, msgtype)
                 return read_custom(data, ros1=is_ros1(connection), fields=fields)
             if is_packets(msgtype):
-                calibration = self._config.lidar_calibration.get(message.topic, "")
+                calibration = self.calibrations.get(message.topic, "")
                 return read_scan(data, msgtype, ros1=is_ros1(connection), calibration=calibration)
             if is_ros1(connection):
                 found = store.deserialize_ros1(data, msgtype)
             else:
-                found = store.deserialize_cdr(data, msgtype)
+                found = vision_msgs.deserialize(store, data, msgtype)
             if is_compressed(msgtype):
                 return decompress(found)
             return foxglove.as_ros(found, msgtype) if foxglove.short_of(msgtype) else found
@@ -421,55 +314,16 @@ class Recording(Closing):
 
     def encode(self, message: RawMessage, content: Any) -> memoryview:
         """``content``, as ``decode`` gave it and changed since, serialised as the message was."""
-        store, msgtype = self._store(message.connection), normalized(message.connection.msgtype)
+        store, msgtype = self.types.store(message.connection), normalized(message.connection.msgtype)
         if is_ros1(message.connection):
             return store.serialize_ros1(content, msgtype)
         return store.serialize_cdr(content, msgtype)
-
-    def definition(self, connection: Connection) -> MessageDefinition:
-        """What a type is made of: as the bag says, else as the ROS release does; NONE where nobody knows."""
-        if connection.msgdef.format != MessageDefinitionFormat.NONE:
-            return connection.msgdef
-        version: Literal[1, 2] = 1 if is_ros1(connection) else 2
-        try:
-            msgtype = normalized(connection.msgtype)
-            text, _ = self._store(connection).generate_msgdef(msgtype, ros_version=version)
-        except (KeyError, TypesysError):
-            return connection.msgdef
-        return MessageDefinition(MessageDefinitionFormat.MSG, text)
-
-    def definitions(self, connection: Connection) -> Mapping[str, Any]:
-        """The fields of every type that a connection's messages may be made of, as rosbags has them."""
-        return self._store(connection).fielddefs
-
-    def _store(self, connection: Connection) -> Typestore:
-        """The types that the bag itself defines, else those of the ROS release."""
-        ros1, definition = is_ros1(connection), connection.msgdef
-        key = (ros1, connection.msgtype, definition)
-        if key not in self._stores:
-            store = None
-            if definition.format != MessageDefinitionFormat.NONE:
-                try:
-                    store = _defined(connection)
-                except Exception as error:  # a definition that rosbags cannot parse
-                    self._notes.append(
-                        f"{connection.topic}: the bag's own definition of {connection.msgtype} is not usable "
-                        f"({error}); that of {self._default.value} is taken"
-                    )
-            if store is None:
-                store = get_typestore(Stores.ROS1_NOETIC if ros1 else self._default)
-                vision_msgs.register(store)
-                grid_map_msgs.register(store)
-                video.register(store)
-                point_cloud_interfaces.register(store)
-            self._stores[key] = store
-        return self._stores[key]
 
     def _has_header(self, connection: Connection) -> bool:
         if form_of(connection):
             return True
         try:
-            _, fields = self._store(connection).fielddefs[normalized(connection.msgtype)]
+            _, fields = self.types.store(connection).fielddefs[normalized(connection.msgtype)]
         except KeyError:
             return is_livox(connection.msgtype) or is_packets(connection.msgtype)
         names = [name for name, _ in fields[:2]]
@@ -499,13 +353,30 @@ class Recording(Closing):
             elif self._config.dataset and path.exists():
                 open_dataset(path, self._config.dataset)
             else:
-                self.files.append(self._open_file(path))
+                self.files.append(open_file(path, self._scratch, self._notes.append))
         except FileNotFoundError:
             raise UserError(f"{path}: no such file or folder") from None
         except PermissionError:
             raise UserError(f"{path}: permission denied: you may not read it") from None
         except OSError as error:
             raise UserError(f"{path}: cannot be read: {error.strerror or error}") from None
+
+    def _attached(self) -> dict[str, str]:
+        """Files of LiDARs' calibrations that are in the bag, by topic, where the stated ones are not here.
+
+        So that a bag that was cut out runs anywhere, with the configuration of where it comes from, too.
+        """
+        found = dict[str, str]()
+        stated = self._config.lidar_calibration
+        for file in self.files:
+            for name, data in mcap.read_attachments(file.path).items() if file.path.is_file() else ():
+                topic, _, base = name.removeprefix(ATTACHED).rpartition("/")
+                known = Path(stated.get(topic, base))
+                here = topic in stated and known.exists()
+                if name.startswith(ATTACHED) and known.name == base and base.strip(".") and not here:
+                    found[topic] = str(self._scratch.new() / base)
+                    Path(found[topic]).write_bytes(data)
+        return found
 
     def _open_folder(self, folder: Path) -> None:
         files = bag_files(folder)
@@ -515,6 +386,7 @@ class Recording(Closing):
         if not files:
             within = sorted(d.name for d in folder.iterdir() if d.is_dir() and bag_files(d))
             hint = f"; there are bags in its folders: {', '.join(within[:5])}" if within else ""
+            hint += f"; {others}" if (others := unread(folder)) else ""
             raise UserError(
                 f"{folder}: a folder without a bag (no .mcap, .db3 or .bag file), and no data set that is "
                 f"recognised (--dataset NAME){hint}"
@@ -524,7 +396,7 @@ class Recording(Closing):
         before = self.message_count
         for file in files:
             try:
-                self.files.append(self._open_file(file))
+                self.files.append(open_file(file, self._scratch, self._notes.append))
             except UserError as error:
                 failed.append(error)
         if len(failed) == len(files):
@@ -552,6 +424,7 @@ class Recording(Closing):
         reader = DatasetReader(dataset)
         self.files.append(BagFile(folder, dataset.about, lambda: reader, lambda: reader))
         self.single_frames |= dataset.single_frames
+        self.is_dataset = True
         self._aside |= reader.aside
         return True
 
@@ -570,97 +443,11 @@ class Recording(Closing):
             content = YAML(typ="safe", pure=True).load(path.read_text())["rosbag2_bagfile_information"]
             distro = content.get("ros_distro")
             if f"ros2_{distro}" in {s.value for s in Stores}:
-                self._default = Stores(f"ros2_{distro}")
+                self.types.release = Stores(f"ros2_{distro}")
             return dict(content)
         except (YAMLError, KeyError, TypeError, AttributeError, ValueError):
             self._notes.append(f"{path}: not readable as {METADATA}: read without")
             return {}
-
-    def _open_file(self, path: Path) -> BagFile:
-        if path.exists() and not path.is_file():  # a pipe would be waited for
-            raise UserError(f"{path}: no bag: it is no file")
-        with path.open("rb") as file:
-            head = file.read(16)
-        if head.startswith(ZSTD):
-            path = self._unpack(path)
-            with path.open("rb") as file:
-                head = file.read(16)
-        if kind := next((kind for kind in KINDS if head.startswith(kind.magic)), None):
-            return self._open_as(kind, path)
-        what = next((text for magic, text in OTHERS.items() if head.startswith(magic)), None)
-        # The first bytes may be damaged; and of a database all may still lie in its log.
-        kind = next((kind for kind in KINDS if path.suffix == kind.suffix), None)
-        if not head and not (kind is SQLITE and sqlite.log_of(path).exists()):
-            raise UserError(f"{path}: the file is empty")
-        if kind and not what:
-            opened = self._open_as(kind, path)
-            if any(c.msgcount for c in opened.connections):
-                return opened
-            opened.close()
-        raise UserError(
-            f"{path}: {what or 'not a bag: neither MCAP, nor sqlite3, nor ROS 1 by its first bytes'}"
-        )
-
-    def _open_as(self, kind: Kind, path: Path) -> BagFile:
-        public = path
-        if path.suffix != kind.suffix or set("?#%") & set(str(path)):  # the latter mean something in a URI
-            public = self._scratch.new() / f"bag{kind.suffix}"
-            public.symlink_to(path.resolve())
-        return BagFile(path, kind.name, lambda: kind.sound(path, public), lambda: kind.rescue(path))
-
-    def _unpack(self, path: Path) -> Path:
-        target = self._scratch.new() / path.stem
-        damaged, whole = unpack_file(path, target)
-        if damaged or not whole:
-            what = f"{damaged} damaged place(s) in it" if damaged else "its end is missing"
-            self._notes.append(
-                f"{path.name}: the compressed file is damaged ({what}): "
-                f"{megabytes(target.stat().st_size)} could be unpacked"
-            )
-        return target
-
-
-def unpack_file(path: Path, target: Path) -> tuple[int, bool]:
-    """Unpack a zstd file; behind a damaged place its next frame is searched for.
-
-    Returns:
-        How many places are damaged, and whether the last frame is whole.
-    """
-    source, damaged, stream = Bytes(path), 0, zstd.ZstdDecompressor()
-    bar = announce.bar(total=source.size, unit="B", unit_scale=True, desc=f"unpack {path.name}", delay=1)
-    try:
-        with target.open("wb") as out, bar:
-            offset = 0
-            while offset < source.size:
-                # In small pieces: what the decompressor makes of the one that it stumbles over is lost.
-                piece = source.read(offset, PIECE)
-                try:
-                    out.write(stream.decompress(piece))
-                    offset += len(piece) - len(stream.unused_data)
-                    found = offset if stream.eof else None
-                except zstd.ZstdError:
-                    damaged += 1
-                    found = next(source.search(FRAME, offset + 1), source.size)
-                bar.update(offset - bar.n)
-                if found is not None and found < source.size:
-                    offset, stream = found, zstd.ZstdDecompressor()
-                elif found is not None:
-                    break
-    finally:
-        source.close()
-    return damaged, stream.eof
-
-
-def form_of(connection: Connection) -> str:
-    """How messages of Foxglove's are serialised where ROS does not: protobuf or json; else empty."""
-    form = getattr(connection.ext, "serialization_format", "")
-    return form if form in foxglove.ENCODINGS and foxglove.short_of(connection.msgtype) else ""
-
-
-def is_ros1(connection: Connection) -> bool:
-    """Whether its messages are serialised as in ROS 1."""
-    extra = connection.ext
-    return isinstance(extra, ConnectionExtRosbag1) or extra.serialization_format == "ros1"
 
 
 def _lazily(
@@ -676,17 +463,3 @@ def _lazily(
     yield file.span[0], None
     for connection, time, data in file.messages(connections, start, stop):
         yield time, RawMessage(connection.topic, time, data, connection)
-
-
-def _defined(connection: Connection) -> Typestore:
-    """A store of the types that a connection's own definition lists."""
-    text, msgtype = connection.msgdef.data, normalized(connection.msgtype)
-    if connection.msgdef.format == MessageDefinitionFormat.MSG:
-        types = get_types_from_msg(text, msgtype)
-    else:
-        types = {}
-        for part in text.split("=" * 80 + "\n"):
-            types.update(get_types_from_idl(part.partition("\n")[2] if part.startswith("IDL: ") else part))
-    store = ReadTypes()
-    store.register(types)
-    return store

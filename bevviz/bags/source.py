@@ -11,14 +11,16 @@ from pathlib import Path
 
 import numpy as np
 
-from bevviz.bags.recording import RawMessage, Recording
+from bevviz.bags.message import RawMessage
+from bevviz.bags.recording import Recording
 from bevviz.bags.state import Losses, ReadingState, dumps, loads
 from bevviz.closing import Closing
 from bevviz.config import Config, stage_topics
 from bevviz.errors import UserError
 from bevviz.frame import F64, I64, Frame, Scene
-from bevviz.ros.messages import MessageError, decode_transforms
+from bevviz.ros.messages import MessageError
 from bevviz.ros.roles import find_roles
+from bevviz.ros.transforms import decode_transforms
 from bevviz.sync.feed import Handler, make_handlers
 from bevviz.sync.report import blindness
 from bevviz.sync.synchronizer import Synchronizer
@@ -291,7 +293,8 @@ class BagSource(Closing):
         try:
             handler(message)
         except MessageError as error:
-            state.damage.add(message.topic, str(error))
+            if message.data or not self.recording.is_dataset:  # of an empty one its file was told
+                state.damage.add(message.topic, str(error))
 
     def _hold_throughout(
         self, state: ReadingState, handlers: Mapping[str, Handler[RawMessage]], low: int

@@ -9,7 +9,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
-from bevviz.bags.recording import RawMessage, Recording
+from bevviz.bags.message import RawMessage
+from bevviz.bags.recording import Recording
 from bevviz.ros.messages import MessageError
 from bevviz.sync.damage import Damage
 from bevviz.sync.feed import Loader

@@ -16,7 +16,7 @@ from typing import Any
 from bevviz.bags.recording import METADATA
 from bevviz.bags.source import FrameSelection
 from bevviz.batch.table import RunInfo, read_info
-from bevviz.config import Config
+from bevviz.config import Config, with_object_files
 from bevviz.datasets import find_loader
 from bevviz.engine.task import JobResult
 from bevviz.errors import UserError
@@ -112,7 +112,9 @@ def make_jobs(
     files = {"names": _absolute(detector.names)}
     if model is not None and detector.model != "demo":
         files["model"] = str(model.resolve())
-    config = config.model_copy(update={"detector": detector.model_copy(update=files)})
+    config = with_object_files(config, _absolute).model_copy(
+        update={"detector": detector.model_copy(update=files)}
+    )
     folder = folder.resolve()
     blueprint = _absolute(blueprint)
     owners = {info.bag: table.stem for table, info in tables(folder)}

@@ -15,8 +15,9 @@ from pydantic import TypeAdapter
 
 from bevviz.config import Config
 from bevviz.counts import counts_of
-from bevviz.frame import Decision, DetectionState, FrameResult, Scene
+from bevviz.frame import Scene
 from bevviz.logging.decisions import remarks
+from bevviz.results import Decision, DetectionState, FrameResult
 
 DECISIONS = tuple(d.name.lower() for d in Decision if d.value in (0, 1, 2, 3, 4, 8))  # what a kept one can be
 STAGES = (
@@ -69,7 +70,7 @@ SEVERITIES = {  # of a frame, the gravest first: what is wrong in it
     "wrong": "an object is missed or false",
     "strange": "an anomaly",
     "unmatched": "a detection has no match",
-    "well": "nothing",
+    "well": "nothing is wrong",
 }
 
 

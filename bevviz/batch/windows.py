@@ -13,9 +13,9 @@ from bevviz.errors import UserError
 from bevviz.logging.recorder import OrderedRecorder
 from bevviz.parallel.drive import LENGTH, InOrder, Windows, obstacle
 from bevviz.parallel.work import Batched, WindowJob
-from bevviz.perceive import StageLoader
 from bevviz.run import few_collections
 from bevviz.session import Session
+from bevviz.stage_loader import StageLoader
 
 LEAST = 2 * LENGTH  # frames of a bag that is cut
 

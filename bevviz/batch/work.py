@@ -22,10 +22,10 @@ from bevviz.evaluate.evaluation import Evaluation
 from bevviz.evaluate.log import EvaluationRecorder
 from bevviz.evaluate.truth import truth_in
 from bevviz.files import unfinished
-from bevviz.frame import FrameResult
 from bevviz.logging.recorder import DiskWatch, Recorder
 from bevviz.logging.sinks import Sinks, open_recording
 from bevviz.report.pictures import ahead, camera_picture, jpeg, shrink
+from bevviz.results import FrameResult
 from bevviz.run import Observer
 from bevviz.run import run as run_frames
 from bevviz.session import Session

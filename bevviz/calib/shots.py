@@ -151,7 +151,7 @@ def _motion(frame: Frame, stamp: int, pose: Pose) -> F64 | None:
 def _flatten(bgr: U8, intrinsics: Intrinsics) -> tuple[U8, F64]:
     """The image without distortion and not larger than need be, and its camera matrix."""
     picture, K = bgr, intrinsics.K
-    if np.any(intrinsics.D):
+    if geometry.is_bent(intrinsics):
         if intrinsics.distortion_model in geometry.FISHEYE:
             picture = cv2.fisheye.undistortImage(picture, K, intrinsics.D[:4], Knew=K)
         else:

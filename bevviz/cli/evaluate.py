@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from bevviz.drive import Frames
     from bevviz.evaluate.evaluation import Evaluation
     from bevviz.evaluate.gate import Limit
-    from bevviz.frame import FrameResult
+    from bevviz.results import FrameResult
     from bevviz.run import Observer
 
 DESCRIPTION = """Hold the results to what is really there: precision and recall by class and range, average

@@ -28,7 +28,7 @@ from bevviz.errors import UserError
 
 if TYPE_CHECKING:
     from bevviz.config import Config
-    from bevviz.frame import FrameResult, Source
+    from bevviz.frame import Source
     from bevviz.live.control import Control
     from bevviz.live.notes import Notes
     from bevviz.live.raw import RawRecorder
@@ -36,7 +36,8 @@ if TYPE_CHECKING:
     from bevviz.live.runtime import Live, Status
     from bevviz.live.settings import Settings
     from bevviz.live.source import LiveSource
-    from bevviz.perceive import StageLoader
+    from bevviz.results import FrameResult
+    from bevviz.stage_loader import StageLoader
 
 
 def add(commands: Commands) -> None:
@@ -118,7 +119,7 @@ def _live(options: argparse.Namespace) -> int:
     os.environ.setdefault("RUST_LOG", "warn,re_log_encoding=error")
     from bevviz.live.notes import Notes
     from bevviz.live.settings import Settings
-    from bevviz.perceive import StageLoader
+    from bevviz.stage_loader import StageLoader
 
     given = {
         "detector.model": options.model,

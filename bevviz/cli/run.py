@@ -16,8 +16,8 @@ if TYPE_CHECKING:
     from bevviz.config import Config
     from bevviz.drive import Drive
     from bevviz.engine.task import Engine
-    from bevviz.frame import FrameResult
     from bevviz.logging.sinks import Sinks
+    from bevviz.results import FrameResult
     from bevviz.run import Items, Observer, Processor, RunEnd
     from bevviz.session import Session
 

@@ -15,7 +15,8 @@ from bevviz.closing import without_collections
 from bevviz.errors import UserError
 
 if TYPE_CHECKING:
-    from bevviz.frame import FrameResult, Scene
+    from bevviz.frame import Scene
+    from bevviz.results import FrameResult
     from bevviz.why import Answer, Questioner, Selection
 
 EXAMPLES = """examples:
@@ -58,6 +59,7 @@ def add(commands: Commands) -> None:
         help="what is in that cell of the bird's-eye view",
     )
     one.add_argument("--cluster", type=_number, metavar="N", help="the cluster of that number")
+    one.add_argument("--object", type=_number, metavar="N", help="the object in that row")
     one.add_argument("--detection", type=_number, metavar="N", help="the detection in that row")
     what.add_argument(
         "--radius", type=_metres, default=0.5, metavar="M", help="around the point or cell (default: 0.5)"
@@ -110,8 +112,8 @@ def _number(text: str) -> int:
 @without_collections()
 def _why(options: argparse.Namespace) -> int:
     from bevviz.bags.source import BagSource
-    from bevviz.perceive import StageLoader
     from bevviz.session import Session
+    from bevviz.stage_loader import StageLoader
     from bevviz.text import printable
     from bevviz.why import Questioner
     from bevviz.why.text import plain
@@ -153,6 +155,7 @@ def _selection(options: argparse.Namespace) -> Selection:
         cell=tuple(map(int, options.cell)),
         cluster=options.cluster,
         detection=options.detection,
+        object=options.object,
         camera=options.camera,
     )
 

@@ -11,7 +11,8 @@ import numpy as np
 
 from bevviz import geometry
 from bevviz.compare.truth import Judged
-from bevviz.frame import F32, F64, Boxes3D, FrameResult
+from bevviz.frame import F32, F64, Boxes3D
+from bevviz.results import FrameResult
 from bevviz.stages.fusion import assign
 
 REACH = 2.0  # metres between the centres of one object, seen from above

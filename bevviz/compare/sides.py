@@ -16,9 +16,10 @@ from bevviz.compare.truth import judge
 from bevviz.config import Config
 from bevviz.errors import UserError
 from bevviz.evaluate import Truth
-from bevviz.frame import Camera, CameraResult, Frame, FrameResult, LabelledBoxes3D, Objects
+from bevviz.frame import Camera, Frame, LabelledBoxes3D
 from bevviz.logging import entities
 from bevviz.logging.logger import Logger
+from bevviz.results import CameraResult, FrameResult, Objects
 from bevviz.run import Items, Observer
 from bevviz.session import Session
 from bevviz.stages.robot import detections_of, in_points_frame

@@ -9,7 +9,8 @@ import numpy as np
 
 from bevviz.evaluate import Truth
 from bevviz.evaluate import judge as judge_objects
-from bevviz.frame import Bool, Boxes3D, FrameResult, Objects
+from bevviz.frame import Bool, Boxes3D
+from bevviz.results import FrameResult, Objects
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,12 +10,18 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from bevviz.datasets.columns import are_doubles, count_columns
 from bevviz.errors import UserError, first_line
+from bevviz.files import LFS_HINT, LFS_POINTER
 from bevviz.frame import F32, I64
+from bevviz.ros.encode import encode_compressed_image
 
 SECOND = 1_000_000_000
-XYZI = np.dtype([(name, "<f4") for name in ("x", "y", "z", "intensity")])
+LOOKED_AT = 500_000  # bytes of a BIN file, for the number of its columns
+MOST_OF_POINTER = 1024  # bytes, by Git LFS's specification
+FIELDS = ("x", "y", "z", "intensity")
 BOXES = "bevviz_msgs/msg/Detection3DArray"
+CLOUDS = (".pcd", ".ply", ".bin", ".npy")
 IMAGES = (".png", ".jpg", ".jpeg", ".webp")
 
 
@@ -92,27 +98,61 @@ class Dataset:
         if text not in self.warnings:
             self.warnings.append(text)
 
+    def columns_in(self, files: Sequence[Path], names: Sequence[str] = FIELDS, hint: str = "") -> list[str]:
+        """Names of the columns of BIN files of float32, of as many as the values of the largest tell.
+
+        Args:
+            files: of any kind.
+            names: of the columns that the data set has, taken where the values do not tell.
+            hint: how the columns can be stated.
+
+        Raises:
+            UserError: it holds float64, or Git LFS has not fetched it.
+        """
+        raw = [file for file in files if file.suffix.lower() == ".bin"]
+        if not raw:
+            return [*names]
+        largest = max(raw, key=lambda file: file.stat().st_size)
+        data = read_bytes(largest)[:LOOKED_AT]
+        if are_doubles(data):
+            raise UserError(f"{largest}: its numbers are float64; save them as float32, or as NPY")
+        count = count_columns(np.frombuffer(data[: len(data) // 4 * 4], "<f4")) or len(names)
+        fields = [*names, *(f"field_{column}" for column in range(len(names), count))][:count]
+        if count != len(names):
+            self.warn(
+                f"BIN files are taken for {count} columns of float32, as their values tell: "
+                f"{', '.join(fields)}{hint}"
+            )
+        return fields
+
     def check_sizes(self, files: Sequence[Path], step: int) -> None:
         """Tell of scans that are no whole number of points, as cut ones are not."""
-        cut = [file for file in files if file.stat().st_size % step]
-        if cut:
-            more = f" and {len(cut) - 1} more" if len(cut) > 1 else ""
+        sizes = {file: file.stat().st_size for file in files}
+        away = sorted(file for file in files if sizes[file] < MOST_OF_POINTER and is_pointer(file))
+        if away:
+            self.warn(f"{self._first(away)}: {LFS_HINT}")
+        for file in away:
+            del sizes[file]
+        if cut := [file for file, size in sizes.items() if size % step]:
             self.warn(
-                f"{cut[0].relative_to(self.path)}{more}: {cut[0].stat().st_size} bytes are no whole number "
+                f"{self._first(cut)}: {sizes[cut[0]]} bytes are no whole number "
                 f"of points of {step} bytes: cut; the whole points in it are read"
             )
-        empty = [file for file in files if file.stat().st_size < step]
-        if empty:
-            more = f" and {len(empty) - 1} more" if len(empty) > 1 else ""
-            self.warn(f"{empty[0].relative_to(self.path)}{more}: no point in it")
+        if empty := [file for file, size in sizes.items() if size < step]:
+            self.warn(f"{self._first(empty)}: no point in it")
 
-    def one_of(self, sequences: Sequence[str]) -> str:
-        """The drive that was asked for.
+    def _first(self, files: Sequence[Path]) -> str:
+        """The first one, and how many more there are."""
+        more = f" and {len(files) - 1} more" if len(files) > 1 else ""
+        return f"{files[0].relative_to(self.path)}{more}"
+
+    def one_of(self, sequences: Sequence[str], others: str = "") -> str:
+        """The drive that was asked for; ``others``: what is said of those that are not among these.
 
         Raises:
             UserError: none of that name, or several to choose from.
         """
-        there = f"there are {', '.join(sequences[:8])}{' ...' if len(sequences) > 8 else ''}"
+        there = f"there are {', '.join(sequences[:8])}{' ...' if len(sequences) > 8 else ''}{others}"
         if not sequences:
             raise UserError(f"{self.path}: no drive in it; {self.about} has {self.expects}")
         if self.sequence:
@@ -124,25 +164,45 @@ class Dataset:
         return sequences[0]
 
 
-def read_points(path: Path, layout: np.dtype[np.void]) -> NDArray[np.void]:
-    """(N,) the whole points of a file.
+def read_points(path: Path, fields: Sequence[str]) -> NDArray[np.void]:
+    """(N,) the whole points of a BIN file with these columns of float32.
 
     Raises:
-        UserError: it cannot be read.
+        UserError: it cannot be read, or Git LFS has not fetched it.
     """
-    try:
-        count = path.stat().st_size // layout.itemsize
-        return np.fromfile(path, layout, count)
-    except OSError as error:
-        raise UserError(f"{path}: cannot be read: {error.strerror}") from None
+    data = read_bytes(path)
+    whole = np.frombuffer(data, "<f4", len(data) // (4 * len(fields)) * len(fields))
+    return columns_of(whole.reshape(-1, len(fields)), fields)
+
+
+def pictures(
+    camera: str, times: I64, files: Sequence[Path], *, rectified: bool = True, aside: str = ""
+) -> Stream:
+    """Images of a camera, as their files have them."""
+
+    def make(row: int) -> Any:
+        kind = files[row].suffix.lower().lstrip(".").replace("jpg", "jpeg")
+        return encode_compressed_image(int(times[row]), camera, read_bytes(files[row]), kind)
+
+    topic = f"/{camera}/{'image_rect' if rectified else 'image_raw'}/compressed"
+    return Stream(topic, "sensor_msgs/msg/CompressedImage", times, make, aside)
 
 
 def read_bytes(path: Path) -> bytes:
-    """Raises UserError: it cannot be read."""
+    """Raises UserError: it cannot be read, or Git LFS has not fetched it."""
     try:
-        return path.read_bytes()
+        data = path.read_bytes()
     except OSError as error:
         raise UserError(f"{path}: cannot be read: {error.strerror}") from None
+    if data.startswith(LFS_POINTER):
+        raise UserError(f"{path}: {LFS_HINT}")
+    return data
+
+
+def is_pointer(path: Path) -> bool:
+    """Whether Git LFS has yet to fetch a file. Raises OSError: it cannot be read."""
+    with path.open("rb") as file:
+        return file.read(len(LFS_POINTER)) == LFS_POINTER
 
 
 def read_text(path: Path) -> str:

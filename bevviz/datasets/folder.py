@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import csv
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
+from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,31 +15,46 @@ from numpy.typing import NDArray
 
 from bevviz import geometry
 from bevviz.datasets.dataset import (
+    CLOUDS,
     IMAGES,
     SECOND,
     Dataset,
     Stream,
     columns_of,
     frames_at,
-    read_bytes,
+    is_pointer,
+    pictures,
+    read_points,
     read_table,
     read_text,
 )
+from bevviz.datasets.pcd import read_pcd
+from bevviz.datasets.ply import read_ply
+from bevviz.datasets.unread import unread
 from bevviz.errors import UserError, first_line
+from bevviz.files import LFS_HINT
 from bevviz.frame import F64, I64, Intrinsics
 from bevviz.ros.encode import (
-    encode_compressed_image,
+    POINT_FIELD,
     encode_intrinsics,
     encode_points,
     encode_transforms,
 )
 
-CLOUDS = (".pcd", ".ply", ".bin", ".npy")
+MOST_SENSORS = 16  # in one folder
+MOST_COLUMNS = 64  # of an NPY file; a grid of heights has more, and so has a table the other way round
 MAP, BASE = "map", "base_link"
 CALIBRATION, STAMPS, POSES = "calibration.yaml", "stamps.csv", "poses.txt"
+DATE = re.compile(  # 20121214T142255.814212, 2011-09-26_13-02-25-594
+    r"(?<!\d)((?:19|20)\d\d)[-_.]?(\d\d)[-_.]?(\d\d)[-_.T ]?(\d\d)[-_.:]?(\d\d)[-_.:]?(\d\d)"
+    r"(?:[-_.](\d{1,9}))?(?=\D*$)"
+)
+OF_CAMERAS = re.compile("cam|im(g|age)", re.IGNORECASE)  # a folder with one for each camera
 UNITS = {19: 1, 16: 1000, 13: 1_000_000, 10: SECOND}  # digits of a stamp -> nanoseconds of its unit
+NEAREST = {"i8": "<f8", "u8": "<f8", "f2": "<f4", "b1": "u1"}  # that a PointCloud2 can hold
 KEYS = {"rate", "fields", "lidars", "cameras"}
-SENSOR_KEYS = {"pose", "K", "D", "distortion_model"}
+LENS = {"D", "distortion_model"}
+SENSOR_KEYS = {"pose", "K", *LENS}
 
 
 class Folder(Dataset):
@@ -60,22 +77,30 @@ class Folder(Dataset):
         if sequence:
             raise UserError(f"{path}: is one drive; leave --sequence {sequence} out")
         about = self._calibration()
-        sensors = {folder.name: folder for folder in _folders(path)}
-        lidars = {name: files for name, folder in sensors.items() if (files := _of_kind(folder, CLOUDS))}
-        cameras = {name: files for name, folder in sensors.items() if (files := _of_kind(folder, IMAGES))}
-        if files := _of_kind(path, CLOUDS):
-            lidars = {"lidar": files, **lidars}
-        if files := _of_kind(path, IMAGES):
-            cameras = {"camera": files, **cameras}
+        places = {path: "", **{folder: folder.name for folder in _folders(path)}}
+        within = [folder for place in places if OF_CAMERAS.match(places[place]) for folder in _folders(place)]
+        lidars, cameras = dict[str, list[Path]](), dict[str, list[Path]]()
+        others = unread(path)
+        for folder, name in places.items():
+            lidars |= self._apart(name or "lidar", _of_kind(folder, CLOUDS), about.get("lidars", ()))
+            cameras |= self._apart(name or "camera", _of_kind(folder, IMAGES), about.get("cameras", ()))
+        for folder in within:
+            name = folder.name if folder.name not in cameras else f"{folder.parent.name}_{folder.name}"
+            cameras |= self._apart(name, _of_kind(folder, IMAGES), about.get("cameras", ()))
         if not lidars:
-            raise UserError(f"{path}: no cloud in it; expected {self.expects}")
+            raise UserError(f"{path}: no cloud in it{others and '; '}{others}; expected {self.expects}")
+        if others:
+            self.warn(others)
         for kind, there in (("lidars", lidars), ("cameras", cameras)):
             if unknown := sorted(about.get(kind, {}).keys() - there.keys()):
-                names = ", ".join(there)
-                raise UserError(f"{path / CALIBRATION}: no {unknown[0]} among the {kind}; there are {names}")
+                names = f"there are {', '.join(there)}" if there else "there is none"
+                names += others and f"; {others}"
+                raise UserError(f"{path / CALIBRATION}: no {unknown[0]} among the {kind}; {names}")
         stamped = self._stamps([*lidars.values(), *cameras.values()], float(about.get("rate", 10.0)))
-        fields = [str(name) for name in about.get("fields", ("x", "y", "z", "intensity"))]
+        fields = self._fields(about.get("fields"), [file for files in lidars.values() for file in files])
         edges, streams = [], list[Stream]()
+        # Where nothing says how the only LiDAR is mounted, its own frame need not be upright.
+        placed = len(lidars) > 1 or (path / POSES).is_file() or any("pose" in s for s in _stated(about))
         for name, files in cameras.items():
             files, times = _in_order(files, stamped)
             stated = about.get("cameras", {}).get(name, {})
@@ -83,24 +108,25 @@ class Folder(Dataset):
                 edges.append((BASE, name, self._pose(stated["pose"], name)))
             if "K" in stated:
                 streams.append(self._camera_info(name, times, stated))
-            streams.append(_pictures(name, times, files, rectified="D" not in stated))
+            streams.append(pictures(name, times, files, rectified=not LENS & stated.keys()))
         for name, files in lidars.items():
             files, times = _in_order(files, stamped)
             self.check_sizes([file for file in files if file.suffix == ".bin"], 4 * len(fields))
             stated = about.get("lidars", {}).get(name, {})
-            edges.append((BASE, name, self._pose(stated["pose"], name) if "pose" in stated else np.eye(4)))
+            if placed:
+                pose = self._pose(stated["pose"], name) if "pose" in stated else np.eye(4)
+                edges.append((BASE, name, pose))
             streams.append(_clouds(name, times, files, fields))
-        start = min(stamped.values())
-        self.streams = [
-            Stream(
-                "/tf_static",
-                "tf2_msgs/msg/TFMessage",
-                np.array([start], np.int64),
-                lambda _: encode_transforms(start, edges),
-            ),
-            *self._poses(),
-            *streams,
-        ]
+        self.streams = [*_mounted(min(stamped.values()), edges), *self._poses(), *streams]
+
+    def _apart(self, sensor: str, files: Sequence[Path], stated: Collection[str]) -> dict[str, list[Path]]:
+        """Files by their sensor: in one folder they may be of several, which their names tell."""
+        groups = sensors_of(files)
+        if len(groups) > 1 and sensor not in stated:
+            groups = {f"{sensor}_{name}" if name else sensor: found for name, found in groups.items()}
+            self.warn(f"by the names of their files there are {', '.join(groups)}")
+            return groups
+        return {sensor: list(files)} if files else {}
 
     def _calibration(self) -> Mapping[str, Any]:
         """What ``calibration.yaml`` says; empty where there is none."""
@@ -118,7 +144,7 @@ class Folder(Dataset):
             isinstance(about.get(k, {}), dict) for k in ("lidars", "cameras")
         ):
             raise UserError(f"{file}: expected {', '.join(sorted(KEYS))}, see docs/inputs.md")
-        stated = [s for kind in ("lidars", "cameras") for s in about.get(kind, {}).values()]
+        stated = _stated(about)
         if any(not isinstance(sensor, dict) for sensor in stated):
             raise UserError(f"{file}: of a sensor {', '.join(sorted(SENSOR_KEYS))} can be stated")
         unknown = sorted(set(about) - KEYS) + sorted({key for s in stated for key in s} - SENSOR_KEYS)
@@ -126,6 +152,16 @@ class Folder(Dataset):
             known = ", ".join(sorted(KEYS | SENSOR_KEYS))
             raise UserError(f"{file}: {unknown[0]} is not known; there are {known}")
         return about
+
+    def _fields(self, stated: Sequence[Any] | None, files: Sequence[Path]) -> list[str]:
+        """Names of the columns of BIN and NPY files, as stated, else as the largest BIN file tells.
+
+        Raises:
+            UserError: it holds float64.
+        """
+        if stated is not None:
+            return [str(name) for name in stated]
+        return self.columns_in(files, hint=f" (fields in {CALIBRATION})")
 
     def _pose(self, values: Any, sensor: str) -> F64:
         """(4, 4) base_link from a sensor, of 7 numbers or of 16."""
@@ -154,6 +190,8 @@ class Folder(Dataset):
                 f"{self.path / CALIBRATION}: camera {name}: K needs 9 numbers, row by row, and D only numbers"
             ) from None
         model = str(stated.get("distortion_model", "plumb_bob" if len(distortion) else ""))
+        if model in geometry.FISHEYE and "D" not in stated:
+            distortion = np.zeros(4)  # r = f theta
         about = Intrinsics(0, 0, matrix, model, distortion)
         return Stream(
             f"/{name}/camera_info",
@@ -168,9 +206,13 @@ class Folder(Dataset):
         files = [file for sensor in sensors for file in sensor]
         if table.is_file():
             return self._listed(table, files)
+        dates = {file: date[1] for file in files if (date := _date(file))}
         texts = {file: _number(file) for file in files}
-        if all("." in text or len(text) in UNITS for text in texts.values() if text) and all(texts.values()):
+        if all(map(_is_stamp, texts.values())) and len(dates) < len(files):
             return {file: _stamp(text) for file, text in texts.items()}
+        if len(dates) == len(files):
+            self.warn("the names are taken for dates and times in UTC")
+            return dates
         if all(texts.values()):
             numbers = [int(text.partition(".")[0]) for text in texts.values()]
             self.warn(
@@ -215,6 +257,11 @@ class Folder(Dataset):
         return [Stream("/tf", "tf2_msgs/msg/TFMessage", times, make)]
 
 
+def _stated(about: Mapping[str, Any]) -> list[Any]:
+    """What the calibration says of each sensor."""
+    return [sensor for kind in ("lidars", "cameras") for sensor in about.get(kind, {}).values()]
+
+
 def _folders(path: Path) -> list[Path]:
     return sorted(found for found in path.iterdir() if found.is_dir() and not found.name.startswith("."))
 
@@ -223,10 +270,59 @@ def _of_kind(folder: Path, suffixes: Sequence[str]) -> list[Path]:
     return sorted(f for f in folder.iterdir() if f.suffix.lower() in suffixes and f.is_file())
 
 
+def sensors_of(files: Sequence[Path]) -> dict[str, list[Path]]:
+    """Files by the words in which their names differ, without their last number; one group: of one sensor.
+
+    They are of several where these words are no mere numbers (which are a date's, or a run's), or where each
+    has the same last numbers, and where there are as many of each, about.
+    """
+    groups = dict[tuple[str, ...], list[Path]]()
+    told = {file: date[0] if (date := _date(file)) else _number(file) for file in files}
+    if not all(told.values()):
+        return {"": list(files)}
+    for file in files:
+        before, _, after = file.stem.rpartition(told[file])
+        groups.setdefault(tuple(re.findall(r"[A-Za-z0-9]+", f"{before} {after}")), []).append(file)
+    counts = [len(found) for found in groups.values()]
+    if not 1 < len(groups) <= MOST_SENSORS or max(counts) > 2 * min(counts):
+        return {"": list(files)}
+    first, last = _alike(list(groups)), _alike([words[::-1] for words in groups])
+    names = {words: words[first : max(first, len(words) - last)] for words in groups}
+    numbers = {tuple(sorted(told[file] for file in found)) for found in groups.values()}
+    named = all(any(map(str.isalpha, "".join(words))) for words in names.values() if words)
+    if not named and len(numbers) > 1:
+        return {"": list(files)}
+    return {"_".join(names[words]): found for words, found in groups.items()}
+
+
+def _alike(rows: Sequence[Sequence[str]]) -> int:
+    """How many words all rows begin with."""
+    return next(
+        (i for i, row in enumerate(zip(*rows, strict=False)) if len(set(row)) > 1), min(map(len, rows))
+    )
+
+
+def _date(file: Path) -> tuple[str, int] | None:
+    """The date and time that a name ends with, and its nanoseconds, taken for UTC; None: it does not."""
+    if not (found := DATE.search(file.stem)):
+        return None
+    year, month, day, hour, minute, second, fraction = found.groups()
+    try:
+        whole = datetime(int(year), int(month), int(day), int(hour), int(minute), int(second), tzinfo=UTC)
+    except ValueError:
+        return None
+    return found[0], int(whole.timestamp()) * SECOND + int((fraction or "")[:9].ljust(9, "0"))
+
+
 def _number(file: Path) -> str:
     """The last number in a name; "" where there is none."""
     found = re.findall(r"\d+(?:\.\d+)?", file.stem)
     return str(found[-1]) if found else ""
+
+
+def _is_stamp(number: str) -> bool:
+    """Whether a number in a name is no frame's, which has zeros before it where it is as long as a stamp."""
+    return "." in number or (len(number) in UNITS and not number.startswith("0"))
 
 
 def _stamp(text: str) -> int:
@@ -242,24 +338,22 @@ def _in_order(files: Sequence[Path], stamped: Mapping[Path, int]) -> tuple[list[
     return ordered, np.array([stamped[file] for file in ordered], np.int64)
 
 
-def _pictures(name: str, times: I64, files: Sequence[Path], *, rectified: bool) -> Stream:
-    def make(row: int) -> Any:
-        kind = files[row].suffix.lower().lstrip(".").replace("jpg", "jpeg")
-        return encode_compressed_image(int(times[row]), name, read_bytes(files[row]), kind)
-
-    topic = f"/{name}/{'image_rect' if rectified else 'image_raw'}/compressed"
-    return Stream(topic, "sensor_msgs/msg/CompressedImage", times, make)
+def _mounted(start: int, edges: Sequence[tuple[str, str, F64]]) -> list[Stream]:
+    times = np.array([start], np.int64)
+    make = partial(encode_transforms, start, list(edges))
+    return [Stream("/tf_static", "tf2_msgs/msg/TFMessage", times, lambda _: make())] if edges else []
 
 
 def _clouds(name: str, times: I64, files: Sequence[Path], fields: Sequence[str]) -> Stream:
     def make(row: int) -> Any:
-        return encode_points(int(times[row]), name, read_cloud(files[row], fields))
+        points, announced = read_cloud(files[row], fields)
+        return encode_points(int(times[row]), name, points, announced)
 
     return Stream(f"/{name}/points", "sensor_msgs/msg/PointCloud2", times, make)
 
 
-def read_cloud(file: Path, fields: Sequence[str]) -> NDArray[np.void]:
-    """(N,) points with x, y, z and what else the file has.
+def read_cloud(file: Path, fields: Sequence[str]) -> tuple[NDArray[np.void], int]:
+    """(N,) points with x, y, z and what else the file has, and how many it says to have, where it does.
 
     Args:
         file: PCD, PLY, BIN (float32) or NPY.
@@ -271,41 +365,30 @@ def read_cloud(file: Path, fields: Sequence[str]) -> NDArray[np.void]:
     suffix = file.suffix.lower()
     try:
         if suffix == ".bin":
-            values = np.frombuffer(
-                read_bytes(file), "<f4", count=file.stat().st_size // (4 * len(fields)) * len(fields)
-            )
-            return columns_of(values.reshape(-1, len(fields)), fields)
+            return read_points(file, fields), 0
+        if is_pointer(file):
+            raise UserError(f"{file}: {LFS_HINT}")
         if suffix == ".npy":
             loaded = np.load(file, allow_pickle=False)
             if loaded.dtype.names:
-                return np.asarray(loaded.reshape(-1))
-            if loaded.ndim != 2 or loaded.shape[1] < 3:
-                raise ValueError(f"has the shape {loaded.shape}, not (N, 3) or more")
+                return _encodable(loaded.reshape(-1)), 0
+            if loaded.ndim != 2 or not 3 <= loaded.shape[1] <= MOST_COLUMNS:
+                raise ValueError(f"has the shape {loaded.shape}, not (N, 3) to (N, {MOST_COLUMNS})")
             names = [*fields, *(f"field_{i}" for i in range(loaded.shape[1]))][: loaded.shape[1]]
-            return columns_of(loaded.astype(np.float32), names)
-        return _read_by_open3d(file)
+            return columns_of(loaded.astype(np.float32), names), 0
+        points, announced = read_pcd(file) if suffix == ".pcd" else read_ply(file)
+        return _encodable(points), announced
     except (OSError, ValueError, EOFError, RuntimeError) as error:
         raise UserError(f"{file}: cannot be read as a cloud: {first_line(error)}") from None
 
 
-def _read_by_open3d(file: Path) -> NDArray[np.void]:
-    """A PCD or PLY with all fields of one number a point."""
-    from bevviz.o3d import load
-
-    o3d = load()
-    if not file.is_file() or not file.stat().st_size:
-        raise ValueError("is empty")
-    with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
-        cloud = o3d.t.io.read_point_cloud(str(file))
-    if "positions" not in cloud.point:
-        raise ValueError("no point in it, or damaged")
-    columns = dict(zip("xyz", cloud.point["positions"].numpy().T, strict=True))
-    for name, values in cloud.point.items():
-        table = values.numpy()
-        if name != "positions" and table.ndim == 2 and table.shape[1] == 1 and table.dtype.kind in "uif":
-            columns[name] = table[:, 0]
-    layout = np.dtype([(name, values.dtype) for name, values in columns.items()])
-    points = np.empty(len(columns["x"]), layout)
-    for name, values in columns.items():
-        points[name] = values
-    return points
+def _encodable(points: NDArray[np.void]) -> NDArray[np.void]:
+    """Points with fields of types that a PointCloud2 can hold, little-endian."""
+    names = points.dtype.names or ()
+    types = {name: points.dtype[name].newbyteorder("<") for name in names}
+    types = {name: np.dtype(NEAREST.get(kind.str[1:], kind)) for name, kind in types.items()}
+    if missing := [name for name, kind in types.items() if kind.str[1:] not in POINT_FIELD]:
+        raise ValueError(f"field {missing[0]} is of the type {types[missing[0]]}")
+    if all(types[name] == points.dtype[name] for name in names):
+        return points
+    return points.astype(np.dtype(list(types.items())))

@@ -9,12 +9,10 @@ from typing import Any
 import numpy as np
 
 from bevviz import geometry
-from bevviz.datasets.dataset import XYZI, Stream, read_bytes, read_points, read_text
-from bevviz.datasets.names import KITTI
+from bevviz.datasets.dataset import IMAGES, Stream, read_points, read_text
 from bevviz.errors import UserError
 from bevviz.frame import F64, I64, Boxes3D, ImageLabels, Intrinsics, LabelledBoxes3D
 from bevviz.ros.encode import (
-    encode_compressed_image,
     encode_intrinsics,
     encode_labels,
     encode_points,
@@ -58,7 +56,7 @@ def read_labels(file: Path) -> LabelledBoxes3D:
 def labelled_boxes(
     file: Path, lines: Sequence[tuple[int, str]], rectified_from_lidar: F64, ids: Sequence[str] = ()
 ) -> LabelledBoxes3D:
-    """Labels in the frame of the LiDAR.
+    """Labels in the frame of the LiDAR: of every type but Misc, as sets in KITTI's form have their own.
 
     Args:
         file: that they are in.
@@ -73,7 +71,7 @@ def labelled_boxes(
     labels, rows, dont_care, kept = [], [], [], []
     for at, (number, line) in enumerate(lines):
         kind, *values = line.split() or [""]
-        if kind not in KITTI and kind != "DontCare":
+        if kind in ("", "Misc"):
             continue
         if len(values) < 14:
             raise UserError(f"{file}: line {number} has {len(values)} numbers, a KITTI label has 14")
@@ -205,24 +203,18 @@ def _turns(axis: int, angles: F64) -> F64:
 # --- streams -----------------------------------------------------------------------------------
 
 
-def clouds(times: I64, files: Sequence[Path]) -> Stream:
-    """Scans of x, y, z and reflectance."""
+def clouds(times: I64, files: Sequence[Path], fields: Sequence[str]) -> Stream:
+    """Scans of x, y, z and reflectance, and what else sets in KITTI's form have (Waymo's: 6 columns)."""
 
     def make(row: int) -> Any:
-        return encode_points(int(times[row]), LIDAR, read_points(files[row], XYZI))
+        return encode_points(int(times[row]), LIDAR, read_points(files[row], fields))
 
     return Stream(CLOUDS, "sensor_msgs/msg/PointCloud2", times, make)
 
 
-def pictures(camera: str, times: I64, files: Sequence[Path], aside: str = "") -> Stream:
-    """Images of a camera that is called like its folder; they are rectified."""
-
-    def make(row: int) -> Any:
-        kind = files[row].suffix.lstrip(".").replace("jpg", "jpeg")
-        return encode_compressed_image(int(times[row]), camera, read_bytes(files[row]), kind)
-
-    topic = f"/{camera}/image_rect/compressed"
-    return Stream(topic, "sensor_msgs/msg/CompressedImage", times, make, aside)
+def images_in(folder: Path) -> list[Path]:
+    """Images in order of name: KITTI's PNG, or what they are converted to."""
+    return sorted(file for file in folder.glob("*") if file.suffix.lower() in IMAGES)
 
 
 def camera_info(camera: str, times: I64, matrix: F64) -> Stream:

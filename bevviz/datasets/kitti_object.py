@@ -9,8 +9,17 @@ from typing import Any
 import numpy as np
 
 from bevviz import geometry
-from bevviz.datasets.dataset import BOXES, SECOND, XYZI, Dataset, Stream
-from bevviz.datasets.kitti import LIDAR, MAP, Calibration, clouds, mountings, pictures, read_labels, truth
+from bevviz.datasets.dataset import BOXES, SECOND, Dataset, Stream, pictures
+from bevviz.datasets.kitti import (
+    LIDAR,
+    MAP,
+    Calibration,
+    clouds,
+    images_in,
+    mountings,
+    read_labels,
+    truth,
+)
 from bevviz.errors import UserError
 from bevviz.frame import Intrinsics
 from bevviz.ros.encode import encode_intrinsics, encode_transforms
@@ -36,7 +45,8 @@ class KittiObject(Dataset):
         scans = sorted((path / "velodyne").glob("*.bin"))
         if not scans:
             raise UserError(f"{path / 'velodyne'}: no scan in it; expected 000000.bin")
-        self.check_sizes(scans, XYZI.itemsize)
+        fields = self.columns_in(scans)
+        self.check_sizes(scans, 4 * len(fields))
         times = APART * np.arange(1, len(scans) + 1, dtype=np.int64)
         names = [scan.stem for scan in scans]
 
@@ -54,8 +64,8 @@ class KittiObject(Dataset):
             mountings(int(times[0]), [(MAP, LIDAR, np.eye(4))]),
             Stream("/tf", "tf2_msgs/msg/TFMessage", times, mounting),
         ]
-        images = [path / f"{CAMERA}/{name}.png" for name in names]
-        seen = [row for row, image in enumerate(images) if image.is_file()]
+        images = {image.stem: image for image in images_in(path / CAMERA)}
+        seen = [row for row, name in enumerate(names) if name in images]
         if seen:
             at = times[seen]
 
@@ -65,10 +75,10 @@ class KittiObject(Dataset):
 
             self.streams += [
                 Stream(f"/{CAMERA}/camera_info", "sensor_msgs/msg/CameraInfo", at, info),
-                pictures(CAMERA, at, [images[row] for row in seen]),
+                pictures(CAMERA, at, [images[names[row]] for row in seen]),
             ]
         labels = [path / f"label_2/{name}.txt" for name in names]
         known = [row for row, file in enumerate(labels) if file.is_file()]
         if known:
             self.streams.append(truth(BOXES, times[known], lambda row: read_labels(labels[known[row]])))
-        self.streams.append(clouds(times, scans))
+        self.streams.append(clouds(times, scans, fields))

@@ -10,11 +10,12 @@ import numpy as np
 from bevviz import geometry
 from bevviz.datasets.dataset import (
     SECOND,
-    XYZI,
     Dataset,
     Stream,
     frames_at,
     joined_columns,
+    pictures,
+    read_bytes,
     read_points,
     read_table,
 )
@@ -24,8 +25,8 @@ from bevviz.datasets.kitti import (
     Calibration,
     camera_info,
     clouds,
+    images_in,
     mountings,
-    pictures,
     places,
     truth,
 )
@@ -89,13 +90,14 @@ class KittiOdometry(Dataset):
             raise UserError(f"{folder / 'velodyne'}: no scan in it; expected 000000.bin")
         if not (folder / "calib.txt").is_file():
             raise UserError(f"{folder / 'calib.txt'} is missing: it says where the cameras are")
-        self.check_sizes(scans, XYZI.itemsize)
+        fields = self.columns_in(scans)
+        self.check_sizes(scans, 4 * len(fields))
         calibration = Calibration(folder / "calib.txt")
         numbers = _numbers(scans)
         times = self._times(folder, numbers)
         edges, cameras = [], list[Stream]()
         for camera, aside in CAMERAS.items():
-            images = {int(file.stem): file for file in (folder / camera).glob("*.png") if file.stem.isdigit()}
+            images = {int(file.stem): file for file in images_in(folder / camera) if file.stem.isdigit()}
             rows = [row for row, number in enumerate(numbers) if number in images]
             if not rows:
                 continue
@@ -104,7 +106,7 @@ class KittiOdometry(Dataset):
             edges.append((LIDAR, camera, geometry.inverse(camera_from_lidar)))
             cameras += [
                 camera_info(camera, at, matrix),
-                pictures(camera, at, [images[numbers[row]] for row in rows], aside),
+                pictures(camera, at, [images[numbers[row]] for row in rows], aside=aside),
             ]
         self.streams = [mountings(int(times[0]), edges)] if edges else []
         poses = self._poses(folder, calibration)
@@ -116,20 +118,20 @@ class KittiOdometry(Dataset):
         self.streams += cameras
         labels = {int(file.stem): file for file in (folder / "labels").glob("*.label")}
         if not labels:
-            self.streams.append(clouds(times, scans))
+            self.streams.append(clouds(times, scans, fields))
             return
         rows = [row for row, number in enumerate(numbers) if number in labels]
         files = {row: labels[numbers[row]] for row in rows}
 
         def cloud(row: int) -> Any:
-            points = read_points(scans[row], XYZI)
+            points = read_points(scans[row], fields)
             label = np.zeros(len(points), np.uint32)
             if row in files:
                 label[:] = self._labels(files[row], len(points))
             return encode_points(int(times[row]), LIDAR, joined_columns(points, {"label": label}))
 
         def objects(row: int) -> LabelledBoxes3D:
-            points = read_points(scans[rows[row]], XYZI)
+            points = read_points(scans[rows[row]], fields)
             return boxes_of(files[rows[row]], points, self._labels(files[rows[row]], len(points)))
 
         self.streams.append(truth("vision_msgs/msg/Detection3DArray", times[rows], objects))
@@ -159,10 +161,8 @@ class KittiOdometry(Dataset):
 
     def _labels(self, file: Path, points: int) -> np.ndarray[Any, np.dtype[np.uint32]]:
         """(points,) of each point."""
-        try:
-            labels = np.fromfile(file, "<u4")
-        except OSError as error:
-            raise UserError(f"{file}: cannot be read: {error.strerror}") from None
+        data = read_bytes(file)
+        labels = np.frombuffer(data[: len(data) // 4 * 4], "<u4")
         if len(labels) != points:
             raise UserError(
                 f"{file}: {len(labels)} labels for {points} points: one of the two is cut, or of another scan"

@@ -11,7 +11,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from bevviz import geometry
-from bevviz.datasets.dataset import XYZI, Dataset, Stream, read_table, read_text
+from bevviz.datasets.dataset import Dataset, Stream, pictures, read_table, read_text
 from bevviz.datasets.kitti import (
     IMU,
     LIDAR,
@@ -19,7 +19,6 @@ from bevviz.datasets.kitti import (
     clouds,
     mountings,
     named_rows,
-    pictures,
     places,
     poses_of_oxts,
     split_projection,
@@ -66,7 +65,8 @@ class KittiRaw(Dataset):
         scans, times = self._files(folder / "velodyne_points", ".bin")
         if not scans:
             raise UserError(f"{folder / 'velodyne_points/data'}: no scan in it; expected 0000000000.bin")
-        self.check_sizes(scans, XYZI.itemsize)
+        fields = self.columns_in(scans)
+        self.check_sizes(scans, 4 * len(fields))
         edges, sensors = self._cameras(folder)
         table = self._oxts(folder)
         self.streams = []
@@ -90,7 +90,7 @@ class KittiRaw(Dataset):
                     lambda row: labelled.get(numbers[row], none),
                 )
             )
-        self.streams.append(clouds(times, scans))
+        self.streams.append(clouds(times, scans, fields))
 
     def _cameras(self, folder: Path) -> tuple[list[tuple[str, str, F64]], list[Stream]]:
         """Where they are, and what they saw."""
@@ -111,7 +111,7 @@ class KittiRaw(Dataset):
             matrix, beside = split_projection(projection)
             camera_from_lidar = beside @ rectified @ _rigid(folder.parent / "calib_velo_to_cam.txt")
             edges.append((LIDAR, camera, geometry.inverse(camera_from_lidar)))
-            streams += [camera_info(camera, times, matrix), pictures(camera, times, images, aside)]
+            streams += [camera_info(camera, times, matrix), pictures(camera, times, images, aside=aside)]
         return edges, streams
 
     def _oxts(self, folder: Path) -> tuple[I64, F64] | None:

@@ -6,16 +6,16 @@ from collections import defaultdict
 from pathlib import Path
 
 from bevviz import geometry
-from bevviz.datasets.dataset import BOXES, XYZI, Dataset, Stream, frames_at, read_table, read_text
+from bevviz.datasets.dataset import BOXES, Dataset, Stream, frames_at, pictures, read_table, read_text
 from bevviz.datasets.kitti import (
     IMU,
     LIDAR,
     Calibration,
     camera_info,
     clouds,
+    images_in,
     labelled_boxes,
     mountings,
-    pictures,
     places,
     poses_of_oxts,
     truth,
@@ -59,18 +59,19 @@ class KittiTracking(Dataset):
         if not scans:
             raise UserError(f"{root / 'velodyne' / name}: no scan in it; expected 000000.bin")
         self.path = root
-        self.check_sizes(scans, XYZI.itemsize)
+        fields = self.columns_in(scans)
+        self.check_sizes(scans, 4 * len(fields))
         calibration = Calibration(root / f"calib/{name}.txt")
         times = frames_at(RATE, _numbers(scans))
         edges, sensors = [], list[Stream]()
         for camera, aside in CAMERAS.items():
-            images = sorted((root / camera / name).glob("*.png"))
+            images = images_in(root / camera / name)
             if not images:
                 continue
             at = frames_at(RATE, _numbers(images))
             matrix, camera_from_lidar = calibration.camera(int(camera[-1]))
             edges.append((LIDAR, camera, geometry.inverse(camera_from_lidar)))
-            sensors += [camera_info(camera, at, matrix), pictures(camera, at, images, aside)]
+            sensors += [camera_info(camera, at, matrix), pictures(camera, at, images, aside=aside)]
         self.streams = []
         oxts = root / f"oxts/{name}.txt"
         if oxts.is_file():
@@ -83,7 +84,7 @@ class KittiTracking(Dataset):
         labels = root / f"label_02/{name}.txt"
         if labels.is_file():
             self.streams.append(self._truth(labels, calibration, scans))
-        self.streams.append(clouds(times, scans))
+        self.streams.append(clouds(times, scans, fields))
 
     def _truth(self, file: Path, calibration: Calibration, scans: list[Path]) -> Stream:
         """Of the scans: a line has the frame, the object, and what a label of the object benchmark has."""

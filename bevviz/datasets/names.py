@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 _PERSON = frozenset({"pedestrian", "person"})
 
 KITTI = {  # Geiger, Lenz and Urtasun 2012; the fourth as the raw drives have it
@@ -29,4 +31,52 @@ SEMANTIC_KITTI = {  # Behley et al. 2019, where COCO has others
     "on-rails": frozenset({"on-rails", "tram", "train", "bus"}),
     "other-vehicle": frozenset({"other-vehicle", "car", "truck", "bus", "train"}),
 }
+CATEGORIES = {  # of nuScenes in its detection task; what belongs to none of them is left out, as there
+    "movable_object.barrier": "barrier",
+    "movable_object.trafficcone": "traffic_cone",
+    "vehicle.bicycle": "bicycle",
+    "vehicle.bus.bendy": "bus",
+    "vehicle.bus.rigid": "bus",
+    "vehicle.car": "car",
+    "vehicle.construction": "construction_vehicle",
+    "vehicle.motorcycle": "motorcycle",
+    "vehicle.trailer": "trailer",
+    "vehicle.truck": "truck",
+    "human.pedestrian.adult": "pedestrian",
+    "human.pedestrian.child": "pedestrian",
+    "human.pedestrian.construction_worker": "pedestrian",
+    "human.pedestrian.police_officer": "pedestrian",
+}
+NOT_DETECTED = frozenset(  # categories of nuScenes that belong to no class of that task
+    {
+        "animal",
+        "human.pedestrian.personal_mobility",
+        "human.pedestrian.stroller",
+        "human.pedestrian.wheelchair",
+        "movable_object.debris",
+        "movable_object.pushable_pullable",
+        "static_object.bicycle_rack",
+        "vehicle.emergency.ambulance",
+        "vehicle.emergency.police",
+    }
+)
 ACCEPTED = KITTI | NUSCENES | SEMANTIC_KITTI
+
+_SYNONYMS = {label.lower(): names for label, names in ACCEPTED.items()} | {
+    "cyclist": ACCEPTED["Cyclist"] | {"rider"}
+}
+
+
+def accepted_names(label: str, known: Iterable[str]) -> frozenset[str]:
+    """What a detector may rightly call an object of that label, in lower case.
+
+    Its own name alone where the detector knows that; KITTI's names stand for several, and a category of
+    nuScenes for its class.
+    """
+    label = CATEGORIES.get(label, label)
+    name = label.lower()
+    if label in ACCEPTED:
+        return frozenset(ACCEPTED[label] | _SYNONYMS[name])
+    if any(name == other.lower() for other in known):
+        return frozenset({name})
+    return frozenset({name, *_SYNONYMS.get(name, ())})

@@ -9,13 +9,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from bevviz import geometry
-from bevviz.datasets.dataset import Dataset, Stream, columns_of, read_bytes
+from bevviz import announce, geometry
+from bevviz.datasets.dataset import Dataset, Stream, pictures
+from bevviz.datasets.folder import read_cloud
+from bevviz.datasets.names import CATEGORIES, NOT_DETECTED
 from bevviz.errors import UserError
-from bevviz.frame import F32, F64, I64, Boxes3D, Intrinsics
+from bevviz.frame import F64, I64, Boxes3D, Intrinsics
 from bevviz.ros.encode import (
-    encode_compressed_image,
     encode_intrinsics,
     encode_labels,
     encode_points,
@@ -26,27 +28,14 @@ MAP, BASE = "map", "base_link"
 TABLES = "sample_data.json"
 FIELDS = ("x", "y", "z", "intensity", "ring")
 PIECE = 1 << 22  # characters of a table that are read at once: the largest has a gigabyte
-CLASSES = {  # of the detection task; what belongs to none of them is left out, as there
-    "movable_object.barrier": "barrier",
-    "movable_object.trafficcone": "traffic_cone",
-    "vehicle.bicycle": "bicycle",
-    "vehicle.bus.bendy": "bus",
-    "vehicle.bus.rigid": "bus",
-    "vehicle.car": "car",
-    "vehicle.construction": "construction_vehicle",
-    "vehicle.motorcycle": "motorcycle",
-    "vehicle.trailer": "trailer",
-    "vehicle.truck": "truck",
-    "human.pedestrian.adult": "pedestrian",
-    "human.pedestrian.child": "pedestrian",
-    "human.pedestrian.construction_worker": "pedestrian",
-    "human.pedestrian.police_officer": "pedestrian",
-}
 Record = Mapping[str, Any]
 
 
 class NuScenes(Dataset):
-    """``v1.0-mini/*.json`` with ``samples`` and ``sweeps`` beside; one scene is a drive."""
+    """``v1.0-mini/*.json`` with ``samples`` and ``sweeps`` beside; one scene is a drive.
+
+    Sets with its tables: T4 (``annotation/*.json`` with ``data`` beside), Lyft Level 5.
+    """
 
     name = "nuscenes"
     about = "nuScenes"
@@ -54,7 +43,7 @@ class NuScenes(Dataset):
 
     @classmethod
     def fits(cls, path: Path) -> bool:
-        return (path / TABLES).is_file() or any(path.glob(f"v*/{TABLES}"))
+        return (path / TABLES).is_file() or bool(_versions(path))
 
     def __init__(self, path: Path, sequence: str) -> None:
         super().__init__(path, sequence)
@@ -62,9 +51,15 @@ class NuScenes(Dataset):
         if (path / TABLES).is_file():
             versions, root = [path], path.parent
         else:
-            versions = sorted(found.parent for found in path.glob(f"v*/{TABLES}"))
+            versions = _versions(path)
         scenes = {row["name"]: (row, tables) for tables in versions for row in records(tables / "scene.json")}
-        scene, tables = scenes[self.one_of(sorted(scenes))]
+        there = sorted(scenes)
+        if len(scenes) > 1 and not sequence:
+            there = self._with_scans(root, scenes)
+        absent = f"{len(scenes) - len(there)} of {len(scenes)} scenes have no LiDAR scan here"
+        scene, tables = scenes[self.one_of(there, f"; {absent}" if len(there) < len(scenes) else "")]
+        if len(there) < len(scenes):
+            self.warn(f"{absent}: {scene['name']} has")
         samples = _by_token(tables, "sample", lambda row: row["scene_token"] == scene["token"])
         data = _by_token(tables, "sample_data", lambda row: row["sample_token"] in samples)
         mounted = _chosen(
@@ -73,7 +68,7 @@ class NuScenes(Dataset):
         sensors = _by_token(tables, "sensor", lambda row: True)
         poses = _chosen(tables, "ego_pose", {row["ego_pose_token"] for row in data.values()})
         taken: dict[str, list[Record]] = defaultdict(list)
-        lost = []
+        lost, lacking = [], set[str]()
         for row in sorted(data.values(), key=lambda row: row["timestamp"]):
             sensor = sensors[mounted[row["calibrated_sensor_token"]]["sensor_token"]]
             if sensor["modality"] == "radar":
@@ -82,8 +77,14 @@ class NuScenes(Dataset):
                 taken[sensor["channel"]].append(row)
             else:
                 lost.append(row["filename"])
+                if row["is_key_frame"]:
+                    lacking.add(row["sample_token"])
         if lost:
-            self.warn(f"{len(lost)} files of the scene are not there, the first: {lost[0]}")
+            named = len(lost) + sum(map(len, taken.values()))
+            self.warn(
+                f"{len(lost)} of {named} files of {scene['name']} are not there, "
+                f"{len(lacking)} of its {len(samples)} samples lack one; the first: {lost[0]}"
+            )
         edges, clouds, images = [], list[Stream](), list[Stream]()
         keys: dict[str, int] = {}  # sample -> stamp of its scan
         for channel, rows in sorted(taken.items()):
@@ -102,8 +103,11 @@ class NuScenes(Dataset):
                 images += self._images(channel, times, files, calibration)
             edges.append((BASE, channel, pose))
         if not clouds:
+            others = self._with_scans(root, scenes)
             raise UserError(
-                f"{root}: no LiDAR scan of {scene['name']} is there; its tables name {len(lost)} files"
+                f"{root}: no LiDAR scan of {scene['name']} is there; its tables name {len(lost)} files; "
+                f"{len(others)} of {len(scenes)} scenes have scans here: {', '.join(others[:8])}"
+                f"{' ...' if len(others) > 8 else ''}"
             )
         self.streams = [
             Stream(
@@ -118,36 +122,60 @@ class NuScenes(Dataset):
             *clouds,
         ]
 
+    def _with_scans(self, root: Path, scenes: Mapping[str, tuple[Record, Path]]) -> list[str]:
+        """The scenes with a LiDAR's key frame among the files: of a large set parts may be here.
+
+        Raises:
+            UserError: there is none.
+        """
+        found = set[str]()
+        for tables in {tables for _, tables in scenes.values()}:
+            lidars = {r["token"] for r in records(tables / "sensor.json") if r["modality"] == "lidar"}
+            mounted = _by_token(tables, "calibrated_sensor", lambda r, of=lidars: r["sensor_token"] in of)
+            scene_of = {row["token"]: row["scene_token"] for row in records(tables / "sample.json")}
+            for row in announce.bar(
+                records(tables / "sample_data.json"), desc=f"files of {tables.name}", unit="row", delay=1
+            ):
+                scene = scene_of.get(row["sample_token"], "")
+                if scene in found or not row["is_key_frame"]:
+                    continue
+                if row["calibrated_sensor_token"] in mounted and (root / row["filename"]).is_file():
+                    found.add(scene)
+        if not found:
+            raise UserError(f"{root}: no LiDAR scan that the tables name is there; expected {self.expects}")
+        return sorted(name for name, (scene, _) in scenes.items() if scene["token"] in found)
+
     def _clouds(self, channel: str, times: I64, files: Sequence[Path], turns: int) -> Stream:
-        """Scans of five float32 a point, turned by quarters of a circle so that x is ahead."""
-        step = 4 * len(FIELDS)
-        self.check_sizes(files, step)
+        """Scans, turned by quarters of a circle so that x is ahead.
+
+        nuScenes has five float32 a point; sets with its tables have other numbers of them, or true PCD.
+        """
+        fields = self.columns_in(files, FIELDS)
+        self.check_sizes([file for file in files if file.suffix == ".bin"], 4 * len(fields))
 
         def make(row: int) -> Any:
-            values = np.frombuffer(read_bytes(files[row]), "<f4")
-            points = values[: len(values) // len(FIELDS) * len(FIELDS)].reshape(-1, len(FIELDS))
-            return encode_points(int(times[row]), channel, columns_of(_turned(points, turns), FIELDS))
+            points, announced = read_cloud(files[row], fields)
+            return encode_points(int(times[row]), channel, _turned(points, turns), announced)
 
         return Stream(f"/{channel}/points", "sensor_msgs/msg/PointCloud2", times, make)
 
     def _images(
         self, channel: str, times: I64, files: Sequence[Path], calibration: Record
     ) -> Iterator[Stream]:
-        """They are rectified."""
+        """They are rectified, unless T4's ``camera_distortion`` says otherwise: OpenCV's coefficients."""
         matrix = np.array(calibration["camera_intrinsic"], np.float64)
         if matrix.shape != (3, 3):
             raise UserError(f"{self.path}: calibrated_sensor.json has no camera_intrinsic for {channel}")
+        distortion = np.array(calibration.get("camera_distortion") or (), np.float64).reshape(-1)
+        rectified = not distortion.any()
+        model = "" if rectified else "plumb_bob" if len(distortion) <= 5 else "rational_polynomial"
+        about = Intrinsics(0, 0, matrix, model, distortion if model else np.zeros(0))
 
         def info(row: int) -> Any:
-            return encode_intrinsics(int(times[row]), channel, Intrinsics(0, 0, matrix))
-
-        def picture(row: int) -> Any:
-            kind = files[row].suffix.lstrip(".").replace("jpg", "jpeg")
-            return encode_compressed_image(int(times[row]), channel, read_bytes(files[row]), kind)
+            return encode_intrinsics(int(times[row]), channel, about)
 
         yield Stream(f"/{channel}/camera_info", "sensor_msgs/msg/CameraInfo", times[:1], info)
-        topic = f"/{channel}/image_rect/compressed"
-        yield Stream(topic, "sensor_msgs/msg/CompressedImage", times, picture)
+        yield pictures(channel, times, files, rectified=rectified)
 
     def _truth(self, tables: Path, keys: Mapping[str, int]) -> Iterator[Stream]:
         """What is labelled at the key frames, in the map."""
@@ -169,9 +197,9 @@ class NuScenes(Dataset):
                 (row, categories[instances[row["instance_token"]]["category_token"]])
                 for row in labelled[sample]
             ]
-            known = [(row, CLASSES[name]) for row, name in rows if name in CLASSES]
+            known = [(row, CATEGORIES.get(name, name)) for row, name in rows if name not in NOT_DETECTED]
             boxes = Boxes3D(
-                np.array([row["translation"] for row, _ in known], np.float32).reshape(-1, 3),
+                np.array([row["translation"] for row, _ in known], np.float64).reshape(-1, 3),
                 np.array([np.array(row["size"])[[1, 0, 2]] for row, _ in known], np.float32).reshape(-1, 3),
                 np.array([geometry.yaw(_pose(row)) for row, _ in known], np.float32),
             )
@@ -207,15 +235,20 @@ def _quarter_turns(number: int) -> F64:
     return pose
 
 
-def _turned(points: F32, turns: int) -> F32:
+def _turned(points: NDArray[np.void], turns: int) -> NDArray[np.void]:
     """The points turned by quarters of a circle: every coordinate keeps its digits."""
-    x, y = points[:, 0], points[:, 1]
+    x, y = points["x"], points["y"]
     turned = points.copy()
-    turned[:, 0], turned[:, 1] = ((x, y), (-y, x), (-x, -y), (y, -x))[turns % 4]
+    turned["x"], turned["y"] = ((x, y), (-y, x), (-x, -y), (y, -x))[turns % 4]
     return turned
 
 
 # --- tables ------------------------------------------------------------------------------------
+
+
+def _versions(path: Path) -> list[Path]:
+    """The folders of tables in it."""
+    return sorted(f.parent for name in ("v*", "annotation") for f in path.glob(f"{name}/{TABLES}"))
 
 
 def records(table: Path) -> Iterator[dict[str, Any]]:

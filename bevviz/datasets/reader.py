@@ -6,12 +6,7 @@ from collections.abc import Collection, Iterator
 from pathlib import Path
 
 import numpy as np
-from rosbags.interfaces import (
-    Connection,
-    ConnectionExtRosbag2,
-    MessageDefinition,
-    MessageDefinitionFormat,
-)
+from rosbags.interfaces import Connection, ConnectionExtRosbag2, MessageDefinition, MessageDefinitionFormat
 
 from bevviz.datasets.dataset import NOT_AS_DOCUMENTED, Dataset, describe
 from bevviz.errors import UserError

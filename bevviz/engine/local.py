@@ -62,13 +62,9 @@ class Processes(Closing):
         on_frame: Callable[[], None],
         tick: Callable[[], None] = lambda: None,
     ) -> JobResults:
-        """Run the jobs, each once, and yield how they ended, as they end. Whoever is left then is ended.
+        """See ``Engine.run``; a job whose process died is run again, too, and whoever is left is ended.
 
-        Args:
-            jobs: what to do; the first ones first. Each is asked for when a worker is free.
-            retries: how often a job is run again whose process died, or that failed for no fault of its bag.
-            on_frame: called for each frame of any of them.
-            tick: called every ``TICK`` seconds and oftener.
+        ``tick`` is called every ``TICK`` seconds and oftener.
         """
         coming = iter(jobs)
         again: deque[Task] = deque()
@@ -169,8 +165,8 @@ def _end(worker: _Worker) -> None:
 
 def _work(pipe: Connection, threads: int, modules: Sequence[str], speaks: bool) -> None:
     """The process: one job after another, until the other end of the pipe is closed."""
-    if speaks:  # of all that compile the stages at the same time one says so
-        announce.to(lambda text: print(f"bevviz: {text}", file=sys.stderr), bars=False)
+    # Of all that compile the stages at the same time one says so.
+    announce.to((lambda text: print(f"bevviz: {text}", file=sys.stderr)) if speaks else None, bars=False)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGTERM})
     os.environ["OMP_NUM_THREADS"] = str(threads)  # before Open3D is loaded
     import cv2

@@ -9,7 +9,8 @@ import numpy as np
 from bevviz import geometry
 from bevviz.evaluate.score import accepts, pair_in_order
 from bevviz.evaluate.truth import Truth
-from bevviz.frame import F32, Bool, CameraResult
+from bevviz.frame import F32, Bool
+from bevviz.results import CameraResult
 
 DETECTION_OVERLAP = 0.5  # least IoU in the image of a detection and what it is
 

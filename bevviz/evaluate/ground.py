@@ -6,7 +6,7 @@ from collections import Counter
 
 import numpy as np
 
-from bevviz.frame import FrameResult
+from bevviz.results import FrameResult
 from bevviz.stages.voxel import of_points
 
 # SemanticKITTI's numbers (Behley et al. 2019), in the field ``label`` of a cloud.

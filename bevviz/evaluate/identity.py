@@ -16,7 +16,8 @@ import numpy as np
 from bevviz import geometry
 from bevviz.evaluate.score import accepts
 from bevviz.evaluate.truth import MAX_DISTANCE, Truth
-from bevviz.frame import F64, I32, FrameResult
+from bevviz.frame import F64, I32
+from bevviz.results import FrameResult
 from bevviz.stages.fusion import assign
 
 ALPHAS = np.arange(0.05, 0.99, 0.05)  # similarities from which on a pair is one, as HOTA has them

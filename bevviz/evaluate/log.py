@@ -12,11 +12,12 @@ from bevviz.colors import TRUTH
 from bevviz.evaluate.evaluation import Evaluation
 from bevviz.evaluate.tables import page
 from bevviz.evaluate.truth import Truth
-from bevviz.frame import Boxes3D, FrameResult
+from bevviz.frame import Boxes3D
 from bevviz.logging import entities
 from bevviz.logging.pieces import boxes3d, document, transform
 from bevviz.logging.spoken import log_spoken, log_spoken_looks, named_in_space
 from bevviz.logging.writer import WAIT, Writer
+from bevviz.results import FrameResult
 from bevviz.run import Items, Observer
 from bevviz.text import markdown
 

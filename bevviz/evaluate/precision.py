@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 from bevviz import geometry
 from bevviz.evaluate.score import accepts
 from bevviz.evaluate.truth import Truth
-from bevviz.frame import F32, Bool, FrameResult
+from bevviz.frame import F32, Bool
+from bevviz.results import FrameResult
 from bevviz.stages.kernel import kernel
 
 RECALL_POINTS = 40

@@ -8,7 +8,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from bevviz.evaluate.truth import MAX_DISTANCE, Truth
-from bevviz.frame import F32, F64, I32, Bool, Objects
+from bevviz.frame import F32, F64, I32, Bool
+from bevviz.results import Objects
 
 
 @dataclass(frozen=True, slots=True)

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from pathlib import Path
+from collections.abc import Sequence
 
 import cv2
 import numpy as np
 
 from bevviz import geometry
-from bevviz.errors import UserError
-from bevviz.frame import F32, F64, U8, Camera, FrameResult, Intrinsics, Objects
-from bevviz.run import Items, Observer
+from bevviz.export.folder import FolderExport, rectified
+from bevviz.frame import F32, F64, U8, Camera, Intrinsics
+from bevviz.results import FrameResult, Objects
 
 KINDS = {  # of a detector, as KITTI calls them; what is not here is Misc
     "car": "Car",
@@ -28,41 +28,17 @@ KINDS = {  # of a detector, as KITTI calls them; what is not here is Misc
 UNKNOWN = 0  # occlusion: what was found is taken as seen
 
 
-class KittiExport(Observer[FrameResult]):
+class KittiExport(FolderExport):
     """Writes each frame; those without the camera's image, calibration or place are counted and left out.
 
     Points are those that bevviz works on: upright, z up, several LiDARs merged. Images are rectified, so that
     P2 projects into them.
 
-    Args:
-        folder: to be made; it must not hold an export yet.
-        camera: name of the one whose images these are; empty: the first.
-
-    Attributes:
-        frames: written.
-        labels: written.
-        skipped: frames that were left out, by the reason.
-
-    Raises:
-        UserError: the folder holds something.
+    ``camera`` is the one whose images these are; empty: the first.
     """
 
-    def __init__(self, folder: Path, camera: str = "") -> None:
-        if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-            raise UserError(f"{folder}: is there already; give another folder")
-        self._folder, self._camera = folder, camera
-        self.frames = self.labels = 0
-        self.skipped: dict[str, int] = {}
-
-    def begin(self, items: Items[object]) -> None:
-        cameras = items.scene.cameras
-        if self._camera and self._camera not in cameras:
-            raise UserError(f"--camera {self._camera}: there is none of that name but {', '.join(cameras)}")
-        try:
-            for name in ("velodyne", "image_2", "calib", "label_2"):
-                (self._folder / name).mkdir(parents=True)
-        except OSError as error:
-            raise UserError(f"{self._folder}: cannot be made: {error.strerror}") from None
+    def _folders(self, cameras: Sequence[str]) -> Sequence[str]:
+        return "velodyne", "image_2", "calib", "label_2"
 
     def see(self, result: FrameResult) -> None:
         frame = result.frame
@@ -74,9 +50,6 @@ class KittiExport(Observer[FrameResult]):
         else:
             self._write(result, camera, camera.image.bgr, camera.intrinsics, camera.camera_from_points)
 
-    def _skip(self, why: str) -> None:
-        self.skipped[why] = self.skipped.get(why, 0) + 1
-
     def _write(
         self, result: FrameResult, camera: Camera, bgr: U8, intrinsics: Intrinsics, camera_from_points: F64
     ) -> None:
@@ -87,14 +60,12 @@ class KittiExport(Observer[FrameResult]):
         if intensity is not None:
             points[:, 3] = intensity
         lines = [] if result.objects is None else labels(result.objects, intrinsics, camera_from_points)
-        try:
+        with self._saving():
             points.tofile(self._folder / "velodyne" / f"{name}.bin")
             if not cv2.imwrite(str(self._folder / "image_2" / f"{name}.png"), rectified(bgr, intrinsics)):
                 raise OSError(0, "the image cannot be written")
             (self._folder / "calib" / f"{name}.txt").write_text(calibration(intrinsics.K, camera_from_points))
             (self._folder / "label_2" / f"{name}.txt").write_text("".join(f"{line}\n" for line in lines))
-        except OSError as error:
-            raise UserError(f"{self._folder}: cannot be written: {error.strerror}") from None
         self.frames += 1
         self.labels += len(lines)
 
@@ -106,17 +77,6 @@ def calibration(K: F64, camera_from_points: F64) -> str:
     rows |= {"R0_rect": np.eye(3), "Tr_velo_to_cam": camera_from_points[:3], "Tr_imu_to_velo": np.eye(4)[:3]}
     lines = (f"{name}: {' '.join(f'{v:.12e}' for v in matrix.ravel())}" for name, matrix in rows.items())
     return "".join(f"{line}\n" for line in lines)
-
-
-def rectified(bgr: U8, intrinsics: Intrinsics) -> U8:
-    """The (H, W, 3) image as a camera of the same K without distortion has it."""
-    if not intrinsics.distortion_model:
-        return bgr
-    if intrinsics.distortion_model == "equidistant":
-        straight = cv2.fisheye.undistortImage(bgr, intrinsics.K, intrinsics.D[:4], Knew=intrinsics.K)
-    else:
-        straight = cv2.undistort(bgr, intrinsics.K, intrinsics.D[:8])
-    return np.asarray(straight, np.uint8)
 
 
 def labels(objects: Objects, intrinsics: Intrinsics, camera_from_points: F64) -> list[str]:

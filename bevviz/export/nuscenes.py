@@ -15,10 +15,10 @@ import cv2
 import numpy as np
 
 from bevviz import geometry
-from bevviz.errors import UserError
-from bevviz.export.kitti import rectified
-from bevviz.frame import F32, F64, Camera, Frame, FrameResult, Objects, Tracks
-from bevviz.run import Items, Observer
+from bevviz.export.folder import FolderExport, rectified
+from bevviz.frame import F32, F64, Camera, Frame
+from bevviz.results import FrameResult, Objects, Tracks
+from bevviz.run import Items
 
 VERSION = "v1.0-bevviz"
 TABLES = (
@@ -46,32 +46,16 @@ KINDS = {  # of a detector, as nuScenes calls them; what is not here becomes a c
 }
 
 
-class NuScenesExport(Observer[FrameResult]):
+class NuScenesExport(FolderExport):
     """Writes each frame as a sample: the scan, the images of all cameras, and the objects as annotations.
 
     The vehicle's frame is that of the points, which are upright, z up, several LiDARs merged. Images are
     rectified, and each has the pose of the vehicle at its own time. An instance is a track. The tables are
     written at the end, also where the run was interrupted.
-
-    Args:
-        folder: to be made; it must not hold an export yet.
-        camera: name of the only one whose images are written; empty: all.
-
-    Attributes:
-        frames: written.
-        labels: written.
-        skipped: frames that were left out, by the reason.
-
-    Raises:
-        UserError: the folder holds something.
     """
 
     def __init__(self, folder: Path, camera: str = "") -> None:
-        if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-            raise UserError(f"{folder}: is there already; give another folder")
-        self._folder, self._camera = folder, camera
-        self.frames = self.labels = 0
-        self.skipped: dict[str, int] = {}
+        super().__init__(folder, camera)
         self._rows: dict[str, list[dict[str, Any]]] = {name: [] for name in TABLES}
         self._last: dict[tuple[str, str], dict[str, Any]] = {}  # row of a table, by what follows itself in it
         self._channels: dict[str, str] = {}
@@ -80,21 +64,16 @@ class NuScenesExport(Observer[FrameResult]):
         self._scene = ""
 
     def begin(self, items: Items[object]) -> None:
-        scene = items.scene
-        if self._camera and self._camera not in scene.cameras:
-            raise UserError(
-                f"--camera {self._camera}: there is none of that name but {', '.join(scene.cameras)}"
-            )
-        self._scene = scene.name
-        channels = [self._channel(name) for name in scene.cameras if self._camera in ("", name)]
-        try:
-            for folder in (VERSION, "maps", "sweeps", *(f"samples/{name}" for name in (LIDAR, *channels))):
-                (self._folder / folder).mkdir(parents=True)
+        super().begin(items)
+        self._scene = items.scene.name
+        with self._saving("made"):
             cv2.imwrite(str(self._folder / MAP), np.zeros((8, 8), np.uint8))
-        except OSError as error:
-            raise UserError(f"{self._folder}: cannot be made: {error.strerror}") from None
         for token, level in (("1", "v0-40"), ("2", "v40-60"), ("3", "v60-80"), ("4", "v80-100")):
             self._rows["visibility"].append({"token": token, "level": level, "description": ""})
+
+    def _folders(self, cameras: Sequence[str]) -> Sequence[str]:
+        channels = [self._channel(name) for name in cameras if self._camera in ("", name)]
+        return VERSION, "maps", "sweeps", *(f"samples/{name}" for name in (LIDAR, *channels))
 
     def _channel(self, camera: str) -> str:
         name = re.sub(r"[^A-Z0-9]+", "_", camera.upper()).strip("_").removeprefix("CAM_") or "CAMERA"
@@ -107,19 +86,17 @@ class NuScenesExport(Observer[FrameResult]):
     def see(self, result: FrameResult) -> None:
         frame = result.frame
         if not frame.lidar:
-            self.skipped["no scan"] = self.skipped.get("no scan", 0) + 1
+            self._skip("no scan")
             return
         scene, token = _token("scene"), _token("sample", self.frames)
         sample = self._follow("sample", "", token, timestamp=_micros(frame.stamp), scene_token=scene)
-        try:
+        with self._saving():
             name = self._write_points(frame)
             mounted = self._calibrated(LIDAR, "lidar", np.eye(4), [])
             self._data(LIDAR, sample["token"], mounted, frame.stamp, frame.pose, name, "pcd", (0, 0))
             for camera in frame.cameras:
                 if self._camera in ("", camera.name):
                     self._write_camera(frame, camera, sample["token"])
-        except OSError as error:
-            raise UserError(f"{self._folder}: cannot be written: {error.strerror}") from None
         if result.objects is not None:
             self._annotate(frame, sample["token"], result.objects, result.tracks)
         self.frames += 1
@@ -278,11 +255,9 @@ class NuScenesExport(Observer[FrameResult]):
             found = self._annotated[row["token"]]
             row["nbr_annotations"] = len(found)
             row["first_annotation_token"], row["last_annotation_token"] = found[0], found[-1]
-        try:
+        with self._saving():
             for table, rows in self._rows.items():
                 (self._folder / VERSION / f"{table}.json").write_text(json.dumps(rows, indent=0))
-        except OSError as error:
-            raise UserError(f"{self._folder}: cannot be written: {error.strerror}") from None
 
 
 def _token(*of: object) -> str:

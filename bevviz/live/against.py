@@ -24,7 +24,8 @@ from bevviz.compare.log import place
 from bevviz.compare.sides import published, robot_topic
 from bevviz.config import LiveConfig
 from bevviz.errors import UserError
-from bevviz.frame import F64, FrameResult, LabelledBoxes2D, LabelledBoxes3D
+from bevviz.frame import F64, LabelledBoxes2D, LabelledBoxes3D
+from bevviz.results import FrameResult
 
 SECOND = 1_000_000_000
 T = TypeVar("T")

@@ -18,12 +18,13 @@ import rerun.blueprint as rrb
 from bevviz.closing import Closing
 from bevviz.compare.log import DifferenceLogger
 from bevviz.config import Config
-from bevviz.frame import FrameResult, LateResult, Scene
+from bevviz.frame import LateResult, Scene
 from bevviz.live.against import AgainstRobot, Compared
 from bevviz.live.thinning import is_cloud, thin_cloud
 from bevviz.logging import blueprints
 from bevviz.logging.logger import Context, Logger
 from bevviz.logging.sinks import APPLICATION
+from bevviz.results import FrameResult
 
 WHOLE = 1.0  # seconds from one frame that needs none before it to the next
 

@@ -9,7 +9,13 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 
-from bevviz.bags.info import Contents, TopicInfo, find_missing, network_of, render_contents
+from bevviz.bags.info import (
+    Contents,
+    TopicInfo,
+    find_missing,
+    networks_of,
+    render_contents,
+)
 from bevviz.config import Config, stated_lines
 from bevviz.frame import Frame
 from bevviz.live.source import LiveSource
@@ -50,10 +56,10 @@ def describe(
         frame = _last_frame(source, seconds)
         seconds = time.monotonic() - start
         counts, volume = source.received - before, source.volume - volume
-        lacking = source.missing
-        missing = [lacking] if lacking else find_missing(source.roles, frame, config)
-        if not config.detector.model:
-            missing.append("no detector: --model FILE.onnx")
+        absent = source.missing
+        missing = [absent] if absent else find_missing(source.roles, frame, config)
+        networks, lacking = networks_of(config)
+        missing += lacking
         return LiveInfo(
             domain=source.domain,
             middleware=source.middleware,
@@ -67,7 +73,8 @@ def describe(
             tree=source.tree,
             points_frame=frame.points_frame if frame else "",
             world_frame=frame.world_frame if frame and frame.world_from_points is not None else "",
-            network=network_of(config),
+            network=networks["detector"],
+            object_network=networks["objects"],
             configured=tuple(stated_lines(config)),
             missing=tuple(missing),
             warnings=tuple(source.warnings),

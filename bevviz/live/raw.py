@@ -22,6 +22,7 @@ from bevviz.ros.definitions import definition
 
 LEAD = 3.0  # seconds before the first frame: what it was synchronised with, and its transforms, came earlier
 BULKY = frozenset({"PointCloud2", "Image", "CompressedImage"})
+PACKETS = frozenset({"PacketMsg", "PandarScan", "VelodyneScan", "CustomMsg", "CompressedPointCloud2"})
 
 
 class RawMessage(NamedTuple):
@@ -33,8 +34,9 @@ class RawMessage(NamedTuple):
     data: bytes
 
     @property
-    def bulky(self) -> bool:
-        return self.connection.msgtype.rpartition("/")[2] in BULKY
+    def passing(self) -> bool:
+        """Whether it holds for its own time alone, as a scan or an image does."""
+        return self.connection.msgtype.rpartition("/")[2] in BULKY | PACKETS
 
 
 Sink = Callable[[RawMessage], None]
@@ -44,7 +46,7 @@ class Earlier:
     """What holds until something else is said: of each topic the last message, of transforms each one.
 
     So a map, a calibration, a robot's description and a mounting that were published once are there however
-    long ago that was. Of clouds and images none is kept.
+    long ago that was. Of clouds, what they are made of, and images none is kept.
     """
 
     def __init__(self) -> None:
@@ -52,7 +54,7 @@ class Earlier:
         self.size = 0
 
     def note(self, message: RawMessage) -> None:
-        if message.bulky:
+        if message.passing:
             return
         is_tf = message.connection.msgtype.endswith("/TFMessage")
         key = message.connection.topic, children(message.data) if is_tf else ()

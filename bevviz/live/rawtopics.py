@@ -24,6 +24,7 @@ from bevviz.live.raw import BULKY, RawMessage, RawRecorder
 from bevviz.ros.definitions import store_of
 from bevviz.ros.graph import PublishedTopic, matched_qos
 from bevviz.ros.node import Node
+from bevviz.ros.type_sources import TypeSources
 from bevviz.ros.typesupport import message_type
 
 SMALL = 1_000_000  # bytes a second of a topic that nobody here needs
@@ -38,6 +39,7 @@ class RawTopics:
     Args:
         node: subscribes, as for the source.
         recorder: gets the messages.
+        sources: asks for types that are not known.
         known: called with the messages of further topics that something else is made of, before they are
             recorded: topic, type, time of receipt, data.
     """
@@ -46,9 +48,11 @@ class RawTopics:
         self,
         node: Node,
         recorder: RawRecorder,
+        sources: TypeSources,
         known: Callable[[str, str, int, bytes], None] = lambda topic, kind, received, data: None,
     ) -> None:
         self._node, self._recorder, self._known = node, recorder, known
+        self._sources = sources
         self._connections: dict[str, Connection] = {}
         self._further: dict[str, Any] = {}  # topic -> subscription
         self._sizes: dict[str, tuple[float, int]] = {}  # topic -> since when, bytes
@@ -107,7 +111,8 @@ class RawTopics:
         try:
             kind = message_type(topic.type)
         except UserError as error:
-            self._refused[topic.name] = str(error)
+            if (why := self._sources.ask(topic)) is not None:
+                self._refused[topic.name] = f"{error}; {why}"
             return
 
         def receive(data: bytes, info: dict[str, Any]) -> None:

@@ -14,7 +14,7 @@ from typing import Any
 
 from bevviz.config import Config
 from bevviz.errors import UserError
-from bevviz.frame import Around, Frame, FrameResult, Scene, Source
+from bevviz.frame import Around, Frame, Scene, Source
 from bevviz.live.against import AgainstRobot
 from bevviz.live.control import Control
 from bevviz.live.encoder import WHOLE, Encoder, Packet
@@ -32,9 +32,10 @@ from bevviz.live.triggers import Triggers
 from bevviz.live.viewers import LATE, Viewer, remote, server, window
 from bevviz.live.warm import warm_up
 from bevviz.logging import entities
-from bevviz.perceive import StageLoader
+from bevviz.results import FrameResult
 from bevviz.run import Dropping, Items, Observer, run
 from bevviz.session import Session
+from bevviz.stage_loader import StageLoader
 
 BEHIND = 3.0  # seconds that a viewer lags when it is told
 LOOK = 1.0  # seconds between two looks at the configuration file and the clock
@@ -392,15 +393,19 @@ class Live:
 
     # --- changes -------------------------------------------------------------------------------
 
-    def update(self, settings: Sequence[str]) -> None:
+    def update(self, settings: Sequence[str], without: Sequence[str] = ()) -> None:
         """Take on settings, ``key=value`` as after ``--set``, from any thread.
+
+        Args:
+            settings: win over all before them.
+            without: of an earlier call, are taken back: what they set is as it is stated elsewhere.
 
         Raises:
             UserError: one of them is wrong; nothing is changed.
         """
         with self._changing:
-            self._apply(self._settings.read(settings))
-            self._settings.keep(self._settings.config, settings)
+            self._apply(self._settings.read(settings, without))
+            self._settings.keep(self._settings.config, settings, without)
 
     def _reload(self) -> None:
         try:
@@ -421,6 +426,8 @@ class Live:
         if config.live.nice != nice:
             self._nice(config.live.nice)
         for key, change in changed.items():
+            if ".params." in key and "absent" in (change.before, change.after):
+                continue  # it comes or goes with a method, which is told
             late = "; takes effect at the next start" if key.startswith(AT_START) else ""
             self.notes.info(f"configuration: {key} {change}{late}")
 

@@ -48,13 +48,17 @@ class Settings:
         self._version = version
         return version is not None
 
-    def read(self, more: Sequence[str] = ()) -> Config:
-        """The configuration as it is now, with more settings; ``keep`` makes them last.
+    def read(self, more: Sequence[str] = (), without: Sequence[str] = ()) -> Config:
+        """The configuration as it is now; ``keep`` makes it last.
+
+        Args:
+            more: further settings.
+            without: those of before that are taken back.
 
         Raises:
             UserError: as ``bevviz.config.load``.
         """
-        return load(self.file, [*self._settings, *more], self._preset, layers=self._layers)
+        return load(self.file, self._with(more, without), self._preset, layers=self._layers)
 
     def take(self, more: Sequence[str]) -> None:
         """More settings, before anything runs with them.
@@ -64,9 +68,15 @@ class Settings:
         """
         self.keep(self.read(more), more)
 
-    def keep(self, config: Config, more: Sequence[str] = ()) -> None:
+    def keep(self, config: Config, more: Sequence[str] = (), without: Sequence[str] = ()) -> None:
         self.config = config
-        self._settings += more
+        self._settings = self._with(more, without)
+
+    def _with(self, more: Sequence[str], without: Sequence[str]) -> list[str]:
+        newest_first = self._settings[::-1]
+        for setting in without:
+            newest_first.remove(setting)
+        return [*newest_first[::-1], *more]
 
     def _stat(self) -> tuple[int, int, int] | None:
         """Editors write in place or put another file there; None while it is missing."""

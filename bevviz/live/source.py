@@ -7,28 +7,31 @@ import time
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from types import MappingProxyType
+from functools import partial
 from typing import Any
 
 from bevviz.closing import Closing
 from bevviz.config import Config, SourceConfig, stage_topics
 from bevviz.errors import UserError
 from bevviz.frame import Frame, Intrinsics, LateResult, Mark, Scene
+from bevviz.live.message import LiveMessage
+from bevviz.live.ousters import Ousters
 from bevviz.live.raw import RawRecorder
 from bevviz.live.rawtopics import RawTopics
+from bevviz.live.stated import resolved, stated_topics, without_absent
 from bevviz.live.watch import SILENCE, Watch
 from bevviz.queues import NewestQueue
-from bevviz.ros import around
-from bevviz.ros.compressed import decompress, is_compressed
+from bevviz.ros import around, ouster
 from bevviz.ros.definitions import store_of
 from bevviz.ros.graph import PublishedTopic, full_name, matched_qos, mismatches, published_topics
-from bevviz.ros.livox import is_livox, read_custom
-from bevviz.ros.messages import MessageError, read_header
+from bevviz.ros.livox import is_livox
+from bevviz.ros.messages import MessageError
 from bevviz.ros.node import Node
 from bevviz.ros.objects import holds_boxes
-from bevviz.ros.packets import is_packets, read_scan
+from bevviz.ros.packets import is_packets
 from bevviz.ros.point_cloud_interfaces import COMPRESSED
-from bevviz.ros.roles import MARK, STAGE_KINDS, Roles, Topic, find_roles, foreign
+from bevviz.ros.roles import MARK, Roles, Topic, find_roles, foreign
+from bevviz.ros.type_sources import TypeSources
 from bevviz.ros.typesupport import message_type
 from bevviz.run import BURST
 from bevviz.sync.around import MARKS
@@ -57,38 +60,6 @@ KINDS = {
     "vision_msgs/msg/Detection3DArray",
     *around.TYPES,
 }
-
-
-@dataclass(frozen=True, slots=True)
-class LiveMessage:
-    topic: str
-    type: str
-    received: int  # nanoseconds, when the middleware had it
-    data: bytes  # CDR
-
-    def header(self) -> tuple[int, str]:
-        return read_header(self.data, "<" if self.data[1:2] != b"\0" else ">", self.topic)
-
-    def decode(self, calibration: Mapping[str, str] = MappingProxyType({})) -> Any:
-        """The message as an object with the fields of its definition.
-
-        ``calibration`` is that of the LiDARs, by topic, as ``source.lidar_calibration`` has it.
-
-        Raises:
-            MessageError: the data does not fit the definition.
-        """
-        try:
-            if is_livox(self.type):
-                return read_custom(self.data, ros1=False)
-            if is_packets(self.type):
-                return read_scan(
-                    self.data, self.type, ros1=False, calibration=calibration.get(self.topic, "")
-                )
-            found = store_of(self.type).deserialize_cdr(self.data, self.type)
-            return decompress(found) if is_compressed(self.type) else found
-        except Exception as error:  # generated decoders raise whatever the bytes lead them to
-            reason = str(error) or type(error).__name__
-            raise MessageError(f"{self.topic}: not a {self.type}: {reason}") from None
 
 
 @dataclass(slots=True)
@@ -139,6 +110,7 @@ class LiveSource(Closing):
         self._subscriptions: dict[str, _Subscription] = {}
         self._handlers: dict[str, Handler[LiveMessage]] = {}
         self._sync = Synchronizer(self.roles, config)
+        self._ousters = Ousters()
         self._begun = self._changed = self._last_cloud = time.monotonic()
         self._settled = threading.Event()
         self._complete = False  # the scene is known
@@ -152,7 +124,8 @@ class LiveSource(Closing):
         self._ended = False
 
         self._node = Node(arguments, on_end=self.stop, name=name)
-        self._raw = None if raw is None else RawTopics(self._node, raw)
+        self._type_sources = TypeSources(self._node)
+        self._raw = None if raw is None else RawTopics(self._node, raw, self._type_sources)
         mark = self._node.resolve(MARK)  # heard before anybody says something: it may be said once
         self._mark = PublishedTopic(mark, "std_msgs/msg/String", ())
         self._add_timer(LOOK, self._look)
@@ -227,12 +200,15 @@ class LiveSource(Closing):
     def _misstated(self) -> dict[str, str]:
         """Topics that the configuration states and that nobody publishes, or with another type."""
         found = {}
-        of_boxes = _resolved(self.config.source, self._node.resolve).boxes.get("topic")
-        for name, (key, kinds) in _stated(self.config, self._node.resolve).items():
-            topic = self.topics.get(name)
+        stated = resolved(self.config.source, self._node.resolve)
+        topics = {topic.name: topic for topic in self._look_up(self.topics.values(), stated)}
+        for name, (key, kinds) in stated_topics(self.config, self._node.resolve).items():
+            topic = topics.get(name)
             if topic is None:
                 found[name] = f"nobody publishes {name}, which {key} states"
-            elif kinds and Topic(name, topic.type, boxes=name == of_boxes).kind not in kinds:
+            elif topic.aside and "PointCloud2" in kinds:
+                found[name] = f"{name}, which {key} states, holds {topic.aside}"
+            elif kinds and topic.kind not in kinds:
                 found[name] = f"{name} is a {topic.type}, but {key} takes {' or '.join(kinds)}"
         return found
 
@@ -332,7 +308,7 @@ class LiveSource(Closing):
         first = self._watch.add(topic, len(data))
         before = self._sync.cameras.intrinsics.get(topic)
         try:
-            if first and kind.endswith(("PointCloud2", "Image")):
+            if first and (kind.endswith(("PointCloud2", "Image")) or is_livox(kind) or is_packets(kind)):
                 self.frame_ids[topic] = message.header()[1]
                 self._assign()
             if (handler := self._handlers.get(topic)) is not None:
@@ -371,9 +347,11 @@ class LiveSource(Closing):
         received = self.received
         known = {name: topic for name, topic in self._known.items() if received[name]}
         known.setdefault(self._mark.name, self._mark)
-        of_boxes = _resolved(self.config.source, self._node.resolve).boxes.get("topic")
+        of_boxes = resolved(self.config.source, self._node.resolve).boxes.get("topic")
+        packets = [name for name, topic in self.topics.items() if ouster.is_packet(topic.type)]
+        besides = {of_boxes, *map(ouster.metadata_of, packets)}
         self._known = known | {
-            name: topic for name, topic in self.topics.items() if _concerns(topic) or name == of_boxes
+            name: topic for name, topic in self.topics.items() if _concerns(topic) or name in besides
         }
         self._assign()
         if self._raw is not None:
@@ -428,7 +406,7 @@ class LiveSource(Closing):
         quiet = f"no cloud for {SILENCE:.0f} s on {', '.join(self.roles.lidars)}"
         watch.note("silence", quiet if silent else "", "the clouds are back")
         misstated = self._misstated() if time.monotonic() - self._begun > SETTLE + LOOK else {}
-        for name in _stated(self.config, self._node.resolve):
+        for name in stated_topics(self.config, self._node.resolve):
             watch.note(
                 f"{name} stated", misstated.get(name, ""), f"{name} is there, as the configuration states"
             )
@@ -444,14 +422,16 @@ class LiveSource(Closing):
 
     def _assign(self) -> None:
         """Give the topics their roles, and listen to those that play one."""
-        topics = [Topic(t.name, t.type, None, self.frame_ids.get(t.name, "")) for t in self._known.values()]
-        stated = _resolved(self.config.source, self._node.resolve)
+        stated = resolved(self.config.source, self._node.resolve)
+        topics = self._look_up(self._known.values(), stated)
+        if stated.lidar_topics:  # packets without their metadata are waited for
+            topics = [t for t in topics if not (t.aside and t.name in stated.lidar_topics)]
         there = {topic.name for topic in topics}
         # As with sensors: one that is not there yet is waited for.
         stages = {key: self._node.resolve(name) for key, name in stage_topics(self.config).items()}
         stages = {key: name for key, name in stages.items() if name in there}
         try:
-            roles = find_roles(*_without_absent(topics, stated), stages, results=self._results)
+            roles = find_roles(*without_absent(topics, stated), stages, results=self._results)
         except UserError as error:
             self._watch.note("roles", str(error))
             return
@@ -462,18 +442,41 @@ class LiveSource(Closing):
             former, self._sync = self._sync, Synchronizer(roles, self.config, beside=results)
             self._sync.take_over(former)
             self._handlers = make_handlers(self._sync, roles, self._decode)
+            for name in self._ousters.packets & self._handlers.keys():
+                self._handlers[name] = partial(self._gather, self._handlers[name])
         elif roles.around != self.roles.around:
             others = self._handlers.keys() - {topic for topic, _, _ in self.roles.around}
             self._handlers = {topic: self._handlers[topic] for topic in others}
             self._handlers |= make_around_handlers(self._sync, roles, LiveMessage.decode)
         self.roles = roles
+        told = [name for name in self._ousters.metadata if name in self._known]
+        self._handlers |= dict.fromkeys(told, self._add_metadata)
         for name in self._subscriptions.keys() - self._handlers.keys():
             self._node.input.destroy_subscription(self._subscriptions.pop(name).handle)
         for name in self._handlers:
             self._listen(self._known[name])
 
+    def _look_up(self, topics: Iterable[PublishedTopic], stated: SourceConfig) -> list[Topic]:
+        """What is known of topics, given what the configuration states."""
+        boxes = stated.boxes.get("topic", "")
+        found = [
+            Topic(t.name, t.type, None, self.frame_ids.get(t.name, ""), boxes=t.name == boxes) for t in topics
+        ]
+        return self._ousters.look(found, stated.lidar_calibration)
+
+    def _add_metadata(self, message: LiveMessage) -> None:
+        if self._ousters.add_metadata(message.topic, message.decode().data):
+            self._watch.tell(f"the metadata on {message.topic} have changed")
+        self._assign()
+
+    def _gather(self, handler: Handler[LiveMessage], message: LiveMessage) -> None:
+        """Packets go on as scans, each received when its last one was."""
+        sensor = self._ousters.sensor(message.topic)
+        for packets in self._ousters.add_packet(message.topic, message.received, message.data):
+            handler(replace(message, received=packets[-1][0], data=b"", sensor=sensor, packets=packets))
+
     def _decode(self, message: LiveMessage) -> Any:
-        return message.decode(_resolved(self.config.source, self._node.resolve).lidar_calibration)
+        return message.decode(resolved(self.config.source, self._node.resolve).lidar_calibration)
 
     def _listen(self, topic: PublishedTopic) -> None:
         """Subscribe, or again where the publishers now offer something else."""
@@ -484,8 +487,11 @@ class LiveSource(Closing):
             if not (is_livox(topic.type) or is_packets(topic.type)):
                 store_of(topic.type)
         except UserError as error:
-            self._watch.note(f"{topic.name} type", f"{topic.name} is not received: {error}")
+            why = self._type_sources.ask(topic)
+            text = f"{topic.name} is not received: {error}; {why}" if why is not None else ""
+            self._watch.note(f"{topic.name} type", text)
             return
+        self._watch.note(f"{topic.name} type", "", f"{topic.name} can be received now")
         qos = matched_qos(topic.publishers, topic.type.rpartition("/")[2])
         former = self._subscriptions.get(topic.name)
         if former is not None:
@@ -532,58 +538,3 @@ def _concerns(topic: PublishedTopic) -> bool:
         or holds_boxes(topic.type)
         or bool(foreign(Topic(topic.name, topic.type, None, "")))
     )
-
-
-def _stated(config: Config, resolve: Callable[[str], str]) -> dict[str, tuple[str, tuple[str, ...]]]:
-    """The topics that the configuration names: where, and which types they may have; none: any."""
-    source, images = _resolved(config.source, resolve), ("Image", "CompressedImage")
-    found: dict[str, tuple[str, tuple[str, ...]]] = {}
-    for key, names, kinds in (
-        ("source.lidar_topics", source.lidar_topics, ("PointCloud2",)),
-        ("source.camera_topics", source.camera_topics, images),
-        ("source.camera_info_topics", source.camera_info_topics, images),
-        ("source.camera_info_topics", source.camera_info_topics.values(), ("CameraInfo",)),
-        ("source.odometry_topic", filter(None, [source.odometry_topic]), ("Odometry",)),
-        ("source.boxes", filter(None, [source.boxes.get("topic", "")]), ()),
-    ):
-        found |= dict.fromkeys(names, (key, kinds))
-    stages = stage_topics(config)
-    return found | {resolve(name): (key, (STAGE_KINDS[key],)) for key, name in stages.items()}
-
-
-def _resolved(config: SourceConfig, resolve: Callable[[str], str]) -> SourceConfig:
-    """The configuration with the topics' names on the graph."""
-    infos, boxes = config.camera_info_topics, config.boxes
-    return config.model_copy(
-        update={
-            "lidar_topics": tuple(map(resolve, config.lidar_topics)),
-            "camera_topics": tuple(map(resolve, config.camera_topics)),
-            "camera_info_topics": {resolve(image): resolve(info) for image, info in infos.items()},
-            "odometry_topic": config.odometry_topic and resolve(config.odometry_topic),
-            "boxes": {key: resolve(path) if key == "topic" else path for key, path in boxes.items()},
-            "lidar_calibration": {resolve(name): file for name, file in config.lidar_calibration.items()},
-        }
-    )
-
-
-def _without_absent(topics: list[Topic], config: SourceConfig) -> tuple[list[Topic], SourceConfig]:
-    """A given topic that is not there yet is waited for; no other one may take its role meanwhile."""
-    names = {topic.name for topic in topics}
-    changes: dict[str, Any] = {}
-    for key, kinds in (("lidar_topics", {"PointCloud2"}), ("camera_topics", {"Image", "CompressedImage"})):
-        given = getattr(config, key)
-        changes[key] = tuple(name for name in given if name in names)
-        if given and not changes[key]:
-            topics = [topic for topic in topics if topic.kind not in kinds]
-    changes["camera_info_topics"] = {
-        image: info for image, info in config.camera_info_topics.items() if {image, info} <= names
-    }
-    if config.boxes.get("topic", "") not in names:
-        changes["boxes"] = {}
-    changes["lidar_calibration"] = {
-        name: file for name, file in config.lidar_calibration.items() if name in names
-    }
-    if config.odometry_topic and config.odometry_topic not in names:
-        changes["odometry_topic"] = ""
-        topics = [topic for topic in topics if topic.kind != "Odometry"]
-    return topics, config.model_copy(update=changes)

@@ -7,7 +7,7 @@ import time
 
 from bevviz.anomalies import Onsets
 from bevviz.config import LiveConfig
-from bevviz.frame import FrameResult
+from bevviz.results import FrameResult
 
 
 class Triggers:

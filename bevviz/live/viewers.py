@@ -128,14 +128,7 @@ class Viewer(Output):
         self._thread.join(patience)
 
     def _start(self) -> subprocess.Popen[bytes]:
-        return subprocess.Popen(
-            self._program.command,
-            stdin=subprocess.PIPE,
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.DEVNULL,
-            env=rerun_cli.environment(),
-            start_new_session=True,  # Ctrl-C is for us alone
-        )
+        return rerun_cli.spawn(self._program.command)
 
     def _run(self) -> None:
         self._begin(self._encoder.context)

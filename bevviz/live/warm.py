@@ -8,23 +8,12 @@ from typing import Any
 import numpy as np
 
 from bevviz.config import Config
-from bevviz.frame import (
-    F64,
-    Camera,
-    Cloud,
-    Detections,
-    DetectionState,
-    Frame,
-    FrameResult,
-    Image,
-    Intrinsics,
-    Masks,
-    Scene,
-)
+from bevviz.frame import F64, Camera, Cloud, Frame, Image, Intrinsics, Scene
 from bevviz.geometry import inverse
 from bevviz.live.encoder import Encoder
-from bevviz.perceive import StageLoader
+from bevviz.results import Detections, DetectionState, FrameResult, Masks
 from bevviz.session import Session
+from bevviz.stage_loader import StageLoader
 
 SCENE = Scene("warm", "lidar", ("lidar",), ("camera",))
 PERIOD = 100_000_000  # nanoseconds

@@ -5,10 +5,10 @@ from __future__ import annotations
 import rerun as rr
 
 from bevviz.colors import palette, turbo
-from bevviz.frame import ClusterState, DetectionState
 from bevviz.logging import entities
 from bevviz.logging.entities import ClassId
 from bevviz.logging.writer import Writer
+from bevviz.results import ClusterState, DetectionState
 
 FAINT = (150, 150, 160, 110)
 

@@ -8,9 +8,9 @@ from collections.abc import Sequence
 import rerun as rr
 
 from bevviz.anomalies import KINDS
-from bevviz.frame import Anomaly, FrameResult
 from bevviz.logging import entities
 from bevviz.logging.writer import Writer
+from bevviz.results import Anomaly, FrameResult
 
 
 def log_anomalies_looks(to: Writer) -> None:

@@ -9,10 +9,11 @@ import rerun as rr
 
 from bevviz import geometry
 from bevviz.config import BevConfig, Config
-from bevviz.frame import F32, F64, Bev, FrameResult
+from bevviz.frame import F32, F64
 from bevviz.logging import entities, keep
 from bevviz.logging.pieces import blob, jpeg, png
 from bevviz.logging.writer import Writer
+from bevviz.results import Bev, FrameResult
 
 _TURNED = np.array([0.0, 0.0, -np.sqrt(0.5), np.sqrt(0.5)])  # by -90 degrees about z, as x, y, z, w
 

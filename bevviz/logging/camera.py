@@ -11,26 +11,13 @@ import rerun as rr
 
 from bevviz import geometry
 from bevviz.colors import bins, class_color
-from bevviz.frame import (
-    F32,
-    F64,
-    I64,
-    Camera,
-    CameraResult,
-    Decision,
-    Detections,
-    DetectionState,
-    Explanation,
-    Frame,
-    Image,
-    Intrinsics,
-    Masks,
-)
+from bevviz.frame import F32, F64, I64, Camera, Frame, Image, Intrinsics
 from bevviz.logging import entities, keep
 from bevviz.logging.annotations import FAINT, depth_annotations
 from bevviz.logging.pieces import CORNER, boxes2d, encode_image, scored, transform
 from bevviz.logging.spoken import IN_IMAGE, apart, log_spoken_in_image, log_spoken_looks_in_image
 from bevviz.logging.writer import Writer
+from bevviz.results import CameraResult, Decision, Detections, DetectionState, Explanation, Masks
 
 if TYPE_CHECKING:
     from bevviz.logging.video import VideoEncoder

@@ -9,11 +9,12 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
-from bevviz.frame import F32, Frame, FrameResult, Quantity
+from bevviz.frame import F32, Frame, Quantity
 from bevviz.logging import color_by, entities, keep
 from bevviz.logging.entities import ClassId
 from bevviz.logging.pieces import rounded, transform
 from bevviz.logging.writer import Writer
+from bevviz.results import FrameResult
 from bevviz.stages.voxel import of_points
 
 RawCloud: TypeAlias = tuple[str, F32, NDArray[np.uint16]]  # entity, points, class id of each

@@ -9,11 +9,12 @@ import rerun as rr
 from numpy.typing import NDArray
 
 from bevviz.config import ClusteringConfig
-from bevviz.frame import F32, I32, I64, Bool, Clusters, ClusterState, Frame, Tracks
+from bevviz.frame import F32, I32, I64, Bool, Frame
 from bevviz.logging import entities, keep, tracks
 from bevviz.logging.cloud import coarse
 from bevviz.logging.pieces import OUTLINE, boxes3d
 from bevviz.logging.writer import Writer
+from bevviz.results import Clusters, ClusterState, Tracks
 
 
 def log_clusters_looks(to: Writer, lidars: Iterable[str]) -> None:

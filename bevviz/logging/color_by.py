@@ -17,9 +17,10 @@ from numpy.typing import NDArray
 from rerun.blueprint.encodings import ComponentSourceKind, VisualizerComponentMapping
 
 from bevviz.colors import palette, turbo
-from bevviz.frame import F32, RING_FIELDS, FrameResult, Quantity
+from bevviz.frame import F32, RING_FIELDS, Quantity
 from bevviz.logging import entities
 from bevviz.logging.annotations import point_classes
+from bevviz.results import FrameResult
 from bevviz.stages.voxel import of_points
 
 ClassIds: TypeAlias = NDArray[np.unsignedinteger]

@@ -7,13 +7,15 @@ from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
 
-from bevviz.frame import Detections, DetectionState, Explanation, FrameResult
 from bevviz.logging import entities
 from bevviz.logging.pieces import document, scored
 from bevviz.logging.writer import Writer
+from bevviz.results import Detections, DetectionState, Explanation, FrameResult
 from bevviz.text import markdown
 
 _WEAK = {"not_kept", "below_threshold", "suppressed"}
+_DOUBT = {"contradicted": 0, "missed": 1, "named otherwise": 2, "confirmed": 3}  # what is read first
+_LINES = 5  # of a frame's contradicted objects that have a line of the log: a network may have hundreds
 _MANY = {"out_of_view", "too_small", "too_large"}  # clusters that are only counted and numbered
 
 
@@ -38,7 +40,7 @@ def remarks(result: FrameResult) -> list[tuple[str, str]]:
         for e in result.explanations
         if e.subject == "detection" and e.state not in _WEAK and e.state != "matched"
     ]
-    return lines
+    return lines + [("INFO", text) for text in _in_doubt(result.explanations)]
 
 
 def _lines(result: FrameResult) -> Iterator[str]:
@@ -51,6 +53,12 @@ def _lines(result: FrameResult) -> Iterator[str]:
     problems = list(frame.problems)
     problems += [e.text for e in result.explanations if e.subject == "camera"]
     yield from _section("Problems", map(markdown, problems))
+    objects = [e for e in result.explanations if e.subject == "object"]
+    said = [e for e in objects if e.state != "unseen"]
+    missed = [e for e in result.explanations if e.subject == "fused" and e.state == "missed"]
+    worst = sorted([*said, *missed], key=lambda e: _DOUBT.get(e.state, len(_DOUBT)))
+    unseen = [f"{len(objects) - len(said)} unseen"] if len(objects) > len(said) else []
+    yield from _section("Objects, by cameras and our fusion", [*map(_item, worst), *unseen])
     for camera in result.cameras:
         name = camera.camera.name
         mine = [e for e in result.explanations if e.subject == "detection" and e.camera == name]
@@ -64,6 +72,16 @@ def _lines(result: FrameResult) -> Iterator[str]:
         made = [e for e in result.explanations if e.subject == "split" and e.camera == name]
         yield from _section(f"{name}: clusters split and merged", map(_item, made))
     yield from _clusters([e for e in result.explanations if e.subject == "cluster" and not e.camera], "")
+
+
+def _in_doubt(explanations: Iterable[Explanation]) -> Iterator[str]:
+    """Of somebody else's objects those that a camera contradicts, and what is missed among them."""
+    said = [(e.subject, e.state, e.text) for e in explanations]
+    denied = [text for *what, text in said if what == ["object", "contradicted"]]
+    yield from denied[:_LINES]
+    if len(denied) > _LINES:
+        yield f"{len(denied) - _LINES} more objects contradicted"
+    yield from (text for *what, text in said if what == ["fused", "missed"])
 
 
 def _not_kept(explanations: Sequence[Explanation], found: Detections) -> Iterator[str]:

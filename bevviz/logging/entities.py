@@ -5,7 +5,8 @@ from __future__ import annotations
 import re
 from enum import IntEnum
 
-from bevviz.frame import AnomalyKind, ClusterState, DetectionState
+from bevviz.config import AnomalyKind
+from bevviz.results import ClusterState, DetectionState
 
 # --- timelines ---------------------------------------------------------------------------------
 
@@ -15,12 +16,15 @@ FRAME = "frame"  # sequence
 VERSION = "version"  # sequence: of the configuration, in bevviz tune
 RECEIVED = "received"  # when the cloud was received, or logged into the bag
 
+SLACK = 1000  # nanoseconds that a time which a viewer tells may be off: it counts them in doubles
+
 # --- entities ----------------------------------------------------------------------------------
 
 WORLD = "/world"
 DIAGNOSTICS = "/robot/diagnostics"
 FUSED = "/world/fused"
 MEASURED = "/world/fused/measured"
+FUSION = "/world/fusion"  # what our fusion would have made, where the objects are somebody else's
 MISSED = "/world/missed"
 FALSE = "/world/false"
 UNNAMED = "/world/unnamed"
@@ -63,7 +67,7 @@ EVALUATE_LOG = "/evaluate/log"
 
 # Names that no sensor can have, as they are something else where it has its entities.
 RESERVED = frozenset(
-    {path.split("/")[2] for path in (FUSED, FRUSTUMS, GRID, TRUTH, TRACKS, MISSED, FALSE, UNNAMED)}
+    {path.split("/")[2] for path in (FUSED, FUSION, FRUSTUMS, GRID, TRUTH, TRACKS, MISSED, FALSE, UNNAMED)}
     | {path.split("/")[2] for path in (COMPARE_ABOUT, COMPARE_LOG, COMPARE_STATES)}
     | {"objects", "count"}  # of /compare
     | {"pipeline", "marks"}  # of /explain/states
@@ -136,6 +140,16 @@ def boxes_of(path: str) -> str:
 
 def projected(camera: str) -> str:
     return f"{WORLD}/{camera}/image/points"
+
+
+def image_opinion(camera: str, opinion: str) -> str:
+    """Objects of somebody else's of which cameras say so, or which they lack, over the image."""
+    return f"{image(camera)}/opinions/{_part(opinion)}"
+
+
+def overlay_opinion(opinion: str) -> str:
+    """The same over the bird's-eye image."""
+    return overlay(f"opinions/{_part(opinion)}")
 
 
 def channel(name: str) -> str:

@@ -9,11 +9,12 @@ import rerun as rr
 
 from bevviz import geometry
 from bevviz.colors import class_color
-from bevviz.frame import F32, CameraResult, Decision, Frame
+from bevviz.frame import F32, Frame
 from bevviz.logging import entities
 from bevviz.logging.camera import camera_pose
 from bevviz.logging.pieces import edges, scored
 from bevviz.logging.writer import Writer
+from bevviz.results import CameraResult, Decision
 
 _NEAR = 0.3  # metres from the camera
 _UNMATCHED_COLOR = (80, 80, 92)

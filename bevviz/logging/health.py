@@ -10,9 +10,10 @@ import rerun as rr
 
 from bevviz.colors import SERIES
 from bevviz.counts import counts_of
-from bevviz.frame import Frame, FrameResult
+from bevviz.frame import Frame
 from bevviz.logging import entities
 from bevviz.logging.writer import Writer
+from bevviz.results import FrameResult
 
 # Curves of one plot, in the order of their colours: the viewer's own may be the same twice.
 STAGES = (

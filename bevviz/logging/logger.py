@@ -11,7 +11,7 @@ import rerun as rr
 
 from bevviz.anomalies import Onsets
 from bevviz.config import Config
-from bevviz.frame import Frame, FrameResult, Intrinsics, LateResult, Scene
+from bevviz.frame import Frame, Intrinsics, LateResult, Scene
 from bevviz.logging import entities
 from bevviz.logging.annotations import log_world
 from bevviz.logging.anomalies import log_anomalies, log_anomalies_looks
@@ -50,11 +50,18 @@ from bevviz.logging.health import Rates, log_health, log_health_looks
 from bevviz.logging.keep import COARSE, FINE, Around, Held, is_whole, sorted_rows, step
 from bevviz.logging.labelled import forget_late, log_late, log_robot, log_truth, log_truth_looks
 from bevviz.logging.objects import log_objects, log_objects_looks
+from bevviz.logging.opinions import (
+    log_fusion,
+    log_opinions_from_above,
+    log_opinions_in_images,
+    log_opinions_looks,
+)
 from bevviz.logging.origin import log_origin
 from bevviz.logging.pieces import transform
 from bevviz.logging.states import COLORS, StateLanes, states_of, track_states
 from bevviz.logging.tracks import Lanes, log_speeds, log_tracks, log_tracks_looks
 from bevviz.logging.writer import Writer
+from bevviz.results import FrameResult
 
 STALE = 3_000_000_000  # nanoseconds that the newest late result of the robot is shown
 
@@ -159,6 +166,8 @@ class Logger(Writer):
         log_clusters_looks(self, lidars)
         log_camera_looks(self, self._scene.cameras)
         log_objects_looks(self)
+        if self._has_opinions:
+            log_opinions_looks(self, self._scene.cameras)
         log_tracks_looks(self)
         log_truth_looks(self)
         log_anomalies_looks(self)
@@ -177,13 +186,21 @@ class Logger(Writer):
 
     def reconfigure(self, config: Config, scene: Scene) -> None:
         """From here on the results are made in another way, or of other sensors."""
+        had_opinions = self._has_opinions
         same, self._config, self._scene = scene == self._scene, config, scene
         self._changed = True
         self.streams_video = config.logging.video == "stream"
         if same:  # the viewer loses class colours that are logged twice
             log_origin(self, config, scene, self._network)
+            if self._has_opinions and not had_opinions:
+                log_opinions_looks(self, scene.cameras)
         else:
             self.log_static()
+
+    @property
+    def _has_opinions(self) -> bool:
+        """Whether objects are somebody else's, so that cameras have opinions on them."""
+        return self._config.objects.method != "frustum"
 
     # --- each frame ----------------------------------------------------------------------------
 
@@ -257,10 +274,12 @@ class Logger(Writer):
             log_detections(self, camera, result.explanations)
             if self._config.logging.projected_points and self._config.logging.keep != "report":
                 log_projected_points(self, camera, packed=not is_whole(self._config))
+        log_opinions_in_images(self, result)
         log_frustums(self, frame, result.cameras)
         log_decisions(self, result)
         if result.bev is not None:
             log_bev(self, result.bev, self._config)
+            log_opinions_from_above(self, result)
             if self._config.logging.keep != "report":
                 log_grid(self, result, result.bev)
         if not self.root:
@@ -277,6 +296,7 @@ class Logger(Writer):
     ) -> None:
         frame = result.frame
         log_objects(self, result)
+        log_fusion(self, result)
         if result.tracks is not None:
             log_tracks(self, frame, result.tracks, self._config.bev)
         lines = marks(frame) if self.root else self._around.lines(frame)

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import rerun as rr
 
 from bevviz import anomalies
 from bevviz.colors import class_color
-from bevviz.frame import SIDES, FrameResult, Objects
 from bevviz.logging import entities, tracks
+from bevviz.logging.opinions import marked
 from bevviz.logging.pieces import boxes3d, scored, transform
 from bevviz.logging.spoken import log_spoken, log_spoken_looks, named_in_space
 from bevviz.logging.writer import Writer
+from bevviz.results import SIDES, FrameResult, Objects, Opinion
 
 
 def log_objects_looks(to: Writer) -> None:
@@ -36,6 +39,12 @@ def log_objects(to: Writer, result: FrameResult) -> None:
             ids[j], speeds[j] = tracked.id[row], tracked.speed[row]
     matches = zip(objects.camera, objects.detection.tolist(), strict=True)
     why = [reasons.get(match, "") for match in matches]
+    opinions, values = result.opinions, dict[str, Any]()
+    if opinions is not None:
+        said = {e.row: e.text for e in result.explanations if e.subject == "object"}
+        why = [said.get(j, "") for j in range(len(objects))]
+        values["opinion"] = [Opinion(value).word for value in opinions.opinion.tolist()]
+        is_odd |= opinions.opinion == Opinion.CONTRADICTED
     colors = [class_color(name) for name in objects.names]
     to.put(
         entities.FUSED,
@@ -50,6 +59,7 @@ def log_objects(to: Writer, result: FrameResult) -> None:
             camera=list(objects.camera),
             seen=sides(objects),
             reason=why,
+            **values,
         ),
     )
     away = np.hypot(*objects.boxes.center[:, :2].T)
@@ -58,12 +68,12 @@ def log_objects(to: Writer, result: FrameResult) -> None:
         to,
         entities.FUSED,
         objects.boxes,
-        [label if named else "" for label, named in zip(labels, is_named, strict=True)],
+        [label if named else "" for label, named in zip(_with_doubts(labels, result), is_named, strict=True)],
         [
             f"{label}, {metres:.1f} m away: {reason.partition(': ')[2] or 'an object'}"
             for label, metres, reason in zip(labels, away, why, strict=True)
         ],
-        colors,
+        marked(result, colors),
     )
     if objects.measured is not None:
         rows = np.flatnonzero((objects.measured.size != objects.boxes.size).any(axis=1))
@@ -72,6 +82,18 @@ def log_objects(to: Writer, result: FrameResult) -> None:
                 objects.measured, rows, [labels[j] for j in rows], colors=[colors[j] for j in rows]
             )
             to.put(entities.MEASURED, transform(result.frame.pose), measured)
+
+
+def _with_doubts(labels: list[str], result: FrameResult) -> list[str]:
+    """As they are written beside the boxes: what a camera says against one comes with its name."""
+    if result.opinions is None:
+        return labels
+    said = map(Opinion, result.opinions.opinion.tolist())
+    doubts = Opinion.CONTRADICTED, Opinion.NAMED_OTHERWISE
+    return [
+        f"{label}, {opinion.word}" if opinion in doubts else label
+        for label, opinion in zip(labels, said, strict=True)
+    ]
 
 
 def sides(objects: Objects) -> list[str]:

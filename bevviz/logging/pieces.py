@@ -12,8 +12,9 @@ import rerun as rr
 from numpy.typing import NDArray
 
 from bevviz import geometry
-from bevviz.frame import F32, F64, U8, Boxes3D, Image
+from bevviz.frame import F32, F64, U8, Boxes3D, Camera, Image
 from bevviz.stages.kernel import kernel
+from bevviz.stages.visibility import image_points
 
 CORNER = 0.5  # pixels: Rerun counts from the corner of the first pixel, bevviz from its centre
 OUTLINE = rr.components.FillMode.MajorWireframe
@@ -43,8 +44,34 @@ def boxes2d(xyxy: F32, labels: list[str], **looks: Any) -> rr.Boxes2D:
 
 
 def edges(corners: F32) -> F32:
-    """(..., 16, 3) every edge of a box or frustum, given its (..., 8, 3) corners, in one stroke."""
+    """(..., 16, D) every edge of a box or frustum, given its (..., 8, D) corners, in one stroke."""
     return corners[..., _EDGES, :]
+
+
+def image_outlines(boxes: Boxes3D, camera: Camera) -> list[F32]:
+    """What can be drawn in an image of each of (K,) boxes around the robot: one stroke of (M, 2) pixels.
+
+    Every edge, where all of them are in the image; else the outline of what is, cut at the image's edge. Of
+    one that is not in it there are no points.
+    """
+    nothing = np.zeros((0, 2), np.float32)
+    if camera.intrinsics is None or (found := image_points(boxes, camera)) is None:
+        return [nothing] * len(boxes)
+    width, height = camera.intrinsics.width - 0.5, camera.intrinsics.height - 0.5
+    image = np.array([(-0.5, -0.5), (width, -0.5), (width, height), (-0.5, height)], np.float32)
+    with np.errstate(invalid="ignore"):
+        inside = (found >= image[0]) & (found < image[2])
+    is_whole: list[bool] = inside[:, :8].all(axis=(1, 2)).tolist()
+    outlines = []
+    for points, whole in zip(found, is_whole, strict=True):
+        if whole:
+            outlines.append(edges(points[:8]))
+            continue
+        area, cut, known = 0.0, nothing, points[np.isfinite(points[:, 0]) & np.isfinite(points[:, 1])]
+        if len(known):
+            area, cut = cv2.intersectConvexConvex(cv2.convexHull(known), image)
+        outlines.append(np.concatenate([cut[:, 0], cut[:1, 0]]) if area > 0 else nothing)
+    return outlines
 
 
 def strips(points: F32, lengths: NDArray[np.integer]) -> pa.Array:

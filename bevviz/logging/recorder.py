@@ -7,10 +7,10 @@ from typing import Any
 import rerun as rr
 
 from bevviz.config import Config
-from bevviz.frame import FrameResult
 from bevviz.logging.logger import Logger
 from bevviz.logging.sinks import Sinks
 from bevviz.logging.writer import WAIT
+from bevviz.results import FrameResult
 from bevviz.run import Items, Observer
 
 

@@ -51,6 +51,26 @@ def environment() -> dict[str, str]:
     return given
 
 
+def spawn(command: Sequence[str], stdin: int = subprocess.PIPE) -> Process:
+    """Start a command beside us, silently.
+
+    Args:
+        command: its words.
+        stdin: as ``subprocess`` takes it.
+
+    Raises:
+        OSError: there is no such program.
+    """
+    return subprocess.Popen(
+        command,
+        stdin=stdin,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        env=environment(),
+        start_new_session=True,  # Ctrl-C is for us alone
+    )
+
+
 def start(
     arguments: Sequence[str], host: str, port: int, *, lasting: bool = False
 ) -> subprocess.Popen[bytes]:
@@ -67,14 +87,7 @@ def start(
     """
     command = [program(), *arguments]
     try:
-        process = subprocess.Popen(
-            command if lasting else tied(command),
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.DEVNULL,
-            env=environment(),
-            start_new_session=True,  # Ctrl-C is for us alone
-        )
+        process = spawn(command if lasting else tied(command), subprocess.DEVNULL)
     except OSError as error:
         raise UserError(f"cannot start {command[0]}: {error.strerror}") from None
     deadline = time.monotonic() + PATIENCE

@@ -14,9 +14,9 @@ import rerun as rr
 
 from bevviz import geometry
 from bevviz.colors import Color
-from bevviz.frame import F32, Bool, Boxes3D
+from bevviz.frame import F32, F64, Bool, Boxes3D
 from bevviz.logging import entities
-from bevviz.logging.pieces import CORNER, edges
+from bevviz.logging.pieces import CORNER, edges, strips
 from bevviz.logging.writer import Writer
 
 NEAR = 6  # boxes that have their names beside them because they are near: with all, names cover the scene
@@ -36,10 +36,13 @@ def log_spoken_looks(to: Writer, path: str) -> None:
 
 def log_spoken_looks_in_image(to: Writer, path: str, draw_order: float) -> None:
     lines = rr.LineStrips2D.from_fields(radii=rr.Radius.ui_points(1.5), draw_order=draw_order)
-    points = rr.Points2D.from_fields(
-        radii=_POINT, colors=[_COLOR], show_labels=True, draw_order=draw_order + 1
-    )
     to.static(entities.outlines(path), lines)
+    log_names_looks(to, path, draw_order + 1)
+
+
+def log_names_looks(to: Writer, path: str, draw_order: float) -> None:
+    """Of what is written beside things in an image."""
+    points = rr.Points2D.from_fields(radii=_POINT, colors=[_COLOR], show_labels=True, draw_order=draw_order)
     to.static(entities.names(path), points)
 
 
@@ -84,7 +87,23 @@ def log_spoken_in_image(
         )
 
 
-def named_in_space(places: F32, first: Bool | None = None, height: float = 1.0) -> Bool:
+def log_stroked(
+    to: Writer, path: str, strokes: Sequence[F32], names: Sequence[str], sentences: Sequence[str], places: F32
+) -> None:
+    """The same of (K,) things that are lines themselves, of (M, 2) pixels; names at (K, 2) ``places``."""
+    rows, words = _rows(len(strokes)), rr.AnyValues(says=_filled(sentences))
+    chosen = [strokes[row] for row in rows]
+    to.put(path, rr.LineStrips2D(strips(np.concatenate(chosen), np.array([*map(len, chosen)]))), words)
+    if any(names):
+        to.put(entities.names(path), rr.Points2D(places[rows], labels=_filled(names)), words)
+
+
+def row_of(instance: int, count: int) -> int:
+    """What a row of outlines or names stands for; see ``_rows``."""
+    return 0 if count == 1 and instance in (0, 1) else instance
+
+
+def named_in_space(places: F32 | F64, first: Bool | None = None, height: float = 1.0) -> Bool:
     """(K,) those of (K, 3) places around the robot that are named: the nearest, as far as names do not meet.
 
     ``first``: (K,) come before what is near; ``height``: of the view, of what it has beside others usually.
@@ -126,7 +145,7 @@ def apart(at: geometry.FloatArray, order: F32, room: tuple[float, float], first:
     return found
 
 
-def _away(places: F32) -> F32:
+def _away(places: F32 | F64) -> F32:
     away: F32 = np.hypot(places[:, 0], places[:, 1])
     return away
 

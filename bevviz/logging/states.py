@@ -11,9 +11,9 @@ import rerun as rr
 from bevviz import anomalies
 from bevviz.anomalies import KINDS
 from bevviz.colors import Color, State
-from bevviz.frame import CameraResult, Decision, FrameResult, Tracks
 from bevviz.logging import entities
 from bevviz.logging.writer import Writer
+from bevviz.results import CameraResult, Decision, FrameResult, Tracks
 
 COLORS: Mapping[str, Color] = {
     "ok": State.GOOD.value,

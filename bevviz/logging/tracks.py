@@ -9,7 +9,7 @@ import rerun as rr
 
 from bevviz import anomalies, geometry
 from bevviz.config import BevConfig
-from bevviz.frame import F32, I64, Frame, Tracks
+from bevviz.frame import F32, I64, Frame
 from bevviz.logging import entities
 from bevviz.logging.annotations import class_annotations
 from bevviz.logging.bev import footprints, seen_from_above
@@ -17,6 +17,7 @@ from bevviz.logging.entities import TRACK_COLORS, ClassId
 from bevviz.logging.pieces import OUTLINE, boxes3d, strips
 from bevviz.logging.spoken import named_from_above
 from bevviz.logging.writer import Writer
+from bevviz.results import Tracks
 
 LANES = 12  # tracks with a state lane and a speed of their own: entities that come and go are never freed
 

@@ -8,6 +8,7 @@ from typing import Any
 
 import rerun.blueprint as rrb
 
+from bevviz.counts import OPINIONS
 from bevviz.frame import Quantity, Scene
 from bevviz.logging import color_by, entities
 from bevviz.logging.health import COUNTS
@@ -57,7 +58,8 @@ def space(
     # The points of what is explained stand out by their colours, which tell another story than the clusters'.
     hidden += [entities.clusters(scene.lidar), entities.FRUSTUMS] if why else []
     hidden += [entities.clusters(scene.lidar), entities.FRUSTUMS] if by is not None else []
-    hidden += [entities.names(entities.FUSED)] if why or not names else []
+    own = entities.names(entities.FUSED), entities.names(entities.FUSION)
+    hidden += [*own] if why or not names else []
     overrides: dict[Any, Any] = dict.fromkeys((root + path for path in hidden), HIDDEN)
     if by is not None:
         overrides |= {root + path: color_by.visualizer(by) for path in clouds}
@@ -229,8 +231,8 @@ def clocks() -> rrb.TimeSeriesView:
 
 
 def counts() -> rrb.TimeSeriesView:
-    """Clusters, detections and matches: the numbers of the same size."""
-    return plot("Counts", entities.HEALTH, [entities.count(what) for what in COUNTS])
+    """Clusters, detections and matches, opinions: the numbers of the same size."""
+    return plot("Counts", entities.HEALTH, [entities.count(what) for what in (*COUNTS, *OPINIONS)])
 
 
 def rates() -> rrb.TimeSeriesView:

@@ -20,12 +20,13 @@ from bevviz.closing import Closing
 from bevviz.config import Config
 from bevviz.engine.task import Engine, JobResult
 from bevviz.errors import UserError
-from bevviz.frame import FrameResult, Scene
+from bevviz.frame import Scene
 from bevviz.logging.sinks import Sinks
 from bevviz.parallel.work import Batched, WindowJob, results_in
-from bevviz.perceive import Stages
+from bevviz.results import FrameResult
 from bevviz.run import Items, Observer
 from bevviz.session import Session
+from bevviz.stage_loader import Stages
 from bevviz.stages.foreign import Foreign
 
 LENGTH = 25  # frames of a window, at most

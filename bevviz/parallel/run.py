@@ -10,9 +10,9 @@ from tqdm import tqdm
 from bevviz.bags.source import BagSource
 from bevviz.drive import Drive
 from bevviz.engine.task import Engine
-from bevviz.frame import FrameResult
 from bevviz.logging.sinks import Sinks
 from bevviz.parallel.drive import AsTheyAre, InOrder, MadeWindows, Windows
+from bevviz.results import FrameResult
 from bevviz.run import Observer, RunEnd, run
 from bevviz.session import Session
 from bevviz.text import printable

@@ -21,13 +21,16 @@ from bevviz.bags.state import Losses
 from bevviz.config import Config
 from bevviz.engine.task import JobResult
 from bevviz.errors import UserError
-from bevviz.frame import Camera, Cloud, FrameResult, Ground, Voxels
+from bevviz.frame import Camera, Cloud
 from bevviz.logging.logger import Logger
 from bevviz.logging.sinks import APPLICATION, batches
 from bevviz.parallel import handed
-from bevviz.perceive import StageLoader, Stages, describe, perceive
+from bevviz.perceive import describe, perceive
+from bevviz.results import FrameResult, Ground, Voxels
+from bevviz.stage_loader import StageLoader, Stages
 from bevviz.stages.visibility import range_image
 
+_TOLD_IN_ORDER = ("detection", "object", "fused")  # explanations that boxes are logged with
 LABEL = "label"  # field that says what each point is of, see ``evaluate.ground``
 
 
@@ -51,7 +54,7 @@ class Found:
     """A frame, as a worker hands it on."""
 
     result: FrameResult  # without what only its frame needs
-    explanations: bytes  # all of them, pickled; the result has those of detections
+    explanations: bytes  # all of them, pickled; the result has those of detections and objects
     extras: Mapping[str, bytes]  # see ``Batched``
 
     def explained(self, result: FrameResult) -> FrameResult:
@@ -198,7 +201,9 @@ def _kept(result: FrameResult, *, judged: bool = False) -> FrameResult:
         robot_clouds=(),
         cameras=tuple(cameras.values()),
     )
-    voxels, ground = result.voxels, result.ground
+    voxels, ground, ranges = result.voxels, result.ground, result.ranges
+    if ranges is None:
+        ranges = range_image(result.frame.points)  # half of what anomalies take, and needs no order
     # Which raw clouds are kept is known only when the anomalies are.
     clouds_too = result.config.logging.keep == "inspect"
     if clouds_too:
@@ -216,8 +221,8 @@ def _kept(result: FrameResult, *, judged: bool = False) -> FrameResult:
             for camera in result.cameras
         ),
         bev=None,
-        explanations=tuple(e for e in result.explanations if e.subject == "detection"),
-        ranges=range_image(result.frame.points),  # half of what anomalies take, and needs no order
+        explanations=tuple(e for e in result.explanations if e.subject in _TOLD_IN_ORDER),
+        ranges=ranges,
     )
 
 

@@ -13,10 +13,9 @@ from typing import Any
 import numpy as np
 from rerun.chunk import RrdReader
 
-from bevviz.config import Config, changes, flat_yaml, load
+from bevviz.config import Config, changes, flat_yaml, load, object_files
 from bevviz.errors import UserError
 from bevviz.files import Scratch
-from bevviz.frame import FrameResult
 from bevviz.logging import entities
 from bevviz.logging.reading import check_decodes, readable
 from bevviz.progress import Progress
@@ -35,6 +34,7 @@ from bevviz.report.make import replay
 from bevviz.report.origin import ReportInfo
 from bevviz.report.seal import check_seal
 from bevviz.report.window import open_window
+from bevviz.results import FrameResult
 from bevviz.run import Observer, run
 from bevviz.session import Session
 from bevviz.stages.detector import DEMO_MODEL
@@ -223,6 +223,13 @@ def _configs(
             used = info.provenance.dependencies.get("detector.model", then.detector.model)
             raise UserError(f"{rrd}: it was made with {used}, which is not beside it: give --model FILE")
         here.append(f"detector.model={beside}")
+    for key, name in object_files(then).items():
+        if any(text.partition("=")[0] in (key, key.replace(".params", "")) for text in settings):
+            continue
+        beside = rrd.with_name(name)
+        if not beside.exists():
+            raise UserError(f"{rrd}: it was made with {name}, which is not beside it: add --set {key}=FILE")
+        here.append(f"{key}={beside}")
     return then, load(file, [*here, *settings])
 
 
@@ -235,7 +242,7 @@ def _changed_input(info: ReportInfo, bag: Path, then: Config, now: Config) -> It
     if file_hash(bag) != info.bag_sha256:
         yield _other(bag)
     for key, change in changes(then, now).items():
-        if key not in ("detector.model", "detector.names"):
+        if key not in ("detector.model", "detector.names", *object_files(then)):
             yield f"{key} was {change.before}, is {change.after}"
 
 

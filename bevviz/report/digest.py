@@ -12,7 +12,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from bevviz.frame import U8, Detections, FrameResult, Masks
+from bevviz.frame import U8
+from bevviz.results import Detections, FrameResult, Masks
 
 Arrays = Mapping[str, NDArray[Any]]
 

@@ -16,14 +16,14 @@ from typing import TYPE_CHECKING
 import rerun as rr
 
 from bevviz import announce, remains
+from bevviz.bags.message import RawMessage
 from bevviz.bags.reader import megabytes
-from bevviz.bags.recording import RawMessage
 from bevviz.bags.source import MARGIN, SECOND, BagSource
 from bevviz.config import Config, changes, load
 from bevviz.errors import UserError
 from bevviz.files import claim, save, unfinished
 from bevviz.files import written as write_beside
-from bevviz.frame import Camera, Detections, Frame, FrameResult
+from bevviz.frame import Camera, Frame
 from bevviz.logging import entities
 from bevviz.logging.pieces import document
 from bevviz.logging.recorder import DiskWatch, Recorder
@@ -38,7 +38,18 @@ from bevviz.report.origin import ReportInfo, shareable
 from bevviz.report.page import page
 from bevviz.report.redact import Redactor
 from bevviz.report.summary import WindowSummary
-from bevviz.report.window import Cut, Window, choose_topics, cut, find_window, fits, open_window
+from bevviz.report.window import (
+    Cut,
+    Edited,
+    Window,
+    as_it_is,
+    choose_topics,
+    cut,
+    find_window,
+    fits,
+    open_window,
+)
+from bevviz.results import Detections, FrameResult
 from bevviz.run import Observer, run
 from bevviz.session import Session
 from bevviz.stages.detector import Detector
@@ -262,9 +273,9 @@ def _cut(
     total = sum(int(((t >= low) & (t < high)).sum()) for t in times)
     with announce.bar(total=total, unit="message", desc="cut") as bar:
 
-        def edit(message: RawMessage, data: bytes | memoryview) -> bytes | memoryview | None:
+        def edit(message: RawMessage, data: bytes | memoryview) -> Edited:
             bar.update()
-            return data if redactor is None else redactor(message, data)
+            return as_it_is(message, data) if redactor is None else redactor(message, data)
 
         return cut(source.recording, window, topics, source.roles.tf_static, bag, edit)
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from pydantic import TypeAdapter
 
-from bevviz.config import Config
+from bevviz.config import Config, with_object_files
 from bevviz.provenance import Provenance, model_path
 
 
@@ -43,10 +43,12 @@ _INFO = TypeAdapter(ReportInfo)
 def shareable(config: Config) -> Config:
     """The configuration without the folders of this machine."""
     detector, live, model = config.detector, config.live, model_path(config)
+    calibrations = {topic: Path(file).name for topic, file in config.source.lidar_calibration.items()}
     name = detector.model if model is None or detector.model == "demo" else model.name
-    return config.model_copy(
+    return with_object_files(config, lambda file: Path(file).name).model_copy(
         update={
             "detector": detector.model_copy(update={"model": name, "names": Path(detector.names).name}),
+            "source": config.source.model_copy(update={"lidar_calibration": calibrations}),
             "live": live.model_copy(update={"flight_folder": ""}),
         }
     )

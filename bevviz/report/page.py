@@ -7,13 +7,13 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 from bevviz.bags.source import SECOND
-from bevviz.frame import Explanation, FrameResult
 from bevviz.html import render
 from bevviz.logging import entities
 from bevviz.report.facts import Facts
 from bevviz.report.pictures import camera_picture, jpeg, shrink
 from bevviz.report.plots import Plot, Series, plot
 from bevviz.report.summary import WindowSummary
+from bevviz.results import Explanation, FrameResult
 
 PICTURE_WIDTH = 960
 COMMON = 5  # problems that are listed
@@ -85,12 +85,15 @@ def _frame(result: FrameResult, facts: Facts) -> FramePage:
     loud = [e for e in result.explanations if e.state not in _QUIET]
     detections = [e for e in loud if e.subject == "detection"]
     clusters = [e for e in loud if e.subject in ("cluster", "split")]
+    doubted = sorted((e for e in loud if e.subject in ("object", "fused")), key=lambda e: e.state)
+    objects = {"objects, by cameras and our fusion": doubted} if doubted else {}
     return FramePage(
         when=_when(result.frame.received, facts),
         verdict=list(_verdict(result)),
         pictures=list(_pictures(result)),
         decisions=sorted(detections, key=lambda e: e.state == "matched"),
         folded={
+            **objects,
             "clusters": sorted(clusters, key=lambda e: e.state == "matched"),
             "more: not kept, or out of view": [e for e in result.explanations if e.state in _QUIET],
         },

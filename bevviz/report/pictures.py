@@ -6,8 +6,9 @@ import cv2
 import numpy as np
 
 from bevviz.colors import bins, class_color, turbo
-from bevviz.frame import U8, Bev, Bool, CameraResult, Decision
+from bevviz.frame import U8, Bool
 from bevviz.logging.entities import DEPTH_BINS, DEPTH_RANGE
+from bevviz.results import Bev, CameraResult, Decision
 
 
 def camera_picture(

@@ -11,10 +11,11 @@ from typing import Any
 
 import cv2
 import numpy as np
-from rosbags.interfaces import MessageDefinition
+from rosbags.interfaces import ConnectionExtRosbag2, MessageDefinition, MessageDefinitionFormat
 
+from bevviz.bags.message import RawMessage
 from bevviz.bags.reader import normalized
-from bevviz.bags.recording import RawMessage, Recording
+from bevviz.bags.recording import Recording
 from bevviz.config import DetectorConfig
 from bevviz.errors import UserError
 from bevviz.frame import F32, U8
@@ -28,9 +29,14 @@ from bevviz.report.contents import (
     is_coloured,
     is_known,
 )
+from bevviz.report.window import Edited
+from bevviz.ros.encode import encode_compressed_image, typestore
 from bevviz.ros.foxglove import short_of
-from bevviz.ros.messages import MessageError, decode_compressed_image, decode_image
+from bevviz.ros.images import decode_compressed_image, decode_image
+from bevviz.ros.messages import MessageError
+from bevviz.ros.video import decode_packet
 from bevviz.stages.detector import MAX_CANDIDATES, Detector
+from bevviz.sync.video import Video
 
 SCORE = 0.01  # candidates from here on are hidden: rather too much than too little
 CELLS = 8  # along the longer side of a box: one or two for a face or a plate
@@ -88,6 +94,11 @@ class Redactor:
                     f"--redact: {config.model} finds no {what}, but {', '.join(names) or 'unnamed'}"
                 )
         self._recording, self._lidars, self._unredacted = recording, lidars, unredacted
+        self._videos = {
+            topic.name: Video(topic.name, recording.packets)
+            for topic in recording.topics
+            if topic.kind == "CompressedVideo"
+        }
         self._contents: dict[tuple[str, MessageDefinition], Contents] = {}
         self._left_out: Counter[str] = Counter()
         self.images = 0
@@ -98,16 +109,21 @@ class Redactor:
         """What is not in the report, one sentence each."""
         return [f"{n} message(s) of {why}" for why, n in self._left_out.items()]
 
-    def __call__(self, message: RawMessage, data: bytes | memoryview) -> bytes | memoryview | None:
-        """The message as it may be written: untouched where it shows nobody, None where nobody can tell."""
+    def __call__(self, message: RawMessage, data: bytes | memoryview) -> Edited:
+        """The message as it may be written: untouched where it shows nobody, None where nobody can tell.
+
+        Of a video each picture becomes a CompressedImage of its own.
+        """
         asked = any(fnmatchcase(message.topic, pattern) for pattern in self._unredacted)
         try:
-            return self._looked_into(message, data, asked)
+            if message.topic in self._videos:
+                return self._picture(message, self._videos[message.topic])
+            return message.connection, self._looked_into(message, data, asked)
         except MessageError as error:
             reason = str(error).removeprefix(f"{message.topic}: ")
             kept = "as it was recorded, as --unredacted says" if asked else "left out"
             self._left_out[f"{message.topic} {kept}: {reason}"] += 1
-            return data if asked else None
+            return (message.connection, data) if asked else None
 
     def _looked_into(self, message: RawMessage, data: bytes | memoryview, asked: bool) -> bytes | memoryview:
         msgtype = normalized(message.connection.msgtype)
@@ -122,7 +138,7 @@ class Redactor:
         key = msgtype, message.connection.msgdef
         contents = self._contents.get(key)
         if contents is None:
-            definitions = self._recording.definitions(message.connection)
+            definitions = self._recording.types.fields(message.connection)
             contents = self._contents[key] = Contents(msgtype, definitions)
         if not contents.may_show:
             return data
@@ -163,6 +179,28 @@ class Redactor:
                 "height": height,
             }
         return self._recording.encode(message, replace(content, **values))
+
+    def _picture(self, message: RawMessage, video: Video) -> Edited:
+        packet = decode_packet(self._recording.decode(message), message.topic, message.received)
+        video.add(packet)
+        if packet.is_header:
+            return None
+        bgr = video.image(packet.place).bgr
+        boxes = self.find(bgr)
+        self.images += 1
+        self.hidden += len(boxes)
+        data = _encoded(hide(bgr, boxes), b"").tobytes()
+        image = encode_compressed_image(packet.stamp, packet.frame_id, data, "jpeg")
+        profiles = getattr(message.connection.ext, "offered_qos_profiles", [])
+        connection = message.connection._replace(
+            msgtype=COMPRESSED,
+            msgdef=MessageDefinition(
+                MessageDefinitionFormat.MSG, typestore().generate_msgdef(COMPRESSED, ros_version=2)[0]
+            ),
+            digest="",
+            ext=ConnectionExtRosbag2("cdr", profiles),
+        )
+        return connection, typestore().serialize_cdr(image, COMPRESSED)
 
     def find(self, bgr: U8) -> F32:
         """(B, 4) boxes of people and vehicles in an (H, W, 3) image, the largest last."""

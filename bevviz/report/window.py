@@ -10,18 +10,26 @@ from pathlib import Path
 
 import numpy as np
 from backports import zstd
+from rosbags.interfaces import Connection
 
 from bevviz.bags.mcap_writer import McapWriter
-from bevviz.bags.recording import RawMessage, Recording, is_ros1
+from bevviz.bags.message import RawMessage, is_ros1
+from bevviz.bags.recording import ATTACHED, Recording
 from bevviz.bags.source import MARGIN, SECOND, BagSource, iso
 from bevviz.config import Config
 from bevviz.errors import UserError
 from bevviz.ros.ouster import metadata_of
 from bevviz.ros.roles import Roles
+from bevviz.sync.damage import Damage
 
 MILLISECOND = 1_000_000
 
-Edit = Callable[[RawMessage, bytes | memoryview], bytes | memoryview | None]
+Edited = tuple[Connection, bytes | memoryview] | None
+Edit = Callable[[RawMessage, bytes | memoryview], Edited]
+
+
+def as_it_is(message: RawMessage, data: bytes | memoryview) -> Edited:
+    return message.connection, data
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,14 +106,14 @@ def cut(
     topics: Collection[str],
     static: Collection[str],
     path: Path,
-    edit: Edit = lambda message, data: data,
+    edit: Edit = as_it_is,
 ) -> Cut:
     """Write the messages of a window to an MCAP file, byte for byte, with all that it needs to run again.
 
-    That is: ``MARGIN`` on either side, as ``BagSource`` reads it, everything that was said on the
-    ``static`` topics, of video what was before and is needed to decode it, and of each topic that is silent
-    in the window the last message before it, else the first one after it (a calibration, a map or a
-    robot's description that was published once).
+    That is: files with calibrations of LiDARs, ``MARGIN`` on either side, as ``BagSource`` reads it,
+    everything that was said on the ``static`` topics, of video what was before and is needed to decode it,
+    and of each topic that is silent in the window the last message before it, else the first one after it
+    (a calibration, a map or a robot's description that was published once).
 
     Args:
         recording: the whole bag.
@@ -113,7 +121,7 @@ def cut(
         topics: those to be written.
         static: topics of static transforms.
         path: of the MCAP file.
-        edit: gives the data to be written for a message, None: leave it out.
+        edit: gives what is to be written for a message, and of which type; None: leave it out.
 
     Raises:
         UserError: the file cannot be written.
@@ -121,18 +129,22 @@ def cut(
     low, high = window.low - MARGIN, window.high + MARGIN
     chosen = [name for name in topics if name not in static]
     counts: Counter[str] = Counter()
-    damaged: Counter[str] = Counter()
+    damage = Damage()
     ros1 = is_ros1(next(c for f in recording.files for c in f.connections))
-    with McapWriter(path, recording.definition, ros1=ros1) as bag:
+    with McapWriter(path, recording.types.definition, ros1=ros1) as bag:
+        for topic in sorted(recording.calibrations.keys() & set(topics)):
+            file = Path(recording.calibrations[topic])
+            bag.attach(f"{ATTACHED}{topic}/{file.name}", file.read_bytes())
 
         def put(message: RawMessage) -> None:
             try:
                 content = message.content()
             except zstd.ZstdError:
-                damaged[message.topic] += 1
+                damage.add(message.topic, f"{message.topic}: it is damaged, and left out")
                 return
-            if (data := edit(message, content)) is not None:
-                bag.write(message.connection, message.received, data)
+            if (edited := edit(message, content)) is not None:
+                connection, data = edited
+                bag.write(connection, message.received, data)
                 counts[message.topic] += 1
 
         videos = {topic.name for topic in recording.topics if topic.kind == "CompressedVideo"}
@@ -148,8 +160,7 @@ def cut(
         late += recording.messages(static, high)
         for message in sorted(late, key=lambda m: m.received):
             put(message)
-    lost = [f"{n} damaged message(s) of {name} are left out" for name, n in damaged.items()]
-    return Cut(counts, tuple(lost))
+    return Cut(counts, tuple(damage.sentences))
 
 
 def _needed(recording: Recording, topic: str, low: int) -> list[RawMessage]:

@@ -9,9 +9,11 @@ import numpy as np
 
 from bevviz import geometry
 from bevviz.frame import F32, F64, U8, Grid, Shape, Solids, Status
+from bevviz.ros.clouds import decode_cloud
 from bevviz.ros.description import links
 from bevviz.ros.grid_map import decode_grid_map
-from bevviz.ros.messages import MessageError, decode_cloud, decode_image, stamp_ns
+from bevviz.ros.images import decode_image
+from bevviz.ros.messages import MessageError, stamp_ns
 
 LEVELS: tuple[Literal["ok", "warning", "error", "stale"], ...] = ("ok", "warning", "error", "stale")
 TYPES = frozenset(

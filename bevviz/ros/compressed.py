@@ -1,4 +1,4 @@
-"""Clouds that point_cloud_transport compressed: CompressedPointCloud2 of its plugins zstd, zlib and draco."""
+"""Clouds that point_cloud_transport compressed: CompressedPointCloud2 of its plugins, cloudini among them."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ import numpy as np
 from backports import zstd
 
 from bevviz.errors import first_line
+from bevviz.ros import cloudini
+from bevviz.ros.clouds import MOST_POINTS, SCALARS
 from bevviz.ros.encode import make
 
 LONGEST = 1 << 30  # bytes of a cloud
-MOST_POINTS = 100_000_000
 DRACO = "which DracoPy reads: pip install 'bevviz[draco]'"
 _NAME = re.compile(r"point_cloud_interfaces/(msg/)?CompressedPointCloud2$")
-_SCALARS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 
 
 def is_compressed(msgtype: str) -> bool:
@@ -30,6 +30,8 @@ def decompress(msg: Any) -> Any:
         ValueError: a format that is not read here, or damaged data.
     """
     data = bytes(msg.compressed_data)
+    if msg.format == "cloudini":
+        return _of_cloudini(msg, data)
     width, height = int(msg.width), int(msg.height)
     if msg.format == "zstd":
         unpacked = np.frombuffer(_unpacked(zstd.ZstdDecompressor(), data), np.uint8)
@@ -39,7 +41,9 @@ def decompress(msg: Any) -> Any:
         unpacked = _of_draco(msg, data)
         width, height = len(unpacked) // max(int(msg.point_step), 1), 1
     else:
-        raise ValueError(f"a cloud compressed by '{msg.format}' is not read: zstd, zlib and draco are")
+        raise ValueError(
+            f"a cloud compressed by '{msg.format}' is not read: zstd, zlib, draco and cloudini are"
+        )
     return make(
         "sensor_msgs/msg/PointCloud2",
         header=msg.header,
@@ -50,6 +54,28 @@ def decompress(msg: Any) -> Any:
         point_step=msg.point_step,
         row_step=width * int(msg.point_step) if msg.format == "draco" else msg.row_step,
         data=unpacked,
+        is_dense=msg.is_dense,
+    )
+
+
+def _of_cloudini(msg: Any, data: bytes) -> Any:
+    """What its header says holds: points may be fewer than the message has."""
+    told, points = cloudini.decode(data) if data else (cloudini.EMPTY, np.zeros(0, np.uint8))
+    fields = [
+        make("sensor_msgs/msg/PointField", name=f.name, offset=f.offset, datatype=f.type, count=1)
+        for f in told.fields
+        if f.type in SCALARS and f.offset != cloudini.NOWHERE
+    ]
+    return make(
+        "sensor_msgs/msg/PointCloud2",
+        header=msg.header,
+        height=told.height,
+        width=told.width,
+        fields=fields if data else msg.fields,
+        is_bigendian=False,
+        point_step=told.point_step or msg.point_step,
+        row_step=told.width * told.point_step,
+        data=points,
         is_dense=msg.is_dense,
     )
 
@@ -82,7 +108,7 @@ def _of_draco(msg: Any, data: bytes) -> Any:
     points = np.zeros(count * step, np.uint8)
     for field, attribute in zip(msg.fields, attributes, strict=True):
         values = np.asarray(attribute["data"]).reshape(count, -1)
-        kind = np.dtype(_SCALARS.get(int(field.datatype), "u1"))
+        kind = np.dtype(SCALARS.get(int(field.datatype), "u1"))
         if values.dtype == np.uint8 and values.shape[1] == kind.itemsize:  # rgb, as its four bytes
             kind = np.dtype(np.uint8)
         end = int(field.offset) + values.shape[1] * kind.itemsize

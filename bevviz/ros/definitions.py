@@ -1,14 +1,18 @@
-"""What a message type is made of: rosbags' definitions and those known here, else the installed package's."""
+"""What a message type is made of: rosbags' definitions and those known here, else the installed package's.
+
+Else what its publisher said, see ``type_sources``.
+"""
 
 from __future__ import annotations
 
 import os
 import sys
+from collections.abc import Mapping
 from functools import cache
 from pathlib import Path
 from typing import Any
 
-from rosbags.typesys import TypesysError, get_types_from_msg
+from rosbags.typesys import TypesysError, get_types_from_idl, get_types_from_msg
 from rosbags.typesys.store import Typestore
 
 from bevviz.errors import UserError
@@ -33,6 +37,8 @@ def store_of(name: str) -> Typestore:
     known = typestore()
     if name in known.types:
         return known
+    if name in _learned:
+        return _learned[name]
     package = name.partition("/")[0]
     try:
         found = _installed(name, {})
@@ -49,6 +55,34 @@ def store_of(name: str) -> Typestore:
     except (OSError, UnicodeDecodeError, TypesysError, KeyError, ValueError) as error:
         raise UserError(f"the definition of {name} in {package} cannot be read: {error}") from None
     return store
+
+
+_learned: dict[str, Typestore] = {}  # type -> what is known of it since a publisher was asked
+
+
+def learn(name: str, sources: Mapping[str, tuple[str, str]], digest: str) -> None:
+    """What ``package/msg/Name`` is made of, from somebody who has it.
+
+    Args:
+        sources: of each type that it contains, itself among them, the encoding (``msg`` or ``idl``) and text.
+        digest: the type's hash, ``RIHS01_...``.
+
+    Raises:
+        UserError: they are of another type, incomplete or cannot be read.
+    """
+    store = Typestore()
+    try:
+        for kind, (encoding, text) in sources.items():
+            if encoding not in ("msg", "idl"):
+                raise UserError(f"it has no source of {kind}")
+            types = get_types_from_msg(text, kind) if encoding == "msg" else get_types_from_idl(text)
+            store.register({**types})
+        found = store.hash_rihs01(name)
+    except (TypesysError, KeyError, ValueError) as error:
+        raise UserError(f"its sources of {name} cannot be read: {error}") from None
+    if found != digest:
+        raise UserError(f"its sources are of another {name}")
+    _learned[name] = store
 
 
 def _installed(name: str, found: dict[str, Any]) -> dict[str, Any]:

@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-from bevviz.frame import FrameResult
+from bevviz.results import FrameResult
 from bevviz.ros.around import LEVELS
 from bevviz.ros.encode import typestore
 from bevviz.ros.typesupport import message_type

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import colorsys
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import cache
 from typing import Any
 
@@ -14,7 +14,7 @@ from rosbags.typesys.store import Typestore
 
 from bevviz import geometry
 from bevviz.frame import F32, F64, I64, Boxes3D, Cloud, Image, ImageLabels, Intrinsics
-from bevviz.ros import grid_map_msgs, point_cloud_interfaces, vision_msgs
+from bevviz.ros import driver_msgs, grid_map_msgs, point_cloud_interfaces, vision_msgs
 
 # A vision_msgs/Detection3DArray that also says what was labelled in an image, see frame.ImageLabels.
 _LABELLED = """std_msgs/Header header
@@ -33,6 +33,7 @@ def typestore() -> Typestore:
     vision_msgs.register(store)
     grid_map_msgs.register(store)
     point_cloud_interfaces.register(store)
+    driver_msgs.register(store)
     store.register(get_types_from_msg(_LABELLED, "bevviz_msgs/msg/Detection3DArray"))
     return store
 
@@ -50,15 +51,22 @@ def encode_cloud(cloud: Cloud) -> Any:
     return encode_points(cloud.stamp, cloud.frame_id, points)
 
 
-def encode_points(stamp: int, frame_id: str, points: NDArray[np.void]) -> Any:
-    """A sensor_msgs/PointCloud2 of (N,) points with fields of numbers, which is not copied."""
-    layout = points.dtype
+def encode_points(stamp: int, frame_id: str, points: NDArray[np.void], announced: int = 0) -> Any:
+    """A sensor_msgs/PointCloud2 of (N,) points with fields of numbers, which is not copied.
+
+    Args:
+        stamp: nanoseconds.
+        frame_id: of the header.
+        points: what there is of the cloud.
+        announced: points that it says to have, where that is more: the rest counts as lost.
+    """
+    layout, width = points.dtype, max(len(points), announced)
     fields = [
         make(
             "sensor_msgs/msg/PointField",
             name=name,
             offset=int(layout.fields[name][1]),  # type: ignore[index]
-            datatype=_POINT_FIELD[layout[name].str[1:]],
+            datatype=POINT_FIELD[layout[name].str[1:]],
             count=1,
         )
         for name in layout.names or ()
@@ -67,17 +75,18 @@ def encode_points(stamp: int, frame_id: str, points: NDArray[np.void]) -> Any:
         "sensor_msgs/msg/PointCloud2",
         header=_header(stamp, frame_id),
         height=1,
-        width=len(points),
+        width=width,
         fields=fields,
         is_bigendian=False,
         point_step=layout.itemsize,
-        row_step=layout.itemsize * len(points),
+        row_step=layout.itemsize * width,
         data=points.view(np.uint8),
         is_dense=True,
     )
 
 
-_POINT_FIELD = {"i1": 1, "u1": 2, "i2": 3, "u2": 4, "i4": 5, "u4": 6, "f4": 7, "f8": 8}
+# Datatypes of a PointField.
+POINT_FIELD: Mapping[str, int] = {"i1": 1, "u1": 2, "i2": 3, "u2": 4, "i4": 5, "u4": 6, "f4": 7, "f8": 8}
 
 
 def encode_image(image: Image) -> Any:

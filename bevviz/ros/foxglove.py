@@ -262,8 +262,9 @@ def _scene(message: Any) -> Any:
             labels.append(_label(entity))
             ids.append(str(entity.id or ""))
     stamp, frame_id = (_stamp(entities[0]), _frame(entities[0])) if entities else (0, "")
-    values = np.array(rows, np.float32).reshape(-1, 7)
-    boxes = Boxes3D(values[:, :3], values[:, 3:6], values[:, 6])
+    values = np.array(rows, np.float64).reshape(-1, 7)
+    size, turn = values[:, 3:6].astype(np.float32), values[:, 6].astype(np.float32)
+    boxes = Boxes3D(values[:, :3], size, turn)
     return encode_boxes_3d(stamp, frame_id, boxes, [[(label, 1.0)] for label in labels], ids=ids)
 
 

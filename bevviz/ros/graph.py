@@ -12,6 +12,9 @@ UNKNOWN = "_NODE_NAME_UNKNOWN_"  # rmw's name of a node whose publishers were me
 LATCHED_DEPTH = 100  # one message of each node that states static transforms
 SENSOR_DEPTH = 5
 STREAM_DEPTH = 100  # small messages that come in bursts
+PACKET_DEPTH = (
+    512  # single packets of a LiDAR, some thousand a second: those of the time that a scan is decoded
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,9 +49,10 @@ def matched_qos(publishers: Sequence[Any], kind: str) -> Any:
     reliable = all(p.qos_profile.reliability == ReliabilityPolicy.RELIABLE for p in publishers)
     latched = any(p.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL for p in publishers)
     bulky = kind in ("PointCloud2", "Image", "CompressedImage")
+    streamed = PACKET_DEPTH if kind == "PacketMsg" else STREAM_DEPTH
     return QoSProfile(
         history=HistoryPolicy.KEEP_LAST,
-        depth=SENSOR_DEPTH if bulky else LATCHED_DEPTH if latched else STREAM_DEPTH,
+        depth=SENSOR_DEPTH if bulky else LATCHED_DEPTH if latched else streamed,
         reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
         durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
     )

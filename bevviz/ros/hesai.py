@@ -14,6 +14,7 @@ import numpy as np
 from bevviz.errors import UserError
 from bevviz.frame import F32, I64
 from bevviz.ros.encode import encode_points
+from bevviz.ros.stated import read_calibration
 
 if TYPE_CHECKING:
     from bevviz.ros.packets import Packets
@@ -154,11 +155,9 @@ def decode(packets: Packets, angles: Path | None = None) -> Any:
     points["intensity"] = blocks["measured"]["reflectivity"][packet, block, channel]
     points["ring"] = channel
     points["time"] = _times(packets, usable, model, returns)[packet, group]
-    message = encode_points(packets.stamp, packets.frame_id, points)
     lost = packets.lost + len(packets.data) - len(data)
-    message.width = len(points) + int((~met).sum()) + lost * met[0].size
-    message.row_step = message.point_step * message.width
-    return message
+    announced = len(points) + int((~met).sum()) + lost * met[0].size
+    return encode_points(packets.stamp, packets.frame_id, points, announced)
 
 
 def _model_of(packets: Packets) -> tuple[Model, I64]:
@@ -218,13 +217,8 @@ def _angles(rows: list[list[float]]) -> Angles:
 
 def _read(path: Path, model: Model) -> Angles:
     """A CSV as the sensor's web page gives it: number of the channel, elevation, azimuth."""
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-    except (OSError, UnicodeDecodeError) as error:
-        why = getattr(error, "strerror", None) or "it is no text"
-        raise UserError(f"source.lidar_calibration: {path}: cannot be read: {why}") from None
     rows = list[list[float]]()
-    for row in csv.reader(StringIO(text)):
+    for row in csv.reader(StringIO(read_calibration(path))):
         try:
             rows.append([float(value) for value in row[:3]])
         except ValueError:

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from bevviz.ros.clouds import MOST_POINTS
 from bevviz.ros.encode import encode_points
 
 NAME = re.compile(r"livox_ros_driver2?/(msg/)?CustomMsg$")
@@ -27,7 +28,6 @@ FIELDS = (
 )
 READ = {"reflectivity": "intensity"}  # as the drivers' own PointCloud2 has it, a float32
 SECOND = 1_000_000_000
-MOST_POINTS = 100_000_000
 
 
 def is_livox(msgtype: str) -> bool:
@@ -77,10 +77,7 @@ def read_custom(data: bytes | memoryview, *, ros1: bool, fields: Sequence[tuple[
         {"names": names, "formats": formats, "offsets": offsets, "itemsize": size}
     )
     given = np.ndarray((there,), point, data, at, (step,))
-    message = encode_points(sec * SECOND + nanosec, frame_id, _as_read(given))
-    message.width = count
-    message.row_step = message.point_step * count
-    return message
+    return encode_points(sec * SECOND + nanosec, frame_id, _as_read(given), count)
 
 
 def _as_read(given: Any) -> Any:

@@ -155,13 +155,14 @@ def _boxes(
     scores: list[float],
     ids: list[str],
 ) -> LabelledBoxes3D:
-    table = np.array(rows, np.float32).reshape(-1, 7)
+    table = np.array(rows, np.float64).reshape(-1, 7)
+    size, yaw = table[:, 3:6].astype(np.float32), table[:, 6].astype(np.float32)
     stamp = received if header is None else int(header.stamp.sec) * 10**9 + int(header.stamp.nanosec)
     return LabelledBoxes3D(
         topic=topic,
         stamp=stamp,
         frame_id="" if header is None else str(header.frame_id).removeprefix("/"),
-        boxes=Boxes3D(table[:, :3], table[:, 3:6], table[:, 6]),
+        boxes=Boxes3D(table[:, :3], size, yaw),
         labels=tuple(labels),
         scores=np.nan_to_num(np.array(scores, np.float32)),
         received=received,

@@ -8,15 +8,15 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Sequence
+from collections import deque
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from bevviz.errors import UserError
-from bevviz.frame import F32, I64, U8
+from bevviz.frame import F32, U8
 from bevviz.ros.encode import encode_points
 
 PACKET = re.compile(r"(ouster_sensor_msgs|ouster_msgs|ouster_ros)/(msg/)?PacketMsg$")
@@ -28,6 +28,7 @@ LACKS = (
 NOT_LIDAR = "packets of an Ouster's IMU"
 SMALLEST = 1000  # bytes: those of the IMU have 48
 MINUTE = 60_000_000_000
+Packet = tuple[int, bytes | memoryview]  # when it was received, nanoseconds, and its bytes
 POINT = np.dtype(
     [(n, "<f4") for n in ("x", "y", "z", "intensity", "time")] + [("reflectivity", "<u2"), ("ring", "<u2")]
 )
@@ -84,6 +85,7 @@ class Sensor:
     Attributes:
         columns: of a whole turn.
         per_packet: columns.
+        sent: packets of a whole scan; fewer than a turn's where the sensor measures a part of it.
         directions: (pixels, 2) altitude and azimuth of the beams, radians.
         origin: (2,) where beams begin, metres from the axis and above its origin.
     """
@@ -91,6 +93,7 @@ class Sensor:
     profile: Profile
     columns: int
     per_packet: int
+    sent: int
     directions: F32
     origin: F32
 
@@ -113,6 +116,45 @@ class Sensor:
         at = self.profile.number
         return int.from_bytes(packet[at : at + 2], "little")
 
+    def begin(self, packet: bytes | memoryview) -> int:
+        """The number of its first column."""
+        at = self.profile.head + 8
+        return int.from_bytes(packet[at : at + 2], "little")
+
+
+class Scans:
+    """Scans of the packets of one sensor, as these come.
+
+    A scan is whole with its last packet; where some are lost, when the next one begins. What comes later, or
+    a second time, is left out.
+    """
+
+    def __init__(self, sensor: Sensor) -> None:
+        self.sensor = sensor
+        self._current = -1
+        self._gone: deque[int] = deque(maxlen=2)  # numbers of the scans before
+        self._held: dict[int, Packet] = {}  # first column -> packet
+
+    def add(self, received: int, packet: bytes | memoryview) -> Iterator[tuple[Packet, ...]]:
+        """The scans that are whole now: of a packet of ``sensor.size`` bytes, received at that time."""
+        number, begin = self.sensor.number(packet), self.sensor.begin(packet)
+        if number in self._gone or begin >= self.sensor.columns:
+            return
+        if number != self._current:
+            yield from self.rest()
+            self._current = number
+        self._held.setdefault(begin, (received, packet))
+        if len(self._held) == self.sensor.sent:
+            yield from self.rest()
+
+    def rest(self) -> Iterator[tuple[Packet, ...]]:
+        """What there is of the scan that is not whole; another packet of it is one that comes too late."""
+        if self._held:
+            found, self._held = tuple(self._held.values()), {}
+            self._gone.append(self._current)
+            self._current = -1
+            yield found
+
 
 def is_packet(msgtype: str) -> bool:
     return PACKET.search(msgtype) is not None
@@ -121,6 +163,14 @@ def is_packet(msgtype: str) -> bool:
 def metadata_of(topic: str) -> str:
     """The topic beside that of packets on which the driver gives the metadata, as a std_msgs/String."""
     return f"{topic.rpartition('/')[0]}/metadata"
+
+
+def waits(topic: str) -> str:
+    """What is said beside a robot of packets whose metadata are not there yet."""
+    return (
+        f"packets of an Ouster whose metadata are waited for on {metadata_of(topic)} (std_msgs/String); "
+        f"--set 'source.lidar_calibration={{{topic}: metadata.json}}' gives them from a file"
+    )
 
 
 def read_sensor(text: str, where: str) -> Sensor:
@@ -143,8 +193,10 @@ def read_sensor(text: str, where: str) -> Sensor:
         if "beam_to_lidar_transform" not in beams:
             origin = np.array([float(beams["lidar_origin_to_beam_origin_mm"]), 0.0])
         per_packet = int(form.get("columns_per_packet", 16))
+        first, last = form.get("column_window") or (0, columns - 1)
         if directions.ndim != 2 or not len(directions) or not 0 < per_packet <= columns <= 1 << 14:
             raise ValueError
+        measured = (int(first) + np.arange((int(last) - int(first)) % columns + 1)) % columns
     except (ValueError, KeyError, TypeError, AttributeError):
         raise UserError(f"{where}: is not the metadata (JSON) of an Ouster") from None
     if profile not in PROFILES:
@@ -156,22 +208,10 @@ def read_sensor(text: str, where: str) -> Sensor:
         PROFILES[profile],
         columns,
         per_packet,
+        len(np.unique(measured // per_packet)),
         directions.astype(np.float32),
         (origin * 1e-3).astype(np.float32),
     )
-
-
-def read_text(path: Path) -> str:
-    """A file of metadata.
-
-    Raises:
-        UserError: it cannot be read.
-    """
-    try:
-        return path.read_text()
-    except (OSError, UnicodeDecodeError) as error:
-        why = getattr(error, "strerror", None) or "it is no text"
-        raise UserError(f"source.lidar_calibration: {path}: cannot be read: {why}") from None
 
 
 def payload(data: bytes | memoryview, *, ros1: bool) -> memoryview:
@@ -182,7 +222,7 @@ def payload(data: bytes | memoryview, *, ros1: bool) -> memoryview:
     return memoryview(data)[at + 4 : at + 4 + length]
 
 
-def decode(sensor: Sensor, packets: Sequence[bytes | memoryview], received: I64) -> Any:
+def decode(sensor: Sensor, packets: Sequence[Packet]) -> Any:
     """The sensor_msgs/PointCloud2 of the packets of one scan, in the frame os_lidar.
 
     The stamp is that of the first column: by the sensor's clock where this is within a minute of the time of
@@ -192,8 +232,8 @@ def decode(sensor: Sensor, packets: Sequence[bytes | memoryview], received: I64)
 
     Args:
         packets: each of ``sensor.size`` bytes.
-        received: (N,) when, nanoseconds.
     """
+    received, contents = zip(*packets, strict=True)
     profile, pixels = sensor.profile, sensor.pixels
     kind, at = profile.status
     measured = np.dtype(
@@ -212,7 +252,7 @@ def decode(sensor: Sensor, packets: Sequence[bytes | memoryview], received: I64)
             "itemsize": sensor.step,
         }
     )
-    data: U8 = np.frombuffer(b"".join(packets), np.uint8).reshape(len(packets), sensor.size)
+    data: U8 = np.frombuffer(b"".join(contents), np.uint8).reshape(len(packets), sensor.size)
     shape, steps = (len(packets), sensor.per_packet), (sensor.size, sensor.step)
     columns = np.ndarray(shape, column, data, profile.head, steps).reshape(-1)
     usable = (columns["status"] & profile.valid == profile.valid) & (columns["number"] < sensor.columns)
@@ -241,7 +281,4 @@ def decode(sensor: Sensor, packets: Sequence[bytes | memoryview], received: I64)
     points["intensity"] = columns["measured"]["signal"][row, pixel]
     points["ring"] = pixel
     points["time"] = times[row]
-    message = encode_points(stamp, FRAME, points)
-    message.width = max(len(points), sensor.columns * pixels)
-    message.row_step = message.point_step * message.width
-    return message
+    return encode_points(stamp, FRAME, points, sensor.columns * pixels)

@@ -10,7 +10,8 @@ import numpy as np
 from bevviz import geometry
 from bevviz.config import Config
 from bevviz.errors import UserError
-from bevviz.frame import F32, F64, I64, Boxes3D, Cloud, FrameResult, Image, Tracks
+from bevviz.frame import F32, F64, I64, Boxes3D, Cloud, Image
+from bevviz.results import FrameResult, Tracks
 from bevviz.ros.encode import (
     encode_boxes_2d,
     encode_boxes_3d,

@@ -145,7 +145,7 @@ def foreign(topic: Topic, sensor: str = "") -> str:
     if topic.kind == "PointCloud2":
         return ""
     if is_packet(topic.type) and topic.aside:
-        return topic.aside if not sensor or (sensor, topic.aside) == ("LiDAR", ouster.LACKS) else ""
+        return topic.aside if not sensor or (sensor == "LiDAR" and topic.aside != ouster.NOT_LIDAR) else ""
     if sensor in ("", "LiDAR") and (why := lacks(topic.type)):
         return why
     return next((why for of, kind, why in _FOREIGN if sensor in ("", of) and kind.search(topic.type)), "")

@@ -1,8 +1,16 @@
-"""Definitions of vision_msgs 4 (ROS 2 Humble to Jazzy), which rosbags' type stores lack."""
+"""Definitions of vision_msgs 4 (ROS 2 Humble to Jazzy) and 2 (Foxy), which rosbags' type stores lack.
+
+Those of 3 (Galactic) have other names for the bytes of 4.
+"""
 
 from __future__ import annotations
 
-from rosbags.typesys import get_types_from_msg
+from collections.abc import Mapping
+from contextlib import suppress
+from functools import cache
+from typing import Any
+
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
 _DETECTION = "std_msgs/Header header\nObjectHypothesisWithPose[] results\n{box} bbox\nstring id\n"
@@ -20,13 +28,46 @@ DEFINITIONS = {
 }
 
 
-def register(typestore: Typestore) -> None:
-    """Add ``vision_msgs/msg/*`` to a store that has the geometry and std messages.
+_OLDER = (
+    "std_msgs/Header header\nObjectHypothesisWithPose[] results\n{box} bbox\nsensor_msgs/{source}\n"
+    "bool is_tracking\nstring tracking_id\n"
+)
+OLDER = DEFINITIONS | {
+    "BoundingBox2D": "geometry_msgs/Pose2D center\nfloat64 size_x\nfloat64 size_y\n",
+    "ObjectHypothesisWithPose": "string id\nfloat64 score\ngeometry_msgs/PoseWithCovariance pose\n",
+    "Detection2D": _OLDER.format(box="BoundingBox2D", source="Image source_img"),
+    "Detection3D": _OLDER.format(box="BoundingBox3D", source="PointCloud2 source_cloud"),
+}
+
+
+def register(typestore: Typestore, definitions: Mapping[str, str] = DEFINITIONS) -> None:
+    """Add ``vision_msgs/msg/*`` to a store that has the geometry, sensor and std messages.
 
     Raises:
         rosbags.typesys.TypesysError: the store has other definitions of the same names.
     """
     types = {}
-    for name, text in DEFINITIONS.items():
+    for name, text in definitions.items():
         types.update(get_types_from_msg(text, f"vision_msgs/msg/{name}"))
     typestore.register(types)
+
+
+@cache
+def _older() -> Typestore:
+    store = get_typestore(Stores.ROS2_JAZZY)
+    register(store, OLDER)
+    return store
+
+
+def deserialize(store: Typestore, data: bytes | memoryview, msgtype: str) -> Any:
+    """A message of any type as the store defines it; one of vision_msgs that is none by that, as of Foxy.
+
+    What is not empty is laid out so that it cannot be taken for the other.
+    """
+    try:
+        return store.deserialize_cdr(data, msgtype)
+    except Exception:  # generated decoders raise whatever the bytes lead them to
+        if msgtype.startswith("vision_msgs/msg/") and msgtype in _older().types:
+            with suppress(Exception):
+                return _older().deserialize_cdr(data, msgtype)
+        raise

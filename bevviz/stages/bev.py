@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 
 from bevviz.colors import class_color, turbo
 from bevviz.config import BevConfig
-from bevviz.frame import F32, I32, U8, Bev, Bool, Boxes3D, Clusters, Objects
+from bevviz.frame import F32, I32, U8, Bool, Boxes3D
 from bevviz.geometry import corners
+from bevviz.results import Bev, Clusters, Objects
 from bevviz.stages.kernel import kernel
 
 UNKNOWN, FREE, OCCUPIED = -1, 0, 100  # values of the occupancy channel, as in nav_msgs/OccupancyGrid

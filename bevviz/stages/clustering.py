@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bevviz.config import ClusteringConfig
-from bevviz.frame import F32, F64, I32, I64, Boxes3D, Clusters, ClusterState
+from bevviz.frame import F32, F64, I32, I64, Boxes3D
+from bevviz.results import Clusters, ClusterState
 from bevviz.stages.cells import cell_keys, sort_by, sort_by_key
 from bevviz.stages.kernel import kernel, unordered_kernel
 

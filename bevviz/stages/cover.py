@@ -6,7 +6,8 @@ import math
 
 import numpy as np
 
-from bevviz.frame import F32, I32, U8, Bool, Masks
+from bevviz.frame import F32, I32, U8, Bool
+from bevviz.results import Masks
 from bevviz.stages.kernel import kernel
 
 

@@ -14,18 +14,9 @@ from numpy.typing import NDArray
 from bevviz import geometry
 from bevviz.config import ClusteringConfig, Config, plugin_of
 from bevviz.errors import StageError, UserError
-from bevviz.frame import (
-    F32,
-    I32,
-    Bool,
-    Boxes3D,
-    Clusters,
-    Detections,
-    DetectionState,
-    Ground,
-    Objects,
-)
+from bevviz.frame import F32, I32, Bool, Boxes3D
 from bevviz.plugins import Plugin
+from bevviz.results import Clusters, Detections, DetectionState, Ground, Objects
 from bevviz.stages.clustering import describe
 
 CELL = 1.0  # metres: edge of a cell of the ground's level, where only its points are known
@@ -155,10 +146,9 @@ def placed(
         kept = np.append(clusters.kept, False)
         candidates = np.flatnonzero(kept[clusters.labels])  # noise, -1, is the last
         points, labels = obstacles[candidates], clusters.labels[candidates]
-        for k in range(len(boxes)):
-            inside = labels[geometry.inside(points, boxes, k)]
-            if len(inside):
-                own[k] = np.bincount(inside).argmax()
+        for k, rows in geometry.inside_each(points, boxes):
+            if len(rows):
+                own[k] = np.bincount(labels[rows]).argmax()
     nobody = np.full(len(boxes), -1, np.int32)
     return Objects(boxes, tuple(names), score, own, ("",) * len(boxes), nobody)
 

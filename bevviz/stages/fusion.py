@@ -7,24 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from bevviz.config import ClusteringConfig, FusionConfig
-from bevviz.frame import (
-    F32,
-    F64,
-    I32,
-    I64,
-    Bool,
-    Boxes3D,
-    CameraResult,
-    Claims,
-    Clusters,
-    Decision,
-    Detections,
-    Fusion,
-    Intrinsics,
-    Objects,
-    Pairs,
-)
+from bevviz.frame import F32, F64, I32, I64, Bool, Boxes3D, Intrinsics
 from bevviz.geometry import apply, iou
+from bevviz.results import CameraResult, Claims, Clusters, Decision, Detections, Fusion, Objects, Pairs
 from bevviz.stages.cover import cover
 from bevviz.stages.kernel import kernel
 

@@ -7,7 +7,8 @@ import math
 import numpy as np
 
 from bevviz.config import GroundConfig
-from bevviz.frame import F32, F64, I32, Bool, Ground
+from bevviz.frame import F32, F64, I32, Bool
+from bevviz.results import Ground
 from bevviz.stages.cells import sort_by
 from bevviz.stages.kernel import kernel
 

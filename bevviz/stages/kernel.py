@@ -87,7 +87,11 @@ def common_clock() -> float:
 
 
 class _Kept(FunctionCache):  # type: ignore[misc]
-    """As numba's own, which imports before the first lookup what only compiling needs: 0.4 s."""
+    """As numba's own, which imports before the first lookup what only compiling needs: 0.4 s.
+
+    numba 0.68 has no public way around that: ``cache=True`` always takes its own class. Its events, used
+    above, are documented (https://numba.readthedocs.io/en/stable/developer/event_api.html).
+    """
 
     def load_overload(self, sig: object, target_context: Any) -> Any:
         rtsys.initialize(target_context)

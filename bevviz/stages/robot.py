@@ -8,21 +8,8 @@ import numpy as np
 
 from bevviz import geometry
 from bevviz.errors import StageError
-from bevviz.frame import (
-    F32,
-    Bool,
-    Boxes3D,
-    Camera,
-    Clusters,
-    ClusterState,
-    Detections,
-    DetectionState,
-    Frame,
-    Ground,
-    LabelledBoxes2D,
-    LabelledBoxes3D,
-    Objects,
-)
+from bevviz.frame import F32, Bool, Boxes3D, Camera, Frame, LabelledBoxes2D, LabelledBoxes3D
+from bevviz.results import Clusters, ClusterState, Detections, DetectionState, Ground, Objects
 from bevviz.stages.cells import cell_keys
 from bevviz.stages.foreign import heights, placed
 
@@ -55,7 +42,7 @@ def cluster(points: F32, frame: Frame, topic: str) -> Clusters:
     boxes = in_points_frame(frame, _boxes(frame, topic))
     labels = np.full(len(points), -1, np.int32)
     nearest = np.full(len(points), np.inf, np.float32)
-    centroid = boxes.center.copy()
+    centroid = boxes.center.astype(np.float32)
     for k in range(len(boxes)):
         inside = np.flatnonzero(geometry.inside(points, boxes, k))
         away = np.linalg.norm(points[inside] - boxes.center[k], axis=1)
@@ -106,9 +93,9 @@ def detections_of(found: LabelledBoxes2D) -> Detections:
 
 def in_points_frame(frame: Frame, labelled: LabelledBoxes3D) -> Boxes3D:
     """Boxes that somebody else states, in the frame of the points."""
-    if labelled.world_from_boxes is None:
-        return labelled.boxes
-    points_from_boxes = geometry.inverse(frame.pose) @ labelled.world_from_boxes
+    points_from_boxes = np.eye(4)
+    if labelled.world_from_boxes is not None:
+        points_from_boxes = geometry.inverse(frame.pose) @ labelled.world_from_boxes
     return geometry.moved(labelled.boxes, points_from_boxes)
 
 

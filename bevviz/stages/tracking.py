@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from bevviz import geometry
 from bevviz.config import TrackingConfig
-from bevviz.frame import F32, F64, I32, I64, Bool, Boxes3D, Clusters, Frame, Objects, Tracks
+from bevviz.frame import F32, F64, I32, I64, Bool, Boxes3D, Frame
+from bevviz.results import Clusters, Objects, Tracks
 from bevviz.stages.fusion import assign
 from bevviz.stages.kernel import kernel
 

@@ -1,16 +1,85 @@
-"""Which boxes are hidden behind something nearer: asked of the range image of the scan."""
+"""What of boxes can be seen: what is in a camera's image, and what nothing nearer hides."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from bevviz import geometry
-from bevviz.frame import F32, Boxes3D
+from bevviz.frame import F32, F64, Boxes3D, Camera
 from bevviz.stages.kernel import kernel
 
 STEP = np.float32(np.radians(0.8))  # radians: edge of a cell of the range image
 NEARER = np.float32(0.7)  # metres that a return must be nearer than the box to hide it
 BELOW, ABOVE = np.float32(np.radians(-40)), np.float32(np.radians(20))
+NEAR_PLANE = 0.1  # metres before the camera, from which on a box is drawn in its image
+
+_EDGES = np.array(
+    [(0, 1), (1, 2), (2, 3), (3, 0), (4, 5), (5, 6), (6, 7), (7, 4), (0, 4), (1, 5), (2, 6), (3, 7)]
+)
+
+# --- in an image -------------------------------------------------------------------------------
+
+
+def image_boxes(boxes: Boxes3D, camera: Camera) -> F32:
+    """(K, 4) box around what of each 3D box is before the camera, cut at the image's edge; NaN: nothing.
+
+    Args:
+        boxes: in the frame of the points.
+        camera: without a place nothing is in its image.
+    """
+    around = np.full((len(boxes), 4), np.nan, np.float32)
+    if camera.intrinsics is None or (uv := image_points(boxes, camera)) is None:
+        return around
+    known = np.isfinite(uv[..., 0]) & np.isfinite(uv[..., 1])
+    low = np.where(known[..., None], uv, np.inf).min(axis=1)
+    high = np.where(known[..., None], uv, -np.inf).max(axis=1)
+    limit = np.array([camera.intrinsics.width, camera.intrinsics.height], np.float32) - 0.5
+    low, high = np.clip(low, -0.5, limit), np.clip(high, -0.5, limit)
+    there = known.any(axis=1) & (high > low).all(axis=1)
+    around[there] = np.hstack([low, high])[there]
+    return around
+
+
+def image_points(boxes: Boxes3D, camera: Camera) -> F32 | None:
+    """(K, 20, 2) pixels of each box's 8 corners, and of where its 12 edges meet the near plane.
+
+    NaN: not before the camera, or the edge does not meet it. None: there are no boxes, or the camera's place
+    is not known.
+    """
+    if camera.intrinsics is None or camera.camera_from_points is None or not len(boxes):
+        return None
+    corners = geometry.apply(camera.camera_from_points, geometry.corners(boxes).reshape(-1, 3))
+    corners = corners.reshape(-1, 8, 3).astype(np.float64)
+    a, b = corners[:, _EDGES[:, 0]], corners[:, _EDGES[:, 1]]
+    cut = (a[..., 2] < NEAR_PLANE) != (b[..., 2] < NEAR_PLANE)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        crossing = a + (b - a) * ((NEAR_PLANE - a[..., 2]) / (b[..., 2] - a[..., 2]))[..., None]
+    points = np.concatenate([corners, crossing], axis=1)
+    points[~np.concatenate([corners[..., 2] >= NEAR_PLANE, cut], axis=1)] = np.nan
+    uv, _ = geometry.project(points.reshape(-1, 3), camera.intrinsics)
+    return uv.reshape(len(boxes), -1, 2)
+
+
+def in_view(boxes: Boxes3D, camera: Camera) -> F64:
+    """(K,) share of each box that is inside the image; 0 where the camera's place is not known."""
+    if camera.intrinsics is None or camera.camera_from_points is None or len(boxes) == 0:
+        return np.zeros(len(boxes))
+    steps = np.linspace(-0.45, 0.45, 5, dtype=np.float32)
+    grid = np.stack(np.meshgrid(steps, steps, steps), axis=-1).reshape(-1, 3)
+    local = grid[None] * boxes.size[:, None]
+    c, s = np.cos(boxes.yaw)[:, None], np.sin(boxes.yaw)[:, None]
+    x, y = c * local[..., 0] - s * local[..., 1], s * local[..., 0] + c * local[..., 1]
+    points = np.stack([x, y, local[..., 2]], axis=-1) + boxes.center[:, None]
+    uv, _ = geometry.project(
+        geometry.apply(camera.camera_from_points, points.reshape(-1, 3)), camera.intrinsics
+    )
+    limit = np.array([camera.intrinsics.width, camera.intrinsics.height], np.float32) - 0.5
+    with np.errstate(invalid="ignore"):
+        inside = ((uv >= -0.5) & (uv < limit)).all(axis=1)
+    return np.asarray(inside.reshape(len(boxes), -1).mean(axis=1), np.float64)
+
+
+# --- behind something --------------------------------------------------------------------------
 
 
 def range_image(points: F32) -> F32:

@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bevviz.config import VoxelConfig
-from bevviz.frame import F32, I32, I64, Voxels
+from bevviz.frame import F32, I32, I64
+from bevviz.results import Voxels
 from bevviz.stages.cells import cell_keys, group
 from bevviz.stages.kernel import kernel
 

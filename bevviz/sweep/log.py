@@ -15,7 +15,7 @@ from bevviz.logging import entities
 from bevviz.logging.pieces import document
 from bevviz.sweep.chart import chart_view, log_chart, log_map
 from bevviz.sweep.parameters import Parameter, Values
-from bevviz.sweep.run import COUNTS, SCORES, STAGES, Sweep
+from bevviz.sweep.run import COUNTS, OPINIONS, SCORES, STAGES, Sweep
 from bevviz.text import markdown
 
 
@@ -119,5 +119,7 @@ def _plots(sweep: Sweep) -> Mapping[str, Sequence[str]]:
         plots["Precision, recall, F1"] = SCORES[:3]
     plots["Detections, matches, objects"] = COUNTS[1:] if one else COUNTS[3:]
     plots["Clusters"] = COUNTS[:1]
+    if any(config.objects.method != "frustum" for config in sweep.configs.values()):
+        plots["Objects, by cameras and our fusion"] = [*OPINIONS.values()] if one else ["contradicted"]
     plots["Time, ms"] = [f"{stage} ms" for stage in STAGES] if one else ["time ms"]
     return plots

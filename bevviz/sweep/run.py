@@ -14,18 +14,20 @@ from typing import Any
 
 import numpy as np
 
-from bevviz import table
+from bevviz import counts, table
 from bevviz.config import Config
 from bevviz.counts import counts_of
 from bevviz.evaluate import Score, Truth
 from bevviz.files import save
-from bevviz.frame import Frame, FrameResult
+from bevviz.frame import Frame
+from bevviz.results import FrameResult
 from bevviz.sweep.parameters import Parameter, Values
 from bevviz.text import printable
 from bevviz.variants import Variants
 
 STAGES = ("voxel", "ground", "clustering", "fusion")  # each has its own time
 COUNTS = ("clusters", "detections", "matches", "objects")
+OPINIONS = {what: what.replace("_", " ") for what in counts.OPINIONS}
 SCORES = ("precision", "recall", "F1", "error m")
 
 
@@ -56,6 +58,7 @@ class Outcome:
         """Means of a frame; medians of the LiDAR stages' milliseconds, shared by values or not; scores."""
         frames = max(self.frames, 1)
         found = {what: self.counts[what] / frames for what in COUNTS}
+        found |= {OPINIONS[what]: self.counts[what] / frames for what in OPINIONS if what in self.counts}
         # The first frame pays for what is loaded with it: no means.
         times = {f"{stage} ms": float(np.median(self.seconds[stage] or [0.0])) * 1e3 for stage in STAGES}
         found |= {"time ms": sum(times.values()), **times}

@@ -9,22 +9,19 @@ from typing import Any, Generic, Protocol, TypeVar
 
 from bevviz.frame import LabelledBoxes3D
 from bevviz.ros.around import decode_shapes, decode_statuses
-from bevviz.ros.messages import (
-    MessageError,
+from bevviz.ros.cameras import decode_camera_info
+from bevviz.ros.clouds import decode_cloud
+from bevviz.ros.detections import decode_boxes, decode_detections_2d, decode_detections_3d
+from bevviz.ros.images import decode_compressed_image, decode_image
+from bevviz.ros.messages import MessageError
+from bevviz.ros.roles import CameraRole, Roles
+from bevviz.ros.transforms import (
     StampedTransform,
     decode_acceleration,
-    decode_boxes,
-    decode_camera_info,
-    decode_cloud,
-    decode_compressed_image,
-    decode_detections_2d,
-    decode_detections_3d,
-    decode_image,
     decode_motion,
     decode_odometry,
     decode_transforms,
 )
-from bevviz.ros.roles import CameraRole, Roles
 from bevviz.ros.video import decode_packet
 from bevviz.sync.synchronizer import Synchronizer
 from bevviz.sync.video import Rewind, Video, VideoLoader

@@ -11,7 +11,7 @@ from bevviz import geometry
 from bevviz.config import Config
 from bevviz.errors import UserError
 from bevviz.frame import F64, Cloud, Frame, LabelledBoxes3D
-from bevviz.ros.messages import StampedTransform
+from bevviz.ros.transforms import StampedTransform
 from bevviz.sync.report import SyncReport
 from bevviz.sync.tf import Lookup, Origin, TransformError
 from bevviz.sync.upright import Upright

@@ -27,8 +27,8 @@ from bevviz.frame import (
     LabelledBoxes3D,
     LateResult,
 )
-from bevviz.ros.messages import StampedTransform
 from bevviz.ros.roles import Roles, entity_name
+from bevviz.ros.transforms import StampedTransform
 from bevviz.sync.around import Surroundings
 from bevviz.sync.cameras import Cameras
 from bevviz.sync.clocks import Clocks
@@ -254,15 +254,21 @@ class Synchronizer:
         return self.clocks.stamp(topic, stamp, received)
 
     def _check_units(self, cloud: Cloud) -> None:
-        """In millimetres nothing is within the reach of any stage, and nothing would be said."""
+        """In millimetres, or far from the origin of a map, nothing is within the reach of any stage."""
         if cloud.topic not in self.report.oddities and len(cloud.xyz):
-            x, y, z = np.abs(cloud.xyz[::16]).T  # their maximum, faster than by row
+            some = cloud.xyz[::16]
+            x, y, z = np.abs(some).T  # their maximum, faster than by row
             middle = float(np.median(np.maximum(np.maximum(x, y), z)))
             if middle > FAR:
-                self.report.oddities[cloud.topic] = (
-                    f"{cloud.topic}: half of its points are farther than {middle:,.0f} m, as coordinates in "
-                    f"millimetres are; a PointCloud2 is in metres (REP 103): correct its driver"
+                around = float(np.median(np.abs(some - np.median(some, axis=0)).max(axis=1)))
+                why = (
+                    "millimetres are; a PointCloud2 is in metres (REP 103): correct its driver"
+                    if around > FAR
+                    else f"a map (UTM) are, with most within {around:,.0f} m of each other; they are wanted "
+                    "in the frame of the LiDAR: take its position away"
                 )
+                far = f"{cloud.topic}: half of its points are farther than {middle:,.0f} m"
+                self.report.oddities[cloud.topic] = f"{far}, as coordinates in {why}"
 
     def _watch_clock(self, stamp: int) -> None:
         newest = self._clouds[-1].stamp if self._clouds else self._last

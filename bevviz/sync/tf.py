@@ -19,7 +19,7 @@ import numpy as np
 from bevviz import geometry
 from bevviz.errors import UserError
 from bevviz.frame import F64
-from bevviz.ros.messages import StampedTransform
+from bevviz.ros.transforms import StampedTransform
 
 
 class TransformError(UserError):

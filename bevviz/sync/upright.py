@@ -20,7 +20,7 @@ import cv2
 import numpy as np
 
 from bevviz.frame import F32, F64, Cloud
-from bevviz.ros.messages import Acceleration
+from bevviz.ros.transforms import Acceleration
 from bevviz.sync.tf import TransformBuffer, TransformError
 
 TILT = math.radians(2.0)  # of a LiDAR on its robot, from which on it is turned

@@ -12,7 +12,8 @@ import numpy as np
 from bevviz.errors import first_line
 from bevviz.frame import U8, Clip, Codec, Image
 from bevviz.ros.bitstream import Continuity
-from bevviz.ros.messages import MOST_PIXELS, MessageError
+from bevviz.ros.images import MOST_PIXELS
+from bevviz.ros.messages import MessageError
 from bevviz.ros.video import Packet
 
 if TYPE_CHECKING:

@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 
 from bevviz.evaluate import MIN_HITS, RANGE
-from bevviz.frame import U8, FrameResult
-from bevviz.perceive import StageLoader
+from bevviz.frame import U8
+from bevviz.results import FrameResult
+from bevviz.stage_loader import StageLoader
 from bevviz.why.chain import Step, chain
 from bevviz.why.evidence import Evidence
 from bevviz.why.gather import gather
@@ -53,7 +54,9 @@ class Answer:
     @property
     def weak(self) -> bool:
         """Whether it is a weak detection of no known object, which is what thresholds are for."""
-        low = self.verdict.reason in (Reason.BELOW_THRESHOLD, Reason.SUPPRESSED)
+        reason, best = self.verdict.reason, self.evidence.best
+        low = reason in (Reason.BELOW_THRESHOLD, Reason.SUPPRESSED)
+        low |= reason is Reason.NOT_AMONG and best is not None and not best.kept
         return self.subject.kind == "detection" and low
 
     @property

@@ -7,7 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from bevviz import geometry
-from bevviz.frame import F32, I64, CameraResult, Decision, DetectionState, Fusion
+from bevviz.frame import F32, I64
+from bevviz.results import CameraResult, Decision, DetectionState, Fusion
 from bevviz.why.evidence import Candidate, Part
 from bevviz.why.subject import LINK, Subject, projected
 from bevviz.why.traces import Traces

@@ -8,8 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from bevviz.frame import Decision, DetectionState
+from bevviz.results import Decision, DetectionState, Opinion
 from bevviz.why.evidence import Candidate, Evidence, fusion_of
+from bevviz.why.named import find_fused, in_box_of, opinion_on
 from bevviz.why.sentences import label, not_run, state_text
 from bevviz.why.subject import Subject, projected
 from bevviz.why.traces import Traces
@@ -57,7 +58,7 @@ def chain(subject: Subject, e: Evidence, traces: Traces) -> Iterator[Step]:
             yield _clustering(e, traces)
             yield from _merged(e, traces)
     yield from _detected(subject, e, traces)
-    yield from _objects(e, traces)
+    yield from _objects(subject, e, traces)
 
 
 def _clock(subject: Subject, traces: Traces) -> Iterator[Step]:
@@ -226,15 +227,44 @@ def _pairs(c: Candidate, e: Evidence, traces: Traces) -> Iterator[Step]:
         )
 
 
-def _objects(e: Evidence, traces: Traces) -> Iterator[Step]:
+def _objects(subject: Subject, e: Evidence, traces: Traces) -> Iterator[Step]:
     """Where they are not made of clusters and detections."""
     there, objects = traces.origin("objects"), traces.result.objects
     if there.ours:
         return
+    j, opinions = find_fused(subject, e, traces), traces.result.opinions
     if e.named is None or objects is None:
         number = "no" if objects is None else str(len(objects))
         yield Step("objects", f"none of the {number} objects of {there.name} is there", {"by": there.name})
+        if j >= 0 and opinions is not None:
+            fused, k = opinions.fused, int(opinions.partner[j])
+            text = f"{fused.names[j]} {fused.score[j]:.2f} of cluster {fused.cluster[j]}, "
+            text += f"which {there.name} has missed" if k < 0 or objects is None else in_box_of(objects, k)
+            yield Step("our fusion", text, {"row": j, "missed": k < 0})
         return
     score = float(objects.score[e.named.row])
     text = f"{there.name} has {e.named.name} {score:.2f} there"
     yield Step("objects", text, {"by": there.name, "row": e.named.row, "score": round(score, 3)})
+    if opinions is not None and (said := opinion_on(traces.result, e.named.row)):
+        opinion = Opinion(int(opinions.opinion[e.named.row]))
+        yield Step(
+            "cameras", said, {"opinion": opinion.word, "seen": not opinion.is_unseen, **_seen(e, traces)}
+        )
+
+
+def _seen(e: Evidence, traces: Traces) -> Mapping[str, Any]:
+    """What an opinion on an object hung on, and the limits."""
+    opinions, least = traces.result.opinions, traces.result.config.opinions
+    assert opinions is not None and e.named is not None
+    k = e.named.row
+    found = {
+        "shown": round(float(opinions.shown[k]), 3),
+        "visible": round(float(opinions.visible[k]), 3),
+        "height_px": round(float(opinions.height[k]), 1),
+    }
+    if opinions.detection[k] >= 0:
+        found["iou"] = round(float(opinions.iou[k]), 3)
+    if not np.isnan(opinions.held[k]):
+        found["cluster_share"] = round(float(opinions.held[k]), 3)
+    limits = {"shown": least.min_shown, "visible": least.min_visible}
+    return {**found, "least": {**limits, "height_px": least.min_height, "iou": least.min_iou}}

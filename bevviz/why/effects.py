@@ -9,7 +9,8 @@ import numpy as np
 
 from bevviz.compare.differences import Change, Seen, compare_objects
 from bevviz.evaluate import MAX_DISTANCE, pair_in_order
-from bevviz.frame import Boxes3D, Objects
+from bevviz.frame import Boxes3D
+from bevviz.results import Objects
 from bevviz.why.subject import Subject, count
 from bevviz.why.traces import joined
 

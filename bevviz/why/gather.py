@@ -7,13 +7,15 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from bevviz import geometry
-from bevviz.frame import F32, I32, I64, ClusterState, FrameResult
+from bevviz.frame import F32, I32, I64
+from bevviz.results import ClusterState, FrameResult
 from bevviz.stages.kernel import kernel
+from bevviz.stages.visibility import in_view
 from bevviz.why.candidates import find_candidates, sort_candidates
 from bevviz.why.evidence import Candidate, Evidence, Part
 from bevviz.why.merged import LOOKED_AT, closest, find_mates, part_from
 from bevviz.why.named import find_named
-from bevviz.why.subject import IN_VIEW, Subject, in_view
+from bevviz.why.subject import IN_VIEW, Subject
 from bevviz.why.traces import FEW, PART, Fate, Traces
 
 NEARER = 0.5  # metres by which something must be nearer to hide what is behind it

@@ -7,8 +7,8 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from bevviz import geometry
-from bevviz.frame import Decision, FrameResult
-from bevviz.why.evidence import Candidate, Named, Part, fusion_of
+from bevviz.results import Decision, FrameResult, Objects
+from bevviz.why.evidence import Candidate, Evidence, Named, Part, fusion_of
 from bevviz.why.subject import LINK, Subject, in_box, one_of, projected
 from bevviz.why.traces import FEW, PART, Traces
 
@@ -30,10 +30,39 @@ def find_named(
         rows = list(_made_of(subject, traces, parts, candidates))
     else:
         rows = list(_boxes_there(subject, traces))
-    rows.sort(key=lambda j: not subject.accepts(objects.names[j]))
+    accepts = subject.accepts if traces.origin("objects").ours else subject.accepts_of_others
+    rows.sort(key=lambda j: not accepts(objects.names[j]))
     for j in rows:
         return _described(subject, j, result, candidates)
     return None
+
+
+def find_fused(subject: Subject, e: Evidence, traces: Traces) -> int:
+    """Row of the object that our fusion would have made of the subject, -1: it would have made none.
+
+    Where the objects are somebody else's; a detection's own, or that of the subject's cluster.
+    """
+    opinions = traces.result.opinions
+    if opinions is None:
+        return -1
+    fused = opinions.fused
+    if subject.kind == "detection":
+        own = {(c.camera, c.row) for c in e.candidates}
+        named = zip(fused.camera, fused.detection.tolist(), strict=True)
+        return next((j for j, key in enumerate(named) if key in own), -1)
+    return fused.cluster.tolist().index(e.main) if e.main in fused.cluster else -1
+
+
+def in_box_of(objects: Objects, row: int) -> str:
+    """Where an object of our fusion is among somebody else's."""
+    return f"in the box of {objects.names[row]} {objects.score[row]:.2f}"
+
+
+def opinion_on(result: FrameResult, row: int) -> str:
+    """What cameras say of an object of somebody else's, without its name; empty: they are not asked."""
+    key = "object", row
+    said = next((x.text for x in result.explanations if (x.subject, x.row) == key), "")
+    return said.partition(": ")[2]
 
 
 def _described(subject: Subject, j: int, result: FrameResult, candidates: Sequence[Candidate]) -> Named:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 
-from bevviz.config import STAGES, Config, plugin_of
+from bevviz.config import OURS, STAGES, Config, plugin_of
 from bevviz.errors import UserError
 from bevviz.plugins import TOPIC
 
@@ -42,4 +43,6 @@ def origin(config: Config, section: str) -> StageOrigin:
         plugin = plugin_of(config, section)
     except UserError:  # it could be had when the frame was run
         return StageOrigin(section, function=method)
+    if plugin is None and section == "objects" and method not in OURS:
+        return StageOrigin(section, function=Path(method).name)  # a network's file
     return StageOrigin(section, function=plugin.name if plugin is not None else "")

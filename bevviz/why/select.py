@@ -9,10 +9,13 @@ import numpy as np
 
 from bevviz import geometry
 from bevviz.config import BevConfig
+from bevviz.datasets.names import accepted_names
 from bevviz.errors import UserError
-from bevviz.frame import F32, I64, Boxes3D, CameraResult, Decision, DetectionState, Intrinsics
-from bevviz.why.subject import IN_VIEW, LINK, Selection, Subject, accepted_names, one_of, projected
-from bevviz.why.traces import FEW, Traces, detection_subject
+from bevviz.frame import F32, I64, Boxes3D, Intrinsics
+from bevviz.results import CameraResult, Decision, DetectionState, Opinion
+from bevviz.why.named import OVERLAP
+from bevviz.why.subject import IN_VIEW, LINK, Selection, Subject, one_of, projected
+from bevviz.why.traces import FEW, Traces, detection_subject, joined
 
 PIXELS = 6.0  # half edge of what is looked at around a pixel
 SPACING = 1.0  # pixels by which the points of what a pixel shows may be farther from it than those of another
@@ -50,16 +53,25 @@ def select(traces: Traces, selection: Selection) -> list[Subject]:
     if selection.camera:
         camera_of(traces, selection.camera)
     subjects = [*_seen(traces, selection.camera), *_strange_detections(traces, selection.camera)]
+    subjects += _denied(traces, selection.camera)
     if not selection.label:
         return subjects
     truth = result.frame.truth
-    known = dict.fromkeys([*traces.classes, *(truth.labels if truth is not None else ())])
+    theirs = result.objects.names if result.opinions is not None and result.objects is not None else ()
+    known = dict.fromkeys([*traces.classes, *(truth.labels if truth is not None else ()), *theirs])
     wanted = selection.label.lower()
     if not any(wanted == name.lower() or wanted in accepted_names(name, ()) for name in known):
         near = difflib.get_close_matches(selection.label, known, 1, 0.5)
         hint = f"did you mean '{near[0]}'?" if near else f"there are {', '.join(sorted(known)) or 'none'}"
         raise UserError(f"--class {selection.label}: no such class; {hint}")
-    return [s for s in subjects if s.label.lower() == wanted or (s.kind == "truth" and s.accepts(wanted))]
+    return [s for s in subjects if s.label.lower() == wanted or _is_called(s, wanted)]
+
+
+def _is_called(subject: Subject, name: str) -> bool:
+    """Whether a name of the detector's stands for the subject, too."""
+    if subject.kind == "object":
+        return name in accepted_names(subject.label, ())
+    return subject.kind == "truth" and subject.accepts(name)
 
 
 def _row(subjects: tuple[Subject, ...], row: int, what: str) -> Subject:
@@ -223,6 +235,18 @@ def _strange_detections(traces: Traces, camera: str) -> Iterator[Subject]:
         strange = (detections.state != DetectionState.SUPPRESSED) & (traces.owners(found) < 0)
         for row in np.flatnonzero(strange).tolist():
             yield detection_subject(found, row)
+
+
+def _denied(traces: Traces, camera: str) -> Iterator[Subject]:
+    """Objects of somebody else's that a camera contradicts; what is of the ground truth speaks for itself."""
+    opinions, objects = traces.result.opinions, traces.result.objects
+    if opinions is None or objects is None:
+        return
+    real = joined([subject.box for subject in traces.truth if subject.box is not None])
+    there = geometry.bev_iou(objects.boxes, real).max(axis=1, initial=0) >= OVERLAP
+    for row in np.flatnonzero(opinions.opinion == Opinion.CONTRADICTED).tolist():
+        if not there[row] and camera in ("", opinions.camera[row]):
+            yield object_subject(traces, row)
 
 
 # --- what lies at a place ----------------------------------------------------------------------

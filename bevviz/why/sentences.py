@@ -8,8 +8,9 @@ import numpy as np
 
 from bevviz.config import Config
 from bevviz.explain import in_mask
-from bevviz.frame import ClusterState, Decision, FrameResult
+from bevviz.results import ClusterState, Decision, FrameResult
 from bevviz.why.evidence import Candidate, Evidence, fusion_of
+from bevviz.why.named import find_fused, in_box_of, opinion_on
 from bevviz.why.origin import StageOrigin
 from bevviz.why.subject import Subject, count
 from bevviz.why.traces import Fate, Traces
@@ -78,6 +79,7 @@ class Because:
             Reason.TAKEN: self._taken,
             Reason.MISFIT: self._misfit,
             Reason.OTHER_CLUSTER: self._other_cluster,
+            Reason.CONTRADICTED: self._contradicted,
             Reason.NOT_AMONG: self._not_among,
             Reason.LOST_IN_FUSION: self._lost_in_fusion,
         }
@@ -114,6 +116,8 @@ class Because:
             return f"{label(self._best)} was kept {whose}; without a LiDAR nothing tells where it is"
         named, text = self.e.named, self._with()
         assert named is not None
+        if opinion := opinion_on(self.result, named.row):
+            return f"{text}, {opinion}"
         if not named.camera or self.result.objects is None:
             return text
         score = self.result.objects.score[named.row]
@@ -180,6 +184,8 @@ class Because:
         named = self.e.named
         assert named is not None
         text = self._with()
+        if opinion := opinion_on(self.result, named.row):
+            text += f", {opinion}"
         if named.camera and not named.own:
             text += f" by a detection that is not its own, {self._whose_box(named.camera, named.detection)}"
         return text
@@ -370,8 +376,29 @@ class Because:
 
     # --- objects that are not ours -------------------------------------------------------------
 
+    def _contradicted(self) -> str:
+        assert self.e.named is not None
+        return f"it is {opinion_on(self.result, self.e.named.row)}"
+
     def _not_among(self) -> str:
-        return f"it is not among the objects of {self._origin('objects').name}; " + ", ".join(self._beside())
+        text = f"it is not among the objects of {self._origin('objects').name}; "
+        return text + (self._fused() or ", ".join(self._beside()))
+
+    def _fused(self) -> str:
+        """What our fusion would have made of it; empty: nothing."""
+        j, opinions, clusters = (
+            find_fused(self.subject, self.e, self.traces),
+            self.result.opinions,
+            self.result.clusters,
+        )
+        if j < 0 or opinions is None or clusters is None:
+            return ""
+        fused = opinions.fused
+        k, name = int(fused.cluster[j]), f"{fused.names[j]} {fused.score[j]:.2f}"
+        points = count(int(clusters.count[k]), "point")
+        text = f"our fusion has it: cluster {k} ({points}), named by {name} of {fused.camera[j]}"
+        row, objects = int(opinions.partner[j]), self.result.objects
+        return text if row < 0 or objects is None else f"{text}, {in_box_of(objects, row)}"
 
     def _beside(self) -> Iterator[str]:
         """What the stages beside it have at the place."""

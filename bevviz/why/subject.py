@@ -2,30 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 
-from bevviz import geometry
-from bevviz.datasets.names import ACCEPTED
-from bevviz.frame import F32, F64, I64, Bool, Boxes3D, Camera
+from bevviz.datasets.names import CATEGORIES, accepted_names
+from bevviz.frame import F32, I64, Bool, Boxes3D, Camera
+from bevviz.stages.visibility import image_boxes
 
 LINK = 0.3  # IoU from which a box is taken for one of a projected object
 IN_VIEW = 0.1  # share of a box that is inside the image, if it is in view
 MARGIN = 0.02  # metres around a box of the ground truth that are still its own: noise of the sensor
 FOOT = 0.03  # metres above its bottom that are the road's: noise of the sensor, too
-NEAR_PLANE = 0.1  # metres before the camera, from which on a box is drawn in its image
 
 Kind = Literal["truth", "object", "detection", "cluster", "track", "pixel", "point", "cell"]
-
-_SYNONYMS = {label.lower(): names for label, names in ACCEPTED.items()} | {
-    "cyclist": ACCEPTED["Cyclist"] | {"rider"}
-}
-_EDGES = np.array(
-    [(0, 1), (1, 2), (2, 3), (3, 0), (4, 5), (5, 6), (6, 7), (7, 4), (0, 4), (1, 5), (2, 6), (3, 7)]
-)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -99,18 +90,9 @@ class Subject:
         """Whether a detection or an object of that class is a right one."""
         return not self.accepted or name.lower() in self.accepted
 
-
-def accepted_names(label: str, known: Iterable[str]) -> frozenset[str]:
-    """What a detector may rightly call an object of the ground truth, in lower case.
-
-    Its own name alone where the detector knows that; KITTI's names stand for several.
-    """
-    name = label.lower()
-    if label in ACCEPTED:
-        return frozenset(ACCEPTED[label] | _SYNONYMS[name])
-    if any(name == other.lower() for other in known):
-        return frozenset({name})
-    return frozenset({name, *_SYNONYMS.get(name, ())})
+    def accepts_of_others(self, name: str) -> bool:
+        """Whether an object of somebody else's, who need not have the detector's names, is a right one."""
+        return self.accepts(name) or CATEGORIES.get(name, name).lower() in accepted_names(self.label, ())
 
 
 def count(number: int, what: str) -> str:
@@ -137,37 +119,5 @@ def in_box(box: Boxes3D, points: F32, margin: float = 0.0, foot: float = 0.0) ->
 
 def projected(box: Boxes3D, camera: Camera) -> F32 | None:
     """(4,) image box around what of a 3D box is before the camera, cut at the image's edge; None: nothing."""
-    if camera.intrinsics is None or camera.camera_from_points is None:
-        return None
-    corners = geometry.apply(camera.camera_from_points, geometry.corners(box)[0]).astype(np.float64)
-    a, b = corners[_EDGES[:, 0]], corners[_EDGES[:, 1]]
-    cut = (a[:, 2] < NEAR_PLANE) != (b[:, 2] < NEAR_PLANE)
-    a, b = a[cut], b[cut]
-    crossing = a + (b - a) * ((NEAR_PLANE - a[:, 2]) / (b[:, 2] - a[:, 2]))[:, None]
-    ahead = np.concatenate([corners[corners[:, 2] >= NEAR_PLANE], crossing])
-    uv, _ = geometry.project(ahead, camera.intrinsics)
-    uv = uv[np.isfinite(uv).all(axis=1)]
-    if len(uv) == 0:
-        return None
-    limit = np.array([camera.intrinsics.width, camera.intrinsics.height], np.float32) - 0.5
-    low, high = np.clip(uv.min(0), -0.5, limit), np.clip(uv.max(0), -0.5, limit)
-    return np.concatenate([low, high]) if (high > low).all() else None
-
-
-def in_view(boxes: Boxes3D, camera: Camera) -> F64:
-    """(K,) share of each box that is inside the image; 0 where the camera's place is not known."""
-    if camera.intrinsics is None or camera.camera_from_points is None or len(boxes) == 0:
-        return np.zeros(len(boxes))
-    steps = np.linspace(-0.45, 0.45, 5, dtype=np.float32)
-    grid = np.stack(np.meshgrid(steps, steps, steps), axis=-1).reshape(-1, 3)
-    local = grid[None] * boxes.size[:, None]
-    c, s = np.cos(boxes.yaw)[:, None], np.sin(boxes.yaw)[:, None]
-    x, y = c * local[..., 0] - s * local[..., 1], s * local[..., 0] + c * local[..., 1]
-    points = np.stack([x, y, local[..., 2]], axis=-1) + boxes.center[:, None]
-    uv, _ = geometry.project(
-        geometry.apply(camera.camera_from_points, points.reshape(-1, 3)), camera.intrinsics
-    )
-    limit = np.array([camera.intrinsics.width, camera.intrinsics.height], np.float32) - 0.5
-    with np.errstate(invalid="ignore"):
-        inside = ((uv >= -0.5) & (uv < limit)).all(axis=1)
-    return np.asarray(inside.reshape(len(boxes), -1).mean(axis=1), np.float64)
+    found = image_boxes(box, camera)[0]
+    return found if np.isfinite(found).all() else None

@@ -10,22 +10,13 @@ from functools import cached_property
 import numpy as np
 
 from bevviz import geometry
-from bevviz.frame import (
-    F32,
-    I32,
-    I64,
-    U8,
-    Bool,
-    Boxes3D,
-    CameraResult,
-    Decision,
-    Detections,
-    Frame,
-    FrameResult,
-)
+from bevviz.datasets.names import accepted_names
+from bevviz.frame import F32, I32, I64, U8, Bool, Boxes3D, Frame
+from bevviz.results import CameraResult, Decision, Detections, FrameResult
 from bevviz.stages.robot import in_points_frame
+from bevviz.stages.visibility import in_view
 from bevviz.why.origin import StageOrigin, origin
-from bevviz.why.subject import FOOT, LINK, MARGIN, Subject, accepted_names, in_box, in_view, one_of, projected
+from bevviz.why.subject import FOOT, LINK, MARGIN, Subject, in_box, one_of, projected
 
 SAME_CLASS = 1.3  # times as good is the overlap of a detection with an object of its class
 FEW = 3  # points that are as good as none

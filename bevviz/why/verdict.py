@@ -7,8 +7,9 @@ from enum import StrEnum
 
 import numpy as np
 
-from bevviz.frame import CameraResult, ClusterState, Decision, DetectionState, FrameResult, Fusion
+from bevviz.results import CameraResult, ClusterState, Decision, DetectionState, FrameResult, Fusion, Opinion
 from bevviz.why.evidence import MOST, Candidate, Evidence, Named, fusion_of
+from bevviz.why.named import find_fused
 from bevviz.why.subject import Subject
 from bevviz.why.traces import FEW, PART, Traces
 
@@ -42,6 +43,7 @@ class Reason(StrEnum):
     TAKEN = "taken"
     MISFIT = "misfit"
     OTHER_CLUSTER = "other cluster"
+    CONTRADICTED = "contradicted"  # reported by somebody else's method, and a camera sees nothing there
     NOT_AMONG = "not among the objects"  # of a 3D detector, or the robot's whose stages are not known
     LOST_IN_FUSION = "lost in the fusion"  # the robot's, which had a cluster and a detection
 
@@ -77,9 +79,13 @@ def find_reason(subject: Subject, e: Evidence, traces: Traces) -> tuple[Reason, 
     """
     if not traces.result.frame.lidar:
         return _seen(subject, e, traces)
-    if e.named is not None and subject.accepts(e.named.name):
+    accepts = subject.accepts if traces.origin("objects").ours else subject.accepts_of_others
+    if e.named is not None and accepts(e.named.name):
         return _flaw(subject, e, e.named, traces), True
-    if e.named is not None and not any(c.kept and subject.accepts(c.name) for c in e.candidates):
+    if e.named is not None and (
+        not any(c.kept and subject.accepts(c.name) for c in e.candidates)
+        or _in_their_box(subject, e, e.named, traces)
+    ):
         return Reason.MISNAMED, False
     if traces.result.objects is None:
         return Reason.FAILED, False
@@ -99,6 +105,10 @@ def _seen(subject: Subject, e: Evidence, traces: Traces) -> tuple[Reason, bool]:
 
 
 def _flaw(subject: Subject, e: Evidence, named: Named, traces: Traces) -> Reason:
+    opinions = traces.result.opinions
+    if opinions is not None and subject.kind == "object":
+        denied = opinions.opinion[named.row] == Opinion.CONTRADICTED
+        return Reason.CONTRADICTED if denied else Reason.REPORTED
     if named.detection < 0 or subject.kind == "object":
         return Reason.SHARED_BOX if named.also else Reason.REPORTED
     if e.mates or (subject.kind == "truth" and e.purity < MOST):
@@ -259,6 +269,12 @@ def _loss_of_others(subject: Subject, e: Evidence, traces: Traces) -> Reason:
         return Reason.NOT_DETECTED if subject.is_place or e.in_view else Reason.OUT_OF_VIEW
     known = {"clustering", "detector"} <= robot and cluster and detected
     return Reason.LOST_IN_FUSION if known else Reason.NOT_AMONG
+
+
+def _in_their_box(subject: Subject, e: Evidence, named: Named, traces: Traces) -> bool:
+    """Whether what our fusion would have made of the subject is in the box that stands there."""
+    j, opinions = find_fused(subject, e, traces), traces.result.opinions
+    return j >= 0 and opinions is not None and int(opinions.partner[j]) == named.row
 
 
 def has_cluster(subject: Subject, e: Evidence) -> bool:

@@ -13,8 +13,11 @@ from pydantic import ValidationError
 
 from bevviz.config import Config, plugin_of
 from bevviz.errors import UserError
-from bevviz.frame import Camera, Detections, DetectionState, FrameResult
-from bevviz.perceive import Detect, Memo, StageLoader, perceive
+from bevviz.frame import Camera
+from bevviz.perceive import perceive
+from bevviz.results import Detections, DetectionState, FrameResult
+from bevviz.stage_loader import Detect, StageLoader
+from bevviz.stage_log import Memo
 from bevviz.why.effects import Effects, effects
 from bevviz.why.evidence import Candidate, Evidence
 from bevviz.why.gather import gather

@@ -17,17 +17,18 @@ import rerun as rr
 
 from bevviz.anomalies import Onsets
 from bevviz.closing import Closing
-from bevviz.config import revised
+from bevviz.config import Config, revised
 from bevviz.drive import Drive, Frames
 from bevviz.errors import UserError, first_line
 from bevviz.evaluate import Truth
-from bevviz.frame import Frame, FrameResult, Objects, Tracks
+from bevviz.frame import Frame
 from bevviz.logging import blueprints, entities
 from bevviz.logging.logger import Logger
 from bevviz.logging.sinks import APPLICATION
 from bevviz.logging.writer import WAIT
 from bevviz.notes import Note, Notes
 from bevviz.perceive import describe
+from bevviz.results import FrameResult, Objects, Tracks
 from bevviz.run import Items, Observer, run
 from bevviz.variants import Variants, check_same_frames
 from bevviz.why import Answer, Questioner
@@ -48,7 +49,6 @@ if TYPE_CHECKING:
 KEPT = 6  # results of frames that were looked at
 PATIENCE = 10.0  # seconds that the run may take to end
 FIRST = 6.0  # seconds that the run waits for a page to have drawn the first frame
-SLACK = 1000  # ns: pages count in doubles
 ASKED = 8  # answers that are kept for reports
 BOTH = (entities.STAMP, entities.TRIED)
 
@@ -272,9 +272,9 @@ class Bench(Closing):
         stamps = list(self._stamps)
         if not stamps:
             raise UserError("no frame has been run yet")
-        place = bisect.bisect_right(stamps, (stamp + SLACK, 2**62)) - 1
+        place = bisect.bisect_right(stamps, (stamp + entities.SLACK, 2**62)) - 1
         at, number = stamps[max(place, 0)]
-        if self.over or stamp <= self._reached or abs(stamp - at) <= SLACK:
+        if self.over or stamp <= self._reached or abs(stamp - at) <= entities.SLACK:
             return number
         return self._sought(stamp, number)
 
@@ -283,9 +283,9 @@ class Bench(Closing):
         with self._looking:
             scans, frame = self.drive.frames.scans, self.look(near).frame
             number = int(np.abs(scans - (stamp + int(scans[near]) - frame.stamp)).argmin())
-            while number > 0 and self._stamp_of(number) > stamp + SLACK:
+            while number > 0 and self._stamp_of(number) > stamp + entities.SLACK:
                 number -= 1
-            while number + 1 < len(scans) and self._stamp_of(number + 1) <= stamp + SLACK:
+            while number + 1 < len(scans) and self._stamp_of(number + 1) <= stamp + entities.SLACK:
                 number += 1
             return number
 
@@ -296,7 +296,7 @@ class Bench(Closing):
 
     def film_row(self, stamp: int) -> int | None:
         """Piece of the film that has the frame which a viewer shows at that time."""
-        place = bisect.bisect_right(self._stamps, (stamp + SLACK, 2**62)) - 1
+        place = bisect.bisect_right(self._stamps, (stamp + entities.SLACK, 2**62)) - 1
         return self._rows.get(self._stamps[place][0]) if place >= 0 else None
 
     def truth(self, frame: Frame) -> Truth | None:
@@ -420,6 +420,14 @@ class Bench(Closing):
         self.desk.add(self._film_desk.read())
 
     # --- other values --------------------------------------------------------------------------
+
+    def configured(self, settings: Settings) -> Config:
+        """How frames are made with other values.
+
+        Raises:
+            UserError: an unknown parameter, or a wrong value.
+        """
+        return revised(self.drive.config, settings)
 
     def attempt(self, number: int, settings: Settings, what: Pick | None = None) -> dict[str, Any]:
         """Show the frame as it is with other values, and tell what they do to it.

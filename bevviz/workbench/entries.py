@@ -10,8 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from bevviz.frame import F32, Anomaly
+from bevviz.frame import F32
 from bevviz.geometry import iou
+from bevviz.results import Anomaly
 from bevviz.workbench.missed import Find, Place
 
 REACH = 2.5  # metres that a thing may have moved since the last frame that it was found in

@@ -10,12 +10,14 @@ import rerun as rr
 
 from bevviz import geometry
 from bevviz.config import BevConfig
-from bevviz.frame import Boxes3D, FrameResult
+from bevviz.frame import Boxes3D
 from bevviz.logging import entities
 from bevviz.logging.bev import footprints, seen_from_above
 from bevviz.logging.camera import over_image
 from bevviz.logging.pieces import OUTLINE, boxes2d, boxes3d, transform
+from bevviz.logging.spoken import named_in_space
 from bevviz.logging.writer import Writer
+from bevviz.results import FrameResult
 from bevviz.stages.robot import in_points_frame
 from bevviz.why.subject import one_of, projected
 from bevviz.why.traces import joined
@@ -44,18 +46,20 @@ def log_layer(to: Writer, result: FrameResult, found: Sequence[Find]) -> Layer:
             continue
         boxes = joined([_box(result, find) for find in rows])
         labels = [f"{find.name} {what}{f': {find.reason}' if find.reason else ''}" for find in rows]
+        beside = named_in_space(boxes.center).tolist() if what == "missed" else [False] * len(rows)
         to.put(
             path,
             transform(result.frame.pose),
             boxes3d(
                 boxes,
                 np.arange(len(rows)),
-                labels,
+                [label if named else "" for label, named in zip(labels, beside, strict=True)],
                 colors=[color],
                 radii=rr.Radius.ui_points(1.5),
                 show_labels=what == "missed",
                 fill_mode=OUTLINE,
             ),
+            rr.AnyValues(says=labels),
         )
         layer[path] = rows
         for camera in result.frame.cameras:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import threading
 from collections import OrderedDict, deque
 from collections.abc import Callable, Sequence
@@ -12,16 +11,17 @@ from typing import Any
 import rerun as rr
 
 from bevviz.closing import Closing
-from bevviz.config import Config, revised, values
+from bevviz.config import Config, revised
 from bevviz.errors import UserError
 from bevviz.evaluate import Truth, truth_of
-from bevviz.frame import FrameResult, Scene
+from bevviz.frame import Scene
 from bevviz.live.runtime import Live
 from bevviz.live.thinning import chosen
 from bevviz.logging import entities
 from bevviz.logging.logger import Logger
 from bevviz.logging.sinks import APPLICATION
 from bevviz.perceive import describe
+from bevviz.results import FrameResult
 from bevviz.session import Session
 from bevviz.variants import Variants
 from bevviz.why import Answer, Questioner
@@ -35,7 +35,7 @@ from bevviz.workbench.trial import attempt
 
 KEPT = 4  # frames that pages may hold at once
 TRIED = 2  # results of held frames with other values
-LISTED = ("missed", "false", "unmatched", "unnamed")
+LISTED = ("missed", "false", "contradicted", "lost", "unmatched", "unnamed")
 
 Settings = tuple[str, ...]
 
@@ -84,7 +84,6 @@ class LiveBench(Closing):
         self._kept: OrderedDict[int, FrameResult] = OrderedDict()
         self._lock = threading.Lock()  # of the two
         self._tried: OrderedDict[tuple[int, Settings], FrameResult] = OrderedDict()
-        self._before = values(live.config)
         self._set: Settings = ()
         self._variants = Variants(live.session.loader)
         self._asked: Questioner | None = None
@@ -141,7 +140,7 @@ class LiveBench(Closing):
         frames = sorted((r.frame.stamp, r.frame.index) for r in self._held())
         if not frames:
             raise UserError("no frame has come yet")
-        there = [index for at, index in frames if at <= stamp + 1000]  # pages count in doubles
+        there = [index for at, index in frames if at <= stamp + entities.SLACK]
         if not there:
             raise UserError(
                 f"that frame is gone: the newest {self._newest.maxlen} can be asked about "
@@ -162,7 +161,7 @@ class LiveBench(Closing):
             UserError: there is none yet.
         """
         frames = sorted((r.frame.stamp, r.frame.index) for r in self._held())
-        shown = [index for at, index in frames if at <= stamp + 1000]
+        shown = [index for at, index in frames if at <= stamp + entities.SLACK]
         if not frames:
             raise UserError("no frame has come yet")
         result = self.look(shown[-1] if shown else frames[0][1])
@@ -259,6 +258,10 @@ class LiveBench(Closing):
         """That pages have changed."""
         return self._set
 
+    def configured(self, settings: Settings) -> Config:
+        """How frames are made, once these have been taken on."""
+        return self.live.config
+
     def attempt(self, number: int, settings: Settings, what: Pick | None = None) -> dict[str, Any]:
         """Change parameters of the running session for good, and tell what they do to a frame.
 
@@ -273,16 +276,14 @@ class LiveBench(Closing):
         return attempt(before, after, truth, asked)
 
     def change(self, settings: Settings) -> None:
-        """Change parameters of the running session; those of before that are none of these are as at first.
+        """Change parameters of the running session; those that pages changed before and that are none of
+        these are as they are stated elsewhere.
 
         Raises:
             UserError: an unknown parameter, or a wrong value; nothing is changed.
         """
-        own = {setting.partition("=")[0] for setting in settings}
-        undone = [key for key in (one.partition("=")[0] for one in self._set) if key not in own]
-        back = [f"{key}={json.dumps(self._before[key])}" for key in undone]
-        if back or settings != self._set:
-            self.live.update([*back, *settings])
+        if settings != self._set:
+            self.live.update(settings, without=self._set)
         self._set = settings
 
     def snap(self) -> str:

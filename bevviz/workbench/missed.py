@@ -9,7 +9,8 @@ import numpy as np
 
 from bevviz import geometry
 from bevviz.evaluate import RANGE, Truth, match
-from bevviz.frame import F32, F64, Decision, FrameResult
+from bevviz.frame import F32, F64
+from bevviz.results import Decision, FrameResult, Opinion
 from bevviz.why import Questioner, Selection
 from bevviz.workbench.pick import Pick
 
@@ -25,7 +26,7 @@ class Find:
     Attributes:
         frame: number of its scan.
         stamp: of that, nanoseconds.
-        what: missed, false, unmatched or unnamed.
+        what: missed, false, contradicted, lost, unmatched or unnamed.
         name: of its class, or of the cluster.
         distance: horizontal metres; NaN where it is not known.
         pick: that asks about it.
@@ -49,9 +50,10 @@ def finds(result: FrameResult, truth: Truth | None) -> list[Find]:
     """Those of a frame within 40 m, the nearest first.
 
     With the truth, which the frame has, too, what had to be found and was not, and objects that are none;
-    without it kept detections that have no cluster, and clusters in view that no detection names.
+    without it objects of somebody else's that a camera contradicts, those that they have lost and our fusion
+    has, kept detections that have no cluster, and clusters in view that no detection names.
     """
-    found = list(_judged(result, truth) if truth is not None else _unexplained(result))
+    found = list(_judged(result, truth) if truth is not None else [*_doubted(result), *_unexplained(result)])
     near = [find for find in found if not find.distance > RANGE]
     return sorted(near, key=lambda find: (find.what == "false", np.nan_to_num(find.distance, nan=RANGE)))
 
@@ -82,6 +84,23 @@ def _judged(result: FrameResult, truth: Truth) -> Iterator[Find]:
         center = truth.boxes.center[row]
         name, away = truth.labels[row].lower(), float(np.hypot(*center[:2]))
         yield Find(*when, "missed", name, away, Pick("truth", row), place=fixed_place(pose, center))
+
+
+def _doubted(result: FrameResult) -> Iterator[Find]:
+    """Of objects that are somebody else's."""
+    opinions, objects = result.opinions, result.objects
+    if opinions is None or objects is None:
+        return
+    when, pose, fused = (result.frame.index, result.frame.stamp), result.frame.pose, opinions.fused
+    for row in np.flatnonzero(opinions.opinion == Opinion.CONTRADICTED).tolist():
+        center, pick = objects.boxes.center[row], Pick("object", row)
+        away, reason = float(np.hypot(*center[:2])), f"by {opinions.camera[row]}"
+        yield Find(*when, "contradicted", objects.names[row], away, pick, reason, fixed_place(pose, center))
+    for row in np.flatnonzero(opinions.missed).tolist():
+        center, camera = fused.boxes.center[row], fused.camera[row]
+        pick = Pick("detection", int(fused.detection[row]), camera)
+        away, reason = float(np.hypot(*center[:2])), f"{fused.score[row]:.2f} in {camera}"
+        yield Find(*when, "lost", fused.names[row], away, pick, reason, fixed_place(pose, center))
 
 
 def _unexplained(result: FrameResult) -> Iterator[Find]:

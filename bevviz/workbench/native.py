@@ -8,7 +8,6 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import json
-import subprocess
 import sys
 import threading
 from collections.abc import Callable, Sequence
@@ -87,14 +86,8 @@ class NativeViewer(Closing):
         return relay
 
     def _start_relay(self, url: str) -> rerun_cli.Process:
-        return subprocess.Popen(
-            rerun_cli.tied([sys.executable, "-m", "bevviz.live.relay", url, self._recording_id]),
-            stdin=subprocess.PIPE,
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.DEVNULL,
-            env=rerun_cli.environment(),
-            start_new_session=True,  # Ctrl-C is for us alone
-        )
+        relay = [sys.executable, "-m", "bevviz.live.relay", url, self._recording_id]
+        return rerun_cli.spawn(rerun_cli.tied(relay))
 
     def _start(self) -> str:
         port = free_port(FIRST_DATA_PORT)

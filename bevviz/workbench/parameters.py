@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal, get_args, get_origin
+from types import UnionType
+from typing import Any, Literal, Union, get_args, get_origin
 
 import annotated_types
 from pydantic.fields import FieldInfo
+from pydantic_core import to_jsonable_python
 
 from bevviz.config import Config, unit, values
 from bevviz.parameters import field_of
@@ -13,13 +15,25 @@ from bevviz.parameters import field_of
 UNSEEN = ("source.", "live.", "logging.", "sync.", "detector.model")  # nothing that one frame could show anew
 
 
-def controls(config: Config) -> list[dict[str, Any]]:
-    """One for each parameter of the stages that a frame can be run with again."""
+def controls(config: Config, opened: Config | None = None) -> list[dict[str, Any]]:
+    """One for each parameter of the stages that a frame can be run with again.
+
+    Args:
+        config: whose stages they are.
+        opened: whose values they have; of a stage that it does not name, the defaults. None: those of
+            ``config``.
+    """
+    at_first = values(config if opened is None else opened)
     return [
-        _control(key, value, info)
+        _control(key, at_first.get(key, _default(value, info)), info)
         for key, value in values(config).items()
-        if "." in key and not key.startswith(UNSEEN) and (info := field_of(key)) is not None
+        if "." in key and not key.startswith(UNSEEN) and (info := field_of(key, config)) is not None
     ]
+
+
+def _default(value: Any, info: FieldInfo) -> Any:
+    """Of a parameter; the value where it has none."""
+    return value if info.is_required() else to_jsonable_python(info.get_default(call_default_factory=True))
 
 
 def _control(key: str, value: Any, info: FieldInfo) -> dict[str, Any]:
@@ -43,5 +57,6 @@ def _control(key: str, value: Any, info: FieldInfo) -> dict[str, Any]:
 def _kind(annotation: Any) -> str:
     if get_origin(annotation) is Literal:
         return "choice"
-    inner = {annotation, *get_args(annotation)}
+    united = get_args(annotation) if get_origin(annotation) in (Union, UnionType) else ()
+    inner = {annotation, *united}
     return "switch" if bool in inner else "whole" if int in inner else "number" if float in inner else "text"

@@ -10,10 +10,12 @@ import numpy as np
 
 from bevviz import geometry
 from bevviz.errors import UserError
-from bevviz.frame import CameraResult, FrameResult, Tracks
 from bevviz.logging import entities
+from bevviz.logging.opinions import MISSED, told_from_above, told_in_image
 from bevviz.logging.pieces import CORNER
+from bevviz.logging.spoken import row_of
 from bevviz.logging.tracks import shown
+from bevviz.results import CameraResult, FrameResult, Tracks
 
 Kind = Literal["truth", "object", "detection", "cluster", "pixel", "point", "cell"]
 
@@ -74,6 +76,8 @@ def pick(
         position: where: 2 pixels in a view of an image, 3 metres of the fixed frame in one of space.
     """
     row, path = -1 if instance is None else instance, entities.boxes_of(path)
+    if found := _told(result, path, row):
+        return found
     for camera in result.cameras:
         if found := _in_image(camera, path, row, position):
             return found
@@ -82,13 +86,38 @@ def pick(
     return _in_space(result, tracks, path, row) or _at(result, position)
 
 
+def _told(result: FrameResult, path: str, row: int) -> Pick | None:
+    """An object over an image or the bird's-eye view of which cameras say something."""
+    views = [told_from_above(result)] if path.startswith(f"{entities.BEV}/") else []
+    views += [
+        told_in_image(result, found.camera)
+        for found in result.cameras
+        if path.startswith(f"{entities.image(found.camera.name)}/")
+    ]
+    for told in views:
+        if path in told and 0 <= (row := row_of(row, len(told[path].rows))) < len(told[path].rows):
+            found = told[path].rows[row]
+            return _missed(result, found) if told[path].opinion == MISSED else Pick("object", found)
+    return None
+
+
+def _missed(result: FrameResult, row: int) -> Pick | None:
+    """What our fusion would have made of a detection, where the objects are somebody else's."""
+    if result.opinions is None:
+        return None
+    fused = result.opinions.fused
+    if (row := row_of(row, len(fused))) >= len(fused):
+        return None
+    return Pick("detection", int(fused.detection[row]), fused.camera[row])
+
+
 def _in_image(found: CameraResult, path: str, row: int, position: Sequence[float]) -> Pick | None:
     name = found.camera.name
     if found.detections is not None and row >= 0:
         kept = found.detections.kept
         for where, rows in ((entities.detections(name), kept), (entities.weak(name), ~kept)):
             listed = np.flatnonzero(rows)
-            if path == where and row < len(listed):
+            if path == where and (row := row_of(row, len(listed))) < len(listed):
                 return Pick("detection", int(listed[row]), name)
     inside = path in (entities.sensor(name), entities.image(name)) or path.startswith(
         (f"{entities.image(name)}/", entities.why(f"{name}/"))
@@ -112,8 +141,10 @@ def _in_space(result: FrameResult, tracks: Tracks | None, path: str, row: int) -
         return None
     if path == entities.points(frame.lidar) and len(frame.clouds) <= 1 and row < len(frame.points):
         return _point(frame.points[row])
-    if path == entities.FUSED and result.objects is not None and row < len(result.objects):
-        return Pick("object", row)
+    if path == entities.FUSED and (objects := result.objects) is not None:
+        return Pick("object", row_of(row, len(objects))) if row_of(row, len(objects)) < len(objects) else None
+    if path == entities.FUSION:
+        return _missed(result, row)
     if path == entities.TRUTH and frame.truth is not None and row < len(frame.truth.boxes):
         return Pick("truth", row)
     if path in (entities.TRACKS, entities.UNSEEN) and tracks is not None:

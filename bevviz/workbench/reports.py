@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from bevviz.bags.source import iso
 from bevviz.config import revised
 from bevviz.errors import UserError, first_line
-from bevviz.frame import FrameResult
+from bevviz.results import FrameResult
 from bevviz.run import Items, Observer
 
 if TYPE_CHECKING:

@@ -11,12 +11,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from bevviz.config import changes, revised
+from bevviz.counts import OPINIONS, opinions_in
 from bevviz.errors import UserError, first_line
 from bevviz.evaluate import Score, Truth
-from bevviz.frame import FrameResult, Objects
 from bevviz.logging import entities
 from bevviz.logging.logger import Logger
 from bevviz.logging.writer import WAIT
+from bevviz.results import FrameResult, Objects
 from bevviz.run import Items, Observer, run
 from bevviz.session import Session
 from bevviz.variants import check_same_frames
@@ -214,11 +215,19 @@ def attempt(before: FrameResult, after: FrameResult, truth: Truth | None, asked:
     told: dict[str, Any] = {
         "changes": {k: str(c) for k, c in changes(before.config, after.config).items()},
         "effects": effects_dict(found),
+        "opinions": _opinions(before, after),
         "failures": [f"{failure.stage}: {failure.reason}" for failure in after.failures],
     }
     if truth is not None:
         told["f1"] = [_f1(result, truth) for result in (before, after)]
     return told
+
+
+def _opinions(before: FrameResult, after: FrameResult) -> dict[str, list[int | None]]:
+    """Of which there are more or fewer, how many there were and are; None: the objects are ours."""
+    was, now = opinions_in(before), opinions_in(after)
+    counts = {what: [was.get(what), now.get(what)] for what in OPINIONS}
+    return {what.replace("_", " "): [a, b] for what, (a, b) in counts.items() if (a or 0) != (b or 0)}
 
 
 def effects_dict(found: Effects) -> dict[str, Any]:

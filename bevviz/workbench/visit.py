@@ -72,6 +72,8 @@ class Visit:
         from bevviz.workbench.parameters import controls
 
         bench = self._bench
+        self._opened = bench.drive.config
+        self._controls = controls(self._opened)
         return {
             "type": "welcome",
             "run": self._run,
@@ -79,7 +81,7 @@ class Visit:
             "scans": len(bench.drive),
             "truth": bench.truth_of is not None,
             "detector": bool(bench.drive.config.detector.model),
-            "controls": controls(bench.drive.config),
+            "controls": self._controls,
         }
 
     async def _tell(self, more: asyncio.Event) -> None:
@@ -175,12 +177,17 @@ class Visit:
             await self._send({"type": "hints", **head, "hints": hints.as_dict()["hints"]})
 
     async def _try(self, number: int, message: dict[str, Any]) -> None:
+        from bevviz.workbench.parameters import controls
         from bevviz.workbench.pick import Pick
 
         settings, frame = _settings(message), await self._frame(message)
         pick = Pick.parse(str(message["pick"])) if message.get("pick") else None
         told = await self._at_desk(number, lambda: self._bench.attempt(frame, settings, pick))
         await self._send({"type": "tried", "id": number, "frame": frame, **told})
+        there = controls(self._bench.configured(settings), self._opened)
+        if there != self._controls:  # a stage is somebody else's now, or is no longer
+            self._controls = there
+            await self._send({"type": "controls", "controls": there})
 
     async def _settle(self, number: int, message: dict[str, Any]) -> None:
         """The page shows this frame for a while: questions about it are to come."""

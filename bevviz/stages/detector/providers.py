@@ -26,7 +26,7 @@ HELP = {
 }
 
 
-def open_session(path: Path, asked: str, options: ort.SessionOptions) -> tuple[Any, str]:
+def open_session(path: Path, asked: str, options: ort.SessionOptions, where: str = "") -> tuple[Any, str]:
     """The session of an ONNX file, and the short name of the execution provider that it runs on.
 
     Args:
@@ -34,11 +34,12 @@ def open_session(path: Path, asked: str, options: ort.SessionOptions) -> tuple[A
         asked: execution provider, by its short or whole name; auto: the best that works. Where that is not
             the best that is installed, it is said why.
         options: of the session.
+        where: the file is stated; empty: as the detector's.
 
     Raises:
         UserError: that provider is not installed or does not work; no network.
     """
-    session, used, failed = _opened(path, asked, options)
+    session, used, failed = _opened(path, asked, options, where or f"detector.model {path}")
     for name, reason in failed.items():
         tell(f"the network runs on {used}: {name} is installed, but {reason}")
     return session, used
@@ -47,13 +48,15 @@ def open_session(path: Path, asked: str, options: ort.SessionOptions) -> tuple[A
 def network(path: Path, asked: str) -> str:
     """What the network of an ONNX file runs on here, in words; where it cannot be run, why."""
     try:
-        _, used, failed = _opened(path, asked, ort.SessionOptions())
+        _, used, failed = _opened(path, asked, ort.SessionOptions(), f"detector.model {path}")
     except UserError as error:
         return str(error)
     return "; ".join([used, *(f"{name} is installed, but {reason}" for name, reason in failed.items())])
 
 
-def _opened(path: Path, asked: str, options: ort.SessionOptions) -> tuple[Any, str, dict[str, str]]:
+def _opened(
+    path: Path, asked: str, options: ort.SessionOptions, where: str
+) -> tuple[Any, str, dict[str, str]]:
     """The session, what it runs on, and why each provider that would be better does not work."""
     available = [name.removesuffix(SUFFIX) for name in ort.get_available_providers()]
     if asked.lower() != "auto":
@@ -73,7 +76,7 @@ def _opened(path: Path, asked: str, options: ort.SessionOptions) -> tuple[Any, s
     failed: dict[str, str] = {}
     for name in [name for name in PREFERRED if name in available]:
         if name == "CPU":
-            session = _started(path, [name], options, f"detector.model {path}")
+            session = _started(path, [name], options, where)
         elif reason := obstacle(name):
             failed[name] = reason
             continue
@@ -87,7 +90,7 @@ def _opened(path: Path, asked: str, options: ort.SessionOptions) -> tuple[Any, s
         if used != name:
             failed[name] = "onnxruntime does not start it"
         return session, used, failed
-    raise UserError(f"detector.model {path}: onnxruntime has none of {', '.join(PREFERRED)}")
+    raise UserError(f"{where}: onnxruntime has none of {', '.join(PREFERRED)}")
 
 
 @lru_cache

@@ -7,6 +7,7 @@ import { drawnThen, isTried, kind, seek, showSide, tell } from "./viewer.js";
 import * as work from "./work.js";
 
 let controls = [];
+let opened = []; // the controls as they were first
 
 // --- questions and answers ----------------------------------------------------------------------
 
@@ -28,7 +29,8 @@ function answer(message) {
   state.pick = message.pick;
   state.place = message.position ? `point//${message.position.join(",")}` : "";
   remember();
-  $("answer").className = message.reported ? "reported" : "missed";
+  // What a camera denies is no good news, although it was reported.
+  $("answer").className = message.reported && message.reason !== "contradicted" ? "reported" : "missed";
   $("answer").dataset.took = took.toFixed(0);
   $("answer").dataset.server = (performance.now() - asked.sent).toFixed(0); // of it, what is not the viewer's
   $("verdict").textContent = message.verdict;
@@ -89,7 +91,10 @@ function effects(found) {
 function change(settings) {
   state.undo.push(state.set);
   const keys = new Set(settings.map((one) => one.split("=")[0]));
-  state.set = [...state.set.filter((one) => !keys.has(one.split("=")[0])), ...settings];
+  // What was set of a method goes with it.
+  const gone = [...keys].filter((key) => key.endsWith(".method")).map((key) => key.replace(/method$/, "params."));
+  const stays = (key) => !keys.has(key) && !gone.some((start) => key.startsWith(start));
+  state.set = [...state.set.filter((one) => stays(one.split("=")[0])), ...settings];
   state.flipped = false;
   changed();
 }
@@ -113,7 +118,10 @@ function attempt() {
   if (state.set.length || kind === "live") { // a robot has to be told that it is undone
     $("effect").textContent = "Running the stages ...";
     trying = send({ type: "try", time: Number(state.time), set: state.set, pick: state.pick });
-  } else $("effect").textContent = "As it was opened.";
+  } else {
+    $("effect").textContent = "As it was opened.";
+    offer({ controls: opened });
+  }
   if (state.pick) askAgain();
 }
 
@@ -123,7 +131,8 @@ function tried(message) {
   const took = () => (performance.now() - since).toFixed(0);
   $("effect").dataset.took = took();
   drawnThen(() => { $("effect").dataset.drawn = took(); });
-  const parts = [effects(message.effects) || "changes nothing that is reported"];
+  const said = Object.entries(message.opinions).map(([what, both]) => `${what} ${both.map((one) => one ?? "–").join(" → ")}`);
+  const parts = [[effects(message.effects), ...said].filter(Boolean).join("; ") || "changes nothing that is reported"];
   if (message.f1) parts.push(`F1 ${message.f1.map((one) => one ?? "–").join(" → ")}`);
   parts.push(...message.failures);
   $("effect").textContent = `${parts.join("; ")}.`;
@@ -164,6 +173,12 @@ function showControls() {
   const focused = document.activeElement?.id;
   $("controls").replaceChildren(...wanted.map((one) => control(one, own)));
   if (focused?.startsWith("control-")) $(focused)?.focus();
+}
+
+// A stage that somebody else's function stands in for has parameters of its own.
+function offer(message) {
+  controls = message.controls;
+  showControls();
 }
 
 function control(one, own) {
@@ -210,14 +225,14 @@ function welcome(message) {
   state.run = message.run;
   document.title = `${message.bag} · bevviz`;
   $("bag").textContent = message.bag;
-  controls = message.controls;
+  controls = opened = message.controls;
   list.restart();
   if (!message.detector) $("run").title = "no detector: give --model";
   showControls();
 }
 
 on({
-  welcome, answer, nothing, hints, tried, opening: open, error: failed, progress: work.progress,
+  welcome, controls: offer, answer, nothing, hints, tried, opening: open, error: failed, progress: work.progress,
   entries: list.told, notes: list.notes, noted: work.noted,
 });
 tell({

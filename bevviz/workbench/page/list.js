@@ -5,8 +5,8 @@ import { seek, showSide } from "./viewer.js";
 
 const SHOWN = 300; // rows that are in the page at once
 const PAUSE = 200; // ms between two drawings of it
-const KINDS = ["missed", "unmatched", "broken", "new false", "fixed", "false gone", "new", "gone", "unnamed", "false",
-  "anomaly", "note"];
+const KINDS = ["missed", "lost", "contradicted", "unmatched", "broken", "new false", "fixed", "false gone", "new", "gone",
+  "unnamed", "false", "anomaly", "note"];
 const RANK = new Map(KINDS.map((kind, row) => [kind, row]));
 RANK.set("unmatched", 0);
 

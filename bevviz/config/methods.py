@@ -1,0 +1,49 @@
+"""What the stages can be: ours, a function, a network, or a topic of the robot's."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+from pydantic_core import PydanticCustomError
+
+from bevviz import plugins
+from bevviz.pillar_params import is_network
+
+
+@dataclass(frozen=True, slots=True)
+class Methods:
+    """What a stage can be: one of ours, ``module:function``, a registered name, or ``topic:NAME``."""
+
+    ours: tuple[str, ...]
+    former: Mapping[str, str] = field(default_factory=dict)  # names that ours once had
+    networks: bool = False  # an ONNX file, too
+
+    def check(self, value: str) -> str:
+        value = self.former.get(value, value)
+        if value in self.ours or ":" in value or value in plugins.registered():
+            return value
+        if self.networks and is_network(value):
+            return value
+        registered = f", {', '.join(plugins.registered())} (registered)" if plugins.registered() else ""
+        raise PydanticCustomError(
+            "method",
+            "must be one of {ours}{registered}, {file}module:function, or topic:/name",
+            {
+                "ours": ", ".join(self.ours),
+                "registered": registered,
+                "file": "FILE.onnx, " if self.networks else "",
+            },
+        )
+
+
+GROUND = Methods(("polar", "plane"), {"ransac": "plane"})
+CLUSTERING = Methods(("dbscan",))
+OBJECTS = Methods(("frustum",), networks=True)
+OURS = ("", "demo", *GROUND.ours, *GROUND.former, *CLUSTERING.ours, *OBJECTS.ours)
+STAGES = {  # section -> the key that names its function
+    "ground": "method",
+    "clustering": "method",
+    "detector": "model",
+    "objects": "method",
+}

@@ -1,0 +1,90 @@
+"""PCD files, by pypcd4: Open3D ends the process on those with padding between the fields, as of PCL."""
+
+from __future__ import annotations
+
+import struct
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bevviz.errors import first_line
+from bevviz.ros.clouds import MOST_POINTS
+
+MOST_LINES = 50  # of a header
+MOST_BYTES = 1 << 30
+
+
+def read_pcd(file: Path) -> tuple[NDArray[np.void], int]:
+    """The points with their fields, and how many the file announces: of one that is cut, the whole points.
+
+    Padding, and fields of several numbers a point, are left out.
+
+    Raises:
+        OSError: it cannot be read.
+        ValueError: it is no PCD, or its points are damaged.
+    """
+    data = file.read_bytes()
+    try:
+        about, body = _header(data)
+        layout = about.build_dtype()
+    except (ValueError, LookupError, TypeError, StopIteration):
+        raise ValueError("no header of a PCD, or a damaged one") from None
+    if about.points > MOST_POINTS:
+        raise ValueError(f"announces {about.points} points: {MOST_POINTS} at most are taken")
+    try:
+        points = _points(about, layout, body)
+    except (ValueError, RuntimeError, LookupError, TypeError, MemoryError, struct.error) as error:
+        raise ValueError(first_line(error)) from None
+    single = {name for name, count in zip(about.fields, about.count, strict=True) if count == 1}
+    names = [n for n in layout.names if n in single and n.isidentifier()]
+    if missing := sorted({"x", "y", "z"} - set(names)):
+        raise ValueError(f"no field {missing[0]} in it")
+    return points[names], about.points
+
+
+def _header(data: bytes) -> tuple[Any, bytes]:
+    """What the file says of itself, and what follows.
+
+    Written out as files of version 0.7 have it: older ones have COLUMNS, no VIEWPOINT and no COUNT, some
+    writers leave the size or the number of points to be told by the other, or name padding of COUNT 0.
+    """
+    from pypcd4.pypcd4 import MetaData
+
+    lines = data.split(b"\n", MOST_LINES)
+    end = next(i for i, line in enumerate(lines) if line.startswith(b"DATA")) + 1
+    words = [line.decode().split() for line in lines[:end] if line.strip() and not line.startswith(b"#")]
+    stated = {key.upper(): values for key, *values in words}
+    fields = stated.get("FIELDS") or stated["COLUMNS"]
+    count = [int(value) for value in stated.get("COUNT", ["1"] * len(fields))]
+    kept = [i for i in range(len(fields)) if count[i]]
+    height = int(stated.get("HEIGHT", "1")[0])
+    size = int(stated["WIDTH"][0]) * height if "WIDTH" in stated else int(stated["POINTS"][0])
+    about = MetaData(
+        fields=tuple(f"-{i}" if fields[i] == "_" else fields[i] for i in kept),
+        size=tuple(int(stated["SIZE"][i]) for i in kept),
+        type=tuple(stated["TYPE"][i] for i in kept),
+        count=tuple(count[i] for i in kept),
+        points=int(stated["POINTS"][0]) if "POINTS" in stated else size,
+        width=size // max(height, 1),
+        height=height,
+        data=stated["DATA"][0].lower(),
+    )
+    return about, data[sum(len(line) + 1 for line in lines[:end]) :]
+
+
+def _points(about: Any, layout: np.dtype[np.void], body: bytes) -> NDArray[np.void]:
+    from pypcd4.pypcd4 import PointCloud
+
+    if about.data == "binary":
+        return np.frombuffer(body, layout, count=min(about.points, len(body) // layout.itemsize))
+    if about.data == "ascii":
+        if not body.endswith(b"\n") and len(body.splitlines()) < about.points:
+            body = body[: body.rfind(b"\n") + 1]  # the last line is cut
+        return np.loadtxt(BytesIO(body), layout, ndmin=1) if body.strip() else np.zeros(0, layout)
+    if struct.unpack("<I", body[4:8])[0] > MOST_BYTES:
+        raise ValueError(f"unpacks to more than {MOST_BYTES} bytes")
+    whole: Any = BytesIO(about.compose_header().encode() + body)
+    return np.asarray(PointCloud.from_fileobj(whole).pc_data)

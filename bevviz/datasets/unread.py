@@ -1,0 +1,28 @@
+"""What is in a folder that no loader reads."""
+
+from __future__ import annotations
+
+from collections import Counter
+from pathlib import Path
+
+AS_CLOUDS = "save them as PCD, PLY, BIN or NPY"
+AS_IMAGES = "save them as PNG or JPEG"
+KINDS = {
+    **dict.fromkeys((".las", ".laz", ".e57", ".xyz", ".pts", ".npz", ".vtk", ".feather"), AS_CLOUDS),
+    **dict.fromkeys((".tif", ".tiff", ".bmp", ".pgm", ".ppm", ".exr", ".raw"), AS_IMAGES),
+    **dict.fromkeys((".mp4", ".avi", ".mkv", ".mov"), "save their images as PNG or JPEG"),
+    ".pcap": "play them through their driver and record its topics",
+    ".tfrecord": "convert them, for instance to KITTI's layout",
+}
+MOST = 10_000  # files that are looked at
+
+
+def unread(folder: Path) -> str:
+    """A clause on the commonest of the files here, or in its folders, that are not read; "": none."""
+    places = [folder, *(d for d in sorted(folder.iterdir()) if d.is_dir())]
+    files = [f for place in places for f, _ in zip(place.iterdir(), range(MOST), strict=False)]
+    counts = Counter(kind for file in files if (kind := file.suffix.lower()) in KINDS)
+    if not counts:
+        return ""
+    kind, count = counts.most_common(1)[0]
+    return f"{count} {kind} file{'s are' if count > 1 else ' is'} not read: {KINDS[kind]}"

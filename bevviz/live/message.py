@@ -1,0 +1,52 @@
+"""A message of a running ROS 2 graph, as it came."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Any
+
+from bevviz.ros import ouster
+from bevviz.ros.compressed import decompress, is_compressed
+from bevviz.ros.definitions import store_of
+from bevviz.ros.livox import is_livox, read_custom
+from bevviz.ros.messages import MessageError, read_header
+from bevviz.ros.packets import is_packets, read_scan
+from bevviz.ros.vision_msgs import deserialize
+
+
+@dataclass(frozen=True, slots=True)
+class LiveMessage:
+    topic: str
+    type: str
+    received: int  # nanoseconds, when the middleware had it
+    data: bytes  # CDR
+    sensor: ouster.Sensor | None = None  # an Ouster, whose packets make a scan
+    packets: tuple[ouster.Packet, ...] = ()
+
+    def header(self) -> tuple[int, str]:
+        return read_header(self.data, "<" if self.data[1:2] != b"\0" else ">", self.topic)
+
+    def decode(self, calibration: Mapping[str, str] = MappingProxyType({})) -> Any:
+        """The message as an object with the fields of its definition.
+
+        ``calibration`` is that of the LiDARs, by topic, as ``source.lidar_calibration`` has it.
+
+        Raises:
+            MessageError: the data does not fit the definition.
+        """
+        try:
+            if self.sensor is not None:
+                return ouster.decode(self.sensor, self.packets)
+            if is_livox(self.type):
+                return read_custom(self.data, ros1=False)
+            if is_packets(self.type):
+                return read_scan(
+                    self.data, self.type, ros1=False, calibration=calibration.get(self.topic, "")
+                )
+            found = deserialize(store_of(self.type), self.data, self.type)
+            return decompress(found) if is_compressed(self.type) else found
+        except Exception as error:  # generated decoders raise whatever the bytes lead them to
+            reason = str(error) or type(error).__name__
+            raise MessageError(f"{self.topic}: not a {self.type}: {reason}") from None

@@ -1,0 +1,209 @@
+"""What the ONNX file of a 3D detector does not tell: the parameters of ``objects.method=FILE.onnx``."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Annotated, Any, Literal
+
+from pydantic import (
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    PositiveFloat,
+    ValidationInfo,
+    field_validator,
+)
+from pydantic_core import PydanticCustomError
+
+SUFFIX = ".onnx"
+
+Feature = Literal[
+    "x",
+    "y",
+    "z",
+    "intensity",
+    "time",
+    "mean_x",
+    "mean_y",
+    "mean_z",
+    "center_x",
+    "center_y",
+    "center_z",
+    "distance",
+]
+Share = Annotated[float, Field(ge=0, le=1)]
+Three = tuple[PositiveFloat, PositiveFloat, PositiveFloat]
+Six = tuple[float, float, float, float, float, float]
+UNFIT = "unfit"  # type of an error that says what was given itself
+
+
+def _unfit(sentence: str) -> PydanticCustomError:
+    return PydanticCustomError(UNFIT, "{sentence}", {"sentence": sentence})
+
+
+def _one_or_several(given: Any) -> Any:
+    return [given] if isinstance(given, str) else given
+
+
+class PillarParams(BaseModel):
+    """How clouds are shown to a network on pillars, and how its maps are read. Metres and radians."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, validate_default=True)
+
+    point_range: Six = Field(
+        description="metres: lowest x, y, z, then highest x, y, z of the points that the network is shown"
+    )
+    voxel_size: Three = Field(
+        description="metres: edges of a pillar; in z it reaches through the whole point_range"
+    )
+    features: tuple[Feature, ...] = Field(
+        min_length=3,
+        description="of a point, in the network's order: x, y, z, intensity, time (0: of this scan); mean_x, "
+        "mean_y, mean_z from the mean of its pillar; center_x, center_y, center_z from its pillar's centre; "
+        "distance from the origin",
+    )
+    classes: Annotated[tuple[str, ...], BeforeValidator(_one_or_several)] = Field(
+        min_length=1, description="class names in the network's order"
+    )
+    encoder: str = Field("", description="ONNX file of the pillars' encoder, where the network is two files")
+    max_points: int | None = Field(
+        None,
+        ge=1,
+        le=1000,
+        description="points of a pillar, later ones are left out; empty: as the file says",
+    )
+    max_pillars: int = Field(
+        40_000, ge=1, le=1_000_000, description="pillars of a cloud, later ones are left out"
+    )
+    intensity_scale: float = Field(
+        1.0, gt=0, description="the cloud's intensity times this is what the network was trained with"
+    )
+    z_offset: float = Field(
+        0.0,
+        ge=-20,
+        le=20,
+        description="metres added to the cloud's z: height of this LiDAR less that of the one in training",
+    )
+
+    anchors: tuple[tuple[PositiveFloat, PositiveFloat, PositiveFloat, float], ...] = Field(
+        (),
+        description="metres: length, width, height, z of the lower face; empty: it is a network of centres",
+    )
+    rotations: tuple[float, ...] = Field(
+        (0.0, 1.57), min_length=1, description="radians: each anchor is turned so"
+    )
+    anchor_places: Literal["cell_centers", "edge_to_edge"] | None = Field(
+        None,
+        description="cell_centers (mmdetection3d's aligned generator), or the first and last on the edges of "
+        "anchor_range (OpenPCDet without align_center)",
+    )
+    anchor_range: tuple[float, float, float, float] | None = Field(
+        None, description="metres: lowest x, y, highest x, y of the anchors; empty: that of point_range"
+    )
+    direction_offset: float | None = Field(
+        None, ge=-7, le=7, description="radians: dir_offset, where the network tells front from back"
+    )
+    direction_limit_offset: float = Field(0.0, ge=-1, le=1, description="dir_limit_offset, in half turns")
+
+    boxes: Literal["lwh", "wlh"] | None = Field(
+        None,
+        description="centres: lwh is length, width, height and yaw from x to the left (OpenPCDet, "
+        "mmdetection3d from 1.0); wlh is width, length, height and -yaw - pi/2 (Autoware, older ones)",
+    )
+    rotation: Literal["sin_cos", "cos_sin"] | None = Field(
+        None, description="centres: sin_cos (mmdetection3d, Autoware) or cos_sin (OpenPCDet)"
+    )
+    groups: tuple[tuple[str, ...], ...] = Field(
+        (), description="centres: class names of each head, where the network has several"
+    )
+    min_rotation: Mapping[str, float] = Field(
+        {},
+        description="centres: least norm of (sin, cos) by class, else 0; Autoware's yaw_norm_thresholds",
+    )
+
+    scores: Literal["logits", "probabilities"] = Field(
+        "logits", description="what the network answers; of logits the sigmoid is taken"
+    )
+    score_threshold: Share = Field(0.3, description="lowest score of an object")
+    score_thresholds: Mapping[str, Share] = Field({}, description="the same of single classes, by name")
+    labels: Literal["best", "each"] = Field(
+        "best",
+        description="best: one class a place (OpenPCDet's anchors, Autoware); each: every class that scores "
+        "enough (mmdetection3d, OpenPCDet's centres)",
+    )
+    nms: Literal["all", "group", "class"] = Field(
+        "class", description="what suppresses one another: all, those of one head, those of one class"
+    )
+    nms_iou: Share = Field(0.1, description="IoU from above that a weaker box goes at; 1: none does")
+    nms_distance: float = Field(
+        0.0, ge=0, le=20, description="metres between centres that a weaker box goes at; 0: none does"
+    )
+    nms_candidates: int = Field(
+        1000, ge=1, le=100_000, description="places that enter it, best first, of each head"
+    )
+    max_objects: int = Field(500, ge=1, le=10_000, description="objects of a cloud, best first")
+
+    @field_validator("point_range")
+    @classmethod
+    def _upwards(cls, given: Six) -> Six:
+        if any(low >= high for low, high in zip(given[:3], given[3:], strict=True)):
+            raise _unfit("has a low end above its high one: it is lowest x, y, z, then highest x, y, z")
+        return given
+
+    @field_validator("voxel_size")
+    @classmethod
+    def _whole(cls, given: Three, info: ValidationInfo) -> Three:
+        if (around := info.data.get("point_range")) is None:
+            return given
+        reach = [high - low for low, high in zip(around[:3], around[3:], strict=True)]
+        if given[2] < reach[2] * 0.999:
+            raise _unfit(
+                f"is {given[2]:g} m in z, less than the {reach[2]:g} m of point_range: these are voxels, and "
+                "only networks on pillars can be run"
+            )
+        for axis, length, edge in zip("xy", reach, given, strict=False):
+            if abs(length / edge - round(length / edge)) > 0.01:
+                raise _unfit(
+                    f"makes {length / edge:.2f} pillars of the {length:g} m of point_range in {axis}"
+                )
+        return given
+
+    @field_validator("classes")
+    @classmethod
+    def _different(cls, given: tuple[str, ...]) -> tuple[str, ...]:
+        if len(set(given)) < len(given):
+            raise _unfit("has a name twice")
+        return given
+
+    @field_validator("score_thresholds", "min_rotation")
+    @classmethod
+    def _known(cls, given: Mapping[str, float], info: ValidationInfo) -> Mapping[str, float]:
+        known = info.data.get("classes", ())
+        for name in given:
+            if name not in known:
+                raise _unfit(f"names '{name}', which is none of classes: {', '.join(known)}")
+        return given
+
+    @field_validator("groups")
+    @classmethod
+    def _all(cls, given: Any, info: ValidationInfo) -> Any:
+        if given and tuple(name for group in given for name in group) != info.data.get("classes"):
+            raise _unfit("must hold the names of classes, each once and in their order")
+        return given
+
+    @property
+    def grid(self) -> tuple[int, int]:
+        """Pillars along x and y."""
+        low, high = self.point_range[:2], self.point_range[3:5]
+        nx, ny = (round((b - a) / size) for a, b, size in zip(low, high, self.voxel_size, strict=False))
+        return nx, ny
+
+
+FED = ("point_range", "voxel_size", "features", "max_points", "max_pillars", "intensity_scale", "z_offset")
+"""The parameters that decide what the network is shown; with equal ones it answers the same."""
+
+
+def is_network(method: str) -> bool:
+    """Whether ``objects.method`` names the file of a network, not a function or a topic."""
+    return method.lower().endswith(SUFFIX) and ":" not in method

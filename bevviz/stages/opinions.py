@@ -1,0 +1,247 @@
+"""Two opinions on what is there: objects of somebody else's method, and what our fusion would have made."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from bevviz import geometry
+from bevviz.config import OpinionsConfig
+from bevviz.datasets.names import accepted_names
+from bevviz.frame import F32, I32, I64, Bool, Boxes3D
+from bevviz.results import (
+    CameraResult,
+    Clusters,
+    Decision,
+    Detections,
+    DetectionState,
+    Objects,
+    Opinion,
+    Opinions,
+)
+from bevviz.stages.visibility import image_boxes, in_view, visible
+
+MARGIN = 0.2  # metres around a box in which points are still its own
+HELD = 0.5  # share of a cluster's points that are in the box which it is of
+RIVAL = 0.7  # of the share that another box has of it: with less, it is that one's
+PARTLY = 0.2  # the same, where no other cluster has more points in the box
+NEAR = 0.1  # IoU from which a detection is worth a word where none looks at a box
+
+
+@dataclass(frozen=True, slots=True)
+class _Sight:
+    """What one camera says of each box; fields as of ``Opinions``."""
+
+    opinion: I32
+    detection: I32
+    iou: F32
+    held: F32
+    shown: F32
+    height: F32
+
+
+def opinions(
+    objects: Objects,
+    fused: Objects,
+    obstacles: F32 | None,
+    clusters: Clusters | None,
+    cameras: Sequence[CameraResult],
+    ranges: F32,
+    config: OpinionsConfig,
+    known: Sequence[str] = (),
+) -> Opinions:
+    """Hold objects that our fusion did not make and those that it would have made against each other.
+
+    A kept detection looks at a box if the cluster that the fusion matched it with is in the box: half of its
+    points, where no other box has far more of them, or a fifth where it has most of the points there. A
+    detection that has no cluster looks at the box that it overlaps most in the image, if IoU is ``min_iou``
+    or more and the box is not hidden; one that has a cluster elsewhere looks at none. A camera says of a box
+
+    - CONFIRMED, where a detection looks at it whose class is right for it;
+    - NAMED_OTHERWISE, where only others do;
+    - CONTRADICTED, where none does, although ``min_shown`` of the box is in the image, ``min_visible``
+      of it not hidden, it is ``min_height`` high, and the detector knows a class that is right for it;
+    - else that it is not seen, and why.
+
+    Of several cameras the one counts whose answer comes first here, and then that which shows more of it.
+
+    Args:
+        objects: of somebody else's method, in the frame of the points.
+        fused: of ``fusion.merge``.
+        obstacles: (P, 3) that the clusters are of; None: there are none.
+        clusters: of those points.
+        cameras: what each has found.
+        ranges: of ``visibility.range_image``.
+        config: of when a camera has to find a box.
+        known: classes that the detector knows; empty: nobody knows which.
+    """
+    boxes, count = objects.boxes, len(objects)
+    open_ = visible(ranges, boxes)
+    named = _named_clusters(fused, cameras, clusters)
+    held = _held(boxes, obstacles, clusters, named)
+    own = objects.cluster[:, None] == named[None]
+    of_box = ((held >= HELD) & (held >= RIVAL * held.max(axis=0, initial=0))) | (own & (held >= PARTLY))
+    best = _unseen(count, Opinion.NOT_ASKED)
+    camera = [""] * count
+    for result in cameras:
+        if result.detections is None:
+            continue
+        sight = _sight(result, result.detections, objects, open_, named, held, of_box, config, known)
+        better = (sight.opinion < best.opinion) | (
+            (sight.opinion == best.opinion) & (sight.shown > best.shown)
+        )
+        rows = np.flatnonzero(better)
+        for field in _Sight.__slots__:
+            getattr(best, field)[rows] = getattr(sight, field)[rows]
+        for k in rows.tolist():
+            camera[k] = result.camera.name if sight.shown[k] > 0 else ""
+    return Opinions(
+        fused=fused,
+        opinion=best.opinion,
+        camera=tuple(camera),
+        detection=best.detection,
+        iou=best.iou,
+        held=best.held,
+        shown=best.shown,
+        visible=open_,
+        height=best.height,
+        partner=_partners(fused, named, held, of_box),
+    )
+
+
+def right_names(label: str, known: Sequence[str]) -> frozenset[str]:
+    """Which of the names of a detector are right for an object that a method calls so, in lower case."""
+    wanted, names = accepted_names(label, known), {name.lower() for name in known}
+    if right := wanted & names:
+        return right
+    # A method may have the names of a detector, and the detector those of a data set.
+    return frozenset(name.lower() for name in known if label.lower() in accepted_names(name, ()))
+
+
+# --- clusters in boxes -------------------------------------------------------------------------
+
+
+def _named_clusters(fused: Objects, cameras: Sequence[CameraResult], clusters: Clusters | None) -> I64:
+    """Rows of the clusters that a detection has named, in order."""
+    matched = np.zeros(0 if clusters is None else len(clusters), np.bool_)
+    for result in cameras:
+        if result.fusion is not None:
+            matched |= result.fusion.cluster_decision == Decision.MATCHED
+    matched[fused.cluster] = True
+    return np.flatnonzero(matched)
+
+
+def _held(boxes: Boxes3D, points: F32 | None, clusters: Clusters | None, named: I64) -> F32:
+    """(K, len(named)) share of the points of each of these clusters that are in each box."""
+    held = np.zeros((len(boxes), len(named)), np.float32)
+    if points is None or clusters is None or held.size == 0:
+        return held
+    column = np.full(len(clusters) + 1, -1, np.int64)  # noise, -1, is the last
+    column[named] = np.arange(len(named))
+    own = column[clusters.labels]
+    rows = np.flatnonzero(own >= 0)
+    points, own = points[rows], own[rows]
+    wide = Boxes3D(boxes.center, boxes.size + np.float32(2 * MARGIN), boxes.yaw)
+    for k, inside in geometry.inside_each(points, wide):
+        held[k] = np.bincount(own[inside], minlength=len(named))
+    whole: F32 = np.maximum(np.bincount(own, minlength=len(named)), 1).astype(np.float32)
+    return held / whole
+
+
+def _partners(fused: Objects, named: I64, held: F32, of_box: Bool) -> I32:
+    """(J,) the box that holds most of the cluster of each of our objects, -1: it is in none."""
+    partner = np.full(len(fused), -1, np.int32)
+    if len(held):
+        columns = np.searchsorted(named, fused.cluster)
+        share = np.where(of_box, held, 0)[:, columns]
+        found = share.max(axis=0) > 0
+        partner[found] = share.argmax(axis=0)[found]
+    return partner
+
+
+# --- one camera --------------------------------------------------------------------------------
+
+
+def _unseen(count: int, opinion: Opinion) -> _Sight:
+    """To be filled in."""
+    zero = np.zeros(count, np.float32)
+    return _Sight(
+        np.full(count, opinion, np.int32),
+        np.full(count, -1, np.int32),
+        zero,
+        np.full(count, np.nan, np.float32),
+        zero.copy(),
+        zero.copy(),
+    )
+
+
+def _sight(
+    result: CameraResult,
+    detections: Detections,
+    objects: Objects,
+    open_: F32,
+    named: I64,
+    held: F32,
+    of_box: Bool,
+    config: OpinionsConfig,
+    known: Sequence[str],
+) -> _Sight:
+    count, around = len(objects), image_boxes(objects.boxes, result.camera)
+    overlap = geometry.iou(around, detections.xyxy)
+    by_cluster, has_cluster = _by_cluster(result, detections, named, held, of_box)
+    looks = ~np.isnan(by_cluster)
+    open_overlap = np.where(open_[:, None] >= config.min_visible, overlap, 0)
+    free = np.flatnonzero(detections.kept & ~has_cluster)
+    if count and len(free):
+        most = open_overlap[:, free].argmax(axis=0)
+        sure = open_overlap[most, free] >= config.min_iou
+        looks[most[sure], free[sure]] = True
+
+    names = tuple(dict.fromkeys([*known, *detections.names]))
+    right = {label: right_names(label, names) for label in dict.fromkeys(objects.names)}
+    fits = np.array([[n.lower() in right[label] for n in detections.names] for label in objects.names], bool)
+    fits = fits.reshape(count, len(detections))
+
+    # Of those that look at it, one of a right class, with a cluster, that fits best.
+    rank = np.where(looks, 8 + 4 * fits + np.where(np.isnan(by_cluster), 0, 2 * by_cluster) + overlap, 0)
+    # Where none does, what is nearest, be it weak: of a right class rather than another.
+    beside = (overlap >= NEAR) & (detections.state != DetectionState.SUPPRESSED)
+    rank = np.maximum(rank, np.where(beside, 2 * fits + overlap, 0))
+    sight = _unseen(count, Opinion.CONTRADICTED)
+    sight.shown[:] = in_view(objects.boxes, result.camera)
+    sight.height[:] = np.nan_to_num(around[:, 3] - around[:, 1])
+    knows = np.array([not known or bool(right[label]) for label in objects.names], bool)
+    sight.opinion[~knows] = Opinion.NO_CLASS
+    sight.opinion[sight.height < config.min_height] = Opinion.TOO_SMALL
+    sight.opinion[open_ < config.min_visible] = Opinion.HIDDEN
+    sight.opinion[sight.shown < config.min_shown] = Opinion.OUT_OF_VIEW
+    if len(detections):
+        every = np.arange(count)
+        best = rank.argmax(axis=1)
+        there = rank[every, best] > 0
+        sight.detection[there] = best[there]
+        sight.iou[there] = overlap[every, best][there]
+        sight.held[there] = by_cluster[every, best][there]
+        seen = there & looks[every, best]
+        sight.opinion[seen] = Opinion.NAMED_OTHERWISE
+        sight.opinion[seen & fits[every, best]] = Opinion.CONFIRMED
+    return sight
+
+
+def _by_cluster(
+    result: CameraResult, detections: Detections, named: I64, held: F32, of_box: Bool
+) -> tuple[F32, Bool]:
+    """(K, D) share of a detection's cluster that is in the box it is of, else NaN; (D,) which have one."""
+    share = np.full((len(held), len(detections)), np.nan, np.float32)
+    has_cluster = np.zeros(len(detections), np.bool_)
+    if result.fusion is None:
+        return share, has_cluster
+    matched = np.flatnonzero(result.fusion.cluster_decision == Decision.MATCHED)
+    detection = result.fusion.cluster_detection[matched]
+    has_cluster[detection] = True
+    for d, column in zip(detection.tolist(), np.searchsorted(named, matched).tolist(), strict=True):
+        mine = np.where(of_box[:, column], held[:, column], np.nan)  # several, where one box names them
+        share[:, d] = np.fmax(share[:, d], mine)
+    return share, has_cluster

@@ -1,0 +1,145 @@
+"""Points grouped into pillars, and what a network is shown of each point (Lang et al. 2019, PointPillars)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from bevviz.frame import F32, F64, I32
+from bevviz.pillar_params import Feature
+from bevviz.stages.kernel import kernel
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Pillars:
+    """P pillars, in the order of each one's first point, with at most M points in each.
+
+    Attributes:
+        points: (P, M, F) float32 features of the points, zeros behind the last one.
+        counts: (P,) int32 points in each.
+        cells: (P, 2) int32 cell of each along x and y.
+        left_out_points: of pillars that are full.
+        left_out_pillars: of a cloud that is full.
+    """
+
+    points: F32
+    counts: I32
+    cells: I32
+    left_out_points: int
+    left_out_pillars: int
+
+    def __len__(self) -> int:
+        return len(self.counts)
+
+
+def group(
+    points: F32,
+    low: Sequence[float],
+    size: Sequence[float],
+    shape: tuple[int, int],
+    high_z: float,
+    max_points: int,
+    max_pillars: int,
+    features: Sequence[Feature],
+    intensity: F32 | None = None,
+) -> Pillars:
+    """Group points as mmcv's and spconv's hard voxelization does: first come, first served.
+
+    Args:
+        points: (N, 3) float32 finite points; those outside the range are in no pillar.
+        low: lowest x, y, z of the range, in metres.
+        size: edges of a pillar.
+        shape: pillars along x and y.
+        high_z: end of the range; a point there is outside.
+        max_points: of a pillar.
+        max_pillars: of the cloud.
+        features: in the order that the network wants.
+        intensity: (N,) of the points; None: 0.
+    """
+    start, edge = np.asarray(low, np.float32), np.asarray(size, np.float32)
+    place, slot, counts, cells, full, more = _placed(
+        points, start, edge, shape[0], shape[1], np.float32(high_z), max_points, max_pillars
+    )
+    kept = np.flatnonzero(place >= 0)
+    place, slot, xyz = place[kept], slot[kept], points[kept]
+    made = np.empty((len(kept), len(features)), np.float32)
+    mean: F64 | None = None
+    center: F32 | None = None
+    for k, feature in enumerate(features):
+        axis = "xyz".find(feature[-1])
+        if feature in ("x", "y", "z"):
+            made[:, k] = xyz[:, axis]
+        elif feature == "intensity":
+            made[:, k] = 0 if intensity is None else intensity[kept]
+        elif feature == "time":
+            made[:, k] = 0
+        elif feature == "distance":
+            made[:, k] = np.sqrt((xyz**2).sum(axis=1))
+        elif feature.startswith("mean"):
+            mean = _means(xyz, place, counts) if mean is None else mean
+            made[:, k] = xyz[:, axis] - mean[place, axis].astype(np.float32)
+        else:
+            if center is None:
+                center = np.zeros((len(counts), 3), np.float32)
+                center[:, :2] = cells
+                center *= edge
+                center += edge / 2 + start
+            made[:, k] = xyz[:, axis] - center[place, axis]
+    shown = np.zeros((len(counts), max_points, len(features)), np.float32)
+    shown[place, slot] = made
+    return Pillars(shown, counts, cells, int(full), int(more))
+
+
+def scatter(features: F32, cells: I32, shape: tuple[int, int]) -> F32:
+    """(1, C, ny, nx) the (P, C) features of pillars, each in its cell, zeros elsewhere."""
+    nx, ny = shape
+    canvas = np.zeros((features.shape[1], ny * nx), np.float32)
+    canvas[:, cells[:, 1].astype(np.int64) * nx + cells[:, 0]] = features.T
+    return canvas.reshape(1, -1, ny, nx)
+
+
+def _means(points: F32, place: I32, counts: I32) -> F64:
+    """(P, 3) mean of each pillar's points."""
+    sums = [np.bincount(place, points[:, axis], len(counts)) for axis in range(3)]
+    return np.column_stack(sums) / np.maximum(counts, 1)[:, None]
+
+
+@kernel
+def _placed(
+    points: F32, low: F32, size: F32, nx: int, ny: int, high_z: np.float32, max_points: int, max_pillars: int
+) -> tuple[I32, I32, I32, I32, int, int]:
+    """Pillar and place in it of each point, -1: none; points and cell of each pillar; what was left out."""
+    n = len(points)
+    number = np.full(nx * ny, -1, np.int32)
+    place = np.full(n, -1, np.int32)
+    slot = np.zeros(n, np.int32)
+    counts = np.zeros(min(max_pillars, n), np.int32)
+    cells = np.empty((len(counts), 2), np.int32)
+    found, full, more = 0, 0, 0
+    for i in range(n):
+        x = np.floor((points[i, 0] - low[0]) / size[0])
+        y = np.floor((points[i, 1] - low[1]) / size[1])
+        z = points[i, 2]
+        if not (x >= 0 and x < nx and y >= 0 and y < ny and z >= low[2] and z < high_z):
+            continue
+        cell = np.int64(y) * nx + np.int64(x)
+        k = number[cell]
+        if k == -1:
+            if found == max_pillars:
+                number[cell] = -2
+                more += 1
+                continue
+            k = np.int32(found)
+            number[cell] = k
+            cells[k, 0], cells[k, 1] = np.int32(x), np.int32(y)
+            found += 1
+        if k < 0:
+            continue
+        if counts[k] == max_points:
+            full += 1
+            continue
+        place[i], slot[i] = k, counts[k]
+        counts[k] += 1
+    return place, slot, counts[:found], cells[:found], full, more

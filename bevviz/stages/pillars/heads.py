@@ -1,0 +1,458 @@
+"""What a network's maps say: boxes about anchors (PointPillars) or about centres (CenterPoint).
+
+Which output is what comes from the names that exporters give, and from the number of channels that the
+parameters call for. What fits in no way or in two is refused: boxes read from the wrong channels look like a
+bad detector.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+
+from bevviz.frame import F32, F64, I64
+from bevviz.pillar_params import PillarParams
+
+MOST_LOG = 10.0  # of a size that is e to the power of this: what is more is no size
+
+
+class Candidates(NamedTuple):
+    """Boxes before any is suppressed.
+
+    Attributes:
+        boxes: (K, 7) x, y, z of the centre, length, width, height, yaw, in the network's frame.
+        score: (K,).
+        class_id: (K,) rows of the class names.
+        group: (K,) head that each is of.
+    """
+
+    boxes: F64
+    score: F32
+    class_id: I64
+    group: I64
+
+
+class Head(Protocol):
+    """Reads the answer to one cloud."""
+
+    @property
+    def wanted(self) -> tuple[str, ...]:
+        """Names of the outputs that are read."""
+
+    def candidates(self, outputs: Mapping[str, Any]) -> Candidates:
+        """What scores enough.
+
+        Raises:
+            ValueError: the numbers cannot be what they are taken for.
+        """
+
+
+def find_head(outputs: Mapping[str, Any], params: PillarParams) -> Head:
+    """How the outputs are to be read.
+
+    Args:
+        outputs: name -> array, of any cloud.
+
+    Raises:
+        ValueError: they cannot be; why, and what was expected.
+    """
+    try:
+        return _anchors(outputs, params) if params.anchors else _centers(outputs, params)
+    except ValueError as error:
+        shapes = ", ".join(f"{name} {list(np.shape(output))}" for name, output in outputs.items())
+        raise ValueError(f"{error}; its outputs: {shapes}") from None
+
+
+# --- maps --------------------------------------------------------------------------------------
+
+
+class Map(NamedTuple):
+    """An output with C channels on a grid, and where its channels are."""
+
+    name: str
+    last: bool  # channels are the last axis, else the second
+
+    def at(self, outputs: Mapping[str, Any], cells: I64 | slice = slice(None)) -> F32:
+        """(K, C) the channels of these cells, which are counted along x first."""
+        array = outputs[self.name][0]
+        if self.last:
+            return np.asarray(array.reshape(-1, array.shape[-1])[cells], np.float32)
+        return np.ascontiguousarray(array.reshape(len(array), -1)[:, cells].T, np.float32)
+
+
+def _map(outputs: Mapping[str, Any], name: str, channels: tuple[int, ...], params: PillarParams) -> Map:
+    """The output as a map of that many channels; several counts are alternatives."""
+    shape = np.shape(outputs[name])
+    wanted = " or ".join(map(str, channels))
+    if len(shape) != 4 or shape[0] != 1:
+        raise ValueError(f"output {name} is no map of one cloud, [1, {wanted}, y, x]")
+    fits = [
+        last
+        for last in (False, True)
+        if shape[3 if last else 1] in channels and _stride(shape[1:3] if last else shape[2:], params)
+    ]
+    if not fits:
+        nx, ny = params.grid
+        raise ValueError(
+            f"output {name} should be [1, {wanted}, {ny} / s, {nx} / s] or the same with the channels last, "
+            f"by classes, anchors and the {nx} x {ny} pillars of point_range and voxel_size"
+        )
+    if len(fits) == 2:
+        raise ValueError(f"output {name} can be read with its channels second or last")
+    return Map(name, fits[0])
+
+
+def _stride(cells: tuple[int, ...], params: PillarParams) -> int:
+    """Pillars along the edge of a cell of a map with (y, x) cells; 0: they do not fit."""
+    (nx, ny), (height, width) = params.grid, cells
+    if height < 1 or width < 1 or nx % width or ny % height or nx // width != ny // height:
+        return 0
+    return nx // width
+
+
+def _grid(outputs: Mapping[str, Any], found: Map) -> tuple[int, int]:
+    """Cells along y and x."""
+    shape = outputs[found.name].shape
+    return (shape[1], shape[2]) if found.last else (shape[2], shape[3])
+
+
+def _same_grid(outputs: Mapping[str, Any], maps: list[Map]) -> tuple[int, int]:
+    grids = {_grid(outputs, one) for one in maps}
+    if len(grids) != 1:
+        raise ValueError("its maps have different grids")
+    return grids.pop()
+
+
+def _scores(given: F32, params: PillarParams) -> F32:
+    """What a map of scores says, 0 to 1."""
+    if not given.size:
+        return given
+    low, high = float(given.min()), float(given.max())
+    if not np.isfinite([low, high]).all():
+        raise ValueError("its scores are not finite")
+    if params.scores == "logits":
+        if low >= 0 and high <= 1:
+            raise ValueError(
+                "its scores all are from 0 to 1, which logits are not: set objects.scores to probabilities"
+            )
+        with np.errstate(over="ignore"):
+            return np.asarray(1 / (1 + np.exp(-given)), np.float32)
+    if low < 0 or high > 1:
+        raise ValueError(
+            f"it scores {low:.3g} to {high:.3g}, which are no probabilities: set objects.scores to logits"
+        )
+    return given
+
+
+def _thresholds(params: PillarParams) -> F32:
+    found = [params.score_thresholds.get(name, params.score_threshold) for name in params.classes]
+    return np.array(found, np.float32)
+
+
+def _best(score: F32, count: int) -> I64:
+    """Rows of the ``count`` best, best first, of equals the first."""
+    if len(score) > count:
+        rows = np.flatnonzero(score >= np.partition(score, -count)[-count])
+    else:
+        rows = np.arange(len(score))
+    return rows[np.argsort(-score[rows], kind="stable")][:count]
+
+
+def _labelled(score: F32, params: PillarParams) -> tuple[I64, I64]:
+    """Rows and classes of (N, C) scores that are high enough, of the best ``nms_candidates`` places."""
+    rows = _best(score.max(axis=1), params.nms_candidates)
+    enough = score[rows] >= _thresholds(params)
+    if params.labels == "best":
+        best = score[rows].argmax(axis=1)
+        kept = enough[np.arange(len(rows)), best]
+        return rows[kept], best[kept]
+    row, class_id = np.nonzero(enough)
+    return rows[row], class_id
+
+
+# --- about anchors -----------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Anchors:
+    """Maps of scores, boxes and, where it tells front from back, directions about anchors.
+
+    As ``DeltaXYZWLHRBBoxCoder`` and ``Anchor3DHead`` of mmdetection3d, ``ResidualCoder`` and
+    ``AnchorHeadSingle`` of OpenPCDet read them.
+    """
+
+    score: Map
+    box: Map
+    direction: Map | None
+    places: F64  # (A, 7) x, y, z of the centre, length, width, height, yaw
+    params: PillarParams
+
+    @property
+    def wanted(self) -> tuple[str, ...]:
+        return tuple(one.name for one in (self.score, self.box, self.direction) if one is not None)
+
+    def candidates(self, outputs: Mapping[str, Any]) -> Candidates:
+        params, each = self.params, len(self.params.anchors) * len(self.params.rotations)
+        score = _scores(self.score.at(outputs).reshape(len(self.places), len(params.classes)), params)
+        rows, class_id = _labelled(score, params)
+        cells, which = rows // each, (np.arange(len(rows)), rows % each)
+        columns = self.box.at(outputs, cells)
+        deltas = columns.reshape(len(rows), each, columns.shape[1] // each)[which][:, :7]
+        boxes = decoded(deltas.astype(np.float64), self.places[rows])
+        if self.direction is not None:
+            facing = self.direction.at(outputs, cells).reshape(len(rows), each, 2)[which].argmax(axis=1)
+            boxes[:, 6] = turned(boxes[:, 6], facing, params)
+        return Candidates(boxes, score[rows, class_id], class_id, np.zeros(len(rows), np.int64))
+
+
+def places(shape: tuple[int, int], params: PillarParams) -> F64:
+    """(ny * nx * anchors * rotations, 7) the anchors of a map with (ny, nx) cells, rotations fastest."""
+    low_x, low_y, high_x, high_y = params.anchor_range or (*params.point_range[:2], *params.point_range[3:5])
+
+    def along(low: float, high: float, count: int) -> F64:
+        if params.anchor_places == "edge_to_edge":
+            return np.linspace(low, high, count)
+        return low + (np.arange(count) + 0.5) * (high - low) / count
+
+    grid = np.empty((*shape, len(params.anchors), len(params.rotations), 7))
+    grid[..., 0] = along(low_x, high_x, shape[1])[None, :, None, None]
+    grid[..., 1] = along(low_y, high_y, shape[0])[:, None, None, None]
+    size = np.array(params.anchors)
+    grid[..., 2] = (size[:, 3] + size[:, 2] / 2)[:, None]
+    grid[..., 3:6] = size[:, None, :3]
+    grid[..., 6] = params.rotations
+    return grid.reshape(-1, 7)
+
+
+def decoded(deltas: F64, anchors: F64) -> F64:
+    """(K, 7) boxes that lie so beside these anchors (Yan et al. 2018, SECOND)."""
+    diagonal = np.hypot(anchors[:, 3], anchors[:, 4])[:, None]
+    boxes = np.empty_like(anchors)
+    boxes[:, :2] = deltas[:, :2] * diagonal + anchors[:, :2]
+    boxes[:, 2] = deltas[:, 2] * anchors[:, 5] + anchors[:, 2]
+    boxes[:, 3:6] = np.exp(np.minimum(deltas[:, 3:6], MOST_LOG)) * anchors[:, 3:6]
+    boxes[:, 6] = deltas[:, 6] + anchors[:, 6]
+    return boxes
+
+
+def turned(yaw: F64, facing: I64, params: PillarParams) -> F64:
+    """Yaw, which is known up to half a turn, with the half that the network chose."""
+    offset = params.direction_offset or 0.0
+    half = yaw - offset
+    half = half - np.floor(half / np.pi + params.direction_limit_offset) * np.pi
+    return np.asarray(half + offset + np.pi * facing)
+
+
+ROLES: dict[str, Callable[[str], object]] = {
+    "score": re.compile(r"^(?!.*dir).*(cls|score|conf|heatmap)").search,
+    "box": re.compile(r"^(?!.*(dir|cls)).*(box|reg|loc)").search,
+    "direction": re.compile(r"dir").search,
+}
+
+
+def _roles(outputs: Mapping[str, Any], channels: Mapping[str, tuple[int, ...]]) -> dict[str, str]:
+    """role -> output, by names, else by the number of channels."""
+    named = {role: [o for o in outputs if known(o.lower())] for role, known in ROLES.items()}
+    if len(named["score"]) == 1 and len(named["box"]) == 1 and len(named["direction"]) <= 1:
+        return {role: found[0] for role, found in named.items() if found}
+    found: dict[str, str] = {}
+    for role, counts in channels.items():
+        fits = [o for o, a in outputs.items() if np.ndim(a) == 4 and set(np.shape(a)[1:]) & set(counts)]
+        if len(fits) == 1 and fits[0] not in found.values():
+            found[role] = fits[0]
+    if {"score", "box"} <= set(found) and len(found) == len(outputs):
+        return found
+    raise ValueError("neither names nor shapes tell which output has scores, boxes and directions")
+
+
+def _anchors(outputs: Mapping[str, Any], params: PillarParams) -> Anchors:
+    if params.anchor_places is None:
+        raise ValueError(
+            "it works with anchors, and objects.anchor_places is not set: cell_centers or edge_to_edge"
+        )
+    each = len(params.anchors) * len(params.rotations)
+    channels = {
+        "score": (each * len(params.classes),),
+        "box": (each * 7, each * 9),  # with a speed
+        "direction": (each * 2,),
+    }
+    roles = _roles(outputs, channels)
+    maps = {role: _map(outputs, name, channels[role], params) for role, name in roles.items()}
+    shape = _same_grid(outputs, list(maps.values()))
+    if "direction" in maps and params.direction_offset is None:
+        raise ValueError(
+            f"output {roles['direction']} tells front from back, and objects.direction_offset is not set"
+        )
+    return Anchors(maps["score"], maps["box"], maps.get("direction"), places(shape, params), params)
+
+
+# --- about centres -----------------------------------------------------------------------------
+
+PARTS = {  # of a box -> its number of channels, and the names that exporters give to it
+    "score": (0, ("heatmap", "hm")),
+    "offset": (2, ("reg", "center")),
+    "z": (1, ("height", "center_z", "z")),
+    "size": (3, ("dim",)),
+    "rotation": (2, ("rot",)),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Part:
+    """Some channels of a map."""
+
+    map: Map
+    first: int
+    count: int
+
+    def at(self, outputs: Mapping[str, Any], cells: I64 | slice = slice(None)) -> F32:
+        return self.map.at(outputs, cells)[:, self.first : self.first + self.count]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Centers:
+    """Maps of the scores of centres, and of the boxes there, of one head or several.
+
+    As ``CenterHead`` of mmdetection3d and of OpenPCDet, and Autoware's ``generateBoxes3D_kernel`` read them.
+    """
+
+    parts: tuple[Mapping[str, Part], ...]  # of each head, by the keys of PARTS
+    shape: tuple[int, int]  # cells along y and x
+    params: PillarParams
+
+    @property
+    def wanted(self) -> tuple[str, ...]:
+        return tuple(dict.fromkeys(part.map.name for head in self.parts for part in head.values()))
+
+    def candidates(self, outputs: Mapping[str, Any]) -> Candidates:
+        found, first = [], 0
+        for number, head in enumerate(self.parts):
+            found.append(self._of_head(outputs, head, number, first))
+            first += head["score"].count
+        return Candidates(*(np.concatenate(column) for column in zip(*found, strict=True)))
+
+    def _of_head(
+        self, outputs: Mapping[str, Any], head: Mapping[str, Part], number: int, first: int
+    ) -> Candidates:
+        params = self.params
+        score = _scores(head["score"].at(outputs), params)
+        least = _thresholds(params)[first : first + score.shape[1]]
+        if params.labels == "best":
+            best = score.argmax(axis=1)
+            highest = score[np.arange(len(score)), best]
+            rows = np.flatnonzero(highest >= least[best])
+            rows = rows[_best(highest[rows], params.nms_candidates)]
+            class_id = best[rows]
+        else:
+            rows, class_id = np.nonzero(score >= least)
+            chosen = _best(score[rows, class_id], params.nms_candidates)
+            rows, class_id = rows[chosen], class_id[chosen]
+        boxes, norm = self._boxes(outputs, head, rows)
+        lengths = np.array([params.min_rotation.get(name, 0.0) for name in params.classes])
+        clear = norm >= lengths[class_id + first]
+        chosen = score[rows, class_id][clear]
+        return Candidates(
+            boxes[clear], chosen, class_id[clear] + first, np.full(len(chosen), number, np.int64)
+        )
+
+    def _boxes(self, outputs: Mapping[str, Any], head: Mapping[str, Part], rows: I64) -> tuple[F64, F64]:
+        """(K, 7) boxes at these cells, and (K,) the lengths of their (sin, cos)."""
+        params, (height, width) = self.params, self.shape
+        offset, z, size, rotation = (
+            head[key].at(outputs, rows).astype(np.float64) for key in ("offset", "z", "size", "rotation")
+        )
+        low_x, low_y, _, high_x, high_y, _ = params.point_range
+        boxes = np.empty((len(rows), 7))
+        boxes[:, 0] = (rows % width + offset[:, 0]) * (high_x - low_x) / width + low_x
+        boxes[:, 1] = (rows // width + offset[:, 1]) * (high_y - low_y) / height + low_y
+        boxes[:, 2] = z[:, 0]
+        boxes[:, 3:6] = np.exp(np.minimum(size, MOST_LOG))
+        sine, cosine = rotation.T if params.rotation == "sin_cos" else rotation.T[::-1]
+        boxes[:, 6] = np.arctan2(sine, cosine)
+        if params.boxes == "wlh":
+            boxes[:, 3:5] = boxes[:, 4:2:-1].copy()
+            boxes[:, 6] = -boxes[:, 6] - np.pi / 2
+        return boxes, np.hypot(sine, cosine)
+
+
+def _centers(outputs: Mapping[str, Any], params: PillarParams) -> Centers:
+    groups = params.groups or (params.classes,)
+    counts = [len(group) for group in groups]
+    heads = _joined(outputs, counts, params) or _separate(outputs, counts, params)
+    for key, choices in (("boxes", "lwh or wlh"), ("rotation", "sin_cos or cos_sin")):
+        if getattr(params, key) is None:
+            raise ValueError(f"it works with centres, and objects.{key} is not set: {choices}")
+    maps = [part.map for head in heads for part in head.values()]
+    return Centers(tuple(heads), _same_grid(outputs, maps), params)
+
+
+def _separate(outputs: Mapping[str, Any], counts: list[int], params: PillarParams) -> list[dict[str, Part]]:
+    """A map for each part of each head, by name; a number behind it counts the heads."""
+    heads = []
+    for number, classes in enumerate(counts):
+        head = {}
+        for key, (channels, names) in PARTS.items():
+            count = channels or classes
+            name = _named(outputs, names, number, len(counts))
+            if name is None:
+                several = f" of head {number}" if len(counts) > 1 else ""
+                raise ValueError(
+                    f"no output{several} is called {' or '.join(names)}, as a network of centres has it "
+                    "(one of anchors needs objects.anchors)"
+                )
+            # Behind the values, some have as many of how sure they are.
+            head[key] = Part(
+                _map(outputs, name, (count, 2 * count) if channels else (count,), params), 0, count
+            )
+        heads.append(head)
+    return heads
+
+
+def _named(outputs: Mapping[str, Any], names: tuple[str, ...], number: int, of: int) -> str | None:
+    """The output that has one of these names, after the name of a graph and before the number of the head."""
+    found = []
+    for output in outputs:
+        match = re.fullmatch(r"(?:.*[./])?(.+?)(?:[_.]?(\d+))?", output)
+        if match is None or match[1].lower() not in names:
+            continue
+        if (match[2] is None and of == 1) or (match[2] is not None and (of == 1 or int(match[2]) == number)):
+            found.append(output)
+    if len(found) > 1:
+        raise ValueError(
+            f"{' and '.join(found)} may both be {names[0]}: set objects.groups, if it has several heads"
+        )
+    return found[0] if found else None
+
+
+def _joined(
+    outputs: Mapping[str, Any], counts: list[int], params: PillarParams
+) -> list[dict[str, Part]] | None:
+    """Three maps with the channels of all heads behind one another, as mmdeploy exports them."""
+    names = {
+        role: [o for o in outputs if re.fullmatch(rf"{role}\d*", o)]
+        for role in ("cls_score", "bbox_pred", "dir_cls_pred")
+    }
+    if any(len(found) != 1 for found in names.values()):
+        return None
+    heads = len(counts)
+    score = _map(outputs, names["cls_score"][0], (sum(counts),), params)
+    box = _map(outputs, names["bbox_pred"][0], (6 * heads, 8 * heads), params)
+    turn = _map(outputs, names["dir_cls_pred"][0], (2 * heads,), params)
+    each = np.shape(outputs[box.name])[3 if box.last else 1] // heads  # 8: with a speed
+    found = []
+    for number, count in enumerate(counts):
+        first = number * each
+        found.append(
+            {
+                "score": Part(score, sum(counts[:number]), count),
+                "offset": Part(box, first, 2),
+                "z": Part(box, first + 2, 1),
+                "size": Part(box, first + 3, 3),
+                "rotation": Part(turn, 2 * number, 2),
+            }
+        )
+    return found

@@ -1,0 +1,307 @@
+"""A 3D detector on pillars: a cloud in, boxes out, by one ONNX file or two."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnxruntime as ort
+
+from bevviz.errors import UserError, first_line
+from bevviz.frame import F32, Boxes3D
+from bevviz.pillar_params import PillarParams
+from bevviz.stages.detector.providers import open_session, tell
+from bevviz.stages.pillars.group import Pillars, group, scatter
+from bevviz.stages.pillars.heads import find_head
+from bevviz.stages.pillars.nms import survivors
+
+FLOATS = {"tensor(float)": np.float32, "tensor(float16)": np.float16}
+NUMBERS = {**FLOATS, "tensor(int32)": np.int32, "tensor(int64)": np.int64}
+PROBED = 8  # points that it is shown at first
+LONGEST = 200.0  # metres: what is longer is no object
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Answer:
+    """What a network said of a cloud, before any threshold.
+
+    Attributes:
+        outputs: name -> array.
+        left_out_points: that found their pillar full.
+        left_out_pillars: that found the cloud full.
+    """
+
+    outputs: Mapping[str, Any]
+    left_out_points: int
+    left_out_pillars: int
+
+
+class PillarNetwork:
+    """The files of a 3D detector, and what they are shown.
+
+    One file takes pillars (N, points, features), and as they are needed the number of points in each (N,)
+    and its cell (N, 4), batch z y x, or (N, 3). Of two files the encoder takes the pillars alone and answers
+    with (N, channels); these are laid out on the grid for the other, [1, channels, y, x].
+
+    Args:
+        path: ONNX file; with ``params.encoder`` that of the second part.
+        params: of these, those in ``FED`` and ``encoder``.
+        provider: onnxruntime execution provider, as ``detector.provider``.
+        threads: as ``detector.threads``.
+
+    Attributes:
+        provider: in use, such as ``CPU``.
+        probe: what it answers to a few points.
+
+    Raises:
+        UserError: no such file, no ONNX file, or it takes what does not fit the parameters.
+    """
+
+    def __init__(self, path: Path, params: PillarParams, provider: str, threads: int) -> None:
+        self.where, self._path = f"objects.method {path}", path
+        self._params = params
+        self._session, self.provider = _open(path, self.where, provider, threads)
+        self._encoder = None
+        first, at = self._session, self.where
+        if params.encoder:
+            at = f"objects.encoder {params.encoder}"
+            first = self._encoder = _open(Path(params.encoder), at, provider, threads)[0]
+        self._inputs = _inputs(first, at, alone=bool(params.encoder))
+        self._max_points, self._fixed = self._fitting(self._inputs["pillars"], at)
+        if self._encoder is not None:
+            self._canvas = self._check_canvas()
+        elif self._fixed:
+            raise UserError(
+                f"{at}: takes {self._fixed} pillars, no more and no less; export it with that axis dynamic"
+            )
+        # Several pillars: OpenPCDet's encoder loses an axis where there is one.
+        across = np.linspace(params.point_range[:3], params.point_range[3:], PROBED + 2)[1:-1]
+        self.probe = self.infer((across - [0, 0, params.z_offset]).astype(np.float32))
+
+    def infer(self, points: F32, intensity: F32 | None = None) -> Answer:
+        """Run the network on a cloud.
+
+        Args:
+            points: (N, 3) float32, upright, in metres.
+            intensity: (N,) of the points, None: there is none.
+
+        Raises:
+            UserError: the network fails.
+        """
+        params = self._params
+        if params.z_offset:
+            points = points + np.array([0, 0, params.z_offset], np.float32)
+        if intensity is not None and params.intensity_scale != 1:
+            intensity = np.asarray(intensity * np.float32(params.intensity_scale), np.float32)
+        pillars = group(
+            points,
+            params.point_range[:3],
+            params.voxel_size,
+            params.grid,
+            params.point_range[5],
+            self._max_points,
+            min(params.max_pillars, self._fixed or params.max_pillars),
+            params.features,
+            intensity,
+        )
+        outputs: dict[str, Any] = {}
+        try:
+            if len(pillars):
+                outputs = self._run(pillars)
+        except Exception as error:  # onnxruntime's errors have no common base class
+            if isinstance(error, UserError):
+                raise
+            raise UserError(
+                f"{self.where}: fails on {len(pillars)} pillars of {self._max_points} points: "
+                f"{first_line(error)}"
+            ) from None
+        return Answer(outputs, pillars.left_out_points, pillars.left_out_pillars)
+
+    def _run(self, pillars: Pillars) -> dict[str, Any]:
+        given = {}
+        for role, wanted in self._inputs.items():
+            if role == "pillars":
+                value: Any = pillars.points
+            elif role == "counts":
+                value = pillars.counts
+            else:
+                value = np.zeros((len(pillars), wanted.shape[1]), np.int32)
+                value[:, -1], value[:, -2] = pillars.cells.T
+            given[wanted.name] = value.astype(NUMBERS[wanted.type], copy=False)
+        if self._encoder is None:
+            return _named(self._session, given)
+        if self._fixed:
+            ((name, value),) = given.items()
+            given = {
+                name: np.concatenate(
+                    [value, np.zeros((self._fixed - len(value), *value.shape[1:]), value.dtype)]
+                )
+            }
+        (encoded,) = self._encoder.run(None, given)
+        encoded = encoded.reshape(len(encoded), -1)[: len(pillars)]
+        channels = self._canvas.shape[1]
+        if encoded.shape != (len(pillars), channels):
+            raise UserError(
+                f"objects.encoder {self._params.encoder}: answers {encoded.shape[-1]} channels, and "
+                f"{self._path.name} takes {channels}"
+            )
+        canvas = scatter(encoded, pillars.cells, self._params.grid)
+        return _named(
+            self._session, {self._canvas.name: canvas.astype(NUMBERS[self._canvas.type], copy=False)}
+        )
+
+    def _fitting(self, pillars: Any, at: str) -> tuple[int, int]:
+        """Points of a pillar, and how many pillars it takes, 0: any number."""
+        count, points, features = pillars.shape
+        params = self._params
+        if isinstance(features, int) and features != len(params.features):
+            raise UserError(
+                f"{at}: input {pillars.name} has {features} features of a point, objects.features states "
+                f"{len(params.features)}: {', '.join(params.features)}"
+            )
+        if isinstance(points, int):
+            if params.max_points not in (None, points):
+                raise UserError(
+                    f"{at}: input {pillars.name} has {points} points of a pillar, "
+                    f"objects.max_points states {params.max_points}"
+                )
+        elif params.max_points is None:
+            raise UserError(
+                f"{at}: input {pillars.name} leaves the points of a pillar open: set objects.max_points"
+            )
+        else:
+            points = params.max_points
+        return points, count if isinstance(count, int) else 0
+
+    def _check_canvas(self) -> Any:
+        """The input of the second file."""
+        inputs, (nx, ny) = self._session.get_inputs(), self._params.grid
+        shape = inputs[0].shape
+        given = ", ".join(f"{i.name} {i.shape}" for i in inputs)
+        known = len(inputs) == 1 and len(shape) == 4 and isinstance(shape[1], int)
+        if not known or inputs[0].type not in FLOATS:
+            raise UserError(
+                f"{self.where}: with objects.encoder it should take one map [1, channels, y, x]; "
+                f"its inputs: {given}"
+            )
+        if any(
+            isinstance(n, int) and n != wanted for n, wanted in zip(shape, (1, shape[1], ny, nx), strict=True)
+        ):
+            raise UserError(
+                f"{self.where}: takes {given}, and by objects.point_range and objects.voxel_size the grid is "
+                f"{nx} pillars in x, {ny} in y"
+            )
+        return inputs[0]
+
+
+class ObjectNetwork:
+    """What a network on pillars answers, read as boxes.
+
+    Args:
+        network: the files.
+        params: thresholds, and how the outputs are to be read.
+
+    Raises:
+        UserError: the outputs do not fit the parameters.
+    """
+
+    def __init__(self, network: PillarNetwork, params: PillarParams) -> None:
+        self.network = network
+        self._params = params
+        try:
+            self._head = find_head(network.probe.outputs, params)
+        except ValueError as error:
+            raise UserError(f"{network.where}: {error}") from None
+        self.interpret(network.probe)  # compiles what the first cloud needs, too
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """That it knows."""
+        return self._params.classes
+
+    def __call__(self, points: F32, intensity: F32 | None = None) -> tuple[Boxes3D, F32, list[str]]:
+        """Boxes in the frame of the points, best first, their scores, and the names of their classes.
+
+        Args:
+            points: (N, 3) float32, upright, in metres.
+            intensity: (N,) of the points, None: there is none.
+
+        Raises:
+            UserError: the network fails, or answers with what it should not.
+        """
+        return self.interpret(self.network.infer(points, intensity))
+
+    def interpret(self, answer: Answer) -> tuple[Boxes3D, F32, list[str]]:
+        """What the thresholds make of the network's answer; ``__call__`` says what."""
+        params, where = self._params, self.network.where
+        if answer.left_out_pillars:
+            tell(
+                f"{where}: clouds hold more than {params.max_pillars:,} pillars (objects.max_pillars); "
+                "those that come last are left out"
+            )
+        if not answer.outputs:
+            return Boxes3D.empty(), np.zeros(0, np.float32), []
+        try:
+            found = self._head.candidates(answer.outputs)
+        except ValueError as error:
+            raise UserError(f"{where}: {error}") from None
+        sound = np.isfinite(found.boxes).all(axis=1)
+        sound &= ((found.boxes[:, 3:6] > 0) & (found.boxes[:, 3:6] < LONGEST)).all(axis=1)
+        rows = np.flatnonzero(sound)
+        rows = rows[np.argsort(-found.score[rows], kind="stable")]
+        boxes, class_id = found.boxes[rows], found.class_id[rows]
+        shared = {"all": np.zeros_like(class_id), "group": found.group[rows], "class": class_id}[params.nms]
+        alive = survivors(boxes, shared, params.nms_iou, params.nms_distance)
+        kept = np.flatnonzero(alive)[: params.max_objects]
+        final = boxes[kept]
+        final[:, 2] -= params.z_offset
+        final[:, 6] = np.arctan2(np.sin(final[:, 6]), np.cos(final[:, 6]))
+        rows32 = final.astype(np.float32)
+        names = [params.classes[c] for c in class_id[kept].tolist()]
+        return Boxes3D(rows32[:, :3], rows32[:, 3:6], rows32[:, 6]), found.score[rows][kept], names
+
+
+def _open(path: Path, where: str, provider: str, threads: int) -> tuple[Any, str]:
+    if not path.is_file():
+        raise UserError(f"{where}: no such file")
+    options = ort.SessionOptions()
+    options.intra_op_num_threads = threads
+    options.log_severity_level = 3
+    options.add_session_config_entry("session.intra_op.allow_spinning", "0")  # as the detector
+    return open_session(path, provider, options, where)
+
+
+def _inputs(session: Any, where: str, *, alone: bool) -> dict[str, Any]:
+    """role -> input, by the number of its axes."""
+    inputs = session.get_inputs()
+    listed = ", ".join(f"{i.name} {i.shape}" for i in inputs)
+    found: dict[str, Any] = {}
+    for one in inputs:
+        shape = one.shape
+        role = {3: "pillars", 2: "cells", 1: "counts"}.get(len(shape), "")
+        fits = one.type in (FLOATS if role == "pillars" else NUMBERS) and role not in found
+        fits &= role != "cells" or shape[1] in (3, 4)
+        fits &= role != "counts" or shape[0] != 1
+        if not role or not fits:
+            found = {}
+            break
+        found[role] = one
+    if "pillars" not in found or (alone and len(found) > 1):
+        wanted = "pillars [N, points, features]"
+        if not alone:
+            wanted += ", and if need be the number of points in each [N] and its cell [N, 4]"
+        raise UserError(f"{where}: its inputs are {listed}; a network on pillars takes {wanted}")
+    if not alone and "cells" not in found:
+        raise UserError(
+            f"{where}: its inputs are {listed}: without the cell of each pillar it is an encoder; set "
+            "objects.method to the file behind it, and objects.encoder to this one"
+        )
+    return found
+
+
+def _named(session: Any, given: Mapping[str, Any]) -> dict[str, Any]:
+    found = session.run(None, dict(given))
+    return {o.name: output for o, output in zip(session.get_outputs(), found, strict=True)}

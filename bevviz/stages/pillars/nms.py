@@ -1,0 +1,102 @@
+"""Greedy non-maximum suppression of boxes that are turned, seen from above."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from bevviz.frame import F64, I64, Bool
+from bevviz.stages.kernel import kernel
+
+
+def survivors(boxes: F64, group: I64, iou: float, distance: float) -> Bool:
+    """Which boxes no better one of their group suppresses.
+
+    Args:
+        boxes: (K, 7) x, y, z, length, width, height, yaw, best score first.
+        group: (K,) only boxes of the same group suppress each other.
+        iou: intersection over union, seen from above, that a weaker box goes above; 1: none goes.
+        distance: metres between the centres, seen from above, that a weaker box goes below; 0: none goes.
+
+    Returns:
+        (K,) those that stay. By distance first, as Autoware does; what went so suppresses nothing more.
+    """
+    alive = np.ones(len(boxes), np.bool_)
+    flat = np.ascontiguousarray(boxes[:, [0, 1, 3, 4, 6]], np.float64)
+    if distance > 0:
+        _by_distance(flat, group, distance, alive)
+    if iou < 1:
+        _by_overlap(flat, group, iou, alive)
+    return alive
+
+
+@kernel
+def _by_distance(boxes: F64, group: I64, distance: float, alive: Bool) -> None:
+    for i in range(len(boxes)):
+        if not alive[i]:
+            continue
+        for j in range(i + 1, len(boxes)):
+            if alive[j] and group[i] == group[j]:
+                dx, dy = boxes[i, 0] - boxes[j, 0], boxes[i, 1] - boxes[j, 1]
+                if dx * dx + dy * dy < distance * distance:
+                    alive[j] = False
+
+
+@kernel
+def _by_overlap(boxes: F64, group: I64, threshold: float, alive: Bool) -> None:
+    n = len(boxes)
+    outline = np.empty((n, 4, 2))
+    reach = np.empty(n)
+    for i in range(n):
+        x, y, length, width, yaw = boxes[i]
+        c, s = np.cos(yaw), np.sin(yaw)
+        reach[i] = np.sqrt(length * length + width * width) / 2
+        for k in range(4):
+            u = length / 2 if k in (0, 3) else -length / 2
+            v = width / 2 if k < 2 else -width / 2
+            outline[i, k, 0], outline[i, k, 1] = x + c * u - s * v, y + s * u + c * v
+    for i in range(n):
+        if not alive[i]:
+            continue
+        for j in range(i + 1, n):
+            if not alive[j] or group[i] != group[j]:
+                continue
+            dx, dy = boxes[i, 0] - boxes[j, 0], boxes[i, 1] - boxes[j, 1]
+            if dx * dx + dy * dy >= (reach[i] + reach[j]) ** 2:
+                continue
+            shared = _shared(outline[i], outline[j])
+            whole = boxes[i, 2] * boxes[i, 3] + boxes[j, 2] * boxes[j, 3] - shared
+            if shared > threshold * whole:
+                alive[j] = False
+
+
+@kernel
+def _shared(a: F64, b: F64) -> float:
+    """Area that two counter-clockwise quadrangles share (Sutherland and Hodgman 1974, shoelace formula)."""
+    polygon, clipped = np.empty((16, 2)), np.empty((16, 2))
+    polygon[:4] = a
+    count = 4
+    for k in range(4):
+        x0, y0 = b[k]
+        ex, ey = b[(k + 1) % 4, 0] - x0, b[(k + 1) % 4, 1] - y0
+        kept = 0
+        for m in range(count):
+            x, y = polygon[m]
+            px, py = polygon[m - 1 if m else count - 1]
+            left = ex * (y - y0) - ey * (x - x0)
+            before = ex * (py - y0) - ey * (px - x0)
+            if (left >= 0) != (before >= 0):
+                t = before / (before - left)
+                clipped[kept, 0], clipped[kept, 1] = px + t * (x - px), py + t * (y - py)
+                kept += 1
+            if left >= 0:
+                clipped[kept, 0], clipped[kept, 1] = x, y
+                kept += 1
+        polygon, clipped, count = clipped, polygon, kept
+        if count < 3:
+            return 0.0
+    area = 0.0
+    for m in range(count):
+        x, y = polygon[m]
+        px, py = polygon[m - 1 if m else count - 1]
+        area += px * y - py * x
+    return abs(area) / 2

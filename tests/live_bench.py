@@ -1,0 +1,26 @@
+"""The workbench's side of a live run that is given its frames: no robot, no server."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+
+from bevviz.live.notes import Notes
+from bevviz.live.replay import Replay
+from bevviz.live.runtime import Live, Outputs
+from bevviz.live.settings import Settings
+from bevviz.results import FrameResult
+from bevviz.synthetic import SyntheticSource
+from bevviz.workbench.live_bench import LiveBench
+
+
+@contextmanager
+def live_bench(results: Sequence[FrameResult], *settings: str) -> Iterator[LiveBench]:
+    """That of a run over the frames of these results, with ``key=value`` settings."""
+    source = Replay([result.frame for result in results], SyntheticSource(frames=1).scene)
+    live = Live(
+        source, Settings(None, ["detector.model=demo", *settings]), Outputs(), Notes(lambda line: None)
+    )
+    with LiveBench(live) as bench:
+        yield bench
+        live.encoder.close()
