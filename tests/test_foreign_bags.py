@@ -1,16 +1,19 @@
-"""Bags as others write them: definitions in IDL."""
+"""Bags as others write them: definitions in IDL, no index."""
 
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
-from mcap.writer import Writer
+from mcap.reader import make_reader
+from mcap.writer import IndexType, Writer
 from rosbags.typesys import Stores, get_typestore
 
 import bevviz
 from bevviz.ros.encode import encode_points
+from tests import bags
 
 LINE = "=" * 80 + "\n"
 IDL = {  # as rosidl generates it from .msg files, and rosbag2 stores it
@@ -80,3 +83,43 @@ def test_definitions_in_idl_are_taken(encoding: str, tmp_path: Path) -> None:
         (frame,) = drive.frames
         np.testing.assert_array_equal(frame.points, xyz)
         assert not [warning for warning in drive.warnings if "not usable" in warning]
+
+
+BARE = {
+    "index_types": IndexType.NONE,
+    "repeat_channels": False,
+    "repeat_schemas": False,
+    "use_statistics": False,
+    "use_summary_offsets": False,
+}
+
+
+@pytest.mark.parametrize(
+    ("left_out", "said"),
+    [
+        (BARE, "it has no index"),  # as rosbag2's preset ``fastwrite``
+        ({"use_statistics": False}, "it has no statistics"),
+        ({}, "it has no index of chunks"),
+    ],
+)
+def test_without_an_index_it_is_read_from_end_to_end(
+    left_out: dict[str, Any], said: str, tmp_path: Path
+) -> None:
+    bag = bags.write(tmp_path / "sound", bags.small_items(scans=3))
+    (sound,) = bag.glob("*.mcap")
+    with sound.open("rb") as source, (tmp_path / "fast.mcap").open("wb") as file:
+        writer = Writer(file, use_chunking=False, **left_out)
+        writer.start("ros2")
+        channels: dict[int, int] = {}
+        for schema, channel, message in make_reader(source).iter_messages():
+            if schema is not None and channel.id not in channels:
+                number = writer.register_schema(schema.name, schema.encoding, schema.data)
+                channels[channel.id] = writer.register_channel(channel.topic, "cdr", number)
+            writer.add_message(channels[channel.id], message.log_time, message.data, message.publish_time)
+        writer.finish()  # type: ignore[no-untyped-call]
+    with bevviz.open(tmp_path / "fast.mcap") as drive, bevviz.open(sound) as same:
+        for frame, other in zip(drive.frames, same.frames, strict=True):
+            np.testing.assert_array_equal(frame.points, other.points)
+        told = [warning for warning in drive.warnings if warning not in same.warnings]
+        assert f": {said}" in told[0] and told[0].endswith(": it is read from end to end")
+        assert not [warning for warning in told if "rescued" in warning or "lost" in warning]

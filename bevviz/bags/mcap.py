@@ -14,7 +14,7 @@ import numpy as np
 from rosbags.interfaces import Connection, ConnectionExtRosbag2, MessageDefinition, MessageDefinitionFormat
 
 from bevviz.bags.chunks import Chunk, Index
-from bevviz.bags.reader import LAST, Bytes, DamageError
+from bevviz.bags.reader import LAST, Bytes, DamageError, UnindexedError
 from bevviz.frame import I64
 from bevviz.loggers import logger
 
@@ -96,7 +96,7 @@ def read_index(path: Path) -> Index:
         if (opcode, length, magic) != (FOOTER, 20, MAGIC):
             raise DamageError("the file ends early (no footer)")
         if not start:
-            raise DamageError("it has no index")
+            raise UnindexedError("it has no index")
         if not len(MAGIC) <= start <= end:
             raise DamageError("its footer is damaged")
         summary = file.read(start, file.size - start)
@@ -167,18 +167,18 @@ def _parse_summary(summary: bytes, end: int) -> Index:
             (size,) = struct.unpack_from("<I", record, _STATISTICS.size)
             counted = dict(_COUNT.iter_unpack(record[_STATISTICS.size + 4 :][:size]))
     if statistics is None:
-        raise DamageError("it has no statistics that its index could be held against")
+        raise UnindexedError("it has no statistics that its index could be held against")
     counts: Counter[int] = Counter()
     for chunk in chunks:
         counts.update(chunk.counts)
     total, chunk_count, first, last = statistics[0], statistics[5], statistics[6], statistics[7]
     index = Index(chunks, channels.connections(counts))
+    if total and not chunks:
+        raise UnindexedError("it has no index of chunks")
     if counts.total() != total or (chunk_count, counts) != (len(chunks), Counter(counted)):
         raise DamageError(
             f"its index, of {len(chunks)} chunks with {counts.total()} messages, disagrees with its "
             f"statistics, of {chunk_count} with {total}"
-            if chunks
-            else "it has no index of chunks"
         )
     if total and index.span != (first, last + 1):
         raise DamageError("its index disagrees with its statistics on the time")

@@ -41,6 +41,10 @@ class DamageError(Exception):
     """What is wrong with a file, for the end of a sentence."""
 
 
+class UnindexedError(DamageError):
+    """A file that its recorder has ended, without an index."""
+
+
 # What rosbags and the libraries below it raise when bytes are not what they should be.
 _DAMAGE: tuple[type[Exception], ...] = (
     *(rosbags.rosbag1.ReaderError, rosbags.rosbag2.ReaderError, apsw.Error),
@@ -220,7 +224,10 @@ class BagFile:
 
     def _tell(self, error: DamageError) -> None:
         _log.info("%s: %s: rescuing what is there", self.path, error, exc_info=error)
-        self._notes.append(f"{error}: what is there was rescued")
+        how = (
+            "it is read from end to end" if isinstance(error, UnindexedError) else "what is there was rescued"
+        )
+        self._notes.append(f"{error}: {how}")
 
 
 class Bytes:
