@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shutil
 import sqlite3
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 
 import zstandard
@@ -158,5 +158,3 @@ FORMATS: dict[str, Callable[[Path], Path]] = {
     "ros1, bz2": ros1("bz2"),
     "ros1, lz4": ros1("lz4"),
 }
-CHECKED: Sequence[str] = ("mcap", "mcap, lz4", "mcap, zstd", "mcap.zstd, several frames")
-"""Those whose chunks have a checksum, so that no wrong payload is excused."""

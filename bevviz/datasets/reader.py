@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator
-from pathlib import Path
 
 import numpy as np
 from rosbags.interfaces import Connection, ConnectionExtRosbag2, MessageDefinition, MessageDefinitionFormat
@@ -81,11 +80,6 @@ class DatasetReader:
     def aside(self) -> dict[str, str]:
         """Topic -> why it plays no role unless it is asked for."""
         return {stream.topic: stream.aside for stream in self._streams if stream.aside}
-
-
-def size_of(folder: Path) -> int:
-    """Bytes of the files in a folder."""
-    return sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
 
 
 def _connection(number: int, topic: str, kind: str, count: int) -> Connection:
