@@ -311,6 +311,7 @@ def test_real_frames(shared: Path, capsys: Capture) -> None:
     said = capsys.readouterr()
     assert "12 frames; 28 objects had to be found" in said.out
     assert "car, moderate" in said.out
+    assert "(of 40 labels or fewer an average precision is (labels - 1) / 40 at best" in said.out
 
 
 # --- many bags ---------------------------------------------------------------------------------

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from bevviz import table
 from bevviz.evaluate.identity import HINT
 from bevviz.evaluate.names import base_of, ranges
-from bevviz.evaluate.precision import OVERLAPS, VIEWS
+from bevviz.evaluate.precision import OVERLAPS, RECALL_POINTS, VIEWS
 from bevviz.text import printable
 
 if TYPE_CHECKING:
@@ -40,6 +40,9 @@ def _lines(
     for rows in tables(found):
         yield ""
         yield from laid_out(rows)
+    if any(labels <= RECALL_POINTS for labels in found.labels.values()):
+        few = f"of {RECALL_POINTS} labels or fewer"
+        yield f"({few} an average precision is (labels - 1) / {RECALL_POINTS} at best, by KITTI's rule)"
     if "hota" in found.metrics and "mota" not in found.metrics:
         yield f"({HINT})"
     worst = found.worst

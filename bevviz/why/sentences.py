@@ -231,9 +231,10 @@ class Because:
         )
 
     def _noise(self) -> str:
-        c = self.config.clustering
+        c, are = self.config.clustering, "is" if self.e.noise == 1 else "are"
+        points, neighbours = count(self.e.noise, "obstacle point"), self.e.neighbours
         return (
-            f"its {count(self.e.noise, 'obstacle point')} are noise: none has more than {self.e.neighbours} "
+            f"its {points} {are} noise: none has more than {neighbours} "
             f"neighbours within {c.eps:g} m (clustering.min_points is {c.min_points})"
         )
 
