@@ -13,7 +13,8 @@ from hypothesis import strategies as st
 import bevviz
 from bevviz import UserError
 from bevviz.datasets.columns import are_doubles, count_columns
-from bevviz.datasets.folder import Folder, read_cloud, sensors_of
+from bevviz.datasets.folder import Folder, read_cloud
+from bevviz.datasets.stamps import sensors_of
 from bevviz.geometry import is_bent
 from bevviz.o3d import load
 from bevviz.ros.cameras import decode_camera_info

@@ -208,28 +208,35 @@ def is_pointer(path: Path) -> bool:
 def read_text(path: Path) -> str:
     """Raises UserError: it cannot be read, or is no text."""
     try:
-        return path.read_text()
+        return path.read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
         reason = getattr(error, "strerror", None) or "is no text"
         raise UserError(f"{path}: cannot be read: {reason}") from None
 
 
-def read_table(path: Path, columns: int) -> NDArray[np.float64]:
-    """(N, columns) numbers, a row a line.
+def read_table(path: Path, columns: int, names: str = "") -> NDArray[np.float64]:
+    """(N, columns) numbers, a row a line, of which further ones are left out; comments begin with #.
+
+    Args:
+        path: the file.
+        columns: how many numbers are taken of each line.
+        names: what they are, where a line may have no others.
 
     Raises:
         UserError: it cannot be read, or a line has something else.
     """
     rows = []
     for number, line in enumerate(read_text(path).splitlines(), 1):
-        if not line.strip():
+        values = line.split()
+        if not values or values[0].startswith("#"):
             continue
+        if len(values) < columns or (names and len(values) > columns):
+            expected = f" ({names})" if names else ""
+            raise UserError(f"{path}: line {number} has {len(values)} numbers, not {columns}{expected}")
         try:
-            row = [float(value) for value in line.split()[:columns]]
+            row = [float(value) for value in values[:columns]]
         except ValueError:
             raise UserError(f"{path}: line {number} has something that is no number") from None
-        if len(row) < columns:
-            raise UserError(f"{path}: line {number} has {len(row)} numbers, not {columns}")
         rows.append(row)
     return np.array(rows, np.float64).reshape(-1, columns)
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import re
 from collections.abc import Collection, Mapping, Sequence
-from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -17,7 +16,6 @@ from bevviz import geometry
 from bevviz.datasets.dataset import (
     CLOUDS,
     IMAGES,
-    SECOND,
     Dataset,
     Stream,
     columns_of,
@@ -30,6 +28,7 @@ from bevviz.datasets.dataset import (
 )
 from bevviz.datasets.pcd import read_pcd
 from bevviz.datasets.ply import read_ply
+from bevviz.datasets.stamps import sensors_of, stamps_in, told_by
 from bevviz.datasets.unread import unread
 from bevviz.errors import UserError, first_line
 from bevviz.files import LFS_HINT
@@ -41,20 +40,16 @@ from bevviz.ros.encode import (
     encode_transforms,
 )
 
-MOST_SENSORS = 16  # in one folder
 MOST_COLUMNS = 64  # of an NPY file; a grid of heights has more, and so has a table the other way round
 MAP, BASE = "map", "base_link"
 CALIBRATION, STAMPS, POSES = "calibration.yaml", "stamps.csv", "poses.txt"
-DATE = re.compile(  # 20121214T142255.814212, 2011-09-26_13-02-25-594
-    r"(?<!\d)((?:19|20)\d\d)[-_.]?(\d\d)[-_.]?(\d\d)[-_.T ]?(\d\d)[-_.:]?(\d\d)[-_.:]?(\d\d)"
-    r"(?:[-_.](\d{1,9}))?(?=\D*$)"
-)
 OF_CAMERAS = re.compile("cam|im(g|age)", re.IGNORECASE)  # a folder with one for each camera
-UNITS = {19: 1, 16: 1000, 13: 1_000_000, 10: SECOND}  # digits of a stamp -> nanoseconds of its unit
 NEAREST = {"i8": "<f8", "u8": "<f8", "f2": "<f4", "b1": "u1"}  # that a PointCloud2 can hold
 KEYS = {"rate", "fields", "lidars", "cameras"}
 LENS = {"D", "distortion_model"}
-SENSOR_KEYS = {"pose", "K", *LENS}
+SENSOR_KEYS = {"pose", "rate", "fields", "K", *LENS}
+MOST_SECONDS = 1e10  # of a stamp: more is another unit
+MUCH_FURTHER = 1.5  # times as many frames, which another rate gives
 
 
 class Folder(Dataset):
@@ -96,11 +91,16 @@ class Folder(Dataset):
                 names = f"there are {', '.join(there)}" if there else "there is none"
                 names += others and f"; {others}"
                 raise UserError(f"{path / CALIBRATION}: no {unknown[0]} among the {kind}; {names}")
-        stamped = self._stamps([*lidars.values(), *cameras.values()], float(about.get("rate", 10.0)))
-        fields = self._fields(about.get("fields"), [file for files in lidars.values() for file in files])
+        stamped = self._stamps({"lidars": lidars, "cameras": cameras}, about)
         edges, streams = [], list[Stream]()
         # Where nothing says how the only LiDAR is mounted, its own frame need not be upright.
         placed = len(lidars) > 1 or (path / POSES).is_file() or any("pose" in s for s in _stated(about))
+        loose = [name for name in lidars if "pose" not in about.get("lidars", {}).get(name, {})]
+        if len(lidars) > 1 and loose:
+            self.warn(
+                f"nothing says how {', '.join(loose)} {'are' if len(loose) > 1 else 'is'} mounted: the "
+                f"points are taken as they are, in {BASE} (pose in {CALIBRATION})"
+            )
         for name, files in cameras.items():
             files, times = _in_order(files, stamped)
             stated = about.get("cameras", {}).get(name, {})
@@ -111,8 +111,9 @@ class Folder(Dataset):
             streams.append(pictures(name, times, files, rectified=not LENS & stated.keys()))
         for name, files in lidars.items():
             files, times = _in_order(files, stamped)
-            self.check_sizes([file for file in files if file.suffix == ".bin"], 4 * len(fields))
             stated = about.get("lidars", {}).get(name, {})
+            fields = self._fields(stated.get("fields", about.get("fields")), files)
+            self.check_sizes([file for file in files if file.suffix.lower() == ".bin"], 4 * len(fields))
             if placed:
                 pose = self._pose(stated["pose"], name) if "pose" in stated else np.eye(4)
                 edges.append((BASE, name, pose))
@@ -200,55 +201,99 @@ class Folder(Dataset):
             lambda row: encode_intrinsics(int(times[row]), name, about),
         )
 
-    def _stamps(self, sensors: Sequence[Sequence[Path]], rate: float) -> dict[Path, int]:
-        """Of each file, in nanoseconds."""
-        table = self.path / STAMPS
-        files = [file for sensor in sensors for file in sensor]
-        if table.is_file():
-            return self._listed(table, files)
-        dates = {file: date[1] for file in files if (date := _date(file))}
-        texts = {file: _number(file) for file in files}
-        if all(map(_is_stamp, texts.values())) and len(dates) < len(files):
-            return {file: _stamp(text) for file, text in texts.items()}
-        if len(dates) == len(files):
-            self.warn("the names are taken for dates and times in UTC")
-            return dates
-        if all(texts.values()):
-            numbers = [int(text.partition(".")[0]) for text in texts.values()]
+    def _stamps(
+        self, sensors: Mapping[str, dict[str, list[Path]]], about: Mapping[str, Any]
+    ) -> dict[Path, int]:
+        """Of each file, in nanoseconds; what has no time is taken out of the sensors, which is said."""
+        everyone = [(kind, name, files) for kind, group in sensors.items() for name, files in group.items()]
+        if (self.path / STAMPS).is_file():
+            return self._listed(self.path / STAMPS, [files for _, _, files in everyone])
+        lead = max(sensors["lidars"].items(), key=lambda item: len(item[1]))
+        leading = told_by(lead[1])
+        if leading is None:
             self.warn(
-                f"the names are no stamps: taken for frame numbers, at {rate:g} a second "
+                f"names without a number: the files are taken in their order, at {_rate(about):g} a second"
+            )
+        elif leading.frames:
+            self.warn(
+                f"the names are no stamps: taken for frame numbers, at {_rate(about):g} a second "
                 f"(rate in {CALIBRATION})"
             )
-            return dict(zip(files, frames_at(rate, numbers).tolist(), strict=True))
-        self.warn(f"names without a number: the files are taken in their order, at {rate:g} a second")
-        return {
-            file: int(stamp)
-            for sensor in sensors
-            for file, stamp in zip(sensor, frames_at(rate, range(len(sensor))), strict=True)
-        }
+        of_lead = leading.values if leading else dict.fromkeys(lead[1], 0)
+        stamped = dict[Path, int]()
+        for kind, name, files in everyone:
+            told = told_by(files)
+            stated = about.get(kind, {}).get(name, {})
+            rate = _rate(about, stated)
+            if leading and told and told.frames == leading.frames:
+                numbers = told.values
+                if told.said:
+                    self.warn(f"the names {told.said}")
+                if told.frames and "rate" not in stated:
+                    self._hold_against(lead[0], leading.values, name, numbers)
+            elif not leading:
+                numbers = {file: i for i, file in enumerate(files)}
+            elif len(files) == len(of_lead):
+                ordered = sorted(files, key=lambda file: (told.values.get(file, -1) if told else 0, file))
+                numbers = dict(zip(ordered, sorted(of_lead.values()), strict=True))
+                self.warn(
+                    f"{name}: its names do not tell when, as those of {lead[0]} do: taken in their order, "
+                    "one for each"
+                )
+            else:
+                numbers = {}
+            if away := [file for file in files if file not in numbers]:
+                self.warn(
+                    f"{self._first(away)}: the name does not tell when it was taken, as those of {lead[0]} "
+                    f"do: left out ({STAMPS} can say it)"
+                )
+                sensors[kind][name] = [file for file in files if file in numbers]
+                if not sensors[kind][name]:
+                    del sensors[kind][name]
+            if leading and not leading.frames:
+                stamped |= numbers
+            else:
+                stamped |= zip(numbers, frames_at(rate, list(numbers.values())).tolist(), strict=True)
+        return stamped
 
-    def _listed(self, table: Path, files: Sequence[Path]) -> dict[Path, int]:
+    def _hold_against(
+        self, lead: str, frames: Mapping[Path, int], name: str, mine: Mapping[Path, int]
+    ) -> None:
+        """Tell of a sensor whose numbers of frames go much further than those of the LiDAR."""
+        (first, last), (start, end) = [(min(n.values()), max(n.values())) for n in (frames, mine)]
+        if end - start > MUCH_FURTHER * (last - first + 1):
+            self.warn(
+                f"{name} has the frames {start} to {end}, {lead} {first} to {last}: taken for the same; "
+                f"where it counts its own, its rate can be stated ({CALIBRATION})"
+            )
+
+    def _listed(self, table: Path, sensors: Sequence[Sequence[Path]]) -> dict[Path, int]:
         """By ``stamps.csv``."""
-        found = {}
+        found = dict[Path, str]()
         for number, row in enumerate(csv.reader(read_text(table).splitlines()), 1):
             if len(row) < 2 or (number == 1 and not re.search(r"\d", row[1])):
                 continue
-            try:
-                found[self.path / row[0].strip()] = _stamp(row[1].strip())
-            except ValueError:
-                raise UserError(f"{table}: line {number}: '{row[1]}' is no stamp") from None
-        if missing := [file for file in files if file not in found]:
+            if not re.fullmatch(r"\d+(\.\d*)?", row[1].strip()):
+                raise UserError(f"{table}: line {number}: '{row[1]}' is no stamp")
+            found[self.path / row[0].strip()] = row[1].strip()
+        if missing := [file for files in sensors for file in files if file not in found]:
             raise UserError(f"{table}: no stamp for {missing[0].relative_to(self.path)}")
-        return found
+        stamped = dict[Path, int]()
+        for files in sensors:
+            stamped |= zip(files, stamps_in([found[file] for file in files]), strict=True)
+        return stamped
 
     def _poses(self) -> list[Stream]:
         """Where the vehicle is: a line has stamp x y z qx qy qz qw."""
         file = self.path / POSES
         if not file.is_file():
             return []
-        table = read_table(file, 8)
+        table = read_table(file, 8, "stamp x y z qx qy qz qw")
         table = table[np.argsort(table[:, 0], kind="stable")]
-        times = np.round(table[:, 0] * 1e9).astype(np.int64)
+        if table[:, 0].max(initial=0) < MOST_SECONDS:
+            times = np.round(table[:, 0] * 1e9).astype(np.int64)
+        else:
+            times = np.array(stamps_in([f"{stamp:.0f}" for stamp in table[:, 0]]), np.int64)
 
         def make(row: int) -> Any:
             pose = geometry.transform(table[row, 1:4], table[row, 4:])
@@ -262,75 +307,17 @@ def _stated(about: Mapping[str, Any]) -> list[Any]:
     return [sensor for kind in ("lidars", "cameras") for sensor in about.get(kind, {}).values()]
 
 
+def _rate(*stated: Mapping[str, Any]) -> float:
+    """Frames a second, as the last of them states it."""
+    return next((float(about["rate"]) for about in reversed(stated) if "rate" in about), 10.0)
+
+
 def _folders(path: Path) -> list[Path]:
     return sorted(found for found in path.iterdir() if found.is_dir() and not found.name.startswith("."))
 
 
 def _of_kind(folder: Path, suffixes: Sequence[str]) -> list[Path]:
     return sorted(f for f in folder.iterdir() if f.suffix.lower() in suffixes and f.is_file())
-
-
-def sensors_of(files: Sequence[Path]) -> dict[str, list[Path]]:
-    """Files by the words in which their names differ, without their last number; one group: of one sensor.
-
-    They are of several where these words are no mere numbers (which are a date's, or a run's), or where each
-    has the same last numbers, and where there are as many of each, about.
-    """
-    groups = dict[tuple[str, ...], list[Path]]()
-    told = {file: date[0] if (date := _date(file)) else _number(file) for file in files}
-    if not all(told.values()):
-        return {"": list(files)}
-    for file in files:
-        before, _, after = file.stem.rpartition(told[file])
-        groups.setdefault(tuple(re.findall(r"[A-Za-z0-9]+", f"{before} {after}")), []).append(file)
-    counts = [len(found) for found in groups.values()]
-    if not 1 < len(groups) <= MOST_SENSORS or max(counts) > 2 * min(counts):
-        return {"": list(files)}
-    first, last = _alike(list(groups)), _alike([words[::-1] for words in groups])
-    names = {words: words[first : max(first, len(words) - last)] for words in groups}
-    numbers = {tuple(sorted(told[file] for file in found)) for found in groups.values()}
-    named = all(any(map(str.isalpha, "".join(words))) for words in names.values() if words)
-    if not named and len(numbers) > 1:
-        return {"": list(files)}
-    return {"_".join(names[words]): found for words, found in groups.items()}
-
-
-def _alike(rows: Sequence[Sequence[str]]) -> int:
-    """How many words all rows begin with."""
-    return next(
-        (i for i, row in enumerate(zip(*rows, strict=False)) if len(set(row)) > 1), min(map(len, rows))
-    )
-
-
-def _date(file: Path) -> tuple[str, int] | None:
-    """The date and time that a name ends with, and its nanoseconds, taken for UTC; None: it does not."""
-    if not (found := DATE.search(file.stem)):
-        return None
-    year, month, day, hour, minute, second, fraction = found.groups()
-    try:
-        whole = datetime(int(year), int(month), int(day), int(hour), int(minute), int(second), tzinfo=UTC)
-    except ValueError:
-        return None
-    return found[0], int(whole.timestamp()) * SECOND + int((fraction or "")[:9].ljust(9, "0"))
-
-
-def _number(file: Path) -> str:
-    """The last number in a name; "" where there is none."""
-    found = re.findall(r"\d+(?:\.\d+)?", file.stem)
-    return str(found[-1]) if found else ""
-
-
-def _is_stamp(number: str) -> bool:
-    """Whether a number in a name is no frame's, which has zeros before it where it is as long as a stamp."""
-    return "." in number or (len(number) in UNITS and not number.startswith("0"))
-
-
-def _stamp(text: str) -> int:
-    """Nanoseconds of a stamp in seconds, or, without a point, in what it has the digits of."""
-    whole, point, fraction = text.partition(".")
-    if point:
-        return int(whole) * SECOND + int(fraction[:9].ljust(9, "0"))
-    return int(whole) * UNITS.get(len(whole), SECOND)
 
 
 def _in_order(files: Sequence[Path], stamped: Mapping[Path, int]) -> tuple[list[Path], I64]:
