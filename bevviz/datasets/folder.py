@@ -48,6 +48,7 @@ NEAREST = {"i8": "<f8", "u8": "<f8", "f2": "<f4", "b1": "u1"}  # that a PointClo
 KEYS = {"rate", "fields", "lidars", "cameras"}
 LENS = {"D", "distortion_model"}
 SENSOR_KEYS = {"pose", "rate", "fields", "K", *LENS}
+STAMP = r"\d{1,19}(\.\d*)?"
 MOST_SECONDS = 1e10  # of a stamp: more is another unit
 MUCH_FURTHER = 1.5  # times as many frames, which another rate gives
 
@@ -273,7 +274,7 @@ class Folder(Dataset):
         for number, row in enumerate(csv.reader(read_text(table).splitlines()), 1):
             if len(row) < 2 or (number == 1 and not re.search(r"\d", row[1])):
                 continue
-            if not re.fullmatch(r"\d+(\.\d*)?", row[1].strip()):
+            if not re.fullmatch(STAMP, row[1].strip()):
                 raise UserError(f"{table}: line {number}: '{row[1]}' is no stamp")
             found[self.path / row[0].strip()] = row[1].strip()
         if missing := [file for files in sensors for file in files if file not in found]:

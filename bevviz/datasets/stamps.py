@@ -84,16 +84,12 @@ def sensors_of(files: Sequence[Path]) -> dict[str, list[Path]]:
 
 
 def stamps_in(texts: Sequence[str]) -> list[int]:
-    """Nanoseconds of stamps in seconds, or, where none has a point, in what their digits or steps tell.
-
-    Raises:
-        ValueError: one is no number.
-    """
-    if any("." in text for text in texts):
-        return _decimals(texts)
-    numbers = [int(text) for text in texts]
-    unit = _unit(texts, numbers) or SECOND
-    return [unit * number for number in numbers]
+    """Nanoseconds of stamps in seconds, or, without a point, in what their digits or steps tell."""
+    whole = [text for text in texts if "." not in text]
+    numbers = list(map(int, whole))
+    unit = (whole and _unit(whole, numbers)) or SECOND
+    stamps = iter(_decimals([text for text in texts if "." in text]))
+    return [next(stamps) if "." in text else unit * int(text) for text in texts]
 
 
 def _words(told: re.Match[str]) -> list[str]:
@@ -166,7 +162,7 @@ def _by_number(files: Sequence[Path], pattern: re.Pattern[str]) -> Told | None:
         if not _counts(values):
             return Told(False, dict(zip(told, values, strict=True)), "are taken for seconds and their parts")
     if any("." in text for text in texts):
-        return Told(False, dict(zip(told, _decimals(texts), strict=True)))
+        return Told(False, dict(zip(told, stamps_in(texts), strict=True)))
     numbers = [int(text) for text in texts]
     if unit := _unit(texts, numbers):
         plain = _are_stamps(texts)
@@ -201,7 +197,7 @@ def _decimals(texts: Sequence[str]) -> list[int]:
     seconds, parts = [int(whole) for whole, _, _ in split], [part for _, _, part in split]
     stamps = [s * SECOND + _nanoseconds(part) for s, part in zip(seconds, parts, strict=True)]
     lengths = set(map(len, parts))
-    if max(lengths) != 9 or len(lengths) == 1 or not all(part.isdigit() for part in parts):
+    if max(lengths, default=0) != 9 or len(lengths) == 1 or not all(part.isdigit() for part in parts):
         return stamps
     return min(stamps, _fractions(seconds, parts), key=_unevenness)
 
