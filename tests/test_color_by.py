@@ -70,7 +70,7 @@ def test_what_a_cloud_has_not_is_said() -> None:
     values=arrays(np.float32, (3,), elements=st.floats(width=32, allow_nan=True, allow_infinity=True)),
     field=st.sampled_from(["intensity", "time"]),
 )
-@pytest.mark.filterwarnings("ignore::RuntimeWarning")
+@pytest.mark.filterwarnings("error")
 def test_every_id_has_a_label_whatever_the_sensor_sends(values: F32, field: Quantity) -> None:
     assert all(said(field, **{field: values}))
 

@@ -6,9 +6,11 @@ from collections.abc import Callable
 from datetime import UTC, datetime
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
+import bevviz
 from bevviz import UserError
 from bevviz.datasets.folder import Folder
 from bevviz.datasets.stamps import sensors_of, told_by
@@ -198,3 +200,89 @@ def test_lidars_with_other_columns(tmp_path: Path) -> None:
         xyz = np.frombuffer(bytes(message.data), "<f4").reshape(-1, columns)[:, :3]
         np.testing.assert_array_equal(xyz, cloud(columns, 3000)[:, :3])
     assert any(line.startswith("nothing says how livox, top are mounted") for line in drive.warnings)
+
+
+def test_what_systems_leave_in_folders_is_no_data(tmp_path: Path) -> None:
+    """Of a drive from a Mac each cloud was there twice, and the second could not be read."""
+    files = {"top": "1.bin ._1.bin .hidden.bin", "front": "1.png ._1.png", "__MACOSX": "1.bin 2.bin"}
+    assert drive_in(tmp_path, files) == {"top": [1.1], "front": [1.1]}
+    (tmp_path / "front/2.png").symlink_to("not_fetched.png")
+    drive_in(tmp_path, {})
+    assert "front/2.png: a link to what is not there" in drive_in.warnings  # type: ignore[attr-defined]
+
+
+def test_labels_and_matrices_are_no_lidars(tmp_path: Path) -> None:
+    """Their numbers were points beside those of the LiDAR."""
+    drive_in(tmp_path, {"top": "1.bin"})
+    for name in ("labels", "pose", "K", "kinds"):
+        (tmp_path / name).mkdir()
+    np.arange(20, dtype=np.uint32).tofile(tmp_path / "labels/1.bin")
+    np.save(tmp_path / "pose/1.npy", np.eye(4))
+    np.save(tmp_path / "K/1.npy", np.eye(3))
+    np.save(tmp_path / "kinds/1.npy", np.zeros(20))
+    assert drive_in(tmp_path, {}) == {"top": [1.1]}
+    told = drive_in.warnings  # type: ignore[attr-defined]
+    for said in (
+        "labels/1.bin: whole numbers",
+        "pose/1.npy: of the shape (4, 4)",
+        "kinds/1.npy: of the shape",
+    ):
+        assert any(line.startswith(said) and line.endswith("left out") for line in told)
+    np.arange(2000, dtype=np.int64).tofile(tmp_path / "labels/1.bin")
+    with pytest.raises(UserError, match="its numbers are whole ones; save points as float32"):
+        Folder(tmp_path / "labels", "")
+
+
+def test_sensors_in_a_folder_of_sensors(tmp_path: Path) -> None:
+    files = ("lidar/left/1.bin", "velodyne/data/1.bin", "2.bin", "images/front/1.png", "images/train/1.png")
+    for name in (*files, "velodyne/0001/1.bin", "front/1.png"):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_bytes(cloud(4, 20).tobytes())
+    there = drive_in(tmp_path, {"lidar": "3.bin"})
+    of_root = f"{tmp_path.name}_lidar"
+    of_others = {name: [1.1] for name in ("left", "velodyne", "front", "images_front")}
+    assert there == {"lidar": [1.3], of_root: [1.2]} | of_others
+
+
+def test_drives_in_a_folder_are_named(tmp_path: Path) -> None:
+    for name in ("monday", "tuesday"):
+        (tmp_path / name).mkdir()
+        drive_in(tmp_path / name, {"top": "1.bin"})
+    with pytest.raises(UserError, match="its folders that are one: monday, tuesday"):
+        bevviz.open(tmp_path)
+
+
+def test_many_files_that_cannot_be_read_are_one_sentence(tmp_path: Path) -> None:
+    drive_in(tmp_path, {"top": "1.bin"})
+    points = "".join(f"{i} 2 -1\n" for i in range(9))
+    for i in range(2, 6):
+        np.save(tmp_path / f"top/{i}.npy", np.zeros((4, 500), np.float32))
+        (tmp_path / f"top/1{i}.pcd").write_text(
+            f"FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nPOINTS 20\nDATA ascii\n{points}"
+        )
+    with bevviz.open(tmp_path) as drive:
+        assert len(list(drive.frames)) == 5
+        told = [line for line in drive.warnings if "/top/points: " in line]
+    assert len(told) == 2
+    assert "4 of its 9 files cannot be read; the first: " in told[0] and "has the shape (4, 500)" in told[0]
+    assert "4 of its 9 files are cut; the first: " in told[1] and "12.pcd: is cut: 9 of 20 points" in told[1]
+
+
+@pytest.mark.parametrize(("size", "told"), [("", True), ("size: [1280, 720], ", False)])
+def test_a_calibration_for_larger_images(size: str, told: bool, tmp_path: Path) -> None:
+    """What was projected fell beside the image, and nothing said why."""
+    drive_in(tmp_path, {"top": "1.bin", "front": ""})
+    cv2.imwrite(str(tmp_path / "front/1.png"), np.zeros((360, 640, 3), np.uint8))
+    about = f"{{{size}K: [700, 0, 640, 0, 700, 360, 0, 0, 1], pose: [0, 0, 0, -0.5, 0.5, -0.5, 0.5]}}"
+    (tmp_path / "calibration.yaml").write_text(f"cameras: {{front: {about}}}")
+    with bevviz.open(tmp_path) as drive:
+        (frame,) = drive.frames
+        intrinsics = frame.cameras[0].intrinsics
+        assert intrinsics and (intrinsics.width, intrinsics.K[0, 0]) == (640, 700 if told else 350)
+        assert any("the principal point (640, 360) is far from" in line for line in drive.warnings) == told
+
+
+@pytest.mark.parametrize("rate", ["0", "-1", "fast", ".nan"])
+def test_a_rate_that_is_none(rate: str, tmp_path: Path) -> None:
+    with pytest.raises(UserError, match=r"calibration\.yaml: rate is"):
+        drive_in(tmp_path, {"top": "1.bin"}, f"rate: {rate}")

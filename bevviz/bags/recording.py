@@ -27,7 +27,7 @@ from bevviz.bags.reader import BagFile, normalized
 from bevviz.bags.types import MessageTypes
 from bevviz.closing import Closing
 from bevviz.config import SourceConfig
-from bevviz.datasets import open_dataset
+from bevviz.datasets import find_loader, open_dataset
 from bevviz.datasets.reader import DatasetReader
 from bevviz.datasets.unread import unread
 from bevviz.errors import UserError
@@ -386,6 +386,8 @@ class Recording(Closing):
         if not files:
             within = sorted(d.name for d in folder.iterdir() if d.is_dir() and bag_files(d))
             hint = f"; there are bags in its folders: {', '.join(within[:5])}" if within else ""
+            if drives := [] if within else [d.name for d in sorted(folder.iterdir()) if find_loader(d)]:
+                hint = f"; its folders that are one: {', '.join(drives[:5])}{' ...' if drives[5:] else ''}"
             hint += f"; {others}" if (others := unread(folder)) else ""
             raise UserError(
                 f"{folder}: a folder without a bag (no .mcap, .db3 or .bag file), and no data set that is "

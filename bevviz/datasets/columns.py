@@ -11,6 +11,7 @@ BINS = 64
 ENOUGH = 1000  # values; fewer tell nothing
 TELLING = 0.1  # nats, below which no number of columns stands out
 NEAR = 0.7  # of the best: a multiple of the right number tells a little more
+NOTHING = 1e-30  # as float32: a whole number below some hundred millions is less
 ODD = 0.1  # share of values that no sensor measures, from which on numbers are of another type
 
 
@@ -39,6 +40,13 @@ def are_doubles(data: bytes) -> bool:
     """Whether numbers are float64: as float32 many would be too large or too small to be measured."""
     whole = data[: len(data) // 8 * 8]
     return _odd(np.frombuffer(whole, "<f4")) > ODD > 10 * _odd(np.frombuffer(whole, "<f8"))
+
+
+def are_whole(data: bytes) -> bool:
+    """Whether numbers are whole ones, such as labels: as float32 they would be next to nothing."""
+    size = np.abs(np.frombuffer(data[: len(data) // 4 * 4], "<f4"))
+    there = size > 0
+    return bool(there.any()) and float(np.mean(size[there] < NOTHING)) > 0.5
 
 
 def _odd(values: F32 | F64) -> float:

@@ -10,7 +10,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from bevviz.datasets.columns import are_doubles, count_columns
+from bevviz.datasets.columns import are_doubles, are_whole, count_columns
 from bevviz.errors import UserError, first_line
 from bevviz.files import LFS_HINT, LFS_POINTER
 from bevviz.frame import F32, I64
@@ -44,6 +44,7 @@ class Stream:
         times: (N,) stamps in nanoseconds, sorted; what is made has them in its header.
         make: the message of a row of ``times``, from ``bevviz.ros.encode``; may raise UserError.
         aside: why the topic plays no role unless it is asked for; "": it plays.
+        files: of clouds that may be cut, each that of a message.
     """
 
     topic: str
@@ -51,6 +52,7 @@ class Stream:
     times: I64
     make: Callable[[int], Any]
     aside: str = ""
+    files: Sequence[Path] = ()
 
 
 class Dataset:
@@ -116,6 +118,8 @@ class Dataset:
         data = read_bytes(largest)[:LOOKED_AT]
         if are_doubles(data):
             raise UserError(f"{largest}: its numbers are float64; save them as float32, or as NPY")
+        if are_whole(data):
+            raise UserError(f"{largest}: its numbers are whole ones; save points as float32, or as NPY")
         count = count_columns(np.frombuffer(data[: len(data) // 4 * 4], "<f4")) or len(names)
         fields = [*names, *(f"field_{column}" for column in range(len(names), count))][:count]
         if count != len(names):

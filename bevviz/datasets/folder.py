@@ -13,9 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bevviz import geometry
+from bevviz.datasets.columns import are_whole
 from bevviz.datasets.dataset import (
     CLOUDS,
     IMAGES,
+    LOOKED_AT,
     Dataset,
     Stream,
     columns_of,
@@ -43,11 +45,15 @@ from bevviz.ros.encode import (
 MOST_COLUMNS = 64  # of an NPY file; a grid of heights has more, and so has a table the other way round
 MAP, BASE = "map", "base_link"
 CALIBRATION, STAMPS, POSES = "calibration.yaml", "stamps.csv", "poses.txt"
-OF_CAMERAS = re.compile("cam|im(g|age)", re.IGNORECASE)  # a folder with one for each camera
+OF_SENSORS = re.compile(  # a folder with one for each camera or LiDAR
+    "cam|im(g|age)|lidar|velo|point|cloud|pcd|scan", re.IGNORECASE
+)
+OF_DRIVES = re.compile(r"\d{3,}$|train|val|test", re.IGNORECASE)  # a folder of one drive or part, not sensor
+HIDDEN = re.compile(r"\.|__MACOSX$")
 NEAREST = {"i8": "<f8", "u8": "<f8", "f2": "<f4", "b1": "u1"}  # that a PointCloud2 can hold
 KEYS = {"rate", "fields", "lidars", "cameras"}
 LENS = {"D", "distortion_model"}
-SENSOR_KEYS = {"pose", "rate", "fields", "K", *LENS}
+SENSOR_KEYS = {"pose", "rate", "fields", "K", "size", *LENS}
 STAMP = r"\d{1,19}(\.\d*)?"
 MOST_SECONDS = 1e10  # of a stamp: more is another unit
 MUCH_FURTHER = 1.5  # times as many frames, which another rate gives
@@ -66,23 +72,15 @@ class Folder(Dataset):
 
     @classmethod
     def fits(cls, path: Path) -> bool:
-        return any(_of_kind(folder, CLOUDS) for folder in (path, *_folders(path)))
+        return any(_of_kind(folder, CLOUDS) for folder in _places(path))
 
     def __init__(self, path: Path, sequence: str) -> None:
         super().__init__(path, sequence)
         if sequence:
             raise UserError(f"{path}: is one drive; leave --sequence {sequence} out")
         about = self._calibration()
-        places = {path: "", **{folder: folder.name for folder in _folders(path)}}
-        within = [folder for place in places if OF_CAMERAS.match(places[place]) for folder in _folders(place)]
-        lidars, cameras = dict[str, list[Path]](), dict[str, list[Path]]()
         others = unread(path)
-        for folder, name in places.items():
-            lidars |= self._apart(name or "lidar", _of_kind(folder, CLOUDS), about.get("lidars", ()))
-            cameras |= self._apart(name or "camera", _of_kind(folder, IMAGES), about.get("cameras", ()))
-        for folder in within:
-            name = folder.name if folder.name not in cameras else f"{folder.parent.name}_{folder.name}"
-            cameras |= self._apart(name, _of_kind(folder, IMAGES), about.get("cameras", ()))
+        lidars, cameras = self._sensors(about)
         if not lidars:
             raise UserError(f"{path}: no cloud in it{others and '; '}{others}; expected {self.expects}")
         if others:
@@ -120,6 +118,24 @@ class Folder(Dataset):
                 edges.append((BASE, name, pose))
             streams.append(_clouds(name, times, files, fields))
         self.streams = [*_mounted(min(stamped.values()), edges), *self._poses(), *streams]
+
+    def _sensors(self, about: Mapping[str, Any]) -> tuple[dict[str, list[Path]], dict[str, list[Path]]]:
+        """LiDARs and cameras by their names, with their files."""
+        found: dict[str, dict[str, list[Path]]] = {"lidars": {}, "cameras": {}}
+        places = _places(self.path)
+        for folder in places:
+            for kind, suffixes, alone in (("lidars", CLOUDS, "lidar"), ("cameras", IMAGES, "camera")):
+                name = places[folder] or alone
+                if name in found[kind] or (folder == self.path and name in places.values()):
+                    name = f"{(folder if folder == self.path else folder.parent).name}_{name}"
+                found[kind] |= self._apart(name, _of_kind(folder, suffixes), about.get(kind, ()))
+        if gone := [file for folder in places for file in _links_to_nowhere(folder)]:
+            self.warn(f"{self._first(gone)}: a link to what is not there")
+        lidars = found["lidars"]
+        for name in list(lidars) if len(lidars) > 1 else ():
+            if reason := no_points(max(lidars[name], key=lambda file: file.stat().st_size)):
+                self.warn(f"{self._first(lidars.pop(name))}: {reason}: left out")
+        return lidars, found["cameras"]
 
     def _apart(self, sensor: str, files: Sequence[Path], stated: Collection[str]) -> dict[str, list[Path]]:
         """Files by their sensor: in one folder they may be of several, which their names tell."""
@@ -163,7 +179,12 @@ class Folder(Dataset):
         """
         if stated is not None:
             return [str(name) for name in stated]
-        return self.columns_in(files, hint=f" (fields in {CALIBRATION})")
+        fields = self.columns_in(files, hint=f" (fields in {CALIBRATION})")
+        shape = next((shape_of(file) for file in files if file.suffix.lower() == ".npy"), ())
+        if len(shape) == 2 and len(fields) < shape[1] <= MOST_COLUMNS:
+            fields += [f"field_{column}" for column in range(len(fields), shape[1])]
+            self.warn(f"NPY files are taken for the columns {', '.join(fields)} (fields in {CALIBRATION})")
+        return fields
 
     def _pose(self, values: Any, sensor: str) -> F64:
         """(4, 4) base_link from a sensor, of 7 numbers or of 16."""
@@ -187,14 +208,16 @@ class Folder(Dataset):
         try:
             matrix = np.array(stated["K"], np.float64).reshape(3, 3)
             distortion = np.array(stated.get("D", ()), np.float64).reshape(-1)
+            width, height = map(int, stated.get("size", (0, 0)))
         except (TypeError, ValueError):
             raise UserError(
-                f"{self.path / CALIBRATION}: camera {name}: K needs 9 numbers, row by row, and D only numbers"
+                f"{self.path / CALIBRATION}: camera {name}: K needs 9 numbers, row by row, D only numbers, "
+                "and size the width and height of the images that K is for"
             ) from None
         model = str(stated.get("distortion_model", "plumb_bob" if len(distortion) else ""))
         if model in geometry.FISHEYE and "D" not in stated:
             distortion = np.zeros(4)  # r = f theta
-        about = Intrinsics(0, 0, matrix, model, distortion)
+        about = Intrinsics(width, height, matrix, model, distortion)
         return Stream(
             f"/{name}/camera_info",
             "sensor_msgs/msg/CameraInfo",
@@ -309,16 +332,36 @@ def _stated(about: Mapping[str, Any]) -> list[Any]:
 
 
 def _rate(*stated: Mapping[str, Any]) -> float:
-    """Frames a second, as the last of them states it."""
-    return next((float(about["rate"]) for about in reversed(stated) if "rate" in about), 10.0)
+    """Frames a second, as the last of them states it. Raises UserError: it is no number above 0."""
+    rate = next((about["rate"] for about in reversed(stated) if "rate" in about), 10.0)
+    if not isinstance(rate, int | float) or not 0 < rate < float("inf"):
+        raise UserError(f"{CALIBRATION}: rate is {rate}, not frames a second")
+    return float(rate)
+
+
+def _places(path: Path) -> dict[Path, str]:
+    """The folder, those in it, and those in one of cameras or LiDARs, with what sensors there are called."""
+    places = {path: "", **{folder: folder.name for folder in _folders(path)}}
+    for folder in [folder for folder, name in places.items() if OF_SENSORS.match(name)]:
+        for within in (found for found in _folders(folder) if not OF_DRIVES.match(found.name)):
+            places[within] = folder.name if within.name == "data" else within.name
+    return places
 
 
 def _folders(path: Path) -> list[Path]:
-    return sorted(found for found in path.iterdir() if found.is_dir() and not found.name.startswith("."))
+    return sorted(found for found in path.iterdir() if found.is_dir() and not HIDDEN.match(found.name))
+
+
+def _links_to_nowhere(folder: Path) -> list[Path]:
+    return sorted(f for f in folder.iterdir() if f.suffix.lower() in (*CLOUDS, *IMAGES) and not f.exists())
 
 
 def _of_kind(folder: Path, suffixes: Sequence[str]) -> list[Path]:
-    return sorted(f for f in folder.iterdir() if f.suffix.lower() in suffixes and f.is_file())
+    return sorted(
+        f
+        for f in folder.iterdir()
+        if f.suffix.lower() in suffixes and f.is_file() and not HIDDEN.match(f.name)
+    )
 
 
 def _in_order(files: Sequence[Path], stamped: Mapping[Path, int]) -> tuple[list[Path], I64]:
@@ -337,7 +380,28 @@ def _clouds(name: str, times: I64, files: Sequence[Path], fields: Sequence[str])
         points, announced = read_cloud(files[row], fields)
         return encode_points(int(times[row]), name, points, announced)
 
-    return Stream(f"/{name}/points", "sensor_msgs/msg/PointCloud2", times, make)
+    return Stream(f"/{name}/points", "sensor_msgs/msg/PointCloud2", times, make, files=files)
+
+
+def shape_of(file: Path) -> tuple[int, ...]:
+    """Of the array in an NPY file; empty where it has named columns, or cannot be read."""
+    try:
+        there = np.load(file, mmap_mode="r", allow_pickle=False)
+    except (OSError, ValueError, EOFError):
+        return ()
+    return () if there.dtype.names else there.shape
+
+
+def no_points(file: Path) -> str:
+    """Why what looks like a cloud by its suffix is none, such as labels and matrices; "": nothing says so."""
+    suffix = file.suffix.lower()
+    if suffix == ".bin":
+        with file.open("rb") as there:
+            return "whole numbers, no points of float32" if are_whole(there.read(LOOKED_AT)) else ""
+    shape = shape_of(file) if suffix == ".npy" else ()
+    if shape and (len(shape) != 2 or (shape[0] in (3, 4) and shape[1] in (3, 4))):
+        return f"of the shape {shape}, no points"
+    return ""
 
 
 def read_cloud(file: Path, fields: Sequence[str]) -> tuple[NDArray[np.void], int]:
@@ -362,7 +426,7 @@ def read_cloud(file: Path, fields: Sequence[str]) -> tuple[NDArray[np.void], int
                 return _encodable(loaded.reshape(-1)), 0
             if loaded.ndim != 2 or not 3 <= loaded.shape[1] <= MOST_COLUMNS:
                 raise ValueError(f"has the shape {loaded.shape}, not (N, 3) to (N, {MOST_COLUMNS})")
-            names = [*fields, *(f"field_{i}" for i in range(loaded.shape[1]))][: loaded.shape[1]]
+            names = [*fields, *(f"field_{i}" for i in range(len(fields), loaded.shape[1]))][: loaded.shape[1]]
             return columns_of(loaded.astype(np.float32), names), 0
         points, announced = read_pcd(file) if suffix == ".pcd" else read_ply(file)
         return _encodable(points), announced

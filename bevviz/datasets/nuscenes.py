@@ -157,7 +157,7 @@ class NuScenes(Dataset):
             points, announced = read_cloud(files[row], fields)
             return encode_points(int(times[row]), channel, _turned(points, turns), announced)
 
-        return Stream(f"/{channel}/points", "sensor_msgs/msg/PointCloud2", times, make)
+        return Stream(f"/{channel}/points", "sensor_msgs/msg/PointCloud2", times, make, files=files)
 
     def _images(
         self, channel: str, times: I64, files: Sequence[Path], calibration: Record

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Collection, Iterator
 
 import numpy as np
@@ -24,6 +25,8 @@ class DatasetReader:
             for number, stream in enumerate(self._streams)
         )
         self.compression = ""
+        # By stream: of which row there is nothing, and of which not all, and why.
+        self._lost, self._cut = defaultdict[int, dict[int, str]](dict), defaultdict[int, dict[int, str]](dict)
 
     @property
     def span(self) -> tuple[int, int]:
@@ -36,7 +39,15 @@ class DatasetReader:
 
     @property
     def warnings(self) -> list[str]:
-        return self._dataset.warnings
+        said = [*self._dataset.warnings]
+        for found, of_many in ((self._lost, "cannot be read"), (self._cut, "are cut")):
+            for number, rows in found.items():
+                stream, first = self._streams[number], rows[min(rows)]
+                several = (
+                    f"{stream.topic}: {len(rows)} of its {len(stream.times)} files {of_many}; the first: "
+                )
+                said.append(f"{several if len(rows) > 1 else ''}{first}")
+        return said
 
     def messages(
         self, ids: Collection[int], start: int, stop: int
@@ -50,16 +61,22 @@ class DatasetReader:
             rows.append(np.arange(first, last, dtype=np.int64))
         at, of, row = (np.concatenate(parts) for parts in (times, numbers, rows))
         for i in np.lexsort((row, of, at)).tolist():
-            stream = self._streams[int(of[i])]
+            stream, at_row = self._streams[int(of[i])], int(row[i])
             data: bytes | memoryview = b""
             try:
-                data = typestore().serialize_cdr(stream.make(int(row[i])), stream.type)
+                message = stream.make(at_row)
+                data = typestore().serialize_cdr(message, stream.type)
             except UserError as error:
-                self._dataset.warn(str(error))
+                self._lost[int(of[i])][at_row] = str(error)
             except NOT_AS_DOCUMENTED as error:
                 self._dataset.warn(
                     f"{stream.topic}: not as {self._dataset.about} is documented ({describe(error)})"
                 )
+            else:
+                if stream.files and (there := len(message.data) // message.point_step) < message.width:
+                    self._cut[int(of[i])][at_row] = (
+                        f"{stream.files[at_row]}: is cut: {there} of {message.width} points are there"
+                    )
             yield self.connections[int(of[i])], int(at[i]), data
 
     def times(self, ids: Collection[int]) -> I64:

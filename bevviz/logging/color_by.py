@@ -52,6 +52,7 @@ class ColoredPoints(rr.AsComponents):
         return batches
 
 
+@np.errstate(over="ignore", invalid="ignore")  # a field may hold anything
 def class_ids(
     wanted: Sequence[Quantity], points: F32, heights: NDArray[np.uint8], fields: Mapping[str, NDArray[Any]]
 ) -> dict[Quantity, ClassIds]:
@@ -77,8 +78,9 @@ def class_ids(
         elif name == "ring":
             found[name] = (values.astype(np.int64) % _RINGS + _RING).astype(np.uint16)
         else:
-            since = values - values.min()
-            found[name] = _scaled(since, 0.0, float(since.max()), _TIME, _SHARES)
+            some = values[np.isfinite(values)]
+            first, last = (some.min(), some.max()) if len(some) else (0, 0)
+            found[name] = _scaled(values - first, 0.0, float(last - first), _TIME, _SHARES)
     return found
 
 

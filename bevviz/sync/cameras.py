@@ -20,6 +20,7 @@ from bevviz.sync.tf import TransformError
 from bevviz.sync.track import Track, too_far
 
 TUTORIAL_K = np.array([[267.0, 0.0, 320.0], [0.0, 267.0, 180.0], [0.0, 0.0, 1.0]])
+MOST_OFF = 0.2  # of the image: how far from its middle a principal point may be before it is told
 
 
 @dataclass(frozen=True, slots=True)
@@ -207,6 +208,14 @@ class Cameras:
         if (width, height) == (intrinsics.width, intrinsics.height):
             return intrinsics
         if not intrinsics.width or not intrinsics.height:  # many drivers leave them empty
+            middle = intrinsics.K[:2, 2] / (width, height)
+            if np.abs(middle - 0.5).max() > MOST_OFF:
+                cx, cy = intrinsics.K[:2, 2]
+                self._report.oddities.setdefault(
+                    role.info_topic,
+                    f"{role.info_topic}: the principal point ({cx:.0f}, {cy:.0f}) is far from the middle of "
+                    f"images of {width} x {height} pixels, and no size is stated: is it for other images?",
+                )
             return replace(intrinsics, width=width, height=height)
         sx, sy = width / intrinsics.width, height / intrinsics.height
         if abs(sx / sy - 1) > 0.01:
