@@ -176,6 +176,9 @@ class LabelledBoxes3D:
     received: int = 0
     ids: tuple[str, ...] = ()  # of each, the same from frame to frame; (): none are stated
     image: ImageLabels | None = None  # of a labelled data set
+    # Until they are placed:
+    turns: F64 | None = None  # (K, 4) quaternions xyzw, where some lean: ``yaw`` does not say enough then
+    frames: tuple[str, ...] = ()  # of each; (): all are in frame_id
 
 
 @dataclass(frozen=True, slots=True)

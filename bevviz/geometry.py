@@ -245,6 +245,25 @@ def moved(boxes: Boxes3D, b_from_a: F64) -> Boxes3D:
     return Boxes3D(center.astype(np.float32), boxes.size, turned)
 
 
+def upright(center: F64, size: F32, turns: F64) -> Boxes3D:
+    """Boxes that are turned in any way as upright ones, which have the same axes up to a lean.
+
+    The axis nearest to the vertical is the height. The heading is that of x, of y where x is the height.
+
+    Args:
+        center: (K, 3).
+        size: (K, 3) along the box's own axes.
+        turns: (K, 3, 3) rotation of each.
+    """
+    rows = np.arange(len(turns))
+    height = np.abs(turns[:, 2]).argmax(axis=1)
+    along = np.where(height == 0, 1, 0)
+    lengths = size[rows[:, None], np.stack([along, 3 - height - along, height], axis=1)]
+    ahead = turns[rows, :, along]
+    heading = np.arctan2(ahead[:, 1], ahead[:, 0])
+    return Boxes3D(center.astype(np.float32), lengths, heading.astype(np.float32))
+
+
 def inside(points: F32, boxes: Boxes3D, k: int) -> Bool:
     """(N,) which points are in box k, its surface included."""
     offset = points - boxes.center[k]

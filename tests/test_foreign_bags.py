@@ -1,7 +1,8 @@
-"""Bags as others write them: definitions in IDL, no index."""
+"""Bags as others write them: definitions in IDL, no index, boxes in any frame."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,12 @@ from mcap.writer import IndexType, Writer
 from rosbags.typesys import Stores, get_typestore
 
 import bevviz
+from bevviz import geometry
+from bevviz.bags.source import BagSource
+from bevviz.config import load
+from bevviz.frame import F64
 from bevviz.ros.encode import encode_points
+from bevviz.stages.robot import in_points_frame
 from tests import bags
 
 LINE = "=" * 80 + "\n"
@@ -123,3 +129,118 @@ def test_without_an_index_it_is_read_from_end_to_end(
         told = [warning for warning in drive.warnings if warning not in same.warnings]
         assert f": {said}" in told[0] and told[0].endswith(": it is read from end to end")
         assert not [warning for warning in told if "rescued" in warning or "lost" in warning]
+
+
+BOX_SIZE = (4.5, 1.8, 1.5)
+BOX = geometry.transform((12.0, 3.0, -1.0), (0, 0, np.sin(0.25), np.cos(0.25)))  # in the LiDAR's frame
+CAMERA = geometry.transform((0.1, 0, -0.2), (-0.5, 0.5, -0.5, 0.5))  # LiDAR from the optical frame
+FRAMES = {bags.LIDAR_FRAME: BOX, bags.CAMERA_FRAME: geometry.inverse(CAMERA) @ BOX}
+
+
+def pose_of(m: bags.Messages, matrix: F64) -> Any:
+    place = dict(zip("xyz", matrix[:3, 3].tolist(), strict=True))
+    turn = dict(zip("xyzw", geometry.quaternion(matrix).tolist(), strict=True))
+    return m.make(
+        "geometry_msgs/msg/Pose",
+        position=m.make("geometry_msgs/msg/Point", **place),
+        orientation=m.make("geometry_msgs/msg/Quaternion", **turn),
+    )
+
+
+def stated_in(m: bags.Messages, array: str, frames: Sequence[str]) -> Any:
+    """The box in each of the frames; ``array``: that of the array's own header."""
+    size = m.make("geometry_msgs/msg/Vector3", **dict(zip("xyz", BOX_SIZE, strict=True)))
+    found = []
+    for frame in frames:
+        bbox = m.make("vision_msgs/msg/BoundingBox3D", center=pose_of(m, FRAMES[frame]), size=size)
+        header = m.header(bags.START, frame)
+        found.append(m.make("vision_msgs/msg/Detection3D", header=header, results=[], bbox=bbox, id=frame))
+    header = m.header(bags.START, array)
+    return m.make("vision_msgs/msg/Detection3DArray", header=header, detections=found)
+
+
+def markers_in(m: bags.Messages, frames: Sequence[str]) -> Any:
+    """The same as cubes."""
+    found = [
+        m.make(
+            "visualization_msgs/msg/Marker",
+            header=m.header(bags.START, frame),
+            ns=frame,
+            id=0,
+            type=1,
+            action=0,
+            pose=pose_of(m, FRAMES[frame]),
+            scale=m.make("geometry_msgs/msg/Vector3", **dict(zip("xyz", BOX_SIZE, strict=True))),
+            color=m.make("std_msgs/msg/ColorRGBA", r=1.0, g=0.0, b=0.0, a=1.0),
+            lifetime=m.make("builtin_interfaces/msg/Duration", sec=0, nanosec=0),
+            frame_locked=False,
+            points=[],
+            colors=[],
+            texture_resource="",
+            texture=m.compressed(0, b""),
+            uv_coordinates=[],
+            text="",
+            mesh_resource="",
+            mesh_file=m.make("visualization_msgs/msg/MeshFile", filename="", data=np.zeros(0, np.uint8)),
+            mesh_use_embedded_materials=False,
+        )
+        for frame in frames
+    ]
+    return m.make("visualization_msgs/msg/MarkerArray", markers=found)
+
+
+@pytest.mark.parametrize("world", [True, False])
+@pytest.mark.parametrize(
+    ("kind", "array", "frames"),
+    [
+        ("detections", bags.CAMERA_FRAME, [bags.CAMERA_FRAME]),
+        ("detections", "", [bags.CAMERA_FRAME]),
+        ("detections", "", list(FRAMES)),
+        ("markers", "", list(FRAMES)),
+    ],
+)
+def test_boxes_are_upright_where_the_points_are(
+    tmp_path: Path, kind: str, array: str, frames: list[str], world: bool
+) -> None:
+    """In an optical frame z is ahead: taken for the vertical, boxes lay on their side, unsaid."""
+    m = bags.Messages()
+    xyzi = np.random.default_rng(0).normal(0, 5, (200, 4)).astype(np.float32)
+    edges = [(bags.LIDAR_FRAME, bags.CAMERA_FRAME, CAMERA)]
+    edges += [("map", bags.LIDAR_FRAME, geometry.transform((5, 6, 0), (0, 0, 0.6, 0.8)))] if world else []
+    message = stated_in(m, array, frames) if kind == "detections" else markers_in(m, frames)
+    type_of = {
+        "detections": "vision_msgs/msg/Detection3DArray",
+        "markers": "visualization_msgs/msg/MarkerArray",
+    }
+    items = [
+        bags.Item("/tf_static", "tf2_msgs/msg/TFMessage", bags.START, m.transforms(bags.START, *edges)),
+        bags.Item(bags.CLOUD, "sensor_msgs/msg/PointCloud2", bags.START, m.cloud(bags.START, xyzi)),
+        bags.Item("/objects", type_of[kind], bags.START + 1000, message),
+    ]
+    path = bags.write(tmp_path / "bag", items, m)
+    settings = ["source.boxes={topic: /objects}"] if kind == "markers" else []
+    with BagSource([path], load(settings=settings)) as source:
+        (frame,) = source
+        assert not [warning for warning in source.warnings if "/objects" in warning]
+    (found,) = frame.robot_boxes
+    boxes = in_points_frame(frame, found)
+    np.testing.assert_allclose(boxes.center, [BOX[:3, 3]] * len(frames), atol=1e-5)
+    np.testing.assert_allclose(boxes.size, [BOX_SIZE] * len(frames), rtol=1e-6)
+    np.testing.assert_allclose(boxes.yaw, [0.5] * len(frames), atol=1e-6)
+
+
+def test_of_boxes_in_several_frames_those_without_a_place_are_left_out_and_said(tmp_path: Path) -> None:
+    m = bags.Messages()
+    items = [
+        bags.Item(
+            bags.CLOUD, "sensor_msgs/msg/PointCloud2", bags.START, m.cloud(bags.START, np.ones((9, 4)))
+        ),
+        bags.Item(
+            "/objects", "vision_msgs/msg/Detection3DArray", bags.START + 1000, stated_in(m, "", list(FRAMES))
+        ),
+    ]
+    with BagSource([bags.write(tmp_path / "bag", items, m)], load()) as source:
+        (frame,) = source
+        (said,) = [warning for warning in source.warnings if "/objects" in warning]
+    assert frame.robot_boxes[0].ids == (bags.LIDAR_FRAME,)
+    assert "frame 'camera_optical' is unknown: the boxes of /objects are left out" in said

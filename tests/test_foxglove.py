@@ -21,6 +21,7 @@ from bevviz.cli import main  # noqa: E402
 from bevviz.config import load  # noqa: E402
 from bevviz.frame import F32, F64  # noqa: E402
 from bevviz.report.window import choose_topics, cut, find_window, open_window  # noqa: E402
+from bevviz.stages.robot import in_points_frame  # noqa: E402
 from tests import bags, videos  # noqa: E402
 
 SCANS = 6
@@ -231,6 +232,47 @@ def test_info_names_kinds_and_roles(tmp_path: Path, capsys: pytest.CaptureFixtur
 def test_boxes_may_be_the_truth(tmp_path: Path) -> None:
     path = write(tmp_path / "drive.mcap")
     assert main(["evaluate", str(path), "--truth", "/markers/annotations", "--quiet"]) == 0
+
+
+def test_boxes_of_a_scene_are_in_the_frames_of_their_entities(tmp_path: Path) -> None:
+    context, path = foxglove.Context(), tmp_path / "drive.mcap"
+    box = geometry.transform((12.0, 3.0, -1.0), (0, 0, np.sin(0.25), np.cos(0.25)))  # in the LiDAR's frame
+    ahead = geometry.transform((7.0, 0, 0), (0, 0, 0.6, 0.8))  # where it is in the map
+    stated = {"map": ahead @ box, "lidar_top": box, "cam_front": geometry.inverse(CAMERA) @ box}
+    with foxglove.open_mcap(path, context=context):
+        cloud = channels.PointCloudChannel("/LIDAR_TOP", context=context)
+        tf = channels.FrameTransformsChannel("/tf", context=context)
+        scene = channels.SceneUpdateChannel("/scene", context=context)
+        for scan in range(2):
+            at = bags.START + scan * bags.PERIOD
+            edges = [edge(scan, "map", "lidar_top", ahead), edge(scan, "lidar_top", "cam_front", CAMERA)]
+            tf.log(messages.FrameTransforms(transforms=edges), log_time=at)
+            fields = [
+                messages.PackedElementField(name=name, offset=4 * i, type=FLOAT32)
+                for i, name in enumerate("xyz")
+            ]
+            about = dict[str, Any](timestamp=time(scan), frame_id="lidar_top", point_stride=16, fields=fields)
+            cloud.log(messages.PointCloud(data=points(scan).tobytes(), **about), log_time=at)
+            size = messages.Vector3(x=4.5, y=1.8, z=1.5)
+            entities = [
+                messages.SceneEntity(
+                    timestamp=time(scan),
+                    frame_id=name,
+                    id=name,
+                    cubes=[messages.CubePrimitive(pose=pose(matrix), size=size)],
+                )
+                for name, matrix in stated.items()
+            ]
+            scene.log(messages.SceneUpdate(entities=entities if scan else []), log_time=at)
+    with BagSource([path], load()) as source:
+        first, last = source
+        assert not source.warnings  # a scene of nothing has neither stamp nor frame
+    assert [len(boxes.boxes) for boxes in first.robot_boxes] == [0]
+    boxes = in_points_frame(last, last.robot_boxes[0])
+    assert last.robot_boxes[0].ids == tuple(stated)
+    np.testing.assert_allclose(boxes.center, [box[:3, 3]] * 3, atol=1e-5)
+    np.testing.assert_allclose(boxes.size, [[4.5, 1.8, 1.5]] * 3, rtol=1e-6)
+    np.testing.assert_allclose(boxes.yaw, [0.5] * 3, atol=1e-6)
 
 
 def test_a_part_cut_out_runs_again(tmp_path: Path) -> None:

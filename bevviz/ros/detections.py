@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 from bevviz.errors import first_line
-from bevviz.frame import F32, F64, Boxes3D, ImageLabels, LabelledBoxes2D, LabelledBoxes3D
+from bevviz.frame import F32, F64, ImageLabels, LabelledBoxes2D, LabelledBoxes3D
 from bevviz.ros.messages import MessageError, either, frame_name, guarded, stamp_ns
-from bevviz.ros.objects import decode_objects
+from bevviz.ros.objects import decode_objects, turned_boxes
 
 
 @guarded
@@ -29,14 +29,14 @@ def decode_detections_2d(msg: Any, topic: str, received: int) -> LabelledBoxes2D
         position = getattr(center, "position", center)  # flat up to ROS 2 Galactic
         return position.x, position.y, center.theta, box.size_x, box.size_y
 
-    values, labels, scores, _ = _rows(msg, row, 5, topic)
+    values, labels, scores, _, frames = _rows(msg, row, 5, topic)
     x, y, theta, w, h = values.T
     cos, sin = np.abs(np.cos(theta)), np.abs(np.sin(theta))
     dx, dy = (w * cos + h * sin) / 2, (w * sin + h * cos) / 2
     return LabelledBoxes2D(
         topic=topic,
         stamp=stamp_ns(msg.header.stamp),
-        frame_id=frame_name(msg.header.frame_id),
+        frame_id=frame_name(msg.header.frame_id) or next(iter(frames), ""),
         xyxy=np.stack([x - dx, y - dy, x + dx, y + dy], axis=1).astype(np.float32),
         labels=labels,
         scores=scores,
@@ -63,8 +63,8 @@ def decode_boxes(msg: Any, topic: str, received: int, stated: Mapping[str, str])
 def decode_detections_3d(msg: Any, topic: str, received: int) -> LabelledBoxes3D:
     """The boxes of a vision_msgs/Detection3DArray, of ROS 1 or any version of ROS 2, or of bevviz_msgs.
 
-    Only the turn about z is kept of an orientation; one left at zero is none. Boxes that are not finite
-    are left out.
+    An orientation left at zero is none. Boxes that are not finite are left out. Where the array's header
+    states no frame, those of the detections count.
 
     Raises:
         MessageError: not laid out as any known version of the message.
@@ -75,20 +75,21 @@ def decode_detections_3d(msg: Any, topic: str, received: int) -> LabelledBoxes3D
         p, q = center.position, center.orientation
         return p.x, p.y, p.z, size.x, size.y, size.z, q.x, q.y, q.z, q.w
 
-    values, labels, scores, ids = _rows(msg, row, 10, topic)
-    x, y, z, w = values[:, 6:].T
-    yaw = np.arctan2(2 * (w * z + x * y), w * w + x * x - y * y - z * z)  # holds at any length, zero too
-    center, size = values[:, :3], values[:, 3:6].astype(np.float32)
+    values, labels, scores, ids, frames = _rows(msg, row, 10, topic)
+    stated = frame_name(msg.header.frame_id)
+    boxes, turns = turned_boxes(values)
     return LabelledBoxes3D(
         topic=topic,
-        stamp=stamp_ns(msg.header.stamp),
-        frame_id=frame_name(msg.header.frame_id),
-        boxes=Boxes3D(center, size, yaw.astype(np.float32)),
+        stamp=stamp_ns(msg.header.stamp) or (0 if len(boxes) else received),
+        frame_id=stated or next(iter(frames), ""),
+        boxes=boxes,
         labels=labels,
         scores=scores,
         received=received,
         ids=ids if all(ids) else (),
         image=_image_labels(msg, len(labels)),
+        turns=turns,
+        frames=frames if not stated and len(set(frames)) > 1 else (),
     )
 
 
@@ -106,16 +107,20 @@ def _image_labels(msg: Any, boxes: int) -> ImageLabels | None:
 
 def _rows(
     msg: Any, row: Callable[[Any], tuple[float, ...]], width: int, topic: str
-) -> tuple[F64, tuple[str, ...], F32, tuple[str, ...]]:
-    """(K, width) numbers, labels, scores and ids of the detections whose numbers are all finite."""
+) -> tuple[F64, tuple[str, ...], F32, tuple[str, ...], tuple[str, ...]]:
+    """(K, width) numbers, labels, scores, ids and frames of the detections whose numbers are all finite."""
     try:
-        rows = [(row(d), *_hypothesis(d.results), _identity(d)) for d in msg.detections]
+        rows = [(row(d), *_hypothesis(d.results), _identity(d), _frame(d)) for d in msg.detections]
     except AttributeError as error:
         raise MessageError(f"{topic}: unknown version of vision_msgs: {error}") from None
     rows = [r for r in rows if all(map(math.isfinite, r[0]))]
     values = np.array([r[0] for r in rows], np.float64).reshape(-1, width)
     scores = np.nan_to_num(np.array([r[2] for r in rows], np.float32))
-    return values, tuple(r[1] for r in rows), scores, tuple(r[3] for r in rows)
+    return values, tuple(r[1] for r in rows), scores, tuple(r[3] for r in rows), tuple(r[4] for r in rows)
+
+
+def _frame(detection: Any) -> str:
+    return frame_name(getattr(getattr(detection, "header", None), "frame_id", ""))
 
 
 def _identity(detection: Any) -> str:

@@ -173,18 +173,18 @@ def encode_boxes_3d(
         boxes.center, boxes.size, boxes.yaw, results, names, strict=True
     ):
         half = float(yaw) / 2
-        place = _pose(turn @ geometry.transform(center, np.array([0, 0, np.sin(half), np.cos(half)])))
-        box = make("vision_msgs/msg/BoundingBox3D", center=place, size=_vector("Vector3", size))
-        detections.append(
-            make(
-                "vision_msgs/msg/Detection3D",
-                header=about,
-                results=_results(hypotheses, place),
-                bbox=box,
-                id=name,
-            )
-        )
+        place = turn @ geometry.transform(center, np.array([0, 0, np.sin(half), np.cos(half)]))
+        detections.append(encode_box_3d(about, place, size, hypotheses, name))
     return make("vision_msgs/msg/Detection3DArray", header=about, detections=detections)
+
+
+def encode_box_3d(header: Any, pose: F64, size: Iterable[float], results: Hypotheses, name: str = "") -> Any:
+    """A vision_msgs/Detection3D; ``pose``: (4, 4) the header's frame from the box."""
+    place = _pose(pose)
+    box = make("vision_msgs/msg/BoundingBox3D", center=place, size=_vector("Vector3", size))
+    return make(
+        "vision_msgs/msg/Detection3D", header=header, results=_results(results, place), bbox=box, id=name
+    )
 
 
 def encode_labels(

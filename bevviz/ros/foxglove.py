@@ -17,8 +17,8 @@ from typing import Any
 import numpy as np
 
 from bevviz import geometry
-from bevviz.frame import F64, U8, Boxes3D
-from bevviz.ros.encode import encode_boxes_3d, encode_camera, encode_pose_edges, make
+from bevviz.frame import F64, U8
+from bevviz.ros.encode import encode_box_3d, encode_camera, encode_pose_edges, make
 
 ENCODINGS = ("protobuf", "json")
 TYPE = re.compile(r"^foxglove(?:_msgs)?[./](?:msg/)?(\w+)$")
@@ -251,21 +251,16 @@ def _transforms(message: Any) -> Any:
 
 
 def _scene(message: Any) -> Any:
-    """Boxes: cubes, and cylinders by what encloses them."""
-    rows, labels, ids = [], list[str](), list[str]()
-    entities = list(message.entities or ())
-    for entity in entities:
+    """Boxes: cubes, and cylinders by what encloses them; each in the frame of its entity."""
+    found = []
+    for entity in message.entities or ():
         for solid in (*(entity.cubes or ()), *(entity.cylinders or ())):
             pose = _matrix(solid.pose) if _given(solid, "pose") else np.eye(4)
-            yaw = float(np.arctan2(pose[1, 0], pose[0, 0]))
-            rows.append((*pose[:3, 3], *_numbers(solid.size, "xyz"), yaw))
-            labels.append(_label(entity))
-            ids.append(str(entity.id or ""))
-    stamp, frame_id = (_stamp(entities[0]), _frame(entities[0])) if entities else (0, "")
-    values = np.array(rows, np.float64).reshape(-1, 7)
-    size, turn = values[:, 3:6].astype(np.float32), values[:, 6].astype(np.float32)
-    boxes = Boxes3D(values[:, :3], size, turn)
-    return encode_boxes_3d(stamp, frame_id, boxes, [[(label, 1.0)] for label in labels], ids=ids)
+            size, results = _numbers(solid.size, "xyz"), [(_label(entity), 1.0)]
+            found.append(encode_box_3d(_header(entity), pose, size, results, str(entity.id or "")))
+    time = next((one.header.stamp for one in found), _header(message).stamp)
+    header = make("std_msgs/msg/Header", stamp=time, frame_id="")
+    return make("vision_msgs/msg/Detection3DArray", header=header, detections=found)
 
 
 def _label(entity: Any) -> str:

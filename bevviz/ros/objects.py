@@ -8,17 +8,18 @@ from __future__ import annotations
 import difflib
 import math
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
 
 from bevviz.errors import UserError
-from bevviz.frame import Boxes3D, LabelledBoxes3D
+from bevviz.frame import F64, Boxes3D, LabelledBoxes3D
 
 CUBE, CYLINDER, TEXT, ADD = 1, 3, 9, 0  # of visualization_msgs/Marker
 POLYGON = 2  # of Autoware's Shape
+LEAN = math.radians(1)  # a box that leans by less is upright
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,33 +92,34 @@ def decode_objects(msg: Any, topic: str, received: int, stated: Mapping[str, str
     where = Fields(**paths) if paths else known
     items = list(_follow(msg, where.objects)[1] if where.objects else _only_list(msg))
     rows, labels, scores, ids = [], list[str](), list[float](), list[str]()
+    header = getattr(msg, "header", None)
+    headers = list[Any]()
     for item in items:
         row = _row(item, where)
         if not all(map(math.isfinite, row)):
             continue
         rows.append(row)
+        headers.append(header or getattr(item, "header", None))
         labels.append(_label(item, where.label) if where.label else "")
         scores.append(float(_follow(item, where.score)[1]) if _has(item, where.score) else 1.0)
         ids.append(_identity(_follow(item, where.id)[1]) if _has(item, where.id) else "")
-    header = getattr(msg, "header", None) or next(
-        (item.header for item in items if hasattr(item, "header")), None
-    )
-    if header is None and items:
+    if None in headers:
         raise ValueError("neither the message nor its objects have a header, which says the frame")
-    return _boxes(header, topic, received, rows, labels, scores, ids)
+    return _boxes(headers or [header], topic, received, rows, labels, scores, ids)
 
 
 def _row(item: Any, where: Fields) -> tuple[float, ...]:
-    """Centre, size and yaw."""
+    """Centre, size and quaternion."""
     holder, center = _follow(item, where.center)
     x, y, z = _vector(center)
-    yaw = 0.0
+    turn = 0.0, 0.0, 0.0, 1.0
     if where.yaw:
-        yaw = float(_follow(item, where.yaw)[1])
+        half = float(_follow(item, where.yaw)[1]) / 2
+        turn = 0.0, 0.0, math.sin(half), math.cos(half)
     elif where.orientation:
-        yaw = _yaw(_follow(item, where.orientation)[1])
+        turn = _quaternion(_follow(item, where.orientation)[1])
     elif hasattr(holder, "orientation"):
-        yaw = _yaw(holder.orientation)
+        turn = _quaternion(holder.orientation)
     length, width, height = _vector(_follow(item, where.size)[1])
     shape = getattr(item, "shape", None)
     if shape is not None and getattr(shape, "type", None) == POLYGON and hasattr(shape, "footprint"):
@@ -125,29 +127,30 @@ def _row(item: Any, where: Fields) -> tuple[float, ...]:
         if len(outline):  # in the object's own axes
             low, high = outline.min(axis=0), outline.max(axis=0)
             (length, width), (dx, dy) = (high - low).tolist(), ((low + high) / 2).tolist()
+            yaw = float(_yaw(np.array(turn)))
             c, s = math.cos(yaw), math.sin(yaw)
             x, y = x + c * dx - s * dy, y + s * dx + c * dy
-    return x, y, z, length, width, height, yaw
+    return x, y, z, length, width, height, *turn
 
 
 def _markers(markers: Iterable[Any], topic: str, received: int) -> LabelledBoxes3D:
-    rows, labels, ids, header = list[tuple[float, ...]](), list[str](), list[str](), None
+    rows, labels, ids, headers = list[tuple[float, ...]](), list[str](), list[str](), list[Any]()
     shown = [marker for marker in markers if marker.action == ADD]
     texts = {marker.id: str(marker.text) for marker in shown if marker.type == TEXT}
     for marker in shown:
         if marker.type not in (CUBE, CYLINDER):
             continue
-        header = header or marker.header
-        row = *_vector(marker.pose.position), *_vector(marker.scale), _yaw(marker.pose.orientation)
+        row = *_vector(marker.pose.position), *_vector(marker.scale), *_quaternion(marker.pose.orientation)
         if all(map(math.isfinite, row)):
             rows.append(row)
+            headers.append(marker.header)
             labels.append(texts.get(marker.id) or str(marker.ns))
             ids.append(f"{marker.ns}/{marker.id}")
-    return _boxes(header, topic, received, rows, labels, [1.0] * len(rows), ids)
+    return _boxes(headers, topic, received, rows, labels, [1.0] * len(rows), ids)
 
 
 def _boxes(
-    header: Any,
+    headers: Sequence[Any],
     topic: str,
     received: int,
     rows: list[tuple[float, ...]],
@@ -155,19 +158,36 @@ def _boxes(
     scores: list[float],
     ids: list[str],
 ) -> LabelledBoxes3D:
-    table = np.array(rows, np.float64).reshape(-1, 7)
-    size, yaw = table[:, 3:6].astype(np.float32), table[:, 6].astype(np.float32)
+    """``headers``: of each row; the first one's stamp counts."""
+    boxes, turns = turned_boxes(np.array(rows, np.float64).reshape(-1, 10))
+    header = next(iter(headers), None)
     stamp = received if header is None else int(header.stamp.sec) * 10**9 + int(header.stamp.nanosec)
+    frames = tuple("" if one is None else str(one.frame_id).removeprefix("/") for one in headers)
     return LabelledBoxes3D(
         topic=topic,
         stamp=stamp,
-        frame_id="" if header is None else str(header.frame_id).removeprefix("/"),
-        boxes=Boxes3D(table[:, :3], size, yaw),
+        frame_id=next(iter(frames), ""),
+        boxes=boxes,
         labels=tuple(labels),
         scores=np.nan_to_num(np.array(scores, np.float32)),
         received=received,
         ids=tuple(ids) if all(ids) else (),
+        turns=turns,
+        frames=frames if len(set(frames)) > 1 else (),
     )
+
+
+def turned_boxes(values: F64) -> tuple[Boxes3D, F64 | None]:
+    """Boxes of (K, 10) centre, size and quaternion, and the quaternions where some of them lean.
+
+    A quaternion left at zero is no turn.
+    """
+    turns = values[:, 6:].copy()
+    turns[~turns.any(axis=1)] = 0, 0, 0, 1
+    x, y, z, w = turns.T
+    leans = x * x + y * y > math.sin(LEAN / 2) ** 2 * (x * x + y * y + z * z + w * w)
+    boxes = Boxes3D(values[:, :3], values[:, 3:6].astype(np.float32), _yaw(turns).astype(np.float32))
+    return boxes, turns if leans.any() else None
 
 
 # --- fields ------------------------------------------------------------------------------------
@@ -223,9 +243,15 @@ def _vector(value: Any) -> tuple[float, float, float]:
     return float(x), float(y), float(z)
 
 
-def _yaw(q: Any) -> float:
-    """Turn about z; one left at zero is none."""
-    return math.atan2(2 * (q.w * q.z + q.x * q.y), q.w * q.w + q.x * q.x - q.y * q.y - q.z * q.z)
+def _quaternion(q: Any) -> tuple[float, float, float, float]:
+    return float(q.x), float(q.y), float(q.z), float(q.w)
+
+
+def _yaw(turns: F64) -> F64:
+    """(...) turns about z of (..., 4) quaternions xyzw of any length; one of zero is none."""
+    x, y, z, w = np.moveaxis(turns, -1, 0)
+    yaw: F64 = np.arctan2(2 * (w * z + x * y), w * w + x * x - y * y - z * z)
+    return yaw
 
 
 def _label(item: Any, path: str) -> str:

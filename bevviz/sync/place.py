@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -18,6 +20,7 @@ from bevviz.sync.upright import Upright
 
 FIXED_FRAMES = {"map", "odom", "world", "earth", "global", "utm", "enu", "ned", "mocap", "vicon", "init"}
 GLOBE_FRAMES = {"earth", "ecef", "utm"}  # coordinates too large for the float32 of a viewer
+LEVEL = math.cos(math.radians(20))  # a frame that leans by less, as on a road, has upright boxes
 
 
 @dataclass(frozen=True, slots=True)
@@ -158,18 +161,55 @@ class Placing:
         return world @ geometry.inverse(from_points)
 
     def placed(self, boxes: LabelledBoxes3D, place: Place, problems: list[str]) -> LabelledBoxes3D:
-        known = place.world_from_points is not None
-        try:
-            found = self._tf.lookup(
-                place.world_frame if known else place.points_frame,
-                boxes.frame_id,
-                boxes.stamp if known else place.stamp,
-                self._config.sync.tf_tolerance,
-            )
-        except TransformError as error:
-            self._report.complain(problems, f"{error}: the boxes of {boxes.topic} have no place in the world")
+        """The boxes with their place in the world.
+
+        Where they lean in the frame of the points, or are in several frames, they become upright ones in it.
+        """
+        if not len(boxes.boxes):
+            return boxes  # without any there may be no frame, either
+        world = place.world_from_points
+        stamp = place.stamp if world is None else boxes.stamp
+        target = place.points_frame if world is None else place.world_frame
+        poses = dict[str, F64]()  # of what each frame is in, in the world
+        for frame in dict.fromkeys(boxes.frames or (boxes.frame_id,)):
+            try:
+                found = self._tf.lookup(target, frame, stamp, self._config.sync.tf_tolerance)
+                poses[frame] = (place.points_from(found) if world is None else found).matrix
+            except TransformError as error:
+                lost = "are left out" if boxes.frames else "have no place in the world"
+                self._report.complain(problems, f"{error}: the boxes of {boxes.topic} {lost}")
+        if not boxes.frames and not poses:
             return boxes
-        return replace(boxes, world_from_boxes=(found if known else place.points_from(found)).matrix)
+        points_from_world = np.eye(4) if world is None else geometry.inverse(world)
+        if not boxes.frames and boxes.turns is None:
+            pose = poses[boxes.frame_id]
+            if (points_from_world @ pose)[2, 2] > LEVEL:
+                return replace(boxes, world_from_boxes=pose)
+        return _upright(boxes, {name: points_from_world @ pose for name, pose in poses.items()}, place)
+
+
+def _upright(boxes: LabelledBoxes3D, poses: Mapping[str, F64], place: Place) -> LabelledBoxes3D:
+    """The boxes in the frame of the points; those in frames that ``poses`` lacks are left out."""
+    frames = boxes.frames or (boxes.frame_id,) * len(boxes.boxes)
+    rows = [row for row, frame in enumerate(frames) if frame in poses]
+    kept = boxes.boxes.chosen(rows)
+    turned = np.empty((len(rows), 4, 4))
+    for k, row in enumerate(rows):
+        half = float(kept.yaw[k]) / 2
+        turn = [0, 0, math.sin(half), math.cos(half)] if boxes.turns is None else boxes.turns[row]
+        turned[k] = poses[frames[row]] @ geometry.transform(kept.center[k], turn)
+    world = place.world_from_points
+    return replace(
+        boxes,
+        frame_id=place.points_frame,
+        boxes=geometry.upright(turned[:, :3, 3], kept.size, turned[:, :3, :3]),
+        labels=tuple(boxes.labels[row] for row in rows),
+        scores=boxes.scores[rows],
+        ids=tuple(boxes.ids[row] for row in rows) if boxes.ids else (),
+        world_from_boxes=np.eye(4) if world is None else world,
+        turns=None,
+        frames=(),
+    )
 
 
 def _words(frame: str) -> set[str]:
