@@ -23,7 +23,7 @@ from bevviz.bags.source import BagSource
 from bevviz.cli import main
 from bevviz.config import Config, changes, dump, keys, load
 from bevviz.errors import StageError, UserError
-from bevviz.frame import Boxes3D, Frame
+from bevviz.frame import Boxes3D, Camera, Frame, LabelledBoxes2D
 from bevviz.geometry import inverse
 from bevviz.results import ClusterState, DetectionState, FrameResult
 from bevviz.ros.encode import (
@@ -36,6 +36,7 @@ from bevviz.ros.encode import (
 )
 from bevviz.session import Session
 from bevviz.stages import foreign
+from bevviz.stages.robot import detect
 from bevviz.synthetic import SyntheticSource
 from tests import bags
 from tests.waiting import PATIENCE
@@ -460,6 +461,19 @@ def test_the_robots_own_stages(robot: Path) -> None:
         assert mine.objects is not None and theirs.objects is not None
         both = Counter(theirs.objects.names) & Counter(mine.objects.names)
         assert both.total() >= 0.85 * max(len(theirs.objects), len(mine.objects))
+
+
+def test_image_boxes_of_nobody_knows_which_camera_are_not_those_of_all() -> None:
+    boxes = np.array([[1, 2, 3, 4]], np.float32)
+    found = LabelledBoxes2D("/boxes", 0, "yolo", boxes, ("car",), np.ones(1, np.float32))
+    front, rear = (Camera(name, None, None, None, None) for name in ("front", "rear"))
+    alone = Frame(
+        0, 0, 0, "l", np.zeros((0, 3), np.float32), "l", cameras=(front,), robot_detections=(found,)
+    )
+    assert detect(alone, front, "/boxes").names == ("car",)
+    for camera in (front, rear):
+        with pytest.raises(StageError, match=r"/boxes does not say which camera .* the frame 'yolo'"):
+            detect(replace(alone, cameras=(front, rear)), camera, "/boxes")
 
 
 def test_the_robots_objects_and_what_it_did_not_publish(robot: Path) -> None:

@@ -233,7 +233,10 @@ def test_of_boxes_in_several_frames_those_without_a_place_are_left_out_and_said(
     m = bags.Messages()
     items = [
         bags.Item(
-            bags.CLOUD, "sensor_msgs/msg/PointCloud2", bags.START, m.cloud(bags.START, np.ones((9, 4)))
+            bags.CLOUD,
+            "sensor_msgs/msg/PointCloud2",
+            bags.START,
+            m.cloud(bags.START, np.ones((9, 4), np.float32)),
         ),
         bags.Item(
             "/objects", "vision_msgs/msg/Detection3DArray", bags.START + 1000, stated_in(m, "", list(FRAMES))

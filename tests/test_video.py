@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 import subprocess
 from collections.abc import Sequence
@@ -128,6 +129,36 @@ def test_lost_packets_cost_the_pictures_that_need_them_and_are_told_in_one_line(
         assert "lost" in told[0]
 
 
+@pytest.mark.parametrize("codec", ["h264", "h265"])
+def test_what_a_stream_says_of_itself_before_each_picture_makes_no_key_frames(
+    codec: str, tmp_path: Path
+) -> None:
+    """Some encoders repeat their parameter sets: each picture was decoded alone, and all but a few failed."""
+    packets = encode(numbered(30), codec)
+    kinds = (7, 8) if codec == "h264" else (32, 33, 34)
+    said = b"".join(
+        b"\0\0\0\1" + unit
+        for unit in filter(None, re.split(b"\0\0\0?\1", packets[0]))
+        if (unit[0] & 31 if codec == "h264" else unit[0] >> 1) in kinds
+    )
+    packets = [packet if row % 10 == 0 else said + packet for row, packet in enumerate(packets)]
+    assert [row for row, packet in enumerate(packets) if is_key(codec, packet)] == [0, 10, 20]
+    path = drive(tmp_path / "drive.mcap", packets, lost=(13, 14), codec=codec)
+    with BagSource([path], load()) as source:
+        assert numbers(list(source)) == [*range(13), 12, *[None] * 6, *range(20, 30)]
+        assert number_of(image(source.frame(27)).bgr) == 27  # type: ignore[union-attr]
+
+
+def test_where_packets_do_not_tell_that_one_is_lost_the_gap_is_said(tmp_path: Path) -> None:
+    packets = encode(numbered(30), "vp9")
+    for lost in ((), (20,), (13, 14)):
+        path = drive(tmp_path / f"{len(lost)}.mcap", packets, lost=lost, codec="vp9")
+        with BagSource([path], load()) as source:
+            assert len(list(source)) == 30
+            told = [warning for warning in source.warnings if "VP9" in warning]
+            assert [text.partition(" between")[0] for text in told] == [f"{videos.VIDEO}: 1 gap"] * bool(lost)
+
+
 def test_damaged_packets_and_other_codecs_are_one_line(tmp_path: Path) -> None:
     packets = encode(numbered(30))
     packets[12] = packets[12][:9] + b"\xff" * 40
@@ -183,6 +214,10 @@ def test_theora_is_decoded(tmp_path: Path) -> None:
     with BagSource([path], load()) as source:
         assert numbers(list(source))[:20] == list(range(20))
         assert numbers([source.frame(17) or pytest.fail()]) == [17]
+    kept = [item for row, item in enumerate(videos.items(made, packets, kind=kind)) if row != 10]
+    path = videos.write_mcap(tmp_path / "lost.mcap", found + kept, made)
+    with BagSource([path], load()) as source:
+        assert numbers(list(source))[:20] == [*range(10), 9, *[None] * 5, *range(16, 20)]
 
 
 def test_a_recording_has_every_packet_untouched_also_in_windows(tmp_path: Path) -> None:

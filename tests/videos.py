@@ -88,7 +88,8 @@ def message(made: bags.Messages, kind: str, stamp: int, data: bytes, codec: str 
         about = {"width": 64, "height": 48, "encoding": f"{codec};yuv420p", "pts": stamp // 1000}
         return made.make(kind, header=header, flags=0, is_bigendian=False, data=values, **about)
     if kind == "theora_image_transport/msg/Packet":
-        numbers = {"b_o_s": 0, "e_o_s": 0, "granulepos": 0, "packetno": 0}
+        number = (stamp - bags.START) // bags.PERIOD
+        numbers = {"b_o_s": 0, "e_o_s": 0, "granulepos": 0, "packetno": number}
         return made.make(kind, header=header, data=values, **numbers)
     return made.compressed(stamp, data, codec)
 

@@ -11,8 +11,10 @@ from dataclasses import dataclass
 
 _START = re.compile(b"\0\0\1")
 _HEAD = 96  # bytes of a unit that are looked at
-_H264_SPS, _H264_SLICES = 7, (1, 5)
-_H265_SPS = 33
+_H264_SPS, _H264_SEI, _H264_SLICES, _H264_IDR = 7, 6, (1, 5), 5
+_H264_INTRA = (2, 4, 7, 9)  # types of slices that need no other picture
+_H265_SPS, _H265_SEI, _H265_SLICES, _H265_IRAP = 33, 39, range(32), range(16, 24)
+_RECOVERY = 6  # of the messages in an SEI: from here on pictures become whole
 _HIGH = {100, 110, 122, 244, 44, 83, 86, 118, 128, 138, 139, 134, 135}  # profiles with more in their SPS
 
 
@@ -23,11 +25,15 @@ def units(data: bytes) -> Iterator[bytes]:
 
 
 def is_key(codec: str, data: bytes) -> bool:
-    """Whether decoding can begin with a packet: of H.264 and H.265, that it has a sequence parameter set."""
+    """Whether decoding can begin with a packet.
+
+    Of H.264 and H.265, that it has a sequence parameter set, and no picture that needs others: there are
+    encoders that put one before each picture.
+    """
     if codec == "h264":
-        return any(unit and unit[0] & 31 == _H264_SPS for unit in units(data))
+        return _begins_h264(data)
     if codec == "h265":
-        return any(unit and unit[0] >> 1 & 63 == _H265_SPS for unit in units(data))
+        return _begins_h265(data)
     if codec == "av1":
         return 1 in _obus(data)  # a sequence header
     if codec == "vp9":
@@ -37,6 +43,30 @@ def is_key(codec: str, data: bytes) -> bool:
     if codec == "vp8":
         return bool(data) and not data[0] & 1
     return bool(data) and data[0] & 0xC0 == 0  # Theora
+
+
+def _begins_h264(data: bytes) -> bool:
+    said = recovers = False
+    for unit in filter(None, units(data)):
+        kind = unit[0] & 31
+        said |= kind == _H264_SPS
+        recovers |= kind == _H264_SEI and unit[1:2] == bytes([_RECOVERY])
+        if kind in _H264_SLICES:
+            bits = _Bits(unit[1:])
+            bits.number()  # place of the slice
+            return said and (recovers or kind == _H264_IDR or bits.number() in _H264_INTRA)
+    return said
+
+
+def _begins_h265(data: bytes) -> bool:
+    said = recovers = False
+    for unit in filter(None, units(data)):
+        kind = unit[0] >> 1 & 63
+        said |= kind == _H265_SPS
+        recovers |= kind == _H265_SEI and unit[2:3] == bytes([_RECOVERY])
+        if kind in _H265_SLICES:
+            return said and (recovers or kind in _H265_IRAP)
+    return said
 
 
 def _obus(data: bytes) -> Iterator[int]:
@@ -73,12 +103,13 @@ class Continuity:
         for unit in units(data):
             kind = unit[0] & 31 if unit else 0
             if kind == _H264_SPS:
-                self._bits, self._last = _number_bits(unit), None
+                bits_before, self._bits = self._bits, _number_bits(unit)
+                self._last = self._last if bits_before == self._bits else None
             elif kind in _H264_SLICES and self._bits:
                 bits = _Bits(unit[1:])
                 bits.number(), bits.number(), bits.number()  # place, type and parameter set of the slice
                 number = bits.take(self._bits)
-                if kind == 5:
+                if kind == _H264_IDR:
                     self._last = number
                 elif self._last is not None:
                     step = (number - self._last) % (1 << self._bits)

@@ -46,6 +46,7 @@ class Packet:
     data: bytes
     is_key: bool  # decoding can begin here
     is_header: bool = False  # no picture: what Theora says before the first one
+    number: int | None = None  # of Theora, which counts its packets
 
     @property
     def place(self) -> tuple[int, int]:
@@ -79,7 +80,8 @@ def decode_packet(msg: Any, topic: str, received: int) -> Packet:
     if hasattr(msg, "granulepos"):
         first, key = data[:1] >= b"\x80", is_key("theora", data)
         frame_id = frame_name(header.frame_id)
-        return Packet(topic, received, stamp, frame_id, "theora", data, key, is_header=first)
+        number = int(msg.packetno)
+        return Packet(topic, received, stamp, frame_id, "theora", data, key, is_header=first, number=number)
     form = str(getattr(msg, "encoding", "") or getattr(msg, "format", ""))
     codec = next((name for name, words in _CODECS if words.search(form)), "")
     if not codec:

@@ -63,9 +63,14 @@ def detect(frame: Frame, camera: Camera, topic: str) -> Detections:
     """The robot's boxes in the camera's image, all of them kept.
 
     Raises:
-        StageError: there are none at this time.
+        StageError: there are none at this time, or nobody says which of several cameras they are of.
     """
     for found in frame.robot_detections:
+        if found.topic == topic and not found.camera and len(frame.cameras) > 1:
+            raise StageError(
+                f"{topic} does not say which camera its boxes are of: no image is in the frame "
+                f"'{found.frame_id}' of its header; name the one camera: source.camera_topics"
+            )
         if found.topic == topic and found.camera in ("", camera.name):
             return detections_of(found)
     raise _missing(topic, "detections")

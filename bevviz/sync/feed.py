@@ -89,7 +89,8 @@ def make_handlers(
     def add_packet(message: M) -> None:
         packet = decode_packet(decode(message), message.topic, message.received)
         video = sync.videos[packet.topic]
-        video.add(packet)
+        if video.add(packet):
+            sync.report.untold[packet.topic, packet.codec] += 1
         if not packet.is_header:
             load = VideoLoader(video, packet.place)
             sync.add_image(packet.topic, packet.stamp, packet.frame_id, packet.received, load)

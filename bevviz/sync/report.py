@@ -34,6 +34,7 @@ class SyncReport:
     images: int = 0  # of all cameras, decoded
     undecodable: Counter[str] = field(default_factory=Counter)  # camera -> images
     first_undecodable: dict[str, str] = field(default_factory=dict)  # camera -> why the first was
+    untold: Counter[tuple[str, str]] = field(default_factory=Counter)  # topic, codec -> gaps in its video
     damage: Damage = field(default_factory=Damage)  # ground truth that could not be decoded
     problems: Counter[str] = field(default_factory=Counter)  # missing transforms and CameraInfo -> frames
     tf: TransformBuffer = field(default_factory=TransformBuffer)  # for what looked wrong in the transforms
@@ -87,6 +88,12 @@ class SyncReport:
         for camera, n in self.undecodable.items():
             first = self.first_undecodable[camera]
             found.append(f"camera '{camera}': an image could not be decoded {_times(n)}, the first: {first}")
+        for (topic, codec), n in self.untold.items():
+            gaps = "1 gap" if n == 1 else f"{n} gaps"
+            found.append(
+                f"{topic}: {gaps} between the stamps of its {codec.upper()} video, whose packets do not tell "
+                "whether one is lost: pictures from a lost one to the next key frame are wrong"
+            )
         found += self.damage.sentences
         found += [f"{text} ({n} of {self.frames} frames)" for text, n in self.problems.items()]
         return (*self.doubts(), *found, *self.tf.problems)

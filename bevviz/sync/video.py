@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from collections import OrderedDict
+import math
+from collections import OrderedDict, deque
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from statistics import median
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
@@ -26,6 +28,8 @@ SHOWN = ("h264", "h265", "av1", "vp8", "vp9")  # which Rerun takes as they are
 HELD = 5_000_000_000  # nanoseconds of receipt that an image may be asked for after its packet
 MOST_BYTES = 64_000_000  # of packets that are held
 MOST_REORDERED = 20  # pictures that a decoder has made and nobody has asked for
+UNNUMBERED = ("av1", "vp8", "vp9")  # whose pictures do not tell that one is missing between them
+STEPS = 9  # between packets, by which a longer one is known
 _DECODERS = {"h265": "hevc", "av1": "libdav1d"}
 LOW_DELAY = 0x80000  # AV_CODEC_FLAG_LOW_DELAY: a picture for each packet, at once
 
@@ -62,11 +66,18 @@ class Video:
         self._next = 0  # packet that the decoder is to be given next
         self._last: Image | None = None
         self._last_place: tuple[int, int] | None = None
+        self._stamp = 0  # of the packet that was added last
+        self._steps: deque[int] = deque(maxlen=STEPS)  # nanoseconds between packets
 
-    def add(self, packet: Packet) -> None:
+    def add(self, packet: Packet) -> bool:
+        """Whether packets may be missing before it, by its stamp, where the codec does not tell."""
         if packet.is_header:
             self._headers[packet.data] = None
-            return
+            return False
+        step = packet.stamp - self._stamp if self._stamp else 0
+        usual = median(self._steps) if len(self._steps) == STEPS else math.inf
+        self._stamp = packet.stamp
+        self._steps.append(step)
         if packet.is_key:
             self._drop(before=packet.received - HELD)
         self._packets.append(packet)
@@ -75,6 +86,7 @@ class Video:
             self._drop(before=packet.received)
         if self._size > MOST_BYTES:  # one group of pictures: of it the decoder has what it needs
             self._forget(self._next or len(self._packets))
+        return packet.codec in UNNUMBERED and not packet.is_key and step > 1.5 * usual
 
     def image(self, place: tuple[int, int]) -> Image:
         """The picture of the packet at that place.
@@ -191,6 +203,7 @@ class _Decoder:
         if codec == "theora":
             self._context.extradata = b"".join(len(h).to_bytes(2) + h for h in headers)
         self._continuity = Continuity() if codec == "h264" else None
+        self._number: int | None = None  # of the packet before
         self._places: list[tuple[int, int]] = []
         self._broken = ""  # why no picture is whole until the next key frame
         self._finished = False
@@ -205,15 +218,23 @@ class _Decoder:
     def put(self, packet: Packet) -> None:
         import av
 
+        lost = self._missing(packet)
         if packet.is_key:
             self._broken = ""
             self.failures.clear()
-        if self._continuity is not None and (lost := self._continuity.missing(packet.data)):
+        elif lost:
             self._broken = f"{lost} packet(s) before it are lost"
         given = av.Packet(packet.data)
         given.pts = len(self._places)
         self._places.append(packet.place)
         self._take(given)
+
+    def _missing(self, packet: Packet) -> int:
+        """How many packets before it are."""
+        if self._continuity is not None:
+            return self._continuity.missing(packet.data)
+        last, self._number = self._number, packet.number
+        return 0 if last is None or packet.number is None else max(0, packet.number - last - 1)
 
     def finish(self) -> None:
         """Have the pictures that wait for later ones."""
