@@ -433,6 +433,23 @@ def test_a_grey_png_of_16_bits_is_shown_as_it_was_reduced() -> None:
     assert np.abs(image.bgr[..., 1] - pixels * 255.0 / 4095).max() <= 0.5
 
 
+@pytest.mark.parametrize("bits", [8, 16])
+def test_raw_pixels_of_a_colour_sensor_that_were_compressed_as_they_are_show_the_colour(bits: int) -> None:
+    """As compressed_image_transport does with bayer; they were shown as a grey checkerboard."""
+    scale = 257 if bits == 16 else 1
+    tile = np.array([[130, 20], [250, 130]], np.uint16) * scale  # green, blue, red, green
+    pixels = np.tile(tile, (5, 6)).astype(f"u{bits // 8}")
+    if bits == 16:
+        pixels[0, 0] = 65535
+    data = encoded(".png", pixels)
+    image = images.decode_compressed_image(compressed(data, f"bayer_gbrg{bits}; png compressed "), "/i", 0)
+    np.testing.assert_array_equal(image.bgr[4:7, 4:7], np.full((3, 3, 3), [20, 130, 250]))
+    assert image.encoded is None and not image.media_type
+    grey = compressed(encoded(".png", pixels.astype(np.uint8)), f"bayer_gbrg{bits}; jpeg compressed mono8")
+    image = images.decode_compressed_image(grey, "/i", 0)
+    assert image.encoded is not None and (np.ptp(image.bgr, axis=2) == 0).all()
+
+
 @pytest.mark.parametrize("channels", [3, 4])  # with transparency the file has another header
 @pytest.mark.parametrize("quality", [95, 101])  # with loss, and without
 def test_webp_is_decoded_and_goes_on_raw(channels: int, quality: int) -> None:

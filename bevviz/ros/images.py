@@ -118,6 +118,8 @@ _MEDIA_TYPES = {  # by what the data begins with
     "image/png": re.compile(rb"\x89PNG\r\n\x1a\n"),
     "image/webp": re.compile(rb"RIFF.{4}WEBP", re.DOTALL),
 }
+# Compressed as it is, by compressed_image_transport; "mono8" or "bgr8" behind it say what was made of it.
+_MOSAIC = re.compile(r"(bayer_(?:rggb|bggr|gbrg|grbg)(?:8|16)); \w+ compressed\s*$")
 _ANNEX_B = (b"\0\0\0\1", b"\0\0\1")  # what every unit of an H.264 or H.265 stream begins with
 
 
@@ -126,8 +128,8 @@ def decode_compressed_image(msg: Any, topic: str, received: int) -> Image:
     """A JPEG, PNG or WebP in a sensor_msgs/CompressedImage, decoded.
 
     The kind is taken from the data, as the format field has many spellings. The encoded bytes are kept
-    beside, untouched, but of WebP, which Rerun does not read, and of a PNG of 16 bits: it is reduced as
-    ``to_8_bits`` says, and would look different.
+    beside, untouched, but of WebP, which Rerun does not read, of a PNG of 16 bits: it is reduced as
+    ``to_8_bits`` says, and would look different, and of a colour sensor's raw pixels (bayer).
 
     Raises:
         MessageError: depth images, other kinds, data that is damaged or cut, and more than ``MOST_PIXELS``
@@ -154,7 +156,10 @@ def decode_compressed_image(msg: Any, topic: str, received: int) -> Image:
     if media_type == "image/jpeg" and encoded.rfind(b"\xff\xd9") < 0:
         cut = True  # decoders would fill the rest with grey
     # Orientation: the calibration belongs to the pixels as they are stored, not as EXIF would turn them.
-    flags = cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
+    mosaic = _MOSAIC.match(msg.format)
+    demosaic = _ENCODINGS[mosaic[1]].to_bgr if mosaic else None
+    channels = cv2.IMREAD_GRAYSCALE if mosaic else cv2.IMREAD_COLOR
+    flags = channels | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
     try:
         bgr = None if cut else cv2.imdecode(data, flags)
     except cv2.error:
@@ -162,11 +167,14 @@ def decode_compressed_image(msg: Any, topic: str, received: int) -> Image:
     if bgr is None:
         raise MessageError(f"{topic}: the {media_type} data ({len(encoded)} bytes) is damaged or cut")
     deep = bgr.dtype == np.uint16
-    kept = not deep and media_type != "image/webp"
+    bgr = to_8_bits(bgr) if deep else bgr
+    if demosaic is not None:
+        bgr = cv2.cvtColor(bgr, demosaic)
+    kept = not deep and not mosaic and media_type != "image/webp"
     return Image(
         stamp=stamp_ns(msg.header.stamp),
         frame_id=frame_name(msg.header.frame_id),
-        bgr=to_8_bits(bgr) if deep else bgr,
+        bgr=bgr,
         encoded=encoded if kept else None,
         media_type=media_type if kept else "",
         topic=topic,
