@@ -234,6 +234,31 @@ def test_boxes_may_be_the_truth(tmp_path: Path) -> None:
     assert main(["evaluate", str(path), "--truth", "/markers/annotations", "--quiet"]) == 0
 
 
+def test_a_transform_that_was_stated_long_before_holds_in_the_midst_of_a_drive(tmp_path: Path) -> None:
+    context, path = foxglove.Context(), tmp_path / "drive.mcap"
+    with foxglove.open_mcap(path, context=context):
+        raw = channels.RawImageChannel("/CAM_FRONT/image_raw", context=context)
+        cloud = channels.PointCloudChannel("/LIDAR_TOP", context=context)
+        single = channels.FrameTransformChannel("/calibration", context=context)
+        fields = [
+            messages.PackedElementField(name=name, offset=4 * i, type=FLOAT32) for i, name in enumerate("xyz")
+        ]
+        for scan in range(0, 120, 10):
+            at = bags.START + scan * bags.PERIOD
+            if scan in (20, 70):
+                single.log(edge(scan, "lidar_top", "cam_front", CAMERA), log_time=at)
+            about = dict[str, Any](timestamp=time(scan), frame_id="lidar_top", point_stride=16, fields=fields)
+            cloud.log(messages.PointCloud(data=points(scan).tobytes(), **about), log_time=at)
+            size = dict[str, Any](width=64, height=48, step=192, encoding="rgb8", frame_id="cam_front")
+            raw.log(messages.RawImage(data=picture(1).tobytes(), timestamp=time(scan), **size), log_time=at)
+    with BagSource([path], load()) as source:
+        placed = [frame.cameras[0].camera_from_points is not None for frame in source]
+        assert not placed[0] and all(placed[2:])
+        for number in (6, 11):
+            frame = source.frame(number)
+            assert frame is not None and frame.cameras[0].camera_from_points is not None
+
+
 def test_boxes_of_a_scene_are_in_the_frames_of_their_entities(tmp_path: Path) -> None:
     context, path = foxglove.Context(), tmp_path / "drive.mcap"
     box = geometry.transform((12.0, 3.0, -1.0), (0, 0, np.sin(0.25), np.cos(0.25)))  # in the LiDAR's frame

@@ -89,6 +89,20 @@ def test_held_past_the_end_within_the_tolerance(robot: TransformBuffer) -> None:
         robot.lookup("rslidar", "map", -SECOND // 2, 0.2)
 
 
+def test_a_held_pose_that_is_stated_again_and_again_holds_until_there_is_another() -> None:
+    buffer = TransformBuffer()
+    for t in (3.0, 8.0):
+        buffer.add(sample("base_link", "camera", t, pose(0.5)), held=True)
+        for stamp in (0, 5, 20):
+            np.testing.assert_array_equal(
+                buffer.lookup("base_link", "camera", stamp * SECOND, 0.2).matrix, pose(0.5)
+            )
+    buffer.add(sample("base_link", "camera", 9.0, pose(0.6)), held=True)
+    np.testing.assert_allclose(buffer.lookup("base_link", "camera", 17 * SECOND // 2, 0.2).matrix, pose(0.55))
+    with pytest.raises(TransformError, match=r"'base_link' -> 'camera' ends 11\.00 s before the asked stamp"):
+        buffer.lookup("base_link", "camera", 20 * SECOND, 0.2)
+
+
 def test_what_is_not_connected_is_told(robot: TransformBuffer) -> None:
     with pytest.raises(TransformError, match="from 'velodyne' to 'odom': frame 'velodyne' is unknown"):
         robot.lookup("odom", "velodyne", 0, 0.2)

@@ -27,6 +27,7 @@ from bevviz.sync.synchronizer import Synchronizer
 
 SECOND = 1_000_000_000
 MARGIN = 2 * SECOND  # what else belongs to the first and the last cloud is looked for this far outside
+MOST_HELD = 2000  # messages of a topic with transforms that are read to begin in the midst of a drive
 EPOCH = 1e8  # a larger number of seconds is a date
 
 
@@ -302,11 +303,15 @@ class BagSource(Closing):
         """Give what is published once to all frames, wherever in the bag it is.
 
         Of each static transform the last one before the start, else the first one after it; of transforms
-        that hold until there are others, those of the first second.
+        that hold until there are others, those before the start, or where they are many those of the first
+        second.
         """
-        for message in self.recording.messages(self.roles.tf_held, None, self.recording.start + SECOND):
-            if message.received < low - MARGIN:
-                self._handle(handlers[message.topic], message, state)
+        counts = {topic.name: topic.count or 0 for topic in self.recording.topics}
+        for name in self.roles.tf_held:
+            few = counts[name] <= MOST_HELD
+            stop = low - MARGIN if few else min(low - MARGIN, self.recording.start + SECOND)
+            for message in self.recording.messages([name], None, stop):
+                self._handle(handlers[name], message, state)
         static = {}
         for message in self.recording.messages(self.roles.tf_static):
             try:

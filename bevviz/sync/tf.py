@@ -49,14 +49,17 @@ class _Edge:
     static: bool
     stamps: list[int] = field(default_factory=list)
     poses: list[F64] = field(default_factory=list)  # parent_from_child
-    held: bool = False  # one sample holds until there are more
+    held: bool = False  # one pose holds until there is another
+    moved: bool = False  # of a held one, whether there was another
 
     @property
     def rests(self) -> bool:
-        """Whether one pose holds at any stamp."""
+        """Whether no further sample is waited for."""
         return self.static or (self.held and len(self.stamps) == 1)
 
     def put(self, stamp: int, pose: F64) -> None:
+        if self.held and self.poses and not np.array_equal(pose, self.poses[-1]):
+            self.moved = True
         if self.static:
             self.poses = [pose]
             return
@@ -74,7 +77,7 @@ class _Edge:
 
     def at(self, stamp: int) -> tuple[F64, float, int]:
         """The pose, the seconds to the nearest sample, and the nanoseconds past the ends (< 0: before)."""
-        if self.rests:
+        if self.static or (self.held and not self.moved):
             return self.poses[0], 0.0, 0
         i = bisect_left(self.stamps, stamp)
         if i == len(self.stamps):
@@ -106,7 +109,7 @@ class TransformBuffer:
     ) -> None:
         """Insert a sample. What cannot be used is left out and told in ``problems``.
 
-        ``held``: where it stays the only one of its frame, it holds at any stamp.
+        ``held``: where the frame is never stated anywhere else, it holds at any stamp.
         """
         parent, child = _name(t.parent), _name(t.child)
         about = f"'{parent}' -> '{child}'"
