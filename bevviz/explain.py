@@ -65,7 +65,7 @@ def explain(
     if splits is not None:
         found.extend(_splits(cameras, splits))
     if objects is not None and opinions is not None:
-        found.extend(_objects(objects, opinions, cameras, config))
+        found.extend(_objects(objects, opinions, cameras, clusters, config))
         found.extend(_fused(objects, opinions, clusters, config))
     return tuple(found)
 
@@ -265,12 +265,16 @@ def _splits(cameras: Sequence[CameraResult], splits: Splits) -> Iterator[Explana
 
 
 def _objects(
-    objects: Objects, opinions: Opinions, cameras: Sequence[CameraResult], config: Config
+    objects: Objects,
+    opinions: Opinions,
+    cameras: Sequence[CameraResult],
+    clusters: Clusters | None,
+    config: Config,
 ) -> Iterator[Explanation]:
     by_name = {result.camera.name: result for result in cameras}
     for k, name in enumerate(opinions.camera):
         opinion = Opinion(int(opinions.opinion[k]))
-        text = _opinion(opinion, k, opinions, by_name.get(name), config)
+        text = _opinion(opinion, k, opinions, by_name.get(name), clusters, config)
         if opinion is Opinion.NOT_ASKED:
             problems = "; ".join(p for result in cameras for p in result.camera.problems)
             text += f": {problems}" if problems else ""
@@ -278,7 +282,12 @@ def _objects(
 
 
 def _opinion(
-    opinion: Opinion, k: int, opinions: Opinions, result: CameraResult | None, config: Config
+    opinion: Opinion,
+    k: int,
+    opinions: Opinions,
+    result: CameraResult | None,
+    clusters: Clusters | None,
+    config: Config,
 ) -> str:
     """What cameras say of an object, with the figure that it hung on."""
     camera, least = "" if result is None else result.camera.name, config.opinions
@@ -302,7 +311,7 @@ def _opinion(
         head = "confirmed by" if opinion is Opinion.CONFIRMED else "named otherwise by"
         return f"{head} {_label(result.detections, d)} of {camera}, {_looks(k, d, opinions, result)}"
     seen = f"{opinions.shown[k]:.0%} in its image, {opinions.visible[k]:.0%} not hidden"
-    return f"contradicted by {camera} ({seen}): {_nearest(k, d, opinions, result, config)}"
+    return f"contradicted by {camera} ({seen}): {_nearest(k, d, opinions, result, clusters, config)}"
 
 
 def _looks(k: int, d: int, opinions: Opinions, result: CameraResult) -> str:
@@ -314,7 +323,9 @@ def _looks(k: int, d: int, opinions: Opinions, result: CameraResult) -> str:
     return f"{opinions.held[k]:.0%} of cluster {cluster} is in the box, {overlap}"
 
 
-def _nearest(k: int, d: int, opinions: Opinions, result: CameraResult, config: Config) -> str:
+def _nearest(
+    k: int, d: int, opinions: Opinions, result: CameraResult, clusters: Clusters | None, config: Config
+) -> str:
     """What a camera has where nothing of its looks at an object."""
     detections, fusion = result.detections, result.fusion
     if d < 0 or detections is None:
@@ -325,9 +336,9 @@ def _nearest(k: int, d: int, opinions: Opinions, result: CameraResult, config: C
     state = DetectionState(int(detections.state[d]))
     if state is DetectionState.BELOW_THRESHOLD:
         return f"{text}, below detector.conf_threshold {config.detector.conf_threshold:g}"
-    if fusion is not None and fusion.detection_decision[d] == Decision.MATCHED:
+    if fusion is not None and clusters is not None and fusion.detection_decision[d] == Decision.MATCHED:
         cluster = int(fusion.detection_cluster[d])
-        return f"{text}, which is cluster {cluster} at {_pair(fusion, d, cluster).depth:.1f} m"
+        return f"{text}, which is cluster {cluster} at {np.hypot(*clusters.centroid[cluster, :2]):.1f} m"
     if opinions.iou[k] < config.opinions.min_iou:
         return f"{text}, opinions.min_iou is {config.opinions.min_iou:g}"
     return f"{text}, which fits another box better"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -35,7 +36,7 @@ from bevviz.session import Session
 from bevviz.stages.detector.names import COCO
 from bevviz.stages.foreign import placed
 from bevviz.stages.opinions import opinions, right_names
-from bevviz.stages.visibility import image_boxes, range_image
+from bevviz.stages.visibility import image_boxes, range_image, visible
 from bevviz.sweep.run import Outcome
 from bevviz.synthetic import SyntheticSource
 from bevviz.why import Questioner, Selection
@@ -177,7 +178,7 @@ def test_what_no_camera_can_see_is_not_contradicted(
         ({}, Opinion.CONTRADICTED, "contradicted by "),
         ({"min_height": 80}, Opinion.TOO_SMALL, " px high in zed, opinions.min_height is 80 px"),
         ({"min_shown": 0.6}, Opinion.OUT_OF_VIEW, "in the image of zed, opinions.min_shown is 0.6"),
-        ({"min_visible": 0.9}, Opinion.HIDDEN, "behind what is nearer, opinions.min_visible is 0.9"),
+        ({"min_visible": 0.95}, Opinion.HIDDEN, "behind what is nearer, opinions.min_visible is 0.95"),
     ],
 )
 def test_when_a_camera_has_to_find_a_box_can_be_said(
@@ -269,6 +270,10 @@ def test_the_frame_step_keeps_both() -> None:
     said = {(e.subject, e.state) for e in result.explanations}
     assert {("object", "confirmed"), ("object", "contradicted"), ("fused", "missed")} <= said
     assert result.timings["opinions"] > 0
+    labelled = replace(stated, topic="/ground_truth")  # a data set's own topic, as bevviz has it
+    of_people = load(settings=["detector.model=demo", "objects.method=topic:/ground_truth"])
+    again = Session(of_people).alone(replace(frame, truth=labelled))
+    assert again.opinions is not None and words(again.opinions) == words(result.opinions)
     silent = Session(theirs).alone(frame)  # it has published nothing at this time
     assert [failure.stage for failure in silent.failures] == ["objects"] and silent.opinions is None
     no_model = load(settings=["objects.method=topic:/objects"])
@@ -334,9 +339,39 @@ def test_labels_five_metres_aside_are_contradicted(kitti: Drive) -> None:
     assert missed >= 0.7 * ours
 
 
+def test_where_a_detection_went_is_as_far_away_as_the_cluster_is_said_to_be(kitti: Drive) -> None:
+    """Boxes six metres behind what is labelled: the two distances of a sentence are of one kind."""
+    counted = 0
+    for result, labelled in kitti:
+        boxes = labelled.boxes
+        away = boxes.center * [1, 1, 0] / np.hypot(*boxes.center[:, :2].T)[:, None]
+        behind = moved(boxes, (6 * away).astype(np.float32))
+        lax = OpinionsConfig(min_visible=0)
+        objects, found = held(result, behind, labelled.labels, COCO, lax)
+        said = {e.row: e.text for e in result.explanations if e.subject == "cluster"}
+        for told in texts(result, objects, found):
+            if went := re.search(r"which is cluster (\d+) at (.+ m)$", told.text):
+                assert f" at {went[2]}: " in said[int(went[1])]
+                counted += 1
+    assert counted >= 5
+
+
 def test_of_no_box_everything_of_ours_is_missed(kitti: Drive) -> None:
     counts, missed, ours = counted(kitti, None)
     assert not counts and missed == ours
+
+
+def test_what_is_hidden_is_what_people_have_labelled_so(kitti: Drive) -> None:
+    """KITTI's occlusion, which people have judged in the image: 0 seen whole, 2 largely hidden."""
+    shares: list[float] = []
+    occluded: list[int] = []
+    for result, labelled in kitti:
+        assert labelled.image is not None
+        shares += visible(range_image(result.frame.points), labelled.boxes).tolist()
+        occluded += labelled.image.occluded.tolist()
+    whole, hidden = (np.array(shares)[np.array(occluded) == degree] for degree in (0, 2))
+    assert len(whole) >= 25 and len(hidden) >= 5
+    assert whole.min() > 0.6 and np.mean(whole > 0.99) >= 0.75 and hidden.max() <= 0.5
 
 
 # --- in a recording ----------------------------------------------------------------------------

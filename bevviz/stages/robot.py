@@ -105,8 +105,9 @@ def in_points_frame(frame: Frame, labelled: LabelledBoxes3D) -> Boxes3D:
 
 
 def _boxes(frame: Frame, topic: str) -> LabelledBoxes3D:
-    for labelled in frame.robot_boxes:
-        if labelled.topic == topic:
+    """Also those that a person has labelled."""
+    for labelled in (*frame.robot_boxes, frame.truth):
+        if labelled is not None and labelled.topic == topic:
             return labelled
     raise _missing(topic, "boxes")
 

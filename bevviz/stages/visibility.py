@@ -100,7 +100,10 @@ def range_image(points: F32) -> F32:
 
 
 def visible(image: F32, boxes: Boxes3D) -> F32:
-    """(K,) share of the directions to each box in which nothing nearer stands.
+    """(K,) share of the directions to each box in which nothing stands that is nearer than all of the box.
+
+    A cell of the image is a direction to the box if its middle is: one that the box's lower edge only touches
+    has the ground before it.
 
     Args:
         image: of ``range_image``.
@@ -114,7 +117,10 @@ def visible(image: F32, boxes: Boxes3D) -> F32:
     azimuth = np.arctan2(corners[..., 1], corners[..., 0]) - middle[:, None]
     azimuth = np.arctan2(np.sin(azimuth), np.cos(azimuth))
     elevation = np.arctan2(corners[..., 2], np.maximum(flat, 1e-3))
-    near = np.maximum(np.linalg.norm(boxes.center, axis=1) - np.linalg.norm(boxes.size, axis=1) / 2, 0.0)
+    c, s = np.cos(boxes.yaw), np.sin(boxes.yaw)
+    x, y, z = boxes.center.T
+    local = np.column_stack([c * x + s * y, c * y - s * x, z])
+    near = np.linalg.norm(np.maximum(np.abs(local) - boxes.size / 2, 0), axis=1)
     return _open(
         image,
         np.column_stack([middle + azimuth.min(1), middle + azimuth.max(1)]).astype(np.float32),
@@ -141,15 +147,23 @@ def _open(image: F32, azimuth: F32, elevation: F32, near: F32) -> F32:
     for k in range(len(near)):
         if azimuth[k, 1] - azimuth[k, 0] > np.pi:
             continue
-        first = int(np.floor((azimuth[k, 0] + np.pi) / STEP))
-        last = int(np.floor((azimuth[k, 1] + np.pi) / STEP))
-        low = max(int(np.floor((elevation[k, 0] - BELOW) / STEP)), 0)
-        high = min(int(np.floor((elevation[k, 1] - BELOW) / STEP)), rows - 1)
+        first, last = _cells((azimuth[k, 0] + np.pi) / STEP, (azimuth[k, 1] + np.pi) / STEP)
+        low, high = _cells((elevation[k, 0] - BELOW) / STEP, (elevation[k, 1] - BELOW) / STEP)
         all_of, hidden = 0, 0
-        for row in range(low, high + 1):
-            for column in range(first, last + 1):
+        for row in range(max(low, 0), min(high, rows)):
+            for column in range(first, last):
                 all_of += 1
                 hidden += image[row, column % columns] < near[k] - NEARER
         if all_of:
             found[k] = np.float32(1 - hidden / all_of)
     return found
+
+
+@kernel
+def _cells(low: float, high: float) -> tuple[int, int]:
+    """First cell and end of those whose middle is between; where none is, the one that holds its middle."""
+    first, end = int(np.ceil(low - 0.5)), int(np.floor(high - 0.5)) + 1
+    if end <= first:
+        first = int(np.floor((low + high) / 2))
+        end = first + 1
+    return first, end
