@@ -208,6 +208,42 @@ def test_how_much_a_detection_without_a_cluster_has_to_overlap_can_be_said() -> 
     assert said.endswith(f", IoU {found.iou[0]:.2f}, opinions.min_iou is 0.95")
 
 
+def test_a_box_is_not_confirmed_by_what_fits_another_one_better() -> None:
+    """1.2 m beside a car with half of the car's points in it, alone and beside the right one."""
+    result = ours()
+    fused = result.objects
+    assert fused is not None and fused.names[0] == "car"
+    car = fused.boxes.chosen([0])
+    beside = moved(car, (0, 1.2, 0))
+    _, alone = held(result, beside, ["car"])
+    assert words(alone) == ["confirmed"] and 0.2 < alone.held[0] < 0.5 and alone.iou[0] < 0.3
+    _, both = held(result, Boxes3D.joined([car, beside]), ["car", "car"])
+    assert words(both) == ["confirmed", "contradicted"]
+    nearer = moved(car, (-2, 0, 0))  # which the camera cannot tell from the right one
+    _, both = held(result, Boxes3D.joined([car, nearer]), ["car", "car"])
+    assert words(both) == ["confirmed", "confirmed"]
+
+
+def test_what_a_cluster_confirms_beside_the_image_has_its_words() -> None:
+    """A cluster that reaches into the image from a box that is outside of it."""
+    result = ours()
+    fused = result.objects
+    assert fused is not None
+    turned = np.diag([-1.0, 1.0, -1.0, 1.0])  # the camera looks back, and what was found stays
+    cameras = tuple(
+        replace(c, camera=replace(c.camera, camera_from_points=turned @ c.camera.camera_from_points))
+        for c in result.cameras
+    )
+    away = replace(result, cameras=cameras)
+    objects, found = held(away, fused.boxes, fused.names)
+    assert set(words(found)) == {"confirmed"} and not found.shown.any() and all(found.camera)
+    assert all(": confirmed by " in e.text for e in texts(away, objects, found) if e.subject == "object")
+    lax = OpinionsConfig(min_shown=0, min_height=0, min_visible=0)
+    objects, found = held(away, box_at((12, 0, 1.5), (4, 1.8, 1.5)), ["car"], config=lax)
+    assert found.opinion.tolist() == [Opinion.OUT_OF_VIEW]
+    assert len(texts(away, objects, found)) == 1 + len(fused)
+
+
 def test_what_is_behind_something_is_hidden() -> None:
     """Of a car, the place behind it on the same ray."""
     result = ours()

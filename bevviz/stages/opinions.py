@@ -27,6 +27,7 @@ MARGIN = 0.2  # metres around a box in which points are still its own
 HELD = 0.5  # share of a cluster's points that are in the box which it is of
 RIVAL = 0.7  # of the share that another box has of it: with less, it is that one's
 PARTLY = 0.2  # the same, where no other cluster has more points in the box
+SAID = (Opinion.CONFIRMED, Opinion.NAMED_OTHERWISE)
 NEAR = 0.1  # IoU from which a detection is worth a word where none looks at a box
 
 
@@ -55,9 +56,10 @@ def opinions(
     """Hold objects that our fusion did not make and those that it would have made against each other.
 
     A kept detection looks at a box if the cluster that the fusion matched it with is in the box: half of its
-    points, where no other box has far more of them, or a fifth where it has most of the points there. A
-    detection that has no cluster looks at the box that it overlaps most in the image, if IoU is ``min_iou``
-    or more and the box is not hidden; one that has a cluster elsewhere looks at none. A camera says of a box
+    points, or a fifth where it has most of the points there. Where another box has far more of them, the
+    detection has to overlap this one in the image, too, IoU ``min_iou``. A detection that has no cluster
+    looks at the box that it overlaps most in the image, if IoU is ``min_iou`` or more and the box is not
+    hidden; one that has a cluster elsewhere looks at none. A camera says of a box
 
     - CONFIRMED, where a detection looks at it whose class is right for it;
     - NAMED_OTHERWISE, where only others do;
@@ -81,14 +83,13 @@ def opinions(
     open_ = visible(ranges, boxes)
     named = _named_clusters(fused, cameras, clusters)
     held = _held(boxes, obstacles, clusters, named)
-    own = objects.cluster[:, None] == named[None]
-    of_box = ((held >= HELD) & (held >= RIVAL * held.max(axis=0, initial=0))) | (own & (held >= PARTLY))
+    least = _least_iou(held, objects.cluster[:, None] == named[None], config)
     best = _unseen(count, Opinion.NOT_ASKED)
     camera = [""] * count
     for result in cameras:
         if result.detections is None:
             continue
-        sight = _sight(result, result.detections, objects, open_, named, held, of_box, config, known)
+        sight = _sight(result, result.detections, objects, open_, named, held, least, config, known)
         better = (sight.opinion < best.opinion) | (
             (sight.opinion == best.opinion) & (sight.shown > best.shown)
         )
@@ -96,7 +97,8 @@ def opinions(
         for field in _Sight.__slots__:
             getattr(best, field)[rows] = getattr(sight, field)[rows]
         for k in rows.tolist():
-            camera[k] = result.camera.name if sight.shown[k] > 0 else ""
+            there = sight.shown[k] > 0 or sight.opinion[k] in SAID  # by its cluster, beside the image
+            camera[k] = result.camera.name if there else ""
     return Opinions(
         fused=fused,
         opinion=best.opinion,
@@ -107,7 +109,7 @@ def opinions(
         shown=best.shown,
         visible=open_,
         height=best.height,
-        partner=_partners(fused, named, held, of_box),
+        partner=_partners(fused, named, held, least),
     )
 
 
@@ -150,12 +152,26 @@ def _held(boxes: Boxes3D, points: F32 | None, clusters: Clusters | None, named: 
     return held / whole
 
 
-def _partners(fused: Objects, named: I64, held: F32, of_box: Bool) -> I32:
+def _least_iou(held: F32, own: Bool, config: OpinionsConfig) -> F32:
+    """(K, C) that a detection with that cluster needs with each box to look at it, inf: never.
+
+    Args:
+        held: (K, C) share of the cluster in the box.
+        own: (K, C) whether it has most of the points in the box.
+        config: for where another box has far more of it.
+    """
+    of_box = own & (held >= PARTLY)
+    first = held >= RIVAL * held.max(axis=0, initial=0)
+    of_box |= first & (held >= HELD)
+    return np.where(of_box, np.where(first, 0, config.min_iou), np.inf).astype(np.float32)
+
+
+def _partners(fused: Objects, named: I64, held: F32, least: F32) -> I32:
     """(J,) the box that holds most of the cluster of each of our objects, -1: it is in none."""
     partner = np.full(len(fused), -1, np.int32)
     if len(held):
         columns = np.searchsorted(named, fused.cluster)
-        share = np.where(of_box, held, 0)[:, columns]
+        share = np.where(np.isfinite(least), held, 0)[:, columns]
         found = share.max(axis=0) > 0
         partner[found] = share.argmax(axis=0)[found]
     return partner
@@ -184,13 +200,13 @@ def _sight(
     open_: F32,
     named: I64,
     held: F32,
-    of_box: Bool,
+    least: F32,
     config: OpinionsConfig,
     known: Sequence[str],
 ) -> _Sight:
     count, around = len(objects), image_boxes(objects.boxes, result.camera)
     overlap = geometry.iou(around, detections.xyxy)
-    by_cluster, has_cluster = _by_cluster(result, detections, named, held, of_box)
+    by_cluster, has_cluster = _by_cluster(result, detections, overlap, named, held, least)
     looks = ~np.isnan(by_cluster)
     open_overlap = np.where(open_[:, None] >= config.min_visible, overlap, 0)
     free = np.flatnonzero(detections.kept & ~has_cluster)
@@ -216,7 +232,7 @@ def _sight(
     sight.opinion[~knows] = Opinion.NO_CLASS
     sight.opinion[sight.height < config.min_height] = Opinion.TOO_SMALL
     sight.opinion[open_ < config.min_visible] = Opinion.HIDDEN
-    sight.opinion[sight.shown < config.min_shown] = Opinion.OUT_OF_VIEW
+    sight.opinion[(sight.shown < config.min_shown) | (sight.shown == 0)] = Opinion.OUT_OF_VIEW
     if len(detections):
         every = np.arange(count)
         best = rank.argmax(axis=1)
@@ -231,7 +247,7 @@ def _sight(
 
 
 def _by_cluster(
-    result: CameraResult, detections: Detections, named: I64, held: F32, of_box: Bool
+    result: CameraResult, detections: Detections, overlap: F32, named: I64, held: F32, least: F32
 ) -> tuple[F32, Bool]:
     """(K, D) share of a detection's cluster that is in the box it is of, else NaN; (D,) which have one."""
     share = np.full((len(held), len(detections)), np.nan, np.float32)
@@ -242,6 +258,7 @@ def _by_cluster(
     detection = result.fusion.cluster_detection[matched]
     has_cluster[detection] = True
     for d, column in zip(detection.tolist(), np.searchsorted(named, matched).tolist(), strict=True):
-        mine = np.where(of_box[:, column], held[:, column], np.nan)  # several, where one box names them
+        looks = overlap[:, d] >= least[:, column]
+        mine = np.where(looks, held[:, column], np.nan)  # several, where one box names them
         share[:, d] = np.fmax(share[:, d], mine)
     return share, has_cluster
