@@ -199,3 +199,20 @@ def test_rich_style_tells_ground_from_obstacles_and_does_not_spoil_its_backgroun
     assert np.ptp(road.astype(int)) < 40  # grey
     assert np.ptp(obstacle.astype(int)) > 100  # a strong colour
     np.testing.assert_array_equal(bev(points[:0], None, None, None, None, config).image, empty)
+
+
+def test_names_of_the_rich_style_are_whole_and_cover_no_other() -> None:
+    """Three people who walk together, and one at the right edge of the image."""
+    config = load().bev
+    center = [[8.0, 2.0, 0.0], [8.3, 1.9, 0.0], [8.0, 1.4, 0.0], [5.0, -config.range_y + 0.5, 0.0]]
+    names = ("anna", "bert", "carl", "dora")
+    nothing = np.zeros((0, 3), np.float32)
+    image = bev(nothing, None, None, named(boxes(center, [[0.5, 0.5, 1.8]] * 4), *names), None, config).image
+    for name in names:
+        text = f"{name} 0.80"
+        (wide, high), below = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, 0.45, 1)
+        drawn = np.zeros((high + below, wide, 3), np.uint8)
+        cv2.putText(drawn, text, (0, high), cv2.FONT_HERSHEY_SIMPLEX, 0.45, (255,) * 3, 1, cv2.LINE_AA)
+        bright = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
+        found = cv2.matchTemplate(bright, drawn[..., 0], cv2.TM_CCOEFF_NORMED)
+        assert found.max() > 0.8, name

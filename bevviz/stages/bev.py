@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import lru_cache
+from itertools import product
 from typing import Any
 
 import cv2
@@ -238,18 +239,31 @@ def _draw_rich(image: U8, objects: Objects | None, clusters: Clusters | None, co
         cv2.polylines(image, list(outlines), True, _UNNAMED, 1, cv2.LINE_AA, _SHIFT)
     if objects is None:
         return
-    for name, score, color, outline, front in zip(
-        objects.names,
-        objects.score.tolist(),
-        [class_color(name)[::-1] for name in objects.names],
-        _pixels(corners(objects.boxes)[:, :4, :2], config),
-        _pixels(_headings(objects.boxes), config),
-        strict=True,
+    colors = [class_color(name)[::-1] for name in objects.names]
+    outlines = _pixels(corners(objects.boxes)[:, :4, :2], config)
+    for color, outline, front in zip(
+        colors, outlines, _pixels(_headings(objects.boxes), config), strict=True
     ):
         cv2.polylines(image, [outline], True, color, 2, cv2.LINE_AA, _SHIFT)
         cv2.polylines(image, [front], False, color, 2, cv2.LINE_AA, _SHIFT)
-        u, v = outline[:, 0].max() >> _SHIFT, outline[:, 1].min() >> _SHIFT
-        _caption(image, f"{name} {score:.2f}", (int(u) + 4, int(v) + 4), color)
+    _write_names(image, objects, outlines >> _SHIFT, colors)
+
+
+def _write_names(image: U8, objects: Objects, outlines: I32, colors: Sequence[Sequence[int]]) -> None:
+    """At a corner of each box, the nearest first; where no place is in the image and free, none."""
+    rows, columns = image.shape[:2]
+    taken = np.zeros((0, 4), np.int64)
+    for k in np.argsort(np.hypot(*objects.boxes.center[:, :2].T), kind="stable").tolist():
+        text = f"{objects.names[k]} {objects.score[k]:.2f}"
+        (wide, high), below = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, _SIZE, 1)
+        (left, top), (right, bottom) = outlines[k].min(axis=0).tolist(), outlines[k].max(axis=0).tolist()
+        for u, v in product((right + 4, left - 4 - wide), (top + 4, bottom + high)):
+            place = np.array([u, v - high, u + wide, v + below])
+            inside = place.min() >= 0 and place[2] <= columns and place[3] <= rows
+            if inside and not ((place[:2] < taken[:, 2:]) & (taken[:, :2] < place[2:])).all(axis=1).any():
+                taken = np.vstack([taken, place])
+                _caption(image, text, (u, v), colors[k])
+                break
 
 
 def _headings(boxes: Boxes3D) -> F32:
@@ -259,6 +273,7 @@ def _headings(boxes: Boxes3D) -> F32:
     return np.asarray(np.stack([center, center + ahead], 1), np.float32)
 
 
+_SIZE = 0.45  # of names, as a scale of OpenCV's font
 _SHIFT = 3  # fractional bits of the pixel coordinates that are given to OpenCV
 
 
@@ -271,7 +286,7 @@ def _pixels(xy: F32, config: BevConfig) -> I32:
 
 def _caption(image: U8, text: str, at: tuple[int, int], color: Sequence[int]) -> None:
     for width, shade in ((3, _BACKGROUND), (1, color)):
-        cv2.putText(image, text, at, cv2.FONT_HERSHEY_SIMPLEX, 0.45, shade, width, cv2.LINE_AA)
+        cv2.putText(image, text, at, cv2.FONT_HERSHEY_SIMPLEX, _SIZE, shade, width, cv2.LINE_AA)
 
 
 @lru_cache(maxsize=2)
