@@ -50,8 +50,9 @@ class NuScenesExport(FolderExport):
     """Writes each frame as a sample: the scan, the images of all cameras, and the objects as annotations.
 
     The vehicle's frame is that of the points, which are upright, z up, several LiDARs merged. Images are
-    rectified, and each has the pose of the vehicle at its own time. An instance is a track. The tables are
-    written at the end, also where the run was interrupted.
+    rectified, and each has the pose of the vehicle at its own time. An instance is a track; its one category
+    is what it was called most, by score. The tables are written at the end, also where the run was
+    interrupted.
     """
 
     def __init__(self, folder: Path, camera: str = "") -> None:
@@ -61,6 +62,7 @@ class NuScenesExport(FolderExport):
         self._channels: dict[str, str] = {}
         self._known: dict[tuple[str, str], str] = {}  # tokens of rows that others refer to, by table and key
         self._annotated: dict[str, list[str]] = defaultdict(list)
+        self._named: dict[str, dict[str, float]] = defaultdict(lambda: defaultdict(float))  # by instance
         self._scene = ""
 
     def begin(self, items: Items[object]) -> None:
@@ -183,8 +185,8 @@ class NuScenesExport(FolderExport):
         for row, name in enumerate(objects.names):
             key = f"track {tracked[row]}" if row in tracked else f"object {self.frames} {row}"
             kind = KINDS.get(name.lower(), f"other.{name}")
-            category = self._once("category", kind, name=kind, description="")
-            instance = self._once("instance", key, category_token=category)
+            instance = self._once("instance", key)
+            self._named[instance][kind] += float(objects.score[row])
             turned = geometry.transform(
                 boxes.center[row], (0, 0, np.sin(boxes.yaw[row] / 2), np.cos(boxes.yaw[row] / 2))
             )
@@ -252,7 +254,9 @@ class NuScenesExport(FolderExport):
             }
         ]
         for row in self._rows["instance"]:
-            found = self._annotated[row["token"]]
+            found, named = self._annotated[row["token"]], self._named[row["token"]]
+            kind = max(named, key=named.__getitem__)
+            row["category_token"] = self._once("category", kind, name=kind, description="")
             row["nbr_annotations"] = len(found)
             row["first_annotation_token"], row["last_annotation_token"] = found[0], found[-1]
         with self._saving():
