@@ -13,6 +13,7 @@ from pathlib import Path
 
 NOT_OURS = 66
 BAGS = (".db3", ".bag")
+METADATA = "metadata.yaml"  # in a folder that is one bag
 
 
 def main() -> None:
@@ -33,12 +34,18 @@ def run(arguments: list[str]) -> int:
     parser.add_argument("--recording-id", default=None, metavar="ID", help="that the viewer proposes")
     options, _ = parser.parse_known_args(arguments)
     path = options.path.absolute()
-    if not _is_ours(path):
+    # What is asked with a folder has the folder's name for its application, else the file's own.
+    with_folder = options.application_id in ("", path.parent.name) and options.application_id != path.stem
+    if not _is_ours(path, with_folder):
         return NOT_OURS
+    if _comes_with_another(path, with_folder):
+        return 0
     from bevviz.errors import UserError
 
+    proposed = (options.application_id, options.recording_id)
     try:
-        _import(path, options.application_id, options.recording_id)
+        # Bags of a folder would be laid over each other in the one recording that is proposed.
+        _import(path, *((path.stem, None) if with_folder and path.is_file() else proposed))
     except UserError as error:
         print(f"bevviz: error: {error}", file=sys.stderr)
         return 1
@@ -75,5 +82,17 @@ def _import(path: Path, application_id: str, recording_id: str | None) -> None:
         warn(drive.warnings)
 
 
-def _is_ours(path: Path) -> bool:
-    return path.suffix in BAGS or (path / "metadata.yaml").is_file()
+def _is_ours(path: Path, with_folder: bool) -> bool:
+    return path.suffix in BAGS or (path / METADATA).is_file() or (with_folder and path.name == METADATA)
+
+
+def _comes_with_another(path: Path, with_folder: bool) -> bool:
+    """Whether Rerun asks about the same bag once more: of a folder it does, and of every file in it."""
+    if path.is_dir():
+        return len(_files(path)) == 1
+    of_folder = path.name == METADATA or ((path.parent / METADATA).is_file() and len(_files(path.parent)) > 1)
+    return with_folder and of_folder
+
+
+def _files(folder: Path) -> list[Path]:
+    return [path for path in folder.iterdir() if path.suffix in BAGS]

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+from bevviz import importer
 from bevviz.importer import NOT_OURS, run
 from tests import bags
 from tests.recordings import Recording, verify
@@ -54,6 +55,41 @@ def test_what_is_none_of_ours_is_said_so(drive: Path, tmp_path: Path) -> None:
     loaded = "import sys; from bevviz.importer import run; run(['x.png']); print('numpy' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", loaded], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "False"
+
+
+def asked(*paths: Path, monkeypatch: pytest.MonkeyPatch) -> list[tuple[Path, str, str | None]]:
+    """What is imported, as application and recording, where Rerun opens a folder and all that is in it."""
+    imported: list[tuple[Path, str, str | None]] = []
+    monkeypatch.setattr(importer, "_import", lambda *asked: imported.append(asked))
+    codes = [run([str(p), "--application-id", paths[0].stem, "--recording-id", "proposed"]) for p in paths]
+    assert not any(codes[1:])  # else Rerun says that it cannot load them
+    return imported
+
+
+def test_of_a_folder_that_is_opened_each_bag_comes_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = tmp_path / "drive"
+    folder.mkdir()
+    about, first, second = (folder / name for name in ("metadata.yaml", "drive.db3", "drive_1.db3"))
+    about.touch()
+    first.touch()
+    assert asked(folder, about, first, monkeypatch=monkeypatch) == [(first, "drive", "proposed")]
+    moved = first.rename(folder / "drive_0.db3")
+    second.touch()
+    assert asked(folder, about, moved, second, monkeypatch=monkeypatch) == [(folder, "drive", "proposed")]
+    imported = asked(second, monkeypatch=monkeypatch)  # by itself: its own name is proposed
+    assert [path for path, *_ in imported] == [second]
+    assert run([str(about), "--application-id", about.stem]) == NOT_OURS
+
+
+def test_bags_of_a_folder_are_not_laid_over_each_other(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bags = [tmp_path / "one.db3", tmp_path / "two.bag"]
+    for bag in bags:
+        bag.touch()
+    assert asked(tmp_path, *bags, monkeypatch=monkeypatch) == [(bags[0], "one", None), (bags[1], "two", None)]
 
 
 def test_a_bag_that_cannot_be_read_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
