@@ -16,7 +16,7 @@ from hypothesis.extra import numpy as hnp
 
 from bevviz import geometry
 from bevviz.config import load
-from bevviz.frame import F64, Cloud, Frame
+from bevviz.frame import F32, F64, Cloud, Frame
 from bevviz.perceive import perceive
 from bevviz.results import FrameResult
 from bevviz.ros.clouds import decode_cloud
@@ -113,6 +113,29 @@ def test_ground_and_clusters_are_those_of_an_upright_lidar(
     assert len(result.obstacles) == pytest.approx(len(plain.obstacles), rel=0.1)
     assert result.clusters.kept.sum() == pytest.approx(plain.clusters.kept.sum(), rel=0.15)
     assert result.clusters.obb.size[:, 2].max() < plain.clusters.obb.size[:, 2].max() + 0.5
+
+
+def in_a_hall(size: tuple[float, float, float], elevations: F64) -> F32:
+    """(N, 3) points of a LiDAR at a height of 1.9 m on the walls, the floor and the ceiling, in its frame."""
+    lidar = np.array([6.0, 0.47 * size[1], 1.9])
+    azimuth, elevation = np.meshgrid(np.radians(np.arange(0.05, 360, 0.4)), np.radians(elevations))
+    flat = np.cos(elevation)
+    rays = np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)], -1).reshape(-1, 3)
+    away = np.where(rays > 0, np.array(size) - lidar, -lidar) / rays
+    return np.asarray(rays * away.min(axis=1)[:, None], np.float32)
+
+
+@pytest.mark.parametrize("size", [(14.0, 7.0, 8.0), (14.0, 7.0, 2.7), (20.0, 3.0, 2.7)])
+@pytest.mark.parametrize("mounting", [np.eye(4), turned(z=70)])
+def test_walls_and_ceilings_are_no_ground(size: tuple[float, float, float], mounting: F64) -> None:
+    """In a hall most points are on them, nothing is behind, and few are on the floor."""
+    seen = geometry.apply(geometry.inverse(mounting), in_a_hall(size, np.linspace(-15, 15, 16)))
+    up = ground_normal(seen)
+    assert up is not None and np.degrees(np.arccos(min(1.0, up[2]))) < 5
+
+
+def test_where_only_walls_are_seen_nothing_tells() -> None:
+    assert ground_normal(in_a_hall((14.0, 7.0, 8.0), np.linspace(-7, 52, 32))) is None
 
 
 def test_the_base_frame_tells_what_is_ahead_too(scan: Cloud) -> None:

@@ -28,8 +28,15 @@ SLOPE = math.radians(8.0)  # the same where nothing but the world tells it: a ro
 DISAGREEMENT = math.radians(12.0)  # between transforms and ground, from which on one of them is wrong
 GRAVITY_TIME = 2.0  # seconds that an acceleration is smoothed over: braking is no slope
 NEAR, POINTS, PLANES = 25.0, 4000, 400  # metres; points and planes that the ground is searched with
+LOW = 0.2  # of the points, by z, that as many planes more are drawn from
 THICKNESS = 0.12  # metres that the ground's points are from its plane
 SUPPORT, BELOW = 0.15, 0.02  # of the near points: in the ground at least, below it at most
+FLOOR, UNDER, LOWEST = (
+    0.05,
+    0.01,
+    0.5,
+)  # the same of the floor of a hall, and metres that it is below at least
+ASTRAY, SURE = math.radians(45.0), 0.25  # z of a frame, from which on a wall may be meant; its SUPPORT
 HEIGHTS = 0.15, 6.0  # metres from the ground to a LiDAR
 TRIES = 5  # scans that the ground is looked for in
 
@@ -146,16 +153,18 @@ class Upright:
 def ground_normal(points: F32) -> F64 | None:
     """Up, as the ground under a LiDAR tells it, whatever way the LiDAR is turned.
 
-    The ground is the plane through many of the near points that has almost nothing below it. Walls may have
-    nothing behind them either: of several planes it is one that z of the frame agrees with, where there is
-    one, else the one with most points.
+    The ground is the plane through many of the near points that has almost nothing below it. Walls and
+    ceilings may have nothing behind them either, and in a hall most of the points. Of several planes it is
+    therefore one that z of the frame agrees with, where there is one, else the one with most points. One that
+    is turned as a wall is to z needs more of them, none like it opposite, and that not even few points are a
+    floor that z agrees with.
     Planes are drawn at random (RANSAC: Fischler and Bolles 1981), always the same ones.
 
     Args:
         points: (N, 3) metres, the LiDAR at the origin.
 
     Returns:
-        (3,) unit vector; None: no such plane.
+        (3,) unit vector; z, where a floor of few points agrees with it; None: no such plane.
     """
     near = points[np.einsum("ij,ij->i", points, points) < NEAR**2]
     if len(near) < 200:
@@ -165,25 +174,40 @@ def ground_normal(points: F32) -> F64 | None:
     # Every third of a metre counts once: else the rings about the LiDAR are all that there is.
     _, first = np.unique(np.floor(sample / 0.3).astype(np.int64), axis=0, return_index=True)
     sample = sample[first]
-    a, b, c = (sample[random.integers(0, len(sample), PLANES)] for _ in range(3))
+    low = sample[sample[:, 2] <= np.quantile(sample[:, 2], LOW)]  # a floor of few points is not drawn else
+    normals, heights = (
+        np.concatenate(pair) for pair in zip(*(_planes(some, random) for some in (sample, low)), strict=True)
+    )
+    distance = sample @ normals.T + heights  # (points, planes), above the plane
+    support = (np.abs(distance) < THICKNESS).mean(axis=0)
+    below = (distance < -2 * THICKNESS).mean(axis=0)
+    floor = (support > FLOOR) & (below < UNDER) & (heights > LOWEST) & (heights < HEIGHTS[1])
+    opposite = (normals @ normals[floor].T < -math.cos(DISAGREEMENT)).any(axis=1)
+    astray = normals[:, 2] < math.cos(ASTRAY)
+    fit = (support > np.where(astray, SURE, SUPPORT)) & (below < BELOW)
+    fit &= (heights > HEIGHTS[0]) & (heights < HEIGHTS[1]) & ~(astray & opposite)
+    upwards = normals[:, 2] > math.cos(DISAGREEMENT)
+    usual = fit & upwards
+    best = int(np.argmax(np.where(usual if usual.any() else fit, support, -1.0)))
+    if (astray[best] or not fit[best]) and (floor & upwards).any():
+        return _Z
+    if not fit[best]:
+        return None
+    inliers = sample[np.abs(distance[:, best]) < THICKNESS]
+    _, _, axes = np.linalg.svd(inliers - inliers.mean(axis=0), full_matrices=False)
+    normal: F64 = axes[2] * np.sign(axes[2] @ normals[best])
+    return normal
+
+
+def _planes(points: F64, random: np.random.Generator) -> tuple[F64, F64]:
+    """(P, 3) normals and (P,) distances of planes through three of the points; they face the origin."""
+    a, b, c = (points[random.integers(0, len(points), PLANES)] for _ in range(3))
     normals = np.cross(b - a, c - a)
     lengths = np.linalg.norm(normals, axis=1)
     normals, origins = normals[lengths > 0.5] / lengths[lengths > 0.5, None], a[lengths > 0.5]
     height = np.einsum("ij,ij->i", normals, origins)
     normals[height > 0] *= -1  # the LiDAR is above its ground
-    heights = np.abs(height)
-    distance = sample @ normals.T + heights  # (points, planes), above the plane
-    support = (np.abs(distance) < THICKNESS).mean(axis=0)
-    below = (distance < -2 * THICKNESS).mean(axis=0)
-    fit = (support > SUPPORT) & (below < BELOW) & (heights > HEIGHTS[0]) & (heights < HEIGHTS[1])
-    if not fit.any():
-        return None
-    usual = fit & (normals[:, 2] > math.cos(DISAGREEMENT))
-    best = int(np.argmax(np.where(usual if usual.any() else fit, support, -1.0)))
-    inliers = sample[np.abs(distance[:, best]) < THICKNESS]
-    _, _, axes = np.linalg.svd(inliers - inliers.mean(axis=0), full_matrices=False)
-    normal: F64 = axes[2] * np.sign(axes[2] @ normals[best])
-    return normal
+    return normals, np.abs(height)
 
 
 def _least_turn(frame: str, up: F64) -> F64:
