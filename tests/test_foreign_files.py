@@ -174,3 +174,23 @@ def test_boxes_in_a_map_far_from_its_origin_keep_their_place() -> None:
     boxes = moved(decode_detections_3d(msg, "/boxes", 0).boxes, inverse(map_from_points))
     assert boxes.center.dtype == np.float32
     np.testing.assert_allclose(boxes.center, there, atol=1e-4)
+
+
+def test_kitti_whose_frames_are_called_by_tokens(tmp_path: Path) -> None:
+    """As nuScenes' devkit converts its scenes; they were a plain folder without a calibration."""
+    token = "3a2e1b9f8c7d4e5f9a0b1c2d3e4f5a6b"
+    for folder in ("velodyne", "calib"):
+        (tmp_path / folder).mkdir()
+    np.ones((2000, 4), "<f4").tofile(tmp_path / f"velodyne/{token}.bin")
+    (tmp_path / f"calib/{token}.txt").write_text(
+        f"P2: {TR}\nR0_rect: 1 0 0 0 1 0 0 0 1\nTr_velo_to_cam: {TR}\n"
+    )
+    drive = open_dataset(tmp_path)
+    assert drive and drive.name == "kitti-object"
+
+
+def test_names_of_fields_as_of_cloudcompare(tmp_path: Path) -> None:
+    head = "ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\nproperty float z\n"
+    (tmp_path / "1.ply").write_text(f"{head}property float scalar_intensity\nend_header\n1 2 3 4\n")
+    points, _ = read_cloud(tmp_path / "1.ply", ())
+    assert points.dtype.names == ("x", "y", "z", "intensity")

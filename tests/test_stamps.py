@@ -264,8 +264,8 @@ def test_many_files_that_cannot_be_read_are_one_sentence(tmp_path: Path) -> None
         assert len(list(drive.frames)) == 5
         told = [line for line in drive.warnings if "/top/points: " in line]
     assert len(told) == 2
-    assert "4 of its 9 files cannot be read; the first: " in told[0] and "has the shape (4, 500)" in told[0]
-    assert "4 of its 9 files are cut; the first: " in told[1] and "12.pcd: is cut: 9 of 20 points" in told[1]
+    assert "4 of 9 cannot be read; the first: " in told[0] and "has the shape (4, 500)" in told[0]
+    assert "4 of 9 are cut; the first: " in told[1] and "12.pcd: is cut: 9 of 20 points" in told[1]
 
 
 @pytest.mark.parametrize(("size", "told"), [("", True), ("size: [1280, 720], ", False)])
@@ -286,3 +286,12 @@ def test_a_calibration_for_larger_images(size: str, told: bool, tmp_path: Path) 
 def test_a_rate_that_is_none(rate: str, tmp_path: Path) -> None:
     with pytest.raises(UserError, match=r"calibration\.yaml: rate is"):
         drive_in(tmp_path, {"top": "1.bin"}, f"rate: {rate}")
+
+
+def test_calibrations_of_other_programs_are_named(tmp_path: Path) -> None:
+    (tmp_path / "calib/camera").mkdir(parents=True)
+    for name in ("calib/camera/front.json", "calib/camera/rear.json", "intrinsics.yaml"):
+        (tmp_path / name).write_text("{}")
+    drive_in(tmp_path, {"top": "1.bin", "front": "1.png"})
+    said = "front: calibration.yaml does not state K; intrinsics.yaml and 2 more are not read"
+    assert said in drive_in.warnings  # type: ignore[attr-defined]

@@ -43,6 +43,7 @@ from bevviz.ros.encode import (
 )
 
 MOST_COLUMNS = 64  # of an NPY file; a grid of heights has more, and so has a table the other way round
+NOTES = (".json", ".yaml", ".yml", ".xml", ".txt", ".toml")
 MAP, BASE = "map", "base_link"
 CALIBRATION, STAMPS, POSES = "calibration.yaml", "stamps.csv", "poses.txt"
 OF_SENSORS = re.compile(  # a folder with one for each camera or LiDAR
@@ -56,6 +57,7 @@ LENS = {"D", "distortion_model"}
 SENSOR_KEYS = {"pose", "rate", "fields", "K", "size", *LENS}
 STAMP = r"\d{1,19}(\.\d*)?"
 MOST_SECONDS = 1e10  # of a stamp: more is another unit
+FEW = 5  # frames, which tell no rate
 MUCH_FURTHER = 1.5  # times as many frames, which another rate gives
 
 
@@ -85,6 +87,8 @@ class Folder(Dataset):
             raise UserError(f"{path}: no cloud in it{others and '; '}{others}; expected {self.expects}")
         if others:
             self.warn(others)
+        if bare := [name for name in cameras if "K" not in about.get("cameras", {}).get(name, {})]:
+            self.warn(f"{', '.join(bare)}: {CALIBRATION} does not state K{_notes(path)}")
         for kind, there in (("lidars", lidars), ("cameras", cameras)):
             if unknown := sorted(about.get(kind, {}).keys() - there.keys()):
                 names = f"there are {', '.join(there)}" if there else "there is none"
@@ -285,7 +289,7 @@ class Folder(Dataset):
     ) -> None:
         """Tell of a sensor whose numbers of frames go much further than those of the LiDAR."""
         (first, last), (start, end) = [(min(n.values()), max(n.values())) for n in (frames, mine)]
-        if end - start > MUCH_FURTHER * (last - first + 1):
+        if min(len(frames), len(mine)) >= FEW and end - start > MUCH_FURTHER * (last - first + 1):
             self.warn(
                 f"{name} has the frames {start} to {end}, {lead} {first} to {last}: taken for the same; "
                 f"where it counts its own, its rate can be stated ({CALIBRATION})"
@@ -350,6 +354,19 @@ def _places(path: Path) -> dict[Path, str]:
 
 def _folders(path: Path) -> list[Path]:
     return sorted(found for found in path.iterdir() if found.is_dir() and not HIDDEN.match(found.name))
+
+
+def _notes(path: Path) -> str:
+    """A clause on other programs' calibrations and labels, which are not read; "": there are none."""
+    folders = [path, *(inner for folder in _folders(path) for inner in (folder, *_folders(folder)))]
+    found = [f for folder in folders for f in sorted(folder.iterdir()) if f.suffix.lower() in NOTES]
+    found = [f for f in found if f.name not in (CALIBRATION, STAMPS, POSES) and not HIDDEN.match(f.name)]
+    if not found:
+        return ""
+    named = found[0].relative_to(path)
+    return (
+        f"; {named} is not read" if len(found) == 1 else f"; {named} and {len(found) - 1} more are not read"
+    )
 
 
 def _links_to_nowhere(folder: Path) -> list[Path]:

@@ -38,7 +38,10 @@ class KittiObject(Dataset):
 
     @classmethod
     def fits(cls, path: Path) -> bool:
-        return (path / "velodyne").is_dir() and any((path / "calib").glob("[0-9]" * 6 + ".txt"))
+        if any((path / "calib").glob("[0-9]" * 6 + ".txt")):
+            return (path / "velodyne").is_dir()
+        scan = next((path / "velodyne").glob("*.bin"), None)  # converters name them by tokens, too
+        return scan is not None and not scan.stem.isdigit() and (path / f"calib/{scan.stem}.txt").is_file()
 
     def __init__(self, path: Path, sequence: str) -> None:
         super().__init__(path, sequence)

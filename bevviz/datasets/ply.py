@@ -56,7 +56,10 @@ def read_ply(file: Path) -> tuple[NDArray[np.void], int]:
 
 
 def _header(data: bytes) -> tuple[str, list[tuple[str, int, list[tuple[str, str]]]], int]:
-    """The format; elements with their number and properties (name, type); where the header ends."""
+    """The format; elements with their number and properties (name, type); where the header ends.
+
+    CloudCompare writes ``scalar_`` before the names of fields.
+    """
     end = data.find(b"end_header", 0, MOST_HEADER)
     newline = data.find(b"\n", end)
     if not data.startswith(b"ply") or end < 0 or newline < 0:
@@ -72,7 +75,7 @@ def _header(data: bytes) -> tuple[str, list[tuple[str, int, list[tuple[str, str]
                 case ["property", "list", _, _, label]:
                     elements[-1][2].append((label, "list"))
                 case ["property", kind, label]:
-                    elements[-1][2].append((label, kind))
+                    elements[-1][2].append((label.removeprefix("scalar_"), kind))
     except (ValueError, IndexError):
         raise ValueError("no header of a PLY, or a damaged one") from None
     if order not in ORDERS or any(count < 0 for _, count, _ in elements):

@@ -43,9 +43,7 @@ class DatasetReader:
         for found, of_many in ((self._lost, "cannot be read"), (self._cut, "are cut")):
             for number, rows in found.items():
                 stream, first = self._streams[number], rows[min(rows)]
-                several = (
-                    f"{stream.topic}: {len(rows)} of its {len(stream.times)} files {of_many}; the first: "
-                )
+                several = f"{stream.topic}: {len(rows)} of {len(stream.times)} {of_many}; the first: "
                 said.append(f"{several if len(rows) > 1 else ''}{first}")
         return said
 

@@ -8,9 +8,13 @@ from pathlib import Path
 AS_CLOUDS = "save them as PCD, PLY, BIN or NPY"
 AS_IMAGES = "save them as PNG or JPEG"
 KINDS = {
-    **dict.fromkeys((".las", ".laz", ".e57", ".xyz", ".pts", ".npz", ".vtk", ".feather"), AS_CLOUDS),
+    **dict.fromkeys(
+        (".las", ".laz", ".e57", ".xyz", ".pts", ".npz", ".vtk", ".feather", ".pkl", ".h5", ".hdf5"),
+        AS_CLOUDS,
+    ),
     **dict.fromkeys((".tif", ".tiff", ".bmp", ".pgm", ".ppm", ".exr", ".raw"), AS_IMAGES),
     **dict.fromkeys((".mp4", ".avi", ".mkv", ".mov"), "save their images as PNG or JPEG"),
+    **dict.fromkeys((".gz", ".zip", ".zst"), "unpack them"),
     ".pcap": "play them through their driver and record its topics",
     ".tfrecord": "convert them, for instance to KITTI's layout",
 }
