@@ -377,6 +377,14 @@ def test_stamps_of_a_table_and_of_names(tmp_path: Path, capsys: Capture) -> None
     [
         ("cameras: {front: {K: [1, 2]}}", "camera front: K needs 9 numbers"),
         ("cameras: {front: {pose: [1, 2, 3]}}", "pose of front: 3 numbers; expected x y z qx qy qz qw"),
+        ("cameras: {front: {K: [7, 0, 0, 0, 7, 0, 4, 3, 1]}}", "row by row (the last 0 0 1)"),
+        ("cameras: {front: {pose: [1, 2, 3, 0, 0, 1, 1]}}", "its quaternion has the length 1.41, not 1"),
+        (
+            "lidars: {top: {pose: [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 5, 6, 7, 1]}}",
+            "last row is not 0 0 0 1",
+        ),
+        ("lidars: {top: {pose: [1, 0, 0, 0, 0, -1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]}}", "is no rotation"),
+        ("lidars: {top: {fields: [x, y, i]}}", "is no list with x, y and z in it"),
         ("cameras: {rear: {}}", "no rear among the cameras; there are front"),
         ("camera: {}", "camera is not known; there are D, K, cameras"),
         ("cameras: [", "is not valid YAML"),

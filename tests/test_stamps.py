@@ -295,3 +295,9 @@ def test_calibrations_of_other_programs_are_named(tmp_path: Path) -> None:
     drive_in(tmp_path, {"top": "1.bin", "front": "1.png"})
     said = "front: calibration.yaml does not state K; intrinsics.yaml and 2 more are not read"
     assert said in drive_in.warnings  # type: ignore[attr-defined]
+
+
+def test_a_pose_in_millimetres_is_told(tmp_path: Path) -> None:
+    drive_in(tmp_path, {"top": "1.bin"}, "lidars: {top: {pose: [500, 0, 1900, 0, 0, 0, 1]}}")
+    said = "calibration.yaml: top is 1,900 m from base_link: a pose is in metres"
+    assert said in drive_in.warnings  # type: ignore[attr-defined]

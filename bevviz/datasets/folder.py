@@ -57,6 +57,8 @@ LENS = {"D", "distortion_model"}
 SENSOR_KEYS = {"pose", "rate", "fields", "K", "size", *LENS}
 STAMP = r"\d{1,19}(\.\d*)?"
 MOST_SECONDS = 1e10  # of a stamp: more is another unit
+UNIT = 0.01  # how far the length of a quaternion may be from one
+FAR = 100  # metres between sensors of a vehicle
 FEW = 5  # frames, which tell no rate
 MUCH_FURTHER = 1.5  # times as many frames, which another rate gives
 
@@ -182,6 +184,10 @@ class Folder(Dataset):
             UserError: it holds float64.
         """
         if stated is not None:
+            if not isinstance(stated, list) or not {"x", "y", "z"} <= {*stated}:
+                raise UserError(
+                    f"{self.path / CALIBRATION}: fields: {stated} is no list with x, y and z in it"
+                )
             return [str(name) for name in stated]
         fields = self.columns_in(files, hint=f" (fields in {CALIBRATION})")
         shape = next((shape_of(file) for file in files if file.suffix.lower() == ".npy"), ())
@@ -196,27 +202,40 @@ class Folder(Dataset):
             numbers = np.array(values, np.float64).reshape(-1)
             if len(numbers) == 16:
                 pose = numbers.reshape(4, 4)
-                if not np.allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), atol=1e-3):
+                rotation = pose[:3, :3]
+                if (
+                    not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3)
+                    or np.linalg.det(rotation) < 0
+                ):
                     raise ValueError("its upper left part is no rotation")
-                return pose
-            if len(numbers) != 7:
+                if not np.allclose(pose[3], (0, 0, 0, 1)):
+                    raise ValueError("its last row is not 0 0 0 1")
+            elif len(numbers) != 7:
                 raise ValueError(f"{len(numbers)} numbers")
-            return geometry.transform(numbers[:3], numbers[3:])
+            elif abs((length := np.linalg.norm(numbers[3:])) - 1) > UNIT:
+                raise ValueError(f"its quaternion has the length {length:.2f}, not 1")
+            else:
+                pose = geometry.transform(numbers[:3], numbers[3:])
         except (TypeError, ValueError) as error:
             raise UserError(
                 f"{self.path / CALIBRATION}: pose of {sensor}: {error}; expected x y z qx qy qz qw of the "
                 "sensor in base_link, or 16 numbers of a matrix"
             ) from None
+        if (away := np.abs(pose[:3, 3]).max()) > FAR:
+            self.warn(f"{CALIBRATION}: {sensor} is {away:,.0f} m from {BASE}: a pose is in metres")
+        return pose
 
     def _camera_info(self, name: str, times: I64, stated: Mapping[str, Any]) -> Stream:
         try:
             matrix = np.array(stated["K"], np.float64).reshape(3, 3)
             distortion = np.array(stated.get("D", ()), np.float64).reshape(-1)
             width, height = map(int, stated.get("size", (0, 0)))
+            if not np.array_equal(matrix[2], (0, 0, 1)):
+                raise ValueError
         except (TypeError, ValueError):
             raise UserError(
-                f"{self.path / CALIBRATION}: camera {name}: K needs 9 numbers, row by row, D only numbers, "
-                "and size the width and height of the images that K is for"
+                f"{self.path / CALIBRATION}: camera {name}: K needs 9 numbers, row by row (the last 0 0 1), D "
+                "numbers, and size the width and height of the images that K is for"
             ) from None
         model = str(stated.get("distortion_model", "plumb_bob" if len(distortion) else ""))
         if model in geometry.FISHEYE and "D" not in stated:
