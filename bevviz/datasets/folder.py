@@ -234,8 +234,8 @@ class Folder(Dataset):
                 raise ValueError
         except (TypeError, ValueError):
             raise UserError(
-                f"{self.path / CALIBRATION}: camera {name}: K needs 9 numbers, row by row (the last 0 0 1), D "
-                "numbers, and size the width and height of the images that K is for"
+                f"{self.path / CALIBRATION}: camera {name}: K needs 9 numbers, row by row (the last 0 0 1), "
+                "D numbers, and size the width and height of the images that K is for"
             ) from None
         model = str(stated.get("distortion_model", "plumb_bob" if len(distortion) else ""))
         if model in geometry.FISHEYE and "D" not in stated:
