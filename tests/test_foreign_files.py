@@ -17,7 +17,7 @@ from bevviz.geometry import inverse, moved, transform
 from bevviz.ros.clouds import decode_cloud
 from bevviz.ros.detections import decode_detections_3d
 from bevviz.ros.encode import encode_labels
-from tests.datasets import TR, kitti_odometry, nuscenes
+from tests.datasets import TR, kitti_odometry, kitti_raw, nuscenes
 
 OLD = """# .PCD v.5 - Point Cloud Data file format
 VERSION .5
@@ -194,3 +194,14 @@ def test_names_of_fields_as_of_cloudcompare(tmp_path: Path) -> None:
     (tmp_path / "1.ply").write_text(f"{head}property float scalar_intensity\nend_header\n1 2 3 4\n")
     points, _ = read_cloud(tmp_path / "1.ply", ())
     assert points.dtype.names == ("x", "y", "z", "intensity")
+
+
+def test_kitti_that_was_copied_by_a_mac(tmp_path: Path) -> None:
+    """What it lays beside each file was a scan without a number, and the drive was refused."""
+    for folder in (kitti_odometry(tmp_path), kitti_raw(tmp_path)):
+        for file in [f for f in folder.rglob("*") if f.suffix in (".bin", ".png", ".label", ".txt")]:
+            file.with_name(f"._{file.name}").write_bytes(b"\0\5\x16\7")
+        drive = open_dataset(folder)
+        assert drive
+        counts = {stream.topic: len(stream.times) for stream in drive.streams}
+        assert counts[CLOUDS] == 3, counts

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,6 +23,7 @@ LOOKED_AT = 500_000  # bytes of a BIN file, for the number of its columns
 MOST_OF_POINTER = 1024  # bytes, by Git LFS's specification
 FIELDS = ("x", "y", "z", "intensity")
 BOXES = "bevviz_msgs/msg/Detection3DArray"
+HIDDEN = re.compile(r"\.|__MACOSX$")
 CLOUDS = (".pcd", ".ply", ".bin", ".npy")
 IMAGES = (".png", ".jpg", ".jpeg", ".webp")
 
@@ -190,6 +193,20 @@ def pictures(
 
     topic = f"/{camera}/{'image_rect' if rectified else 'image_raw'}/compressed"
     return Stream(topic, "sensor_msgs/msg/CompressedImage", times, make, aside)
+
+
+def files_in(
+    folder: Path, suffixes: Sequence[str], chosen: Callable[[os.DirEntry[str]], bool] = os.DirEntry.is_file
+) -> list[Path]:
+    """Files with these suffixes, in lower or upper case, by name; none where there is no such folder.
+
+    What systems hide there is left out. Of many thousands none is looked at by itself.
+    """
+    if not folder.is_dir():
+        return []
+    with os.scandir(folder) as entries:
+        names = [e.name for e in entries if e.name.lower().endswith((*suffixes,)) and chosen(e)]
+    return [folder / name for name in sorted(names) if not HIDDEN.match(name)]
 
 
 def read_bytes(path: Path) -> bytes:

@@ -16,11 +16,13 @@ from bevviz import geometry
 from bevviz.datasets.columns import are_whole
 from bevviz.datasets.dataset import (
     CLOUDS,
+    HIDDEN,
     IMAGES,
     LOOKED_AT,
     Dataset,
     Stream,
     columns_of,
+    files_in,
     frames_at,
     is_pointer,
     pictures,
@@ -50,7 +52,6 @@ OF_SENSORS = re.compile(  # a folder with one for each camera or LiDAR
     "cam|im(g|age)|lidar|velo|point|cloud|pcd|scan", re.IGNORECASE
 )
 OF_DRIVES = re.compile(r"\d{3,}$|train|val|test", re.IGNORECASE)  # a folder of one drive or part, not sensor
-HIDDEN = re.compile(r"\.|__MACOSX$")
 NEAREST = {"i8": "<f8", "u8": "<f8", "f2": "<f4", "b1": "u1"}  # that a PointCloud2 can hold
 KEYS = {"rate", "fields", "lidars", "cameras"}
 LENS = {"D", "distortion_model"}
@@ -76,7 +77,7 @@ class Folder(Dataset):
 
     @classmethod
     def fits(cls, path: Path) -> bool:
-        return any(_of_kind(folder, CLOUDS) for folder in _places(path))
+        return any(files_in(folder, CLOUDS) for folder in _places(path))
 
     def __init__(self, path: Path, sequence: str) -> None:
         super().__init__(path, sequence)
@@ -134,7 +135,7 @@ class Folder(Dataset):
                 name = places[folder] or alone
                 if name in found[kind] or (folder == self.path and name in places.values()):
                     name = f"{(folder if folder == self.path else folder.parent).name}_{name}"
-                found[kind] |= self._apart(name, _of_kind(folder, suffixes), about.get(kind, ()))
+                found[kind] |= self._apart(name, files_in(folder, suffixes), about.get(kind, ()))
         if gone := [file for folder in places for file in _links_to_nowhere(folder)]:
             self.warn(f"{self._first(gone)}: a link to what is not there")
         lidars = found["lidars"]
@@ -378,8 +379,8 @@ def _folders(path: Path) -> list[Path]:
 def _notes(path: Path) -> str:
     """A clause on other programs' calibrations and labels, which are not read; "": there are none."""
     folders = [path, *(inner for folder in _folders(path) for inner in (folder, *_folders(folder)))]
-    found = [f for folder in folders for f in sorted(folder.iterdir()) if f.suffix.lower() in NOTES]
-    found = [f for f in found if f.name not in (CALIBRATION, STAMPS, POSES) and not HIDDEN.match(f.name)]
+    found = [file for folder in folders for file in files_in(folder, NOTES)]
+    found = [file for file in found if file.name not in (CALIBRATION, STAMPS, POSES)]
     if not found:
         return ""
     named = found[0].relative_to(path)
@@ -389,15 +390,7 @@ def _notes(path: Path) -> str:
 
 
 def _links_to_nowhere(folder: Path) -> list[Path]:
-    return sorted(f for f in folder.iterdir() if f.suffix.lower() in (*CLOUDS, *IMAGES) and not f.exists())
-
-
-def _of_kind(folder: Path, suffixes: Sequence[str]) -> list[Path]:
-    return sorted(
-        f
-        for f in folder.iterdir()
-        if f.suffix.lower() in suffixes and f.is_file() and not HIDDEN.match(f.name)
-    )
+    return files_in(folder, (*CLOUDS, *IMAGES), lambda entry: entry.is_symlink() and not entry.is_file())
 
 
 def _in_order(files: Sequence[Path], stamped: Mapping[Path, int]) -> tuple[list[Path], I64]:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from bevviz import geometry
-from bevviz.datasets.dataset import IMAGES, Stream, read_points, read_text
+from bevviz.datasets.dataset import Stream, files_in, read_points, read_text
 from bevviz.errors import UserError
 from bevviz.frame import F64, I64, Boxes3D, ImageLabels, Intrinsics, LabelledBoxes3D
 from bevviz.ros.encode import (
@@ -33,7 +33,7 @@ def label_files(path: Path) -> Sequence[Path]:
     Raises:
         UserError: there is none.
     """
-    files = sorted(path.glob("*.txt")) if path.is_dir() else [path]
+    files = files_in(path, [".txt"]) if path.is_dir() else [path]
     if not files or not files[0].is_file():
         raise UserError(f"--kitti-labels {path}: no label file there; expected label_2/000000.txt or label_2")
     return files
@@ -210,11 +210,6 @@ def clouds(times: I64, files: Sequence[Path], fields: Sequence[str]) -> Stream:
         return encode_points(int(times[row]), LIDAR, read_points(files[row], fields))
 
     return Stream(CLOUDS, "sensor_msgs/msg/PointCloud2", times, make)
-
-
-def images_in(folder: Path) -> list[Path]:
-    """Images in order of name: KITTI's PNG, or what they are converted to."""
-    return sorted(file for file in folder.glob("*") if file.suffix.lower() in IMAGES)
 
 
 def camera_info(camera: str, times: I64, matrix: F64) -> Stream:

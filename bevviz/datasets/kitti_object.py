@@ -9,13 +9,12 @@ from typing import Any
 import numpy as np
 
 from bevviz import geometry
-from bevviz.datasets.dataset import BOXES, SECOND, Dataset, Stream, pictures
+from bevviz.datasets.dataset import BOXES, IMAGES, SECOND, Dataset, Stream, files_in, pictures
 from bevviz.datasets.kitti import (
     LIDAR,
     MAP,
     Calibration,
     clouds,
-    images_in,
     mountings,
     read_labels,
     truth,
@@ -40,12 +39,12 @@ class KittiObject(Dataset):
     def fits(cls, path: Path) -> bool:
         if any((path / "calib").glob("[0-9]" * 6 + ".txt")):
             return (path / "velodyne").is_dir()
-        scan = next((path / "velodyne").glob("*.bin"), None)  # converters name them by tokens, too
-        return scan is not None and not scan.stem.isdigit() and (path / f"calib/{scan.stem}.txt").is_file()
+        scans = files_in(path / "velodyne", [".bin"])[:1]  # converters name them by tokens, too
+        return any(not s.stem.isdigit() and (path / f"calib/{s.stem}.txt").is_file() for s in scans)
 
     def __init__(self, path: Path, sequence: str) -> None:
         super().__init__(path, sequence)
-        scans = sorted((path / "velodyne").glob("*.bin"))
+        scans = files_in(path / "velodyne", [".bin"])
         if not scans:
             raise UserError(f"{path / 'velodyne'}: no scan in it; expected 000000.bin")
         fields = self.columns_in(scans)
@@ -67,7 +66,7 @@ class KittiObject(Dataset):
             mountings(int(times[0]), [(MAP, LIDAR, np.eye(4))]),
             Stream("/tf", "tf2_msgs/msg/TFMessage", times, mounting),
         ]
-        images = {image.stem: image for image in images_in(path / CAMERA)}
+        images = {image.stem: image for image in files_in(path / CAMERA, IMAGES)}
         seen = [row for row, name in enumerate(names) if name in images]
         if seen:
             at = times[seen]

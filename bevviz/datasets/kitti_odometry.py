@@ -9,9 +9,11 @@ import numpy as np
 
 from bevviz import geometry
 from bevviz.datasets.dataset import (
+    IMAGES,
     SECOND,
     Dataset,
     Stream,
+    files_in,
     frames_at,
     joined_columns,
     pictures,
@@ -25,7 +27,6 @@ from bevviz.datasets.kitti import (
     Calibration,
     camera_info,
     clouds,
-    images_in,
     mountings,
     places,
     truth,
@@ -85,7 +86,7 @@ class KittiOdometry(Dataset):
             folder = path / "sequences" / self.one_of([drive.name for drive in self.drives(path)])
         elif sequence:
             raise UserError(f"{path}: is one drive; leave --sequence {sequence} out")
-        scans = sorted((folder / "velodyne").glob("*.bin"))
+        scans = files_in(folder / "velodyne", [".bin"])
         if not scans:
             raise UserError(f"{folder / 'velodyne'}: no scan in it; expected 000000.bin")
         if not (folder / "calib.txt").is_file():
@@ -97,7 +98,9 @@ class KittiOdometry(Dataset):
         times = self._times(folder, numbers)
         edges, cameras = [], list[Stream]()
         for camera, aside in CAMERAS.items():
-            images = {int(file.stem): file for file in images_in(folder / camera) if file.stem.isdigit()}
+            images = {
+                int(file.stem): file for file in files_in(folder / camera, IMAGES) if file.stem.isdigit()
+            }
             rows = [row for row, number in enumerate(numbers) if number in images]
             if not rows:
                 continue
@@ -116,7 +119,7 @@ class KittiOdometry(Dataset):
                 self.warn(f"poses.txt has {len(poses)} poses: {len(numbers) - len(known)} scans have none")
             self.streams.append(places(times[known], LIDAR, poses[[numbers[row] for row in known]]))
         self.streams += cameras
-        labels = {int(file.stem): file for file in (folder / "labels").glob("*.label")}
+        labels = {int(file.stem): file for file in files_in(folder / "labels", [".label"])}
         if not labels:
             self.streams.append(clouds(times, scans, fields))
             return

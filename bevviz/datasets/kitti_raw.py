@@ -11,7 +11,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from bevviz import geometry
-from bevviz.datasets.dataset import Dataset, Stream, pictures, read_table, read_text
+from bevviz.datasets.dataset import IMAGES, Dataset, Stream, files_in, pictures, read_table, read_text
 from bevviz.datasets.kitti import (
     IMU,
     LIDAR,
@@ -60,7 +60,7 @@ class KittiRaw(Dataset):
             folder = path / self.one_of([drive.name for drive in self.drives(path)])
         elif sequence:
             raise UserError(f"{path}: is one drive; leave --sequence {sequence} out")
-        if any((folder / "velodyne_points/data").glob("*.txt")):
+        if files_in(folder / "velodyne_points/data", [".txt"]):
             raise UserError(f"{folder}: is unrectified (extract); give the drive that is called ..._sync")
         scans, times = self._files(folder / "velodyne_points", ".bin")
         if not scans:
@@ -96,7 +96,7 @@ class KittiRaw(Dataset):
         """Where they are, and what they saw."""
         edges, streams = [], list[Stream]()
         for camera, aside in CAMERAS.items():
-            images, times = self._files(folder / camera, ".png", ".jpg")
+            images, times = self._files(folder / camera, *IMAGES)
             if not images:
                 continue
             cameras = folder.parent / "calib_cam_to_cam.txt"
@@ -127,7 +127,7 @@ class KittiRaw(Dataset):
 
     def _files(self, folder: Path, *suffixes: str) -> tuple[list[Path], I64]:
         """The files of a sensor and their stamps; a file is missing here and there, a stamp never."""
-        files = sorted(f for suffix in suffixes for f in (folder / "data").glob(f"*{suffix}"))
+        files = files_in(folder / "data", suffixes)
         if not files:
             return [], np.zeros(0, np.int64)
         stamps = folder / "timestamps.txt"

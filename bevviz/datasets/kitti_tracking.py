@@ -6,14 +6,23 @@ from collections import defaultdict
 from pathlib import Path
 
 from bevviz import geometry
-from bevviz.datasets.dataset import BOXES, Dataset, Stream, frames_at, pictures, read_table, read_text
+from bevviz.datasets.dataset import (
+    BOXES,
+    IMAGES,
+    Dataset,
+    Stream,
+    files_in,
+    frames_at,
+    pictures,
+    read_table,
+    read_text,
+)
 from bevviz.datasets.kitti import (
     IMU,
     LIDAR,
     Calibration,
     camera_info,
     clouds,
-    images_in,
     labelled_boxes,
     mountings,
     places,
@@ -55,7 +64,7 @@ class KittiTracking(Dataset):
                 raise UserError(f"{path}: is one drive; leave --sequence {sequence} out")
         else:
             name = self.one_of([drive.name for drive in self.drives(path)])
-        scans = sorted((root / "velodyne" / name).glob("*.bin"))
+        scans = files_in(root / "velodyne" / name, [".bin"])
         if not scans:
             raise UserError(f"{root / 'velodyne' / name}: no scan in it; expected 000000.bin")
         self.path = root
@@ -65,7 +74,7 @@ class KittiTracking(Dataset):
         times = frames_at(RATE, _numbers(scans))
         edges, sensors = [], list[Stream]()
         for camera, aside in CAMERAS.items():
-            images = images_in(root / camera / name)
+            images = files_in(root / camera / name, IMAGES)
             if not images:
                 continue
             at = frames_at(RATE, _numbers(images))
