@@ -189,11 +189,12 @@ def test_kitti_whose_frames_are_called_by_tokens(tmp_path: Path) -> None:
     assert drive and drive.name == "kitti-object"
 
 
-def test_names_of_fields_as_of_cloudcompare(tmp_path: Path) -> None:
+@pytest.mark.parametrize(("label", "name"), [("scalar_Intensity", "intensity"), ("I", "i")])
+def test_names_of_fields_of_cloudcompare_and_carla(label: str, name: str, tmp_path: Path) -> None:
     head = "ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\nproperty float z\n"
-    (tmp_path / "1.ply").write_text(f"{head}property float scalar_intensity\nend_header\n1 2 3 4\n")
+    (tmp_path / "1.ply").write_text(f"{head}property float {label}\nend_header\n1 2 3 4\n")
     points, _ = read_cloud(tmp_path / "1.ply", ())
-    assert points.dtype.names == ("x", "y", "z", "intensity")
+    assert points.dtype.names == ("x", "y", "z", name)
 
 
 def test_kitti_that_was_copied_by_a_mac(tmp_path: Path) -> None:

@@ -250,6 +250,10 @@ def test_drives_in_a_folder_are_named(tmp_path: Path) -> None:
         drive_in(tmp_path / name, {"top": "1.bin"})
     with pytest.raises(UserError, match="its folders that are one: monday, tuesday"):
         bevviz.open(tmp_path)
+    drive_in(tmp_path / "monday", {"0000": "1.bin", "0001": "1.bin", "top": ""})
+    (tmp_path / "monday/top/1.bin").unlink()
+    with pytest.raises(UserError, match="its folders that are one: 0000, 0001"):
+        bevviz.open(tmp_path / "monday")
 
 
 def test_many_files_that_cannot_be_read_are_one_sentence(tmp_path: Path) -> None:

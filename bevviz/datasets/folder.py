@@ -51,7 +51,9 @@ CALIBRATION, STAMPS, POSES = "calibration.yaml", "stamps.csv", "poses.txt"
 OF_SENSORS = re.compile(  # a folder with one for each camera or LiDAR
     "cam|im(g|age)|lidar|velo|point|cloud|pcd|scan", re.IGNORECASE
 )
-OF_DRIVES = re.compile(r"\d{3,}$|train|val|test", re.IGNORECASE)  # a folder of one drive or part, not sensor
+OF_DRIVES = re.compile(
+    r"(\d{3,}|(train|test)(ing)?|val(idation)?)$", re.IGNORECASE
+)  # a folder of one drive or part, not sensor
 NEAREST = {"i8": "<f8", "u8": "<f8", "f2": "<f4", "b1": "u1"}  # that a PointCloud2 can hold
 KEYS = {"rate", "fields", "lidars", "cameras"}
 LENS = {"D", "distortion_model"}
@@ -367,9 +369,9 @@ def _places(path: Path) -> dict[Path, str]:
     """The folder, those in it, and those in one of cameras or LiDARs, with what sensors there are called."""
     places = {path: "", **{folder: folder.name for folder in _folders(path)}}
     for folder in [folder for folder, name in places.items() if OF_SENSORS.match(name)]:
-        for within in (found for found in _folders(folder) if not OF_DRIVES.match(found.name)):
+        for within in _folders(folder):
             places[within] = folder.name if within.name == "data" else within.name
-    return places
+    return {folder: name for folder, name in places.items() if not OF_DRIVES.match(name)}
 
 
 def _folders(path: Path) -> list[Path]:

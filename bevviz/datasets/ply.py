@@ -58,7 +58,7 @@ def read_ply(file: Path) -> tuple[NDArray[np.void], int]:
 def _header(data: bytes) -> tuple[str, list[tuple[str, int, list[tuple[str, str]]]], int]:
     """The format; elements with their number and properties (name, type); where the header ends.
 
-    CloudCompare writes ``scalar_`` before the names of fields.
+    CloudCompare writes ``scalar_`` before the names of fields, CARLA calls the intensity ``I``.
     """
     end = data.find(b"end_header", 0, MOST_HEADER)
     newline = data.find(b"\n", end)
@@ -75,7 +75,7 @@ def _header(data: bytes) -> tuple[str, list[tuple[str, int, list[tuple[str, str]
                 case ["property", "list", _, _, label]:
                     elements[-1][2].append((label, "list"))
                 case ["property", kind, label]:
-                    elements[-1][2].append((label.removeprefix("scalar_"), kind))
+                    elements[-1][2].append((label.removeprefix("scalar_").lower(), kind))
     except (ValueError, IndexError):
         raise ValueError("no header of a PLY, or a damaged one") from None
     if order not in ORDERS or any(count < 0 for _, count, _ in elements):

@@ -45,7 +45,7 @@ class DatasetReader:
                 stream, first = self._streams[number], rows[min(rows)]
                 several = f"{stream.topic}: {len(rows)} of {len(stream.times)} {of_many}; the first: "
                 said.append(f"{several if len(rows) > 1 else ''}{first}")
-        return said
+        return list(dict.fromkeys(said))
 
     def messages(
         self, ids: Collection[int], start: int, stop: int
