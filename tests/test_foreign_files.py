@@ -176,17 +176,19 @@ def test_boxes_in_a_map_far_from_its_origin_keep_their_place() -> None:
     np.testing.assert_allclose(boxes.center, there, atol=1e-4)
 
 
-def test_kitti_whose_frames_are_called_by_tokens(tmp_path: Path) -> None:
-    """As nuScenes' devkit converts its scenes; they were a plain folder without a calibration."""
-    token = "3a2e1b9f8c7d4e5f9a0b1c2d3e4f5a6b"
+@pytest.mark.parametrize("name", ["3a2e1b9f8c7d4e5f9a0b1c2d3e4f5a6b", "00544", "0000001"])
+def test_kitti_with_other_names_of_frames(name: str, tmp_path: Path) -> None:
+    """As nuScenes' devkit converts its scenes, as View of Delft's: they were plain folders, not calibrated."""
     for folder in ("velodyne", "calib"):
         (tmp_path / folder).mkdir()
-    np.ones((2000, 4), "<f4").tofile(tmp_path / f"velodyne/{token}.bin")
-    (tmp_path / f"calib/{token}.txt").write_text(
-        f"P2: {TR}\nR0_rect: 1 0 0 0 1 0 0 0 1\nTr_velo_to_cam: {TR}\n"
-    )
+    np.ones((2000, 4), "<f4").tofile(tmp_path / f"velodyne/{name}.bin")
+    rows = f"P2: {TR}\nR0_rect: 1 0 0 0 1 0 0 0 1\nTr_velo_to_cam: {TR}\n"
+    (tmp_path / f"calib/{name}.txt").write_text(rows)
     drive = open_dataset(tmp_path)
     assert drive and drive.name == "kitti-object"
+    (tmp_path / f"calib/{name}.txt").write_text(rows.replace("cam:", "cam_0:"))  # Waymo's, which is none
+    drive = open_dataset(tmp_path)
+    assert drive and drive.name == "folder"
 
 
 @pytest.mark.parametrize(("label", "name"), [("scalar_Intensity", "intensity"), ("I", "i")])

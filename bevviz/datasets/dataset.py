@@ -90,7 +90,7 @@ class Dataset:
 
     @classmethod
     def fits(cls, path: Path) -> bool:
-        """Whether a folder looks like one of it; quick, and no file is opened."""
+        """Whether a folder looks like one of it; quick, and at most one small file is opened."""
         raise NotImplementedError
 
     @classmethod

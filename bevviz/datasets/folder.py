@@ -59,6 +59,7 @@ KEYS = {"rate", "fields", "lidars", "cameras"}
 LENS = {"D", "distortion_model"}
 SENSOR_KEYS = {"pose", "rate", "fields", "K", "size", *LENS}
 STAMP = r"\d{1,19}(\.\d*)?"
+SECONDS, NANOSECONDS = re.compile(r"\d{1,6}|\d{10}"), re.compile(r"\d{1,9}")
 MOST_SECONDS = 1e10  # of a stamp: more is another unit
 UNIT = 0.01  # how far the length of a quaternion may be from one
 FAR = 100  # metres between sensors of a vehicle
@@ -323,9 +324,12 @@ class Folder(Dataset):
         for number, row in enumerate(csv.reader(read_text(table).splitlines()), 1):
             if len(row) < 2 or (number == 1 and not re.search(r"\d", row[1])):
                 continue
-            if not re.fullmatch(STAMP, row[1].strip()):
-                raise UserError(f"{table}: line {number}: '{row[1]}' is no stamp")
-            found[self.path / row[0].strip()] = row[1].strip()
+            name, stamp, *more = map(str.strip, row)
+            if not re.fullmatch(STAMP, stamp):
+                raise UserError(f"{table}: line {number}: '{stamp}' is no stamp")
+            if more and SECONDS.fullmatch(stamp) and NANOSECONDS.fullmatch(more[0]):
+                stamp = f"{stamp}.{more[0]:0>9}"
+            found[self.path / name] = stamp
         if missing := [file for files in sensors for file in files if file not in found]:
             raise UserError(f"{table}: no stamp for {missing[0].relative_to(self.path)}")
         stamped = dict[Path, int]()

@@ -16,6 +16,7 @@ from bevviz.datasets.kitti import (
     Calibration,
     clouds,
     mountings,
+    named_rows,
     read_labels,
     truth,
 )
@@ -39,8 +40,9 @@ class KittiObject(Dataset):
     def fits(cls, path: Path) -> bool:
         if any((path / "calib").glob("[0-9]" * 6 + ".txt")):
             return (path / "velodyne").is_dir()
-        scans = files_in(path / "velodyne", [".bin"])[:1]  # converters name them by tokens, too
-        return any(not s.stem.isdigit() and (path / f"calib/{s.stem}.txt").is_file() for s in scans)
+        # Sets in its form name frames otherwise: View of Delft by five digits, converters by tokens.
+        beside = [path / f"calib/{scan.stem}.txt" for scan in files_in(path / "velodyne", [".bin"])[:1]]
+        return any("Tr_velo_to_cam" in named_rows(file) for file in beside if file.is_file())
 
     def __init__(self, path: Path, sequence: str) -> None:
         super().__init__(path, sequence)
