@@ -178,7 +178,7 @@ def test_boxes_in_a_map_far_from_its_origin_keep_their_place() -> None:
 
 @pytest.mark.parametrize("name", ["3a2e1b9f8c7d4e5f9a0b1c2d3e4f5a6b", "00544", "0000001"])
 def test_kitti_with_other_names_of_frames(name: str, tmp_path: Path) -> None:
-    """As nuScenes' devkit converts its scenes, as View of Delft's: they were plain folders, not calibrated."""
+    """As nuScenes' devkit converts its scenes, and View of Delft: they were plain folders, not calibrated."""
     for folder in ("velodyne", "calib"):
         (tmp_path / folder).mkdir()
     np.ones((2000, 4), "<f4").tofile(tmp_path / f"velodyne/{name}.bin")
