@@ -31,6 +31,10 @@ SEMANTIC_KITTI = {  # Behley et al. 2019, where COCO has others
     "on-rails": frozenset({"on-rails", "tram", "train", "bus"}),
     "other-vehicle": frozenset({"other-vehicle", "car", "truck", "bus", "train"}),
 }
+VIEW_OF_DELFT = {  # Palffy et al. 2022, where COCO has others
+    "moped_scooter": frozenset({"moped_scooter", "motorcycle"}),
+    "motor": frozenset({"motor", "motorcycle"}),
+}
 CATEGORIES = {  # of nuScenes in its detection task; what belongs to none of them is left out, as there
     "movable_object.barrier": "barrier",
     "movable_object.trafficcone": "traffic_cone",
@@ -60,7 +64,7 @@ NOT_DETECTED = frozenset(  # categories of nuScenes that belong to no class of t
         "vehicle.emergency.police",
     }
 )
-ACCEPTED = KITTI | NUSCENES | SEMANTIC_KITTI
+ACCEPTED = KITTI | NUSCENES | SEMANTIC_KITTI | VIEW_OF_DELFT
 
 _SYNONYMS = {label.lower(): names for label, names in ACCEPTED.items()} | {
     "cyclist": ACCEPTED["Cyclist"] | {"rider"}
