@@ -306,3 +306,9 @@ def test_a_pose_in_millimetres_is_told(tmp_path: Path) -> None:
     drive_in(tmp_path, {"top": "1.bin"}, "lidars: {top: {pose: [500, 0, 1900, 0, 0, 0, 1]}}")
     said = "calibration.yaml: top is 1,900 m from base_link: a pose is in metres"
     assert said in drive_in.warnings  # type: ignore[attr-defined]
+
+
+def test_images_taken_in_their_order_are_at_the_times_of_the_clouds(tmp_path: Path) -> None:
+    about = "lidars: {top: {rate: 5}}\ncameras: {front: {rate: 30}}"
+    there = drive_in(tmp_path, {"top": "3.bin 4.bin", "front": "a.png b.png"}, about)
+    assert there["front"] == there["top"] == [1.6, 1.8]

@@ -287,6 +287,7 @@ class Folder(Dataset):
             elif len(files) == len(of_lead):
                 ordered = sorted(files, key=lambda file: (told.values.get(file, -1) if told else 0, file))
                 numbers = dict(zip(ordered, sorted(of_lead.values()), strict=True))
+                rate = _rate(about, about.get("lidars", {}).get(lead[0], {}))
                 self.warn(
                     f"{name}: its names do not tell when, as those of {lead[0]} do: taken in their order, "
                     "one for each"
