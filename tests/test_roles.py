@@ -102,6 +102,46 @@ def test_cameras_side_by_side_in_a_namespace_are_two_cameras() -> None:
     assert list(cameras(find_roles(topics, DEFAULT))) == ["cameras_front", "cameras_rear"]
 
 
+AUTOWARE = {  # cloud topics of its sensing, below /sensing/lidar, by frame
+    "velodyne_top": ["top/pointcloud_raw", "top/pointcloud_raw_ex"],
+    "velodyne_left": ["left/pointcloud_raw_ex"],
+    "base_link": [
+        "top/self_cropped/pointcloud_ex",
+        "top/rectified/pointcloud_ex",
+        "top/pointcloud_before_sync",
+    ],
+}
+
+
+def test_one_lidar_is_not_taken_twice_raw_and_moved_to_the_robots_frame() -> None:
+    topics = [
+        Topic(f"/sensing/lidar/{name}", CLOUD, 9, frame)
+        for frame, names in AUTOWARE.items()
+        for name in names
+    ]
+    raw = ("/sensing/lidar/left/pointcloud_raw_ex", "/sensing/lidar/top/pointcloud_raw")
+    assert find_roles(topics, DEFAULT).lidars == raw
+    moved = [topic for topic in topics if topic.frame_id == "base_link"]
+    assert find_roles(moved, DEFAULT).lidars == ("/sensing/lidar/top/pointcloud_before_sync",)
+    alone = [Topic("/lidar/points", CLOUD, 9, "base_link")]
+    assert find_roles(alone, DEFAULT).lidars == ("/lidar/points",)
+
+
+@pytest.mark.parametrize("radar", ["/radar_front/points", "/ti_mmwave/cloud", "/sonar/points"])
+def test_a_radars_cloud_is_not_merged_with_a_lidars(radar: str) -> None:
+    topics = [Topic("/velodyne_points", CLOUD, 9, "velodyne"), Topic(radar, CLOUD, 9, "other")]
+    roles = find_roles(topics, DEFAULT)
+    assert roles.lidars == ("/velodyne_points",)
+    assert "a radar's" in roles.notes[radar]
+    assert find_roles(topics[1:], DEFAULT).lidars == (radar,)
+
+
+def test_images_that_a_driver_makes_of_scans_are_no_cameras() -> None:
+    made = [f"/ouster/{kind}_image" for kind in ("range", "signal", "reflec", "nearir")]
+    topics = [Topic("/ouster/points", CLOUD, 9, "os_lidar"), *(Topic(t, IMAGE, 9, "os_lidar") for t in made)]
+    assert find_roles(topics, DEFAULT).cameras == ()
+
+
 def test_ros_1_spelling_of_types() -> None:
     ros1 = [Topic(t.name, t.type.replace("/msg/", "/"), t.count, t.frame_id) for t in TUTORIAL]
     assert find_roles(ros1, DEFAULT).cameras == find_roles(TUTORIAL, DEFAULT).cameras

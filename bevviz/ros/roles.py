@@ -333,6 +333,7 @@ _LIDAR = re.compile(r"lidar|laser|velodyne|ouster|os_|livox|hesai|robosense|pand
 _DERIVED_CLOUD = re.compile(
     r"ground|cluster|obstacle|filter|registered|depth|stereo|camera|zed|realsense|rgbd|map|voxel|fused|segment"
     r"|crop|downsample|object|debug|feature|plane|merged|concat|keypoint|matched|odom|slam"
+    r"|radar|mmwave|sonar"
 )
 _FIXED = ("map", "odom", "world", "camera_init")  # no sensor moves with them
 
@@ -344,9 +345,9 @@ def _find_lidars(topics: Sequence[Topic], config: SourceConfig, notes: dict[str,
         _note(notes, clouds, "not used: not in source.lidar_topics")
         _note(notes, chosen, "LiDAR, by source.lidar_topics")
         return chosen
-    tiers = {topic: _lidar_tier(topic) for topic in clouds}
+    tiers = {topic: _lidar_tier(topic, config.base_frame) for topic in clouds}
     best = min(tiers.values(), default=0)
-    _note(notes, clouds, "not used: looks like a result or a depth camera's cloud, not like a LiDAR's")
+    _note(notes, clouds, "not used: looks like a result, a radar's or a depth camera's cloud, not a LiDAR's")
     _note(notes, [t for t in clouds if t.count == 0], "not used: without messages")
     candidates = sorted((t for t in clouds if tiers[t] == best), key=lambda t: (len(t.name), t.name))
     if best in (2, 3):
@@ -355,8 +356,12 @@ def _find_lidars(topics: Sequence[Topic], config: SourceConfig, notes: dict[str,
     return sorted(chosen, key=lambda t: t.name)
 
 
-def _lidar_tier(topic: Topic) -> int:
-    """0: named like a LiDAR, 1: other cloud, 2: derived one, 3: in a fixed frame, 4: without messages."""
+def _lidar_tier(topic: Topic, base_frame: str) -> int:
+    """0: named like a LiDAR, 1: other cloud, 2: derived one, 3: in a fixed frame, 4: without messages.
+
+    Who publishes in the robot's own frame has moved the points there: beside a LiDAR's raw ones they would
+    be the same twice.
+    """
     name, frame = topic.name.lower(), topic.frame_id.lower()
     if topic.count == 0:
         return 4
@@ -364,7 +369,8 @@ def _lidar_tier(topic: Topic) -> int:
         return 3
     if _DERIVED_CLOUD.search(name) or "optical" in frame:
         return 2
-    return 0 if _LIDAR.search(name) or _LIDAR.search(frame) else 1
+    named = _LIDAR.search(name) or _LIDAR.search(frame)
+    return 0 if named and frame not in (base_frame, "base_link", "base_footprint") else 1
 
 
 def _one_a_frame(
@@ -387,6 +393,7 @@ _TRANSPORT = re.compile(r"/(compressed|compressedDepth|theora|ffmpeg|foxglove|zs
 _DERIVED_IMAGE = re.compile(
     r"depth(?!ai)|disparity|confidence|annotat|debug|dbg|bev|mask|overlay|detect|visuali[sz]|segment|semantic"
     r"|label|heat_?map|costmap|stereo(_raw)?/image|track|result|infra|normal|cloud|side_by_side"
+    r"|(range|signal|reflec|nearir)_image"  # that Ouster's driver makes of its scans
 )
 _RECTIFIED = re.compile(r"(?<![a-z])rect")
 
