@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -16,8 +17,9 @@ import bevviz
 from bevviz import geometry
 from bevviz.bags.source import BagSource
 from bevviz.config import load
-from bevviz.frame import F64
+from bevviz.frame import F64, Intrinsics
 from bevviz.ros.encode import encode_points
+from bevviz.ros.objects import decode_objects
 from bevviz.stages.robot import in_points_frame
 from tests import bags
 
@@ -247,3 +249,30 @@ def test_of_boxes_in_several_frames_those_without_a_place_are_left_out_and_said(
         (said,) = [warning for warning in source.warnings if "/objects" in warning]
     assert frame.robot_boxes[0].ids == (bags.LIDAR_FRAME,)
     assert "frame 'camera_optical' is unknown: the boxes of /objects are left out" in said
+
+
+def test_objects_with_headers_of_their_own_count_where_the_message_states_no_frame() -> None:
+    def one(frame: str) -> Any:
+        place = SimpleNamespace(position=SimpleNamespace(x=1.0, y=2.0, z=3.0))
+        return SimpleNamespace(header=header(frame), pose=place, size=(4.0, 2.0, 1.5))
+
+    def header(frame: str) -> Any:
+        return SimpleNamespace(stamp=SimpleNamespace(sec=5, nanosec=0), frame_id=frame)
+
+    for array, frame_id, frames in (("", "lidar", ("lidar", "/map")), ("base", "base", ())):
+        msg = SimpleNamespace(header=header(array), boxes=[one("lidar"), one("/map")])
+        found = decode_objects(msg, "/b", 9, {"topic": "/b", "objects": "boxes"})
+        assert (found.stamp, found.frame_id) == (5 * 10**9, frame_id)
+        assert found.frames == tuple(frame.removeprefix("/") for frame in frames)
+
+
+def test_messages_that_cannot_be_used_are_counted_once(tmp_path: Path) -> None:
+    m = bags.Messages()
+    items = [item for item in bags.small_items(m, scans=3) if item.topic != bags.INFO]
+    nothing = Intrinsics(64, 48, np.zeros((3, 3)))
+    for scan in range(3):
+        at = bags.START + scan * bags.PERIOD
+        items.append(bags.Item(bags.INFO, "sensor_msgs/msg/CameraInfo", at, m.camera_info(at, nothing)))
+    with BagSource([bags.write(tmp_path / "bag", items, m)], load()) as source:
+        assert len(list(source)) == 3
+        assert [w.partition(" of ")[0] for w in source.warnings if "message(s)" in w] == ["3 message(s)"]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from functools import cached_property
@@ -324,7 +325,8 @@ class BagSource(Closing):
             state.sync.add_transform(transform, static=True)
         for topic in {camera.info_topic for camera in self.roles.cameras} - {""}:
             if (info := self.recording.first(topic)) is not None:
-                self._handle(handlers[topic], info, state)
+                with suppress(MessageError):  # counted when its turn comes
+                    handlers[topic](info)
 
     def _find_driver(self) -> str:
         """The first LiDAR: its scans make the frames. Without one, the first camera."""

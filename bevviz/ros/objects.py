@@ -99,7 +99,8 @@ def decode_objects(msg: Any, topic: str, received: int, stated: Mapping[str, str
         if not all(map(math.isfinite, row)):
             continue
         rows.append(row)
-        headers.append(header or getattr(item, "header", None))
+        own = getattr(item, "header", None)
+        headers.append(header if own is None or (header and header.frame_id) else own)
         labels.append(_label(item, where.label) if where.label else "")
         scores.append(float(_follow(item, where.score)[1]) if _has(item, where.score) else 1.0)
         ids.append(_identity(_follow(item, where.id)[1]) if _has(item, where.id) else "")
