@@ -255,13 +255,13 @@ def test_what_is_wrong_with_a_mapping(
 def test_markers_by_the_documented_rule(tmp_path: Path) -> None:
     m = bags.Messages()
 
-    def marker(number: int, kind: int, action: int = 0, text: str = "") -> Any:
+    def marker(number: int, kind: int, action: int = 0, text: str = "", ns: str = "cars") -> Any:
         zero = m.make("builtin_interfaces/msg/Duration", sec=0, nanosec=0)
         header = m.header(bags.START, bags.LIDAR_FRAME)
         return m.make(
             "visualization_msgs/msg/Marker",
             header=header,
-            ns="cars",
+            ns=ns,
             id=number,
             type=kind,
             action=action,
@@ -282,12 +282,13 @@ def test_markers_by_the_documented_rule(tmp_path: Path) -> None:
         )
 
     shown = [marker(4, 1), marker(4, 9, text="bus"), marker(5, 1), marker(6, 1, action=2), marker(7, 2)]
+    shown += [marker(4, 1, ns="people"), marker(8, 1), marker(8, 9, text="van", ns="labels")]
     message = m.make("visualization_msgs/msg/MarkerArray", markers=shown)
     path = bag(tmp_path, m, "visualization_msgs/msg/MarkerArray", message)
     found = boxes(path, "source.boxes={topic: /my/objects}")
-    assert found.labels == ("bus", "cars")
-    assert found.ids == ("cars/4", "cars/5")
-    np.testing.assert_allclose(found.boxes.size, [BOX[3:6]] * 2, rtol=1e-6)
-    np.testing.assert_allclose(found.boxes.yaw, [BOX[6]] * 2, rtol=1e-6)
+    assert found.labels == ("bus", "cars", "people", "van")  # people/4 is no bus, as cars/4 is
+    assert found.ids == ("cars/4", "cars/5", "people/4", "cars/8")
+    np.testing.assert_allclose(found.boxes.size, [BOX[3:6]] * 4, rtol=1e-6)
+    np.testing.assert_allclose(found.boxes.yaw, [BOX[6]] * 4, rtol=1e-6)
     with BagSource([path], load()) as source:  # without being asked to be boxes they are only shown
         assert source.roles.notes["/my/objects"] == "shown: around perception"

@@ -75,7 +75,7 @@ def decode_objects(msg: Any, topic: str, received: int, stated: Mapping[str, str
     """The boxes of a message that is no Detection3DArray.
 
     Of markers, each CUBE or CYLINDER that is added is a box; its label is the text of a TEXT_VIEW_FACING
-    marker with the same id, else its namespace.
+    marker with the same id, in its namespace or in one that has no boxes, else its namespace.
 
     Args:
         msg: with a header, or objects that have one.
@@ -137,15 +137,16 @@ def _row(item: Any, where: Fields) -> tuple[float, ...]:
 def _markers(markers: Iterable[Any], topic: str, received: int) -> LabelledBoxes3D:
     rows, labels, ids, headers = list[tuple[float, ...]](), list[str](), list[str](), list[Any]()
     shown = [marker for marker in markers if marker.action == ADD]
-    texts = {marker.id: str(marker.text) for marker in shown if marker.type == TEXT}
-    for marker in shown:
-        if marker.type not in (CUBE, CYLINDER):
-            continue
+    solids = [marker for marker in shown if marker.type in (CUBE, CYLINDER)]
+    texts = {(marker.ns, marker.id): str(marker.text) for marker in shown if marker.type == TEXT}
+    others = {number: text for (ns, number), text in texts.items() if ns not in {one.ns for one in solids}}
+    for marker in solids:
         row = *_vector(marker.pose.position), *_vector(marker.scale), *_quaternion(marker.pose.orientation)
         if all(map(math.isfinite, row)):
             rows.append(row)
             headers.append(marker.header)
-            labels.append(texts.get(marker.id) or str(marker.ns))
+            text = texts.get((marker.ns, marker.id)) or others.get(marker.id)
+            labels.append(text or str(marker.ns))
             ids.append(f"{marker.ns}/{marker.id}")
     return _boxes(headers, topic, received, rows, labels, [1.0] * len(rows), ids)
 
