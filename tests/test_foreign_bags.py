@@ -16,6 +16,7 @@ from rosbags.typesys import Stores, get_typestore
 import bevviz
 from bevviz import geometry
 from bevviz.bags.source import BagSource
+from bevviz.cli import main
 from bevviz.config import load
 from bevviz.frame import F64, Intrinsics
 from bevviz.ros.encode import encode_points
@@ -276,3 +277,38 @@ def test_messages_that_cannot_be_used_are_counted_once(tmp_path: Path) -> None:
     with BagSource([bags.write(tmp_path / "bag", items, m)], load()) as source:
         assert len(list(source)) == 3
         assert [w.partition(" of ")[0] for w in source.warnings if "message(s)" in w] == ["3 message(s)"]
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        ["evaluate", "--truth", "/objects"],
+        ["evaluate", "--truth", "/objects", "--save", "evaluated.rrd"],
+        ["export", "-o", "training"],
+        ["compare", "--set-b", "clustering.method=topic:/nothing", "--save", "compared.rrd"],
+    ],
+)
+def test_a_stage_that_fails_is_said_where_only_its_result_is_judged(
+    command: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """All objects are missed then, and labels empty: as if the robot had found nothing."""
+    monkeypatch.chdir(tmp_path)
+    m = bags.Messages()
+    boxes = "vision_msgs/msg/Detection3DArray"
+    items = [
+        *bags.small_items(m, scans=3),
+        *(bags.Item("/objects", boxes, bags.START + i * bags.PERIOD, truth(m, i)) for i in range(3)),
+        bags.Item("/nothing", boxes, bags.START + 3600 * 10**9, truth(m, 36_000)),
+    ]
+    path = bags.write(tmp_path / "bag", items, m)
+    objects = [] if command[0] == "compare" else ["--set", "objects.method=topic:/nothing"]
+    main([command[0], str(path), *command[1:], *objects, "--quiet"])
+    (said,) = [line for line in capsys.readouterr().err.splitlines() if "failed in" in line]
+    side, stage = ("B: ", "clustering") if command[0] == "compare" else ("", "objects")
+    assert f"warning: {side}{stage} failed in 3 of 3 frames, first: the robot published no boxes" in said
+
+
+def truth(m: bags.Messages, scan: int) -> Any:
+    message = stated_in(m, bags.LIDAR_FRAME, [bags.LIDAR_FRAME])
+    message.header.stamp = m.header(bags.START + scan * bags.PERIOD, "").stamp
+    return message

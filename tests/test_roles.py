@@ -127,6 +127,13 @@ def test_one_lidar_is_not_taken_twice_raw_and_moved_to_the_robots_frame() -> Non
     assert find_roles(alone, DEFAULT).lidars == ("/lidar/points",)
 
 
+def test_what_a_stage_is_taken_from_is_no_truth() -> None:
+    topics = [Topic("/points", CLOUD, 9, "lidar"), Topic("/sim/ground_truth", BOXES_3D, 9, "lidar")]
+    assert find_roles(topics, DEFAULT).truth == "/sim/ground_truth"
+    roles = find_roles(topics, DEFAULT, {"objects.method": "/sim/ground_truth"})
+    assert (roles.truth, roles.robot_detections_3d) == ("", ("/sim/ground_truth",))
+
+
 @pytest.mark.parametrize("radar", ["/radar_front/points", "/ti_mmwave/cloud", "/sonar/points"])
 def test_a_radars_cloud_is_not_merged_with_a_lidars(radar: str) -> None:
     topics = [Topic("/velodyne_points", CLOUD, 9, "velodyne"), Topic(radar, CLOUD, 9, "other")]

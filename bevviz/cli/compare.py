@@ -18,7 +18,7 @@ from bevviz.cli.options import (
     loaded,
     open_bag,
 )
-from bevviz.cli.outputs import Outputs, hint, say
+from bevviz.cli.outputs import Outputs, hint, say, warn
 from bevviz.cli.run import logged
 from bevviz.errors import UserError
 
@@ -124,17 +124,18 @@ def _run(
     configs: tuple[Config, Config],
     options: argparse.Namespace,
 ) -> int:
-    from bevviz.compare.sides import ComparisonRecorder
+    from bevviz.compare.sides import ComparisonRecorder, SideFailures
     from bevviz.compare.summary import ComparisonSummary
     from bevviz.config import changes
 
-    summary = ComparisonSummary(names, changes(*configs))
+    summary, failures = ComparisonSummary(names, changes(*configs)), SideFailures()
 
     def observers(recording: RecordingStream) -> list[Observer[ComparedFrame]]:
         hint(source.scene, config)
-        return [ComparisonRecorder(recording, *configs, summary), summary]
+        return [ComparisonRecorder(recording, *configs, summary), summary, failures]
 
     def finish() -> None:
+        warn(failures.warnings)
         if summary.without:
             say(f"{summary.without} frames for which the robot published nothing are left out")
         _report(summary, options)

@@ -79,13 +79,14 @@ def _evaluate(options: argparse.Namespace) -> int:
 
 def _run(frames: Frames, config: Config, evaluation: Evaluation, outputs: Outputs, *, table: bool) -> int:
     """The exit status of the run."""
+    from bevviz.anomalies import FailureSummary
     from bevviz.session import Session
 
-    session = Session(config)
+    session, failures = Session(config), FailureSummary()
     if not outputs:
         hint(frames.scene, config)
-        end = through(frames, session, [evaluation])
-        warn(frames.warnings)
+        end = through(frames, session, [evaluation, failures])
+        warn([*frames.warnings, *failures.warnings])
         if end.interrupted:
             say(f"interrupted after {end.frames} frames; the table is of these")
             return 130
@@ -98,10 +99,12 @@ def _run(frames: Frames, config: Config, evaluation: Evaluation, outputs: Output
         return [
             Recorder(recording, config, session.stages.provider),
             evaluation,
+            failures,
             EvaluationRecorder(recording, evaluation),
         ]
 
     def finish() -> None:
+        warn(failures.warnings)
         if table:
             print(evaluation.table(), flush=True)
 

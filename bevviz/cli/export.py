@@ -42,6 +42,7 @@ def add(commands: Commands) -> None:
 
 
 def _export(options: argparse.Namespace) -> int:
+    from bevviz.anomalies import FailureSummary
     from bevviz.drive import Drive
     from bevviz.export.kitti import KittiExport
     from bevviz.export.nuscenes import NuScenesExport
@@ -52,8 +53,9 @@ def _export(options: argparse.Namespace) -> int:
         drive = Drive(source, config)
         hint(drive.scene, config)
         export = writer(options.out, options.camera)
-        end = through(drive.frames, drive.new_session(), [export])
-        warn(source.warnings)
+        failures = FailureSummary()
+        end = through(drive.frames, drive.new_session(), [export, failures])
+        warn([*source.warnings, *failures.warnings])
     warn(f"{count} frame(s) left out: {why}" for why, count in export.skipped.items())
     say(f"{export.frames} frames with {export.labels} labels in {options.out}")
     return 130 if end.interrupted else 0 if export.frames else 1

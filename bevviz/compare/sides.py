@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import rerun as rr
 
+from bevviz.anomalies import FailureSummary
 from bevviz.compare.differences import FrameDifferences, differences, seen
 from bevviz.compare.log import DifferenceLogger
 from bevviz.compare.summary import ComparisonSummary
@@ -34,6 +35,23 @@ class ComparedFrame:
     a: FrameResult | None
     b: FrameResult | None
     found: FrameDifferences | None = None
+
+
+class SideFailures(Observer[ComparedFrame]):
+    """Which stages failed on either side."""
+
+    def __init__(self) -> None:
+        self._sides = {"A": FailureSummary(), "B": FailureSummary()}
+
+    def see(self, result: ComparedFrame) -> None:
+        for side, made in (("A", result.a), ("B", result.b)):
+            if made is not None:
+                self._sides[side].see(made)
+
+    @property
+    def warnings(self) -> list[str]:
+        """One sentence for each stage of a side."""
+        return [f"{side}: {text}" for side, found in self._sides.items() for text in found.warnings]
 
 
 Truths = Callable[[Frame], Truth | None]

@@ -231,7 +231,7 @@ def find_roles(
     imus = [topic for topic in _of(topics, "Imu") if topic.count != 0]
     _note(notes, imus, "plotted; gravity, where the transforms have no upright frame")
     boxes = _of(topics, "Detection3DArray")
-    truth = [t for t in boxes if t.name.endswith("ground_truth")][:1]
+    truth = [t for t in boxes if t.name.endswith("ground_truth") and t not in staged.values()][:1]
     boxes = [t for t in boxes if t not in truth]
     detections = _of(topics, "Detection2DArray")
     _note(notes, truth, "ground truth, by its name")
