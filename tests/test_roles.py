@@ -127,6 +127,19 @@ def test_one_lidar_is_not_taken_twice_raw_and_moved_to_the_robots_frame() -> Non
     assert find_roles(alone, DEFAULT).lidars == ("/lidar/points",)
 
 
+def test_transforms_of_another_robot_are_not_mixed_in() -> None:
+    kinds = {"lidar/points": CLOUD, "camera/image_raw": IMAGE, "tf": TF, "tf_static": TF}
+    robots = [Topic(f"/{name}/{t}", kind, 9, t[:3]) for name in ("a", "b") for t, kind in kinds.items()]
+    beside = [Topic("/tf", TF, 9), Topic("/localization/tf", TF, 9)]
+    roles = find_roles(robots + beside, DEFAULT)
+    assert (roles.lidars, roles.tf_static) == (("/a/lidar/points",), ("/a/tf_static",))
+    assert roles.tf == ("/a/tf", "/localization/tf", "/tf")
+    assert "another robot" in roles.notes["/b/tf"]
+    chosen = SourceConfig(lidar_topics=["/b/lidar/points"], camera_topics=["/b/camera/image_raw"])
+    assert find_roles(robots, chosen).tf == ("/b/tf",)
+    assert find_roles([t for t in robots if t.type == TF], DEFAULT).tf == ("/a/tf", "/b/tf")
+
+
 def test_what_a_stage_is_taken_from_is_no_truth() -> None:
     topics = [Topic("/points", CLOUD, 9, "lidar"), Topic("/sim/ground_truth", BOXES_3D, 9, "lidar")]
     assert find_roles(topics, DEFAULT).truth == "/sim/ground_truth"

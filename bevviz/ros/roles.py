@@ -223,6 +223,9 @@ def find_roles(
         )
 
     transforms = [t for t in topics if t.kind.lower() == "tfmessage"]
+    others = [t for t in transforms if _of_another_robot(t, topics, [*lidars, *images])]
+    _note(notes, others, "not used: transforms of another robot, whose sensors are not")
+    transforms = [t for t in transforms if t not in others]
     static = [t for t in transforms if t.name.endswith("tf_static")]
     moving = [t for t in transforms if t not in static]
     _note(notes, static, "static transforms")
@@ -265,6 +268,16 @@ def find_roles(
         no_camera="" if images else _no_camera(topics),
         notes=notes,
     )
+
+
+def _of_another_robot(topic: Topic, topics: Sequence[Topic], used: Sequence[Topic]) -> bool:
+    """Whether a namespace has transforms and sensors of its own, and none of these is used.
+
+    Robots of one kind name their frames alike: their transforms are not to be mixed.
+    """
+    namespace = topic.name.rpartition("/")[0] + "/"
+    own = [t for t in _of(topics, "PointCloud2", *_IMAGES) if t.name.startswith(namespace)]
+    return bool(own and used) and not any(t in used for t in own)
 
 
 def _with_boxes(topics: list[Topic], config: SourceConfig) -> list[Topic]:
