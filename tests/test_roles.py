@@ -156,6 +156,11 @@ def test_a_radars_cloud_is_not_merged_with_a_lidars(radar: str) -> None:
     assert find_roles(topics[1:], DEFAULT).lidars == (radar,)
 
 
+def test_of_colour_and_infrared_in_one_frame_the_colour_is_taken() -> None:
+    topics = [Topic(f"/kinect/{kind}/image_raw", IMAGE, 9, "camera") for kind in ("ir", "rgb")]
+    assert list(cameras(find_roles(topics, DEFAULT)).values()) == ["/kinect/rgb/image_raw"]
+
+
 def test_images_that_a_driver_makes_of_scans_are_no_cameras() -> None:
     made = [f"/ouster/{kind}_image" for kind in ("range", "signal", "reflec", "nearir")]
     topics = [Topic("/ouster/points", CLOUD, 9, "os_lidar"), *(Topic(t, IMAGE, 9, "os_lidar") for t in made)]

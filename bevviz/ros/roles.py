@@ -408,6 +408,7 @@ _DERIVED_IMAGE = re.compile(
     r"|label|heat_?map|costmap|stereo(_raw)?/image|track|result|infra|normal|cloud|side_by_side"
     r"|(range|signal|reflec|nearir)_image"  # that Ouster's driver makes of its scans
 )
+_COLOURLESS = re.compile(r"gray|mono|(?<![a-z])ir(?![a-z])")
 _RECTIFIED = re.compile(r"(?<![a-z])rect")
 
 
@@ -435,7 +436,7 @@ def _find_images(topics: Sequence[Topic], config: SourceConfig, notes: dict[str,
         name = topic.name.lower()
         return (
             not _RECTIFIED.search(name),
-            "gray" in name or "mono" in name,
+            bool(_COLOURLESS.search(name)),
             not _info_topic(topic, topics),
             _IMAGES.index(topic.kind),  # what the robot's detector saw is mostly the first one
             len(name),
