@@ -312,3 +312,18 @@ def truth(m: bags.Messages, scan: int) -> Any:
     message = stated_in(m, bags.LIDAR_FRAME, [bags.LIDAR_FRAME])
     message.header.stamp = m.header(bags.START + scan * bags.PERIOD, "").stamp
     return message
+
+
+def test_messages_with_the_stamp_of_another_one_are_said(tmp_path: Path) -> None:
+    """Of two results with one stamp, as of two cameras on one topic, the first was gone without a word."""
+    m = bags.Messages()
+    items = bags.small_items(m, scans=3)
+    for i in range(3):
+        for late in (1000, 2000):
+            at = bags.START + i * bags.PERIOD + late
+            items.append(bags.Item("/objects", "vision_msgs/msg/Detection3DArray", at, truth(m, i)))
+    with BagSource([bags.write(tmp_path / "bag", items, m)], load()) as source:
+        assert len(list(source)) == 3
+        assert [w for w in source.warnings if "stamp" in w] == [
+            "/objects: 3 of its messages had the stamp of another one, whose place they took"
+        ]

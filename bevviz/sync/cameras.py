@@ -68,11 +68,11 @@ class Cameras:
         self._report, self._tf = former._report, former._tf
         self.intrinsics, self._infos, self._refused = former.intrinsics, former._infos, former._refused
 
-    def add_image(self, topic: str, stamp: int, frame_id: str, load: Callable[[], Image]) -> None:
-        """An image not yet decoded."""
+    def add_image(self, topic: str, stamp: int, frame_id: str, load: Callable[[], Image]) -> bool:
+        """An image not yet decoded. Whether it takes the place of another one with that stamp."""
         self.frames[topic] = frame_id
         self._image_counts[topic] += 1
-        self.images[topic].add(stamp, Undecoded(stamp, frame_id, load))
+        return self.images[topic].add(stamp, Undecoded(stamp, frame_id, load))
 
     def add_info(self, topic: str, stamp: int, intrinsics: Intrinsics) -> None:
         """A calibration; for an image the one that is nearest in stamp holds."""

@@ -30,6 +30,7 @@ class SyncReport:
     longest_gap: float = 0.0  # seconds
     idle: str = ""  # topic of the LiDAR that should drive, while only others deliver
     unstamped: Counter[str] = field(default_factory=Counter)  # topic -> messages with stamp zero
+    repeated: Counter[str] = field(default_factory=Counter)  # topic -> messages with the stamp of another one
     without_image: Counter[str] = field(default_factory=Counter)  # camera -> frames
     images: int = 0  # of all cameras, decoded
     undecodable: Counter[str] = field(default_factory=Counter)  # camera -> images
@@ -78,6 +79,8 @@ class SyncReport:
             )
         for topic, n in self.unstamped.items():
             found.append(f"{topic}: no stamp in the header {_times(n)}, time of receipt used instead")
+        for topic, n in (+self.repeated).items():
+            found.append(f"{topic}: {n} of its messages had the stamp of another one, whose place they took")
         for topic, n in self.overtaken.items():
             found.append(
                 f"{topic}: {n} result{'' if n == 1 else 's'} came when the frame of that time had gone on, "

@@ -138,7 +138,7 @@ class Synchronizer:
         self._check_units(cloud)
         self.report.clouds += 1
         if cloud.topic in self._partners:
-            self._partners[cloud.topic].add(cloud.stamp, cloud)
+            self.report.repeated[cloud.topic] += self._partners[cloud.topic].add(cloud.stamp, cloud)
             return
         self._drive(cloud)
 
@@ -164,7 +164,9 @@ class Synchronizer:
         """
         if topic in self.cameras.images:
             stamp = self._arrived(topic, stamp, received)
-            self.cameras.add_image(topic, stamp, frame_id, load)
+            repeated = self.cameras.add_image(topic, stamp, frame_id, load)
+            if topic not in self.videos:  # whose parameters may come before the picture, with its stamp
+                self.report.repeated[topic] += repeated
             if topic == self._roles.driver:  # there is no LiDAR
                 self.report.clouds += 1
                 self._drive(Cloud(stamp, frame_id, np.zeros((0, 3), np.float32), {}, topic, received))
@@ -207,7 +209,8 @@ class Synchronizer:
         ``load`` may raise a UserError: it is counted, and the boxes are as if they had not come.
         """
         stamp = self._arrived(topic, stamp, received)
-        self._truth.setdefault(topic, Track(self._horizon)).add(stamp, _UndecodedBoxes(stamp, load))
+        track = self._truth.setdefault(topic, Track(self._horizon))
+        self.report.repeated[topic] += track.add(stamp, _UndecodedBoxes(stamp, load))
 
     def _add_result(self, tracks: dict[str, Track[Any]], result: LabelledBoxes2D | LabelledBoxes3D) -> None:
         stamp = self._arrived(result.topic, result.stamp, result.received)
@@ -215,7 +218,8 @@ class Synchronizer:
         if result.topic in self._beside and self._is_past(stamp):
             self._overtake(result)
         else:
-            tracks.setdefault(result.topic, Track(self._horizon)).add(stamp, result)
+            track = tracks.setdefault(result.topic, Track(self._horizon))
+            self.report.repeated[result.topic] += track.add(stamp, result)
 
     def _is_past(self, stamp: int) -> bool:
         """Whether the frame that is nearest to a stamp has gone on."""

@@ -25,16 +25,18 @@ class Track(Generic[T]):
     def newest(self) -> int | None:
         return self._stamps[-1] if self._stamps else None
 
-    def add(self, stamp: int, item: T) -> None:
+    def add(self, stamp: int, item: T) -> bool:
+        """Whether it takes the place of another one with that stamp."""
         if self._stamps and stamp < self._stamps[-1] - JUMP:
             self.keep(0, -1)
         i = bisect_left(self._stamps, stamp)
         if i < len(self._stamps) and self._stamps[i] == stamp:
             self._items[i] = item
-            return
+            return True
         self._stamps.insert(i, stamp)
         self._items.insert(i, item)
         self.forget(self._stamps[-1] - self._horizon)
+        return False
 
     def nearest(self, stamp: int) -> tuple[int, T] | None:
         near = bisect_left(self._stamps, stamp)
