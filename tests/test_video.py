@@ -129,6 +129,16 @@ def test_lost_packets_cost_the_pictures_that_need_them_and_are_told_in_one_line(
         assert "lost" in told[0]
 
 
+def test_a_stream_without_whole_pictures_begins_where_it_says_that_it_recovers() -> None:
+    """As encoders with intra-refresh write it, among other messages in one unit."""
+    said, slice_p = b"\0\0\1\x67\x42\0\x1e\0\0\1\x68\xce", b"\0\0\1\x41\x9a"
+    long = bytes([5, 255, 3]) + bytes(258)
+    for sei, key in (([6, 1, 0xC4], True), ([0, 2, 6, 1, 6, 1, 0xC4], True), ([0, 2, 6, 1, 0x80], False)):
+        assert is_key("h264", said + b"\0\0\1\x06" + bytes(sei) + slice_p) is key
+    assert is_key("h264", said + b"\0\0\1\x06" + long[:60] + slice_p) is False
+    assert is_key("h264", said) and not is_key("h264", said + slice_p)
+
+
 @pytest.mark.parametrize("codec", ["h264", "h265"])
 def test_what_a_stream_says_of_itself_before_each_picture_makes_no_key_frames(
     codec: str, tmp_path: Path

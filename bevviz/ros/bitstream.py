@@ -50,7 +50,7 @@ def _begins_h264(data: bytes) -> bool:
     for unit in filter(None, units(data)):
         kind = unit[0] & 31
         said |= kind == _H264_SPS
-        recovers |= kind == _H264_SEI and unit[1:2] == bytes([_RECOVERY])
+        recovers |= kind == _H264_SEI and _RECOVERY in _messages(unit[1:])
         if kind in _H264_SLICES:
             bits = _Bits(unit[1:])
             bits.number()  # place of the slice
@@ -63,10 +63,27 @@ def _begins_h265(data: bytes) -> bool:
     for unit in filter(None, units(data)):
         kind = unit[0] >> 1 & 63
         said |= kind == _H265_SPS
-        recovers |= kind == _H265_SEI and unit[2:3] == bytes([_RECOVERY])
+        recovers |= kind == _H265_SEI and _RECOVERY in _messages(unit[2:])
         if kind in _H265_SLICES:
             return said and (recovers or kind in _H265_IRAP)
     return said
+
+
+def _messages(sei: bytes) -> Iterator[int]:
+    """Types of the messages in an SEI; each is behind its type and its size, of which 255 are a byte."""
+    plain = iter(sei.replace(b"\0\0\3", b"\0\0"))
+    for byte in plain:
+        kind, size = byte, next(plain, 0)
+        while byte == 255:
+            byte, size = size, next(plain, 0)
+            kind += byte
+        yield kind
+        rest = size
+        while size == 255:
+            size = next(plain, 0)
+            rest += size
+        for _ in range(rest):
+            next(plain, 0)
 
 
 def _obus(data: bytes) -> Iterator[int]:
