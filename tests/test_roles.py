@@ -164,6 +164,7 @@ def test_of_colour_and_infrared_in_one_frame_the_colour_is_taken() -> None:
 def test_images_that_a_driver_makes_of_scans_are_no_cameras() -> None:
     made = [f"/ouster/{kind}_image" for kind in ("range", "signal", "reflec", "nearir")]
     topics = [Topic("/ouster/points", CLOUD, 9, "os_lidar"), *(Topic(t, IMAGE, 9, "os_lidar") for t in made)]
+    topics.append(Topic("/radar/polar", IMAGE, 9, "navtech"))
     assert find_roles(topics, DEFAULT).cameras == ()
 
 

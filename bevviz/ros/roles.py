@@ -406,7 +406,7 @@ _TRANSPORT = re.compile(r"/(compressed|compressedDepth|theora|ffmpeg|foxglove|zs
 _DERIVED_IMAGE = re.compile(
     r"depth(?!ai)|disparity|confidence|annotat|debug|dbg|bev|mask|overlay|detect|visuali[sz]|segment|semantic"
     r"|label|heat_?map|costmap|stereo(_raw)?/image|track|result|infra|normal|cloud|side_by_side"
-    r"|(range|signal|reflec|nearir)_image"  # that Ouster's driver makes of its scans
+    r"|radar|sonar|(range|signal|reflec|nearir)_image"  # the latter Ouster's driver makes of its scans
 )
 _COLOURLESS = re.compile(r"gray|mono|(?<![a-z])ir(?![a-z])")
 _RECTIFIED = re.compile(r"(?<![a-z])rect")
