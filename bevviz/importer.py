@@ -8,8 +8,13 @@ none of ours is answered before anything is imported.
 from __future__ import annotations
 
 import argparse
+import os
+import select
 import sys
+import threading
 from pathlib import Path
+
+from bevviz import remains
 
 NOT_OURS = 66
 BAGS = (".db3", ".bag")
@@ -18,6 +23,7 @@ METADATA = "metadata.yaml"  # in a folder that is one bag
 
 def main() -> None:
     """The executable."""
+    threading.Thread(target=_end_with_viewer, daemon=True).start()
     sys.exit(run(sys.argv[1:]))
 
 
@@ -49,9 +55,18 @@ def run(arguments: list[str]) -> int:
     except UserError as error:
         print(f"bevviz: error: {error}", file=sys.stderr)
         return 1
-    except (KeyboardInterrupt, BrokenPipeError):  # the viewer has gone
+    except KeyboardInterrupt:
         return 1
     return 0
+
+
+def _end_with_viewer() -> None:
+    """When nobody reads standard output any more, ends at once: the SDK would go on, or wait for ever."""
+    pipe = select.poll()
+    pipe.register(sys.stdout, 0)  # errors and hang-ups are told in any case
+    pipe.poll()
+    remains.remove()
+    os._exit(1)
 
 
 def _import(path: Path, application_id: str, recording_id: str | None) -> None:
@@ -66,7 +81,7 @@ def _import(path: Path, application_id: str, recording_id: str | None) -> None:
     from bevviz.project import layers
     from bevviz.recorded import Origin
 
-    config = load(layers=layers(path.parent))
+    config = load(layers=layers(path if path.is_dir() else path.parent))
     with BagSource([path], config) as source:
         drive = Drive(source, config)
         hint(drive.scene, config)

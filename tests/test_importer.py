@@ -57,6 +57,16 @@ def test_what_is_none_of_ours_is_said_so(drive: Path, tmp_path: Path) -> None:
     assert done.stdout.strip() == "False"
 
 
+def test_a_viewer_that_is_closed_ends_it_without_a_word_of_ours(drive: Path) -> None:
+    (bag,) = drive.glob("*.db3")
+    with subprocess.Popen([*COMMAND, str(bag)], stdout=subprocess.PIPE, stderr=subprocess.PIPE) as importing:
+        assert importing.stdout is not None and importing.stderr is not None
+        importing.stdout.close()
+        said = importing.stderr.read().decode()
+        assert importing.wait(PATIENCE) == 1
+    assert "Traceback" not in said
+
+
 def asked(*paths: Path, monkeypatch: pytest.MonkeyPatch) -> list[tuple[Path, str, str | None]]:
     """What is imported, as application and recording, where Rerun opens a folder and all that is in it."""
     imported: list[tuple[Path, str, str | None]] = []
