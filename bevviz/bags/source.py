@@ -168,17 +168,25 @@ class BagSource(Closing):
             raise UserError(f"{self.recording.name}: {self._driver} has no scan that can be read")
         return int(np.abs(self.scans - self._time(str(time), 0)).argmin())
 
+    def checked(self, number: int) -> int:
+        """The number of a scan.
+
+        Raises:
+            UserError: there is none of that number.
+        """
+        if not 0 <= number < len(self.scans):
+            raise UserError(
+                f"frame {number}: {self.recording.name} has {len(self.scans)} scans, counted from 0"
+            )
+        return number
+
     def frame(self, number: int) -> Frame | None:
         """The frame of one scan of the recording, whichever were chosen; None where it cannot be read.
 
         Raises:
             UserError: there is no scan of that number.
         """
-        if not 0 <= number < len(self.scans):
-            raise UserError(
-                f"frame {number}: {self.recording.name} has {len(self.scans)} scans, counted from 0"
-            )
-        low = int(self.scans[number])
+        low = int(self.scans[self.checked(number)])
         return next(self._frames(low, low + 1, number, range(1)), None)
 
     def __iter__(self) -> Iterator[Frame]:

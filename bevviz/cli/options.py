@@ -95,12 +95,25 @@ def add_limits(parser: argparse.ArgumentParser) -> None:
     gate.add_argument("--junit", type=Path, metavar="FILE.xml", help="whether each limit is kept, for a CI")
 
 
+def add_at(group: argparse._ArgumentGroup, what: str, *, required: bool = False) -> None:
+    """One of its frames, by time or, as single frames have none, by number."""
+    scan = group.add_mutually_exclusive_group(required=required)
+    scan.add_argument("--at", metavar="TIME", help=what)
+    scan.add_argument("--at-frame", type=number, metavar="N", help="the same by its number, counted from 0")
+
+
 def add_selection(group: argparse._ArgumentGroup) -> None:
     """Which of its frames."""
     group.add_argument("--start", metavar="TIME", help="skip what is before this time")
     group.add_argument("--end", metavar="TIME", help="stop at this time")
     group.add_argument("--every", type=positive, default=1, metavar="N", help="run each N-th scan only")
     group.add_argument("--frames", type=slice_, metavar="A:B", help="run scans A to B-1, counted from 0")
+
+
+def number(text: str) -> int:
+    if not text.isdecimal():
+        raise argparse.ArgumentTypeError(f"'{text}' is no number, counted from 0")
+    return int(text)
 
 
 def open_bag(options: argparse.Namespace, config: Config) -> BagSource:

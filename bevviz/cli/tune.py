@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 from bevviz.cli.interrupts import terminable
 from bevviz.cli.options import (
     Commands,
+    add_at,
     add_bag,
     add_config,
     add_output,
@@ -33,7 +34,7 @@ def add(commands: Commands) -> None:
         "changed. A file that is not there is made, with every parameter and its meaning.",
     )
     group = add_bag(tune)
-    group.add_argument("--at", metavar="TIME", help="the scan nearest to this time (default: the first)")
+    add_at(group, "the scan nearest to this time (default: the first)")
     add_config(tune)
     tune.set_defaults(config=Path("bevviz.yaml"))
     add_output(tune, blueprint="tune")
@@ -87,8 +88,8 @@ def _frame(options: argparse.Namespace, settings: Settings) -> tuple[Frame, Scen
     """The frame, decoded once, with the sensors' names and what is to be said of the bag."""
     from bevviz.bags.source import BagSource
 
-    at = {"at": options.at} if options.at is not None else {"frames": (0, 1)}
-    with BagSource(options.paths, settings.config, **at) as source:
-        for frame in source:
+    with BagSource(options.paths, settings.config, at=options.at) as source:
+        frame = source.frame(options.at_frame or 0) if options.at is None else next(iter(source), None)
+        if frame is not None:
             return frame, source.scene, source.warnings
         raise UserError(f"{source.scene.name}: the scan cannot be used: {'; '.join(source.warnings)}")

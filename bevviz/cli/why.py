@@ -9,7 +9,16 @@ from typing import TYPE_CHECKING, Any
 
 from bevviz import announce
 from bevviz.cli.machine import add_json, give, on_stdout
-from bevviz.cli.options import Commands, add_bag, add_config, add_output, load_config, positive
+from bevviz.cli.options import (
+    Commands,
+    add_at,
+    add_bag,
+    add_config,
+    add_output,
+    load_config,
+    number,
+    positive,
+)
 from bevviz.cli.outputs import Outputs, say, warn
 from bevviz.closing import without_collections
 from bevviz.errors import UserError
@@ -35,9 +44,7 @@ def add(commands: Commands) -> None:
         epilog=EXAMPLES,
     )
     group = add_bag(why)
-    scan = group.add_mutually_exclusive_group(required=True)
-    scan.add_argument("--at", metavar="TIME", help="the scan nearest to this time")
-    scan.add_argument("--at-frame", type=_number, metavar="N", help="scan N, counted from 0")
+    add_at(group, "the scan nearest to this time", required=True)
     what = why.add_argument_group("what to explain", "Nothing: what did not end as an object of its own.")
     one = what.add_mutually_exclusive_group()
     one.add_argument("--class", dest="label", default="", metavar="NAME", help="all of that class")
@@ -58,9 +65,9 @@ def add(commands: Commands) -> None:
         metavar="ROW,COLUMN",
         help="what is in that cell of the bird's-eye view",
     )
-    one.add_argument("--cluster", type=_number, metavar="N", help="the cluster of that number")
-    one.add_argument("--object", type=_number, metavar="N", help="the object in that row")
-    one.add_argument("--detection", type=_number, metavar="N", help="the detection in that row")
+    one.add_argument("--cluster", type=number, metavar="N", help="the cluster of that number")
+    one.add_argument("--object", type=number, metavar="N", help="the object in that row")
+    one.add_argument("--detection", type=number, metavar="N", help="the detection in that row")
     what.add_argument(
         "--radius", type=_metres, default=0.5, metavar="M", help="around the point or cell (default: 0.5)"
     )
@@ -103,12 +110,6 @@ def _metres(text: str) -> float:
     return value
 
 
-def _number(text: str) -> int:
-    if not text.isdecimal():
-        raise argparse.ArgumentTypeError(f"'{text}' is no number, counted from 0")
-    return int(text)
-
-
 @without_collections()
 def _why(options: argparse.Namespace) -> int:
     from bevviz.bags.source import BagSource
@@ -122,11 +123,11 @@ def _why(options: argparse.Namespace) -> int:
     with BagSource(options.paths, config, at=options.at) as source:
         loader = StageLoader()
         session = Session(config, loader=loader)
-        number = options.at_frame
-        frame = next(iter(source), None) if number is None else source.frame(number)
+        row = options.at_frame
+        frame = next(iter(source), None) if row is None else source.frame(row)
         warn(source.warnings)
         if frame is None:
-            asked = f"--at {options.at}" if number is None else f"--at-frame {number}"
+            asked = f"--at {options.at}" if row is None else f"--at-frame {row}"
             raise UserError(f"{asked}: the scan there cannot be read")
         outputs = Outputs.of(options)
         result = session.run(frame) if outputs else session.explained(frame)

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from bevviz.cli.interrupts import terminable, wait_for_interrupt
-from bevviz.cli.options import Commands, add_bag, add_config, add_truth, load_config, port
+from bevviz.cli.options import Commands, add_at, add_bag, add_config, add_truth, load_config, port
 from bevviz.cli.outputs import has_display, hint, say, tell_of_browser, warn
 from bevviz.errors import UserError
 
@@ -34,7 +34,7 @@ def add(commands: Commands) -> None:
         epilog=EXAMPLES,
     )
     group = add_bag(command)
-    group.add_argument("--at", metavar="TIME", help="show the scan nearest to this time first")
+    add_at(group, "show the scan nearest to this time first")
     add_truth(command)
     add_config(command)
     page = command.add_argument_group("page")
@@ -67,7 +67,8 @@ def _open(options: argparse.Namespace) -> int:
         from bevviz.bags.source import BagSource
 
         source, again = (stack.enter_context(BagSource(options.paths, config)) for _ in range(2))
-        first = source.number_at(options.at) if options.at is not None else 0
+        number = options.at_frame or 0
+        first = source.checked(number) if options.at is None else source.number_at(options.at)
         warn(source.warnings)
 
         def make() -> Bench:
