@@ -14,6 +14,7 @@ import urllib.error
 import urllib.request
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from dataclasses import replace
 from functools import partial
 from html import unescape
 from pathlib import Path
@@ -803,6 +804,39 @@ def test_a_frame_that_has_not_been_run_yet_is_meant_by_its_time(bag: Path) -> No
             assert bench.number_at(stamps[-1] + 10**9) == FRAMES - 1
             bench.see(drive.at(frame=ran))
         bench.close()
+
+
+def test_a_frame_shows_nothing_of_those_that_a_page_has_got_before(bag: Path, tmp_path: Path) -> None:
+    """It was drawn before all others, or came before those just before it."""
+    from rerun.chunk import RrdReader
+
+    def blind(result: FrameResult) -> FrameResult:
+        return replace(result, cameras=tuple(replace(c, detections=None) for c in result.cameras))
+
+    def left(pieces: list[bytes], stamp: int) -> list[bool]:
+        """Whether the last detections up to that time are cleared, for each timeline of the stamp."""
+        rows = []
+        for number, piece in enumerate(pieces):
+            (path := tmp_path / f"{number}.rrd").write_bytes(piece)
+            for chunk in RrdReader(path).stream():
+                if chunk.entity_path == seen and not chunk.is_static:
+                    batch = chunk.to_record_batch()
+                    cleared = any("Clear" in name for name in batch.schema.names)
+                    rows += [(at.value, cleared) for at in batch.column("stamp") if at.value <= stamp]
+        return [cleared for at, cleared in rows if at == max(rows)[0]]
+
+    with bevviz.open(bag, model="demo") as drive, bevviz.open(bag, model="demo") as again:
+        results = [drive.at(frame=number) for number in range(4)]
+        seen = entities.detections(results[0].cameras[0].camera.name)
+        bench = Bench(drive, again.frames, [bag], first=3)
+        bench._show(blind(results[3]), ())
+        for result in (results[0], blind(results[1]), blind(results[2])):
+            bench.see(result)
+        first, *others = [bench.film[row] for row in range(len(bench.film))]
+        bench.close()
+    assert left([first, others[0]], results[3].frame.stamp) == [True]
+    assert left([others[0], others[2]], results[2].frame.stamp) == [True]
+    assert left([others[0]], results[0].frame.stamp) == [False]
 
 
 # --- parts --------------------------------------------------------------------------------------

@@ -55,6 +55,7 @@ class Writer(Closing):
         self._known: set[str] = set()  # entities that any frame had
         self._shown: set[str] = set()  # entities with something of the frame before
         self._now: set[str] = set()
+        self.apart = False  # whether a frame may be looked at without those just before it
         self.streams_video = True  # else each picture as an image
         self._codecs: dict[str, Codec] = {}  # of entities that are video
         self._reached: dict[str, tuple[tuple[int, int], dict[str, int]]] = {}  # last packet of each, and when
@@ -69,13 +70,19 @@ class Writer(Closing):
             self.flush()  # a column has the same timelines from end to end
 
     def end(self) -> None:
-        """Clear what the frame before had and this one has not."""
+        """Clear what the frame before had, or any where they are looked at apart, and this one has not."""
         self._known |= self._now
-        for path in self._shown - self._now:
+        for path in (self._known if self.apart else self._shown) - self._now:
             self.write(path, rr.Clear(recursive=False))
         self._shown = self._now
         if time.monotonic() - self._sent >= self._wait:
             self.flush()
+
+    def clear_at(self, index: int, stamp: int, received: int, paths: Set[str]) -> None:
+        """Clear in another frame what was not known when that was written."""
+        self.set_time(index, stamp, received)
+        for path in paths:
+            self.write(path, rr.Clear(recursive=False))
 
     def refresh(self, known: Set[str] = frozenset()) -> None:
         """Make the next frame whole without those before: what it lacks is cleared, nothing is kept.

@@ -98,6 +98,8 @@ class Bench(Closing):
         self._listeners: list[Callable[[], None]] = []
         self._stamps: list[tuple[int, int]] = []  # stamp, number of each frame on the film, in order
         self._reached = 0  # stamp that the run is at
+        self._ahead = (0, 0, 0)  # index and times of the frame that was drawn first
+        self._ahead_knows: frozenset[str] = frozenset()  # entities that are cleared there, or its own
         self._rows: dict[int, int] = {}  # on the film, of each stamp
         self._tracks: dict[int, Tracks] = {}
         self._objects: dict[int, Objects | None] = {}
@@ -116,6 +118,7 @@ class Bench(Closing):
         layout = blueprints.load("workbench", drive.scene, drive.config)
         self._main.send_blueprint(layout, make_active=True)
         self._logger = Logger(self._main, drive.config, drive.scene, wait=WAIT, stamps=BOTH)
+        self._logger.apart = True  # pages get them in whatever order they are looked at
         self._logger.log_static()
         self._desk_logger = Logger(self._desk, drive.config, drive.scene, stamps=BOTH)
         self._tried_logger = tried_logger(self._desk, drive.session, self)
@@ -216,6 +219,11 @@ class Bench(Closing):
     def _show(self, result: FrameResult, found: Sequence[Find]) -> None:
         frame = result.frame
         self._draw(self._logger, result, found, tried=False)
+        if self.opening is None:
+            self._ahead, self._ahead_knows = (frame.index, frame.stamp, frame.received), self._logger.known
+        elif frame.stamp < self._ahead[1]:
+            self._logger.clear_at(*self._ahead, self._logger.known - self._ahead_knows)
+            self._ahead_knows = self._logger.known
         entry = (frame.stamp, frame.index)
         place = bisect.bisect_left(self._stamps, entry)
         if self._stamps[place : place + 1] != [entry]:
