@@ -31,6 +31,13 @@ def test_names_do_not_meet_and_the_nearest_has_one(places: F32) -> None:
             assert (np.abs(chosen - place) < (4.0, 2.0)).all(axis=1).any()
 
 
+def test_a_longer_name_has_more_room() -> None:
+    at = np.array([[0, 0], [5, 0], [10, 0]], np.float32)
+    order = np.arange(3, dtype=np.float32)
+    assert apart(at, order, (np.array([4.0, 4.0, 4.0]), 1.0)).all()
+    assert apart(at, order, (np.array([8.0, 4.0, 4.0]), 1.0)).tolist() == [True, False, True]
+
+
 def test_who_comes_first_is_named_before_the_nearest() -> None:
     places = np.array([[10, 0, 0], [10.5, 0.2, 0], [10, 9, 0]], np.float32)
     assert named_in_space(places).tolist() == [True, False, True]

@@ -162,7 +162,7 @@ def log_detections(to: Writer, result: CameraResult, explanations: Iterable[Expl
         if result.fusion is not None:
             lost = result.fusion.detection_decision[kept] != Decision.MATCHED
         size = _size(result.camera)
-        below = np.stack([xyxy[:, ::2].mean(axis=1), xyxy[:, 3]], axis=1) / size
+        below = np.stack([xyxy[:, ::2].mean(axis=1), xyxy[:, 3]], axis=1) / size[0]
         named = apart(below, xyxy[:, 1] - xyxy[:, 3], IN_IMAGE, lost)  # the tallest are what is near
         log_spoken_in_image(
             to,

@@ -20,6 +20,7 @@ from bevviz.logging.pieces import CORNER, OUTLINE, boxes3d, image_outlines, scor
 from bevviz.logging.spoken import (
     FROM_ABOVE,
     IN_IMAGE,
+    LETTER,
     apart,
     log_names_looks,
     log_spoken,
@@ -141,15 +142,16 @@ def log_opinions_in_images(to: Writer, result: FrameResult) -> None:
     for found in result.cameras if result.opinions is not None else ():
         camera = found.camera
         if (told := told_in_image(result, camera)) and camera.intrinsics is not None:
-            room = np.array(IN_IMAGE) * (camera.intrinsics.width, camera.intrinsics.height)
-            _log_told(to, result, told, _Beside(room, CORNER, over=True))
+            width = camera.intrinsics.width
+            beside = _Beside(np.array(IN_IMAGE) * width, LETTER * width, CORNER, over=True)
+            _log_told(to, result, told, beside)
 
 
 def log_opinions_from_above(to: Writer, result: FrameResult) -> None:
     """The same over the bird's-eye image, which has the names of the method's objects itself."""
     if result.opinions is not None:
         room = np.array(FROM_ABOVE) / result.config.bev.resolution
-        _log_told(to, result, told_from_above(result), _Beside(room, 0.0, over=False))
+        _log_told(to, result, told_from_above(result), _Beside(room, 0.0, 0.0, over=False))
 
 
 def _by_opinion(result: FrameResult) -> Iterator[tuple[str, Boxes3D, I64]]:
@@ -177,11 +179,13 @@ class _Beside:
 
     Attributes:
         room: (2,) of a name, across and up in pixels.
+        letter: of each letter of a name that is longer, in pixels.
         corner: what Rerun adds to a pixel.
         over: over the outlines, as the names of detections are under them; else under them.
     """
 
     room: F64
+    letter: float
     corner: float
     over: bool
 
@@ -201,13 +205,13 @@ def _log_told(to: Writer, result: FrameResult, told: Mapping[str, Told], beside:
     centers = [_of(result, found.opinion).boxes.center[found.rows, :2] for found in doubted]
     away = np.hypot(*np.concatenate([np.zeros((0, 2), np.float32), *centers]).T)
     denied = np.array([found.opinion != MISSED for found in doubted for _ in found.rows], bool)
-    across, up = beside.room.tolist()
-    named = iter(apart(places.reshape(-1, 2), away, (across, up), denied).tolist())
+    letters = [len(name) for found in doubted for name in _names(result, found)]
+    across = np.maximum(beside.room[0], beside.letter * np.array(letters, np.float64))
+    named = iter(apart(places.reshape(-1, 2), away, (across, float(beside.room[1])), denied).tolist())
     for path, found in told.items():
-        theirs = _of(result, found.opinion)
         subject = "fused" if found.opinion == MISSED else "object"
         said = {e.row: e.text for e in result.explanations if e.subject == subject}
-        names = [f"{theirs.names[row]} {found.opinion}" for row in found.rows]
+        names = _names(result, found)
         shown = [next(named) for _ in names] if found.opinion in DOUBTS else [False] * len(names)
         log_stroked(
             to,
@@ -217,6 +221,11 @@ def _log_told(to: Writer, result: FrameResult, told: Mapping[str, Told], beside:
             [said.get(row, name) for row, name in zip(found.rows, names, strict=True)],
             np.array([beside.place(stroke) for stroke in found.strokes], np.float32),
         )
+
+
+def _names(result: FrameResult, found: Told) -> list[str]:
+    theirs = _of(result, found.opinion)
+    return [f"{theirs.names[row]} {found.opinion}" for row in found.rows]
 
 
 def _of(result: FrameResult, opinion: str) -> Objects:

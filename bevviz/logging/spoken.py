@@ -22,8 +22,9 @@ from bevviz.logging.writer import Writer
 NEAR = 6  # boxes that have their names beside them because they are near: with all, names cover the scene
 EYE, LOOK = (-16.0, 5.0, 11.0), (10.0, 0.0, -1.0)  # from where the layouts look into space, and whereto
 # The room of a name, across and up: in space as the eye sees it (tangents), from above in metres, in an image
-# in parts of its width and height. What is named must be further apart than one of the two.
-IN_SPACE, FROM_ABOVE, IN_IMAGE = (0.24, 0.035), (20.0, 3.5), (0.21, 0.09)
+# in parts of its width, as views are narrow. What is named must be further apart than one of the two.
+IN_SPACE, FROM_ABOVE, IN_IMAGE = (0.24, 0.035), (20.0, 3.5), (0.21, 0.05)
+LETTER = 0.014  # of a longer name in an image: part of its width
 
 _POINT, _COLOR = rr.Radius.ui_points(0.0), (235, 238, 245)
 
@@ -122,24 +123,27 @@ def named_from_above(places: F32) -> Bool:
     return apart(places[:, 1::-1], _away(places), FROM_ABOVE)
 
 
-def apart(at: geometry.FloatArray, order: F32, room: tuple[float, float], first: Bool | None = None) -> Bool:
+def apart(
+    at: geometry.FloatArray, order: F32, room: tuple[float | F64, float], first: Bool | None = None
+) -> Bool:
     """(K,) the first ``NEAR`` whose names do not meet.
 
     Args:
         at: (K, 2) where the names are, across and up.
         order: (K,) the least comes first.
-        room: of a name, across and up.
+        room: of a name, across, one for all or (K,), and up.
         first: (K,) come before all others.
     """
-    chosen: list[tuple[float, float]] = []
+    chosen: list[tuple[float, float, float]] = []
+    wide = np.broadcast_to(room[0], len(at)).tolist()
     found: Bool = np.zeros(len(at), bool)
     rows = np.lexsort((order, ~first)) if first is not None else np.argsort(order, kind="stable")
     places = at.tolist()
     for row in rows.tolist():
         x, y = places[row]
-        if all(abs(x - u) >= room[0] or abs(y - v) >= room[1] for u, v in chosen):
+        if all(abs(x - u) >= (wide[row] + w) / 2 or abs(y - v) >= room[1] for u, v, w in chosen):
             found[row] = True
-            chosen.append((x, y))
+            chosen.append((x, y, wide[row]))
             if len(chosen) == NEAR:
                 break
     return found
