@@ -17,10 +17,12 @@ import pytest
 import bevviz
 from bevviz import geometry
 from bevviz.cli import main
+from bevviz.datasets.names import accepted_names
 from bevviz.evaluate import Truth, judge, truth_in, truth_of
 from bevviz.evaluate.evaluation import Evaluation
 from bevviz.evaluate.identity import Identities
 from bevviz.evaluate.precision import DIFFICULTIES, AveragePrecision, Found
+from bevviz.evaluate.score import Score
 from bevviz.frame import Boxes3D, ImageLabels
 from bevviz.results import Objects
 from bevviz.stages.robot import in_points_frame
@@ -311,7 +313,73 @@ def test_real_frames(shared: Path, capsys: Capture) -> None:
     said = capsys.readouterr()
     assert "12 frames; 28 objects had to be found" in said.out
     assert "car, moderate" in said.out
+    assert "\nperson" not in said.out, "what is called so counts for the labels that it may be"
     assert "(of 40 labels or fewer an average precision is (labels - 1) / 40 at best" in said.out
+
+
+# --- detectors' names and labels ----------------------------------------------------------------
+
+ACCEPTED = {name: accepted_names(name, ()) for name in ("Pedestrian", "Cyclist", "Car")}
+
+
+def labelled(*rows: tuple[str, float, float]) -> Truth:
+    """Labels at places on the ground, all of which must be found."""
+    center = np.array([[x, y, 0.0] for _, x, y in rows]).reshape(-1, 3)
+    there = Boxes3D(center, np.ones((len(rows), 3), np.float32), np.zeros(len(rows), np.float32))
+    names = tuple(name for name, *_ in rows)
+    return Truth(there, names, tuple(ACCEPTED[name] for name in names), np.ones(len(rows), bool))
+
+
+def named(*rows: tuple[str, float, float]) -> Objects:
+    """What a detector of COCO's classes made of a frame."""
+    count = len(rows)
+    numbers = np.arange(count, dtype=np.int32)
+    score = np.linspace(0.9, 0.5, count, dtype=np.float32)
+    names = tuple(name for name, *_ in rows)
+    return Objects(
+        labelled(*(("Car", x, y) for _, x, y in rows)).boxes, names, score, numbers, ("",) * count, numbers
+    )
+
+
+def test_what_is_false_counts_for_the_class_that_it_may_be() -> None:
+    """Also in frames before the first label of that class."""
+    score = Score()
+    score.add(named(("person", 5, 5), ("bench", 7, 7)), labelled(("Cyclist", 30, 0)))
+    score.add(
+        named(("person", 10, 0), ("person", 20, 0), ("person", 15, 9), ("bicycle", 25, 9)),
+        labelled(("Pedestrian", 10, 0), ("Cyclist", 20, 0), ("Car", 40, 0)),
+    )
+    assert {name: dict(found) for name, found in score.classes.items()} == {
+        "pedestrian": {"tp": 1, "fp": 2},
+        "cyclist": {"tp": 1, "fp": 1, "fn": 1},
+        "car": {"fn": 1},
+    }
+    assert dict(score.total) == {"tp": 2, "fp": 3, "fn": 2}
+
+
+def test_average_precision_falls_by_what_is_false_in_any_frame() -> None:
+    """A detector's persons, where people have labelled pedestrians and cyclists."""
+
+    def averages(*more: Objects) -> dict[str, float]:
+        precision = AveragePrecision(("bev",))
+        places = [(float(x), 0.0) for x in range(0, 150, 3)]
+        frames = [(objects, labelled()) for objects in more]
+        frames += [
+            (
+                named(("person", x, y), ("person", x, y + 9)),
+                labelled(("Pedestrian", x, y), ("Cyclist", x, y + 9)),
+            )
+            for x, y in places
+        ]
+        for objects, truth in frames:
+            above, _ = geometry.box_iou(objects.boxes, truth.boxes)
+            height = np.full(len(objects), np.inf, np.float32)
+            precision.add(Found(objects.names, objects.score, height, {"bev": above}, {}), truth)
+        return {name: value for (_, overlap, name, _), value in precision.results().items() if overlap == 0.5}
+
+    assert averages() == {"pedestrian": 1.0, "cyclist": 1.0}
+    assert averages(*[named(("person", 0, 0))] * 50) == {"pedestrian": 0.5, "cyclist": 1.0}
+    assert averages(named(("bench", 0, 0))) == {"pedestrian": 1.0, "cyclist": 1.0}
 
 
 # --- many bags ---------------------------------------------------------------------------------

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import Counter, defaultdict
 
 import numpy as np
 
 from bevviz import geometry
-from bevviz.evaluate.score import accepts, pair_in_order
+from bevviz.evaluate.score import Classes, accepts, pair_in_order
 from bevviz.evaluate.truth import Truth
 from bevviz.frame import F32, Bool
 from bevviz.results import CameraResult
@@ -15,28 +15,42 @@ from bevviz.results import CameraResult
 DETECTION_OVERLAP = 0.5  # least IoU in the image of a detection and what it is
 
 
-def count_detections(counts: dict[str, Counter[str]], result: CameraResult, truth: Truth) -> None:
-    """One camera's detections against the image boxes of the truth, best score first."""
-    found, camera = result.detections, result.camera
-    if found is None or camera.intrinsics is None or camera.camera_from_points is None:
-        return
-    boxes = _image_boxes(truth, result)
-    kept = np.flatnonzero(found.kept)
-    kept = kept[np.argsort(-found.score[kept], kind="stable")]
-    names = [found.names[d].lower() for d in kept]
-    overlap = geometry.iou(found.xyxy[kept], boxes)
-    cost = np.where(accepts(truth, names) & (overlap >= DETECTION_OVERLAP), 1 - overlap, np.inf)
-    partner, free = pair_in_order(cost, 1.0)
-    judged = frozenset().union(*truth.accepted)
-    excused = _in_regions(found.xyxy[kept], truth)
-    here = truth.must & np.isfinite(boxes).all(axis=1)
-    for name, k, out in zip(names, partner.tolist(), excused.tolist(), strict=True):
-        if k >= 0 and here[k]:
-            counts[truth.labels[k].lower()]["true"] += 1
-        elif k < 0 and not out and name in judged:
-            counts[name]["false"] += 1
-    for row in np.flatnonzero(free & here).tolist():
-        counts[truth.labels[row].lower()]["missed"] += 1
+class DetectionScore:
+    """Counts over frames: right ones and missed ones by label, false ones by name."""
+
+    def __init__(self) -> None:
+        self._labels: dict[str, Counter[str]] = defaultdict(Counter)
+        self._false: Counter[str] = Counter()
+
+    def classes(self, judged: Classes) -> dict[str, Counter[str]]:
+        """``true``, ``false`` and ``missed`` of each class."""
+        counts = {label: Counter(found) for label, found in self._labels.items()}
+        for name, number in self._false.items():
+            if (cls := judged.of(name)) is not None:
+                counts.setdefault(cls, Counter())["false"] += number
+        return counts
+
+    def add(self, result: CameraResult, truth: Truth) -> None:
+        """One camera's detections against the image boxes of the truth, best score first."""
+        found, camera = result.detections, result.camera
+        if found is None or camera.intrinsics is None or camera.camera_from_points is None:
+            return
+        boxes = _image_boxes(truth, result)
+        kept = np.flatnonzero(found.kept)
+        kept = kept[np.argsort(-found.score[kept], kind="stable")]
+        names = [found.names[d].lower() for d in kept]
+        overlap = geometry.iou(found.xyxy[kept], boxes)
+        cost = np.where(accepts(truth, names) & (overlap >= DETECTION_OVERLAP), 1 - overlap, np.inf)
+        partner, free = pair_in_order(cost, 1.0)
+        excused = _in_regions(found.xyxy[kept], truth)
+        here = truth.must & np.isfinite(boxes).all(axis=1)
+        for name, k, out in zip(names, partner.tolist(), excused.tolist(), strict=True):
+            if k >= 0 and here[k]:
+                self._labels[truth.labels[k].lower()]["true"] += 1
+            elif k < 0 and not out:
+                self._false[name] += 1
+        for row in np.flatnonzero(free & here).tolist():
+            self._labels[truth.labels[row].lower()]["missed"] += 1
 
 
 def _image_boxes(truth: Truth, result: CameraResult) -> F32:

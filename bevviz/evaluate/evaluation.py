@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from bevviz.evaluate.detections import count_detections
+from bevviz.evaluate.detections import DetectionScore
 from bevviz.evaluate.ground import count_ground
 from bevviz.evaluate.identity import TrackScore
 from bevviz.evaluate.names import base_of, ranges
@@ -59,7 +59,7 @@ class Evaluation(Observer[FrameResult]):
         self._rows: list[tuple[str, str, float]] = []  # what became of it, class, metres away
         self._precision = AveragePrecision()
         self._tracks = TrackScore()
-        self._detections: dict[str, Counter[str]] = defaultdict(Counter)
+        self._detections = DetectionScore()
         self._ground: Counter[str] = Counter()
         self._errors: dict[str, list[float]] = defaultdict(list)
         self._metrics: dict[str, float] | None = None
@@ -77,9 +77,9 @@ class Evaluation(Observer[FrameResult]):
         self._place(objects, truth, matches)
         if result.objects is not None:
             self._precision.add(found_objects(result, truth), truth)
-        self._tracks.add(result, truth)
+        self._tracks.add(result, truth, self._score.judged)
         for camera in result.cameras:
-            count_detections(self._detections, camera, truth)
+            self._detections.add(camera, truth)
         count_ground(self._ground, result)
 
     def _place(self, objects: Objects, truth: Truth, matches: Matches) -> None:
@@ -96,10 +96,9 @@ class Evaluation(Observer[FrameResult]):
 
     # --- numbers -------------------------------------------------------------------------------
 
-    @property
-    def names(self) -> set[str]:
-        """Names that are judged: those that labels accept, in lower case."""
-        return self._score.names
+    def judges(self, name: str) -> bool:
+        """Whether some label accepts a name, in lower case."""
+        return self._score.judged.of(name) is not None
 
     @property
     def metrics(self) -> Mapping[str, float]:
@@ -132,8 +131,9 @@ class Evaluation(Observer[FrameResult]):
         for cls, found in self._tracks.results().items():
             for name, value in found.items():
                 yield (f"{name}.{cls}" if cls else name), value
-        for cls in ("", *sorted(self._detections)):
-            counts = self._detections[cls] if cls else sum(self._detections.values(), Counter())
+        detections = self._detections.classes(self._score.judged)
+        for cls in ("", *sorted(detections)):
+            counts = detections[cls] if cls else sum(detections.values(), Counter())
             if counts.total():
                 tail = f".{cls}" if cls else ""
                 yield f"detection_recall{tail}", share(counts["true"], counts["missed"])
@@ -147,15 +147,21 @@ class Evaluation(Observer[FrameResult]):
     @property
     def classes(self) -> list[str]:
         """That labels have, or a false object that is judged."""
-        return sorted({cls for what, cls, _ in self._rows if what != "false" or cls in self.names})
+        return sorted({cls for _, cls, _ in self._judged_rows()})
 
     def counts(self, cls: str = "", low: float = 0.0, high: float = math.inf) -> Counter[str]:
         """``true``, ``false`` and ``missed``, of a class or of all, between two distances in metres."""
         return Counter(
-            what
-            for what, name, away in self._rows
-            if (not cls or name == cls) and low <= away < high and (what != "false" or name in self.names)
+            what for what, name, away in self._judged_rows() if name == (cls or name) and low <= away < high
         )
+
+    def _judged_rows(self) -> Iterator[tuple[str, str, float]]:
+        """What is true, missed or false, its class and range."""
+        classes = {name: self._score.judged.of(name) for what, name, _ in self._rows if what == "false"}
+        for what, name, away in self._rows:
+            cls = classes[name] if what == "false" else name
+            if cls is not None:
+                yield what, cls, away
 
     @property
     def labels(self) -> Mapping[str, int]:
@@ -181,7 +187,7 @@ class Evaluation(Observer[FrameResult]):
             "stamp": frame.stamp,
             "true": list(frame.true),
             "missed": list(frame.missed),
-            "false": [words for name, words in frame.false if name in self.names],
+            "false": [words for name, words in frame.false if self.judges(name)],
         }
 
     # --- how it is shown -----------------------------------------------------------------------

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from bevviz import geometry
-from bevviz.evaluate.score import accepts
+from bevviz.evaluate.score import Classes, accepts
 from bevviz.evaluate.truth import MAX_DISTANCE, Truth
 from bevviz.frame import F64, I32
 from bevviz.results import FrameResult
@@ -119,7 +119,7 @@ class TrackScore:
     def __init__(self) -> None:
         self.classes: dict[str, Identities] = defaultdict(Identities)
 
-    def add(self, result: FrameResult, truth: Truth) -> None:
+    def add(self, result: FrameResult, truth: Truth, judged: Classes) -> None:
         """One frame; nothing where the objects have no ids, or nothing is tracked."""
         tracks = result.tracks
         if tracks is None or not truth.ids:
@@ -135,9 +135,13 @@ class TrackScore:
         distance[distance > MAX_DISTANCE] = np.inf
         column = assign(distance, unmatched=MAX_DISTANCE + 1)
         free = np.setdiff1d(np.arange(len(shown)), column[~truth.must & (column >= 0)])
-        for name in ("", *{*names, *(label.lower() for label in truth.labels)}):
-            rows = [k for k in np.flatnonzero(truth.must) if name in ("", *truth.accepted[k])]
-            mine = [t for t in free if name in ("", names[t])]
+        labels = [label.lower() for label in truth.labels]
+        classes = [judged.of(name) for name in names]
+        for k in np.flatnonzero(column >= 0).tolist():
+            classes[column[k]] = labels[k]
+        for name in {"", *labels, *(cls for cls in classes if cls)}:
+            rows = [k for k in np.flatnonzero(truth.must) if name in ("", labels[k])]
+            mine = [t for t in free if name in ("", classes[t])]
             self.classes[name].add(
                 [truth.ids[k] for k in rows], tracks.id[shown[mine]].tolist(), distance[np.ix_(rows, mine)]
             )

@@ -51,10 +51,10 @@ class EvaluationRecorder(Observer[FrameResult]):
         writer, frame = self._writer, result.frame
         writer.begin(frame.index, frame.stamp, frame.received)
         _, truth, matches = self._evaluation.last
-        names = self._evaluation.names
+        judges = self._evaluation.judges
         parts: list[Judged] = [("missed", truth.boxes, np.flatnonzero(matches.missed).tolist(), truth.labels)]
         if (objects := result.objects) is not None:
-            false = [j for j in np.flatnonzero(matches.false).tolist() if objects.names[j].lower() in names]
+            false = [j for j in np.flatnonzero(matches.false).tolist() if judges(objects.names[j].lower())]
             parts.append(("false", objects.boxes, false, objects.names))
             parts.append(("true", objects.boxes, np.flatnonzero(matches.true).tolist(), objects.names))
         self._boxes(result, [part for part in parts if part[2]])

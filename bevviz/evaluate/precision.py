@@ -7,15 +7,16 @@ anybody, and at which scores the curve is sampled.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bevviz import geometry
-from bevviz.evaluate.score import accepts
+from bevviz.evaluate.score import Classes, accepts
 from bevviz.evaluate.truth import Truth
 from bevviz.frame import F32, Bool
 from bevviz.results import FrameResult
@@ -25,6 +26,7 @@ RECALL_POINTS = 40
 COUNTS, IGNORED, OTHER = 0, 1, -1  # what a label or a detection is to a class and difficulty
 
 Roles = NDArray[np.int8]  # of these
+Key: TypeAlias = tuple[str, float, str, str]  # view, overlap, class, difficulty
 
 
 class Difficulty(NamedTuple):
@@ -183,18 +185,17 @@ class AveragePrecision:
 
     def __init__(self, views: Sequence[str] = VIEWS) -> None:
         self._views = views
-        self._curves: dict[tuple[str, float, str, str], Curve] = {}
+        self._curves: dict[Key, Curve] = {}
+        self._frames: list[tuple[Found, Truth]] = []  # of other labels than KITTI's
+        self._judged = Classes()  # of these
 
     def add(self, found: Found, truth: Truth) -> None:
         """One frame."""
-        labels = np.array(truth.labels, object)
         if truth.image is None:
-            for name in sorted({label.lower() for label in truth.labels} | set(self._classes())):
-                of_class = np.array([label.lower() == name for label in truth.labels], bool)
-                label = _roles(of_class & truth.must, of_class)
-                mine = accepts_name(truth, found.names, name)
-                self._add(name, "", found, _roles(mine, mine), label)
+            self._judged.add(truth)
+            self._frames.append((found, truth))
             return
+        labels = np.array(truth.labels, object)
         size = truth.image.xyxy[:, 3] - truth.image.xyxy[:, 1]
         for kind, (neighbours, names) in KITTI_CLASSES.items():
             own, near = labels == kind, np.isin(labels.astype(str), neighbours)
@@ -205,39 +206,53 @@ class AveragePrecision:
                 label = _roles(counts, own | near)
                 small = found.height < limit.height
                 det = _roles(mine & ~small, mine | small)
-                self._add(kind.lower(), name, found, det, label)
+                self._add(self._curves, (kind.lower(), name), found, det, label)
 
-    def _classes(self) -> set[str]:
-        return {key[2] for key in self._curves}
+    def _by_label(self) -> dict[Key, Curve]:
+        """Of labels that are not KITTI's: what each detection is is known when all labels are."""
+        curves: dict[Key, Curve] = {}
+        names = {label.lower() for _, truth in self._frames for label in truth.labels}
+        for found, truth in self._frames:
+            labels = np.array([label.lower() for label in truth.labels], object)
+            classes = np.array(_classes(found, truth, self._judged), object)
+            for name in sorted(names):
+                own, mine = labels == name, classes == name
+                self._add(curves, (name, ""), found, _roles(mine, mine), _roles(own & truth.must, own))
+        return curves
 
-    def _add(self, name: str, difficulty: str, found: Found, det: Roles, label: Roles) -> None:
+    def _add(
+        self, curves: dict[Key, Curve], of: tuple[str, str], found: Found, det: Roles, label: Roles
+    ) -> None:
         for view in self._views:
             for overlap in OVERLAPS:
-                key = view, overlap, name, difficulty
-                curve = self._curves.setdefault(key, Curve(view, overlap))
-                curve.add(found, det, label)
+                curves.setdefault((view, overlap, *of), Curve(view, overlap)).add(found, det, label)
 
     @property
     def labels(self) -> dict[tuple[str, str], int]:
         """(class, difficulty) -> labels that had to be found."""
-        return {key[2:]: curve.labels for key, curve in self._curves.items() if curve.labels}
+        found = {key[2:]: curve.labels for key, curve in self._curves.items()}
+        must = ((k, truth) for _, truth in self._frames for k in np.flatnonzero(truth.must).tolist())
+        found |= Counter((truth.labels[k].lower(), "") for k, truth in must)
+        return {of: count for of, count in found.items() if count}
 
-    def results(self) -> dict[tuple[str, float, str, str], float]:
+    def results(self) -> dict[Key, float]:
         """(view, overlap, class, difficulty) -> average precision; only where there was something to find.
 
         The kit takes one score for each right object at most: with 40 labels or fewer it has fewer than 40
         points, and the average is (labels - 1) / 40 at best.
         """
-        return {key: curve.average() for key, curve in self._curves.items() if curve.labels}
+        curves = self._curves | self._by_label()
+        return {key: curve.average() for key, curve in curves.items() if curve.labels}
 
 
 def _roles(counts: Bool, ignored: Bool) -> Roles:
     return np.where(counts, COUNTS, np.where(ignored, IGNORED, OTHER)).astype(np.int8)
 
 
-def accepts_name(truth: Truth, names: Sequence[str], label: str) -> Bool:
-    """(D,) which names are right for that label."""
-    rows = [k for k, own in enumerate(truth.labels) if own.lower() == label]
-    if rows:
-        return np.asarray(accepts(truth, list(names))[:, rows[0]])
-    return np.array([name == label for name in names], bool)
+def _classes(found: Found, truth: Truth, judged: Classes) -> list[str | None]:
+    """Of each detection: that of the label it overlaps most of those it may be, else what it is judged as."""
+    overlap = np.where(accepts(truth, list(found.names)), found.overlaps[VIEWS[0]], 0)
+    classes = [judged.of(name) for name in found.names]
+    for d in np.flatnonzero((overlap > 0).any(axis=1)).tolist():
+        classes[d] = truth.labels[int(overlap[d].argmax())].lower()
+    return classes

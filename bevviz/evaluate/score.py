@@ -27,35 +27,62 @@ class Matches:
     missed: Bool  # (K,) had to be found, and was not
 
 
+class Classes:
+    """The labels of the frames so far, and what may be called so."""
+
+    def __init__(self) -> None:
+        self._accepted: dict[str, frozenset[str]] = {}
+
+    def add(self, truth: Truth) -> None:
+        """One frame's."""
+        for label, names in zip(truth.labels, truth.accepted, strict=True):
+            self._accepted[label.lower()] = self._accepted.get(label.lower(), frozenset()) | names
+
+    def of(self, name: str) -> str | None:
+        """What counts for which class where it is nothing that is labelled; None: it is not judged.
+
+        For that of its own name; where no label has it, for the label that has fewest other names: what is
+        called a person is a pedestrian rather than a cyclist.
+        """
+        fits = [label for label, names in self._accepted.items() if name in names]
+        return name if name in fits else min(fits, key=lambda f: (len(self._accepted[f]), f), default=None)
+
+
 @dataclass
 class Score:
     """Counts over frames. A name that no label accepts in any frame is not judged."""
 
-    classes: dict[str, Counter[str]] = field(default_factory=lambda: defaultdict(Counter))
-    names: set[str] = field(default_factory=set)  # that labels accept
+    judged: Classes = field(default_factory=Classes)
     errors: list[float] = field(default_factory=list)  # metres, of the right ones
+    _labels: dict[str, Counter[str]] = field(default_factory=lambda: defaultdict(Counter))
+    _false: Counter[str] = field(default_factory=Counter)  # by name
 
     def add(self, found: Objects, truth: Truth) -> Matches:
         """Pair one frame's objects with the truth, best score first, and count."""
-        self.names.update(*truth.accepted)
+        self.judged.add(truth)
         matches = judge(found, truth)
-        for j in np.flatnonzero(matches.false):
-            self.classes[found.names[j].lower()]["fp"] += 1
+        self._false.update(found.names[j].lower() for j in np.flatnonzero(matches.false))
         best_first = np.argsort(-found.score, kind="stable")
         for j in best_first[matches.true[best_first]]:
-            self.classes[truth.labels[matches.partner[j]].lower()]["tp"] += 1
+            self._labels[truth.labels[matches.partner[j]].lower()]["tp"] += 1
             self.errors.append(float(matches.distance[j]))
         for k in np.flatnonzero(matches.missed):
-            self.classes[truth.labels[k].lower()]["fn"] += 1
+            self._labels[truth.labels[k].lower()]["fn"] += 1
         return matches
 
     @property
+    def classes(self) -> dict[str, Counter[str]]:
+        """Right ones (tp), false ones (fp) and missed ones (fn) of each class, in lower case."""
+        counts = {name: Counter(found) for name, found in self._labels.items()}
+        for name, number in self._false.items():
+            if (cls := self.judged.of(name)) is not None:
+                counts.setdefault(cls, Counter())["fp"] += number
+        return counts
+
+    @property
     def total(self) -> Counter[str]:
-        """Right ones (tp), false ones of the names that are judged (fp), missed ones (fn)."""
-        total: Counter[str] = Counter()
-        for name, counts in self.classes.items():
-            total.update({k: n for k, n in counts.items() if k != "fp" or name in self.names})
-        return total
+        """The same of all classes."""
+        return sum(self.classes.values(), Counter())
 
     @property
     def precision(self) -> float:

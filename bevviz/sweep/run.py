@@ -153,8 +153,8 @@ class Sweep:
                     "frames": outcome.frames,
                     "metrics": outcome.metrics,
                     "classes": {
-                        name: {kind: outcome.score.classes[name][kind] for kind in ("tp", "fp", "fn")}
-                        for name in outcome.score.names
+                        name: {kind: found[kind] for kind in ("tp", "fp", "fn")}
+                        for name, found in sorted(outcome.score.classes.items())
                     },
                     "failures": outcome.failures,
                 }
@@ -170,7 +170,7 @@ class Sweep:
             UserError: the file cannot be written.
         """
         names = self._metrics()
-        classes = sorted({name for o in self.outcomes.values() for name in o.score.names})
+        classes = sorted({name for o in self.outcomes.values() for name in o.score.classes})
         kinds = ("tp", "fp", "fn")
         header = [p.key for p in self.parameters] + ["frames", *names]
         header += [f"{name} {kind}" for name in classes for kind in kinds]
@@ -179,7 +179,8 @@ class Sweep:
         writer.writerow(header)
         for values, outcome in self.outcomes.items():
             metrics = outcome.metrics
-            by_class = [outcome.score.classes[name][kind] for name in classes for kind in kinds]
+            found = outcome.score.classes
+            by_class = [found.get(name, Counter())[kind] for name in classes for kind in kinds]
             rounded = (f"{metrics.get(name, math.nan):.6g}" for name in names)
             writer.writerow([*values, outcome.frames, *rounded, *by_class])
         save(path, file.getvalue(), "--csv")
