@@ -21,6 +21,7 @@ from bevviz.export.kitti import KittiExport, labels
 from bevviz.export.nuscenes import TABLES, VERSION, NuScenesExport
 from bevviz.frame import Boxes3D, Intrinsics
 from bevviz.results import FrameResult, Objects
+from tests import bags
 
 OPTICAL = geometry.inverse(geometry.transform(np.array([0.2, 0.1, -0.3]), np.array([-0.5, 0.5, -0.5, 0.5])))
 
@@ -193,6 +194,19 @@ def test_a_track_is_called_what_it_was_called_most(tmp_path: Path) -> None:
     names = {row["token"]: row["name"] for row in tables["category"]}
     called = Counter(names[row["category_token"]] for row in tables["instance"] if row["nbr_annotations"] > 3)
     assert len(called) > 1 and "vehicle.bus.rigid" not in called
+
+
+def test_tables_of_two_scenes_can_be_joined(tmp_path: Path) -> None:
+    for name in ("one", "two"):
+        bevviz.open(bags.write(tmp_path / f"{name}.mcap", bags.small_items(scans=2))).run(
+            [NuScenesExport(tmp_path / name)]
+        )
+    for table in TABLES:
+        one, two = (
+            {row["token"] for row in json.loads((tmp_path / f"{name}/{VERSION}/{table}.json").read_text())}
+            for name in ("one", "two")
+        )
+        assert one == two if table in ("sensor", "category", "visibility") else not one & two, table
 
 
 def test_a_scene_is_written_by_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -25,6 +25,7 @@ TABLES = (
     *("attribute", "calibrated_sensor", "category", "ego_pose", "instance", "log", "map", "sample"),
     *("sample_annotation", "sample_data", "scene", "sensor", "visibility"),
 )
+SHARED = ("category", "sensor")  # by scenes, so that tables of several can be joined
 LIDAR = "LIDAR_TOP"
 MAP = "maps/unknown.png"  # of a scene whose map nobody knows; the devkit asks for one
 JPEG_QUALITY = 95
@@ -63,7 +64,7 @@ class NuScenesExport(FolderExport):
         self._known: dict[tuple[str, str], str] = {}  # tokens of rows that others refer to, by table and key
         self._annotated: dict[str, list[str]] = defaultdict(list)
         self._named: dict[str, dict[str, float]] = defaultdict(lambda: defaultdict(float))  # by instance
-        self._scene = ""
+        self._scene, self._start = "", 0  # name, and nanoseconds of its first frame
 
     def begin(self, items: Items[object]) -> None:
         super().begin(items)
@@ -90,7 +91,8 @@ class NuScenesExport(FolderExport):
         if not frame.lidar:
             self._skip("no scan")
             return
-        scene, token = _token("scene"), _token("sample", self.frames)
+        self._start = self._start or frame.stamp
+        scene, token = self._token("scene"), self._token("sample", self.frames)
         sample = self._follow("sample", "", token, timestamp=_micros(frame.stamp), scene_token=scene)
         with self._saving():
             name = self._write_points(frame)
@@ -160,7 +162,7 @@ class NuScenesExport(FolderExport):
         form: str,
         size: tuple[int, int],
     ) -> None:
-        token = _token("sample_data", channel, self.frames)
+        token = self._token("sample_data", channel, self.frames)
         self._rows["ego_pose"].append({"token": token, "timestamp": _micros(stamp), **_placed(pose)})
         self._follow(
             "sample_data",
@@ -193,7 +195,7 @@ class NuScenesExport(FolderExport):
             annotation = self._follow(
                 "sample_annotation",
                 instance,
-                _token("sample_annotation", self.frames, row),
+                self._token("sample_annotation", self.frames, row),
                 sample_token=sample,
                 instance_token=instance,
                 visibility_token="",  # not known
@@ -210,9 +212,14 @@ class NuScenesExport(FolderExport):
     def _once(self, table: str, key: str, **values: Any) -> str:
         """The token of a row that is written when it is first named."""
         if (table, key) not in self._known:
-            token = self._known[table, key] = _token(table, key)
+            token = self._known[table, key] = self._token(table, key)
             self._rows[table].append({"token": token, **values})
         return self._known[table, key]
+
+    def _token(self, table: str, *key: object) -> str:
+        """As nuScenes has them, 32 hexadecimal digits; of another scene others, but for what is shared."""
+        of = (table, *key) if table in SHARED else (self._scene, self._start, table, *key)
+        return hashlib.md5("\0".join(map(str, of)).encode(), usedforsecurity=False).hexdigest()
 
     def _follow(self, table: str, of: str, token: str, **values: Any) -> dict[str, Any]:
         """A row that is chained to the one before it."""
@@ -229,7 +236,7 @@ class NuScenesExport(FolderExport):
         if not samples:
             return
         captured = datetime.fromtimestamp(samples[0]["timestamp"] / 1e6, UTC)
-        log, scene = _token("log"), _token("scene")
+        log, scene = self._token("log"), self._token("scene")
         self._rows["log"] = [
             {
                 "token": log,
@@ -240,7 +247,7 @@ class NuScenesExport(FolderExport):
             }
         ]
         self._rows["map"] = [
-            {"token": _token("map"), "log_tokens": [log], "category": "semantic_prior", "filename": MAP}
+            {"token": self._token("map"), "log_tokens": [log], "category": "semantic_prior", "filename": MAP}
         ]
         self._rows["scene"] = [
             {
@@ -262,11 +269,6 @@ class NuScenesExport(FolderExport):
         with self._saving():
             for table, rows in self._rows.items():
                 (self._folder / VERSION / f"{table}.json").write_text(json.dumps(rows, indent=0))
-
-
-def _token(*of: object) -> str:
-    """As nuScenes has them, 32 hexadecimal digits; the same for the same."""
-    return hashlib.md5("\0".join(map(str, of)).encode(), usedforsecurity=False).hexdigest()
 
 
 def _micros(stamp: int) -> int:
