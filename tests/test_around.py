@@ -19,7 +19,8 @@ from bevviz.ros.around import decode_shapes, decode_statuses
 from bevviz.ros.description import mesh_file
 from bevviz.ros.encode import encode_cloud, encode_image, typestore
 from bevviz.ros.messages import MessageError
-from bevviz.ros.roles import Topic, find_roles, kind_of
+from bevviz.ros.roles import find_roles, kind_of
+from bevviz.ros.topics import Topic
 from bevviz.sync.around import MANY, SAMPLES, Surroundings
 from bevviz.synthetic import SyntheticSource
 from bevviz.synthetic.sensors import Lidar, PinholeCamera

@@ -19,7 +19,8 @@ from bevviz.config import Config, load
 from bevviz.errors import UserError
 from bevviz.frame import F64, Boxes3D, Cloud, Frame, Image, Intrinsics, LabelledBoxes2D, LabelledBoxes3D
 from bevviz.ros.messages import MessageError
-from bevviz.ros.roles import CameraRole, Roles
+from bevviz.ros.roles import Roles
+from bevviz.ros.sensors import CameraRole
 from bevviz.ros.transforms import StampedTransform
 from bevviz.sync.clocks import Clocks
 from bevviz.sync.feed import make_handlers

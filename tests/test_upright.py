@@ -21,7 +21,8 @@ from bevviz.perceive import perceive
 from bevviz.results import FrameResult
 from bevviz.ros.clouds import decode_cloud
 from bevviz.ros.encode import encode_boxes_3d, encode_cloud
-from bevviz.ros.roles import Roles, Topic, find_roles
+from bevviz.ros.roles import Roles, find_roles
+from bevviz.ros.topics import Topic
 from bevviz.ros.transforms import Acceleration, StampedTransform
 from bevviz.stage_loader import StageLoader
 from bevviz.sync.synchronizer import Synchronizer

@@ -19,7 +19,8 @@ from bevviz.config import Config, DetectorConfig, ObjectsConfig, object_network,
 from bevviz.errors import UserError
 from bevviz.frame import Camera, Frame
 from bevviz.provenance import model_path
-from bevviz.ros.roles import Roles, Topic, find_roles
+from bevviz.ros.roles import Roles, find_roles
+from bevviz.ros.topics import Topic
 from bevviz.text import printable
 
 if TYPE_CHECKING:

@@ -38,8 +38,8 @@ from bevviz.ros.compressed import decompress, is_compressed
 from bevviz.ros.livox import fields_of, is_livox, read_custom
 from bevviz.ros.messages import MessageError
 from bevviz.ros.packets import is_packets, read_scan
-from bevviz.ros.roles import Topic
 from bevviz.ros.stated import read_calibration
+from bevviz.ros.topics import Topic
 from bevviz.ros.video import Packet, decode_packet, is_video
 from bevviz.text import path_text
 

@@ -9,8 +9,8 @@ from pathlib import Path
 from bevviz.errors import UserError
 from bevviz.ros import ouster
 from bevviz.ros.messages import MessageError
-from bevviz.ros.roles import Topic
 from bevviz.ros.stated import read_calibration
+from bevviz.ros.topics import Topic
 
 
 class Ousters:

@@ -30,7 +30,8 @@ from bevviz.ros.node import Node
 from bevviz.ros.objects import holds_boxes
 from bevviz.ros.packets import is_packets
 from bevviz.ros.point_cloud_interfaces import COMPRESSED
-from bevviz.ros.roles import MARK, Roles, Topic, find_roles, foreign
+from bevviz.ros.roles import MARK, Roles, find_roles
+from bevviz.ros.topics import Topic, foreign
 from bevviz.ros.type_sources import TypeSources
 from bevviz.ros.typesupport import message_type
 from bevviz.run import BURST

@@ -6,7 +6,8 @@ from collections.abc import Callable
 from typing import Any
 
 from bevviz.config import Config, SourceConfig, stage_topics
-from bevviz.ros.roles import STAGE_KINDS, Topic
+from bevviz.ros.roles import STAGE_KINDS
+from bevviz.ros.topics import Topic
 
 
 def stated_topics(config: Config, resolve: Callable[[str], str]) -> dict[str, tuple[str, tuple[str, ...]]]:

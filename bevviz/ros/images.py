@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from bevviz.frame import U8, Image
 from bevviz.ros.messages import MessageError, frame_name, guarded, stamp_ns
-from bevviz.ros.roles import VIDEO
+from bevviz.ros.topics import VIDEO
 
 MOST_PIXELS = 100_000_000  # of an image
 

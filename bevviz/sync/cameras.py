@@ -13,7 +13,8 @@ from bevviz import geometry
 from bevviz.config import Config
 from bevviz.errors import UserError
 from bevviz.frame import F64, Camera, Image, Intrinsics
-from bevviz.ros.roles import CameraRole, Roles
+from bevviz.ros.roles import Roles
+from bevviz.ros.sensors import CameraRole
 from bevviz.sync.place import Place, Placing
 from bevviz.sync.report import SyncReport
 from bevviz.sync.tf import TransformError

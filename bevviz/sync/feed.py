@@ -14,7 +14,8 @@ from bevviz.ros.clouds import decode_cloud
 from bevviz.ros.detections import decode_boxes, decode_detections_2d, decode_detections_3d
 from bevviz.ros.images import decode_compressed_image, decode_image
 from bevviz.ros.messages import MessageError
-from bevviz.ros.roles import CameraRole, Roles
+from bevviz.ros.roles import Roles
+from bevviz.ros.sensors import CameraRole
 from bevviz.ros.transforms import (
     StampedTransform,
     decode_acceleration,

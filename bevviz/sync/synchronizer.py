@@ -27,7 +27,8 @@ from bevviz.frame import (
     LabelledBoxes3D,
     LateResult,
 )
-from bevviz.ros.roles import Roles, entity_name
+from bevviz.ros.roles import Roles
+from bevviz.ros.topics import entity_name
 from bevviz.ros.transforms import StampedTransform
 from bevviz.sync.around import Surroundings
 from bevviz.sync.cameras import Cameras
