@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import rerun as rr
 
 from bevviz.config import Config, dump, stated_lines
@@ -33,18 +35,18 @@ def log_origin(to: Writer, config: Config, scene: Scene, network: str = "") -> N
     )
     if not to.root:
         to.recording.send_recording_name(scene.name)
-    to.recording.send_property(
-        entities.PROPERTY + to.root.replace("/", "_"),
-        rr.AnyValues(
-            source=scene.name,
-            preset=config.preset,
-            config=settings,
-            stated=stated or None,
-            versions=packages,
-            lidars=[name for name in scene.lidars or (scene.lidar,) if name] or None,
-            cameras=list(scene.cameras) or None,
-            keep=config.logging.keep,
-            left_out=lacking or None,
-            network=network or None,
-        ),
-    )
+    made: dict[str, Any] = {
+        "source": scene.name,
+        "preset": config.preset,
+        "config": settings,
+        "stated": stated,
+        "versions": packages,
+        "lidars": [name for name in scene.lidars or (scene.lidar,) if name],
+        "cameras": list(scene.cameras),
+        "keep": config.logging.keep,
+        "left_out": lacking,
+        "network": network,
+    }
+    # Rerun leaves out what is None or has it empty, as its process has met the name before or not.
+    there = rr.AnyValues(**{name: value for name, value in made.items() if value})
+    to.recording.send_property(entities.PROPERTY + to.root.replace("/", "_"), there)
