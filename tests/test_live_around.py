@@ -198,7 +198,8 @@ def fly(folder: Path) -> Flight:
                         def told(around: Any, text: str = text, level: int = level) -> bool:
                             robot.status(level, text)
                             robot.path()
-                            return bool(around.shapes and any(s.text == text for s in around.statuses))
+                            seen = {shape.topic for shape in around.shapes}  # each is found at its own time
+                            return seen == SHAPES and any(s.text == text for s in around.statuses)
 
                         until(latest(told), text)
                     mark = node.node.create_publisher(message_type("std_msgs/msg/String"), "/bevviz/mark", 10)
@@ -225,6 +226,7 @@ def fly(folder: Path) -> Flight:
 
 
 PARTS = ("pipeline", "anomalies", "sources")
+SHAPES = {"/plan", "/heights"}
 
 
 def test_heights_are_a_surface_and_an_imu_is_plotted(flight: Flight) -> None:
@@ -296,6 +298,6 @@ def test_the_bag_tells_the_same(flight: Flight) -> None:
         assert source.roles.notes["/plan"] == "shown: around perception"
     assert [f.around.marks for f in frames if f.around and f.around.marks] == [(MARK,)]
     last = frames[-1].around
-    assert last is not None and {shape.topic for shape in last.shapes} == {"/plan", "/heights"}
+    assert last is not None and {shape.topic for shape in last.shapes} == SHAPES
     assert sum(len(f.around.motions) for f in frames if f.around) >= 2
     assert {(s.name, s.level) for s in last.statuses if s.name == "lidar/fan"} == {("lidar/fan", "warning")}
