@@ -24,11 +24,7 @@ class DetectionScore:
 
     def classes(self, judged: Classes) -> dict[str, Counter[str]]:
         """``true``, ``false`` and ``missed`` of each class."""
-        counts = {label: Counter(found) for label, found in self._labels.items()}
-        for name, number in self._false.items():
-            if (cls := judged.of(name)) is not None:
-                counts.setdefault(cls, Counter())["false"] += number
-        return counts
+        return judged.with_false(self._labels, self._false, "false")
 
     def add(self, result: CameraResult, truth: Truth) -> None:
         """One camera's detections against the image boxes of the truth, best score first."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter, defaultdict
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -47,6 +48,16 @@ class Classes:
         fits = [label for label, names in self._accepted.items() if name in names]
         return name if name in fits else min(fits, key=lambda f: (len(self._accepted[f]), f), default=None)
 
+    def with_false(
+        self, labels: Mapping[str, Counter[str]], false: Mapping[str, int], what: str
+    ) -> dict[str, Counter[str]]:
+        """Counts by label, and in them as ``what`` the counts by name of what is nothing."""
+        counts = {label: Counter(found) for label, found in labels.items()}
+        for name, number in false.items():
+            if (cls := self.of(name)) is not None:
+                counts.setdefault(cls, Counter())[what] += number
+        return counts
+
 
 @dataclass
 class Score:
@@ -73,11 +84,7 @@ class Score:
     @property
     def classes(self) -> dict[str, Counter[str]]:
         """Right ones (tp), false ones (fp) and missed ones (fn) of each class, in lower case."""
-        counts = {name: Counter(found) for name, found in self._labels.items()}
-        for name, number in self._false.items():
-            if (cls := self.judged.of(name)) is not None:
-                counts.setdefault(cls, Counter())["fp"] += number
-        return counts
+        return self.judged.with_false(self._labels, self._false, "fp")
 
     @property
     def total(self) -> Counter[str]:
@@ -87,12 +94,14 @@ class Score:
     @property
     def precision(self) -> float:
         """NaN where nothing was found."""
-        return share(self.total["tp"], self.total["fp"])
+        total = self.total
+        return share(total["tp"], total["fp"])
 
     @property
     def recall(self) -> float:
         """NaN where nothing had to be found."""
-        return share(self.total["tp"], self.total["fn"])
+        total = self.total
+        return share(total["tp"], total["fn"])
 
     @property
     def f1(self) -> float:

@@ -139,7 +139,8 @@ def _markers(markers: Iterable[Any], topic: str, received: int) -> LabelledBoxes
     shown = [marker for marker in markers if marker.action == ADD]
     solids = [marker for marker in shown if marker.type in (CUBE, CYLINDER)]
     texts = {(marker.ns, marker.id): str(marker.text) for marker in shown if marker.type == TEXT}
-    others = {number: text for (ns, number), text in texts.items() if ns not in {one.ns for one in solids}}
+    of_solids = {marker.ns for marker in solids}
+    others = {number: text for (ns, number), text in texts.items() if ns not in of_solids}
     for marker in solids:
         row = *_vector(marker.pose.position), *_vector(marker.scale), *_quaternion(marker.pose.orientation)
         if all(map(math.isfinite, row)):
