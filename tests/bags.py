@@ -84,6 +84,42 @@ class Messages:
             data=np.ascontiguousarray(bgr).reshape(-1),
         )
 
+    def marker(
+        self,
+        frame_id: str,
+        pose: Any,
+        size: Sequence[float],
+        *,
+        ns: str,
+        number: int = 0,
+        kind: int = 1,
+        action: int = 0,
+        text: str = "",
+    ) -> Any:
+        """A visualization_msgs/Marker, a cube unless it is said."""
+        return self.make(
+            "visualization_msgs/msg/Marker",
+            header=self.header(START, frame_id),
+            ns=ns,
+            id=number,
+            type=kind,
+            action=action,
+            pose=pose,
+            scale=self.make("geometry_msgs/msg/Vector3", **dict(zip("xyz", size, strict=True))),
+            color=self.make("std_msgs/msg/ColorRGBA", r=1.0, g=0.0, b=0.0, a=1.0),
+            lifetime=self.make("builtin_interfaces/msg/Duration", sec=0, nanosec=0),
+            frame_locked=False,
+            points=[],
+            colors=[],
+            texture_resource="",
+            texture=self.compressed(0, b""),
+            uv_coordinates=[],
+            text=text,
+            mesh_resource="",
+            mesh_file=self.make("visualization_msgs/msg/MeshFile", filename="", data=np.zeros(0, np.uint8)),
+            mesh_use_embedded_materials=False,
+        )
+
     def compressed(self, stamp: int, encoded: bytes, form: str = "png", frame_id: str = CAMERA_FRAME) -> Any:
         return self.make(
             "sensor_msgs/msg/CompressedImage",

@@ -164,31 +164,7 @@ def stated_in(m: bags.Messages, array: str, frames: Sequence[str]) -> Any:
 
 def markers_in(m: bags.Messages, frames: Sequence[str]) -> Any:
     """The same as cubes."""
-    found = [
-        m.make(
-            "visualization_msgs/msg/Marker",
-            header=m.header(bags.START, frame),
-            ns=frame,
-            id=0,
-            type=1,
-            action=0,
-            pose=pose_of(m, FRAMES[frame]),
-            scale=m.make("geometry_msgs/msg/Vector3", **dict(zip("xyz", BOX_SIZE, strict=True))),
-            color=m.make("std_msgs/msg/ColorRGBA", r=1.0, g=0.0, b=0.0, a=1.0),
-            lifetime=m.make("builtin_interfaces/msg/Duration", sec=0, nanosec=0),
-            frame_locked=False,
-            points=[],
-            colors=[],
-            texture_resource="",
-            texture=m.compressed(0, b""),
-            uv_coordinates=[],
-            text="",
-            mesh_resource="",
-            mesh_file=m.make("visualization_msgs/msg/MeshFile", filename="", data=np.zeros(0, np.uint8)),
-            mesh_use_embedded_materials=False,
-        )
-        for frame in frames
-    ]
+    found = [m.marker(frame, pose_of(m, FRAMES[frame]), BOX_SIZE, ns=frame) for frame in frames]
     return m.make("visualization_msgs/msg/MarkerArray", markers=found)
 
 

@@ -256,30 +256,8 @@ def test_markers_by_the_documented_rule(tmp_path: Path) -> None:
     m = bags.Messages()
 
     def marker(number: int, kind: int, action: int = 0, text: str = "", ns: str = "cars") -> Any:
-        zero = m.make("builtin_interfaces/msg/Duration", sec=0, nanosec=0)
-        header = m.header(bags.START, bags.LIDAR_FRAME)
-        return m.make(
-            "visualization_msgs/msg/Marker",
-            header=header,
-            ns=ns,
-            id=number,
-            type=kind,
-            action=action,
-            pose=pose(m),
-            scale=vector(m, "Vector3", BOX[3:6]),
-            color=m.make("std_msgs/msg/ColorRGBA", r=1.0, g=0.0, b=0.0, a=1.0),
-            lifetime=zero,
-            frame_locked=False,
-            points=[],
-            colors=[],
-            texture_resource="",
-            texture=m.compressed(0, b""),
-            uv_coordinates=[],
-            text=text,
-            mesh_resource="",
-            mesh_file=m.make("visualization_msgs/msg/MeshFile", filename="", data=np.zeros(0, np.uint8)),
-            mesh_use_embedded_materials=False,
-        )
+        box = pose(m), BOX[3:6]
+        return m.marker(bags.LIDAR_FRAME, *box, ns=ns, number=number, kind=kind, action=action, text=text)
 
     shown = [marker(4, 1), marker(4, 9, text="bus"), marker(5, 1), marker(6, 1, action=2), marker(7, 2)]
     shown += [marker(4, 1, ns="people"), marker(8, 1), marker(8, 9, text="van", ns="labels")]
