@@ -16,6 +16,7 @@ import numpy as np
 
 from bevviz.errors import UserError
 from bevviz.frame import F64, Boxes3D, LabelledBoxes3D
+from bevviz.ros.messages import frame_name, stamp_ns
 
 CUBE, CYLINDER, TEXT, ADD = 1, 3, 9, 0  # of visualization_msgs/Marker
 POLYGON = 2  # of Autoware's Shape
@@ -164,8 +165,8 @@ def _boxes(
     """``headers``: of each row; the first one's stamp counts."""
     boxes, turns = turned_boxes(np.array(rows, np.float64).reshape(-1, 10))
     header = next(iter(headers), None)
-    stamp = received if header is None else int(header.stamp.sec) * 10**9 + int(header.stamp.nanosec)
-    frames = tuple("" if one is None else str(one.frame_id).removeprefix("/") for one in headers)
+    stamp = received if header is None else stamp_ns(header.stamp)
+    frames = tuple("" if one is None else frame_name(str(one.frame_id)) for one in headers)
     return LabelledBoxes3D(
         topic=topic,
         stamp=stamp,
