@@ -7,6 +7,8 @@
 
 import os
 
+from bevviz.version import __version__
+
 # Neither ``typing`` nor ``__future__``: to an interrupt among these imports Python gives a traceback.
 TYPE_CHECKING = False
 if TYPE_CHECKING:
@@ -19,8 +21,7 @@ if TYPE_CHECKING:
     from bevviz.frame import Frame
     from bevviz.results import FrameResult
 
-__version__ = "0.1.0"
-__all__ = ["Config", "Drive", "Frame", "FrameResult", "UserError", "open", "simulate"]
+__all__ = ["Config", "Drive", "Frame", "FrameResult", "UserError", "__version__", "open", "simulate"]
 
 # onnxruntime stores a number for this machine when it is imported, unless it is told not to before.
 os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")

@@ -7,16 +7,17 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol, overload
+from typing import TYPE_CHECKING, Any, overload
 
 import numpy as np
 
 from bevviz.closing import Closing
 from bevviz.config import Config, ParameterChange, Preset, load
 from bevviz.errors import UserError
-from bevviz.frame import F64, I64, Frame, Scene
+from bevviz.frame import F64, Frame, Scene
+from bevviz.protocols import Frames, Observer
 from bevviz.results import FrameResult
-from bevviz.run import Observer, RunEnd, results, run
+from bevviz.run import RunEnd, results, run
 from bevviz.session import Session
 
 if TYPE_CHECKING:
@@ -29,32 +30,6 @@ if TYPE_CHECKING:
 
 Settings = Mapping[str, Any] | Sequence[str]
 KEPT = 8  # results of single frames that are kept for those who ask again
-
-
-class Frames(Protocol):
-    """A source whose frames can also be had one by one."""
-
-    @property
-    def scene(self) -> Scene: ...
-
-    @property
-    def total(self) -> int: ...
-
-    @property
-    def warnings(self) -> Sequence[str]: ...
-
-    @property
-    def scans(self) -> I64:
-        """Log time of every scan in nanoseconds, in order; its place is its number."""
-        ...
-
-    def __iter__(self) -> Iterator[Frame]: ...
-
-    def number_at(self, time: str | float) -> int: ...
-
-    def frame(self, number: int) -> Frame | None: ...
-
-    def close(self) -> None: ...
 
 
 class Drive(Closing):

@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any, Literal, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from bevviz.config.sections import Quantity
 from bevviz.errors import UserError
 
 if TYPE_CHECKING:
@@ -52,7 +53,6 @@ def data_frame(columns: Mapping[str, Any] | Sequence[Mapping[str, Any]]) -> Data
 
 
 RING_FIELDS = ("ring", "line", "channel")
-Quantity = Literal["height", "intensity", "ring", "time", "distance"]  # of a point
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from bevviz import announce
-from bevviz.run import Items, Observer
+from bevviz.protocols import Items, Observer
 from bevviz.text import printable
 
 

@@ -23,6 +23,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationEr
 
 from bevviz import plugins
 from bevviz.config import OURS, TUTORIAL_NAMES, Config, Layer, Preset, flattened, read_layer
+from bevviz.config.methods import CLASS_LISTS
 from bevviz.errors import UserError
 from bevviz.pillar_params import is_network
 
@@ -115,7 +116,5 @@ def _of_file(path: Path) -> Iterator[Layer]:
 
 def _from(folder: Path, key: str, value: str) -> str:
     """A file as seen from here; what is no file stays as it is."""
-    from bevviz.stages.detector.names import GIVEN
-
-    known = (*OURS, *plugins.registered()) if key == "detector.model" else GIVEN
+    known = (*OURS, *plugins.registered()) if key == "detector.model" else CLASS_LISTS
     return value if not value or value in known or ":" in value else str(folder / value)

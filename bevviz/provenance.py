@@ -16,9 +16,10 @@ from functools import lru_cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
-from bevviz import __version__
 from bevviz.config import STAGES, Config, object_files, plugin_of
+from bevviz.config.methods import CLASS_LISTS
 from bevviz.plugins import TOPIC
+from bevviz.version import __version__
 
 PACKAGES = (  # those that are not installed do not count: some libraries come as one of several
     *("rerun-sdk", "rosbags", "numpy"),
@@ -123,10 +124,8 @@ def model_path(config: Config) -> Path | None:
 
 def names_path(config: Config) -> Path | None:
     """The file with the detector's class names; None: there is none, or they are known by a name."""
-    from bevviz.stages.detector.names import GIVEN
-
     name = config.detector.names
-    return Path(name) if name and name not in GIVEN and config.detector.model else None
+    return Path(name) if name and name not in CLASS_LISTS and config.detector.model else None
 
 
 def file_hash(path: Path) -> str:

@@ -10,10 +10,10 @@ from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass
 from queue import SimpleQueue
-from typing import Any, Generic, Protocol, TypeVar
+from typing import Any, Generic, TypeVar
 
 from bevviz.errors import interrupt_in
-from bevviz.frame import Scene
+from bevviz.protocols import Items, Observer, Processor
 from bevviz.queues import NewestQueue
 
 T = TypeVar("T")
@@ -26,55 +26,6 @@ DEPTH = 2  # frames that are drawn ahead of what is observed
 BURST = 3  # frames that may come together without one being lost
 TICK = 0.2  # seconds between two looks at whether it is over
 PATIENCE = 10.0  # seconds that an observer of its own thread may take to end
-
-
-class Items(Protocol[T_co]):
-    """What a run works through: a ``Source`` of frames, or something like it."""
-
-    @property
-    def scene(self) -> Scene: ...
-
-    @property
-    def total(self) -> int | None: ...
-
-    @property
-    def warnings(self) -> Sequence[str]: ...
-
-    def __iter__(self) -> Iterator[T_co]: ...
-
-
-class Processor(Protocol[T_contra, R]):
-    """What makes a result of each item: a ``Session``, or something like it.
-
-    ``perceive`` runs beside the drawing of the next items, ``finish`` beside the next ``perceive``; each is
-    called in the order of the items.
-    """
-
-    def perceive(self, item: T_contra, network: Executor | None = None, /) -> R: ...
-
-    def finish(self, result: R, /) -> R: ...
-
-
-class Observer(Generic[R_contra]):
-    """Sees every result of a run, in order and in one thread.
-
-    Attributes:
-        name: for the counts of what was left out.
-        beside: results that may wait for it in a thread of its own, where it must hold nobody up; the
-            newest win. None: it is waited for.
-    """
-
-    name = ""
-    beside: int | None = None
-
-    def begin(self, items: Items[object]) -> None:
-        """Before the first result."""
-
-    def see(self, result: R_contra) -> None:
-        """One result, and the next only after it."""
-
-    def end(self) -> None:
-        """After the last one, also where the run was interrupted or failed; only if it has begun."""
 
 
 class Dropping:

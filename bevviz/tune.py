@@ -22,8 +22,8 @@ from bevviz.logging import entities
 from bevviz.logging.logger import Logger
 from bevviz.logging.pieces import document
 from bevviz.perceive import describe
+from bevviz.protocols import Items, Observer
 from bevviz.results import FrameResult
-from bevviz.run import Items, Observer
 from bevviz.text import markdown, printable
 from bevviz.variants import Variants, check_same_frames
 

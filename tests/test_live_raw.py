@@ -25,10 +25,10 @@ from bevviz.bags.source import BagSource
 from bevviz.config import load
 from bevviz.errors import UserError
 from bevviz.files import write_all
+from bevviz.protocols import Observer
 from bevviz.recorded import read
 from bevviz.report.digest import compare, digest
 from bevviz.results import FrameResult
-from bevviz.run import Observer
 from bevviz.run import run as run_frames
 from bevviz.session import Session
 from bevviz.synthetic import SyntheticSource

@@ -26,8 +26,8 @@ from bevviz.logging.parts import PartsWriter
 from bevviz.logging.recorder import OrderedRecorder
 from bevviz.logging.sinks import open_recording
 from bevviz.parallel.run import run_windows
+from bevviz.protocols import Observer
 from bevviz.results import FrameResult
-from bevviz.run import Observer
 from tests import bags
 from tests.recordings import Recording, verify
 from tests.waiting import meanwhile

@@ -11,9 +11,8 @@ from hypothesis import strategies as st
 from bevviz.config import SourceConfig
 from bevviz.errors import UserError
 from bevviz.logging import entities
-from bevviz.logging.entities import RESERVED
 from bevviz.ros.roles import Roles, find_roles
-from bevviz.ros.topics import Topic, entity_name
+from bevviz.ros.topics import RESERVED, Topic, entity_name
 
 CLOUD = "sensor_msgs/msg/PointCloud2"
 IMAGE = "sensor_msgs/msg/Image"

@@ -16,7 +16,8 @@ import pytest
 
 import bevviz.run
 from bevviz.frame import Scene
-from bevviz.run import Dropping, Items, Observer, RunEnd, overlapped, results, run
+from bevviz.protocols import Items, Observer
+from bevviz.run import Dropping, RunEnd, overlapped, results, run
 from tests.waiting import PATIENCE, until
 
 

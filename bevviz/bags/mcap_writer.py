@@ -24,7 +24,7 @@ from rosbags.interfaces import (
 )
 from ruamel.yaml import YAML
 
-from bevviz import __version__, remains
+from bevviz import remains
 from bevviz.bags.mcap import (
     ATTACHMENT,
     ATTACHMENT_INDEX,
@@ -42,6 +42,7 @@ from bevviz.bags.mcap import (
 )
 from bevviz.errors import UserError
 from bevviz.files import claim, unfinished, write_all
+from bevviz.version import __version__
 
 HEADER, CHUNK_INDEX, STATISTICS = 1, 8, 0x0B
 CHUNK_SIZE = 1 << 22  # bytes that a chunk is closed at

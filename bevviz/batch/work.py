@@ -24,9 +24,9 @@ from bevviz.evaluate.truth import truth_in
 from bevviz.files import unfinished
 from bevviz.logging.recorder import DiskWatch, Recorder
 from bevviz.logging.sinks import Sinks, open_recording
+from bevviz.protocols import Observer
 from bevviz.report.pictures import ahead, camera_picture, jpeg, shrink
 from bevviz.results import FrameResult
-from bevviz.run import Observer
 from bevviz.run import run as run_frames
 from bevviz.session import Session
 from bevviz.text import path_text

@@ -10,7 +10,6 @@ from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from bevviz import __version__
 from bevviz.cli import (
     bag,
     batch,
@@ -37,6 +36,7 @@ from bevviz.cli.machine import with_json
 from bevviz.cli.options import follow_recording, with_negatives
 from bevviz.cli.parser import COMMAND, Parser
 from bevviz.errors import UserError, first_line, interrupt_in
+from bevviz.version import __version__
 
 if TYPE_CHECKING:
     from logging import Logger

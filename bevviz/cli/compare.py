@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from bevviz.config import Config, Preset
     from bevviz.evaluate import Truth
     from bevviz.frame import Frame
-    from bevviz.run import Observer, Processor
+    from bevviz.protocols import Observer, Processor
 
 DESCRIPTION = """Run two configurations on the same frames and show how the results differ: objects that only
 A or only B has, that have moved, or that have another class. Without --a, --b, --set-a, --set-b, --preset

@@ -26,11 +26,10 @@ if TYPE_CHECKING:
     from rerun import RecordingStream
 
     from bevviz.config import Config
-    from bevviz.drive import Frames
     from bevviz.evaluate.evaluation import Evaluation
     from bevviz.evaluate.gate import Limit
+    from bevviz.protocols import Frames, Observer
     from bevviz.results import FrameResult
-    from bevviz.run import Observer
 
 DESCRIPTION = """Hold the results to what is really there: precision and recall by class and range, average
 precision as KITTI defines it, tracks (HOTA, MOTA, IDF1), image boxes, ground. PATH is a bag, or a

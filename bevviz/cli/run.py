@@ -17,8 +17,9 @@ if TYPE_CHECKING:
     from bevviz.drive import Drive
     from bevviz.engine.task import Engine
     from bevviz.logging.sinks import Sinks
+    from bevviz.protocols import Items, Observer, Processor
     from bevviz.results import FrameResult
-    from bevviz.run import Items, Observer, Processor, RunEnd
+    from bevviz.run import RunEnd
     from bevviz.session import Session
 
 T = TypeVar("T")

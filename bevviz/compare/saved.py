@@ -25,7 +25,7 @@ from bevviz.logging.camera import log_shared_image
 from bevviz.logging.pieces import CORNER
 from bevviz.logging.reading import check_decodes, readable
 from bevviz.logging.writer import Writer
-from bevviz.run import Items, Observer
+from bevviz.protocols import Items, Observer
 
 Row = Mapping[str, Any]
 

@@ -20,8 +20,8 @@ from bevviz.evaluate import Truth
 from bevviz.frame import Camera, Frame, LabelledBoxes3D
 from bevviz.logging import entities
 from bevviz.logging.logger import Logger
+from bevviz.protocols import Items, Observer
 from bevviz.results import CameraResult, FrameResult, Objects
-from bevviz.run import Items, Observer
 from bevviz.session import Session
 from bevviz.stages.robot import detections_of, in_points_frame
 from bevviz.variants import Sessions, check_same_frames

@@ -17,7 +17,7 @@ from bevviz.compare.log import place
 from bevviz.compare.truth import Judged
 from bevviz.config import ParameterChange
 from bevviz.files import save
-from bevviz.run import Observer
+from bevviz.protocols import Observer
 from bevviz.text import fenced, printable
 
 WORST = 10  # frames in the table

@@ -41,6 +41,7 @@ GROUND = Methods(("polar", "plane"), {"ransac": "plane"})
 CLUSTERING = Methods(("dbscan",))
 OBJECTS = Methods(("frustum",), networks=True)
 OURS = ("", "demo", *GROUND.ours, *GROUND.former, *CLUSTERING.ours, *OBJECTS.ours)
+CLASS_LISTS = ("coco", "coco91")  # values of detector.names that are no file
 STAGES = {  # section -> the key that names its function
     "ground": "method",
     "clustering": "method",

@@ -20,10 +20,10 @@ from pydantic_core import PydanticCustomError
 from bevviz.config.methods import CLUSTERING, GROUND, OBJECTS
 from bevviz.config.sizes import SIZES, ClassSize, _with_known
 from bevviz.config.units import Degrees, Megabytes, Metres, Pixels, Seconds
-from bevviz.frame import Quantity
 
 Preset = Literal["default", "reference"]
 Keep = Literal["everything", "inspect", "report"]
+Quantity = Literal["height", "intensity", "ring", "time", "distance"]  # of a point
 
 
 class Section(BaseModel):

@@ -18,8 +18,8 @@ from bevviz.evaluate.precision import AveragePrecision, found_objects
 from bevviz.evaluate.score import Matches, Score, share
 from bevviz.evaluate.truth import Truth, Truths
 from bevviz.frame import Boxes3D, Frame
+from bevviz.protocols import Observer
 from bevviz.results import FrameResult, Objects
-from bevviz.run import Observer
 
 if TYPE_CHECKING:
     from pandas import DataFrame

@@ -17,8 +17,8 @@ from bevviz.logging import entities
 from bevviz.logging.pieces import boxes3d, document, transform
 from bevviz.logging.spoken import log_spoken, log_spoken_looks, named_in_space
 from bevviz.logging.writer import WAIT, Writer
+from bevviz.protocols import Items, Observer
 from bevviz.results import FrameResult
-from bevviz.run import Items, Observer
 from bevviz.text import markdown
 
 # What became of them, boxes, the rows of these that are meant, and the names of all.

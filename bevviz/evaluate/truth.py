@@ -18,7 +18,7 @@ from bevviz.ros.roles import Roles
 from bevviz.stages.robot import in_points_frame
 
 if TYPE_CHECKING:
-    from bevviz.drive import Frames
+    from bevviz.protocols import Frames
 
 MIN_HITS = 10  # LiDAR points on an object that must be found
 MAX_DISTANCE = 2.0  # metres between the centres, on the ground plane, of a box and its object

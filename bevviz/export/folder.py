@@ -12,8 +12,8 @@ import numpy as np
 
 from bevviz.errors import UserError
 from bevviz.frame import U8, Intrinsics
+from bevviz.protocols import Items, Observer
 from bevviz.results import FrameResult
-from bevviz.run import Items, Observer
 
 
 class FolderExport(Observer[FrameResult]):

@@ -17,8 +17,8 @@ import numpy as np
 from bevviz import geometry
 from bevviz.export.folder import FolderExport, rectified
 from bevviz.frame import F32, F64, Camera, Frame
+from bevviz.protocols import Items
 from bevviz.results import FrameResult, Objects, Tracks
-from bevviz.run import Items
 
 VERSION = "v1.0-bevviz"
 TABLES = (

@@ -32,8 +32,9 @@ from bevviz.live.triggers import Triggers
 from bevviz.live.viewers import LATE, Viewer, remote, server, window
 from bevviz.live.warm import warm_up
 from bevviz.logging import entities
+from bevviz.protocols import Items, Observer
 from bevviz.results import FrameResult
-from bevviz.run import Dropping, Items, Observer, run
+from bevviz.run import Dropping, run
 from bevviz.session import Session
 from bevviz.stage_loader import StageLoader
 

@@ -10,7 +10,6 @@ from pathlib import Path
 import rerun.blueprint as rrb
 from rerun.recording_stream import RecordingStream
 
-import bevviz
 from bevviz.config import BevConfig, Config
 from bevviz.errors import UserError
 from bevviz.frame import Scene
@@ -20,7 +19,7 @@ from bevviz.logging.reading import check_decodes
 
 def _folder() -> Path:
     """Beside the package where it is installed, beside the package's folder in a checkout."""
-    package = Path(bevviz.__file__).parent
+    package = Path(__file__).parents[1]
     installed = package / "blueprints"
     return installed if installed.is_dir() else package.parent / "blueprints"
 

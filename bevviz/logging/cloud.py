@@ -9,7 +9,8 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
-from bevviz.frame import F32, Frame, Quantity
+from bevviz.config.sections import Quantity
+from bevviz.frame import F32, Frame
 from bevviz.logging import color_by, entities, keep
 from bevviz.logging.entities import ClassId
 from bevviz.logging.pieces import rounded, transform

@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 from rerun.blueprint.encodings import ComponentSourceKind, VisualizerComponentMapping
 
 from bevviz.colors import palette, turbo
-from bevviz.frame import F32, RING_FIELDS, Quantity
+from bevviz.config.sections import Quantity
+from bevviz.frame import F32, RING_FIELDS
 from bevviz.logging import entities
 from bevviz.logging.annotations import point_classes
 from bevviz.results import FrameResult

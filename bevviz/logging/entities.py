@@ -65,15 +65,6 @@ EVALUATE = "/evaluate"
 EVALUATE_ABOUT = "/evaluate/about"
 EVALUATE_LOG = "/evaluate/log"
 
-# Names that no sensor can have, as they are something else where it has its entities.
-RESERVED = frozenset(
-    {path.split("/")[2] for path in (FUSED, FUSION, FRUSTUMS, GRID, TRUTH, TRACKS, MISSED, FALSE, UNNAMED)}
-    | {path.split("/")[2] for path in (COMPARE_ABOUT, COMPARE_LOG, COMPARE_STATES)}
-    | {"objects", "count"}  # of /compare
-    | {"pipeline", "marks"}  # of /explain/states
-    | {"lidars"}  # several LiDARs that are merged
-)
-
 
 def sensor(name: str) -> str:
     """A LiDAR or a camera: carries its pose."""

@@ -10,8 +10,8 @@ from bevviz.config import Config
 from bevviz.logging.logger import Logger
 from bevviz.logging.sinks import Sinks
 from bevviz.logging.writer import WAIT
+from bevviz.protocols import Items, Observer
 from bevviz.results import FrameResult
-from bevviz.run import Items, Observer
 
 
 class Recorder(Observer[FrameResult]):

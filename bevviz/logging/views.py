@@ -8,8 +8,9 @@ from typing import Any
 
 import rerun.blueprint as rrb
 
+from bevviz.config.sections import Quantity
 from bevviz.counts import OPINIONS
-from bevviz.frame import Quantity, Scene
+from bevviz.frame import Scene
 from bevviz.logging import color_by, entities
 from bevviz.logging.health import COUNTS
 from bevviz.logging.spoken import EYE, LOOK

@@ -23,8 +23,8 @@ from bevviz.errors import UserError
 from bevviz.frame import Scene
 from bevviz.logging.sinks import Sinks
 from bevviz.parallel.work import Batched, WindowJob, results_in
+from bevviz.protocols import Items, Observer
 from bevviz.results import FrameResult
-from bevviz.run import Items, Observer
 from bevviz.session import Session
 from bevviz.stage_loader import Stages
 from bevviz.stages.foreign import Foreign

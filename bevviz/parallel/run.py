@@ -12,8 +12,9 @@ from bevviz.drive import Drive
 from bevviz.engine.task import Engine
 from bevviz.logging.sinks import Sinks
 from bevviz.parallel.drive import AsTheyAre, InOrder, MadeWindows, Windows
+from bevviz.protocols import Observer
 from bevviz.results import FrameResult
-from bevviz.run import Observer, RunEnd, run
+from bevviz.run import RunEnd, run
 from bevviz.session import Session
 from bevviz.text import printable
 

@@ -19,6 +19,7 @@ from bevviz.files import Scratch
 from bevviz.logging import entities
 from bevviz.logging.reading import check_decodes, readable
 from bevviz.progress import Progress
+from bevviz.protocols import Observer
 from bevviz.provenance import differences, file_hash, model_path, provenance
 from bevviz.recorded import check_functions
 from bevviz.report.digest import (
@@ -35,7 +36,7 @@ from bevviz.report.origin import ReportInfo
 from bevviz.report.seal import check_seal
 from bevviz.report.window import open_window
 from bevviz.results import FrameResult
-from bevviz.run import Observer, run
+from bevviz.run import run
 from bevviz.session import Session
 from bevviz.stages.detector import DEMO_MODEL
 

@@ -30,6 +30,7 @@ from bevviz.logging.recorder import DiskWatch, Recorder
 from bevviz.logging.sinks import open_recording
 from bevviz.notes import Note
 from bevviz.progress import Progress
+from bevviz.protocols import Observer
 from bevviz.provenance import Provenance, file_hash, model_path, names_path, provenance, versions
 from bevviz.recorded import Origin
 from bevviz.report.digest import digest, pack
@@ -50,7 +51,7 @@ from bevviz.report.window import (
     open_window,
 )
 from bevviz.results import Detections, FrameResult
-from bevviz.run import Observer, run
+from bevviz.run import run
 from bevviz.session import Session
 from bevviz.stages.detector import Detector
 

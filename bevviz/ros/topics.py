@@ -8,7 +8,6 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 from bevviz.errors import UserError
-from bevviz.logging.entities import RESERVED
 from bevviz.ros import ouster
 from bevviz.ros.compressed import is_compressed
 from bevviz.ros.foxglove import KINDS, short_of
@@ -20,6 +19,15 @@ from bevviz.ros.packets import is_packets, lacks
 IMAGES = ("Image", "CompressedImage", "CompressedVideo")
 VIDEO = "video of a kind that is not decoded here: republish it as images (image_transport) and record these"
 _VIDEO = re.compile(r"ffmpeg_image_transport_msgs/(msg/)?FFMPEGPacket$|theora_image_transport/(msg/)?Packet$")
+
+# Entities that a recording has beside those of its sensors (docs/entities.md). No sensor may be called so.
+RESERVED = frozenset(
+    {"fused", "fusion", "frustums", "bev", "ground_truth", "tracks"}  # of /world
+    | {"missed", "false", "unnamed"}  # of /world, too
+    | {"about", "log", "states", "objects", "count"}  # of /compare
+    | {"pipeline", "marks"}  # of /explain/states
+    | {"lidars"}  # the merged cloud of several LiDARs
+)
 
 
 @dataclass(frozen=True, slots=True)

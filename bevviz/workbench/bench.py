@@ -18,7 +18,7 @@ import rerun as rr
 from bevviz.anomalies import Onsets
 from bevviz.closing import Closing
 from bevviz.config import Config, revised
-from bevviz.drive import Drive, Frames
+from bevviz.drive import Drive
 from bevviz.errors import UserError, first_line
 from bevviz.evaluate import Truth
 from bevviz.frame import Frame
@@ -28,8 +28,9 @@ from bevviz.logging.sinks import APPLICATION
 from bevviz.logging.writer import WAIT
 from bevviz.notes import Note, Notes
 from bevviz.perceive import describe
+from bevviz.protocols import Frames, Items, Observer
 from bevviz.results import FrameResult, Objects, Tracks
-from bevviz.run import Items, Observer, run
+from bevviz.run import run
 from bevviz.variants import Variants, check_same_frames
 from bevviz.why import Answer, Questioner
 from bevviz.why.log import mark_answers

@@ -7,9 +7,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from bevviz.drive import Frames
 from bevviz.evaluate import Truth
 from bevviz.frame import I64, Frame, LabelledBoxes3D, Scene
+from bevviz.protocols import Frames
 
 TruthOf = Callable[[Frame], Truth | None]
 

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any
 from bevviz.bags.source import iso
 from bevviz.config import revised
 from bevviz.errors import UserError, first_line
+from bevviz.protocols import Items, Observer
 from bevviz.results import FrameResult
-from bevviz.run import Items, Observer
 
 if TYPE_CHECKING:
     from bevviz.workbench.bench import Bench, Settings

@@ -17,8 +17,9 @@ from bevviz.evaluate import Score, Truth
 from bevviz.logging import entities
 from bevviz.logging.logger import Logger
 from bevviz.logging.writer import WAIT
+from bevviz.protocols import Items, Observer
 from bevviz.results import FrameResult, Objects
-from bevviz.run import Items, Observer, run
+from bevviz.run import run
 from bevviz.session import Session
 from bevviz.variants import check_same_frames
 from bevviz.why.effects import Effects, effects

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from bevviz.config.methods import CLASS_LISTS
 from bevviz.errors import UserError, first_line
 
 COCO = (
@@ -26,7 +27,7 @@ _found = iter(COCO)
 COCO_CATEGORIES = tuple(
     "background" if i == 0 else f"unused_{i}" if i in COCO_GAPS else next(_found) for i in range(91)
 )
-GIVEN = {"coco": COCO, "coco91": COCO_CATEGORIES}  # values of detector.names that are no file
+GIVEN = dict(zip(CLASS_LISTS, (COCO, COCO_CATEGORIES), strict=True))
 
 
 def literal(text: str | None, kind: type) -> Any:
