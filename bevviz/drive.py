@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import ExitStack
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, overload
@@ -284,52 +283,24 @@ class Drive(Closing):
         self.run([evaluation])
         return evaluation
 
-    def save(self, path: str | PathLike[str], blueprint: str | Blueprint = "debug", jobs: int = 1) -> Path:
+    def save(self, path: str | PathLike[str], blueprint: str | Blueprint = "debug") -> Path:
         """Run the whole drive into a Rerun recording.
 
         Args:
             path: of the file, .rrd.
             blueprint: layout.
-            jobs: processes that a bag is cut into windows for, as ``bevviz bag --jobs``. A script that asks
-                for them needs ``if __name__ == "__main__":`` around what it does.
 
         Raises:
-            UserError: the file cannot be written, there is no such blueprint, or a drive that is to be cut
-                cannot be.
+            UserError: the file cannot be written, or there is no such blueprint.
         """
-        from bevviz.logging.recorder import DiskWatch, OrderedRecorder, Recorder
+        from bevviz.logging.recorder import DiskWatch, Recorder
         from bevviz.logging.sinks import open_recording
         from bevviz.progress import Progress
 
         target = Path(path)
-        with ExitStack() as stack:
-            processes = None
-            session = self.new_session()
-            if jobs > 1:
-                from bevviz.engine.local import Processes
-                from bevviz.parallel.drive import obstacle
-                from bevviz.parallel.run import run_windows
-
-                if reason := obstacle(self.frames, session.stages):
-                    raise UserError(f"jobs={jobs}: {reason}")
-                processes = stack.enter_context(Processes(jobs, ["bevviz.parallel.work"]))
-            sinks = stack.enter_context(
-                open_recording(self.scene, self.config, save=target, blueprint=blueprint, in_parts=jobs > 1)
-            )
-            if processes is not None:
-                ordered = [
-                    OrderedRecorder(sinks.recording, self.config, session.stages.provider),
-                    DiskWatch(sinks),
-                ]
-                end = run_windows(self, session, sinks, ordered, processes)
-            else:
-                end = self.run(
-                    [
-                        Recorder(sinks.recording, self.config, self.session.stages.provider),
-                        DiskWatch(sinks),
-                        Progress(),
-                    ]
-                )
+        with open_recording(self.scene, self.config, save=target, blueprint=blueprint) as sinks:
+            recorder = Recorder(sinks.recording, self.config, self.session.stages.provider)
+            end = self.run([recorder, DiskWatch(sinks), Progress()])
             if end.interrupted:
                 raise KeyboardInterrupt
         return target

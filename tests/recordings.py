@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import subprocess
 import sys
 from collections import defaultdict
@@ -60,3 +61,12 @@ def verify(path: Path) -> None:
     done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=120)
     assert done.returncode == 0, done.stdout + done.stderr
     assert "verified without error" in done.stdout + done.stderr
+
+
+def without_nan(value: Any) -> Any:
+    """Return a value in which every NaN is a text, so that it equals itself."""
+    if isinstance(value, dict):
+        return {key: without_nan(inner) for key, inner in value.items()}
+    if isinstance(value, list):
+        return [without_nan(inner) for inner in value]
+    return "nan" if isinstance(value, float) and math.isnan(value) else value

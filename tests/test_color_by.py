@@ -17,7 +17,8 @@ from rerun.chunk import RrdReader
 
 import bevviz
 from bevviz.config import load
-from bevviz.frame import F32, Quantity, Scene
+from bevviz.config.sections import Quantity
+from bevviz.frame import F32, Scene
 from bevviz.live.thinning import chosen, is_cloud, thin_cloud
 from bevviz.logging import blueprints
 from bevviz.logging.color_by import ColoredPoints, annotation_context, class_ids

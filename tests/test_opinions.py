@@ -30,7 +30,6 @@ from bevviz.logging import entities
 from bevviz.logging.logger import Logger
 from bevviz.logging.pieces import image_outlines
 from bevviz.logging.sinks import open_recording
-from bevviz.parallel.work import _kept
 from bevviz.results import Explanation, FrameResult, Objects, Opinion, Opinions
 from bevviz.session import Session
 from bevviz.stages.detector.names import COCO
@@ -425,12 +424,12 @@ def foreign() -> FrameResult:
     return replace(result, explanations=(*result.explanations, *texts(result, objects, found)))
 
 
-def recorded(path: Path, result: FrameResult, *, in_order: bool = False) -> Recording:
+def recorded(path: Path, result: FrameResult) -> Recording:
     scene = SyntheticSource(frames=1).scene
     with open_recording(scene, result.config, save=path) as sinks:
         logger = Logger(sinks.recording, result.config, scene)
         logger.log_static()
-        (logger.log_in_order if in_order else logger.log)(result)
+        logger.log(result)
     return Recording(path)
 
 
@@ -513,19 +512,6 @@ def clear_of_the_edge(around: F32, camera: Camera) -> bool:
     assert camera.intrinsics is not None
     size = np.array([camera.intrinsics.width, camera.intrinsics.height])
     return bool((around[:2] > 0).all() and (around[2:] < size - 1).all())
-
-
-def test_a_window_hands_on_what_the_recording_needs(tmp_path: Path) -> None:
-    """What is logged in order from what another process kept is what is logged at once."""
-    result = foreign()
-    whole = recorded(tmp_path / "a.rrd", result)
-    handed = replace(_kept(result), config=result.config)
-    parts = recorded(tmp_path / "b.rrd", handed, in_order=True)
-    for boxes in (entities.FUSED, entities.FUSION):
-        for path in (boxes, entities.outlines(boxes), entities.names(boxes)):
-            columns = whole.at[path].keys() - {"speed"}  # NaN, without tracks
-            assert columns and columns == parts.at[path].keys() - {"speed"}
-            assert all(whole.at[path][name] == parts.at[path][name] for name in columns), path
 
 
 def test_of_our_own_objects_nothing_is_made_or_logged(tmp_path: Path) -> None:

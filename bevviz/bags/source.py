@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from functools import cached_property
-from itertools import islice
 from pathlib import Path
 
 import numpy as np
 
 from bevviz.bags.message import RawMessage
 from bevviz.bags.recording import Recording
-from bevviz.bags.state import Losses, ReadingState, dumps, loads
 from bevviz.closing import Closing
 from bevviz.config import Config, stage_topics
 from bevviz.errors import UserError
@@ -22,6 +20,7 @@ from bevviz.frame import F64, I64, Frame, Scene
 from bevviz.ros.messages import MessageError
 from bevviz.ros.roles import find_roles
 from bevviz.ros.transforms import decode_transforms
+from bevviz.sync.damage import Damage
 from bevviz.sync.feed import Handler, make_handlers
 from bevviz.sync.report import blindness
 from bevviz.sync.synchronizer import Synchronizer
@@ -45,21 +44,23 @@ class FrameSelection:
         return BagSource(paths, config, start=self.start, end=self.end, every=self.every, frames=self.frames)
 
 
-@dataclass(frozen=True, slots=True)
-class Window:
-    """Consecutive frames of a source, to be read by themselves.
+@dataclass(slots=True)
+class ReadingState:
+    """Position in a recording between two messages, and what the messages so far left behind.
 
     Attributes:
-        number: counted from 0.
-        length: frames in it, at most.
-        again: frames to be read before them: the last one of the window before, or none.
-        content: what the source remembered when it came there.
+        sync: the synchroniser with its queues.
+        stop: log time in nanoseconds at which reading ends; 0: not known yet.
+        number: number of the last scan met, from the first that is read; -1: none.
+        numbers: numbers of the scans that are not yet delivered, by time of receipt.
+        damage: messages that could not be used.
     """
 
-    number: int
-    length: int
-    again: int
-    content: bytes
+    sync: Synchronizer
+    stop: int = 0
+    number: int = -1
+    numbers: dict[int, list[int]] = field(default_factory=dict)
+    damage: Damage = field(default_factory=Damage)
 
 
 class BagSource(Closing):
@@ -192,54 +193,13 @@ class BagSource(Closing):
     def __iter__(self) -> Iterator[Frame]:
         return self._frames(self._low, self._high, self._first, self._chosen)
 
-    def windows(self, length: Callable[[int], int]) -> Iterator[Window]:
-        """The same frames in windows, each to be read by another source.
-
-        ``length`` tells how many frames one has, two at least, by how many there are left. All messages are
-        read for it, but no image is decoded and no frame made: what frames lack is not among the warnings
-        then, see ``add_losses``.
-        """
-        state = self._begin(self._low)
-        state.sync.skims = True
-        content, again = dumps(state), 0
-        number, first, end = 0, 0, length(self.total)
-        for n, _ in enumerate(self._deliver(state, self._low, self._high, self._first, self._chosen)):
-            if n == first:
-                yield Window(number, end - first, again, content)
-            if n == end - 2:
-                content, again = dumps(state), 1
-            if n == end - 1:
-                number, first, end = number + 1, end, end + length(max(self.total - end, 0))
-
-    def window(self, window: Window) -> Iterator[tuple[Frame, bool]]:
-        """Its frames, and before them, told by False, the last one of the window before."""
-        state = self._state = loads(window.content, self.recording)
-        state.sync.skims = False
-        frames = self._deliver(state, self._low, self._high, self._first, self._chosen)
-        for frame in islice(frames, window.again):
-            yield frame, False
-        Losses.forget(state.sync)
-        for frame in islice(frames, window.length):
-            yield frame, True
-
-    @property
-    def losses(self) -> Losses:
-        """Of the frames read last."""
-        assert self._state is not None
-        return Losses.of(self._state.sync)
-
-    def add_losses(self, losses: Losses) -> None:
-        """Of a window that another source has read, in the order of the windows."""
-        if self._state is not None:
-            losses.add_to(self._state.sync)
-
     def _frames(self, low: int, high: int, first: int, chosen: range) -> Iterator[Frame]:
         """The chosen ones of the scans with low <= log time < high, the first of which is ``first``."""
         return self._deliver(self._begin(low), low, high, first, chosen)
 
     def _begin(self, low: int) -> ReadingState:
         sync = Synchronizer(self.roles, self.config)
-        state = self._state = ReadingState(sync, 0)
+        state = self._state = ReadingState(sync)
         self._hold_throughout(state, self._handlers(sync), low)
         return state
 
@@ -249,12 +209,11 @@ class BagSource(Closing):
     def _deliver(
         self, state: ReadingState, low: int, high: int, first: int, chosen: range
     ) -> Iterator[Frame]:
-        """The frames from that state on, which is kept up to date."""
+        """Yield the frames; ``state`` follows the reading."""
         sync = state.sync
         handlers = self._handlers(sync)
-        state.stop = state.stop or high + MARGIN
-        yield from self._numbered(sync.ready(), state)
-        for message in self._messages(handlers.keys(), state, low - MARGIN, high + MARGIN):
+        state.stop = high + MARGIN
+        for message in self.recording.scans(handlers.keys(), low - MARGIN, high + MARGIN):
             if message.received > state.stop:
                 break
             if message.topic == self._driver:
@@ -273,22 +232,6 @@ class BagSource(Closing):
             self._handle(handlers[message.topic], message, state)
             yield from self._numbered(sync.ready(message.received), state)
         yield from self._numbered(sync.flush(), state)
-
-    def _messages(
-        self, topics: Collection[str], state: ReadingState, start: int, stop: int
-    ) -> Iterator[RawMessage]:
-        """From where the state has come to."""
-        reached, known = state.reached or (start, 0)
-        for message in self.recording.scans(topics, reached, stop):
-            if message.received != reached:
-                reached, count = message.received, 1
-            elif known:
-                known -= 1
-                continue
-            else:
-                count = 1 if state.reached is None else state.reached[1] + 1
-            state.reached = reached, count
-            yield message
 
     def _numbered(self, frames: Iterator[Frame], state: ReadingState) -> Iterator[Frame]:
         """The frames, each with the number of its scan in the part of the recording that is read."""

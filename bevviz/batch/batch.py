@@ -14,8 +14,6 @@ from bevviz import remains
 from bevviz.batch.jobs import PARTIAL, Job
 from bevviz.errors import UserError
 
-LONG = 0.5  # of what each worker has to do; a bag that is more is cut
-
 
 @contextmanager
 def claimed(folder: Path) -> Iterator[None]:
@@ -57,11 +55,3 @@ def left_to_do(jobs: Sequence[Job], force: bool) -> list[Job]:
         for job in jobs:
             job.table.unlink(missing_ok=True)
     return sorted((job for job in jobs if not job.complete()), key=lambda job: -job.size)
-
-
-def long_ones(jobs: Sequence[Job], workers: int) -> list[Job]:
-    """Those that some workers would still be busy with when the others have ended: more than half of what
-    each of them has to do."""
-    sizes = [job.size for job in jobs]
-    share = sum(sizes) / workers
-    return [job for job, size in zip(jobs, sizes, strict=True) if workers > 1 and size > LONG * share]

@@ -86,7 +86,7 @@ class Output(Closing):
         for path in (self._recording, unfinished(self._recording), self._table):
             path.unlink(missing_ok=True)
 
-    def opened(self, source: BagSource, *, in_parts: bool = False) -> AbstractContextManager[Sinks]:
+    def opened(self, source: BagSource) -> AbstractContextManager[Sinks]:
         """The recording."""
         self._recording.parent.mkdir(parents=True, exist_ok=True)
         return open_recording(
@@ -96,7 +96,6 @@ class Output(Closing):
             blueprint=self._job.blueprint,
             recording_id=self._job.recording_id,
             place=self._job.recording,
-            in_parts=in_parts,
         )
 
     def observers(

@@ -177,8 +177,6 @@ def _run(jobs: list[Job], options: argparse.Namespace, failed: list[tuple[str, s
 def _execute(
     todo: list[Job], options: argparse.Namespace, on_frame: Callable[[], None], tick: Callable[[], None]
 ) -> JobResults:
-    from bevviz.batch.batch import long_ones
-
     if not todo:
         return
     with ExitStack() as stack:
@@ -187,20 +185,12 @@ def _execute(
             from bevviz.engine.dask import Cluster
 
             engine = stack.enter_context(Cluster(options.dask))
-            long = long_ones(todo, engine.count)
         else:
             from bevviz.engine.local import Processes
 
             workers = options.jobs or max(1, (os.cpu_count() or 1) // 2)
-            long = long_ones(todo, workers)
-            engine = stack.enter_context(Processes(workers if long else min(workers, len(todo))))
-        if not long:
-            ends = engine.run(todo, options.retries, on_frame, tick)
-        else:
-            from bevviz.batch.windows import run_jobs
-
-            ends = run_jobs(todo, long, engine, options.retries, on_frame, tick)
-        yield from stack.enter_context(closing(ends))
+            engine = stack.enter_context(Processes(min(workers, len(todo))))
+        yield from stack.enter_context(closing(engine.run(todo, options.retries, on_frame, tick)))
 
 
 def _sum_up(

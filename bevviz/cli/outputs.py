@@ -68,7 +68,7 @@ class Outputs(NamedTuple):
         return chosen._replace(save=default, unseen=True)
 
     @contextmanager
-    def opened(self, scene: Scene, config: Config, *, in_parts: bool = False) -> Iterator[Sinks]:
+    def opened(self, scene: Scene, config: Config) -> Iterator[Sinks]:
         """A recording that goes there; addresses are said."""
         from bevviz.logging.sinks import open_recording
 
@@ -81,7 +81,6 @@ class Outputs(NamedTuple):
             connect=self.connect,
             spawn=self.viewer,
             blueprint=self.blueprint,
-            in_parts=in_parts,
         ) as sinks:
             for url in sinks.urls:
                 say(f"viewer at {url}", always=True)

@@ -6,9 +6,8 @@ import os
 import signal
 import sys
 from collections import Counter, deque
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from importlib import import_module
 from multiprocessing import get_context
 from multiprocessing.connection import Connection, wait
 from multiprocessing.context import SpawnProcess
@@ -31,17 +30,15 @@ class _Worker:
 
 
 class Processes(Closing):
-    """Worker processes. They start at once, and load what their jobs need while these are being found.
+    """Worker processes, which start at once.
 
     Args:
-        count: processes at the same time.
-        modules: that they import meanwhile.
+        count: number of processes that run at the same time.
     """
 
-    def __init__(self, count: int, modules: Sequence[str] = ()) -> None:
+    def __init__(self, count: int) -> None:
         self.count = count
         self._threads = max(1, (os.cpu_count() or 1) // max(count, 1))
-        self._modules = tuple(modules)
         self._idle: list[_Worker] = []
         try:
             while len(self._idle) < count:
@@ -113,7 +110,7 @@ class Processes(Closing):
     def _start(self, *, speaks: bool = False) -> _Worker:
         context = get_context("spawn")  # a fork would copy threads of Rerun and onnxruntime in midst of work
         ours, theirs = context.Pipe()
-        given = (theirs, self._threads, self._modules, speaks)
+        given = (theirs, self._threads, speaks)
         process = context.Process(target=_work, args=given, name="bevviz batch", daemon=True)
         # Inherited: signals of the terminal are for the batch alone, which ends its workers. It must not be
         # interrupted itself between a worker's start and its name.
@@ -163,7 +160,7 @@ def _end(worker: _Worker) -> None:
     worker.process.join()
 
 
-def _work(pipe: Connection, threads: int, modules: Sequence[str], speaks: bool) -> None:
+def _work(pipe: Connection, threads: int, speaks: bool) -> None:
     """The process: one job after another, until the other end of the pipe is closed."""
     # Of all that compile the stages at the same time one says so.
     announce.to((lambda text: print(f"bevviz: {text}", file=sys.stderr)) if speaks else None, bars=False)
@@ -172,8 +169,6 @@ def _work(pipe: Connection, threads: int, modules: Sequence[str], speaks: bool) 
     import cv2
 
     cv2.setNumThreads(threads)
-    for module in modules:
-        import_module(module)
     while True:
         try:
             job: Task = pipe.recv()

@@ -34,13 +34,19 @@ def log_clusters(
     tracked: Tracks | None,
     obstacles: F32,
     config: ClusteringConfig,
-    colored: bool = True,
     packed: float | None = None,
 ) -> None:
-    """In the colours of their tracks. ``obstacles``: (P, 3), as of ``clusters.labels``.
+    """Log clusters in the colours of their tracks.
 
-    Without colours, they are for ``log_cluster_colors`` to log. ``packed``: cluster by cluster, rounded to so
-    many steps in a metre (0: not), as where less is kept.
+    Args:
+        to: writer of the recording.
+        frame: frame of the clusters.
+        clusters: all clusters of the frame.
+        tracked: tracks that give the colours; None: there are none.
+        obstacles: (P, 3) points, in the order of ``clusters.labels``.
+        config: parameters of the clustering.
+        packed: steps per metre to which points are rounded (0: none), and points are sorted by cluster, as in
+            recordings that keep less; None: points stay as they are.
     """
     boxes = clusters.boxes(config)
     kept, others = np.flatnonzero(clusters.kept), np.flatnonzero(~clusters.kept)
@@ -50,7 +56,7 @@ def log_clusters(
         if packed is not None:
             rows = keep.sorted_rows(points, packed, labels)
             points, labels = coarse(points.take(rows, axis=0), packed), labels.take(rows)
-        of_points, of_boxes = _colors(clusters, tracked, labels, kept) if colored else (None, None)
+        of_points, of_boxes = _colors(clusters, tracked, labels, kept)
         to.put(
             entities.clusters(frame.lidar),
             rr.Points3D(points, class_ids=of_points),
@@ -66,21 +72,6 @@ def log_clusters(
                 [f"{k}: {n} points" for k, n in zip(others, clusters.count[others], strict=True)],
                 class_ids=[entities.CLUSTER_CLASS[s] for s in states],
             ),
-        )
-
-
-def log_cluster_colors(
-    to: Writer, frame: Frame, clusters: Clusters, tracked: Tracks | None, *, packed: bool = False
-) -> None:
-    """Of a frame that ``log_clusters`` logged without."""
-    kept = np.flatnonzero(clusters.kept)
-    if len(kept):
-        labels = clusters.labels.compress(in_kept(clusters))
-        of_points, of_boxes = _colors(clusters, tracked, np.sort(labels) if packed else labels, kept)
-        to.write(
-            entities.clusters(frame.lidar),
-            rr.Points3D.from_fields(class_ids=of_points),
-            rr.Boxes3D.from_fields(class_ids=of_boxes),
         )
 
 

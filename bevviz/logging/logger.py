@@ -43,7 +43,7 @@ from bevviz.logging.cloud import (
     quantised,
     raw_clouds,
 )
-from bevviz.logging.clusters import in_kept, log_cluster_colors, log_clusters, log_clusters_looks
+from bevviz.logging.clusters import in_kept, log_clusters, log_clusters_looks
 from bevviz.logging.decisions import log_decisions
 from bevviz.logging.frustums import log_frustums
 from bevviz.logging.health import Rates, log_health, log_health_looks
@@ -230,36 +230,14 @@ class Logger(Writer):
             self._late[found.boxes.topic] = found.boxes.stamp
             log_late(self, found, self._config.bev)
         self.begin(frame.index, frame.stamp, frame.received)
-        self._log_alone(result, cloud=cloud)
-        self._log_in_order(result, health, notes, states)
+        self._log_stages(result, cloud)
+        self._log_changes(result, health, notes, states)
         if beside is not None:
             beside()
         self.end()
 
-    def log_alone(self, result: FrameResult) -> None:
-        """What no other frame has a part in but the one before it; ``log_in_order`` has the rest.
-
-        With both, by two loggers that need not know each other, a recording says of a frame what it says with
-        ``log``.
-        """
-        frame = result.frame
-        self.begin(frame.index, frame.stamp, frame.received)
-        self._log_alone(result, colored=False)
-        self.end()
-
-    def log_in_order(self, result: FrameResult) -> None:
-        """What the frames before have a part in: tracks and their colours, anomalies, states, rates."""
-        frame = result.frame
-        self.begin(frame.index, frame.stamp, frame.received)
-        if result.clusters is not None:
-            packed = not is_whole(self._config)
-            log_cluster_colors(self, frame, result.clusters, result.tracks, packed=packed)
-        if any(failure.stage == "tracking" for failure in result.failures):
-            log_decisions(self, result)  # once more, as ``log_alone`` did not know
-        self._log_in_order(result)
-        self.end()
-
-    def _log_alone(self, result: FrameResult, *, cloud: bool = False, colored: bool = True) -> None:
+    def _log_stages(self, result: FrameResult, cloud: bool) -> None:
+        """Log what the stages computed from this frame alone."""
         frame = result.frame
         if frame.lidar:
             self.put(entities.sensor(frame.lidar), transform(frame.pose))
@@ -269,7 +247,7 @@ class Logger(Writer):
         elif cloud:
             log_cloud(self, result, self._config.logging.color_by)
         self._brought |= self._now - before
-        self._log_lidar_results(result, colored)
+        self._log_lidar_results(result)
         for camera in result.cameras:
             log_detections(self, camera, result.explanations)
             if self._config.logging.projected_points and self._config.logging.keep != "report":
@@ -287,13 +265,14 @@ class Logger(Writer):
             log_shapes(self, frame)
             log_motions(self, frame)
 
-    def _log_in_order(
+    def _log_changes(
         self,
         result: FrameResult,
-        health: Mapping[str, float] = MappingProxyType({}),
-        notes: Sequence[tuple[str, str]] = (),
-        states: Mapping[str, str] = MappingProxyType({}),
+        health: Mapping[str, float],
+        notes: Sequence[tuple[str, str]],
+        states: Mapping[str, str],
     ) -> None:
+        """Log what depends on the frames before: tracks, anomalies, states, rates."""
         frame = result.frame
         log_objects(self, result)
         log_fusion(self, result)
@@ -359,10 +338,10 @@ class Logger(Writer):
         if last is None or (last.width, last.height) != size or not np.array_equal(last.K, intrinsics.K):
             log_intrinsics(self, name, intrinsics)
 
-    def _log_lidar_results(self, result: FrameResult, colored: bool) -> None:
+    def _log_lidar_results(self, result: FrameResult) -> None:
         frame, config, clusters = result.frame, self._config, result.clusters
         if not is_whole(config):
-            self._log_packed_results(result, colored)
+            self._log_packed_results(result)
             return
         log_ground(self, result, config.voxel.size)
         if result.obstacles is None:
@@ -370,9 +349,9 @@ class Logger(Writer):
         obstacles = quantised(result.obstacles, config.voxel.size)
         log_obstacles(self, frame, obstacles)
         if clusters is not None:
-            log_clusters(self, frame, clusters, result.tracks, obstacles, config.clustering, colored)
+            log_clusters(self, frame, clusters, result.tracks, obstacles, config.clustering)
 
-    def _log_packed_results(self, result: FrameResult, colored: bool) -> None:
+    def _log_packed_results(self, result: FrameResult) -> None:
         """Each voxel once: those of clusters with these."""
         frame, config, clusters = result.frame, self._config, result.clusters
         size, ground_too = config.voxel.size, config.logging.keep != "report"
@@ -389,9 +368,7 @@ class Logger(Writer):
             log_obstacles(self, frame, others)
         if clusters is not None:
             scale = step(size, FINE)
-            log_clusters(
-                self, frame, clusters, result.tracks, result.obstacles, config.clustering, colored, scale
-            )
+            log_clusters(self, frame, clusters, result.tracks, result.obstacles, config.clustering, scale)
 
     def _log_some_clouds(self, result: FrameResult, *, strange: bool) -> None:
         """The raw clouds of this frame where they are wanted, and those before it that are wanted with it.

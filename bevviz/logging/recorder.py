@@ -45,13 +45,6 @@ class Recorder(Observer[FrameResult]):
         return [f"raw clouds around what begins were left out {times} times: there are {share} of all frames"]
 
 
-class OrderedRecorder(Recorder):
-    """Writes of a run what the frames before have a part in, where others have written the rest."""
-
-    def see(self, result: FrameResult) -> None:
-        self.logger.log_in_order(result)
-
-
 class DiskWatch(Observer[Any]):
     """Ends a run whose recording cannot be written any more: the rest would be for nothing."""
 

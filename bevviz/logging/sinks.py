@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import socket
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -20,7 +20,6 @@ from bevviz.frame import Scene
 from bevviz.logging import blueprints, rerun_cli
 from bevviz.logging.file_writer import FileWriter
 from bevviz.logging.keep import is_whole
-from bevviz.logging.parts import Parts, PartsWriter
 from bevviz.logging.ports import (
     FIRST_DATA_PORT,
     LOOPBACK,
@@ -47,30 +46,19 @@ class Sinks:
         urls: what to open in a browser or viewer, one for each server.
         warnings: one sentence each.
         file: where the recording is until it is whole; None: in no file.
-        parts: between which others have theirs; None: nobody has.
     """
 
     recording: rr.RecordingStream
     urls: list[str] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
     file: Path | None = None
-    writer: FileWriter | PartsWriter | None = None
-    parts: Parts | None = None
+    writer: FileWriter | None = None
 
     @property
     def recording_id(self) -> str:
         found = rr.get_recording_id(self.recording)
         assert found is not None
         return str(found)
-
-    def add(self, part: Path) -> None:
-        """What another process has logged of the same recording, which is open ``in_parts``.
-
-        Raises:
-            UserError: the file cannot be read.
-        """
-        assert self.parts is not None
-        self.parts.add(part)
 
     def check(self) -> None:
         """Raises UserError where the file cannot be written any more."""
@@ -92,7 +80,6 @@ def open_recording(
     recording_id: str | None = None,
     place: Path | None = None,
     origin: Origin | None = None,
-    in_parts: bool = False,
 ) -> Iterator[Sinks]:
     """Open a recording that goes to everything that is asked for, with the blueprint.
 
@@ -112,7 +99,6 @@ def open_recording(
             random one, the same for all recordings of a process.
         place: where ``save`` is going to lie, if elsewhere.
         origin: what it says of what it was made from; None: everything.
-        in_parts: other processes make parts of it. What is logged reaches the outputs with the next part.
 
     Raises:
         UserError: unknown blueprint, file that cannot be written or that another
@@ -125,17 +111,12 @@ def open_recording(
     warnings: list[str] = []
     file: Path | None = None
     writer: FileWriter | None = None
-    joined: PartsWriter | None = None
-    parts: Parts | None = None
     with ExitStack() as stack:
         if save is not None:
             given = stack.enter_context(_file(save))
             file = given.path
-            if in_parts:
-                joined = stack.enter_context(PartsWriter(file))
-            else:
-                writer = stack.enter_context(FileWriter(file))
-                sinks.append(writer.sink)
+            writer = stack.enter_context(FileWriter(file))
+            sinks.append(writer.sink)
             if given.leftover:
                 warnings.append(f"{file.name}, which a run that did not end had left, is overwritten")
         if connect is not None:
@@ -149,10 +130,7 @@ def open_recording(
         watched = connect is not None or spawn or serve is not None
         recording = _stream(recording_id, batcher=None if watched else batches(config))
         try:
-            if in_parts:
-                parts = stack.enter_context(_parts(recording, sinks, layout, joined, file))
-            else:
-                recording.set_sinks(*sinks, default_blueprint=layout)
+            recording.set_sinks(*sinks, default_blueprint=layout)
         except (RuntimeError, ValueError) as error:
             raise UserError(f"cannot open the outputs: {error}") from None
         if writer is not None:
@@ -161,17 +139,14 @@ def open_recording(
             origin = Origin.of(scene, config, place or save)
         if origin is not None:
             origin.log(recording)
-        into = joined or writer
         try:
-            yield Sinks(recording, urls, warnings, file, into, parts)
+            yield Sinks(recording, urls, warnings, file, writer)
         finally:
             _close(recording)
-            if parts is not None:
-                parts.close()
-            if into is not None:
-                into.close()
-        if into is not None:
-            into.check()
+            if writer is not None:
+                writer.close()
+        if writer is not None:
+            writer.check()
 
 
 def _stream(
@@ -182,35 +157,6 @@ def _stream(
     )
     recording.set_log_time_enabled(False)  # frames have their own clocks
     return recording
-
-
-@contextmanager
-def _parts(
-    recording: rr.RecordingStream,
-    sinks: Sequence[rr.FileSink | rr.GrpcSink | rr.GrpcServerSink],
-    layout: rrb.Blueprint,
-    writer: PartsWriter | None,
-    file: Path | None,
-) -> Iterator[Parts]:
-    """The layout in a part of its own: Rerun indexes parts that hold one store."""
-    recording_id = str(rr.get_recording_id(recording))
-    shown = None
-    if sinks:
-        shown = _stream(recording_id, properties=False)
-        shown.set_sinks(*sinks, default_blueprint=layout)
-    parts = Parts(recording, writer, shown, None if file is None else file.parent)
-    try:
-        if writer is not None:
-            first = parts.folder / "layout.rrd"
-            alone = _stream(recording_id, properties=False)
-            alone.set_sinks(rr.FileSink(first), default_blueprint=layout)
-            alone.disconnect()
-            writer.add(first)
-        yield parts
-    finally:
-        parts.close()
-        if shown is not None:
-            _close(shown)
 
 
 def batches(config: Config) -> rr.ChunkBatcherConfig | None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_left
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
@@ -72,14 +72,11 @@ class Synchronizer:
 
     Attributes:
         followed: the frame that odometry places.
-        skims: remember what a frame leaves behind, and do not make it: somebody else does. The frames have
-            their numbers and stamps then, and what they would have complained of is not counted.
     """
 
     def __init__(self, roles: Roles, config: Config, beside: Collection[str] = ()) -> None:
         self.report = SyncReport()
         self.followed = ""
-        self.skims = False
         self.absent: frozenset[str] = frozenset()  # topics that nobody publishes now: not waited for
         self.tf = self.report.tf
         self.upright = Upright(self.tf, config.source.base_frame, config.sync.tf_tolerance)
@@ -409,11 +406,6 @@ class Synchronizer:
     def _build(self) -> Frame:
         cloud = self._clouds.pop(0)
         problems: list[str] = []
-        if self.skims:
-            counted, self.report.problems = self.report.problems, Counter()
-            place = self.placing.of(cloud, problems)
-            self.report.problems = counted
-            return self._passed(place, self._skimmed(cloud, place))
         place = self.placing.of(cloud, problems)
         clouds, poses = self._gather(cloud, place, problems)
         in_place = place.upright is None and cloud.frame_id.lstrip("/") == place.points_frame
@@ -446,30 +438,6 @@ class Synchronizer:
             around=self.around.take(lambda name: self.placing.world_from(place, name)),
         )
         return self._passed(place, frame)
-
-    def _skimmed(self, cloud: Cloud, place: Place) -> Frame:
-        """Of a frame what is known at once. What belongs to it is taken, as in ``_build``."""
-        window = self._window(cloud.stamp)
-        groups: tuple[Mapping[str, Track[Any]], ...] = (
-            self._boxes,
-            self._truth,
-            self._detections,
-            self._robot_clouds,
-        )
-        for group in groups:
-            for track in group.values():
-                track.take(cloud.stamp, *window)
-        self.around.take(lambda name: None)
-        points, pose = np.zeros((0, 3), np.float32), place.world_from_points
-        return Frame(
-            self._index,
-            cloud.stamp,
-            cloud.received,
-            cloud.name,
-            points,
-            place.points_frame,
-            world_from_points=pose,
-        )
 
     def _passed(self, place: Place, frame: Frame) -> Frame:
         """The frame, from here on that of before."""
