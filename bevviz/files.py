@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import errno
 import fcntl
 import os
+import random
+import re
+import secrets
 import shutil
 import stat
 import tempfile
@@ -23,45 +27,103 @@ LFS_HINT = "a Git LFS pointer, not the file itself: 'git lfs pull' fetches it"
 YOUNG = 60.0  # seconds that a temporary folder may be without its lock: it is being made
 
 
+# What the stem of an unfinished file ends with. Nobody can guess it, and so plant a link under that name.
+MARK = re.compile(r"\.partial-[0-9a-f]{8}$")
+ATTEMPTS = 5  # to be the only writer, where several processes begin at the same moment
+PAUSE = 0.1  # seconds between two attempts, at most
+
+
 @dataclass(frozen=True, slots=True)
 class Unfinished:
-    """Where a file is written until it is whole. ``leftover``: an earlier run had left something there."""
+    """A file that is being written, under a name of its own beside its target.
+
+    Attributes:
+        path: where it is written until it is whole.
+        handle: descriptor of the file. It holds the lock until it is closed.
+        leftovers: unfinished files of the same target that earlier processes have left.
+    """
 
     path: Path
-    leftover: bool = False
+    handle: int
+    leftovers: tuple[Path, ...] = ()
+
+    @property
+    def warnings(self) -> list[str]:
+        """One sentence about the leftovers, if there are any."""
+        if not self.leftovers:
+            return []
+        names = ", ".join(path.name for path in self.leftovers)
+        return [f"{names}: left by a run that did not end; keep or delete it"]
+
+    def discard(self) -> None:
+        """Delete the file and give up the lock."""
+        self.path.unlink(missing_ok=True)
+        os.close(self.handle)
 
 
-def unfinished(target: Path) -> Path:
-    """The name of a file while it is written: NAME.partial.SUFFIX, so that what knows the suffix opens it."""
-    return target.with_name(f"{target.stem}.partial{target.suffix}")
+def unfinished_files(target: Path) -> list[Path]:
+    """Find the unfinished files of a target: NAME.partial-XXXXXXXX.SUFFIX beside it, in order of age."""
+    pattern = re.compile(re.escape(target.stem) + MARK.pattern)
+    found: list[tuple[float, Path]] = []
+    with suppress(OSError):
+        for path in target.parent.iterdir():
+            if path.suffix != target.suffix or not pattern.fullmatch(path.stem):
+                continue
+            with suppress(FileNotFoundError):  # its process has just given it its name
+                status = path.lstat()
+                if stat.S_ISREG(status.st_mode):
+                    found.append((status.st_mtime, path))
+    return [path for _, path in sorted(found)]
+
+
+def is_locked(path: Path) -> bool:
+    """Tell whether a process is writing an unfinished file."""
+    try:
+        handle = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
+    except OSError:
+        return False
+    try:
+        fcntl.flock(handle, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return True
+    except OSError:
+        pass  # a network file system without locks
+    finally:
+        os.close(handle)
+    return False
+
+
+def create(path: Path) -> int:
+    """Create a file for writing and return its descriptor. Fail where the name exists, even as a link."""
+    return os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC, 0o666)
 
 
 @contextmanager
 def written(target: Path, what: str) -> Iterator[Unfinished]:
-    """A name beside ``target``, for this process alone; what is there takes its place at the end.
+    """Give a file beside ``target`` to write to, for this process alone. At the end it replaces ``target``.
 
-    An interrupt is an end like any other. After an error, or a kill, what was written stays under the name of
-    ``unfinished``, and ``target`` is as it was before.
+    An interrupt is an end like any other. After an error, or a kill, what was written stays under the name
+    of the unfinished file, and ``target`` is as it was before.
 
     Args:
         target: the file; a link is followed.
         what: it is, for errors.
 
     Raises:
-        UserError: it cannot be written, is no file, or another process is writing it; an error within, with
-            where the unfinished file is.
+        UserError: it cannot be written, is no file, is a link to a file of another kind, or another process
+            is writing it; an error within, with where the unfinished file is.
     """
-    target = target.resolve()
-    path = unfinished(target)
+    whole = target.resolve()
+    if whole.suffix != target.suffix:
+        raise UserError(f"{target}: cannot write the {what}: it is a link to {whole}")
     with remains.unfinished():
-        handle = claim(target, what)
+        unfinished = claim(whole, what)
+        path, handle = unfinished.path, unfinished.handle
         try:
-            leftover = os.fstat(handle).st_size > 0
-            os.ftruncate(handle, 0)
             try:
-                yield Unfinished(path, leftover)
+                yield unfinished
             except KeyboardInterrupt:
-                _finish(path, target, what)
+                _finish(path, whole, what)
                 raise
             except BaseException as error:
                 if not os.fstat(handle).st_size:
@@ -69,7 +131,7 @@ def written(target: Path, what: str) -> Iterator[Unfinished]:
                 elif isinstance(error, UserError):
                     raise UserError(f"{error}; what was made until then is in {path.name}") from error
                 raise
-            _finish(path, target, what)
+            _finish(path, whole, what)
         finally:
             os.close(handle)  # and with it the lock
 
@@ -85,39 +147,45 @@ def save(target: Path, text: str, option: str) -> None:
             target.write_text(text, encoding="utf-8", newline="")
             return
         with written(target, "file") as file:
-            file.path.write_text(text, encoding="utf-8", newline="")
+            try:
+                file.path.write_text(text, encoding="utf-8", newline="")
+            except OSError:
+                os.ftruncate(file.handle, 0)  # half a text is of no use to anybody: it is not kept
+                raise
     except OSError as error:
         raise UserError(f"{option} {target}: cannot write the file: {error.strerror}") from None
     except UserError as error:
         raise UserError(f"{option} {error}") from None
 
 
-def claim(target: Path, what: str) -> int:
-    """Open the unfinished file for a target, or make it, for this process alone.
+def claim(target: Path, what: str) -> Unfinished:
+    """Create an unfinished file for a target that no other process is writing.
 
-    Returns:
-        Its descriptor, which holds the lock. What is in the file stays.
+    The name is new: no existing file or link is opened. The lock is taken before it is looked whether another
+    process has one, so that of two that begin together at most one goes on.
 
     Raises:
         UserError: the target is no file, another process is writing it, or it cannot be written.
     """
     if target.exists() and not target.is_file():
         raise UserError(f"{target}: cannot write the {what}: it is no file")
-    path = unfinished(target)
-    while True:
+    taken = f"{target}: another process is writing it"
+    for _ in range(ATTEMPTS):
+        if any(is_locked(path) for path in unfinished_files(target)):
+            break
+        path = target.with_name(f"{target.stem}.partial-{secrets.token_hex(4)}{target.suffix}")
         try:
-            handle = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NONBLOCK, 0o666)
+            handle = create(path)
         except OSError as error:
             raise UserError(f"{target}: cannot write the {what}: {error.strerror}") from None
-        try:
-            lock(handle, f"{target}: another process is writing it")
-        except UserError:
-            os.close(handle)
-            raise
-        with suppress(OSError):
-            if os.path.samestat(path.stat(), os.fstat(handle)):
-                return handle
-        os.close(handle)  # who had it before has just given it its name
+        with suppress(UserError):
+            lock(handle, taken)
+            others = tuple(other for other in unfinished_files(target) if other != path)
+            if not any(is_locked(other) for other in others):
+                return Unfinished(path, handle, others)
+        Unfinished(path, handle).discard()
+        time.sleep(random.uniform(0, PAUSE))
+    raise UserError(taken)
 
 
 def lock(handle: int, taken: str) -> None:
@@ -128,6 +196,20 @@ def lock(handle: int, taken: str) -> None:
         raise UserError(taken) from None
     except OSError:
         pass  # a network file system without locks
+
+
+def rename_new(path: Path, target: Path) -> None:
+    """Rename a file. Raise FileExistsError where the new name exists: nothing is overwritten."""
+    try:
+        os.link(path, target, follow_symlinks=False)
+    except FileExistsError:
+        raise
+    except OSError:  # a file system without hard links, as on USB sticks
+        if os.path.lexists(target):
+            raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST), str(target)) from None
+        path.rename(target)
+    else:
+        path.unlink()
 
 
 def _finish(path: Path, target: Path, what: str) -> None:

@@ -20,7 +20,7 @@ from rosbags.typesys import get_types_from_msg
 
 from bevviz.cli import main
 from bevviz.cli.options import with_negatives
-from bevviz.files import unfinished
+from bevviz.files import unfinished_files
 from bevviz.logging.logger import Logger
 from bevviz.results import FrameResult
 from tests import bags
@@ -348,7 +348,7 @@ def test_an_interrupted_run_leaves_a_readable_recording(tmp_path: Path) -> None:
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env=environment()) as run:
         try:
             while run.poll() is None and time.monotonic() < deadline:
-                if unfinished(saved).exists() and unfinished(saved).stat().st_size > 4_000_000:
+                if sum(path.stat().st_size for path in unfinished_files(saved)) > 4_000_000:
                     break
                 time.sleep(0.1)
             run.send_signal(signal.SIGINT)

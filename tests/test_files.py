@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import resource
 import signal
 import subprocess
@@ -10,11 +11,15 @@ import sys
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
+from mcap.reader import make_reader
+from rosbags.interfaces import Connection, ConnectionExtRosbag2, MessageDefinition, MessageDefinitionFormat
 
+from bevviz.bags.mcap_writer import McapWriter, complete
 from bevviz.cli import main
 from bevviz.errors import UserError
-from bevviz.files import Scratch, save, unfinished, written
+from bevviz.files import Scratch, claim, save, unfinished_files, written
 from tests import bags
 from tests.recordings import Recording, verify
 from tests.test_cli import Capture, environment, error_of
@@ -30,7 +35,8 @@ def test_a_file_gets_its_name_at_the_end() -> None:
     target = Path("a.rrd")
     target.write_text("old")
     with written(target, "recording") as given:
-        assert given.path.name == "a.partial.rrd" and not given.leftover
+        assert re.fullmatch(r"a\.partial-[0-9a-f]{8}\.rrd", given.path.name)
+        assert unfinished_files(target.resolve()) == [given.path] and not given.leftovers
         given.path.write_text("new")
         assert target.read_text() == "old"
     assert target.read_text() == "new" and not given.path.exists()
@@ -39,16 +45,20 @@ def test_a_file_gets_its_name_at_the_end() -> None:
 def test_an_error_leaves_the_old_and_says_where_the_new_is() -> None:
     target = Path("a.rrd")
     target.write_text("old")
-    half = r"^no more; what was made until then is in a\.partial\.rrd$"
+    half = r"^no more; what was made until then is in a\.partial-[0-9a-f]{8}\.rrd$"
     with pytest.raises(UserError, match=half), written(target, "recording") as given:
         given.path.write_text("half")
         raise UserError("no more")
-    assert (target.read_text(), Path("a.partial.rrd").read_text()) == ("old", "half")
+    (left,) = unfinished_files(target)
+    assert (target.read_text(), left.read_text()) == ("old", "half")
     with written(target, "recording") as given:
-        assert given.leftover and given.path.read_text() == ""
+        assert given.leftovers == (left.resolve(),) and given.path.read_text() == ""
+        assert given.warnings == [f"{left.name}: left by a run that did not end; keep or delete it"]
+    assert left.read_text() == "half"
+    left.unlink()
     with pytest.raises(UserError, match=r"^nothing$"), written(target, "recording"):
         raise UserError("nothing")
-    assert not Path("a.partial.rrd").exists()
+    assert not unfinished_files(target)
 
 
 def test_one_process_at_a_time() -> None:
@@ -66,7 +76,7 @@ def test_two_runs_into_one_recording(tmp_path: Path, capsys: Capture) -> None:
     with subprocess.Popen(command, env=environment(), stderr=subprocess.DEVNULL) as first:
         try:
             deadline = time.monotonic() + 60
-            while not Path("out.partial.rrd").exists() and time.monotonic() < deadline:
+            while not unfinished_files(Path("out.rrd")) and time.monotonic() < deadline:
                 time.sleep(0.05)
             said = error_of(capsys, "bag", "drive", "--save", "out.rrd")
             assert "out.rrd: another process is writing it" in said
@@ -201,9 +211,10 @@ def test_a_full_disk_ends_the_run_early(tmp_path: Path) -> None:
     assert done.returncode == 2 and len(errors) == 1, done.stderr[-2000:]
     assert "Traceback" not in done.stderr
     assert "its disk takes no more" in errors[0]
-    assert "what was made until then is in out.partial.rrd" in errors[0]
+    (left,) = unfinished_files(tmp_path / "out.rrd")
+    assert f"what was made until then is in {left.name}" in errors[0]
     assert Path("out.rrd").read_text() == "an older result"
-    frames = len(Recording(tmp_path / "out.partial.rrd").rows["/bev"])
+    frames = len(Recording(left).rows["/bev"])
     assert 0 < frames < 1000
 
 
@@ -245,5 +256,152 @@ def test_a_bag_that_needs_no_temporary_folder_makes_none(
     assert main(["info", "drive"]) == 0
 
 
-def test_the_name_of_an_unfinished_file_opens_with_what_knows_the_whole() -> None:
-    assert unfinished(Path("runs/drive.v2.rrd")) == Path("runs/drive.v2.partial.rrd")
+def test_unfinished_files_are_known_by_their_names() -> None:
+    target = Path("drive.v2.rrd")
+    claimed = claim(target, "recording")
+    for name in ("drive.v2.partial.rrd", "drive.partial-0123abcd.rrd", "drive.v2.partial-0123abcd.mcap"):
+        Path(name).write_text("of somebody else")
+    Path("drive.v2.partial-00000000.rrd").symlink_to("drive.v2.partial.rrd")
+    assert unfinished_files(target) == [claimed.path]
+    claimed.discard()
+    assert not unfinished_files(target)
+
+
+# --- planted names -----------------------------------------------------------------------------
+
+
+def plant(target: Path, bag: Path) -> None:
+    """Make links to a bag under names that an unfinished file has, or had."""
+    target.with_name(f"{target.stem}.partial{target.suffix}").symlink_to(bag)
+    os.link(bag, target.with_name(f"{target.stem}.partial-00000000{target.suffix}"))
+    target.with_name(f"{target.stem}.partial-ffffffff{target.suffix}").symlink_to(bag)
+
+
+@pytest.mark.parametrize(
+    ("command", "options", "outputs"),
+    [
+        ("bag", ["--save", "o.rrd"], ["o.rrd"]),
+        ("bag", ["--save", "o.rrd", "--jobs", "2"], ["o.rrd"]),
+        ("compare", ["--csv", "s.csv", "--json", "s.json", "--set-b", "voxel.size=0.3"], ["s.csv", "s.json"]),
+        ("calib", ["--write", "a.yaml"], ["a.yaml"]),
+        ("report", ["--at", "0", "-o", "o.rrd"], ["o.rrd", "o.html", "o.mcap"]),
+    ],
+)
+def test_planted_links_do_not_reach_the_bag(command: str, options: list[str], outputs: list[str]) -> None:
+    bags.write(Path("drive"), bags.small_items(scans=2))
+    (bag,) = Path("drive").glob("*.mcap")
+    before = bag.read_bytes()
+    for name in outputs:
+        plant(Path(name), bag)
+    assert main([command, "drive", *options]) == 0
+    assert bag.read_bytes() == before
+    assert all(Path(name).stat().st_size and Path(name).stat().st_nlink == 1 for name in outputs)
+
+
+def test_an_unfinished_file_is_never_an_existing_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    bag = Path("drive.mcap")
+    bag.write_text("the bag")
+    names = iter(["00000000", "11111111", "22222222"])
+    monkeypatch.setattr("secrets.token_hex", lambda size: next(names))
+    Path("o.partial-00000000.rrd").symlink_to(bag)
+    os.link(bag, "o.partial-11111111.rrd")
+    for _ in range(2):
+        with pytest.raises(UserError, match=r"o\.rrd: cannot write the recording: File exists"):
+            claim(Path("o.rrd"), "recording")
+    claim(Path("o.rrd"), "recording").discard()
+    assert bag.read_text() == "the bag" and bag.stat().st_nlink == 2
+
+
+def test_a_link_to_a_file_of_another_kind_is_refused() -> None:
+    bag = Path("drive.mcap")
+    bag.write_text("the bag")
+    Path("s.csv").symlink_to(bag)
+    with pytest.raises(
+        UserError, match=r"^--csv s\.csv: cannot write the file: it is a link to .*drive\.mcap"
+    ):
+        save(Path("s.csv"), "a,b\n", "--csv")
+    assert bag.read_text() == "the bag"
+
+
+def test_of_two_that_begin_together_one_goes_on() -> None:
+    script = (
+        "import sys, time; from pathlib import Path; from bevviz.files import claim\n"
+        "from bevviz.errors import UserError\n"
+        "sys.stdin.readline()\n"
+        "try: claim(Path('a.rrd'), 'recording'); print('mine', flush=True); sys.stdin.readline()\n"
+        "except UserError as error: print(error, flush=True)\n"
+    )
+    command = [sys.executable, "-c", script]
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True, "env": environment()}
+    both = [subprocess.Popen(command, **pipes) for _ in range(2)]
+    for process in both:
+        process.stdin.write("go\n")
+        process.stdin.flush()
+    said = sorted(process.stdout.readline() for process in both)
+    for process in both:
+        process.communicate(timeout=PATIENCE)
+    assert said[1] == "mine\n" and said[0].endswith("a.rrd: another process is writing it\n")
+
+
+# --- a bag that a killed process leaves --------------------------------------------------------
+
+
+def little_bag(path: Path, *, compress: bool) -> list[tuple[int, int, bytes]]:
+    """Write a bag of three chunks. Return log time, time of publication and data of its messages."""
+    nothing = MessageDefinition(MessageDefinitionFormat.NONE, "")
+    topics = [
+        Connection(i, f"/{i}", "a/msg/X", nothing, "", 0, ConnectionExtRosbag2("cdr", []), None)
+        for i in range(2)
+    ]
+    random_bytes = np.random.default_rng(0).bytes
+    messages = [(100 + i, 50 + i, random_bytes(50_000 + i)) for i in range(200)]
+    with McapWriter(path, lambda connection: nothing, compress=compress) as bag:
+        for i, (received, sent, data) in enumerate(messages):
+            bag.write(topics[i % 2], received, data, sent)
+    return messages
+
+
+def read_bag(path: Path) -> list[tuple[int, int, bytes]]:
+    with path.open("rb") as file:
+        reader = make_reader(file, validate_crcs=True)
+        summary = reader.get_summary()
+        found = [(m.log_time, m.publish_time, m.data) for _, _, m in reader.iter_messages()]
+    assert summary is not None and summary.statistics is not None
+    assert summary.statistics.message_count == len(found) and summary.statistics.chunk_count
+    assert len(summary.channels) == summary.statistics.channel_count == 2
+    return found
+
+
+@pytest.mark.parametrize("compress", [False, True])
+def test_a_bag_cut_anywhere_is_completed(compress: bool) -> None:
+    messages = little_bag(Path("whole.mcap"), compress=compress)
+    whole, cut = Path("whole.mcap").read_bytes(), Path("cut.mcap")
+    assert complete(Path("whole.mcap")) == 0 and Path("whole.mcap").read_bytes() == whole
+    second = whole.index(b"\x07", 4_300_000)  # somewhere in the second chunk
+    ends = [*range(len(whole) - 1, 9_000_000, -160_000), second, second + 1, 8_600_000, 5_000_000]
+    for end in ends:
+        cut.write_bytes(whole[:end])
+        count = complete(cut)
+        assert read_bag(cut) == messages[:count]
+        if not compress:  # of a compressed chunk nothing is left
+            assert (count + 1) * 50_300 > min(end, 200 * 50_000)
+        cut.write_bytes(whole[:end] + bytes(5000))  # as after a power cut, within a message or behind it
+        assert complete(cut) in (count, count + 1) and read_bag(cut)[:count] == messages[:count]
+
+
+def test_a_bag_that_is_damaged_before_its_end_stays_as_it_is() -> None:
+    little_bag(Path("whole.mcap"), compress=False)
+    whole, cut = Path("whole.mcap").read_bytes(), Path("cut.mcap")
+    for at in (100, 4_250_000, 6_000_000):
+        data = whole[:at] + b"\x55" * 60_000 + whole[at + 60_000 : -1]
+        cut.write_bytes(data)
+        with pytest.raises(UserError, match=r"cut\.mcap: cannot be completed"):
+            complete(cut)
+        assert cut.read_bytes() == data
+    os.link("cut.mcap", "other.mcap")
+    with pytest.raises(UserError, match="another name"):
+        complete(cut)
+    Path("link.mcap").symlink_to("whole.mcap")
+    with pytest.raises(UserError, match="cannot be completed"):
+        complete(Path("link.mcap"))
+    assert Path("whole.mcap").read_bytes() == whole

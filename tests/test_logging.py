@@ -25,7 +25,7 @@ from bevviz.anomalies import KINDS
 from bevviz.config import Config, load
 from bevviz.errors import UserError
 from bevviz.explain import explain
-from bevviz.files import unfinished
+from bevviz.files import unfinished_files
 from bevviz.frame import (
     Boxes3D,
     Camera,
@@ -575,7 +575,7 @@ def test_numbers_that_wait_for_others_are_the_same(tmp_path: Path) -> None:
                 logger.log(result)
             raise ValueError("cut")
         assert not path.exists()
-        path = unfinished(path)  # whole all the same: an error leaves it under this name
+        (path,) = unfinished_files(path)  # whole all the same: an error leaves it under this name
         verify(path)
         rows = {e: r for e, r in Recording(path).rows.items() if e.startswith("/health")}
         found.append({e: sorted(r, key=lambda row: int(row["frame"])) for e, r in rows.items()})
@@ -850,12 +850,12 @@ def test_a_killed_process_leaves_what_it_had_logged(tmp_path: Path) -> None:
         [sys.executable, "-c", textwrap.dedent(script)], cwd=root, env=env, timeout=PATIENCE
     )
     assert done.returncode == -signal.SIGKILL
-    left = tmp_path / "killed.partial.rrd"
+    (left,) = unfinished_files(path)
     assert not path.exists()
     assert sorted(Recording(left).at["/world/lidar/points"]["Points3D:positions"]) == [0, 1, 2, 3, 4]
     with open_recording(SCENE, load(), save=path) as sinks:  # the next run tells
-        assert sinks.warnings == ["killed.partial.rrd, which a run that did not end had left, is overwritten"]
-    assert path.exists() and not left.exists()
+        assert sinks.warnings == [f"{left.name}: left by a run that did not end; keep or delete it"]
+    assert path.exists() and left.exists()
 
 
 @pytest.mark.parametrize(

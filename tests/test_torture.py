@@ -55,7 +55,7 @@ def test_what_counts_as_false_or_unreadable(tmp_path: Path, monkeypatch: pytest.
     assert not kill._falsehood(tmp_path, bag, -signal.SIGINT, "")
     monkeypatch.setattr(kill, "PATIENCE", 0.2)
     (tmp_path / "half.txt").write_text("of something")
-    (tmp_path / "out.partial.rrd").write_text("half")
+    (tmp_path / "out.partial-0123abcd.rrd").write_text("half")
     assert kill._left(tmp_path, 2**31 - 1, set(), ["out.rrd"], killed=False) == "left: half.txt"
     assert kill._left(tmp_path, 2**31 - 1, {"half.txt"}, ["out.rrd"], killed=False) == ""
     with subprocess.Popen(["sleep", "60"], start_new_session=True) as left:

@@ -18,6 +18,7 @@ from pathlib import Path
 
 from tqdm import tqdm
 
+from bevviz.files import unfinished_files
 from tests import bags
 
 SCANS = 40
@@ -241,7 +242,7 @@ def _left(folder: Path, session: int, before: set[str], made: Sequence[str], kil
         with suppress(ProcessLookupError):
             os.killpg(session, signal.SIGKILL)
         return f"still running: {'; '.join(running)}"
-    expected = {*made, *(f"{Path(name).stem}.partial{Path(name).suffix}" for name in made)}
+    expected = {*made, *(path.name for name in made for path in unfinished_files(folder / name))}
     files = {name for name in _files(folder) - before if name.split("/")[0] not in expected}
     if killed:  # the next one removes it
         files = {name for name in files if not name.startswith("tmp/")}
@@ -297,7 +298,7 @@ def _cluster() -> Iterator[str]:
 
 def _clean(folder: Path, name: str) -> None:
     for made in COMMANDS[name].made:
-        for path in (folder / made, (folder / made).with_stem(f"{Path(made).stem}.partial")):
+        for path in (folder / made, *unfinished_files(folder / made)):
             shutil.rmtree(path) if path.is_dir() else path.unlink(missing_ok=True)
 
 

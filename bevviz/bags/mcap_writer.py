@@ -6,9 +6,10 @@ import os
 import struct
 from binascii import crc32
 from collections import Counter, defaultdict
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from io import BytesIO
+from mmap import ACCESS_READ, mmap
 from pathlib import Path
 from types import TracebackType
 from typing import Self
@@ -40,8 +41,8 @@ from bevviz.bags.mcap import (
     RECORD,
     SCHEMA,
 )
-from bevviz.errors import UserError
-from bevviz.files import claim, unfinished, write_all
+from bevviz.errors import UserError, first_line
+from bevviz.files import claim, lock, rename_new, write_all
 from bevviz.version import __version__
 
 HEADER, CHUNK_INDEX, STATISTICS = 1, 8, 0x0B
@@ -53,17 +54,19 @@ _SCHEMAS = {"protobuf": "protobuf", "json": "jsonschema"}  # of messages that ar
 class McapWriter:
     """Context manager: ``write`` messages in order of log time. The file appears when all went well.
 
-    Until then it is NAME.partial.mcap, which a process that is killed leaves, and which can be read. Where
-    ``write`` finds the disk full, what was written until then becomes a complete file if the context is left
-    without an error.
+    Until then it is NAME.partial-XXXXXXXX.mcap, which a process that is killed leaves, and which can be read.
+    Where ``write`` finds the disk full, what was written until then becomes a complete file if the context is
+    left without an error.
 
     The messages of ROS 1 stay what they are: with the encoding ``ros1``, which MCAP has beside ``cdr``.
 
     Args:
-        path: the ``.mcap`` file; replaced where it exists.
+        path: the ``.mcap`` file.
         define: tells what the type of a connection is made of.
         ros1: the profile that the file states.
         compress: chunks with zstd.
+        replace: overwrite an existing file. Otherwise that stays, and a bag that cannot get its name, or its
+            summary, keeps its unfinished name.
 
     Raises:
         UserError: the file cannot be written.
@@ -76,15 +79,17 @@ class McapWriter:
         *,
         ros1: bool = False,
         compress: bool = True,
+        replace: bool = True,
     ) -> None:
         self._path = path.resolve()
-        self._part = unfinished(self._path)
+        self._replaces = replace
         self._define = define
         self._profile = "ros1" if ros1 else "ros2"
         self._compression = "zstd" if compress else ""
         self._schemas: dict[tuple[str, MessageDefinition], int] = {}
         self._channels: dict[tuple[str, str, MessageDefinition], int] = {}
         self._declared = BytesIO()  # schemas and channels, for the summary
+        self._declared_count: Counter[int] = Counter()  # by opcode
         self._chunk = BytesIO()
         self._index: dict[int, list[tuple[int, int]]] = defaultdict(list)  # of the open chunk, by channel
         self._chunks = BytesIO()  # their records of the summary
@@ -95,32 +100,38 @@ class McapWriter:
         self._end = 0
 
     def __enter__(self) -> Self:
-        self._lock = claim(self._path, "bag")
+        unfinished = claim(self._path, "bag")
+        self._part, self._file = unfinished.path, unfinished.handle
         remains.remember(self, partial(self._part.unlink, missing_ok=True))
         try:
-            self._file = os.open(self._part, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, 0o666)
             self._put(MAGIC + _record(HEADER, _text(self._profile) + _text(f"bevviz {__version__}")))
         except OSError as error:
             remains.forget(self)
-            os.close(self._lock)
+            unfinished.discard()
             raise UserError(f"{self._path}: cannot write the bag: {error.strerror}") from None
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
+        keep = kind is None and not self._replaces
         try:
             if kind is None:
                 self._finish()
-            if kind is None:
-                self._part.replace(self._path)
+                if self._replaces:
+                    self._part.replace(self._path)
+                else:
+                    rename_new(self._part, self._path)
+        except FileExistsError:
+            raise UserError(f"{self._path}: is already there; the bag is {self._part.name}") from None
         except OSError as failure:
-            raise UserError(f"{self._path}: cannot write the bag: {failure.strerror}") from None
+            where = f"; what was written is in {self._part.name}" if keep else ""
+            raise UserError(f"{self._path}: cannot write the bag: {failure.strerror}{where}") from None
         finally:
-            os.close(self._file)
-            self._part.unlink(missing_ok=True)
+            if not keep:
+                self._part.unlink(missing_ok=True)
             remains.forget(self)
-            os.close(self._lock)
+            os.close(self._file)  # and with it the lock
 
     @property
     def size(self) -> int:
@@ -218,37 +229,129 @@ class McapWriter:
         record = _record(opcode, content)
         self._chunk.write(record)
         self._declared.write(record)
+        self._declared_count[opcode] += 1
 
     def _close_chunk(self) -> None:
         data, start = self._chunk.getvalue(), self._end
         index, self._chunk, self._index = self._index, BytesIO(), defaultdict(list)
         packed = zstd.compress(data) if self._compression else data
         times = [time for entries in index.values() for time, _ in entries]
-        first, last = min(times, default=0), max(times, default=0)
-        head = CHUNK_HEAD.pack(first, last, len(data), crc32(data), len(self._compression))
+        head = CHUNK_HEAD.pack(
+            min(times, default=0), max(times, default=0), len(data), crc32(data), len(self._compression)
+        )
         head += self._compression.encode() + struct.pack("<Q", len(packed))
-        listed, offsets = b"", b""
-        index_start = start + RECORD.size + len(head) + len(packed)
-        for channel, entries in index.items():
-            offsets += struct.pack("<HQ", channel, index_start + len(listed))
-            pairs = b"".join(struct.pack("<QQ", *entry) for entry in entries)
-            listed += _record(MESSAGE_INDEX, struct.pack("<H", channel) + _bytes(pairs))
         try:
             self._put(RECORD.pack(CHUNK, len(head) + len(packed)) + head)
             self._put(packed)
-            self._put(listed)
+            self._put(_listed(index)[0])
         except OSError:  # whole chunks are left, and place for the summary of them
             os.ftruncate(self._file, start)
             os.lseek(self._file, start, os.SEEK_SET)
             self._end = start
             self._counts -= Counter({channel: len(entries) for channel, entries in index.items()})
             raise
-        about = struct.pack("<QQQQ", first, last, start, index_start - start) + _bytes(offsets)
+        self._note_chunk(start, RECORD.size + len(head) + len(packed), index, len(packed), len(data))
+
+    def _note_chunk(
+        self, start: int, length: int, index: Mapping[int, Sequence[tuple[int, int]]], packed: int, size: int
+    ) -> None:
+        """Add a chunk that is in the file to the summary."""
+        times = [time for entries in index.values() for time, _ in entries]
+        first, last = min(times, default=0), max(times, default=0)
+        listed, places = _listed(index)
+        offsets = b"".join(struct.pack("<HQ", channel, start + length + at) for channel, at in places.items())
+        about = struct.pack("<QQQQ", first, last, start, length) + _bytes(offsets)
         about += struct.pack("<Q", len(listed)) + _text(self._compression)
-        self._chunks.write(_record(CHUNK_INDEX, about + struct.pack("<QQ", len(packed), len(data))))
+        self._chunks.write(_record(CHUNK_INDEX, about + struct.pack("<QQ", packed, size)))
         self._chunk_count += 1
         if times:
             self._span = min(first, self._span[0]), max(last, self._span[1])
+
+    def _resume(self, data: mmap, handle: int) -> bool:
+        """Go on where a killed writer ended, behind its last whole message.
+
+        Returns:
+            Whether there was anything to go on with. False: the file is whole already.
+
+        Raises:
+            ValueError: a writer like this one has not written it, or it is damaged before its end.
+        """
+        size, at = len(data), len(MAGIC)
+        if data[:at] != MAGIC:
+            raise ValueError("it is no MCAP file")
+        if size > at and data[-len(MAGIC) :] == MAGIC:
+            return False
+        missing = b""  # behind the last chunk
+        declared: set[tuple[int, int]] = set()  # opcode and number
+        while not missing and at + RECORD.size <= size:
+            opcode, length = RECORD.unpack_from(data, at)
+            end = at + RECORD.size + length
+            if opcode == HEADER and end <= size:
+                at = end
+                continue
+            if opcode != CHUNK:
+                if opcode != DATA_END and any(data[at:]):  # a power cut leaves zeros
+                    raise ValueError(f"it is damaged at byte {at}")
+                break
+            content = at + RECORD.size + CHUNK_HEAD.size
+            if content > size:
+                break
+            *_, unpacked, _, named = CHUNK_HEAD.unpack_from(data, at + RECORD.size)
+            self._compression = data[content : content + named].decode()
+            content += named + 8
+            if end > size:  # a part of the chunk is there
+                if not self._compression:
+                    whole = self._take(data[content:], declared, self._index)
+                    self._chunk.write(data[content : content + whole])
+                break
+            packed, index = data[content:end], defaultdict[int, list[tuple[int, int]]](list)
+            chunk = zstd.decompress(packed) if self._compression else packed
+            if self._take(chunk, declared, index) != len(chunk):
+                raise ValueError(f"the chunk at byte {at} is damaged")
+            self._note_chunk(at, end - at, index, len(packed), unpacked)
+            listed, _ = _listed(index)
+            behind = data[end : end + len(listed)]
+            if behind != listed:
+                missing = listed
+                if not listed.startswith(behind.rstrip(b"\0")):
+                    raise ValueError(f"the index at byte {end} is damaged")
+            at = end if missing else end + len(listed)
+        self._file, self._end = handle, at
+        os.lseek(handle, at, os.SEEK_SET)
+        self._put(missing)
+        return True
+
+    def _take(
+        self, data: bytes, declared: set[tuple[int, int]], index: defaultdict[int, list[tuple[int, int]]]
+    ) -> int:
+        """Count the whole records of a chunk, and list its messages in ``index``.
+
+        Returns:
+            Bytes of the whole records.
+
+        Raises:
+            ValueError: what follows them is no part of a record.
+        """
+        at = 0
+        while at + RECORD.size <= len(data):
+            opcode, length = RECORD.unpack_from(data, at)
+            end = at + RECORD.size + length
+            if opcode not in (SCHEMA, CHANNEL, MESSAGE):
+                if any(data[at:]):
+                    raise ValueError("a chunk is damaged")
+                break
+            if end > len(data):
+                break
+            if opcode == MESSAGE:
+                channel, _, time, _ = MESSAGE_HEAD.unpack_from(data, at + RECORD.size)
+                index[channel].append((time, at))
+                self._counts[channel] += 1
+            elif (key := (opcode, *struct.unpack_from("<H", data, at + RECORD.size))) not in declared:
+                declared.add(key)
+                self._declared.write(data[at:end])
+                self._declared_count[opcode] += 1
+            at = end
+        return at
 
     def _finish(self) -> None:
         if self._chunk.tell():
@@ -259,8 +362,8 @@ class McapWriter:
         about = struct.pack(
             "<QHIIIIQQ",
             self._counts.total(),
-            len(self._schemas),
-            len(self._channels),
+            self._declared_count[SCHEMA],
+            self._declared_count[CHANNEL],
             len(self._attachments),
             0,  # metadata
             self._chunk_count,
@@ -269,6 +372,50 @@ class McapWriter:
         self._put(self._declared.getvalue() + _record(STATISTICS, about + _bytes(counts)))
         self._put(self._chunks.getvalue() + b"".join(self._attachments))
         self._put(_record(FOOTER, struct.pack("<QQI", summary, 0, 0)) + MAGIC)
+
+
+def complete(path: Path) -> int:
+    """Complete a bag in place that a killed process has left: whole messages stay, and get an index.
+
+    Returns:
+        How many messages there are.
+
+    Raises:
+        UserError: the file cannot be completed. It is as it was.
+    """
+    writer = McapWriter(path, _undefined)
+    try:
+        handle = os.open(path, os.O_RDWR | os.O_NOFOLLOW | os.O_CLOEXEC)
+        try:
+            lock(handle, f"{path}: another process is writing it")
+            if os.fstat(handle).st_nlink > 1:
+                raise UserError(f"{path}: cannot be completed: it has another name, too (a hard link)")
+            with mmap(handle, 0, access=ACCESS_READ) as data:
+                unfinished = writer._resume(data, handle)
+            if unfinished:
+                os.ftruncate(handle, writer._end)
+                writer._finish()
+        finally:
+            os.close(handle)
+    except OSError as error:
+        raise UserError(f"{path}: cannot be completed: {error.strerror}") from None
+    except (ValueError, struct.error, zstd.ZstdError) as error:
+        raise UserError(f"{path}: cannot be completed: {first_line(error)}") from None
+    return writer._counts.total()
+
+
+def _undefined(connection: Connection) -> MessageDefinition:
+    raise ValueError(f"{connection.topic}: a bag that is completed gets no further messages")
+
+
+def _listed(index: Mapping[int, Sequence[tuple[int, int]]]) -> tuple[bytes, dict[int, int]]:
+    """Encode the index of a chunk's messages. Return it, and where in it each channel's record begins."""
+    listed, places = b"", {}
+    for channel, entries in index.items():
+        places[channel] = len(listed)
+        pairs = b"".join(struct.pack("<QQ", *entry) for entry in entries)
+        listed += _record(MESSAGE_INDEX, struct.pack("<H", channel) + _bytes(pairs))
+    return listed, places
 
 
 def _profile(qos: Qos) -> dict[str, object]:

@@ -24,7 +24,7 @@ from bevviz.files import bag_files, sampled_files
 from bevviz.provenance import dependencies_of, file_hash, model_path
 from bevviz.text import path_text
 
-PARTIAL = ".partial"  # folder of what is not complete
+PARTIAL = ".bevviz-partial"  # folder of what is not complete
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,7 @@ from bevviz.errors import UserError
 from bevviz.evaluate.evaluation import Evaluation
 from bevviz.evaluate.log import EvaluationRecorder
 from bevviz.evaluate.truth import truth_in
-from bevviz.files import unfinished
+from bevviz.files import unfinished_files
 from bevviz.logging.recorder import DiskWatch, Recorder
 from bevviz.logging.sinks import Sinks, open_recording
 from bevviz.protocols import Observer
@@ -83,7 +83,7 @@ class Output(Closing):
         self._evaluation: Evaluation | None = None
 
     def close(self) -> None:
-        for path in (self._recording, unfinished(self._recording), self._table):
+        for path in (self._recording, *unfinished_files(self._recording), self._table):
             path.unlink(missing_ok=True)
 
     def opened(self, source: BagSource) -> AbstractContextManager[Sinks]:

@@ -162,7 +162,7 @@ def write_bag(path: Path, messages: Sequence[RawMessage]) -> None:
     """
     if path.exists():
         raise UserError(f"{path}: is already there")
-    with McapWriter(path, define) as bag:
+    with McapWriter(path, define, replace=False) as bag:
         for message in messages:
             bag.write(message.connection, message.received, message.data, message.sent)
 

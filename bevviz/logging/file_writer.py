@@ -35,7 +35,7 @@ class FileWriter(Closing):
     def __init__(self, file: Path) -> None:
         self._failure: OSError | None = None
         self._written = 0  # bytes
-        self._handle = os.open(file, os.O_WRONLY | os.O_CLOEXEC)
+        self._handle = os.open(file, os.O_WRONLY | os.O_NOFOLLOW | os.O_CLOEXEC)
         self._out, self._in = os.pipe()
         if sys.platform == "linux":
             with suppress(OSError):

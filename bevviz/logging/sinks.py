@@ -117,8 +117,7 @@ def open_recording(
             file = given.path
             writer = stack.enter_context(FileWriter(file))
             sinks.append(writer.sink)
-            if given.leftover:
-                warnings.append(f"{file.name}, which a run that did not end had left, is overwritten")
+            warnings += given.warnings
         if connect is not None:
             sinks.append(_connection(connect))
         if spawn:
@@ -129,6 +128,8 @@ def open_recording(
             urls.append(address)
         watched = connect is not None or spawn or serve is not None
         recording = _stream(recording_id, batcher=None if watched else batches(config))
+        # The writer waits until Rerun closes the sink: an interrupt at any moment from here on must close it.
+        stack.callback(recording.disconnect)
         try:
             recording.set_sinks(*sinks, default_blueprint=layout)
         except (RuntimeError, ValueError) as error:

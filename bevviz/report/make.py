@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import shutil
 import threading
 from collections.abc import Callable, Mapping, Sequence
@@ -21,7 +20,7 @@ from bevviz.bags.reader import megabytes
 from bevviz.bags.source import MARGIN, SECOND, BagSource
 from bevviz.config import Config, changes, load
 from bevviz.errors import UserError
-from bevviz.files import claim, save, unfinished
+from bevviz.files import claim, save
 from bevviz.files import written as write_beside
 from bevviz.frame import Camera, Frame
 from bevviz.logging import entities
@@ -134,10 +133,10 @@ def make(
             )
         # Whatever ends this run, nobody must take an older report for this one, least of all unredacted.
         for target in (rrd, html, bag):
-            handle = claim(target, "report")
+            unfinished = claim(target, "report")
             target.unlink(missing_ok=True)
-            unfinished(target).unlink()
-            os.close(handle)
+            unfinished.discard()
+            written.warnings += unfinished.warnings
         if request.redact:
             found = _detect(request, window)
         detect = None if found is None else replay(found)
