@@ -27,7 +27,7 @@ from bevviz.errors import UserError
 from bevviz.files import lock
 from bevviz.frame import Frame, Mark, Scene
 from bevviz.live.encoder import WHOLE, Encoder, Packet
-from bevviz.live.files import Indexer, Saver, remove_leftovers
+from bevviz.live.files import INDEX, Indexer, Saver, remove_leftovers, unused_names
 from bevviz.live.flight import FlightRecorder
 from bevviz.live.notes import Notes
 from bevviz.live.replay import Replay
@@ -410,12 +410,14 @@ def test_viewers_can_be_given_fewer_frames_than_files(
 
 
 def test_leftover_indexes_are_removed_and_those_in_work_are_not(tmp_path: Path) -> None:
-    left, work = tmp_path / "a.rrd.part", tmp_path / "b.rrd.part"
+    left, work = tmp_path / f"a{INDEX}0123abcd", tmp_path / f"b{INDEX}0123abcd"
     left.write_bytes(b"half")
+    download = tmp_path / "a.rrd.part"  # as browsers name what is on its way
+    download.write_bytes(b"half")
     with work.open("wb") as file:
         lock(file.fileno(), "taken")
         remove_leftovers(tmp_path)
-    assert not left.exists() and work.exists()
+    assert not left.exists() and work.exists() and download.exists()
 
 
 def test_a_steady_run_logs_every_frame_with_its_health(run: Run) -> None:
@@ -1046,3 +1048,60 @@ def test_signals_and_snap_on_a_running_process(tmp_path: Path) -> None:
     assert f"flight recorder saved in {signalled.name} (SIGUSR1)" in said
     assert " frames in all.rrd" in said
     assert "no 'bevviz live' of yours runs" in ask().stderr
+
+
+# --- files of earlier runs ---------------------------------------------------------------------
+
+
+def test_a_run_never_writes_over_files_of_an_earlier_one(tmp_path: Path) -> None:
+    asked = tmp_path / "drive.rrd", tmp_path / "drive.mcap"
+
+    def names() -> list[str]:
+        return [path.name for path in unused_names(*asked)]
+
+    (tmp_path / "drive-20240131.rrd").touch()  # of somebody else, and not in the way
+    assert names() == ["drive.rrd", "drive.mcap"]
+    (tmp_path / "drive-20240131.rrd").unlink()
+    for taken, free in [
+        ("drive.partial-0123abcd.mcap", "drive-2"),
+        ("drive-2_000.rrd", "drive-3"),
+        ("drive-9.mcap", "drive-10"),
+    ]:
+        (tmp_path / taken).touch()
+        assert names() == [f"{free}.rrd", f"{free}.mcap"]
+    (tmp_path / "null.rrd").symlink_to("/dev/null")
+    assert unused_names(tmp_path / "null.rrd") == [tmp_path / "null.rrd"]
+
+
+def test_a_link_is_no_place_for_a_recording(drive: SyntheticSource, tmp_path: Path) -> None:
+    bag, link = tmp_path / "bag.mcap", tmp_path / "drive.rrd"
+    bag.write_text("the bag")
+    link.symlink_to(bag)
+    config = load()
+    with Encoder(config, drive.scene, "live") as encoder, pytest.raises(UserError, match="is already there"):
+        Saver(link, config.live, encoder, NoIndexer(), Notes(lambda text: None))
+    assert bag.read_text() == "the bag"
+
+
+def test_killed_twice_and_started_again_nothing_is_lost(tmp_path: Path) -> None:
+    """As systemd does it with Restart=always: the same command each time."""
+    environment = {k: v for k, v in os.environ.items() if k not in ("DISPLAY", "WAYLAND_DISPLAY")}
+    environment |= alone(tmp_path)
+    command = [sys.executable, "-m", "bevviz.cli", "live", "--synthetic", "4", "--save", "drive.rrd"]
+    before: dict[str, bytes] = {}
+    said = ""
+    for number, name in enumerate(["drive.rrd", "drive-2.rrd", "drive-3.rrd"]):
+        saved = tmp_path / name
+        with subprocess.Popen(
+            command, stderr=subprocess.PIPE, text=True, cwd=tmp_path, env=environment
+        ) as run:
+            try:
+                until(lambda saved=saved: saved.exists() and saved.stat().st_size > 3_000_000)
+            finally:
+                run.send_signal(signal.SIGKILL if number < 2 else signal.SIGTERM)
+                _, said = run.communicate(timeout=180)
+        assert {name: (tmp_path / name).read_bytes() for name in before} == before
+        before[name] = saved.read_bytes()
+        assert numbers(saved)
+    assert "an earlier run is saved in drive.rrd: this one goes to drive-3.rrd" in said
+    assert sorted(path.name for path in tmp_path.glob("*.rrd")) == ["drive-2.rrd", "drive-3.rrd", "drive.rrd"]

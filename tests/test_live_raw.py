@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import errno
 import re
+import signal
+import subprocess
+import sys
 import threading
 import time
 from array import array
@@ -24,7 +27,7 @@ from bevviz.bags.mcap_writer import McapWriter
 from bevviz.bags.source import BagSource
 from bevviz.config import load
 from bevviz.errors import UserError
-from bevviz.files import write_all
+from bevviz.files import unfinished_files, write_all
 from bevviz.protocols import Observer
 from bevviz.recorded import read
 from bevviz.report.digest import compare, digest
@@ -37,7 +40,8 @@ from bevviz.synthetic.drive import LIDAR_TOPIC
 from tests.graphs import own_graph, playing
 from tests.recordings import Recording, verify
 from tests.ros_player import Play
-from tests.waiting import PATIENCE
+from tests.test_cli import environment
+from tests.waiting import PATIENCE, until
 
 pytest.importorskip("rclpy", reason="needs rclpy: pip install 'bevviz[ros]'")
 
@@ -258,3 +262,44 @@ def test_a_full_disk_leaves_a_bag_that_can_be_read(tmp_path: Path, monkeypatch: 
         room = 1_000_000  # of the chunk that did not fit
     with (tmp_path / "x.mcap").open("rb") as file:
         assert len(list(make_reader(file, validate_crcs=True).iter_messages())) == 10
+
+
+def test_killed_twice_and_started_again_each_bag_is_whole(tmp_path: Path) -> None:
+    """As systemd does it with Restart=always: the same command each time."""
+    command = [sys.executable, "-m", "bevviz.cli", "live", "--save", "drive.rrd", "--save", "drive.mcap"]
+    stems = ["drive", "drive-2", "drive-3"]
+    before: dict[Path, bytes] = {}
+    said = ""
+    with own_graph() as patch:
+        patch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+        with playing(Play(frames=4, points=10_000)):
+            for number, stem in enumerate(stems):
+                recording, bag = tmp_path / f"{stem}.rrd", tmp_path / f"{stem}.mcap"
+                with subprocess.Popen(
+                    command, stderr=subprocess.PIPE, text=True, cwd=tmp_path, env=environment()
+                ) as run:
+                    try:
+                        until(
+                            lambda bag=bag: sum(f.stat().st_size for f in unfinished_files(bag)) > 9_000_000
+                        )
+                        until(lambda recording=recording: recording.stat().st_size > 1_000_000)
+                    finally:
+                        run.send_signal(signal.SIGKILL if number < 2 else signal.SIGTERM)
+                        _, said = run.communicate(timeout=180)
+                assert {path: path.read_bytes() for path in before} == before, said
+                before[recording] = recording.read_bytes()
+                before |= {tmp_path / f"{name}.mcap": b"" for name in stems[:number]}
+                before |= {path: path.read_bytes() for path in before}
+    names = {f"{stem}.{suffix}" for stem in stems for suffix in ("rrd", "mcap")}
+    assert {path.name for path in tmp_path.iterdir() if path.is_file()} == names
+    assert "drive-2.mcap: " in said and "messages of a run that was killed, completed" in said
+    taken = (
+        "an earlier run is saved in drive.rrd and drive.mcap: this one goes to drive-3.rrd and drive-3.mcap"
+    )
+    assert taken in said
+    for stem in stems:
+        with (tmp_path / f"{stem}.mcap").open("rb") as file:
+            summary = make_reader(file, validate_crcs=True).get_summary()
+        assert summary is not None and summary.statistics is not None
+        assert summary.statistics.message_count > 20
+        assert len(Recording(tmp_path / f"{stem}.rrd").times["stamp"]) > 2

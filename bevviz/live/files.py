@@ -3,22 +3,25 @@
 from __future__ import annotations
 
 import os
+import re
+import secrets
 import subprocess
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from pathlib import Path
 
+from bevviz.bags.mcap_writer import complete
 from bevviz.config import LiveConfig
 from bevviz.errors import UserError
-from bevviz.files import lock, write_all
+from bevviz.files import create, is_locked, lock, rename_new, write_all
 from bevviz.live.encoder import Encoder, Packet
 from bevviz.live.notes import Notes
 from bevviz.live.output import Output
 from bevviz.logging import rerun_cli
 
 MEGABYTE = 1_000_000
-PART = ".rrd.part"  # suffix of a file while its index is made
+INDEX = ".bevviz-index-"  # and eight digits: how a file ends while its index is made
 INDEXED = 1000 * MEGABYTE  # the index is made in memory; a larger file stays without
 
 
@@ -49,12 +52,11 @@ class Indexer:
         self._worker.shutdown()
 
     def _index(self, path: Path) -> None:
-        indexed = path.with_suffix(PART)
+        indexed = path.with_name(f"{path.stem}{INDEX}{secrets.token_hex(4)}")
         optimize = ["nice", "-n", "19", rerun_cli.program(), "rrd", "optimize", str(path), "-o", str(indexed)]
-        handle = os.open(indexed, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
+        handle = create(indexed)
         try:
             lock(handle, f"{indexed}: another process is writing it")
-            os.ftruncate(handle, 0)
             done = subprocess.run(
                 rerun_cli.tied(optimize),
                 capture_output=True,
@@ -80,8 +82,8 @@ def check_name(path: Path, *suffixes: str) -> None:
 
 
 def remove_leftovers(folder: Path) -> None:
-    """Indexes that nobody is making any more."""
-    for path in folder.glob(f"*{PART}"):
+    """Delete indexes that no process is making any more. Their recordings are there without them."""
+    for path in folder.glob(f"*{INDEX}????????"):
         with suppress(OSError, UserError):
             handle = os.open(path, os.O_RDWR | os.O_NOFOLLOW | os.O_CLOEXEC)
             try:
@@ -91,8 +93,59 @@ def remove_leftovers(folder: Path) -> None:
                 os.close(handle)
 
 
+def unused_names(*paths: Path) -> list[Path]:
+    """Return free names for the files of a run: those asked for, or all with the same number.
+
+    A name is taken by a recording, a bag, a part or an unfinished file. So drive-2.rrd and drive-2.mcap
+    belong to one run, and no run writes over another one's files.
+    """
+    number = max((_runs(path) for path in paths), default=0) + 1
+    return [path if number == 1 else path.with_stem(f"{path.stem}-{number}") for path in paths]
+
+
+def _runs(path: Path) -> int:
+    """Return the number of the last run that has files of this name, 0 where the name is free."""
+    if path.exists() and not path.is_file():
+        return 0  # a device
+    name = re.compile(
+        re.escape(path.stem)
+        + r"(?:-(?P<run>[1-9]\d{0,5}))?(?:_\d{3,})?(?:\.partial-[0-9a-f]{8})?\.(?:rrd|mcap)"
+    )
+    runs = [found["run"] for file in path.parent.iterdir() if (found := name.fullmatch(file.name))]
+    return max(int(run or 1) for run in runs) if None in runs else 0
+
+
+def complete_leftovers(path: Path, notes: Notes) -> None:
+    """Complete the bags that killed runs with the same ``--save FILE.mcap`` have left, and say so.
+
+    Each gets the name that it would have had, or its unfinished name without ".partial" where that is taken.
+    """
+    name = re.compile(re.escape(path.stem) + r"(?:-[1-9]\d{0,5})?(?:_\d{3,})?\.partial-[0-9a-f]{8}\.mcap")
+    for left in sorted(path.parent.iterdir()):
+        if not name.fullmatch(left.name) or left.is_symlink() or is_locked(left):
+            continue
+        try:
+            count = complete(left)
+            whole = _give_name(left)
+        except (OSError, UserError) as error:
+            notes.warn(f"{left.name}: left by a run that was killed; it stays as it is ({error})")
+        else:
+            notes.info(f"{whole}: {count} messages of a run that was killed, completed")
+
+
+def _give_name(left: Path) -> Path:
+    stem, _, key = left.stem.rpartition(".partial-")
+    for whole in (left.with_stem(stem), left.with_stem(f"{stem}-{key}")):
+        with suppress(FileExistsError):
+            rename_new(left, whole)
+            return whole
+    raise UserError(f"{left}: its name is taken")
+
+
 class Saver(Output):
     """Writes every packet to ``path``, or with a limit of size or time to ``path`` numbered.
+
+    No existing file is overwritten; ``unused_names`` gives names that are free.
 
     A full disk is said once and ends the saving, nothing else; what is on it is cut to whole frames.
 
@@ -117,6 +170,8 @@ class Saver(Output):
         self._file = -1
         try:
             self._open()
+        except FileExistsError:
+            raise UserError(f"{self._next}: is already there") from None
         except OSError as error:
             raise UserError(f"{self._next}: cannot write the recording: {error.strerror}") from None
         self._thread.start()
@@ -159,14 +214,10 @@ class Saver(Output):
 
     def _open(self) -> None:
         path = self._next
-        self._file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_CLOEXEC, 0o666)
-        try:
-            lock(self._file, f"{path}: another process is writing it")
-        except UserError:
-            os.close(self._file)
-            raise
-        with suppress(OSError):  # no file but a device
-            os.ftruncate(self._file, 0)
+        if path.exists() and not path.is_file():
+            self._file = os.open(path, os.O_WRONLY | os.O_CLOEXEC)  # a device
+        else:
+            self._file = create(path)
         self.paths.append(path)
         self._written = self._whole = 0
 

@@ -21,10 +21,10 @@ WAITING = 200 * MEGABYTE  # of messages that wait for a slow disk
 class RawSaver(Closing):
     """Writes every message, from those that are held already.
 
-    A part that is being written is NAME.partial.mcap. It begins with what holds from before and with the last
-    seconds of the part before it, so that its first scan has what belongs to it. A full disk is said once and
-    ends the saving, nothing else; what is on it is a whole file. Messages that a disk is too slow for are
-    left out and counted.
+    A part that is being written is NAME.partial-XXXXXXXX.mcap. It begins with what holds from before and with
+    the last seconds of the part before it, so that its first scan has what belongs to it. A full disk is
+    said once and ends the saving, nothing else; what is on it is a whole file. Messages that a disk is too
+    slow for are left out and counted. No existing file is overwritten.
 
     Args:
         path: the .mcap file; with a limit of size or time it is numbered.
@@ -89,9 +89,10 @@ class RawSaver(Closing):
     def _open(self) -> McapWriter:
         number = f"_{len(self.paths):03d}" if self._numbered else ""
         # As `ros2 bag record` does by itself: what is saved must not take the CPU from what it is saved for.
-        part = McapWriter(self._path.with_stem(f"{self._path.stem}{number}"), define, compress=False)
+        path = self._path.with_stem(f"{self._path.stem}{number}")
+        part = McapWriter(path, define, compress=False, replace=False)
         part.__enter__()
-        self.paths.append(self._path.with_stem(f"{self._path.stem}{number}"))
+        self.paths.append(path)
         return part
 
     def _run(self) -> None:

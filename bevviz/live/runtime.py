@@ -18,7 +18,7 @@ from bevviz.frame import Around, Frame, Scene, Source
 from bevviz.live.against import AgainstRobot
 from bevviz.live.control import Control
 from bevviz.live.encoder import WHOLE, Encoder, Packet
-from bevviz.live.files import Indexer, Saver
+from bevviz.live.files import Indexer, Saver, check_name, complete_leftovers, unused_names
 from bevviz.live.flight import FlightRecorder
 from bevviz.live.health import Health, set_nice
 from bevviz.live.notes import Notes
@@ -145,6 +145,7 @@ class Live:
             programs.append(window())
         self.saver: Saver | None = None
         self._outputs: list[Output] = []
+        outputs = _with_unused_names(outputs, notes)
         if outputs.save is not None:
             self.saver = Saver(outputs.save, live, self.encoder, self._indexer, notes)
             self._outputs.append(self.saver)
@@ -437,6 +438,26 @@ class Live:
             set_nice(nice)
         except PermissionError:
             self.notes.warn(f"live.nice={nice}: only root may take priority back")
+
+
+def _with_unused_names(outputs: Outputs, notes: Notes) -> Outputs:
+    """Change the names of files that earlier runs have, and complete what these have left."""
+    asked = [path for path in (outputs.save, outputs.raw) if path is not None]
+    for path in asked:
+        check_name(path, ".rrd", ".mcap")
+    if outputs.raw is not None:
+        complete_leftovers(outputs.raw, notes)
+    free = unused_names(*asked)
+    if free == asked:
+        return outputs
+    taken, new = (" and ".join(map(str, paths)) for paths in (asked, free))
+    notes.info(f"an earlier run is saved in {taken}: this one goes to {new}")
+    names = dict(zip(asked, free, strict=True))
+    return replace(
+        outputs,
+        save=None if outputs.save is None else names[outputs.save],
+        raw=None if outputs.raw is None else names[outputs.raw],
+    )
 
 
 def _handle(handlers: Mapping[signal.Signals, Any]) -> None:
