@@ -114,3 +114,60 @@ def test_a_bar_leaves_no_semaphore_where_its_process_is_killed() -> None:
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert (done.returncode, done.stderr) == (-signal.SIGKILL, "")
+
+
+INTERRUPTED_AT = """
+import faulthandler, os, sys
+from pathlib import Path
+from bevviz import remains
+from bevviz.logging import sinks
+
+FILES = {sinks.__file__}
+
+
+def interrupt_at(moment, work):
+    # Raise at one line of this thread, as the handler of a signal does. Return the number of lines.
+    lines = 0
+
+    def trace(frame, event, value):
+        nonlocal lines
+        if frame.f_code.co_filename not in FILES:
+            return None
+        if event == "line" and remains.any_unfinished():
+            lines += 1
+            if lines == moment:
+                raise KeyboardInterrupt
+        return trace
+
+    faulthandler.dump_traceback_later(30, exit=True)
+    sys.settrace(trace)
+    try:
+        work()
+    except KeyboardInterrupt:
+        pass
+    finally:
+        sys.settrace(None)
+        faulthandler.cancel_dump_traceback_later()
+    return lines
+"""
+
+
+def test_an_interrupt_at_any_line_ends_an_open_recording(tmp_path: Path) -> None:
+    """Rerun holds the pipe to the file open until its sink is closed, and the writer waits for that."""
+    script = INTERRUPTED_AT + (
+        "import rerun as rr\n"
+        "from bevviz.config import load\n"
+        "from bevviz.frame import Scene\n"
+        "from bevviz.recorded import Origin\n"
+        "SCENE = Scene('test', 'lidar', ('lidar',))\n"
+        "def work():\n"
+        "    with sinks.open_recording(SCENE, load(), save=Path('a.rrd')) as opened:\n"
+        "        opened.recording.log('a', rr.TextLog('b'))\n"
+        "total = interrupt_at(0, work)\n"
+        "for moment in range(1, total + 1):\n"
+        "    interrupt_at(moment, work)\n"
+        "print(total)\n"
+    )
+    done = python(script, tmp_path)
+    assert done.returncode == 0, done.stderr[-3000:]
+    assert int(done.stdout) > 30
