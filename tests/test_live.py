@@ -1078,7 +1078,8 @@ def test_a_link_is_no_place_for_a_recording(drive: SyntheticSource, tmp_path: Pa
     bag.write_text("the bag")
     link.symlink_to(bag)
     config = load()
-    with Encoder(config, drive.scene, "live") as encoder, pytest.raises(UserError, match="is already there"):
+    encoder = Encoder(config, drive.scene, "live")
+    with pytest.raises(UserError, match="is already there"):
         Saver(link, config.live, encoder, NoIndexer(), Notes(lambda text: None))
     assert bag.read_text() == "the bag"
 
