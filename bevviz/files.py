@@ -227,6 +227,36 @@ def write_all(file: int, data: bytes | memoryview) -> None:
             done += os.write(file, rest[done:])
 
 
+def full_disk(error: BaseException) -> UserError | None:
+    """Name the folder whose disk is full, and what to do. None: the error has another reason.
+
+    An error without a file name came of a temporary file: these have none.
+    """
+    if not isinstance(error, OSError):
+        return None
+    if "No usable temporary directory" in str(error):  # of ``tempfile``, which tries to write in each
+        return UserError(f"{error.strerror}: make room in one of them, or name another with TMPDIR")
+    if error.errno not in (errno.ENOSPC, errno.EDQUOT):
+        return None
+    temporary = Path(tempfile.gettempdir())
+    folder = temporary if error.filename is None else Path(os.fsdecode(error.filename)).absolute().parent
+    other = ", or name another folder for temporary files with TMPDIR"
+    there = other if folder.is_relative_to(temporary) else ""
+    return UserError(f"{folder}: the disk is full: make room there{there}")
+
+
+@contextmanager
+def on_disk() -> Iterator[None]:
+    """Raise UserError where a full disk ends what is within."""
+    try:
+        yield
+    except OSError as error:
+        full = full_disk(error)
+        if full is None:
+            raise
+        raise full from error
+
+
 # --- folders -----------------------------------------------------------------------------------
 
 
@@ -285,6 +315,8 @@ class Scratch:
                     fcntl.flock(self._lock, fcntl.LOCK_SH | fcntl.LOCK_NB)
             return Path(tempfile.mkdtemp(dir=self._folder))
         except OSError as error:
+            if (full := full_disk(error)) is not None:
+                raise full from None
             where = tempfile.gettempdir()
             raise UserError(
                 f"no temporary folder in {where}: {error.strerror}; TMPDIR names another"

@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import re
 import resource
+import shutil
 import signal
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 import pytest
+from backports import zstd
 from mcap.reader import make_reader
 from rosbags.interfaces import Connection, ConnectionExtRosbag2, MessageDefinition, MessageDefinitionFormat
 
@@ -20,6 +25,7 @@ from bevviz.bags.mcap_writer import McapWriter, complete
 from bevviz.cli import main
 from bevviz.errors import UserError
 from bevviz.files import Scratch, claim, save, unfinished_files, written
+from bevviz.workbench.film import Film
 from tests import bags
 from tests.recordings import Recording, verify
 from tests.test_cli import Capture, environment, error_of
@@ -216,6 +222,53 @@ def test_a_full_disk_ends_the_run_early(tmp_path: Path) -> None:
     assert Path("out.rrd").read_text() == "an older result"
     frames = len(Recording(left).rows["/bev"])
     assert 0 < frames < 1000
+
+
+@contextmanager
+def small_disk(folder: Path, size: str) -> Iterator[Path]:
+    """Mount a disk in memory. Only root may."""
+    folder.mkdir()
+    mount = ["mount", "-t", "tmpfs", "-o", f"size={size}", "tmpfs", str(folder)]
+    if shutil.which("mount") is None or subprocess.run(mount, capture_output=True).returncode:
+        pytest.skip("needs the right to mount")
+    try:
+        yield folder
+    finally:
+        subprocess.run(["umount", "--lazy", str(folder)], check=True)
+
+
+def test_a_full_temporary_disk_names_its_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capture
+) -> None:
+    bags.write(Path("drive"), bags.small_items(scans=40))
+    (bag,) = Path("drive").glob("*.mcap")
+    packed = Path("packed.mcap.zstd")
+    packed.write_bytes(zstd.compress(bag.read_bytes()))
+    with small_disk(tmp_path / "small", "64k") as small:
+        monkeypatch.setattr("tempfile.tempdir", str(small))
+        full = f"{small}: the disk is full: make room there, or name another folder for temporary files"
+        with Film() as film:
+            film.add(b"first")
+            with pytest.raises(UserError, match=f"^{re.escape(full)} with TMPDIR$"):
+                film.add(bytes(100_000))
+            assert film[0] == b"first" and len(film) == 1
+        within = f"{small}/bevviz-scratch-"
+        said = error_of(capsys, "info", packed)
+        assert within in said or full in said
+        assert "the disk is full: make room there, or name another folder" in said
+
+
+def test_no_temporary_folder_at_all_is_one_line(monkeypatch: pytest.MonkeyPatch, capsys: Capture) -> None:
+    def full(path: object, *_: object) -> int:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), path)
+
+    bags.write(Path("drive"), bags.small_items(scans=2))
+    (bag,) = Path("drive").glob("*.mcap")
+    Path("packed.mcap.zstd").write_bytes(zstd.compress(bag.read_bytes()))
+    monkeypatch.setattr("tempfile.tempdir", None)
+    monkeypatch.setattr("tempfile._os.open", full)
+    said = error_of(capsys, "info", "packed.mcap.zstd")
+    assert "No usable temporary directory found" in said and "TMPDIR" in said
 
 
 # --- what a killed process leaves --------------------------------------------------------------

@@ -42,6 +42,7 @@ from bevviz.workbench.parameters import controls
 from bevviz.workbench.pick import Pick, pick
 from bevviz.workbench.token import kept_token
 from tests import waiting
+from tests.test_files import small_disk
 from tests.waiting import PATIENCE
 
 if TYPE_CHECKING:
@@ -871,3 +872,16 @@ def test_controls_are_made_of_the_fields() -> None:
     assert made["voxel.average"]["kind"] == "switch"
     assert made["clustering.max_cluster_points"]["kind"] == "whole"
     assert not any(key.startswith("live.") for key in made)
+
+
+def test_a_full_temporary_disk_is_told_with_its_folder(
+    bag: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with small_disk(tmp_path / "small", "1m") as small:
+        monkeypatch.setenv("TMPDIR", str(small))
+        with serving(str(bag)) as (address, _), Talk(address) as talk:
+            error = talk.over["error"] if talk.over["type"] == "progress" else talk.over["text"]
+    full = (
+        f"{small}: the disk is full: make room there, or name another folder for temporary files with TMPDIR"
+    )
+    assert error == full

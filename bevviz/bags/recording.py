@@ -31,7 +31,7 @@ from bevviz.datasets import find_loader, open_dataset
 from bevviz.datasets.reader import DatasetReader
 from bevviz.datasets.unread import unread
 from bevviz.errors import UserError
-from bevviz.files import Scratch, bag_files, drive_files
+from bevviz.files import Scratch, bag_files, drive_files, full_disk
 from bevviz.frame import I64
 from bevviz.ros import foxglove, ouster, vision_msgs
 from bevviz.ros.compressed import decompress, is_compressed
@@ -359,6 +359,8 @@ class Recording(Closing):
         except PermissionError:
             raise UserError(f"{path}: permission denied: you may not read it") from None
         except OSError as error:
+            if (full := full_disk(error)) is not None:  # of the temporary folder: a file is unpacked there
+                raise full from None
             raise UserError(f"{path}: cannot be read: {error.strerror or error}") from None
 
     def _attached(self) -> dict[str, str]:

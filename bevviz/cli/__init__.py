@@ -112,6 +112,12 @@ def _main(arguments: Sequence[str] | None) -> int:
         if interrupt_in(error) or interrupts.came():
             print("bevviz: interrupted", file=sys.stderr)
             return 130
+        from bevviz.files import full_disk
+
+        if (full := full_disk(error)) is not None:
+            _log().debug("what led to the error", exc_info=error)
+            print(f"{style.error('bevviz: error:')} {full}", file=sys.stderr)
+            return 2
         _log().error("an error that nobody foresaw", exc_info=error)
         what = f"{type(error).__name__}: {first_line(error)}"
         began = style.error("bevviz: error of bevviz itself:")

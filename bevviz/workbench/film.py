@@ -8,16 +8,21 @@ import threading
 from collections.abc import Callable
 
 from bevviz.closing import Closing
+from bevviz.files import on_disk
 
 
 class Film(Closing):
     """Pieces in the order in which they were made, each a whole ``.rrd``, on disk rather than in memory.
 
     ``add`` may be called from any thread; every reader goes on at its own pace.
+
+    Raises:
+        UserError: the disk of the temporary folder is full.
     """
 
     def __init__(self) -> None:
-        self._file = tempfile.TemporaryFile(prefix="bevviz-")  # noqa: SIM115, it lives as long as the film
+        with on_disk():
+            self._file = tempfile.TemporaryFile(prefix="bevviz-")  # noqa: SIM115, it lives as long as the film
         self._ends = [0]
         self._lock = threading.Lock()
         self._listeners: list[Callable[[], None]] = []
@@ -29,14 +34,19 @@ class Film(Closing):
         return len(self._ends) - 1
 
     def add(self, piece: bytes | None) -> None:
-        """None is nothing."""
+        """Append a piece; None is nothing.
+
+        Raises:
+            UserError: the disk of the temporary folder is full. The pieces before it stay.
+        """
         if not piece:
             return
         with self._lock:
             view, end = memoryview(piece), self._ends[-1]
-            while view:
-                written = os.pwrite(self._file.fileno(), view, end)
-                view, end = view[written:], end + written
+            with on_disk():
+                while view:
+                    written = os.pwrite(self._file.fileno(), view, end)
+                    view, end = view[written:], end + written
             self._ends.append(end)
             listeners = tuple(self._listeners)
         for listener in listeners:
