@@ -385,12 +385,15 @@ def test_of_two_that_begin_together_one_goes_on() -> None:
         "except UserError as error: print(error, flush=True)\n"
     )
     command = [sys.executable, "-c", script]
-    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True, "env": environment()}
-    both = [subprocess.Popen(command, **pipes) for _ in range(2)]
+    both = [
+        subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environment())
+        for _ in range(2)
+    ]
     for process in both:
+        assert process.stdin is not None
         process.stdin.write("go\n")
         process.stdin.flush()
-    said = sorted(process.stdout.readline() for process in both)
+    said = sorted(process.stdout.readline() for process in both if process.stdout is not None)
     for process in both:
         process.communicate(timeout=PATIENCE)
     assert said[1] == "mine\n" and said[0].endswith("a.rrd: another process is writing it\n")

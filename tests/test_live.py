@@ -13,6 +13,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager, suppress
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -1084,6 +1085,10 @@ def test_a_link_is_no_place_for_a_recording(drive: SyntheticSource, tmp_path: Pa
     assert bag.read_text() == "the bag"
 
 
+def is_large(path: Path) -> bool:
+    return path.exists() and path.stat().st_size > 3_000_000
+
+
 def test_killed_twice_and_started_again_nothing_is_lost(tmp_path: Path) -> None:
     """As systemd does it with Restart=always: the same command each time."""
     environment = {k: v for k, v in os.environ.items() if k not in ("DISPLAY", "WAYLAND_DISPLAY")}
@@ -1097,7 +1102,7 @@ def test_killed_twice_and_started_again_nothing_is_lost(tmp_path: Path) -> None:
             command, stderr=subprocess.PIPE, text=True, cwd=tmp_path, env=environment
         ) as run:
             try:
-                until(lambda saved=saved: saved.exists() and saved.stat().st_size > 3_000_000)
+                until(partial(is_large, saved))
             finally:
                 run.send_signal(signal.SIGKILL if number < 2 else signal.SIGTERM)
                 _, said = run.communicate(timeout=180)

@@ -304,7 +304,8 @@ class McapWriter:
                     whole = self._take(data[content:], declared, self._index)
                     self._chunk.write(data[content : content + whole])
                 break
-            packed, index = data[content:end], defaultdict[int, list[tuple[int, int]]](list)
+            packed = data[content:end]
+            index: dict[int, list[tuple[int, int]]] = {}
             chunk = zstd.decompress(packed) if self._compression else packed
             if self._take(chunk, declared, index) != len(chunk):
                 raise ValueError(f"the chunk at byte {at} is damaged")
@@ -322,7 +323,7 @@ class McapWriter:
         return True
 
     def _take(
-        self, data: bytes, declared: set[tuple[int, int]], index: defaultdict[int, list[tuple[int, int]]]
+        self, data: bytes, declared: set[tuple[int, int]], index: dict[int, list[tuple[int, int]]]
     ) -> int:
         """Count the whole records of a chunk, and list its messages in ``index``.
 
@@ -344,7 +345,7 @@ class McapWriter:
                 break
             if opcode == MESSAGE:
                 channel, _, time, _ = MESSAGE_HEAD.unpack_from(data, at + RECORD.size)
-                index[channel].append((time, at))
+                index.setdefault(channel, []).append((time, at))
                 self._counts[channel] += 1
             elif (key := (opcode, *struct.unpack_from("<H", data, at + RECORD.size))) not in declared:
                 declared.add(key)
