@@ -334,7 +334,6 @@ def plant(target: Path, bag: Path) -> None:
     ("command", "options", "outputs"),
     [
         ("bag", ["--save", "o.rrd"], ["o.rrd"]),
-        ("bag", ["--save", "o.rrd", "--jobs", "2"], ["o.rrd"]),
         ("compare", ["--csv", "s.csv", "--json", "s.json", "--set-b", "voxel.size=0.3"], ["s.csv", "s.json"]),
         ("calib", ["--write", "a.yaml"], ["a.yaml"]),
         ("report", ["--at", "0", "-o", "o.rrd"], ["o.rrd", "o.html", "o.mcap"]),
