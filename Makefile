@@ -3,7 +3,11 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN = $(VENV)/bin
 
-.PHONY: demo test test-fast check docs bench accuracy clean
+# The versions that the tests passed with. CONSTRAINTS= takes the newest that pyproject.toml allows.
+CONSTRAINTS ?= docs/constraints.txt
+INSTALL = $(BIN)/pip install --quiet $(CONSTRAINTS:%=--constraint %)
+
+.PHONY: demo test test-fast check docs bench accuracy constraints sbom clean
 
 demo: $(VENV)/.installed
 	$(BIN)/bevviz demo
@@ -35,14 +39,33 @@ accuracy: $(VENV)/.tested
 	$(BIN)/python -m benchmarks.ground --write docs/accuracy.md
 	$(BIN)/python -m benchmarks.anomalies --write docs/accuracy.md
 
-$(VENV)/.installed: pyproject.toml
+# Renew the versions. Commit the result when make test and make check pass with it.
+constraints: .venv-release/.installed
+	.venv-release/bin/uv pip compile pyproject.toml --upgrade --universal --python-version 3.11 --all-extras \
+		--group dev --group release --no-annotate --custom-compile-command "make constraints" --quiet \
+		--output-file docs/constraints.txt
+
+# List what a user installs. The tool runs in another environment, so that it does not list itself.
+sbom: .venv-release/.installed
+	$(MAKE) VENV=.venv-user .venv-user/.installed
+	mkdir -p dist
+	.venv-release/bin/cyclonedx-py environment --pyproject pyproject.toml --output-reproducible \
+		--output-file dist/bevviz.cdx.json .venv-user/bin/python
+
+$(VENV)/.installed: pyproject.toml $(CONSTRAINTS)
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/pip install --quiet --upgrade "pip>=25.1"
-	$(BIN)/pip install --quiet --editable ".[workbench]"
+	$(BIN)/pip install --quiet --upgrade "pip>=25.1,<27"
+	$(INSTALL) --editable ".[workbench]"
 	touch $@
 
 $(VENV)/.tested: $(VENV)/.installed
-	$(BIN)/pip install --quiet --group dev --editable ".[ros]"
+	$(INSTALL) --group dev --editable ".[ros]"
+	touch $@
+
+.venv-release/.installed: pyproject.toml
+	$(PYTHON) -m venv .venv-release
+	.venv-release/bin/pip install --quiet --upgrade "pip>=25.1,<27"
+	.venv-release/bin/pip install --quiet --group release
 	touch $@
 
 clean:
