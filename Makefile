@@ -41,8 +41,8 @@ accuracy: $(VENV)/.tested
 
 # Renew the versions. Commit the result when make test and make check pass with it.
 constraints: .venv-release/.installed
-	.venv-release/bin/uv pip compile pyproject.toml --upgrade --universal --python-version 3.11 --all-extras \
-		--group dev --group release --no-annotate --custom-compile-command "make constraints" --quiet \
+	.venv-release/bin/uv pip compile pyproject.toml --upgrade --universal --fork-strategy fewest --python-version 3.11 \
+		--all-extras --group dev --group release --no-annotate --custom-compile-command "make constraints" --quiet \
 		--output-file docs/constraints.txt
 
 # List what a user installs. The tool runs in another environment, so that it does not list itself.
