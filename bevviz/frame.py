@@ -65,7 +65,7 @@ class Cloud:
     fields: Mapping[str, NDArray[Any]] = field(default_factory=dict)  # extra (N,) fields by name
     topic: str = ""
     received: int = 0
-    dropped: int = 0  # points of the message that were NaN, infinite or (0, 0, 0)
+    dropped: int = 0  # points of the message that were NaN, infinite, beyond any sensor or (0, 0, 0)
     name: str = ""  # entity name of the LiDAR
 
 

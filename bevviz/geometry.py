@@ -15,6 +15,9 @@ from bevviz.frame import F32, F64, I64, Bool, Boxes3D, Intrinsics
 FloatArray = NDArray[Any]
 
 MIN_DEPTH = 1e-3  # metres; what is nearer to the camera's plane has no meaningful pixel
+WIDEST = (
+    1e8  # squared slope of a ray, 0.006 degrees from the camera's plane: its sixth power fits into float32
+)
 FISHEYE = ("equidistant", "fisheye")
 
 # --- rigid transforms --------------------------------------------------------------------------
@@ -190,7 +193,7 @@ def _distort(x: FloatArray, y: FloatArray, intrinsics: Intrinsics) -> tuple[Floa
     numerator, denominator = Polynomial([1, k1, k2, k3]), Polynomial([1, k4, k5, k6])
     turns = numerator.deriv() * denominator - numerator * denominator.deriv()
     slope = numerator * denominator + Polynomial([0, 2]) * turns
-    r2 = np.where(r2 < min(_first_root(slope), _first_root(denominator)), r2, np.nan)
+    r2 = np.where(r2 < min(_first_root(slope), _first_root(denominator), WIDEST), r2, np.nan)
     radial = (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / (1 + r2 * (k4 + r2 * (k5 + r2 * k6)))
     return (
         x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),

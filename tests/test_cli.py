@@ -423,3 +423,26 @@ def test_an_error_of_bevviz_itself_is_one_line_too(
     assert said[-1] == (
         "bevviz: error of bevviz itself: RuntimeError: planted; --verbose shows where, please report it"
     )
+
+
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+@pytest.mark.parametrize("preset", ["default", "reference"])
+def test_points_beyond_any_sensor_warn_of_nothing(preset: str, tmp_path: Path) -> None:
+    near = np.random.default_rng(0).normal(0, 10, (200, 4))
+    far = [[sign * 1e30 if i == axis else 5.0 for i in range(4)] for axis in range(4) for sign in (1, -1)]
+    far += [[3e38, 3e38, 3e38, 3e38], [9e7, 5, 1, 1]]
+    points = np.array([*near, *far], np.float32)
+
+    def change(items: list[bags.Item], messages: bags.Messages) -> None:
+        replaced(bags.CLOUD, lambda m, t: m.cloud(t, points))(items, messages)
+        for i, item in enumerate(items):
+            if item.topic == bags.INFO:
+                item.message.d = np.array([0.1, 0.05, 0.0, 0.0, 0.02])
+            elif item.topic == bags.IMAGE:  # not rectified
+                items[i] = item._replace(topic="/camera/image_raw")
+
+    small_bag(change)
+    assert main(["bag", "drive", "--save", "out.rrd", "--preset", preset]) == 0
+    recording = Recording(tmp_path / "out.rrd")
+    assert recording.column("/health/count/invalid_points", "Scalars:scalars") == [[7.0]] * 5
+    assert recording.column("/health/count/failures", "Scalars:scalars") == [[0.0]] * 5

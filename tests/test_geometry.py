@@ -284,3 +284,11 @@ def test_points_in_many_boxes_are_those_in_each(seed: int, count: int, number: i
     for k in range(number):
         rows = np.flatnonzero(geometry.inside(points, boxes, k))
         np.testing.assert_array_equal(np.sort(found.get(k, rows[:0])), rows)
+
+
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+def test_points_beside_the_camera_overflow_no_distortion() -> None:
+    lens = Intrinsics(64, 48, np.diag([60.0, 60, 1]), "plumb_bob", np.array([0.1, 0.05, 0, 0, 0.02]))
+    points = np.array([[1e8, 1e8, 0.002], [1e8, -1, 5], [1, 1, 5]], np.float32)
+    uv, _ = geometry.project(points, lens)
+    assert np.isnan(uv[:2]).all() and np.isfinite(uv[2]).all()

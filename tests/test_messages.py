@@ -141,7 +141,8 @@ def test_any_layout_equals_unpacking_point_by_point(msg: Message) -> None:
     kept = [
         p
         for p in expected
-        if all(math.isfinite(p[axis]) for axis in "xyz") and any(np.float32(p[axis]) for axis in "xyz")
+        if math.hypot(*(p[axis] for axis in "xyz")) <= clouds.FARTHEST
+        and any(np.float32(p[axis]) for axis in "xyz")
     ]
     cloud = clouds.decode_cloud(msg, "/points", 7)
     assert cloud.dropped == len(expected) - len(kept)
@@ -258,6 +259,20 @@ def test_coordinates_beyond_float32_are_dropped_without_a_warning() -> None:
     points["y"][0] = 4_500_000.25
     cloud = clouds.decode_cloud(cloud_message(points), "/p", 0)
     assert cloud.dropped == 1 and cloud.xyz[0, 1] == np.float32(4_500_000.25)
+
+
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+@pytest.mark.parametrize("far", [1e30, -1e30, 3e38, 1e12])
+@pytest.mark.parametrize("axis", "xyz")
+def test_points_beyond_any_sensor_are_dropped_and_counted(axis: str, far: float) -> None:
+    points = random_points(5)
+    points[axis][2] = far
+    points["y"][0] = 9_999_999.0  # a northing of UTM
+    points["intensity"][1] = far
+    cloud = clouds.decode_cloud(cloud_message(points), "/p", 0)
+    assert cloud.dropped == 1
+    np.testing.assert_array_equal(cloud.xyz[:, 1], np.delete(points["y"], 2))
+    np.testing.assert_array_equal(cloud.fields["intensity"], np.delete(points["intensity"], 2))
 
 
 def test_padding_fields_of_the_same_name_do_no_harm() -> None:

@@ -12,6 +12,9 @@ from bevviz.ros.messages import MessageError, frame_name, guarded, stamp_ns
 
 MOST_POINTS = 100_000_000  # of a cloud
 MOST_FIELDS = 1024  # of a point; each element of a field counts
+# Metres from the cloud's origin. No sensor measures so far, and coordinates on Earth are smaller (UTM: 1e7).
+# Stages compute squares and higher powers, which do not fit into float32 for larger numbers.
+FARTHEST = 1e8
 
 _AXES = ("x", "y", "z")
 SCALARS = {
@@ -31,10 +34,10 @@ def decode_cloud(msg: Any, topic: str, received: int) -> Cloud:
     """Points and extra fields of a sensor_msgs/PointCloud2.
 
     Any field types, offsets, padding and byte order; organised clouds are flattened row by row. Points
-    with a coordinate that is NaN or infinite are dropped, and so are those at (0, 0, 0), by which
-    drivers mean a beam without a return, and those that the header announces but cut data no longer
-    holds; all are counted in ``Cloud.dropped``. A field of several elements becomes one field for each:
-    ``name_0``, ``name_1`` ...
+    with a coordinate that is NaN or infinite are dropped, and so are those beyond ``FARTHEST``, those at
+    (0, 0, 0), by which drivers mean a beam without a return, and those that the header announces but cut
+    data no longer holds; all are counted in ``Cloud.dropped``. A field of several elements becomes one
+    field for each: ``name_0``, ``name_1`` ...
 
     Raises:
         MessageError: x, y or z is missing, a field does not fit into its point, or the header announces more
@@ -49,9 +52,10 @@ def decode_cloud(msg: Any, topic: str, received: int) -> Cloud:
     grid = _point_grid(msg, layout)
     with np.errstate(over="ignore", invalid="ignore"):  # a float64 beyond float32 is infinite, and dropped
         xyz = _positions(grid)
-        total = xyz[:, 0] + xyz[:, 1] + xyz[:, 2]
-    usable = np.isfinite(total)
-    if not total.all():
+        x, y, z = xyz.T
+        squared = x * x + y * y + z * z
+        usable = squared <= np.float32(FARTHEST**2)  # false for NaN and for what overflows
+    if not squared.all():
         usable &= xyz.any(axis=1)
     kept = None if usable.all() else np.flatnonzero(usable)
     fields: dict[str, NDArray[Any]] = {}
