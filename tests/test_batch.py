@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import shutil
@@ -24,9 +25,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from bevviz.bags.source import BagSource, FrameSelection
-from bevviz.batch.batch import claimed, left_to_do
+from bevviz.batch.batch import claimed, left_to_do, whole_results
 from bevviz.batch.jobs import PARTIAL, Job, find_bags, make_jobs, name_bags, tables
 from bevviz.batch.table import SEVERITIES, row, severity
+from bevviz.batch.work import run
 from bevviz.cli import main
 from bevviz.config import Config, load
 from bevviz.errors import UserError
@@ -444,3 +446,83 @@ def test_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert "Not a directory" in error_of(bag, "-o", bag / "metadata.yaml" / "runs")
     with claimed(runs), pytest.raises(UserError, match="another batch is running"), claimed(runs):
         pass
+
+
+# --- results that were damaged later -----------------------------------------------------------
+
+
+def misspell(path: Path, name: bytes) -> None:
+    """Change the last letter of a name in a file. Its size stays as it is."""
+    data = path.read_bytes()
+    assert name in data
+    path.write_bytes(data.replace(name, name[:-1] + b"x"))
+
+
+def recount(path: Path) -> None:
+    """Change the number of frames that a table says of itself."""
+    table = pq.read_table(path)
+    metadata = dict(table.schema.metadata)
+    metadata[b"bevviz"] = metadata[b"bevviz"].replace(b'"frames":2', b'"frames":3')
+    pq.write_table(table.replace_schema_metadata(metadata), path)
+
+
+@pytest.fixture
+def done(tmp_path: Path) -> Job:
+    """A bag whose result is complete."""
+    bag = bags.write(tmp_path / "drive", bags.small_items(scans=2))
+    (job,) = make_jobs([bag], tmp_path / "runs", load(), FrameSelection(), "debug")
+    job.folder.mkdir()
+    assert not run(job, 1).error
+    return job
+
+
+DAMAGES = [
+    (lambda job: os.truncate(job.recording, 0), "drive.rrd has 0 bytes instead of "),
+    (lambda job: os.truncate(job.recording, job.recording.stat().st_size - 1), "drive.rrd has "),
+    (lambda job: misspell(job.recording, b"/health"), "drive.rrd was changed or damaged (SHA-256)"),
+    (lambda job: job.recording.unlink(), "drive.rrd is missing"),
+    (lambda job: os.truncate(job.table, job.table.stat().st_size // 2), "drive.parquet is damaged"),
+    (lambda job: misspell(job.table, b"JFIF"), "drive.parquet is damaged"),  # in a picture
+    (lambda job: misspell(job.table, b"badness"), "drive.parquet is damaged"),  # name of a column
+    (lambda job: recount(job.table), "drive.parquet is damaged"),
+]
+
+
+@pytest.mark.parametrize(("damage", "line"), DAMAGES)
+def test_a_damaged_result_is_named_and_made_again(done: Job, damage: Any, line: str) -> None:
+    warnings: list[str] = []
+    assert left_to_do([done], False, warnings.append) == [] == warnings
+    damage(done)
+    assert whole_results(done.folder, warnings.append) == []
+    assert left_to_do([done], False, warnings.append) == [done]
+    assert len(warnings) == 2 and all(text.startswith(f"drive: {line}") for text in warnings)
+    assert not run(done, 1).error
+    assert left_to_do([done], False, warnings.append) == [] and len(warnings) == 2
+
+
+def test_a_table_without_the_checksum_of_its_recording_is_made_again(done: Job) -> None:
+    table = pq.read_table(done.table)
+    about = json.loads(table.schema.metadata[b"bevviz"])
+    del about["recording_size"], about["recording_sha256"]
+    pq.write_table(table.replace_schema_metadata({"bevviz": json.dumps(about)}), done.table)
+    warnings: list[str] = []
+    assert [path for path, _ in whole_results(done.folder, warnings.append)] == [done.table]
+    assert left_to_do([done], False, warnings.append) == [done]
+    assert ["1 tables of an older version hold no checksum" in text for text in warnings] == [True, True]
+
+
+def test_a_batch_goes_on_over_damaged_tables(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for name in ("a", "b"):
+        bags.write(tmp_path / "bags" / name, bags.small_items(scans=2))
+    arguments = ["batch", str(tmp_path / "bags"), "-o", str(tmp_path / "runs"), "--jobs", "1"]
+    assert main(arguments) == 0
+    misspell(tmp_path / "runs/a.parquet", b"JFIF")
+    os.truncate(tmp_path / "runs/summary.parquet", 9)
+    capsys.readouterr()
+    assert main(["batch", "-o", str(tmp_path / "runs")]) == 0
+    assert "a: a.parquet is damaged; it is left out" in capsys.readouterr().err
+    assert main(arguments) == 0
+    said = capsys.readouterr().err
+    assert "a: a.parquet is damaged; its bag is run again" in said
+    assert "1 of 2 bags are complete" in said and "2 bags complete, 0 failed, 4 frames" in said
+    assert pq.read_table(tmp_path / "runs/summary.parquet").num_rows == 4

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -17,6 +18,7 @@ from bevviz.config import Config
 from bevviz.counts import counts_of
 from bevviz.frame import Scene
 from bevviz.logging.decisions import remarks
+from bevviz.provenance import file_hash
 from bevviz.results import Decision, DetectionState, FrameResult
 
 DECISIONS = tuple(d.name.lower() for d in Decision if d.value in (0, 1, 2, 3, 4, 8))  # what a kept one can be
@@ -98,9 +100,15 @@ class RunInfo:
     scene: Scene
     warnings: tuple[str, ...] = ()
     metrics: dict[str, float | None] | None = None  # None: it was not held to the truth
+    recording_size: int = 0  # bytes
+    # Of every byte: samples would miss damage between them. A core hashes about 1 GB/s, far faster than a
+    # recording is made. Rerun writes the file, so it is read once more when it is complete.
+    recording_sha256: str = ""  # empty: the table is of a version that did not keep it
 
 
 _INFO = TypeAdapter(RunInfo)
+_ABOUT, _CHECKSUM = b"bevviz", b"bevviz_sha256"  # metadata of a table: the RunInfo as JSON, and its checksum
+_UNREADABLE = (OSError, LookupError, ValueError, MemoryError, pa.ArrowException)  # errors of damaged tables
 
 
 def row(result: FrameResult, config: Config) -> dict[str, Any]:
@@ -170,17 +178,65 @@ def judged(row: Mapping[str, Any], missed: Sequence[str], false: Sequence[str]) 
 
 
 def write(path: Path, rows: Sequence[Mapping[str, Any]], info: RunInfo) -> None:
+    """Write a table with checksums of its pages and of ``info``, which ``find_damage`` verifies."""
     table = pa.Table.from_pylist([dict(r) for r in rows], schema=SCHEMA)
-    pq.write_table(table.replace_schema_metadata({"bevviz": _INFO.dump_json(info)}), path)
+    about = _INFO.dump_json(info)
+    metadata = {_ABOUT: about, _CHECKSUM: hashlib.sha256(about).hexdigest()}
+    # Statistics of a page lie outside its checksum. A table of one bag needs none.
+    pq.write_table(
+        table.replace_schema_metadata(metadata), path, write_page_checksum=True, write_statistics=False
+    )
 
 
 def read_info(path: Path) -> RunInfo | None:
     """What is known of a table; None where there is none, or a broken or foreign one."""
     try:
         metadata = pq.read_schema(path).metadata or {}
-        return _INFO.validate_json(metadata[b"bevviz"])
-    except (OSError, KeyError, ValueError):  # ArrowInvalid and ValidationError are values too
+        return _INFO.validate_json(metadata[_ABOUT])
+    except _UNREADABLE:
         return None
+
+
+def find_damage(table: Path, recording: Path) -> str:
+    """Say what is damaged in the result of a bag; an empty text means nothing is.
+
+    A table of an older version says nothing of its recording: any file is accepted there.
+
+    Args:
+        table: of the frames, an existing file.
+        recording: that was made with it.
+    """
+    info = read_info(table)
+    if info is None or not _is_whole(table, info):
+        return f"{table.name} is damaged"
+    try:
+        size = recording.stat().st_size
+        if not info.recording_sha256:
+            return ""
+        if size != info.recording_size:
+            return f"{recording.name} has {size} bytes instead of {info.recording_size}"
+        if file_hash(recording) != info.recording_sha256:
+            return f"{recording.name} was changed or damaged (SHA-256)"
+    except FileNotFoundError:
+        return f"{recording.name} is missing"
+    except OSError as error:
+        return f"{recording.name} cannot be read ({error.strerror})"
+    return ""
+
+
+def _is_whole(table: Path, info: RunInfo) -> bool:
+    """Return whether a table can be read to its end and fits its checksums, where it has some."""
+    try:
+        with pq.ParquetFile(table, page_checksum_verification=True) as file:
+            file.read()
+            if not info.recording_sha256:
+                return True
+            metadata = file.schema_arrow.metadata
+            checksum = hashlib.sha256(metadata[_ABOUT]).hexdigest()
+            # Names of columns have no checksum; one that is damaged would be read as a missing column.
+            return bool(file.schema_arrow.equals(SCHEMA)) and metadata[_CHECKSUM] == checksum.encode()
+    except _UNREADABLE:
+        return False
 
 
 def _worst(seconds: Sequence[float]) -> float | None:

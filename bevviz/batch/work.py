@@ -25,6 +25,7 @@ from bevviz.files import unfinished_files
 from bevviz.logging.recorder import DiskWatch, Recorder
 from bevviz.logging.sinks import Sinks, open_recording
 from bevviz.protocols import Observer
+from bevviz.provenance import file_hash
 from bevviz.report.pictures import ahead, camera_picture, jpeg, shrink
 from bevviz.results import FrameResult
 from bevviz.run import run as run_frames
@@ -152,6 +153,8 @@ class Output(Closing):
             replace(source.scene, bag=(), topics=()),
             warnings,
             None if self._evaluation is None else self._evaluation.as_tree()["metrics"],
+            self._recording.stat().st_size,
+            file_hash(self._recording),
         )
         write(self._table, self._rows.rows, info)
         job.table.unlink(missing_ok=True)  # of an older result: it must not vouch for the new recording

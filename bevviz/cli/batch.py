@@ -24,7 +24,7 @@ from bevviz.cli.options import (
     port,
     positive,
 )
-from bevviz.cli.outputs import hint, say
+from bevviz.cli.outputs import hint, say, warn
 from bevviz.errors import UserError
 
 if TYPE_CHECKING:
@@ -91,8 +91,7 @@ def add(commands: Commands) -> None:
 
 
 def _batch(options: argparse.Namespace) -> int:
-    from bevviz.batch.batch import claimed
-    from bevviz.batch.jobs import tables
+    from bevviz.batch.batch import claimed, whole_results
 
     limits = _limits(options)
     if options.catalog and options.serve_catalog:
@@ -105,8 +104,7 @@ def _batch(options: argparse.Namespace) -> int:
             complete = [(job.table, info) for job in jobs if (info := job.complete())]
         else:
             interrupted = False
-            found = tables(options.output.resolve())
-            complete = [(table, info) for table, info in found if table.with_suffix(".rrd").is_file()]
+            complete = whole_results(options.output.resolve(), _warn)
         return _sum_up(complete, failed, limits, options, interrupted)
 
 
@@ -142,7 +140,7 @@ def _run(jobs: list[Job], options: argparse.Namespace, failed: list[tuple[str, s
 
     from bevviz.batch.batch import left_to_do
 
-    todo = left_to_do(jobs, options.force)
+    todo = left_to_do(jobs, options.force, _warn)
     if len(todo) < len(jobs):
         say(f"{len(jobs) - len(todo)} of {len(jobs)} bags are complete and up to date")
     frames = 0
@@ -172,6 +170,10 @@ def _run(jobs: list[Job], options: argparse.Namespace, failed: list[tuple[str, s
     except KeyboardInterrupt:
         return True
     return False
+
+
+def _warn(text: str) -> None:
+    warn([text])
 
 
 def _execute(
