@@ -14,7 +14,7 @@ import pytest
 from benchmarks.torture.samples import FORMATS, items
 from bevviz.bags import chunks, mcap
 from bevviz.bags.info import describe, render
-from bevviz.bags.reader import DamageError
+from bevviz.bags.reader import Bytes, DamageError
 from bevviz.bags.recording import Recording
 from bevviz.bags.source import BagSource
 from bevviz.bags.sqlite_pages import checksum_of
@@ -431,3 +431,56 @@ def test_names_that_mean_something_else(tmp_path: Path, name: str) -> None:
     found, said = read(path.rename(tmp_path / name))
     assert not missing(found, "sqlite3")
     assert not said
+
+
+# --- a summary that describes topics in another way than the data --------------------------------
+
+UNSEALED = ["mcap, no checksums", "mcap, zstd, no checksums"]
+
+
+def in_summary(path: Path, old: bytes, new: bytes) -> None:
+    """Replace bytes of the same length at their last occurrence in the summary of an MCAP file."""
+    data = path.read_bytes()
+    (start,) = struct.unpack_from("<Q", data, len(data) - 28)
+    at = data.rindex(old)
+    assert at > start and len(old) == len(new)
+    change(path, at, new)
+
+
+@pytest.mark.parametrize("name", UNSEALED)
+def test_the_data_names_a_topic_where_the_summary_is_damaged(tmp_path: Path, name: str) -> None:
+    path = FORMATS[name](tmp_path)
+    in_summary(path, b"/velodyne_points", b"/velodyne_pojnts")
+    found, said = read(path)
+    assert not missing(found, name)
+    assert said == [
+        "bag.mcap: its index is damaged: it describes 1 topic(s) in another way than the data, which is "
+        "believed: /velodyne_points, not /velodyne_pojnts"
+    ]
+
+
+@pytest.mark.parametrize("name", UNSEALED)
+def test_the_data_describes_a_type_where_the_summary_is_damaged(tmp_path: Path, name: str) -> None:
+    path = FORMATS[name](tmp_path)
+    in_summary(path, b"sensor_msgs/msg/PointCloud2", b"sensor_msgs/msg/PointCloud3")
+    with Recording([path]) as recording:
+        kinds = {topic.name: topic.type for topic in recording.topics}
+        assert kinds["/velodyne_points"] == "sensor_msgs/msg/PointCloud2"
+        assert "is believed: /velodyne_points" in recording.warnings[0]
+
+
+def test_only_chunks_with_the_first_message_of_a_topic_are_compared(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = FORMATS["mcap, zstd, no checksums"](tmp_path)
+    chunks_read = Counter[int]()
+
+    def unpack(file: Bytes, chunk: chunks.Chunk) -> tuple[bytes, bool]:
+        chunks_read[chunk.data] += 1
+        return unpack_chunk(file, chunk)
+
+    unpack_chunk = mcap.unpack_chunk
+    monkeypatch.setattr(mcap, "unpack_chunk", unpack)
+    index = mcap.read_index(path)
+    assert not index.corrected
+    assert len(index.chunks) > 5 and chunks_read == {index.chunks[0].data: 1}

@@ -31,6 +31,7 @@ from bevviz.loggers import logger
 
 _log = logger(__name__)
 
+NAMED = 3  # topics in a note
 PublicReader = rosbags.rosbag1.Reader | rosbags.rosbag2.Reader
 
 
@@ -67,6 +68,8 @@ class Index:
     connections: list[Connection]
     outside: I64 = field(default_factory=lambda: np.zeros((0, 4), np.int64))
     """(N, 4) messages outside chunks: log time, connection, offset and size of the data."""
+    corrected: Mapping[int, str] = field(default_factory=dict)
+    """Topics as the index had them, by connection, where the data describes the connection in another way."""
 
     @property
     def span(self) -> tuple[int, int]:
@@ -182,7 +185,8 @@ class SoundChunks:
         except DamageError as error:
             _log.info("%s: read by its index, for rosbags says: %s", path, error)
         else:
-            known = {c.id: c for c in reader.connections}  # with their quality of service
+            # With their quality of service; corrected connections are not those of the index.
+            known = {c.id: c for c in reader.connections if c.id not in index.corrected}
             index.connections = [
                 known.get(c.id, c)._replace(msgcount=c.msgcount, owner=None) for c in index.connections
             ]
@@ -275,6 +279,15 @@ class IndexedChunks:
     @property
     def warnings(self) -> Sequence[str]:
         notes = list(self._notes)
+        if corrected := self._index.corrected:
+            topics = {c.topic: corrected[c.id] for c in self._index.connections if c.id in corrected}
+            names = [
+                topic if topic == former else f"{topic}, not {former}" for topic, former in topics.items()
+            ]
+            notes.append(
+                f"its index is damaged: it describes {len(corrected)} topic(s) in another way than the data, "
+                f"which is believed: {'; '.join(names[:NAMED])}{' ...' if len(names) > NAMED else ''}"
+            )
         if self._damaged:
             lost = sum(lost.total() for lost, _, _ in self._damaged.values())
             why = next(iter(self._damaged.values()))[2]

@@ -7,6 +7,7 @@ from binascii import crc32
 from collections import Counter
 from collections.abc import Mapping
 from contextlib import suppress
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ import numpy as np
 from rosbags.interfaces import Connection, ConnectionExtRosbag2, MessageDefinition, MessageDefinitionFormat
 
 from bevviz.bags.chunks import Chunk, Index
-from bevviz.bags.reader import LAST, Bytes, DamageError, UnindexedError
+from bevviz.bags.reader import LAST, Bytes, DamageError, UnindexedError, unpack
 from bevviz.frame import I64
 from bevviz.loggers import logger
 
@@ -68,6 +69,22 @@ class Channels:
             topic, form = (text.decode(errors="replace") for text in strings(record, 4, 2))
             self._channels.setdefault(number, (schema, topic, form))
 
+    def correct(self, others: Channels) -> dict[int, str]:
+        """Take the descriptions of ``others`` where they differ. Return the former topics by channel."""
+        known = self._channels.keys() & others._channels.keys()
+        before = {number: (self._channels[number][1], self._description(number)) for number in known}
+        self.schemas |= others.schemas
+        self._channels |= {number: others._channels[number] for number in known}
+        return {
+            number: topic
+            for number, (topic, description) in before.items()
+            if self._description(number) != description
+        }
+
+    def _description(self, number: int) -> tuple[object, ...]:
+        schema, topic, encoding = self._channels[number]
+        return topic, encoding, self.schemas.get(schema)
+
     def connections(self, counts: Mapping[int, int]) -> list[Connection]:
         found = []
         for number, (schema, topic, encoding) in self._channels.items():
@@ -102,7 +119,10 @@ def read_index(path: Path) -> Index:
         summary = file.read(start, file.size - start)
         if crc and crc32(summary[: -len(MAGIC) - 4]) != crc:
             raise DamageError("its index does not fit its checksum")
-        index = _parse_summary(summary[: end - start], start)
+        channels = Channels()
+        index = _parse_summary(summary[: end - start], start, channels)
+        if not crc:
+            _correct_channels(file, index, channels)
         for chunk in index.chunks[-1:]:  # where bytes are missing or too many, at least the last one is moved
             at = chunk.data - RECORD.size - CHUNK_HEAD.size - len(chunk.compression) - 8
             length = CHUNK_HEAD.size + len(chunk.compression) + 8 + chunk.packed
@@ -146,8 +166,54 @@ def read_attachments(path: Path) -> dict[str, bytes]:
         file.close()
 
 
-def _parse_summary(summary: bytes, end: int) -> Index:
-    channels, chunks = Channels(), []
+def _correct_channels(file: Bytes, index: Index, channels: Channels) -> None:
+    """Describe channels as the data does where a summary without a checksum differs.
+
+    To read all data takes too long. A writer describes a channel at its first message at the latest, so the
+    chunk with that message is enough: one chunk of most files, a few of others. A channel that is described
+    in none of these stays as it is.
+    """
+    in_data, seen = Channels(), set[int]()
+    for chunk in sorted(index.chunks, key=attrgetter("data")):
+        if chunk.counts.keys() <= seen:
+            continue
+        seen |= chunk.counts.keys()
+        with suppress(DamageError):  # reading its messages will say so
+            _note_all(unpack_chunk(file, chunk)[0], in_data)
+    index.corrected = channels.correct(in_data)
+    if index.corrected:
+        index.connections = channels.connections({c.id: c.msgcount for c in index.connections})
+
+
+def _note_all(content: bytes, channels: Channels) -> None:
+    """Note the schema and channel records in the content of a chunk."""
+    offset = 0
+    while offset + RECORD.size <= len(content):
+        opcode, length = RECORD.unpack_from(content, offset)
+        start = offset + RECORD.size
+        offset = start + length
+        if opcode in (SCHEMA, CHANNEL) and offset <= len(content):
+            with suppress(struct.error):
+                channels.note(opcode, content[start:offset])
+
+
+def unpack_chunk(file: Bytes, chunk: Chunk) -> tuple[bytes, bool]:
+    """The content of a chunk, and whether it is known to be as it was written.
+
+    Raises:
+        DamageError: it cannot be unpacked.
+    """
+    crc = chunk.crc
+    if crc is None:  # it stands before the content
+        crc = int.from_bytes(file.read(chunk.data - 16 - len(chunk.compression), 4), "little")
+    packed = file.read(chunk.data, chunk.packed)
+    cut = chunk.cut or len(packed) < chunk.packed
+    return unpack(chunk.compression, packed, chunk.size, crc, cut=cut), bool(crc) and not cut
+
+
+def _parse_summary(summary: bytes, end: int, channels: Channels) -> Index:
+    """The index in a summary, which ends at ``end``; ``channels`` is filled with its schemas and channels."""
+    chunks = []
     statistics: tuple[Any, ...] | None = None
     counted: Mapping[int, int] = {}
     offset = 0

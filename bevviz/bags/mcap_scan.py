@@ -31,8 +31,9 @@ from bevviz.bags.mcap import (
     read_index,
     read_times,
     strings,
+    unpack_chunk,
 )
-from bevviz.bags.reader import LAST, Bytes, Content, DamageError, unpack
+from bevviz.bags.reader import LAST, Bytes, Content, DamageError
 
 HEAD = re.compile(  # an opcode with a length below 2^40, or the first bytes of a compressed chunk's content
     rb"(?=[\x01-\x0f].{5}\0\0\0|\x04\0\0\0zstd.{8}\x28\xb5\x2f\xfd|\x03\0\0\0lz4.{8}\x04\x22\x4d\x18)",
@@ -289,7 +290,7 @@ def _read_head(file: Bytes, body: int, end: int) -> Chunk:
 def _describe(file: Bytes, chunk: Chunk, channels: Channels, found: Scan) -> None:
     """Fill in what is in a chunk."""
     times: dict[int, array[int]] = defaultdict(lambda: array("q"))
-    content = Content(_unpacked(file, chunk)[0])
+    content = Content(unpack_chunk(file, chunk)[0])
     walker = Walker(content, channels, _span(chunk))
     for opcode, body, end in walker(0):
         if opcode == MESSAGE:
@@ -309,7 +310,7 @@ def look_into(file: Bytes, chunk: Chunk) -> list[tuple[int, int, memoryview]]:
     Raises:
         DamageError: it cannot be unpacked.
     """
-    content, crc = _unpacked(file, chunk)
+    content, crc = unpack_chunk(file, chunk)
     data = memoryview(content)
     found, whole = _messages(data, chunk.counts)
     if crc or (whole and len(found) == sum(chunk.counts.values())):
@@ -330,16 +331,6 @@ def _messages(data: memoryview, channels: Container[int]) -> tuple[list[tuple[in
             if channel in channels and time < LAST:
                 found.append((time, channel, data[body + MESSAGE_HEAD.size : offset]))
     return found, offset == size
-
-
-def _unpacked(file: Bytes, chunk: Chunk) -> tuple[bytes, bool]:
-    """The content of a chunk, and whether it is known to be as it was written."""
-    crc = chunk.crc
-    if crc is None:  # it stands before the content
-        crc = int.from_bytes(file.read(chunk.data - 16 - len(chunk.compression), 4), "little")
-    packed = file.read(chunk.data, chunk.packed)
-    cut = chunk.cut or len(packed) < chunk.packed
-    return unpack(chunk.compression, packed, chunk.size, crc, cut=cut), bool(crc) and not cut
 
 
 def _span(chunk: Chunk) -> tuple[int, int] | None:
