@@ -4,12 +4,17 @@ from __future__ import annotations
 
 from bevviz.text import printable
 
+LONGEST = 4000  # characters of a line
+
 
 class UserError(Exception):
     """What is wrong, in which file, topic or field, and what to do. The command exits with status 2."""
 
     def __str__(self) -> str:
-        return printable(super().__str__())  # it is shown on a terminal
+        text = printable(super().__str__())  # it is shown on a terminal
+        if len(text) > LONGEST:  # it repeats what a file holds
+            text = f"{text[: LONGEST // 2]} ... {text[-LONGEST // 2 :]}"
+        return text
 
 
 class StageError(Exception):

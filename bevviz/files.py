@@ -1,4 +1,4 @@
-"""Files that are there as a whole or not at all, each written by one process at a time."""
+"""Write files atomically, by one process at a time. Read files of strangers with limits."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import BinaryIO
 
 from bevviz import remains
 from bevviz.errors import UserError
@@ -24,6 +25,11 @@ from bevviz.errors import UserError
 # How what stands for a file begins that Git LFS has not fetched; and what is said of it.
 LFS_POINTER = b"version https://git-lfs.github.com/"
 LFS_HINT = "a Git LFS pointer, not the file itself: 'git lfs pull' fetches it"
+# The largest files that are read, in bytes. They keep a damaged or hostile file from taking all memory.
+CONFIG_LIMIT = 1 << 20  # a configuration, a project file, a list of names: a few kilobytes as a rule
+TEXT_LIMIT = 1 << 24  # a calibration, the labels or the stamps of a drive: a megabyte at most as a rule
+TABLE_LIMIT = 1 << 27  # a table with a line for each pose: an hour at 200 Hz is 115 MB
+SENSOR_LIMIT = 1 << 30  # a scan or an image: 100 million points without colour
 YOUNG = 60.0  # seconds that a temporary folder may be without its lock: it is being made
 
 
@@ -257,6 +263,88 @@ def on_disk() -> Iterator[None]:
         raise full from error
 
 
+# --- reading -----------------------------------------------------------------------------------
+
+
+def open_regular(path: Path, *, pipe: bool = False) -> BinaryIO:
+    """Open a regular file for reading. Links are followed.
+
+    A FIFO, a device or a socket is not opened: reading it could wait for ever, or never end.
+
+    Args:
+        path: of the file.
+        pipe: open a pipe of the shell, too: ``<(...)`` or ``/dev/stdin``.
+
+    Raises:
+        OSError: it is not there, is no regular file, or may not be read.
+    """
+    of_shell = pipe and path.parts[1:2] in (("dev",), ("proc",))
+    allowed = of_shell and (path.is_fifo() or str(path) == os.devnull)
+    _check_regular(path.stat(), allowed)
+    handle = os.open(path, os.O_RDONLY | os.O_CLOEXEC | (0 if allowed else os.O_NONBLOCK))
+    try:
+        _check_regular(os.fstat(handle), allowed)  # it may have been exchanged since
+    except OSError:
+        os.close(handle)
+        raise
+    return os.fdopen(handle, "rb")
+
+
+def _check_regular(about: os.stat_result, allowed: bool) -> None:
+    if stat.S_ISDIR(about.st_mode):
+        raise IsADirectoryError(errno.EISDIR, "it is a folder")
+    if not stat.S_ISREG(about.st_mode) and not allowed:
+        raise OSError(errno.EINVAL, "it is no file")
+
+
+def read_bytes(path: Path, limit: int, *, problem: str = "", pipe: bool = False) -> bytes:
+    """Read a whole file that somebody else may have made.
+
+    Args:
+        path: of the file.
+        limit: bytes that it may have.
+        problem: begins the sentence of an error; "": ``PATH: cannot be read``.
+        pipe: as of ``open_regular``.
+
+    Raises:
+        UserError: it is not there, is no regular file, may not be read, or is larger than the limit.
+    """
+    problem = problem or f"{path}: cannot be read"
+    try:
+        with open_regular(path, pipe=pipe) as file:
+            about = os.fstat(file.fileno())
+            size = about.st_size if stat.S_ISREG(about.st_mode) else None
+            # Of a pipe nobody knows how much is to come.
+            data = file.read(limit + 1 if size is None else size if size <= limit else 0)
+    except (OSError, ValueError) as error:  # the latter: a NUL in the name
+        raise UserError(f"{problem}: {getattr(error, 'strerror', None) or error}") from None
+    if max(size or 0, len(data)) > limit:
+        raise UserError(f"{problem}: it has more than {limit:,} bytes, which are read at most")
+    return data
+
+
+def read_head(path: Path, count: int) -> bytes:
+    """Read the first bytes of a regular file. Raises OSError: as ``open_regular``."""
+    with open_regular(path) as file:
+        return file.read(count)
+
+
+def read_text(path: Path, limit: int = TEXT_LIMIT, *, problem: str = "", pipe: bool = False) -> str:
+    """Read a UTF-8 text that somebody else may have made; its lines end with ``\\n``.
+
+    Args and errors are those of ``read_bytes``.
+
+    Raises:
+        UserError: it cannot be read, is larger than the limit, or is no UTF-8 text.
+    """
+    data = read_bytes(path, limit, problem=problem, pipe=pipe)
+    try:
+        return data.decode("utf-8-sig").replace("\r\n", "\n").replace("\r", "\n")
+    except UnicodeDecodeError as error:
+        problem = problem or f"{path}: cannot be read"
+        raise UserError(f"{problem}: it is no UTF-8 text: {error.reason} at byte {error.start}") from None
+
+
 # --- folders -----------------------------------------------------------------------------------
 
 
@@ -276,7 +364,8 @@ def drive_files(folder: Path) -> list[Path]:
     found = bag_files(folder)
     if found:
         return found
-    return [Path(where, name) for where, _, names in os.walk(folder) for name in names]
+    files = (Path(where, name) for where, _, names in os.walk(folder) for name in names)
+    return [file for file in files if file.is_file()]  # no pipes, and no links to what is not there
 
 
 def sampled_files(folder: Path) -> tuple[int, list[Path]]:
@@ -287,7 +376,7 @@ def sampled_files(folder: Path) -> tuple[int, list[Path]]:
         names.sort()
         count += len(names)
         chosen += [Path(where, names[i]) for i in sorted({0, len(names) // 2, len(names) - 1}) if names]
-    return count, chosen
+    return count, [file for file in chosen if file.is_file()]
 
 
 class Scratch:

@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from bevviz.errors import UserError
-from bevviz.files import written
+from bevviz.files import read_text, written
 
 SUFFIX = ".notes.json"
 LONGEST = 2000  # characters of a note
@@ -75,14 +75,12 @@ class Notes:
             self._write([other for other in self._read() if other != note])
 
     def _read(self) -> list[Note]:
-        try:
-            values = json.loads(self.path.read_text(encoding="utf-8"))
-            return sorted(Note(**value) for value in values["notes"])
-        except FileNotFoundError:
+        if not self.path.exists():
             return []
-        except OSError as error:
-            raise UserError(f"{self.path}: cannot be read: {error.strerror}") from None
-        except (ValueError, KeyError, TypeError):
+        try:
+            values = json.loads(read_text(self.path))
+            return sorted(Note(**value) for value in values["notes"])
+        except (ValueError, KeyError, TypeError, RecursionError):
             raise UserError(f"{self.path}: holds no notes as bevviz writes them; move it away") from None
 
     def _write(self, notes: Sequence[Note]) -> None:

@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import difflib
 import os
-import tomllib
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Any
@@ -23,9 +22,11 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationEr
 
 from bevviz import plugins
 from bevviz.config import OURS, TUTORIAL_NAMES, Config, Layer, Preset, flattened, read_layer
+from bevviz.config.files import toml_tree
 from bevviz.config.methods import CLASS_LISTS
 from bevviz.errors import UserError
 from bevviz.pillar_params import is_network
+from bevviz.text import shown
 
 NAME = "bevviz.toml"
 MODEL = "BEVVIZ_MODEL"
@@ -79,18 +80,13 @@ def find(folder: Path) -> Path | None:
 
 def _of_file(path: Path) -> Iterator[Layer]:
     try:
-        tree = tomllib.loads(path.read_text(encoding="utf-8"))
-        stated = ProjectFile.model_validate(tree)
-    except OSError as error:
-        raise UserError(f"{path}: cannot read the project file: {error.strerror}") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise UserError(f"{path}: is no TOML: {error}") from None
+        stated = ProjectFile.model_validate(toml_tree(path, f"{path}: cannot read the project file"))
     except ValidationError as error:
         first = error.errors()[0]
         key = ".".join(str(part) for part in first["loc"])
         about = ProjectFile.model_fields[str(first["loc"][0])].description
         message = first["msg"].replace("Input should be", "must be")
-        raise UserError(f"{path}: {key} {message} (given: {first['input']!r}); it is {about}") from None
+        raise UserError(f"{path}: {key} {message} (given: {shown(first['input'])}); it is {about}") from None
     sections = stated.model_extra or {}
     known = [*ProjectFile.model_fields, *Config.model_fields, *TUTORIAL_NAMES]
     for name in sections:
@@ -99,7 +95,7 @@ def _of_file(path: Path) -> Iterator[Layer]:
             hint = f"; did you mean '{near[0]}'?" if near else ""
             raise UserError(f"{path}: unknown key '{name}'{hint}")
     for name in stated.config:
-        yield read_layer(path.parent / name)
+        yield read_layer(path.parent / name, pipe=False)
     own = flattened(sections)
     if stated.preset is not None:
         own["preset"] = stated.preset

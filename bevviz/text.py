@@ -5,10 +5,14 @@ from __future__ import annotations
 import os
 import re
 from pathlib import Path
+from reprlib import Repr
 
 # What Markdown would take for its own anywhere, and what only at the beginning of a line.
 _MARKS = re.compile(r"[\\`*\[\]<~|&$]|_(?:(?<![^\W_]_)|(?![^\W_]))")
 _START = re.compile(r"[#>+=:-]|\d+(?=[.)])")
+_SHORT = Repr()
+_SHORT.maxstring = _SHORT.maxother = _SHORT.maxlong = 200
+_SHORT.maxlist = _SHORT.maxtuple = _SHORT.maxdict = _SHORT.maxset = 20
 _PLAIN = re.compile(r"[A-Za-z][\w .,:;()'%/>=+-]*", re.ASCII)  # most sentences: nothing but perhaps _ to do
 
 
@@ -21,6 +25,18 @@ def printable(text: str) -> str:
     if text.isprintable():
         return text
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
+
+
+def shown(value: object) -> str:
+    """A value that somebody stated, as Python writes it; the middle of a long one is left out.
+
+    >>> shown("a" * 1000)[:8]
+    "'aaaaaaa"
+    """
+    try:
+        return _SHORT.repr(value)
+    except ValueError:  # Python writes no whole number of more than 4300 digits
+        return "a number of thousands of digits"
 
 
 def path_text(path: Path | str) -> str:

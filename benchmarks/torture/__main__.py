@@ -8,10 +8,11 @@ false result after a signal, a process or a file that is left, or one that canno
 from __future__ import annotations
 
 import argparse
+import random
 import sys
 from collections.abc import Callable, Mapping
 
-from benchmarks.torture import damage, fuzz, kill
+from benchmarks.torture import damage, folders, fuzz, kill
 from benchmarks.torture.samples import FORMATS
 
 EXAMPLES = 40  # of what went wrong that are printed
@@ -56,6 +57,20 @@ def killed_processes(options: argparse.Namespace) -> bool:
     return well
 
 
+def strange_folders(options: argparse.Namespace) -> bool:
+    total = folders.Tally()
+    print(f"\nData set folders and configuration files of strangers, seed {options.seed}\n\n{folders.HEAD}")
+    names = [name for name in (*folders.FOLDERS, "project") if (options.kind or "") in name]
+    if not names:
+        raise SystemExit(f"--kind {options.kind}: none of {', '.join(folders.FOLDERS)}, project")
+    for name, tally in folders.run(options.seed, options.folders, names):
+        print(folders.row(name, tally), flush=True)
+        total += tally
+    print(folders.row("all", total))
+    _print_examples(total.examples)
+    return total.well
+
+
 def _print_examples(examples: list[str]) -> None:
     for example in examples[:EXAMPLES]:
         print(f"- {example}")
@@ -63,7 +78,16 @@ def _print_examples(examples: list[str]) -> None:
         print(f"- and {len(examples) - EXAMPLES} more")
 
 
-PARTS: Mapping[str, Part] = {"damage": damaged_bags, "fuzz": fuzzed_messages, "kill": killed_processes}
+PARTS: Mapping[str, Part] = {
+    "damage": damaged_bags,
+    "fuzz": fuzzed_messages,
+    "kill": killed_processes,
+    "folders": strange_folders,
+}
+
+
+def _seed(text: str) -> int:
+    return random.randrange(1 << 32) if text == "random" else int(text)
 
 
 def main() -> int:
@@ -73,10 +97,16 @@ def main() -> int:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("parts", nargs="*", metavar="PART", help=f"{', '.join(PARTS)} (default: all of them)")
-    parser.add_argument("--seed", type=int, default=0, help="of all that is random (default: 0)")
+    parser.add_argument(
+        "--seed", type=_seed, default=0, help="number, or 'random' for another one each time (default: 0)"
+    )
     parser.add_argument("--bags", type=int, default=900, help="damaged bags (default: 900)")
     parser.add_argument("--format", metavar="NAME", help="only the formats whose name has this in it")
     parser.add_argument("--messages", type=int, default=2000, help="fuzzed messages (default: 2000)")
+    parser.add_argument(
+        "--folders", type=int, default=560, help="data set folders, and as many project files (default: 560)"
+    )
+    parser.add_argument("--kind", metavar="NAME", help="only folders of kinds whose name has this in it")
     parser.add_argument(
         "--signals", type=int, default=280, help="signals, shared among the commands (default: 280)"
     )

@@ -153,24 +153,29 @@ def renamed(text: str, rng: random.Random) -> str:
     return text.replace(word, rng.choice(["other", "uint8", "string", "float64", "\0", "Ünicode"]))
 
 
-def bombs() -> list[Row]:
-    """Small messages that ask for a lot: of memory, or of time."""
-    messages = bags.Messages()
-    store, stamp = messages.store, bags.START
-    side = 32_000
-    raw = zlib.compress((b"\0" + bytes(side // 8)) * side, 9)
+def png(side: int) -> bytes:
+    """A square PNG of one bit a pixel: a small file of a large image. The largest lack their pixels."""
+    rows = (b"\0" + bytes(side // 8)) * (side if side <= 32_000 else 1)
 
     def part(kind: bytes, content: bytes) -> bytes:
         return (
             struct.pack(">I", len(content)) + kind + content + struct.pack(">I", zlib.crc32(kind + content))
         )
 
-    head = struct.pack(">IIBBBBB", side, side, 1, 0, 0, 0, 0)
-    png = b"\x89PNG\r\n\x1a\n" + part(b"IHDR", head) + part(b"IDAT", raw) + part(b"IEND", b"")
+    head = part(b"IHDR", struct.pack(">IIBBBBB", side, side, 1, 0, 0, 0, 0))
+    return b"\x89PNG\r\n\x1a\n" + head + part(b"IDAT", zlib.compress(rows, 9)) + part(b"IEND", b"")
+
+
+def bombs() -> list[Row]:
+    """Small messages that ask for a lot: of memory, or of time."""
+    messages = bags.Messages()
+    store, stamp = messages.store, bags.START
     small = cv2.imencode(".jpg", np.zeros((16, 16, 3), np.uint8))[1].tobytes()
     at = small.index(b"\xff\xc0") + 5
     jpeg = small[:at] + struct.pack(">HH", 65_000, 65_000) + small[at + 4 :]
-    found = [(topic, messages.compressed(stamp, data)) for topic, data in [("png", png), ("jpeg", jpeg)]]
+    found = [
+        (topic, messages.compressed(stamp, data)) for topic, data in [("png", png(32_000)), ("jpeg", jpeg)]
+    ]
     rows = [("/rear/image/compressed", COMPRESSED, message) for _, message in found]
     cloud = "sensor_msgs/msg/PointCloud2"
     for changes in ({"count": 10**6}, {"count": 2**32 - 1}):

@@ -104,9 +104,11 @@ class Worker:
 
 
 def _serve(pipe: Connection) -> None:
+    from benchmarks.torture.folders import run_commands
     from benchmarks.torture.fuzz import read_messages, run_over
 
     tasks: dict[str, Any] = {"bag": read_bag, "messages": read_messages, "run": run_over}
+    tasks["commands"] = run_commands
     while True:
         try:
             task, argument = pipe.recv()

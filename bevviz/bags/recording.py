@@ -27,11 +27,12 @@ from bevviz.bags.reader import BagFile, normalized
 from bevviz.bags.types import MessageTypes
 from bevviz.closing import Closing
 from bevviz.config import SourceConfig
+from bevviz.config.files import yaml_value
 from bevviz.datasets import find_loader, open_dataset
 from bevviz.datasets.reader import DatasetReader
 from bevviz.datasets.unread import unread
 from bevviz.errors import UserError
-from bevviz.files import Scratch, bag_files, drive_files, full_disk
+from bevviz.files import Scratch, bag_files, drive_files, full_disk, read_text
 from bevviz.frame import I64
 from bevviz.ros import foxglove, ouster, vision_msgs
 from bevviz.ros.compressed import decompress, is_compressed
@@ -433,9 +434,6 @@ class Recording(Closing):
         return True
 
     def _read_metadata(self, folder: Path) -> Mapping[str, Any]:
-        from ruamel.yaml import YAML
-        from ruamel.yaml.error import YAMLError
-
         path = folder / METADATA
         if not path.exists():
             if not any(f.suffix == ".bag" for f in bag_files(folder)):
@@ -444,12 +442,12 @@ class Recording(Closing):
                 )
             return {}
         try:
-            content = YAML(typ="safe", pure=True).load(path.read_text())["rosbag2_bagfile_information"]
+            content = yaml_value(read_text(path), str(path))["rosbag2_bagfile_information"]
             distro = content.get("ros_distro")
             if f"ros2_{distro}" in {s.value for s in Stores}:
                 self.types.release = Stores(f"ros2_{distro}")
             return dict(content)
-        except (YAMLError, KeyError, TypeError, AttributeError, ValueError):
+        except (UserError, KeyError, TypeError, AttributeError, ValueError):
             self._notes.append(f"{path}: not readable as {METADATA}: read without")
             return {}
 

@@ -8,6 +8,7 @@ from pathlib import Path
 from bevviz.cli.options import Commands, add_bag, add_config, add_keep, load_config
 from bevviz.cli.outputs import say, warn
 from bevviz.errors import UserError
+from bevviz.files import CONFIG_LIMIT, read_text
 
 
 def add(commands: Commands) -> None:
@@ -111,10 +112,7 @@ def _check(options: argparse.Namespace) -> int:
 
 
 def _read(path: Path) -> str:
-    try:
-        return path.read_text(encoding="utf-8").strip()
-    except (OSError, UnicodeDecodeError) as error:
-        raise UserError(f"--note-file {path}: cannot be read: {error}") from None
+    return read_text(path, CONFIG_LIMIT, problem=f"--note-file {path}: cannot be read", pipe=True).strip()
 
 
 def _seconds(text: str) -> float:

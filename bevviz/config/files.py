@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,7 +11,10 @@ from typing import Any
 
 from bevviz.config.dotted import flattened, keys, unit
 from bevviz.config.sections import Config
-from bevviz.errors import UserError
+from bevviz.errors import UserError, first_line
+from bevviz.files import CONFIG_LIMIT, read_text
+
+MOST_VALUES = 1_000_000  # of a YAML file, with each alias counted as often as it is used
 
 
 @dataclass(frozen=True, slots=True)
@@ -21,25 +25,22 @@ class Layer:
     values: Mapping[str, Any]
 
 
-def read_layer(path: Path) -> Layer:
-    """What a YAML file states.
+def read_layer(path: Path, *, pipe: bool = True) -> Layer:
+    """Read the values that a YAML file states.
+
+    Args:
+        path: of the file.
+        pipe: whether it may be a pipe of the shell, ``<(...)``.
 
     Raises:
         UserError: it cannot be read.
     """
-    return Layer(str(path), flattened(_read_yaml(path)))
+    return Layer(str(path), flattened(_read_yaml(path, pipe)))
 
 
-def _read_yaml(path: Path) -> Mapping[str, Any]:
-    try:
-        if path.is_fifo() and path.parts[1:2] not in (("dev",), ("proc",)):  # <(...) of a shell is welcome
-            raise UserError(f"{path}: cannot read the configuration: it is no file")
-        text = path.read_text(encoding="utf-8")
-    except OSError as error:
-        raise UserError(f"{path}: cannot read the configuration: {error.strerror}") from None
-    except UnicodeDecodeError as error:
-        raise UserError(f"{path}: is no UTF-8 text: {error.reason} at byte {error.start}") from None
-    tree = yaml_value(text, str(path))
+def _read_yaml(path: Path, pipe: bool) -> Mapping[str, Any]:
+    problem = f"{path}: cannot read the configuration"
+    tree = yaml_value(read_text(path, CONFIG_LIMIT, problem=problem, pipe=pipe), str(path))
     if tree is None:
         return {}
     if not isinstance(tree, Mapping):
@@ -52,7 +53,8 @@ def yaml_value(text: str, where: str) -> Any:
     from ruamel.yaml.error import YAMLError
 
     try:
-        return YAML(typ="safe", pure=True).load(text)
+        tree = YAML(typ="safe", pure=True).load(text)
+        _check_size(tree, where)
     except YAMLError as error:
         problem = getattr(error, "problem", None) or str(error).splitlines()[0]
         mark = getattr(error, "problem_mark", None)
@@ -62,6 +64,46 @@ def yaml_value(text: str, where: str) -> Any:
         raise UserError(f"{where}: is not valid YAML for a configuration: too deep") from None
     except (ValueError, OverflowError) as error:  # a date that is none
         raise UserError(f"{where}: is not valid YAML: {error}") from None
+    return tree
+
+
+def _check_size(tree: Any, where: str) -> None:
+    """Refuse YAML whose aliases stand for too many values: few lines can stand for billions.
+
+    Raises:
+        UserError: there are more than ``MOST_VALUES``.
+    """
+    sizes: dict[int, int] = {}
+
+    def size(node: Any) -> int:
+        if not isinstance(node, list | dict):
+            return 1
+        if id(node) not in sizes:
+            sizes[id(node)] = 1  # of a node that is within itself
+            sizes[id(node)] = 1 + sum(map(size, node.values() if isinstance(node, dict) else node))
+        return sizes[id(node)]
+
+    if size(tree) > MOST_VALUES:
+        raise UserError(f"{where}: its aliases stand for more than {MOST_VALUES:,} values")
+
+
+def toml_tree(path: Path, problem: str) -> dict[str, Any]:
+    """Read a TOML file.
+
+    Args:
+        path: of the file.
+        problem: begins the sentence where it cannot be read.
+
+    Raises:
+        UserError: it cannot be read, or is no TOML.
+    """
+    text = read_text(path, CONFIG_LIMIT, problem=problem)
+    try:
+        return tomllib.loads(text)
+    except RecursionError:
+        raise UserError(f"{path}: is no TOML for a configuration: too deep") from None
+    except ValueError as error:  # also a number of thousands of digits
+        raise UserError(f"{path}: is no TOML: {first_line(error)}") from None
 
 
 def dump(config: Config) -> str:

@@ -15,6 +15,7 @@ from bevviz.config.methods import STAGES
 from bevviz.config.sections import Config, Preset
 from bevviz.errors import UserError
 from bevviz.pillar_params import UNFIT, is_network
+from bevviz.text import shown
 
 BASE = "configuration"  # where values are stated that came as a whole
 
@@ -113,7 +114,7 @@ def load(
                 _unfit_network(origin.get("objects.method", where), method, key, params)
             ) from None
         silent = first["type"] in ("wrong_unit", "missing", UNFIT)
-        value = f" (given: {first['input']!r})" if not silent else ""
+        value = f" (given: {shown(first['input'])})" if not silent else ""
         about = keys().get(key) or params.get(key, "")
         hint = f"; it is: {about}" if about else ""
         stated_unit = f", in {unit(key)}" if unit(key) and not silent else ""

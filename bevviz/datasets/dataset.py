@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import os
 import re
+import struct
+from array import array
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from io import StringIO
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -14,7 +17,8 @@ from numpy.typing import NDArray
 
 from bevviz.datasets.columns import are_doubles, are_whole, count_columns
 from bevviz.errors import UserError, first_line
-from bevviz.files import LFS_HINT, LFS_POINTER
+from bevviz.files import LFS_HINT, LFS_POINTER, SENSOR_LIMIT, TABLE_LIMIT, read_head, read_text
+from bevviz.files import read_bytes as read_limited
 from bevviz.frame import F32, I64
 from bevviz.ros.encode import encode_compressed_image
 
@@ -29,7 +33,10 @@ IMAGES = (".png", ".jpg", ".jpeg", ".webp")
 
 
 # What a loader raises where a file holds something else than its data set documents.
-NOT_AS_DOCUMENTED = (KeyError, IndexError, TypeError, ValueError, AttributeError, OverflowError)
+NOT_AS_DOCUMENTED = (
+    *(KeyError, IndexError, TypeError, ValueError, AttributeError, OverflowError),
+    *(struct.error, RecursionError, MemoryError),  # a number, a depth or a size beyond all measure
+)
 
 
 def describe(error: Exception) -> str:
@@ -118,7 +125,7 @@ class Dataset:
         if not raw:
             return [*names]
         largest = max(raw, key=lambda file: file.stat().st_size)
-        data = read_bytes(largest)[:LOOKED_AT]
+        data = read_bytes(largest, LOOKED_AT)
         if are_doubles(data):
             raise UserError(f"{largest}: its numbers are float64; save them as float32, or as NPY")
         if are_whole(data):
@@ -209,10 +216,18 @@ def files_in(
     return [folder / name for name in sorted(names) if not HIDDEN.match(name)]
 
 
-def read_bytes(path: Path) -> bytes:
-    """Raises UserError: it cannot be read, or Git LFS has not fetched it."""
+def read_bytes(path: Path, first: int = 0) -> bytes:
+    """Read a scan, an image or labels.
+
+    Args:
+        path: of the file.
+        first: how many bytes from its beginning on; 0: all of it.
+
+    Raises:
+        UserError: it cannot be read, is larger than ``SENSOR_LIMIT``, or Git LFS has not fetched it.
+    """
     try:
-        data = path.read_bytes()
+        data = read_head(path, first) if first else read_limited(path, SENSOR_LIMIT)
     except OSError as error:
         raise UserError(f"{path}: cannot be read: {error.strerror}") from None
     if data.startswith(LFS_POINTER):
@@ -222,17 +237,7 @@ def read_bytes(path: Path) -> bytes:
 
 def is_pointer(path: Path) -> bool:
     """Whether Git LFS has yet to fetch a file. Raises OSError: it cannot be read."""
-    with path.open("rb") as file:
-        return file.read(len(LFS_POINTER)) == LFS_POINTER
-
-
-def read_text(path: Path) -> str:
-    """Raises UserError: it cannot be read, or is no text."""
-    try:
-        return path.read_text(encoding="utf-8-sig")
-    except (OSError, UnicodeDecodeError) as error:
-        reason = getattr(error, "strerror", None) or "is no text"
-        raise UserError(f"{path}: cannot be read: {reason}") from None
+    return read_head(path, len(LFS_POINTER)) == LFS_POINTER
 
 
 def read_table(path: Path, columns: int, names: str = "") -> NDArray[np.float64]:
@@ -246,8 +251,8 @@ def read_table(path: Path, columns: int, names: str = "") -> NDArray[np.float64]
     Raises:
         UserError: it cannot be read, or a line has something else.
     """
-    rows = []
-    for number, line in enumerate(read_text(path).splitlines(), 1):
+    numbers = array("d")  # a list of lists would take ten times the memory
+    for number, line in enumerate(StringIO(read_text(path, TABLE_LIMIT)), 1):
         values = line.split()
         if not values or values[0].startswith("#"):
             continue
@@ -255,11 +260,10 @@ def read_table(path: Path, columns: int, names: str = "") -> NDArray[np.float64]
             expected = f" ({names})" if names else ""
             raise UserError(f"{path}: line {number} has {len(values)} numbers, not {columns}{expected}")
         try:
-            row = [float(value) for value in values[:columns]]
+            numbers.extend([float(value) for value in values[:columns]])
         except ValueError:
             raise UserError(f"{path}: line {number} has something that is no number") from None
-        rows.append(row)
-    return np.array(rows, np.float64).reshape(-1, columns)
+    return np.array(numbers, np.float64).reshape(-1, columns)
 
 
 def frames_at(rate: float, numbers: Sequence[int]) -> I64:

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import csv
+import os
 import re
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from functools import partial
+from io import StringIO
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bevviz import geometry
+from bevviz.config.files import yaml_value
 from bevviz.datasets.columns import are_whole
 from bevviz.datasets.dataset import (
     CLOUDS,
@@ -28,14 +31,13 @@ from bevviz.datasets.dataset import (
     pictures,
     read_points,
     read_table,
-    read_text,
 )
 from bevviz.datasets.pcd import read_pcd
 from bevviz.datasets.ply import read_ply
 from bevviz.datasets.stamps import sensors_of, stamps_in, told_by
 from bevviz.datasets.unread import unread
 from bevviz.errors import UserError, first_line
-from bevviz.files import LFS_HINT
+from bevviz.files import CONFIG_LIMIT, LFS_HINT, SENSOR_LIMIT, TABLE_LIMIT, open_regular, read_head, read_text
 from bevviz.frame import F64, I64, Intrinsics
 from bevviz.ros.encode import (
     POINT_FIELD,
@@ -59,11 +61,13 @@ KEYS = {"rate", "fields", "lidars", "cameras"}
 LENS = {"D", "distortion_model"}
 SENSOR_KEYS = {"pose", "rate", "fields", "K", "size", *LENS}
 STAMP = r"\d{1,19}(\.\d*)?"
+MOST_PIXELS = 1 << 31  # of a side of an image, far more than there are
 SECONDS, NANOSECONDS = re.compile(r"\d{1,6}|\d{10}"), re.compile(r"\d{1,9}")
 MOST_SECONDS = 1e10  # of a stamp: more is another unit
 UNIT = 0.01  # how far the length of a quaternion may be from one
 FAR = 100  # metres between sensors of a vehicle
 FEW = 5  # frames, which tell no rate
+SLOWEST = 1e-6  # frames a second
 MUCH_FURTHER = 1.5  # times as many frames, which another rate gives
 
 
@@ -158,16 +162,10 @@ class Folder(Dataset):
 
     def _calibration(self) -> Mapping[str, Any]:
         """What ``calibration.yaml`` says; empty where there is none."""
-        from ruamel.yaml import YAML
-        from ruamel.yaml.error import YAMLError
-
         file = self.path / CALIBRATION
         if not file.is_file():
             return {}
-        try:
-            about = YAML(typ="safe", pure=True).load(read_text(file)) or {}
-        except YAMLError as error:
-            raise UserError(f"{file}: is not valid YAML: {first_line(error)}") from None
+        about = yaml_value(read_text(file, CONFIG_LIMIT), str(file)) or {}
         if not isinstance(about, dict) or not all(
             isinstance(about.get(k, {}), dict) for k in ("lidars", "cameras")
         ):
@@ -234,7 +232,8 @@ class Folder(Dataset):
             matrix = np.array(stated["K"], np.float64).reshape(3, 3)
             distortion = np.array(stated.get("D", ()), np.float64).reshape(-1)
             width, height = map(int, stated.get("size", (0, 0)))
-            if not np.array_equal(matrix[2], (0, 0, 1)):
+            sides = (0 <= side < MOST_PIXELS for side in (width, height))
+            if not np.array_equal(matrix[2], (0, 0, 1)) or not all(sides):
                 raise ValueError
         except (TypeError, ValueError):
             raise UserError(
@@ -322,7 +321,7 @@ class Folder(Dataset):
     def _listed(self, table: Path, sensors: Sequence[Sequence[Path]]) -> dict[Path, int]:
         """By ``stamps.csv``."""
         found = dict[Path, str]()
-        for number, row in enumerate(csv.reader(read_text(table).splitlines()), 1):
+        for number, row in enumerate(_csv_rows(table), 1):
             if len(row) < 2 or (number == 1 and not re.search(r"\d", row[1])):
                 continue
             name, stamp, *more = map(str.strip, row)
@@ -357,15 +356,26 @@ class Folder(Dataset):
         return [Stream("/tf", "tf2_msgs/msg/TFMessage", times, make)]
 
 
+def _csv_rows(table: Path) -> Iterator[list[str]]:
+    try:
+        yield from csv.reader(StringIO(read_text(table, TABLE_LIMIT)))
+    except csv.Error as error:
+        raise UserError(f"{table}: is no CSV: {error}") from None
+
+
 def _stated(about: Mapping[str, Any]) -> list[Any]:
     """What the calibration says of each sensor."""
     return [sensor for kind in ("lidars", "cameras") for sensor in about.get(kind, {}).values()]
 
 
 def _rate(*stated: Mapping[str, Any]) -> float:
-    """Frames a second, as the last of them states it. Raises UserError: it is no number above 0."""
+    """Frames a second, as the last of them states it.
+
+    Raises:
+        UserError: it is no number, or one that no sensor has.
+    """
     rate = next((about["rate"] for about in reversed(stated) if "rate" in about), 10.0)
-    if not isinstance(rate, int | float) or not 0 < rate < float("inf"):
+    if not isinstance(rate, int | float) or not SLOWEST <= rate <= 1 / SLOWEST:
         raise UserError(f"{CALIBRATION}: rate is {rate}, not frames a second")
     return float(rate)
 
@@ -422,18 +432,33 @@ def _clouds(name: str, times: I64, files: Sequence[Path], fields: Sequence[str])
 def shape_of(file: Path) -> tuple[int, ...]:
     """Of the array in an NPY file; empty where it has named columns, or cannot be read."""
     try:
-        there = np.load(file, mmap_mode="r", allow_pickle=False)
+        there = _load_array(file)
     except (OSError, ValueError, EOFError):
         return ()
     return () if there.dtype.names else there.shape
+
+
+def _load_array(file: Path) -> NDArray[Any]:
+    """Map an NPY file into memory: one that announces more numbers than it has is refused.
+
+    Raises:
+        OSError: it cannot be read.
+        ValueError: it is no NPY file, is cut, or is larger than ``SENSOR_LIMIT``.
+    """
+    with open_regular(file) as opened:
+        if os.fstat(opened.fileno()).st_size > SENSOR_LIMIT:
+            raise ValueError(f"it has more than {SENSOR_LIMIT:,} bytes, which are read at most")
+    loaded = np.load(file, mmap_mode="r", allow_pickle=False)
+    if not isinstance(loaded, np.ndarray):
+        raise ValueError("is an archive of arrays (NPZ), no NPY file")
+    return loaded
 
 
 def no_points(file: Path) -> str:
     """Why what looks like a cloud by its suffix is none, such as labels and matrices; "": nothing says so."""
     suffix = file.suffix.lower()
     if suffix == ".bin":
-        with file.open("rb") as there:
-            return "whole numbers, no points of float32" if are_whole(there.read(LOOKED_AT)) else ""
+        return "whole numbers, no points of float32" if are_whole(read_head(file, LOOKED_AT)) else ""
     shape = shape_of(file) if suffix == ".npy" else ()
     if shape and (len(shape) != 2 or (shape[0] in (3, 4) and shape[1] in (3, 4))):
         return f"of the shape {shape}, no points"
@@ -457,7 +482,7 @@ def read_cloud(file: Path, fields: Sequence[str]) -> tuple[NDArray[np.void], int
         if is_pointer(file):
             raise UserError(f"{file}: {LFS_HINT}")
         if suffix == ".npy":
-            loaded = np.load(file, allow_pickle=False)
+            loaded = _load_array(file)
             if loaded.dtype.names:
                 return _encodable(loaded.reshape(-1)), 0
             if loaded.ndim != 2 or not 3 <= loaded.shape[1] <= MOST_COLUMNS:

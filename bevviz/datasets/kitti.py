@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 
 from bevviz import geometry
-from bevviz.datasets.dataset import Stream, files_in, read_points, read_text
+from bevviz.datasets.dataset import Stream, files_in, read_points
 from bevviz.errors import UserError
+from bevviz.files import read_text
 from bevviz.frame import F64, I64, Boxes3D, ImageLabels, Intrinsics, LabelledBoxes3D
 from bevviz.ros.encode import (
     encode_intrinsics,

@@ -11,7 +11,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from bevviz import geometry
-from bevviz.datasets.dataset import IMAGES, Dataset, Stream, files_in, pictures, read_table, read_text
+from bevviz.datasets.dataset import IMAGES, Dataset, Stream, files_in, pictures, read_table
 from bevviz.datasets.kitti import (
     IMU,
     LIDAR,
@@ -26,6 +26,7 @@ from bevviz.datasets.kitti import (
 )
 from bevviz.datasets.names import KITTI
 from bevviz.errors import UserError
+from bevviz.files import read_text
 from bevviz.frame import F64, I64, Boxes3D, LabelledBoxes3D
 
 CAMERAS = {

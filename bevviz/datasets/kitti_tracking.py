@@ -15,7 +15,6 @@ from bevviz.datasets.dataset import (
     frames_at,
     pictures,
     read_table,
-    read_text,
 )
 from bevviz.datasets.kitti import (
     IMU,
@@ -30,6 +29,7 @@ from bevviz.datasets.kitti import (
     truth,
 )
 from bevviz.errors import UserError
+from bevviz.files import read_text
 
 RATE = 10.0  # Hz; the benchmark has no stamps
 CAMERAS = {"image_02": "", "image_03": "the right eye of a stereo pair"}

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+import os
 from collections import defaultdict
 from collections.abc import Collection, Iterator, Mapping, Sequence
+from io import TextIOWrapper
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +17,8 @@ from bevviz import announce, geometry
 from bevviz.datasets.dataset import Dataset, Stream, pictures
 from bevviz.datasets.folder import read_cloud
 from bevviz.datasets.names import CATEGORIES, NOT_DETECTED
-from bevviz.errors import UserError
+from bevviz.errors import UserError, first_line
+from bevviz.files import open_regular
 from bevviz.frame import F64, I64, Boxes3D, Intrinsics
 from bevviz.ros.encode import (
     encode_intrinsics,
@@ -28,6 +31,8 @@ MAP, BASE = "map", "base_link"
 TABLES = "sample_data.json"
 FIELDS = ("x", "y", "z", "intensity", "ring")
 PIECE = 1 << 22  # characters of a table that are read at once: the largest has a gigabyte
+MOST_OF_ROW = 1 << 24  # characters: a row has a thousand as a rule
+MOST_BYTES = 1 << 33  # of a table
 Record = Mapping[str, Any]
 
 
@@ -73,7 +78,7 @@ class NuScenes(Dataset):
             sensor = sensors[mounted[row["calibrated_sensor_token"]]["sensor_token"]]
             if sensor["modality"] == "radar":
                 continue
-            if (root / row["filename"]).is_file():
+            if _within(root, row["filename"]).is_file():
                 taken[sensor["channel"]].append(row)
             else:
                 lost.append(row["filename"])
@@ -91,7 +96,7 @@ class NuScenes(Dataset):
             calibration = mounted[rows[0]["calibrated_sensor_token"]]
             pose = _pose(calibration)
             times = 1000 * np.array([row["timestamp"] for row in rows], np.int64)
-            files = [root / row["filename"] for row in rows]
+            files = [_within(root, row["filename"]) for row in rows]
             if sensors[calibration["sensor_token"]]["modality"] == "lidar":
                 turns = round(geometry.yaw(pose) / (np.pi / 2))
                 pose = pose @ _quarter_turns(-turns)
@@ -139,7 +144,7 @@ class NuScenes(Dataset):
                 scene = scene_of.get(row["sample_token"], "")
                 if scene in found or not row["is_key_frame"]:
                     continue
-                if row["calibrated_sensor_token"] in mounted and (root / row["filename"]).is_file():
+                if row["calibrated_sensor_token"] in mounted and _within(root, row["filename"]).is_file():
                     found.add(scene)
         if not found:
             raise UserError(f"{root}: no LiDAR scan that the tables name is there; expected {self.expects}")
@@ -246,6 +251,21 @@ def _turned(points: NDArray[np.void], turns: int) -> NDArray[np.void]:
 # --- tables ------------------------------------------------------------------------------------
 
 
+def _within(root: Path, name: str) -> Path:
+    """Return the file that a table names, which must be in the data set.
+
+    Only the name counts: ``..`` and an absolute name may not lead out of the folder. Links that lie in the
+    folder are followed, as many have their ``sweeps`` on another disk.
+
+    Raises:
+        UserError: the name leads out of the folder.
+    """
+    place = os.path.relpath(root / name, root)
+    if place == os.pardir or place.startswith(f"{os.pardir}{os.sep}"):
+        raise UserError(f"{root}: {TABLES} names the file {name}, which is not in the data set")
+    return root / place
+
+
 def _versions(path: Path) -> list[Path]:
     """The folders of tables in it."""
     return sorted(f.parent for name in ("v*", "annotation") for f in path.glob(f"{name}/{TABLES}"))
@@ -259,7 +279,9 @@ def records(table: Path) -> Iterator[dict[str, Any]]:
     """
     decoder, buffer, at = json.JSONDecoder(), "", 0
     try:
-        with table.open(encoding="utf-8") as file:
+        with TextIOWrapper(open_regular(table), encoding="utf-8") as file:
+            if os.fstat(file.fileno()).st_size > MOST_BYTES:
+                raise UserError(f"{table}: has more than {MOST_BYTES:,} bytes, which are read at most")
             while True:
                 while at < len(buffer) and buffer[at] in "[, \t\r\n":
                     at += 1
@@ -271,13 +293,15 @@ def records(table: Path) -> Iterator[dict[str, Any]]:
                     continue
                 except json.JSONDecodeError:
                     more = file.read(PIECE)
-                if not more:
+                if not more or len(buffer) - at > MOST_OF_ROW:
                     raise UserError(f"{table}: is cut, or no table of nuScenes")
                 buffer, at = buffer[at:] + more, 0
     except OSError as error:
         raise UserError(f"{table}: cannot be read: {error.strerror}") from None
     except UnicodeDecodeError:
         raise UserError(f"{table}: is no text") from None
+    except (ValueError, RecursionError) as error:  # a number of thousands of digits, a deep row
+        raise UserError(f"{table}: is no table of nuScenes: {first_line(error)}") from None
 
 
 def _by_token(tables: Path, name: str, chosen: Any) -> dict[str, Record]:

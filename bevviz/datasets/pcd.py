@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bevviz.errors import first_line
+from bevviz.files import SENSOR_LIMIT, read_bytes
 from bevviz.ros.clouds import MOST_POINTS
 
 MOST_LINES = 50  # of a header
@@ -26,7 +27,7 @@ def read_pcd(file: Path) -> tuple[NDArray[np.void], int]:
         OSError: it cannot be read.
         ValueError: it is no PCD, or its points are damaged.
     """
-    data = file.read_bytes()
+    data = read_bytes(file, SENSOR_LIMIT)
     try:
         about, body = _header(data)
         layout = about.build_dtype()
@@ -83,7 +84,9 @@ def _points(about: Any, layout: np.dtype[np.void], body: bytes) -> NDArray[np.vo
     if about.data == "ascii":
         if not body.endswith(b"\n") and len(body.splitlines()) < about.points:
             body = body[: body.rfind(b"\n") + 1]  # the last line is cut
-        return np.loadtxt(BytesIO(body), layout, ndmin=1) if body.strip() else np.zeros(0, layout)
+        if not body.strip():
+            return np.zeros(0, layout)
+        return np.loadtxt(BytesIO(body), layout, ndmin=1, max_rows=MOST_POINTS)
     if struct.unpack("<I", body[4:8])[0] > MOST_BYTES:
         raise ValueError(f"unpacks to more than {MOST_BYTES} bytes")
     whole: Any = BytesIO(about.compose_header().encode() + body)

@@ -6,11 +6,13 @@ The format is Turk's (The PLY Polygon File Format, 1994). The library plyfile is
 from __future__ import annotations
 
 from io import BytesIO
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from bevviz.files import SENSOR_LIMIT, read_bytes
 from bevviz.ros.clouds import MOST_POINTS
 
 MOST_HEADER = 1 << 16  # bytes
@@ -29,7 +31,7 @@ def read_ply(file: Path) -> tuple[NDArray[np.void], int]:
         OSError: it cannot be read.
         ValueError: it is no PLY, has no x, y, z, or lists where points have to be found.
     """
-    data = file.read_bytes()
+    data = read_bytes(file, SENSOR_LIMIT)
     order, elements, at = _header(data)
     before = 0
     for name, count, properties in elements:
@@ -49,7 +51,7 @@ def read_ply(file: Path) -> tuple[NDArray[np.void], int]:
     if order != "ascii":
         there = max(0, len(data) - at - before) // layout.itemsize
         return np.frombuffer(data, layout, min(count, there), at + before if there else 0), count
-    lines = [line for line in data[at:].splitlines(keepends=True) if line.strip()][before : before + count]
+    lines = [*islice((line for line in BytesIO(data[at:]) if line.strip()), before, before + count)]
     if lines and len(lines[-1].split()) < len(properties):
         lines.pop()  # it is cut
     return np.loadtxt(BytesIO(b"".join(lines)), layout, ndmin=1) if lines else np.zeros(0, layout), count

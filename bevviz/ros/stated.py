@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from bevviz.errors import UserError
+from bevviz.files import read_text
 
 
 def read_calibration(path: Path) -> str:
@@ -13,8 +13,4 @@ def read_calibration(path: Path) -> str:
     Raises:
         UserError: it cannot be read.
     """
-    try:
-        return path.read_text(encoding="utf-8-sig")
-    except (OSError, UnicodeDecodeError) as error:
-        why = getattr(error, "strerror", None) or "it is no text"
-        raise UserError(f"source.lidar_calibration: {path}: cannot be read: {why}") from None
+    return read_text(path, problem=f"source.lidar_calibration: {path}: cannot be read")

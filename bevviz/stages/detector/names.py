@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from bevviz.config.methods import CLASS_LISTS
-from bevviz.errors import UserError, first_line
+from bevviz.errors import UserError
+from bevviz.files import CONFIG_LIMIT, read_text
 
 COCO = (
     "person", "bicycle", "car", "motorcycle", "airplane", "bus", "train", "truck", "boat", "traffic light",
@@ -55,10 +56,8 @@ def read_names(value: str) -> tuple[str, ...]:
     """
     if value in GIVEN:
         return GIVEN[value]
-    try:
-        names = tuple(line.strip() for line in Path(value).read_text().splitlines() if line.strip())
-    except (OSError, UnicodeDecodeError) as error:
-        raise UserError(f"detector.names {value}: cannot be read: {first_line(error)}") from None
+    text = read_text(Path(value), CONFIG_LIMIT, problem=f"detector.names {value}: cannot be read")
+    names = tuple(line.strip() for line in text.splitlines() if line.strip())
     if not names:
         raise UserError(f"detector.names {value}: holds no class name; expected one a line")
     return names
