@@ -16,6 +16,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
+from io import TextIOWrapper
 from pathlib import Path
 from typing import BinaryIO
 
@@ -29,6 +30,7 @@ LFS_HINT = "a Git LFS pointer, not the file itself: 'git lfs pull' fetches it"
 CONFIG_LIMIT = 1 << 20  # a configuration, a project file, a list of names: a few kilobytes as a rule
 TEXT_LIMIT = 1 << 24  # a calibration, the labels or the stamps of a drive: a megabyte at most as a rule
 TABLE_LIMIT = 1 << 27  # a table with a line for each pose: an hour at 200 Hz is 115 MB
+LINE_LIMIT = 1 << 16  # characters of a line of a table
 SENSOR_LIMIT = 1 << 30  # a scan or an image: 100 million points without colour
 YOUNG = 60.0  # seconds that a temporary folder may be without its lock: it is being made
 
@@ -326,7 +328,7 @@ def read_bytes(path: Path, limit: int, *, problem: str = "", pipe: bool = False)
 def read_head(path: Path, count: int) -> bytes:
     """Read the first bytes of a regular file. Raises OSError: as ``open_regular``."""
     with open_regular(path) as file:
-        return file.read(count)
+        return file.read(count) or b""  # None: a file of the system that would wait
 
 
 def read_text(path: Path, limit: int = TEXT_LIMIT, *, problem: str = "", pipe: bool = False) -> str:
@@ -342,6 +344,29 @@ def read_text(path: Path, limit: int = TEXT_LIMIT, *, problem: str = "", pipe: b
         return data.decode("utf-8-sig").replace("\r\n", "\n").replace("\r", "\n")
     except UnicodeDecodeError as error:
         problem = problem or f"{path}: cannot be read"
+        raise UserError(f"{problem}: it is no UTF-8 text: {error.reason} at byte {error.start}") from None
+
+
+def read_lines(path: Path, limit: int) -> Iterator[str]:
+    """Read a long UTF-8 text line by line, so that little of it is in memory.
+
+    Raises:
+        UserError: as of ``read_text``, or a line has more than ``LINE_LIMIT`` characters.
+    """
+    problem = f"{path}: cannot be read"
+    try:
+        with TextIOWrapper(open_regular(path), encoding="utf-8-sig") as file:
+            if os.fstat(file.fileno()).st_size > limit:
+                raise UserError(f"{problem}: it has more than {limit:,} bytes, which are read at most")
+            number = 0
+            while line := file.readline(LINE_LIMIT + 1):
+                number += 1
+                if len(line) > LINE_LIMIT:
+                    raise UserError(f"{path}: line {number} has more than {LINE_LIMIT:,} characters")
+                yield line
+    except OSError as error:
+        raise UserError(f"{problem}: {error.strerror or error}") from None
+    except UnicodeDecodeError as error:
         raise UserError(f"{problem}: it is no UTF-8 text: {error.reason} at byte {error.start}") from None
 
 

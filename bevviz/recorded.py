@@ -15,7 +15,7 @@ import rerun as rr
 
 from bevviz.config import STAGES, Config, Preset, flat_yaml, load, object_files, values
 from bevviz.errors import UserError, first_line
-from bevviz.files import bag_files, sampled_files
+from bevviz.files import bag_files, open_regular, sampled_files
 from bevviz.frame import Scene
 from bevviz.logging import entities
 from bevviz.logging.reading import check_decodes
@@ -112,12 +112,12 @@ def fingerprint(path: Path) -> tuple[int, str]:
         count, files = sampled_files(path)
         mark.update(count.to_bytes(8, "little"))
     for file in files:
-        with file.open("rb") as content:
+        with open_regular(file) as content:
             size = os.fstat(content.fileno()).st_size
             mark.update(size.to_bytes(8, "little"))
             for start in sorted({0, max(size // 2 - BLOCK // 2, 0), max(size - BLOCK, 0)}):
                 content.seek(start)
-                mark.update(content.read(BLOCK))
+                mark.update(content.read(BLOCK) or b"")  # None: a file of the system that would wait
         total += size
     return total, mark.hexdigest()
 

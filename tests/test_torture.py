@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.torture import damage, fuzz, kill
+from benchmarks.torture import damage, folders, fuzz, kill
 from benchmarks.torture.__main__ import SHARE
 from benchmarks.torture.damage import DAMAGES, Tally, judged
 from benchmarks.torture.judges import judges, taken
@@ -98,8 +98,25 @@ def test_the_command_says_which_parts_there_are(capsys: pytest.CaptureFixture[st
     from benchmarks.torture.__main__ import PARTS, damaged_bags
 
     options = argparse.Namespace(seed=2, bags=10, format="ros1, bz2", messages=1, signals=1)
-    assert set(PARTS) == {"damage", "fuzz", "kill"}
+    assert set(PARTS) == {"damage", "fuzz", "kill", "folders"}
     assert damaged_bags(options)
     lines = capsys.readouterr().out.splitlines()
     assert "Damaged bags, seed 2" in lines
     assert any(line.startswith("| all | 10 | 1610 |") for line in lines)
+
+
+def test_strange_folders_end_well_or_in_one_line() -> None:
+    total = folders.Tally()
+    for _, tally in folders.run(seed=1, cases=14):
+        total += tally
+    assert total.cases == 28
+    assert total.read > 10 and total.refused > 10
+    assert total.well, total.examples
+
+
+def test_what_counts_as_a_failure_of_a_command() -> None:
+    assert folders._wrong(0, "bevviz: warning: a scan is cut") == ""
+    assert folders._wrong(2, "bevviz: error: no such file") == ""
+    assert folders._wrong(3, "bevviz: error of bevviz itself: KeyError")
+    assert folders._wrong(2, "no line of an error")
+    assert folders._wrong(0, "Traceback (most recent call last):")

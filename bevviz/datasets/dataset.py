@@ -8,7 +8,6 @@ import struct
 from array import array
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from io import StringIO
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -17,7 +16,7 @@ from numpy.typing import NDArray
 
 from bevviz.datasets.columns import are_doubles, are_whole, count_columns
 from bevviz.errors import UserError, first_line
-from bevviz.files import LFS_HINT, LFS_POINTER, SENSOR_LIMIT, TABLE_LIMIT, read_head, read_text
+from bevviz.files import LFS_HINT, LFS_POINTER, SENSOR_LIMIT, TABLE_LIMIT, read_head, read_lines
 from bevviz.files import read_bytes as read_limited
 from bevviz.frame import F32, I64
 from bevviz.ros.encode import encode_compressed_image
@@ -252,7 +251,7 @@ def read_table(path: Path, columns: int, names: str = "") -> NDArray[np.float64]
         UserError: it cannot be read, or a line has something else.
     """
     numbers = array("d")  # a list of lists would take ten times the memory
-    for number, line in enumerate(StringIO(read_text(path, TABLE_LIMIT)), 1):
+    for number, line in enumerate(read_lines(path, TABLE_LIMIT), 1):
         values = line.split()
         if not values or values[0].startswith("#"):
             continue

@@ -7,7 +7,6 @@ import os
 import re
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from functools import partial
-from io import StringIO
 from pathlib import Path
 from typing import Any
 
@@ -37,7 +36,16 @@ from bevviz.datasets.ply import read_ply
 from bevviz.datasets.stamps import sensors_of, stamps_in, told_by
 from bevviz.datasets.unread import unread
 from bevviz.errors import UserError, first_line
-from bevviz.files import CONFIG_LIMIT, LFS_HINT, SENSOR_LIMIT, TABLE_LIMIT, open_regular, read_head, read_text
+from bevviz.files import (
+    CONFIG_LIMIT,
+    LFS_HINT,
+    SENSOR_LIMIT,
+    TABLE_LIMIT,
+    open_regular,
+    read_head,
+    read_lines,
+    read_text,
+)
 from bevviz.frame import F64, I64, Intrinsics
 from bevviz.ros.encode import (
     POINT_FIELD,
@@ -358,7 +366,7 @@ class Folder(Dataset):
 
 def _csv_rows(table: Path) -> Iterator[list[str]]:
     try:
-        yield from csv.reader(StringIO(read_text(table, TABLE_LIMIT)))
+        yield from csv.reader(read_lines(table, TABLE_LIMIT))
     except csv.Error as error:
         raise UserError(f"{table}: is no CSV: {error}") from None
 

@@ -140,7 +140,7 @@ class Calibration:
 
     def _matrix(self, rows: int, columns: int, *names: str) -> F64:
         values = next((self._rows[name] for name in names if name in self._rows), None)
-        if values is None or len(values) != rows * columns:
+        if values is None or len(values) != rows * columns or not np.isfinite(values).all():
             raise UserError(
                 f"{self.file}: no {' or '.join(names)} of {rows} x {columns} numbers, as KITTI writes it"
             )
