@@ -386,7 +386,7 @@ def project(root: Path, rng: random.Random) -> str:
         lines[at] = f"{key}{separator} {value}"
         file.write_text("\n".join(lines) + "\n")
         return f"{key}{separator} {value[:40]} in {file.name}"
-    change = rng.choice([change for change in CHANGES if change is not bomb])
+    change = rng.choice([change for change in CHANGES if change not in (bomb, renamed)])
     change(file, rng)
     return f"{change.__name__} {file.name}"
 
