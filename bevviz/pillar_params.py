@@ -17,6 +17,7 @@ from pydantic import (
 from pydantic_core import PydanticCustomError
 
 SUFFIX = ".onnx"
+MAX_POINTS = 1000  # of a pillar; known networks have up to 100
 
 Feature = Literal[
     "x",
@@ -70,7 +71,7 @@ class PillarParams(BaseModel):
     max_points: int | None = Field(
         None,
         ge=1,
-        le=1000,
+        le=MAX_POINTS,
         description="points of a pillar, later ones are left out; empty: as the file says",
     )
     max_pillars: int = Field(

@@ -51,8 +51,7 @@ def test_a_missing_library_is_told_once_and_the_processor_takes_over(
     said: list[str] = []
     monkeypatch.setattr(announce, "_say", said.append)
     for _ in range(2):
-        _, used = providers.open_session(DEMO_MODEL, "auto", ort.SessionOptions())
-        assert used == "CPU"
+        assert providers.open_session(DEMO_MODEL, "auto", ort.SessionOptions()).provider == "CPU"
     assert said == [
         "the network runs on CPU: CUDA is installed, but libcublasLt.so.13 is missing "
         "(pip install 'onnxruntime-gpu[cuda,cudnn]', and NVIDIA's driver)"
@@ -78,7 +77,7 @@ def test_a_gpu_that_does_not_start(gpu_package: Path, monkeypatch: pytest.Monkey
         return real(path, options, chosen, **more)
 
     monkeypatch.setattr(ort, "InferenceSession", session)
-    assert providers.open_session(DEMO_MODEL, "auto", ort.SessionOptions())[1] == "CPU"
+    assert providers.open_session(DEMO_MODEL, "auto", ort.SessionOptions()).provider == "CPU"
     (line,) = said
     assert "CUDA failure 35" in line
     assert "cuda_call" not in line

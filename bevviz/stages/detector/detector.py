@@ -12,18 +12,20 @@ import numpy as np
 import onnxruntime as ort
 
 from bevviz.config import DetectorConfig
-from bevviz.errors import UserError, first_line
+from bevviz.errors import UserError
 from bevviz.frame import I32, U8
 from bevviz.results import Detections, DetectionState
 from bevviz.stages.detector.image import Placement
 from bevviz.stages.detector.layouts import Facts, find_head
 from bevviz.stages.detector.masks import masks as make_masks
-from bevviz.stages.detector.names import literal, metadata_names, read_names
+from bevviz.stages.detector.metadata import DEFAULT_STRIDE, stated_size, stated_stride
+from bevviz.stages.detector.names import metadata_names, read_names
 from bevviz.stages.detector.providers import open_session
+from bevviz.stages.detector.session import NetworkSession, listed, reading
 from bevviz.stages.detector.suppression import nms
 
 DEMO_MODEL = Path(__file__).parents[2] / "data" / "demo_detector.onnx"
-DEFAULT_SIZE = 640  # of models that leave their input size open, as most families are trained
+MIN_SIDE, MAX_SIDE = 8, 4096  # pixels of the input: one cell of a grid, and the widest cameras of vehicles
 MAX_CANDIDATES = 30_000  # that enter the NMS, best first, as Ultralytics bounds what a nonsense model costs
 
 # From the fastest down. DirectML and others that are not named here are used when asked for.
@@ -64,24 +66,28 @@ class Detector:
         self._config = config
         path = DEMO_MODEL if config.model == "demo" else Path(config.model)
         self._where = f"detector.model {path}"
-        self._session, self.provider = _open(path, config)
-        metadata = self._session.get_modelmeta().custom_metadata_map
-        image, *others = self._session.get_inputs()
+        self._session = _open(path, config)
+        self.provider = self._session.provider
+        metadata = self._session.metadata
+        image, *others = self._session.inputs
         self._input, self._rank = image.name, len(image.shape)
         self._check_inputs(image, others)
         self._dtype = TYPES[image.type]
         self._sized = others[0].name if others else None  # an input for the size of the image
 
-        self._stride = int(literal(metadata.get("stride"), int) or 32)
-        size = literal(metadata.get("imgsz"), list) or []
-        size = size if len(size) == 2 else [DEFAULT_SIZE, DEFAULT_SIZE]
         height, width = image.shape[-2:]
         self._is_open = not isinstance(height, int), not isinstance(width, int)
+        try:
+            self._stride = stated_stride(metadata) if any(self._is_open) else DEFAULT_STRIDE
+            size = stated_size(metadata) if any(self._is_open) else (height, width)
+            names = read_names(config.names) if config.names else metadata_names(metadata)
+        except ValueError as error:
+            raise UserError(f"{self._where}: {error}") from None
         self.input_size: tuple[int, int] = (
-            int(size[0]) if self._is_open[0] else height,
-            int(size[1]) if self._is_open[1] else width,
+            size[0] if self._is_open[0] else height,
+            size[1] if self._is_open[1] else width,
         )
-        names = read_names(config.names) if config.names else metadata_names(metadata)
+        self._check_size()
         facts = Facts(
             metadata=metadata,
             inputs=tuple(i.name for i in (image, *others)),
@@ -91,10 +97,8 @@ class Detector:
             names=names,
             outputs=self._probe(),
         )
-        try:
+        with reading(self._where):
             self._head = find_head(facts)
-        except ValueError as error:
-            raise UserError(f"{self._where}: {error}") from None
         self.names, self.layout = self._head.names, self._head.layout
         self._wanted = self._wanted_classes()
         self.description = (
@@ -136,7 +140,7 @@ class Detector:
     def infer(self, bgr: U8) -> Inference:
         """Run the network alone, on an image that is not empty."""
         blob, where = self.prepare(bgr)
-        return Inference(tuple(self._run(self._head.wanted, blob)), where)
+        return Inference(tuple(self._run(self._head.wanted, blob).values()), where)
 
     def interpret(self, found: Inference) -> Detections:
         """What the thresholds make of the network's output; ``__call__`` says what.
@@ -145,12 +149,10 @@ class Detector:
             UserError: as ``__call__``.
         """
         config, where = self._config, found.where
-        try:
+        with reading(self._where):
             xyxy, score, class_id, table_row = self._head.candidates(
                 found.outputs, where.input_size, config.explain_threshold
             )
-        except ValueError as error:
-            raise UserError(f"{self._where}: {error}") from None
         sound = np.isfinite(xyxy).all(axis=1)
         if self._wanted is not None:
             sound &= np.isin(class_id, self._wanted)
@@ -177,8 +179,10 @@ class Detector:
         masks = None
         if self._head.prototypes:
             kept = np.flatnonzero(state[row] == DetectionState.KEPT)
-            weights = self._head.coefficients(found.outputs, table_row[order[row[kept]]])
-            masks = make_masks(weights, found.outputs[-1][0], inner[row[kept]], kept, len(row), where)
+            weighed = table_row[order[row[kept]]]
+            with reading(self._where):
+                weights = self._head.coefficients(found.outputs, weighed)
+                masks = make_masks(weights, found.outputs[-1][0], inner[row[kept]], kept, len(row), where)
         return Detections(
             xyxy=xyxy[row] - np.float32(0.5),  # networks count from the corner of the first pixel
             score=score[row],
@@ -192,7 +196,7 @@ class Detector:
 
     def _check_inputs(self, image: Any, others: list[Any]) -> None:
         shape = image.shape
-        found = ", ".join(f"{i.name} {i.shape}" for i in (image, *others))
+        found = listed((i.name, i.shape) for i in (image, *others))
         batch = shape[0] if self._rank == 4 and isinstance(shape[0], int) else 1
         sizes = [i.type == "tensor(int64)" and len(i.shape) == 2 and i.shape[1] == 2 for i in others]
         if self._rank not in (3, 4) or shape[-3] != 3 or len(sizes) > 1 or not all(sizes):
@@ -206,12 +210,19 @@ class Detector:
         if image.type not in TYPES:
             raise UserError(f"{self._where}: its input is {image.type}; supported: {', '.join(TYPES)}")
 
-    def _run(self, outputs: list[str] | None, blob: Any) -> list[Any]:
+    def _check_size(self) -> None:
+        height, width = self.input_size
+        if any(not MIN_SIDE <= side <= MAX_SIDE for side in self.input_size):
+            raise UserError(
+                f"{self._where}: takes images of {width} x {height} pixels, and {MIN_SIDE} to {MAX_SIDE} "
+                "a side are possible; export it with another size"
+            )
+
+    def _run(self, outputs: list[str] | None, blob: Any) -> dict[str, Any]:
         given = {self._input: blob if self._rank == 4 else blob[0]}
         if self._sized is not None:
             given[self._sized] = np.array([blob.shape[:1:-1]], np.int64)  # boxes come in pixels of the input
-        found: list[Any] = self._session.run(outputs, given)
-        return found
+        return self._session.run(given, outputs)
 
     def _probe(self) -> dict[str, Any]:
         """What the network returns for grey patches: it can tell its layout, and shows nothing.
@@ -223,13 +234,7 @@ class Detector:
         grey = patch.repeat(32, axis=2).repeat(32, axis=3)[:, :, :height, :width]
         whole = self._dtype is np.uint8
         blob = (grey * 255 if whole else grey).astype(self._dtype)
-        try:
-            found = self._run(None, blob)
-        except Exception as error:  # onnxruntime's errors have no common base class
-            raise UserError(
-                f"{self._where}: fails on an input of {list(blob.shape)}: {first_line(error)}"
-            ) from None
-        return {o.name: output for o, output in zip(self._session.get_outputs(), found, strict=True)}
+        return self._run(None, blob)
 
     def _wanted_classes(self) -> I32 | None:
         for name in self._config.classes:
@@ -255,8 +260,7 @@ def _best(row: Any, state: Any, limit: int) -> Any:
     return np.delete(row, others[room:])
 
 
-def _open(path: Path, config: DetectorConfig) -> tuple[Any, str]:
-    """The session of an ONNX file and the short name of the execution provider it runs on."""
+def _open(path: Path, config: DetectorConfig) -> NetworkSession:
     if not path.is_file():
         raise UserError(f"detector.model {path}: no such file")
     if path.suffix == ".pt":
@@ -265,7 +269,6 @@ def _open(path: Path, config: DetectorConfig) -> tuple[Any, str]:
         )
     options = ort.SessionOptions()
     options.intra_op_num_threads = config.threads
-    options.log_severity_level = 3
     # Threads that spin between runs cost as much processor time as the network, and the LiDAR stages need it.
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
     return open_session(path, config.provider, options)

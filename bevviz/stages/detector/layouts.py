@@ -16,8 +16,9 @@ import numpy as np
 from bevviz.frame import I64
 from bevviz.stages.detector import outputs as read
 from bevviz.stages.detector.image import Feed, Fit, Resampling
-from bevviz.stages.detector.names import COCO, COCO_CATEGORIES, default_names
+from bevviz.stages.detector.names import COCO, COCO_CATEGORIES, MAX_CLASSES, default_names
 from bevviz.stages.detector.outputs import Boxes, Candidates, Listed, Scored
+from bevviz.stages.detector.session import listed
 
 CLASS_OFFSET = 7680.0  # pixels by which Ultralytics moves the boxes of each class in its NMS
 
@@ -365,7 +366,7 @@ def find_head(facts: Facts) -> Head:
         if found is not None:
             reason = found
             break
-    shapes = ", ".join(f"{name} {list(np.shape(output))}" for name, output in facts.outputs.items())
+    shapes = listed((name, np.shape(output)) for name, output in facts.outputs.items())
     raise ValueError(f"{reason}; its outputs: {shapes}; supported: {SUPPORTED}")
 
 
@@ -382,6 +383,11 @@ def _prototypes(layout: Layout, found: Found, facts: Facts) -> str:
 
 
 def _names(layout: Layout, found: Found, facts: Facts) -> tuple[str, ...]:
+    if (found.classes or 0) > MAX_CLASSES:
+        raise ValueError(
+            f"read as {layout}, it scores {found.classes:,} classes, "
+            f"and no more than {MAX_CLASSES:,} are read"
+        )
     names = facts.names or default_names(found.classes)
     if names and layout.background and names[0].strip("_").lower() != "background":
         return ("background", *names)

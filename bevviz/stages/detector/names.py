@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-import ast
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 from bevviz.config.methods import CLASS_LISTS
 from bevviz.errors import UserError
 from bevviz.files import CONFIG_LIMIT, read_text
+from bevviz.stages.detector.metadata import literal
+from bevviz.stages.detector.session import clip
+
+MAX_CLASSES = 100_000  # the largest set of classes, ImageNet-21k, has 21,841
+MAX_NAME = 200  # characters of a class name, which stands in every frame of a recording
 
 COCO = (
     "person", "bicycle", "car", "motorcycle", "airplane", "bus", "train", "truck", "boat", "traffic light",
@@ -31,21 +34,40 @@ COCO_CATEGORIES = tuple(
 GIVEN = dict(zip(CLASS_LISTS, (COCO, COCO_CATEGORIES), strict=True))
 
 
-def literal(text: str | None, kind: type) -> Any:
-    """The Python literal in a metadata value, None where there is none of that kind."""
-    try:
-        value = ast.literal_eval(text or "")
-    except (ValueError, SyntaxError):
-        return None
-    return value if isinstance(value, kind) else None
-
-
 def metadata_names(metadata: Mapping[str, str]) -> tuple[str, ...] | None:
-    """Ultralytics writes ``names`` as a dict of class id -> name, others as a list."""
-    by_id = literal(metadata.get("names"), dict)
-    if by_id:
-        return tuple(str(by_id.get(i, f"class_{i}")) for i in range(max(by_id) + 1))
-    return tuple(map(str, literal(metadata.get("names"), list) or ())) or None
+    """Return the class names in a model's metadata, None where there are none.
+
+    Ultralytics writes ``names`` as a dict of class id -> name, others as a list.
+
+    Raises:
+        ValueError: the names are no names, or too many.
+    """
+    stated = literal(metadata, "names")
+    if isinstance(stated, list):
+        return _sound("its metadata", [str(name) for name in stated]) or None
+    if not isinstance(stated, dict) or not stated:
+        return None
+    wrong = next((key for key in stated if not isinstance(key, int) or not 0 <= key < MAX_CLASSES), None)
+    if wrong is not None:
+        raise ValueError(
+            f"its metadata give a name to class {clip(repr(wrong))}, and classes are numbers from 0 to "
+            f"{MAX_CLASSES - 1}; name them by detector.names"
+        )
+    return _sound("its metadata", [str(stated.get(i, f"class_{i}")) for i in range(max(stated) + 1)])
+
+
+def _sound(where: str, names: Sequence[str]) -> tuple[str, ...]:
+    if len(names) > MAX_CLASSES:
+        raise ValueError(
+            f"{where} hold {len(names):,} class names, and no more than {MAX_CLASSES:,} are read"
+        )
+    long = next((name for name in names if len(name) > MAX_NAME), None)
+    if long is not None:
+        raise ValueError(
+            f"{where} hold a class name of {len(long):,} characters, and no more than {MAX_NAME} are read: "
+            f"{long[:40]}...; name the classes by detector.names"
+        )
+    return tuple(names)
 
 
 def read_names(value: str) -> tuple[str, ...]:
@@ -60,7 +82,10 @@ def read_names(value: str) -> tuple[str, ...]:
     names = tuple(line.strip() for line in text.splitlines() if line.strip())
     if not names:
         raise UserError(f"detector.names {value}: holds no class name; expected one a line")
-    return names
+    try:
+        return _sound("its lines", names)
+    except ValueError as error:
+        raise UserError(f"detector.names {value}: {error}") from None
 
 
 def default_names(count: int | None) -> tuple[str, ...]:

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from bevviz.frame import F32, I32, I64
+from bevviz.stages.detector.names import MAX_CLASSES
 
 SLACK = 0.01  # by which half precision and quantisation may take a score above 1 ...
 NEGATIVE = -1e-3  # ... and below 0
@@ -157,6 +158,8 @@ def wrong_list(score: Any, class_id: Any, names: tuple[str, ...]) -> str:
     """Why these cannot be scores and classes, empty where they can."""
     if score.size and score.max() > 1 + SLACK:
         return f"it has scores up to {score.max():.3g}"
+    if class_id.size and class_id.max() > MAX_CLASSES:
+        return f"it has class {class_id.max():.3g}, and no more than {MAX_CLASSES:,} are read"
     odd = class_id[(class_id != np.rint(class_id)) | (class_id < 0)]
     if odd.size:
         return f"it has classes such as {odd[0]:.3g}"
@@ -171,7 +174,11 @@ def wrong_scores(found: Scored, counted: bool) -> str:
     ``counted``: something tells that there are so many classes.
     """
     tables = [found.scores] if found.objectness is None else [found.scores, found.objectness]
-    low, high = min(t.min() for t in tables), max(t.max() for t in tables)
+    if not all(table.size for table in tables):
+        return "it has no boxes, or no scores"
+    low, high = np.min([t.min() for t in tables]), np.max([t.max() for t in tables])
+    if np.isnan(low):
+        return "some of its scores are no numbers (NaN)"
     if low < NEGATIVE or high > 1 + SLACK:
         return f"it has scores from {low:.3g} to {high:.3g}"
     if found.objectness is None and not counted and np.median(found.scores[:, -1]) > EVERYWHERE:
@@ -183,6 +190,8 @@ def wrong_scores(found: Scored, counted: bool) -> str:
 
 def wrong_boxes(boxes: Any, kind: Boxes, trusted: bool) -> str:
     """Why these cannot be boxes, empty where they can."""
+    if boxes.size and not np.isfinite(boxes).any():
+        return "none of its boxes has numbers that are finite"
     largest = np.abs(boxes).max() if boxes.size else 0.0
     if kind in (Boxes.CENTRE, Boxes.CORNERS) and 0 < largest <= PIXELS:
         return f"its boxes are not in pixels, but numbers up to {largest:.3g}"

@@ -16,6 +16,7 @@ import numpy as np
 
 from bevviz.frame import F32, F64, I64
 from bevviz.pillar_params import PillarParams
+from bevviz.stages.detector.session import listed
 
 MOST_LOG = 10.0  # of a size that is e to the power of this: what is more is no size
 
@@ -63,7 +64,7 @@ def find_head(outputs: Mapping[str, Any], params: PillarParams) -> Head:
     try:
         return _anchors(outputs, params) if params.anchors else _centers(outputs, params)
     except ValueError as error:
-        shapes = ", ".join(f"{name} {list(np.shape(output))}" for name, output in outputs.items())
+        shapes = listed((name, np.shape(output)) for name, output in outputs.items())
         raise ValueError(f"{error}; its outputs: {shapes}") from None
 
 

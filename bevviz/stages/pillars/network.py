@@ -10,10 +10,11 @@ from typing import Any
 import numpy as np
 import onnxruntime as ort
 
-from bevviz.errors import UserError, first_line
+from bevviz.errors import UserError
 from bevviz.frame import F32, Boxes3D
-from bevviz.pillar_params import PillarParams
+from bevviz.pillar_params import MAX_POINTS, PillarParams
 from bevviz.stages.detector.providers import open_session, tell
+from bevviz.stages.detector.session import NetworkSession, clip, listed, reading
 from bevviz.stages.pillars.group import Pillars, group, scatter
 from bevviz.stages.pillars.heads import find_head
 from bevviz.stages.pillars.nms import survivors
@@ -63,12 +64,13 @@ class PillarNetwork:
     def __init__(self, path: Path, params: PillarParams, provider: str, threads: int) -> None:
         self.where, self._path = f"objects.method {path}", path
         self._params = params
-        self._session, self.provider = _open(path, self.where, provider, threads)
+        self._session = _open(path, self.where, provider, threads)
+        self.provider = self._session.provider
         self._encoder = None
         first, at = self._session, self.where
         if params.encoder:
             at = f"objects.encoder {params.encoder}"
-            first = self._encoder = _open(Path(params.encoder), at, provider, threads)[0]
+            first = self._encoder = _open(Path(params.encoder), at, provider, threads)
         self._inputs = _inputs(first, at, alone=bool(params.encoder))
         self._max_points, self._fixed = self._fitting(self._inputs["pillars"], at)
         if self._encoder is not None:
@@ -107,17 +109,7 @@ class PillarNetwork:
             params.features,
             intensity,
         )
-        outputs: dict[str, Any] = {}
-        try:
-            if len(pillars):
-                outputs = self._run(pillars)
-        except Exception as error:  # onnxruntime's errors have no common base class
-            if isinstance(error, UserError):
-                raise
-            raise UserError(
-                f"{self.where}: fails on {len(pillars)} pillars of {self._max_points} points: "
-                f"{first_line(error)}"
-            ) from None
+        outputs = self._run(pillars) if len(pillars) else {}
         return Answer(outputs, pillars.left_out_points, pillars.left_out_pillars)
 
     def _run(self, pillars: Pillars) -> dict[str, Any]:
@@ -132,7 +124,7 @@ class PillarNetwork:
                 value[:, -1], value[:, -2] = pillars.cells.T
             given[wanted.name] = value.astype(NUMBERS[wanted.type], copy=False)
         if self._encoder is None:
-            return _named(self._session, given)
+            return self._session.run(given)
         if self._fixed:
             ((name, value),) = given.items()
             given = {
@@ -140,18 +132,16 @@ class PillarNetwork:
                     [value, np.zeros((self._fixed - len(value), *value.shape[1:]), value.dtype)]
                 )
             }
-        (encoded,) = self._encoder.run(None, given)
-        encoded = encoded.reshape(len(encoded), -1)[: len(pillars)]
+        encoded = next(iter(self._encoder.run(given).values()))
         channels = self._canvas.shape[1]
-        if encoded.shape != (len(pillars), channels):
+        if encoded.ndim < 2 or encoded.size != len(encoded) * channels or len(encoded) < len(pillars):
             raise UserError(
-                f"objects.encoder {self._params.encoder}: answers {encoded.shape[-1]} channels, and "
-                f"{self._path.name} takes {channels}"
+                f"objects.encoder {self._params.encoder}: answers {list(encoded.shape)} to {len(pillars)} "
+                f"pillars, and {self._path.name} takes {channels} channels of each"
             )
+        encoded = encoded.reshape(len(encoded), channels)[: len(pillars)]
         canvas = scatter(encoded, pillars.cells, self._params.grid)
-        return _named(
-            self._session, {self._canvas.name: canvas.astype(NUMBERS[self._canvas.type], copy=False)}
-        )
+        return self._session.run({self._canvas.name: canvas.astype(NUMBERS[self._canvas.type], copy=False)})
 
     def _fitting(self, pillars: Any, at: str) -> tuple[int, int]:
         """Points of a pillar, and how many pillars it takes, 0: any number."""
@@ -163,6 +153,11 @@ class PillarNetwork:
                 f"{len(params.features)}: {', '.join(params.features)}"
             )
         if isinstance(points, int):
+            if points > MAX_POINTS:
+                raise UserError(
+                    f"{at}: input {clip(pillars.name)} has {points:,} points of a pillar, and no more than "
+                    f"{MAX_POINTS:,} are possible; export it with fewer"
+                )
             if params.max_points not in (None, points):
                 raise UserError(
                     f"{at}: input {pillars.name} has {points} points of a pillar, "
@@ -178,9 +173,9 @@ class PillarNetwork:
 
     def _check_canvas(self) -> Any:
         """The input of the second file."""
-        inputs, (nx, ny) = self._session.get_inputs(), self._params.grid
+        inputs, (nx, ny) = self._session.inputs, self._params.grid
         shape = inputs[0].shape
-        given = ", ".join(f"{i.name} {i.shape}" for i in inputs)
+        given = listed((i.name, i.shape) for i in inputs)
         known = len(inputs) == 1 and len(shape) == 4 and isinstance(shape[1], int)
         if not known or inputs[0].type not in FLOATS:
             raise UserError(
@@ -211,10 +206,8 @@ class ObjectNetwork:
     def __init__(self, network: PillarNetwork, params: PillarParams) -> None:
         self.network = network
         self._params = params
-        try:
+        with reading(network.where):
             self._head = find_head(network.probe.outputs, params)
-        except ValueError as error:
-            raise UserError(f"{network.where}: {error}") from None
         self.interpret(network.probe)  # compiles what the first cloud needs, too
 
     @property
@@ -244,10 +237,8 @@ class ObjectNetwork:
             )
         if not answer.outputs:
             return Boxes3D.empty(), np.zeros(0, np.float32), []
-        try:
+        with reading(where):
             found = self._head.candidates(answer.outputs)
-        except ValueError as error:
-            raise UserError(f"{where}: {error}") from None
         sound = np.isfinite(found.boxes).all(axis=1)
         sound &= ((found.boxes[:, 3:6] > 0) & (found.boxes[:, 3:6] < LONGEST)).all(axis=1)
         rows = np.flatnonzero(sound)
@@ -264,20 +255,19 @@ class ObjectNetwork:
         return Boxes3D(rows32[:, :3], rows32[:, 3:6], rows32[:, 6]), found.score[rows][kept], names
 
 
-def _open(path: Path, where: str, provider: str, threads: int) -> tuple[Any, str]:
+def _open(path: Path, where: str, provider: str, threads: int) -> NetworkSession:
     if not path.is_file():
         raise UserError(f"{where}: no such file")
     options = ort.SessionOptions()
     options.intra_op_num_threads = threads
-    options.log_severity_level = 3
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")  # as the detector
     return open_session(path, provider, options, where)
 
 
-def _inputs(session: Any, where: str, *, alone: bool) -> dict[str, Any]:
+def _inputs(session: NetworkSession, where: str, *, alone: bool) -> dict[str, Any]:
     """role -> input, by the number of its axes."""
-    inputs = session.get_inputs()
-    listed = ", ".join(f"{i.name} {i.shape}" for i in inputs)
+    inputs = session.inputs
+    given = listed((i.name, i.shape) for i in inputs)
     found: dict[str, Any] = {}
     for one in inputs:
         shape = one.shape
@@ -293,15 +283,10 @@ def _inputs(session: Any, where: str, *, alone: bool) -> dict[str, Any]:
         wanted = "pillars [N, points, features]"
         if not alone:
             wanted += ", and if need be the number of points in each [N] and its cell [N, 4]"
-        raise UserError(f"{where}: its inputs are {listed}; a network on pillars takes {wanted}")
+        raise UserError(f"{where}: its inputs are {given}; a network on pillars takes {wanted}")
     if not alone and "cells" not in found:
         raise UserError(
-            f"{where}: its inputs are {listed}: without the cell of each pillar it is an encoder; set "
+            f"{where}: its inputs are {given}: without the cell of each pillar it is an encoder; set "
             "objects.method to the file behind it, and objects.encoder to this one"
         )
     return found
-
-
-def _named(session: Any, given: Mapping[str, Any]) -> dict[str, Any]:
-    found = session.run(None, dict(given))
-    return {o.name: output for o, output in zip(session.get_outputs(), found, strict=True)}
