@@ -44,7 +44,8 @@ class Placement:
         """Boxes of the input in pixels of the image, counted from the corner of its first one."""
         scale = np.array([inner / image for inner, image in zip(self.inner, self.image_size, strict=True)])
         moved: F32 = xyxy - np.array(self.corner[::-1] * 2, np.float32)
-        moved /= np.tile(scale[::-1], 2).astype(np.float32)
+        with np.errstate(over="ignore"):  # what lies beyond all measure is clipped to the image
+            moved /= np.tile(scale[::-1], 2).astype(np.float32)
         return moved
 
 

@@ -18,7 +18,7 @@ from bevviz.stages.detector import outputs as read
 from bevviz.stages.detector.image import Feed, Fit, Resampling
 from bevviz.stages.detector.names import COCO, COCO_CATEGORIES, MAX_CLASSES, default_names
 from bevviz.stages.detector.outputs import Boxes, Candidates, Listed, Scored
-from bevviz.stages.detector.session import listed
+from bevviz.stages.detector.session import clip, listed
 
 CLASS_OFFSET = 7680.0  # pixels by which Ultralytics moves the boxes of each class in its NMS
 
@@ -280,8 +280,9 @@ def _yolov5(facts: Facts, name: str, table: Any) -> Found | str | None:
 
 @_in_a_table
 def _yolox(facts: Facts, name: str, table: Any) -> Found | str | None:
-    near = np.median(np.abs(table[:, :2])) <= 8  # in strides; pixels would lie all over the input
-    return _with_objectness(facts, name, table, anchors=1) if near else None
+    found = _with_objectness(facts, name, table, anchors=1)
+    # In strides; pixels would lie all over the input.
+    return found if found is not None and np.median(np.abs(table[:, :2])) <= 8 else None
 
 
 @_in_a_table
@@ -405,7 +406,7 @@ def _stranger(facts: Facts) -> str:
     """What is known not to be readable, and what to do, else empty."""
     names, maps = set(facts.outputs), [o for o in facts.outputs.values() if o.ndim in (4, 5)]
     if facts.ultralytics and facts.task not in ("", "detect", "segment", "pose"):
-        return f"a model for the task '{facts.task}': export one for detect, segment or pose"
+        return f"a model for the task '{clip(facts.task)}': export one for detect, segment or pose"
     if {"logits", "pred_boxes"} <= names:
         return "a DETR of Hugging Face, whose file does not tell how it wants its image: export the original"
     if {"num_dets", "det_boxes"} <= names:

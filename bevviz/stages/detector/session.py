@@ -37,6 +37,7 @@ MAX_INPUT_NUMBERS = 200_000_000
 MAX_OUTPUT_NUMBERS = 100_000_000
 # Inputs and outputs of a network. Detectors have up to 4 inputs, and 6 outputs for each of 6 heads.
 MAX_TENSORS = 100
+MAX_NAME = 1000  # characters in the name of an input or output, which stands in error messages
 
 CHECK = 0.05  # seconds between two looks at the memory: 100 MB fill up meanwhile
 GRACE = 1.0  # seconds that a network has to end when it is told to
@@ -159,6 +160,11 @@ class NetworkSession:
                     f"{self.where}: has {len(nodes):,} {kind}s, and no more than {MAX_TENSORS} are read"
                 )
             for node in nodes:
+                if len(node.name) > MAX_NAME:
+                    raise UserError(
+                        f"{self.where}: its {kind} {clip(node.name)} has a name of {len(node.name):,} "
+                        f"characters, and no more than {MAX_NAME} are read; export it with another name"
+                    )
                 if not NUMBERS.fullmatch(node.type):
                     raise UserError(
                         f"{self.where}: its {kind} {clip(node.name)} is a {clip(node.type)}, no tensor of "
@@ -313,7 +319,7 @@ def _run_in_time(work: Callable[[], T], end: Callable[[], None], seconds: float)
 
 
 def _overdue(verb: str, seconds: float) -> str:
-    return f"does not {verb} within {seconds:.0f} s"
+    return f"does not {verb} within {seconds:g} s"
 
 
 def _too_large() -> str:

@@ -23,6 +23,7 @@ FLOATS = {"tensor(float)": np.float32, "tensor(float16)": np.float16}
 NUMBERS = {**FLOATS, "tensor(int32)": np.int32, "tensor(int64)": np.int64}
 PROBED = 8  # points that it is shown at first
 LONGEST = 200.0  # metres: what is longer is no object
+FARTHEST = 10_000.0  # metres: no LiDAR reaches as far
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -241,6 +242,7 @@ class ObjectNetwork:
             found = self._head.candidates(answer.outputs)
         sound = np.isfinite(found.boxes).all(axis=1)
         sound &= ((found.boxes[:, 3:6] > 0) & (found.boxes[:, 3:6] < LONGEST)).all(axis=1)
+        sound &= (np.abs(found.boxes[:, :3]) < FARTHEST).all(axis=1)
         rows = np.flatnonzero(sound)
         rows = rows[np.argsort(-found.score[rows], kind="stable")]
         boxes, class_id = found.boxes[rows], found.class_id[rows]
