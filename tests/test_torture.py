@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.torture import damage, folders, fuzz, kill
+from benchmarks.torture import damage, folders, fuzz, kill, models
 from benchmarks.torture.__main__ import SHARE
 from benchmarks.torture.damage import DAMAGES, Tally, judged
 from benchmarks.torture.judges import judges, taken
@@ -120,3 +120,9 @@ def test_what_counts_as_a_failure_of_a_command() -> None:
     assert folders._wrong(3, "bevviz: error of bevviz itself: KeyError")
     assert folders._wrong(2, "no line of an error")
     assert folders._wrong(0, "Traceback (most recent call last):")
+
+
+def test_changed_onnx_files_are_read_or_refused_in_a_line() -> None:
+    (total,) = models.run(seed=1, files=40)
+    assert total.files == 40 and total.refused > 20
+    assert total.well, total.examples

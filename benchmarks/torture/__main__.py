@@ -12,7 +12,7 @@ import random
 import sys
 from collections.abc import Callable, Mapping
 
-from benchmarks.torture import damage, folders, fuzz, kill
+from benchmarks.torture import damage, folders, fuzz, kill, models
 from benchmarks.torture.samples import FORMATS
 
 EXAMPLES = 40  # of what went wrong that are printed
@@ -41,6 +41,13 @@ def fuzzed_messages(options: argparse.Namespace) -> bool:
     print(f"\nFuzzed messages, seed {options.seed}\n\n{fuzz.HEAD}\n{fuzz.row(total)}")
     _print_examples(total.examples)
     return not (total.tracebacks or total.broken or total.hangs)
+
+
+def changed_models(options: argparse.Namespace) -> bool:
+    (total,) = models.run(options.seed, options.models)
+    print(f"\nHostile and broken ONNX files, seed {options.seed}\n\n{models.HEAD}\n{models.row(total)}")
+    _print_examples(total.examples)
+    return total.well
 
 
 def killed_processes(options: argparse.Namespace) -> bool:
@@ -81,8 +88,9 @@ def _print_examples(examples: list[str]) -> None:
 PARTS: Mapping[str, Part] = {
     "damage": damaged_bags,
     "fuzz": fuzzed_messages,
-    "kill": killed_processes,
+    "models": changed_models,
     "folders": strange_folders,
+    "kill": killed_processes,
 }
 
 
@@ -103,6 +111,7 @@ def main() -> int:
     parser.add_argument("--bags", type=int, default=900, help="damaged bags (default: 900)")
     parser.add_argument("--format", metavar="NAME", help="only the formats whose name has this in it")
     parser.add_argument("--messages", type=int, default=2000, help="fuzzed messages (default: 2000)")
+    parser.add_argument("--models", type=int, default=600, help="changed ONNX files (default: 600)")
     parser.add_argument(
         "--folders", type=int, default=560, help="data set folders, and as many project files (default: 560)"
     )

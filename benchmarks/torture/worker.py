@@ -85,9 +85,13 @@ class Worker:
             outcome = Outcome(hung=True)
         except EOFError:
             outcome = Outcome(traceback=f"the process ended ({self._process.exitcode})")
+        self.restart()
+        return outcome
+
+    def restart(self) -> None:
+        """Replace the process, whatever it still does."""
         self._end()
         self._start()
-        return outcome
 
     def _start(self) -> None:
         context: Any = multiprocessing.get_context("spawn")
@@ -106,9 +110,10 @@ class Worker:
 def _serve(pipe: Connection) -> None:
     from benchmarks.torture.folders import run_commands
     from benchmarks.torture.fuzz import read_messages, run_over
+    from benchmarks.torture.models import try_model
 
     tasks: dict[str, Any] = {"bag": read_bag, "messages": read_messages, "run": run_over}
-    tasks["commands"] = run_commands
+    tasks |= {"commands": run_commands, "model": try_model}
     while True:
         try:
             task, argument = pipe.recv()
