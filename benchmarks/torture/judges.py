@@ -9,8 +9,8 @@ import sqlite3
 import struct
 import subprocess
 from bz2 import BZ2Decompressor
-from collections.abc import Callable, Iterator
-from contextlib import closing
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import closing, suppress
 from pathlib import Path
 from typing import Any
 
@@ -22,12 +22,14 @@ import zstandard
 from mcap.data_stream import ReadDataStream
 from mcap.reader import make_reader
 from mcap.records import Channel, Chunk, Message
-from mcap.stream_reader import CRCValidationError, StreamReader, breakup_chunk
+from mcap.stream_reader import StreamReader
 
 Found = tuple[str, int, bytes]
 """Topic, log time and serialised message."""
 
 Judge = Callable[[Path], Iterator[Found]]
+
+STEP = 32  # compressed bytes that a decompressor gets at once; what it made of the last ones is lost
 
 
 def taken(judge: Judge, path: Path) -> list[Found]:
@@ -45,7 +47,7 @@ def taken(judge: Judge, path: Path) -> list[Found]:
 
 
 def mcap_stream(path: Path) -> Iterator[Found]:
-    """The mcap package, from front to back; a chunk that it cannot read costs that chunk alone."""
+    """The mcap package, from front to back. Of a chunk that is damaged the part before the damage counts."""
     channels: dict[int, Channel] = {}
     with path.open("rb") as file:
         for record in StreamReader(file, emit_chunks=True, record_size_limit=1 << 28).records:
@@ -53,17 +55,47 @@ def mcap_stream(path: Path) -> Iterator[Found]:
 
 
 def _records(record: Any, channels: dict[int, Channel]) -> Iterator[Found]:
-    inner = [record]
-    if isinstance(record, Chunk):
-        try:
-            inner = breakup_chunk(record, validate_crc=True)
-        except Exception:
-            return
+    inner: Iterable[Any] = _opened(record) if isinstance(record, Chunk) else [record]
     for item in inner:
         if isinstance(item, Channel):
             channels.setdefault(item.id, item)
         elif isinstance(item, Message) and item.channel_id in channels:
             yield channels[item.channel_id].topic, item.log_time, item.data
+
+
+def _opened(chunk: Chunk) -> Iterator[Any]:
+    """Yield the records of a chunk up to the first one that is damaged or cut.
+
+    The zstandard and lz4 packages unpack it a few bytes at a time: each gives the blocks before the damage.
+    A wrong checksum is no reason to give nothing, for wrong messages count for nobody.
+    """
+    content = chunk.data
+    if chunk.compression == "zstd":
+        content = _streamed(zstandard.ZstdDecompressor().decompressobj(), chunk.data)
+    elif chunk.compression == "lz4":
+        content = _streamed(lz4.frame.LZ4FrameDecompressor(), chunk.data)
+    elif chunk.compression:
+        return
+    at = 0
+    while at + 9 <= len(content):
+        opcode, length = struct.unpack_from("<BQ", content, at)
+        at += 9 + length
+        if at > len(content):
+            return
+        record = ReadDataStream(io.BytesIO(content[at - length : at]))
+        if opcode == 4:
+            yield Channel.read(record)
+        elif opcode == 5:
+            yield Message.read(record, length)
+
+
+def _streamed(stream: Any, packed: bytes) -> bytes:
+    """Return what a decompressor gives until it raises an error or has reached the end."""
+    content = bytearray()
+    with suppress(Exception):  # each library has errors of its own
+        for at in range(0, len(packed), STEP):
+            content += stream.decompress(packed[at : at + STEP])
+    return bytes(content)
 
 
 def mcap_index(path: Path) -> Iterator[Found]:
@@ -76,7 +108,7 @@ def mcap_index(path: Path) -> Iterator[Found]:
 def mcap_resync(path: Path) -> Iterator[Found]:
     """A scan that tries every place which looks like the head of a record, with the mcap package's parser.
 
-    What is in a chunk that does not fit its checksum counts for nothing, here as there.
+    A chunk that is cut by the end of the file is read as far as it goes.
     """
     data = path.read_bytes()
     channels: dict[int, Channel] = {}
@@ -85,7 +117,7 @@ def mcap_resync(path: Path) -> Iterator[Found]:
     while at + 9 < len(data):
         opcode, length = struct.unpack_from("<BQ", data, at)
         end = at + 9 + length
-        if 0 < opcode < 16 and end <= len(data):
+        if 0 < opcode < 16 and (end <= len(data) or opcode == 6):
             stream = ReadDataStream(io.BytesIO(data[at + 9 : end]))
             try:
                 if opcode == 4:
@@ -98,14 +130,7 @@ def mcap_resync(path: Path) -> Iterator[Found]:
                     else:
                         late.append(message)
                 elif opcode == 6:
-                    for item in breakup_chunk(Chunk.read(stream), validate_crc=True):
-                        if isinstance(item, Channel):
-                            channels.setdefault(item.id, item)
-                        elif isinstance(item, Message) and item.channel_id in channels:
-                            yield channels[item.channel_id].topic, item.log_time, item.data
-                at = end
-                continue
-            except CRCValidationError:
+                    yield from _records(Chunk.read(stream), channels)
                 at = end
                 continue
             except Exception:
@@ -226,11 +251,7 @@ def _ros1_records(data: bytes, at: int, topics: dict[int, str]) -> Iterator[Foun
                 sec, nsec = struct.unpack("<II", fields[b"time"])
                 yield topics[number], sec * 10**9 + nsec, data[body:end]
         elif opcode == 5:
-            try:
-                content = _ros1_content(fields[b"compression"], data[body:end])
-            except Exception:
-                content = b""
-            yield from _ros1_records(content, 0, topics)
+            yield from _ros1_records(_ros1_content(fields[b"compression"], data[body:end]), 0, topics)
         at = end
 
 
@@ -257,9 +278,9 @@ def _ros1_record(data: bytes, at: int) -> tuple[dict[bytes, bytes], int, int] | 
 
 def _ros1_content(compression: bytes, packed: bytes) -> bytes:
     if compression == b"bz2":
-        return BZ2Decompressor().decompress(packed)
+        return _streamed(BZ2Decompressor(), packed)
     if compression == b"lz4":
-        return bytes(lz4.frame.LZ4FrameDecompressor().decompress(packed))
+        return _streamed(lz4.frame.LZ4FrameDecompressor(), packed)
     return packed
 
 

@@ -17,6 +17,7 @@ from tests import bags
 
 SCANS, POINTS = 40, 150  # 161 messages
 CHUNK_SIZE = 40_000  # bytes
+ONE_CHUNK = 1 << 30  # bytes, more than a sample has
 
 Item = tuple[str, str, int, bytes]
 """Topic, type, log time and serialised message."""
@@ -49,7 +50,9 @@ def rosbag2(plugin: StoragePlugin, mode: CompressionMode | None = None) -> Calla
     return write
 
 
-def mcap(compression: CompressionType, *, chunked: bool = True, crc: bool = True) -> Callable[[Path], Path]:
+def mcap(
+    compression: CompressionType, *, chunked: bool = True, crc: bool = True, chunk_size: int = CHUNK_SIZE
+) -> Callable[[Path], Path]:
     """A file as the mcap package writes it, of several chunks."""
 
     def write(folder: Path) -> Path:
@@ -58,7 +61,7 @@ def mcap(compression: CompressionType, *, chunked: bool = True, crc: bool = True
         with path.open("wb") as file:
             writer = McapWriter(
                 file,
-                chunk_size=CHUNK_SIZE,
+                chunk_size=chunk_size,
                 compression=compression,
                 use_chunking=chunked,
                 enable_crcs=crc,
@@ -92,11 +95,11 @@ def packed(write: Callable[[Path], Path]) -> Callable[[Path], Path]:
     return pack
 
 
-def ros1(compression: str = "") -> Callable[[Path], Path]:
+def ros1(compression: str = "", chunk_size: int = CHUNK_SIZE) -> Callable[[Path], Path]:
     def write(folder: Path) -> Path:
         store = bags.Messages(ros1=True).store
         writer = Writer1(folder / "bag.bag")
-        writer.chunk_threshold = CHUNK_SIZE
+        writer.chunk_threshold = chunk_size
         if compression:
             writer.set_compression(Writer1.CompressionFormat[compression.upper()])
         with writer:
@@ -146,6 +149,7 @@ FORMATS: dict[str, Callable[[Path], Path]] = {
     "mcap, zstd, no checksums": mcap(ZSTD, crc=False),
     "mcap, flat": mcap(NONE, chunked=False),
     "mcap, one chunk": rosbag2(MCAP),
+    "mcap, one lz4 chunk": mcap(LZ4, chunk_size=ONE_CHUNK),
     "mcap, one zstd chunk": rosbag2(MCAP, CompressionMode.STORAGE),
     "mcap, messages packed": rosbag2(MCAP, CompressionMode.MESSAGE),
     "mcap.zstd": rosbag2(MCAP, CompressionMode.FILE),
@@ -157,4 +161,5 @@ FORMATS: dict[str, Callable[[Path], Path]] = {
     "ros1": ros1(),
     "ros1, bz2": ros1("bz2"),
     "ros1, lz4": ros1("lz4"),
+    "ros1, one lz4 chunk": ros1("lz4", ONE_CHUNK),
 }

@@ -50,6 +50,7 @@ class Chunk:
     times: Mapping[int, I64] | None = None  # log times by connection; None: to be read by ``index``
     index: Mapping[int, int] = field(default_factory=dict)  # offset of the times by connection
     cut: bool = False  # the end is missing
+    damage: str = ""  # what is wrong with its content, as a scan has found it
 
     def fill(self, times: Mapping[int, array[int]]) -> None:
         """Take the log times that were found by looking into it."""
@@ -85,7 +86,6 @@ class Scan:
     """What was found by looking through a file, and what was not."""
 
     index: Index = field(default_factory=lambda: Index([], []))
-    damaged: Counter[str] = field(default_factory=Counter)  # chunks, by what is wrong with them
     missing: int = 0  # messages that the file says were in its chunks
     undescribed: int = 0  # messages of connections that nothing describes
     stated: int | None = None  # messages by the file's statistics
@@ -130,9 +130,10 @@ class Scan:
         """What was found and what was not; ``repair`` says which command writes a sound copy."""
         part = f", {self.rescued} of them from the incomplete last {megabytes(self.cut)}" if self.cut else ""
         notes = [f"read {self.count} messages{part}; {repair}"]
-        if self.damaged:
-            ((why, _),) = self.damaged.most_common(1)
-            notes.append(f"{self.damaged.total()} damaged chunk(s), {why}: {self.missing} messages lost")
+        damaged = [chunk for chunk in self.index.chunks if chunk.damage]
+        if damaged:
+            kept = sum(sum(chunk.counts.values()) for chunk in damaged)
+            notes.append(_damage_note([chunk.damage for chunk in damaged], self.missing, kept))
         elif self.missing:
             notes.append(f"{self.missing} messages that the index of a chunk lists are not there: lost")
         if self.undescribed:
@@ -144,6 +145,17 @@ class Scan:
         return notes
 
 
+def _damage_note(damages: Sequence[str], lost: int, kept: int) -> str:
+    """Tell what is wrong with damaged chunks, and how many of their messages are lost and kept."""
+    ((why, _),) = Counter(damages).most_common(1)
+    doubt = f", {kept} that were kept may be wrong" if kept else ""
+    return f"{len(damages)} damaged chunk(s), {why}: {lost} messages lost{doubt}"
+
+
+ChunkMessage = tuple[int, int, memoryview]
+"""Log time, connection and data."""
+
+
 @dataclass(frozen=True, slots=True)
 class Form:
     """What differs between the formats."""
@@ -152,7 +164,7 @@ class Form:
     views: bool  # messages are read by our index, see SoundChunks
     read_index: Callable[[Path], Index]  # DamageError: it is not to be believed
     read_times: Callable[[Bytes, Chunk, int], I64]  # of one connection in a chunk, by its own index; the same
-    look_into: Callable[[Bytes, Chunk], list[tuple[int, int, memoryview]]]  # log time, connection and data
+    look_into: Callable[[Bytes, Chunk], tuple[list[ChunkMessage], str]]  # and what is wrong with the chunk
     scan: Callable[[Bytes, Scan, Callable[[int], object]], None]  # the last one is told how far it has come
     repair: str  # what writes a sound copy
 
@@ -258,7 +270,7 @@ class SoundChunks:
 
 
 class IndexedChunks:
-    """Messages by an index, in order of log time. A damaged chunk costs its own, which are counted."""
+    """Messages by an index, in order of log time. What a damaged chunk costs is counted."""
 
     def __init__(self, path: Path, form: Form, index: Index, notes: Sequence[str] = ()) -> None:
         self._form, self._index, self._notes = form, index, notes
@@ -289,9 +301,10 @@ class IndexedChunks:
                 f"which is believed: {'; '.join(names[:NAMED])}{' ...' if len(names) > NAMED else ''}"
             )
         if self._damaged:
-            lost = sum(lost.total() for lost, _, _ in self._damaged.values())
-            why = next(iter(self._damaged.values()))[2]
-            notes.append(f"{len(self._damaged)} damaged chunk(s), {why}: {lost} messages lost")
+            chunks = self._damaged.values()
+            lost = sum(lost.total() for lost, _, _ in chunks)
+            kept = sum(len(times) for _, by_connection, _ in chunks for times in by_connection.values())
+            notes.append(_damage_note([why for _, _, why in chunks], lost, kept))
         return notes
 
     def messages(self, ids: Collection[int], start: int, stop: int) -> Iterator[Message]:
@@ -340,19 +353,15 @@ class IndexedChunks:
         found.sort(key=itemgetter(0))
         yield from found
 
-    def _content(self, number: int) -> list[tuple[int, int, memoryview]]:
-        """Log time, connection and data of the messages of a chunk."""
+    def _content(self, number: int) -> list[ChunkMessage]:
+        """Return the messages of a chunk, of a damaged one those that can be read."""
         chunk = self._index.chunks[number]
-        why = "whose content is not all there"
-        try:
-            found = self._form.look_into(self._bytes, chunk)
-            found = [item for item in found if chunk.start <= item[0] <= chunk.end]
-        except DamageError as damage:
-            found, why = [], str(damage)
-        if len(found) < sum(chunk.counts.values()):
+        found, damage = self._form.look_into(self._bytes, chunk)
+        found = [item for item in found if chunk.start <= item[0] <= chunk.end]
+        if len(found) < sum(chunk.counts.values()) or (damage and not chunk.damage):
             times = {id_: np.array([t for t, c, _ in found if c == id_], np.int64) for id_ in chunk.counts}
             lost = Counter({id_: count - len(times[id_]) for id_, count in chunk.counts.items()})
-            self._damaged[number] = lost, times, why
+            self._damaged[number] = lost, times, damage or "whose content is not all there"
         return found
 
     def _outside(

@@ -178,8 +178,9 @@ def _correct_channels(file: Bytes, index: Index, channels: Channels) -> None:
         if chunk.counts.keys() <= seen:
             continue
         seen |= chunk.counts.keys()
-        with suppress(DamageError):  # reading its messages will say so
-            _note_all(unpack_chunk(file, chunk)[0], in_data)
+        content, damage, _ = unpack_chunk(file, chunk)
+        if not damage:  # reading its messages says so
+            _note_all(content, in_data)
     index.corrected = channels.correct(in_data)
     if index.corrected:
         index.connections = channels.connections({c.id: c.msgcount for c in index.connections})
@@ -197,18 +198,15 @@ def _note_all(content: bytes, channels: Channels) -> None:
                 channels.note(opcode, content[start:offset])
 
 
-def unpack_chunk(file: Bytes, chunk: Chunk) -> tuple[bytes, bool]:
-    """The content of a chunk, and whether it is known to be as it was written.
-
-    Raises:
-        DamageError: it cannot be unpacked.
-    """
+def unpack_chunk(file: Bytes, chunk: Chunk) -> tuple[bytes, str, bool]:
+    """Return the content of a chunk, what is wrong with it, and whether it fits its checksum."""
     crc = chunk.crc
     if crc is None:  # it stands before the content
         crc = int.from_bytes(file.read(chunk.data - 16 - len(chunk.compression), 4), "little")
     packed = file.read(chunk.data, chunk.packed)
     cut = chunk.cut or len(packed) < chunk.packed
-    return unpack(chunk.compression, packed, chunk.size, crc, cut=cut), bool(crc) and not cut
+    data, damage = unpack(chunk.compression, packed, chunk.size, crc, cut=cut)
+    return data, damage, bool(crc) and not (cut or damage)
 
 
 def _parse_summary(summary: bytes, end: int, channels: Channels) -> Index:

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 from rosbags.rosbag2 import Reader
 
-from bevviz.bags.chunks import Chunk, Form, Scan
+from bevviz.bags.chunks import Chunk, ChunkMessage, Form, Scan
 from bevviz.bags.mcap import (
     CHANNEL,
     CHUNK,
@@ -33,7 +33,7 @@ from bevviz.bags.mcap import (
     strings,
     unpack_chunk,
 )
-from bevviz.bags.reader import LAST, Bytes, Content, DamageError
+from bevviz.bags.reader import LAST, Bytes, Content
 
 HEAD = re.compile(  # an opcode with a length below 2^40, or the first bytes of a compressed chunk's content
     rb"(?=[\x01-\x0f].{5}\0\0\0|\x04\0\0\0zstd.{8}\x28\xb5\x2f\xfd|\x03\0\0\0lz4.{8}\x04\x22\x4d\x18)",
@@ -262,10 +262,7 @@ def scan(file: Bytes, found: Scan, tell: Callable[[int], object]) -> None:
         elif opcode == CHUNK:
             chunk = _read_head(file, body, end)
             found.begin(chunk)
-            try:
-                _describe(file, chunk, channels, found)
-            except DamageError as damage:
-                found.damaged[str(damage)] += 1
+            _describe(file, chunk, channels, found)
             if chunk.cut:
                 found.cut, found.rescued = file.size - body, sum(chunk.counts.values())
         elif opcode == MESSAGE_INDEX:
@@ -290,7 +287,8 @@ def _read_head(file: Bytes, body: int, end: int) -> Chunk:
 def _describe(file: Bytes, chunk: Chunk, channels: Channels, found: Scan) -> None:
     """Fill in what is in a chunk."""
     times: dict[int, array[int]] = defaultdict(lambda: array("q"))
-    content = Content(unpack_chunk(file, chunk)[0])
+    data, chunk.damage, _ = unpack_chunk(file, chunk)
+    content = Content(data)
     walker = Walker(content, channels, _span(chunk))
     for opcode, body, end in walker(0):
         if opcode == MESSAGE:
@@ -298,28 +296,25 @@ def _describe(file: Bytes, chunk: Chunk, channels: Channels, found: Scan) -> Non
             times[channel].append(time)
         elif opcode in (SCHEMA, CHANNEL):
             channels.note(opcode, content.read(body, end - body))
-    if not chunk.cut:
+    if not (chunk.cut or chunk.damage):
         found.broken += walker.broken
         found.passed += walker.passed
     chunk.fill(times)
 
 
-def look_into(file: Bytes, chunk: Chunk) -> list[tuple[int, int, memoryview]]:
-    """Log time, channel and data of the messages of a chunk, those of its index.
-
-    Raises:
-        DamageError: it cannot be unpacked.
-    """
-    content, crc = unpack_chunk(file, chunk)
+def look_into(file: Bytes, chunk: Chunk) -> tuple[list[ChunkMessage], str]:
+    """Return the messages of a chunk on the channels of its index, and what is wrong with its content."""
+    content, damage, checked = unpack_chunk(file, chunk)
     data = memoryview(content)
     found, whole = _messages(data, chunk.counts)
-    if crc or (whole and len(found) == sum(chunk.counts.values())):
-        return found
-    walk = Walker(Content(content), chunk.counts, _span(chunk))(0)
-    return [i for r in walk if r.opcode == MESSAGE for i in _messages(data[r.start : r.end], chunk.counts)[0]]
+    if not checked and not (whole and len(found) == sum(chunk.counts.values())):
+        walk = Walker(Content(content), chunk.counts, _span(chunk))(0)
+        records = [data[r.start : r.end] for r in walk if r.opcode == MESSAGE]
+        found = [message for record in records for message in _messages(record, chunk.counts)[0]]
+    return found, damage
 
 
-def _messages(data: memoryview, channels: Container[int]) -> tuple[list[tuple[int, int, memoryview]], bool]:
+def _messages(data: memoryview, channels: Container[int]) -> tuple[list[ChunkMessage], bool]:
     """The messages of a content by the lengths of its records, and whether these lead to its end."""
     found, offset, size = [], 0, len(data)
     while offset + RECORD.size <= size:

@@ -289,61 +289,79 @@ class Content(Bytes):
         return (match.start() for match in pattern.finditer(self._data, start))
 
 
-def unpack(compression: str, packed: bytes, size: int, crc: int = 0, *, cut: bool = False) -> bytes:
-    """The content of a chunk.
-
-    Of bzip2, whose blocks have checksums of their own, the sound blocks before a damaged one are given. Of
-    what the others unpacked before they stumbled nothing is, for it may be wrong already.
+def unpack(
+    compression: str, packed: bytes, size: int, crc: int = 0, *, cut: bool = False
+) -> tuple[bytes, str]:
+    """Unpack the content of a chunk, of a damaged one the part before the damage.
 
     Args:
         compression: zstd, lz4, bz2, or nothing.
         packed: as it lies in the file.
         size: bytes that it should have.
         crc: its checksum, 0: it has none.
-        cut: the end of ``packed`` is missing; what there is, is given.
+        cut: the end of ``packed`` is missing. That alone is no damage.
 
-    Raises:
-        DamageError: it cannot be unpacked, ends early, or does not fit its checksum.
+    Returns:
+        The content, and what is wrong with it. The latter is empty for a sound chunk.
     """
-    try:
-        data, whole = _unpacked(compression, packed, min(max(size, LEAST), LONGEST))
-    except (OSError, ValueError, RuntimeError, EOFError, zstd.ZstdError) as error:
-        raise DamageError(f"a chunk cannot be unpacked ({first_line(error)})") from None
-    if not cut and not whole and compression != "bz2":
-        raise DamageError("a chunk ends early")
-    if not cut and crc and crc32(data) != crc:
-        raise DamageError("the content of a chunk does not fit its checksum")
-    return data
-
-
-def _unpacked(compression: str, packed: bytes, most: int) -> tuple[bytes, bool]:
-    """At most ``most`` bytes, and whether they are all."""
+    most, whole = min(max(size, LEAST), LONGEST), True
     if compression in ("", "none"):
-        return packed, True
-    if compression == "bz2":
-        return _unpacked_blocks(packed, most)
-    if compression not in ("zstd", "lz4"):
-        raise ValueError(f"compression '{compression}' is not known")
-    stream: Any = zstd.ZstdDecompressor() if compression == "zstd" else LZ4FrameDecompressor()
+        data = packed
+    elif compression not in _STREAMS:
+        return b"", f"a chunk cannot be unpacked (compression '{compression}' is not known)"
+    else:
+        stream = _STREAMS[compression]()
+        try:
+            data = _drawn(stream, packed, most)
+            whole = stream.eof
+        except _STUMBLES as error:
+            data = _before_damage(_STREAMS[compression], packed, most)
+            return data, f"a chunk cannot be unpacked ({first_line(error)})"
+    if cut:
+        return data, ""
+    if not whole:
+        return data, "a chunk ends early"
+    if crc and crc32(data) != crc:
+        return data, "the content of a chunk does not fit its checksum"
+    return data, ""
+
+
+_STREAMS: dict[str, Callable[[], Any]] = {
+    "zstd": zstd.ZstdDecompressor,
+    "lz4": LZ4FrameDecompressor,
+    "bz2": BZ2Decompressor,
+}
+_STUMBLES = (OSError, ValueError, RuntimeError, EOFError, zstd.ZstdError)  # what these raise on damage
+
+
+def _drawn(stream: Any, packed: bytes, most: int) -> bytes:
+    """Return what a decompressor makes of some bytes, ``most`` bytes of it."""
     parts = [stream.decompress(packed, most)]
     most -= len(parts[0])
     while most > 0 and not stream.eof and not stream.needs_input:
         parts.append(stream.decompress(b"", most))
         most -= len(parts[-1])
-    return parts[0] if len(parts) == 1 else b"".join(parts), stream.eof
+    return parts[0] if len(parts) == 1 else b"".join(parts)
 
 
-def _unpacked_blocks(packed: bytes, most: int) -> tuple[bytes, bool]:
-    stream, parts = BZ2Decompressor(), []
-    for start in range(0, len(packed), PIECE):
+def _before_damage(new_stream: Callable[[], Any], packed: bytes, most: int) -> bytes:
+    """Return the content of all compressed blocks before the damage.
+
+    A decompressor keeps what it made of the piece that it stumbles over. So the first pass finds this
+    piece, and the second one feeds it byte by byte.
+    """
+    data, sound = bytearray(), 0
+    for step in (PIECE, 1):
+        stream = new_stream()
         try:
-            parts.append(stream.decompress(packed[start : start + PIECE], most))
-        except OSError:
-            break
-        most -= len(parts[-1])
-        if stream.eof or most <= 0:
-            break
-    return b"".join(parts), stream.eof
+            data = bytearray(_drawn(stream, packed[:sound], most)) if sound else bytearray()
+            while sound < len(packed) and len(data) < most and not stream.eof:
+                data += _drawn(stream, packed[sound : sound + step], most - len(data))
+                sound += step
+        except _STUMBLES:
+            continue
+        break
+    return bytes(data)
 
 
 def megabytes(size: int) -> str:

@@ -14,7 +14,7 @@ import numpy as np
 from rosbags.interfaces import Connection, ConnectionExtRosbag1, MessageDefinition, MessageDefinitionFormat
 from rosbags.rosbag1 import Reader
 
-from bevviz.bags.chunks import Chunk, Form, Index, Scan
+from bevviz.bags.chunks import Chunk, ChunkMessage, Form, Index, Scan
 from bevviz.bags.reader import LAST, Bytes, Content, DamageError, normalized, unpack
 from bevviz.frame import I64
 
@@ -311,10 +311,7 @@ def scan(file: Bytes, found: Scan, tell: Callable[[int], object]) -> None:
             chunk = Chunk(LAST, -1, record.body, packed, record.number("size"), compression, {}, 0, {})
             chunk.cut = record.end > file.size
             found.begin(chunk)
-            try:
-                _describe(file, chunk, connections, found)
-            except DamageError as damage:
-                found.damaged[str(damage)] += 1
+            _describe(file, chunk, connections, found)
             if chunk.cut:
                 found.cut, found.rescued = file.size - record.body, sum(chunk.counts.values())
         elif record.kind == "index":
@@ -331,38 +328,37 @@ def scan(file: Bytes, found: Scan, tell: Callable[[int], object]) -> None:
 def _describe(file: Bytes, chunk: Chunk, connections: Connections, found: Scan) -> None:
     """Fill in what is in a chunk."""
     times: dict[int, array[int]] = defaultdict(lambda: array("q"))
-    content = _unpacked(file, chunk)
+    content, chunk.damage = _unpacked(file, chunk)
     walker = Walker(content)
     for record in walker(0):
         if record.kind == "message":
             times[record.number("conn")].append(record.time("time"))
         elif record.kind == "connection":
             connections.note(record, content.read(record.body, record.end - record.body))
-    if not chunk.cut:
+    if not (chunk.cut or chunk.damage):
         found.broken += walker.broken
         found.passed += walker.passed
     chunk.fill(times)
 
 
-def look_into(file: Bytes, chunk: Chunk) -> list[tuple[int, int, memoryview]]:
-    """Log time, connection and data of the messages of a chunk, those of its index.
-
-    Raises:
-        DamageError: it cannot be unpacked.
-    """
-    content = _unpacked(file, chunk)
+def look_into(file: Bytes, chunk: Chunk) -> tuple[list[ChunkMessage], str]:
+    """Return the messages of a chunk on the connections of its index, and what is wrong with its content."""
+    content, damage = _unpacked(file, chunk)
     data = memoryview(content.read(0, content.size))
-    return [
+    found = [
         (r.time("time"), r.number("conn"), data[r.body : r.end])
         for r in Walker(content)(0)
         if r.kind == "message" and r.number("conn") in chunk.counts
     ]
+    return found, damage
 
 
-def _unpacked(file: Bytes, chunk: Chunk) -> Content:
+def _unpacked(file: Bytes, chunk: Chunk) -> tuple[Content, str]:
+    """Return the content of a chunk and what is wrong with it."""
     packed = file.read(chunk.data, chunk.packed)
     cut = chunk.cut or len(packed) < chunk.packed
-    return Content(unpack(chunk.compression, packed, chunk.size, cut=cut))
+    data, damage = unpack(chunk.compression, packed, chunk.size, cut=cut)
+    return Content(data), damage
 
 
 REPAIR = "'rosbag reindex' repairs the file"
