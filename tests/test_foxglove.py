@@ -327,3 +327,26 @@ def test_what_is_no_message_is_one_line(tmp_path: Path) -> None:
     with BagSource([path], load()) as source:
         assert [len(frame.points) for frame in source][:1] == [50]
         assert any("of /points could not be used, the first: /points: not a" in w for w in source.warnings)
+
+
+@pytest.mark.parametrize("wrong", [2**70, "text", [1]])
+def test_a_time_of_json_that_no_date_has_is_one_line(tmp_path: Path, wrong: object) -> None:
+    context, path = foxglove.Context(), tmp_path / "drive.mcap"
+    schema = foxglove.Schema(
+        name="foxglove.FrameTransform", encoding="jsonschema", data=b'{"type": "object"}'
+    )
+    edge = {"parent_frame_id": "map", "child_frame_id": "lidar_top", "timestamp": {"sec": wrong}}
+    fields = [messages.PackedElementField(name=n, offset=4 * i, type=FLOAT32) for i, n in enumerate("xyz")]
+    with foxglove.open_mcap(path, context=context):
+        clouds = channels.PointCloudChannel("/LIDAR_TOP", context=context)
+        tf = foxglove.Channel("/tf", message_encoding="json", schema=schema, context=context)
+        for scan in range(2):
+            at, about = bags.START + scan * bags.PERIOD, dict[str, Any](timestamp=time(scan), point_stride=16)
+            cloud = messages.PointCloud(
+                frame_id="lidar_top", fields=fields, data=points(scan).tobytes(), **about
+            )
+            tf.log(json.dumps(edge | {"rotation": {"w": 1}}).encode(), log_time=at)
+            clouds.log(cloud, log_time=at)
+    with BagSource([path], load()) as source:
+        assert len(list(source)) == 2
+        assert any("2 message(s) of /tf could not be used" in text for text in source.warnings)

@@ -47,7 +47,11 @@ class RawMessage:
         except zstd.ZstdError:
             raise MessageError(f"{self.topic}: a message of {len(self.data)} bytes is damaged") from None
         if form_of(self.connection):
-            return foxglove.header(self.parsed(data), self.connection.msgtype)
+            parsed = self.parsed(data)
+            try:
+                return foxglove.header(parsed, self.connection.msgtype)
+            except Exception as error:  # JSON may have anything in the place of a time
+                raise MessageError(f"{self.topic}: no time in its message: {first_line(error)}") from None
         little = is_ros1(self.connection) or data[1:2] != b"\0"
         return read_header(data, "<" if little else ">", self.topic)
 

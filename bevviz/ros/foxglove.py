@@ -129,7 +129,10 @@ def _stamp(message: Any) -> int:
     if time is None:
         return 0
     seconds, rest = _first(time, "seconds", "sec"), _first(time, "nanos", "nsec", "nanosec")
-    return int(seconds or 0) * 1_000_000_000 + int(rest or 0)
+    stamp = int(seconds or 0) * 1_000_000_000 + int(rest or 0)
+    if abs(stamp) >= 1 << 63:  # JSON has numbers of any size
+        raise ValueError(f"a timestamp of {seconds} seconds, which no date has")
+    return stamp
 
 
 def _first(message: Any, *names: str) -> Any:
