@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import builtins
+import tracemalloc
 import zlib
 from base64 import b64decode
 from pathlib import Path
@@ -197,3 +198,21 @@ def test_what_cannot_be_unpacked_says_why(monkeypatch: pytest.MonkeyPatch) -> No
     monkeypatch.setattr(builtins, "__import__", without)
     with pytest.raises(MessageError, match=r"which DracoPy reads: pip install 'bevviz\[draco\]'"):
         decoded(draco(b64decode(DRACO[0])))
+
+
+@pytest.mark.parametrize("form", ["zstd", "zlib"])
+def test_a_cloud_is_unpacked_to_the_size_that_it_states(form: str) -> None:
+    made = messages()
+    message = compressed(made, made.cloud(bags.START, points(0)), form, packed(form, bytes(200 << 20)))
+    tracemalloc.start()
+    with pytest.raises(MessageError, match="or it is too long"):
+        decoded(message)
+    most = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert most < 60e6
+
+
+def test_a_header_of_cloudini_is_not_searched_for_without_end() -> None:
+    text = b"a: [" + b"1, " * 5000 + b"1]"
+    with pytest.raises(ValueError, match="its cloudini header is damaged"):
+        cloudini.read_header(b"CLOUDINI_V04\n" + text + b"\0")

@@ -10,6 +10,7 @@ from __future__ import annotations
 import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from backports import zstd
@@ -24,6 +25,7 @@ from bevviz.stages.kernel import kernel
 MAGIC = b"CLOUDINI_V"
 CHUNK = 32 * 1024  # points
 MOST_BYTES = 1 << 30  # of a cloud
+LONGEST_HEADER = 1 << 13  # bytes in YAML: those of 20 fields take 1.5 kB, and it is read slowly
 TYPES = ("", "INT8", "UINT8", "INT16", "UINT16", "INT32", "UINT32", "FLOAT32", "FLOAT64", "INT64", "UINT64")
 SIZES = (0, 1, 1, 2, 2, 4, 4, 4, 8, 8, 8)
 FLOAT32, FLOAT64 = 7, 8
@@ -127,13 +129,16 @@ def read_header(data: bytes) -> tuple[Header, int]:
         raise ValueError(f"its data are of cloudini's format {version}; 3 to 5 are read")
     try:
         if data[12:13] == b"\n" and data[13:14] != b"{":
-            end = data.index(b"\0", 13)
+            end = data.index(b"\0", 13, 13 + LONGEST_HEADER)
             return _of_yaml(version, data[13:end].decode()), end + 1
         return _of_binary(version, data)
     except (ValueError, LookupError, TypeError, struct.error) as error:
         raise ValueError(f"its cloudini header is damaged ({first_line(error)})") from None
 
 
+@lru_cache(
+    maxsize=64
+)  # all messages of a topic have the same one, which takes longer to read than the points
 def _of_yaml(version: int, text: str) -> Header:
     from ruamel.yaml import YAML
     from ruamel.yaml.error import YAMLError

@@ -14,7 +14,7 @@ from bevviz.ros import cloudini
 from bevviz.ros.clouds import MOST_POINTS, SCALARS
 from bevviz.ros.encode import make
 
-LONGEST = 1 << 30  # bytes of a cloud
+LEAST, LONGEST = 1 << 24, 1 << 30  # bytes that a cloud may be unpacked to, whatever it says
 DRACO = "which DracoPy reads: pip install 'bevviz[draco]'"
 _NAME = re.compile(r"point_cloud_interfaces/(msg/)?CompressedPointCloud2$")
 
@@ -33,10 +33,13 @@ def decompress(msg: Any) -> Any:
     if msg.format == "cloudini":
         return _of_cloudini(msg, data)
     width, height = int(msg.width), int(msg.height)
+    size = height * max(int(msg.row_step), width * int(msg.point_step))
     if msg.format == "zstd":
-        unpacked = np.frombuffer(_unpacked(zstd.ZstdDecompressor(), data), np.uint8)
+        unpacked = np.frombuffer(_unpacked(zstd.ZstdDecompressor(), data, size), np.uint8)
     elif msg.format == "zlib":
-        unpacked = np.frombuffer(_unpacked(zlib.decompressobj(47), data), np.uint8)  # of zlib or of gzip
+        unpacked = np.frombuffer(
+            _unpacked(zlib.decompressobj(47), data, size), np.uint8
+        )  # of zlib or of gzip
     elif msg.format == "draco":
         unpacked = _of_draco(msg, data)
         width, height = len(unpacked) // max(int(msg.point_step), 1), 1
@@ -80,9 +83,10 @@ def _of_cloudini(msg: Any, data: bytes) -> Any:
     )
 
 
-def _unpacked(stream: Any, data: bytes) -> bytes:
+def _unpacked(stream: Any, data: bytes, size: int) -> bytes:
+    """Unpack a cloud that has ``size`` bytes by its own word, with as much memory as that takes."""
     try:
-        found: bytes = stream.decompress(data, LONGEST)
+        found: bytes = stream.decompress(data, min(max(size, LEAST), LONGEST))
     except (zlib.error, zstd.ZstdError) as error:
         raise ValueError(f"its compressed data is damaged ({first_line(error)})") from None
     if not stream.eof:
