@@ -6,11 +6,14 @@ import argparse
 import signal
 import subprocess
 from collections import Counter
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
+from typing import cast
 
 import pytest
 
-from benchmarks.torture import damage, folders, fuzz, kill, models
+from benchmarks.torture import damage, folders, fuzz, kill, messages, models
 from benchmarks.torture.__main__ import SHARE
 from benchmarks.torture.damage import DAMAGES, Tally, judged
 from benchmarks.torture.judges import judges, taken
@@ -98,7 +101,7 @@ def test_the_command_says_which_parts_there_are(capsys: pytest.CaptureFixture[st
     from benchmarks.torture.__main__ import PARTS, damaged_bags
 
     options = argparse.Namespace(seed=2, bags=10, format="ros1, bz2", messages=1, signals=1)
-    assert set(PARTS) == {"damage", "fuzz", "kill", "folders"}
+    assert set(PARTS) == {"damage", "fuzz", "messages", "models", "folders", "kill"}
     assert damaged_bags(options)
     lines = capsys.readouterr().out.splitlines()
     assert "Damaged bags, seed 2" in lines
@@ -126,3 +129,52 @@ def test_changed_onnx_files_are_read_or_refused_in_a_line() -> None:
     (total,) = models.run(seed=1, files=40)
     assert total.files == 40 and total.refused > 20
     assert total.well, total.examples
+
+
+SHORT_KINDS = ("Livox CustomMsg", "CompressedPointCloud2, zstd", "RadarTracks", "foxglove.SceneUpdate, json")
+
+
+def test_messages_of_other_kinds() -> None:
+    total = messages.Tally()
+    for _, tally in messages.run(seed=1, each=60, names=SHORT_KINDS):
+        total += tally
+    assert total.cases == 241  # and a bomb
+    assert total.well, total.examples
+
+
+def test_a_case_is_known_by_its_seed_and_number() -> None:
+    rows = messages.KINDS["MarkerArray"].rows()
+    assert messages.case("MarkerArray", rows, 7, 0) == messages.case("MarkerArray", rows, 7, 0)
+    changed = {messages.case("MarkerArray", rows, 7, seed)[1] for seed in range(5)}
+    assert len(changed) > 3
+
+
+def test_a_case_that_goes_wrong_is_named(tmp_path: Path) -> None:
+    class Broken:
+        def do(self, task: str, argument: tuple[Path, Sequence[str]]) -> Outcome:
+            wrong = b"wrong" in argument[0].read_bytes()
+            return Outcome(said=["0.1", "5", ""], traceback="Traceback\nValueError: bad" if wrong else "")
+
+    trial = messages.Trial("PoseStamped", cast(Worker, Broken()), tmp_path)
+    places = [place for place, row in enumerate(trial.rows) if row.topic == messages.TOPIC][:8]
+    cases = {place: trial.rows[place] for place in places}
+    cases[places[5]] = replace(cases[places[5]], data=b"wrong")
+    tally = messages.Tally()
+    trial.judge(cases, dict(zip(places, range(8), strict=True)), tally)
+    assert (tally.cases, tally.tracebacks, tally.well) == (8, 1, False)
+    assert tally.examples == ["PoseStamped, case 5: tracebacks; ; ValueError: bad"]
+
+
+@pytest.mark.parametrize(
+    ("outcome", "expected"),
+    [
+        (Outcome(said=["0.1", "5", ""]), ""),
+        (Outcome(said=["0.1", "5", ""], memory=2 * messages.MEMORY), "large"),
+        (Outcome(said=["99", "5", ""]), "slow"),
+        (Outcome(said=["0.1", "0", "no LiDAR"]), "ended"),
+        (Outcome(hung=True), "hangs"),
+        (Outcome(traceback="the process ended (-9)"), "tracebacks"),
+    ],
+)
+def test_what_is_wrong_with_the_reading_of_a_drive(outcome: Outcome, expected: str) -> None:
+    assert messages.fault(outcome) == expected

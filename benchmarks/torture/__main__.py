@@ -12,7 +12,7 @@ import random
 import sys
 from collections.abc import Callable, Mapping
 
-from benchmarks.torture import damage, folders, fuzz, kill, models
+from benchmarks.torture import damage, folders, fuzz, kill, messages, models
 from benchmarks.torture.samples import FORMATS
 
 EXAMPLES = 40  # of what went wrong that are printed
@@ -46,6 +46,20 @@ def fuzzed_messages(options: argparse.Namespace) -> bool:
 def changed_models(options: argparse.Namespace) -> bool:
     (total,) = models.run(options.seed, options.models)
     print(f"\nHostile and broken ONNX files, seed {options.seed}\n\n{models.HEAD}\n{models.row(total)}")
+    _print_examples(total.examples)
+    return total.well
+
+
+def messages_of_all_kinds(options: argparse.Namespace) -> bool:
+    names = [name for name in messages.KINDS if options.kind is None or options.kind in name]
+    if not names:
+        raise SystemExit(f"--kind {options.kind}: none of {'; '.join(messages.KINDS)}")
+    total = messages.Tally()
+    print(f"\nMessages of all kinds, seed {options.seed}\n\n{messages.HEAD}")
+    for name, tally in messages.run(options.seed, options.each, names):
+        print(messages.row(name, tally), flush=True)
+        total += tally
+    print(messages.row("all", total))
     _print_examples(total.examples)
     return total.well
 
@@ -88,6 +102,7 @@ def _print_examples(examples: list[str]) -> None:
 PARTS: Mapping[str, Part] = {
     "damage": damaged_bags,
     "fuzz": fuzzed_messages,
+    "messages": messages_of_all_kinds,
     "models": changed_models,
     "folders": strange_folders,
     "kill": killed_processes,
@@ -111,11 +126,14 @@ def main() -> int:
     parser.add_argument("--bags", type=int, default=900, help="damaged bags (default: 900)")
     parser.add_argument("--format", metavar="NAME", help="only the formats whose name has this in it")
     parser.add_argument("--messages", type=int, default=2000, help="fuzzed messages (default: 2000)")
+    parser.add_argument("--each", type=int, default=500, help="messages of each kind (default: 500)")
     parser.add_argument("--models", type=int, default=600, help="changed ONNX files (default: 600)")
     parser.add_argument(
         "--folders", type=int, default=560, help="data set folders, and as many project files (default: 560)"
     )
-    parser.add_argument("--kind", metavar="NAME", help="only folders of kinds whose name has this in it")
+    parser.add_argument(
+        "--kind", metavar="NAME", help="only folders or messages whose kind has this in its name"
+    )
     parser.add_argument(
         "--signals", type=int, default=280, help="signals, shared among the commands (default: 280)"
     )

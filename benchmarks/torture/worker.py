@@ -110,10 +110,11 @@ class Worker:
 def _serve(pipe: Connection) -> None:
     from benchmarks.torture.folders import run_commands
     from benchmarks.torture.fuzz import read_messages, run_over
+    from benchmarks.torture.messages import read_frames
     from benchmarks.torture.models import try_model
 
     tasks: dict[str, Any] = {"bag": read_bag, "messages": read_messages, "run": run_over}
-    tasks |= {"commands": run_commands, "model": try_model}
+    tasks |= {"commands": run_commands, "model": try_model, "frames": read_frames}
     while True:
         try:
             task, argument = pipe.recv()
