@@ -235,8 +235,9 @@ class Drive(Closing):
             UserError: an unknown key or a wrong value; nothing is changed then.
         """
         from bevviz.config import revised
+        from bevviz.trust import USER
 
-        return self.session.configure(revised(self.config, [*settings, *_settings(more)]))
+        return self.session.configure(revised(self.config, [*settings, *_settings(more)], USER))
 
     def _number(self, time: str | float | None, frame: int | None) -> int:
         if (time is None) == (frame is None):

@@ -373,6 +373,25 @@ def read_lines(path: Path, limit: int) -> Iterator[str]:
 # --- folders -----------------------------------------------------------------------------------
 
 
+def check_owned(folder: Path, variable: str = "XDG_RUNTIME_DIR") -> None:
+    """Check that nobody else can put a file into a folder.
+
+    Args:
+        folder: which one.
+        variable: of the environment, which names another folder.
+
+    Raises:
+        UserError: it is no folder, it belongs to another user, or others can write there.
+    """
+    found = folder.lstat()
+    if not stat.S_ISDIR(found.st_mode):
+        raise UserError(f"{folder} is not a folder")
+    if found.st_uid != os.getuid():
+        raise UserError(f"{folder} belongs to another user: set {variable} to a folder of yours")
+    if found.st_mode & 0o022:
+        raise UserError(f"{folder} can be written by others: chmod 700 it")
+
+
 def bag_files(folder: Path) -> list[Path]:
     """Bag files of a folder by suffix, compressed ones too."""
     suffixes = {".mcap", ".db3", ".bag", ".active"}

@@ -12,6 +12,7 @@ import os
 import select
 import sys
 import threading
+from dataclasses import replace
 from pathlib import Path
 
 from bevviz import remains
@@ -80,8 +81,12 @@ def _import(path: Path, application_id: str, recording_id: str | None) -> None:
     from bevviz.logging.recorder import Recorder
     from bevviz.project import layers
     from bevviz.recorded import Origin
+    from bevviz.trust import Trust
 
-    config = load(layers=layers(path if path.is_dir() else path.parent))
+    # A viewer opens files of anybody: no function is run, whoever trusts it.
+    never = Trust(advice="Rerun's viewer runs none; 'bevviz' does, on the command line")
+    stated = layers(path if path.is_dir() else path.parent)
+    config = load(layers=[replace(layer, trust=never) for layer in stated])
     with BagSource([path], config) as source:
         drive = Drive(source, config)
         hint(drive.scene, config)

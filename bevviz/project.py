@@ -14,7 +14,8 @@ from __future__ import annotations
 
 import difflib
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -27,6 +28,7 @@ from bevviz.config.methods import CLASS_LISTS
 from bevviz.errors import UserError
 from bevviz.pillar_params import is_network
 from bevviz.text import shown
+from bevviz.trust import USER, NamedCode, trust_in
 
 NAME = "bevviz.toml"
 MODEL = "BEVVIZ_MODEL"
@@ -53,32 +55,50 @@ def layers(folder: Path, environment: Mapping[str, str] = os.environ) -> list[La
         UserError: the project file, or one that it names, cannot be used.
     """
     path = find(folder)
-    found = list(_of_file(path)) if path is not None else []
+    found: list[Layer] = []
+    if path is not None:
+        stated = _of_file(path)
+        trust = trust_in(_code(path, stated))
+        found = [replace(layer, trust=trust) for layer in stated]
     if model := environment.get(MODEL, "").strip():
-        found.append(Layer(MODEL, {"detector.model": model}))
+        found.append(Layer(MODEL, {"detector.model": model}, USER))
     return found
 
 
 def find(folder: Path) -> Path | None:
-    """The nearest project file, in the folder or above.
+    """Find the nearest project file, in the folder or above.
 
     Raises:
-        UserError: it belongs to somebody else, who could have any code run by it.
+        UserError: a folder cannot be looked into.
     """
     for place in (folder, *folder.parents):
         path = place / NAME
         try:
-            owner = path.stat().st_uid if path.is_file() else None
+            is_there = path.is_file()
         except OSError as error:
             raise UserError(f"{path}: cannot read the project file: {error.strerror}") from None
-        if owner is not None:
-            if os.geteuid() not in (0, owner) and owner != 0:
-                raise UserError(f"{path}: belongs to another user, and can name code to run; move or copy it")
+        if is_there:
             return Path(os.path.relpath(path))
     return None
 
 
-def _of_file(path: Path) -> Iterator[Layer]:
+def named_code(path: Path) -> NamedCode:
+    """Read which functions a project file, or a YAML file, names.
+
+    Raises:
+        UserError: it, or a file that it names, cannot be used.
+    """
+    return _code(path, _of_file(path) if path.suffix == ".toml" else [read_layer(path)])
+
+
+def _code(path: Path, stated: Sequence[Layer]) -> NamedCode:
+    files = [Path(layer.where) for layer in stated if layer.where != str(path)]
+    functions = dict.fromkeys(function for layer in stated for function in layer.functions)
+    return NamedCode((path, *files), tuple(functions))
+
+
+def _of_file(path: Path) -> list[Layer]:
+    """Read the YAML files that a project file names, and then itself."""
     try:
         stated = ProjectFile.model_validate(toml_tree(path, f"{path}: cannot read the project file"))
     except ValidationError as error:
@@ -94,8 +114,6 @@ def _of_file(path: Path) -> Iterator[Layer]:
             near = difflib.get_close_matches(name, known, 1)
             hint = f"; did you mean '{near[0]}'?" if near else ""
             raise UserError(f"{path}: unknown key '{name}'{hint}")
-    for name in stated.config:
-        yield read_layer(path.parent / name, pipe=False)
     own = flattened(sections)
     if stated.preset is not None:
         own["preset"] = stated.preset
@@ -107,7 +125,8 @@ def _of_file(path: Path) -> Iterator[Layer]:
     for key in ("objects.method", "objects.encoder", "objects.params.encoder"):
         if is_network(str(own.get(key, ""))):
             own[key] = str(path.parent / own[key])
-    yield Layer(str(path), own)
+    named = [read_layer(path.parent / name, pipe=False) for name in stated.config]
+    return [*named, Layer(str(path), own)]
 
 
 def _from(folder: Path, key: str, value: str) -> str:

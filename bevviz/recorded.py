@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from itertools import islice
 from pathlib import Path
@@ -13,14 +13,13 @@ from typing import Any, Self
 
 import rerun as rr
 
-from bevviz.config import STAGES, Config, Preset, flat_yaml, load, object_files, values
+from bevviz.config import Config, Layer, Preset, flat_yaml, load, object_files, received, values
 from bevviz.errors import UserError, first_line
 from bevviz.files import bag_files, open_regular, sampled_files
 from bevviz.frame import Scene
 from bevviz.logging import entities
 from bevviz.logging.reading import check_decodes
 from bevviz.pillar_params import is_network
-from bevviz.plugins import is_foreign
 from bevviz.provenance import model_path, names_path
 from bevviz.text import path_text
 
@@ -217,27 +216,31 @@ class Recorded:
         recording's where these have nothing but the preset's own; the objects' method is not, as nothing is
         without its parameters.
 
+        Functions that it names run where ``settings``, or a trusted file, name them as well.
+
         Raises:
-            UserError: as ``bevviz.config.load``; it names somebody's function that ``settings`` do not.
+            UserError: as ``bevviz.config.load``.
         """
         if file or preset is not None:
             stated = load(file, settings, preset)
-            return load(file, [*self.missing(stated), *settings], preset)
-        base, own = flat_yaml(self.yaml, str(self.recording)), {one.partition("=")[0] for one in settings}
-        left = {key: value for key, value in base.items() if key not in own}
-        check_functions(self.recording, left, "go on with it")
-        return load(settings=[*self.settings, *settings], base=base)
+            return load(file, [self.missing(stated), *settings], preset)
+        base = Layer(str(self.recording), flat_yaml(self.yaml, str(self.recording)))
+        return load(settings=[*self._received(), *settings], base=base)
 
-    def missing(self, config: Config) -> list[str]:
-        """``key=value`` each: what frames are made of, and the detector, where a configuration leaves it."""
+    def missing(self, config: Config) -> Layer:
+        """Values that a configuration leaves open: what frames are made of, and the detector."""
         stated, own = values(config), values(load(preset=config.preset))
         there = flat_yaml(self.yaml, str(self.recording))
-        frames = [f"{key}={json.dumps(value)}" for key, value in there.items() if key.startswith(FRAMES)]
-        model = str(there.get("detector.model") or "")
-        detector = [f"detector.model={model}"] if model and not is_foreign(model) else []
-        keys = [(one, one.partition("=")[0]) for one in (*frames, *detector, *self.settings)]
-        stays = [(one, key) for one, key in keys if key in own and key not in OBJECTS]
-        return [one for one, key in stays if stated[key] == own[key]]
+        recorded = {key: value for key, value in there.items() if key.startswith(FRAMES)}
+        if there.get("detector.model"):
+            recorded["detector.model"] = there["detector.model"]
+        for layer in self._received():
+            recorded |= layer.values
+        stays = [key for key in recorded if key in own and key not in OBJECTS and stated[key] == own[key]]
+        return Layer(str(self.recording), {key: recorded[key] for key in stays})
+
+    def _received(self) -> list[Layer]:
+        return received(self.settings, str(self.recording))
 
 
 def follow(recording: Path, bag: Sequence[Path] = (), settings: Sequence[str] = ()) -> Recorded:
@@ -361,27 +364,3 @@ def _column(chunk: Any, name: str) -> list[Any]:
     """Its values; none where the chunk has no such column."""
     batch = chunk.to_record_batch()
     return list(batch.column(name).to_pylist()) if name in batch.schema.names else []
-
-
-def check_functions(
-    recording: Path, stated: Mapping[str, Any], what: str, trusted: Collection[str] = ()
-) -> None:
-    """A recording may come from somebody else: code that it names is run where the user names it, too.
-
-    Args:
-        recording: for the error.
-        stated: its configuration, by dotted key.
-        what: is to be done with it, for the error.
-        trusted: settings that the user has given, ``key=value`` each.
-
-    Raises:
-        UserError: it was made with somebody's function that the user has not named.
-    """
-    for section, name in STAGES.items():
-        key = f"{section}.{name}"
-        function = str(stated.get(key, ""))
-        if is_foreign(function) and f"{key}={function}" not in trusted:
-            raise UserError(
-                f"{recording}: it was made with the function {function}, and to {what} is to run that "
-                f"module; if you trust it, add --set {key}={function}"
-            )

@@ -54,7 +54,7 @@ class StageLoader:
 
     def __init__(self) -> None:
         self._networks: dict[tuple[str, str, str, int], Detector] = {}
-        self._foreign: dict[tuple[str, str], Foreign | None] = {}
+        self._foreign: dict[tuple[str, str, str], Foreign | None] = {}
         self._pillars: dict[tuple[object, ...], PillarNetwork] = {}
 
     def load(self, config: Config, detect: Detect | None = None) -> Stages:
@@ -75,7 +75,7 @@ class StageLoader:
         )
 
     def _function(self, config: Config, section: str) -> Foreign | None:
-        key = section, getattr(config, section).model_dump_json()
+        key = section, getattr(config, section).model_dump_json(), str(config.functions)
         if key not in self._foreign:
             self._foreign[key] = foreign.foreign(config, section)
         return self._foreign[key]

@@ -25,6 +25,7 @@ from bevviz.config import Config, changes, dump, keys, load
 from bevviz.errors import StageError, UserError
 from bevviz.frame import Boxes3D, Camera, Frame, LabelledBoxes2D
 from bevviz.geometry import inverse
+from bevviz.project import named_code
 from bevviz.results import ClusterState, DetectionState, FrameResult
 from bevviz.ros.encode import (
     encode_boxes_2d,
@@ -38,6 +39,7 @@ from bevviz.session import Session
 from bevviz.stages import foreign
 from bevviz.stages.robot import detect
 from bevviz.synthetic import SyntheticSource
+from bevviz.trust import allow
 from tests import bags
 from tests.waiting import PATIENCE
 
@@ -252,13 +254,15 @@ def test_a_registered_name(here: Path, frame: Frame, monkeypatch: pytest.MonkeyP
 # --- parameters --------------------------------------------------------------------------------
 
 
-def test_parameters_become_part_of_the_section(here: Path) -> None:
+def test_parameters_become_part_of_the_section(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     method = "clustering.method=mine.stages:cells"
     config = configured(method, "clustering.params.cell=2", "clustering.height=0.5")
     assert config.clustering.params == {"height": 0.5, "cell": 2.0, "score": 0.8}
     text = dump(config)
     assert "  params:\n    height: 0.5  # metres above the lowest point\n" in text
     Path("c.yaml").write_text(text)
+    monkeypatch.setenv("XDG_DATA_HOME", str(here / "data"))
+    allow(named_code(Path("c.yaml")))
     assert load("c.yaml") == config
     assert "clustering.params.cell" in keys(config)
     assert {k: str(c) for k, c in changes(configured(method), config).items()} == {

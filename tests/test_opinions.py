@@ -38,6 +38,7 @@ from bevviz.stages.opinions import opinions, right_names
 from bevviz.stages.visibility import image_boxes, range_image, visible
 from bevviz.sweep.run import Outcome
 from bevviz.synthetic import SyntheticSource
+from bevviz.trust import USER
 from bevviz.why import Questioner, Selection
 from bevviz.why.origin import origin
 from bevviz.why.verdict import Reason
@@ -623,7 +624,7 @@ def test_a_stage_that_is_somebody_elses_brings_its_own_controls(
     (tmp_path / "boxes_of.py").write_text(text)
     monkeypatch.syspath_prepend(tmp_path)
     opened = load(settings=["clustering.eps=0.7"])
-    tried = revised(opened, ["objects.method=boxes_of:detect", "objects.cell=3", "clustering.eps=0.4"])
+    tried = revised(opened, ["objects.method=boxes_of:detect", "objects.cell=3", "clustering.eps=0.4"], USER)
     found = {one["key"]: one["value"] for one in controls(tried, opened)}
     before = {one["key"]: one["value"] for one in controls(opened)}
     assert found == {**before, "objects.params.cell": 1.0, "objects.params.axes": [1, 2]}

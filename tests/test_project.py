@@ -56,7 +56,8 @@ def test_the_nearest_one_is_taken(project: Path) -> None:
 @pytest.mark.parametrize("model", ["demo", "mine:Detector", "topic:/detections", ""])
 def test_what_is_no_file_is_named_as_it_is(project: Path, model: str) -> None:
     project.write_text(f'model = "{model}"\n')
-    assert load(layers=layers(Path.cwd(), {})).detector.model == model if "mine" not in model else True
+    if "mine" not in model:  # which is code, and asks for trust
+        assert load(layers=layers(Path.cwd(), {})).detector.model == model
     (layer,) = layers(Path.cwd(), {})
     assert layer.values.get("detector.model", "") == model
 
@@ -104,19 +105,6 @@ def test_a_wrong_project_is_one_clear_line(project: Path, capsys: Capture, text:
 def test_a_file_that_it_names_and_that_is_not_there(project: Path) -> None:
     project.write_text('config = ["robot.yaml", "absent.yaml"]')
     with pytest.raises(UserError, match=r"\.\./\.\./absent\.yaml: cannot read"):
-        layers(Path.cwd(), {})
-
-
-def test_somebody_elses_is_not_taken(monkeypatch: pytest.MonkeyPatch, project: Path) -> None:
-    owner = project.stat().st_uid
-    monkeypatch.setattr("os.geteuid", lambda: owner + 1000)
-    if owner == 0:  # root could do anything anyway
-        assert layers(Path.cwd(), {})
-        project.chmod(0o644)
-        import os
-
-        os.chown(project, 1234, 1234)
-    with pytest.raises(UserError, match="belongs to another user"):
         layers(Path.cwd(), {})
 
 

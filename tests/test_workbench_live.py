@@ -261,12 +261,23 @@ def detect(points, params):
 """
 
 
-def test_the_objects_method_is_changed_there_and_back(
-    bench: LiveBench, results: list[FrameResult], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Ours, a function with parameters of its own, the robot's topic, and ours again."""
+@pytest.fixture
+def bench_with_network(
+    results: list[FrameResult], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> Iterator[LiveBench]:
+    """A run whose user has named a function, and then ours again: a page may go to and fro."""
     (tmp_path / "network.py").write_text(NETWORK)
     monkeypatch.syspath_prepend(tmp_path)
+    named = ("objects.method=network:detect", "objects.method=frustum")
+    with live_bench(results, f"live.held={HELD}", *named) as bench:
+        yield bench
+
+
+def test_the_objects_method_is_changed_there_and_back(
+    bench_with_network: LiveBench, results: list[FrameResult]
+) -> None:
+    """Ours, a function with parameters of its own, the robot's topic, and ours again."""
+    bench = bench_with_network
     bench._see(results[0])
     theirs = ("objects.method=network:detect", "objects.params.ahead=14", "opinions.min_height=400")
     told = bench.attempt(0, theirs)
@@ -279,7 +290,7 @@ def test_the_objects_method_is_changed_there_and_back(
     told = bench.attempt(0, ("objects.method=topic:/nobody",))
     assert told["failures"] == ["objects: the robot published no boxes on /nobody at the time of this scan"]
     assert bench.live.config.opinions.min_height == 25 and not bench.live.config.objects.params
-    with pytest.raises(UserError, match="no module 'nowhere'"):
+    with pytest.raises(UserError, match=r"start bevviz with --set objects\.method=nowhere:detect"):
         bench.attempt(0, ("objects.method=nowhere:detect",))
     assert bench.live.config.objects.method == "topic:/nobody"
     told = bench.attempt(0, ())

@@ -168,7 +168,7 @@ def _alone(config: Config, section: str) -> Stages:
     runs_on = {"provider": config.detector.provider, "threads": config.detector.threads}
     detector = config.detector if section == "detector" else DetectorConfig().model_copy(update=runs_on)
     objects = config.objects if section == "objects" else ObjectsConfig()
-    return StageLoader().load(Config(detector=detector, objects=objects))
+    return StageLoader().load(config.restated({"detector": detector, "objects": objects}))
 
 
 def _topic(recording: Recording, topic: Topic, roles: Roles) -> TopicInfo:

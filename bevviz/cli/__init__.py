@@ -27,6 +27,7 @@ from bevviz.cli import (
     report,
     style,
     sweep,
+    trust,
     tune,
     why,
     workbench,
@@ -59,6 +60,7 @@ EPILOG = """examples:
   bevviz calib drive.mcap                     is it the calibration or the clock?
   bevviz config --preset reference            every parameter, with its unit and meaning
   bevviz config clustering.eps                one of them explained, and where its value is stated
+  bevviz trust                                let functions run that the folder's bevviz.toml names
 """
 
 
@@ -156,6 +158,7 @@ def _parser() -> tuple[argparse.ArgumentParser, Collection[str]]:
         demo,
         live,
         config,
+        trust,
         completion,
     ):
         command.add(commands)

@@ -22,6 +22,7 @@ from bevviz.cli.outputs import Outputs, hint, say, warn
 from bevviz.errors import UserError
 
 if TYPE_CHECKING:
+    from bevviz.config import Layer
     from bevviz.frame import Frame, Scene
     from bevviz.live.settings import Settings
 
@@ -49,14 +50,15 @@ def _tune(options: argparse.Namespace) -> int:
     from bevviz.tune import OneFrame, Saves, Version, VersionRecorder, create
 
     given = given_settings(options)
+    known: list[Layer] = []
     if not options.config.exists() and create(
         options.config, dump(loaded(options, None, given, options.preset))
     ):
         say(f"{options.config}: made, with every parameter")
     elif (recorded := getattr(options, "recorded", None)) is not None:
         say(f"{options.config}: is there already, and taken instead of the recording's configuration")
-        given = [*recorded.missing(load(options.config, given, options.preset)), *given]
-    settings = Settings(options.config, given, options.preset, project_layers(options))
+        known = [recorded.missing(load(options.config, given, options.preset))]
+    settings = Settings(options.config, [*known, *given], options.preset, project_layers(options))
     frame, scene, warnings = _frame(options, settings)
     outputs = Outputs.of(options).or_viewer()
     if not outputs:

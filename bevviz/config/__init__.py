@@ -25,7 +25,7 @@ from bevviz.config.foreign import (
     stage_topics,
     with_object_files,
 )
-from bevviz.config.loading import load, revised
+from bevviz.config.loading import load, received, revised
 from bevviz.config.methods import OURS, STAGES
 from bevviz.config.sections import (
     AnomaliesConfig,
@@ -83,6 +83,7 @@ __all__ = [
     "params_of",
     "plugin_of",
     "read_layer",
+    "received",
     "revised",
     "stage_topics",
     "stated_lines",

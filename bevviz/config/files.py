@@ -5,28 +5,44 @@ from __future__ import annotations
 import json
 import tomllib
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from bevviz.config.dotted import flattened, keys, unit
+from bevviz.config.methods import STAGES
 from bevviz.config.sections import Config
 from bevviz.errors import UserError, first_line
 from bevviz.files import CONFIG_LIMIT, read_text
+from bevviz.plugins import is_foreign
+from bevviz.trust import RECEIVED, NamedCode, Trust, trust_in
 
 MOST_VALUES = 1_000_000  # of a YAML file, with each alias counted as often as it is used
 
 
 @dataclass(frozen=True, slots=True)
 class Layer:
-    """Values by dotted key, and where they are stated."""
+    """Values by dotted key, and where they are stated.
+
+    Attributes:
+        where: for errors.
+        values: by dotted key.
+        trust: whether functions among the values may run. They may not, unless a caller says so.
+    """
 
     where: str
     values: Mapping[str, Any]
+    trust: Trust = RECEIVED
+
+    @property
+    def functions(self) -> tuple[str, ...]:
+        """``module:function`` of every stage that the values name."""
+        named = (self.values.get(f"{section}.{key}") for section, key in STAGES.items())
+        return tuple(method for method in named if isinstance(method, str) and is_foreign(method))
 
 
 def read_layer(path: Path, *, pipe: bool = True) -> Layer:
-    """Read the values that a YAML file states.
+    """Read what a YAML file states. Its functions may run where the user has trusted the file.
 
     Args:
         path: of the file.
@@ -35,7 +51,8 @@ def read_layer(path: Path, *, pipe: bool = True) -> Layer:
     Raises:
         UserError: it cannot be read.
     """
-    return Layer(str(path), flattened(_read_yaml(path, pipe)))
+    layer = Layer(str(path), flattened(_read_yaml(path, pipe)))
+    return replace(layer, trust=trust_in(NamedCode((path,), layer.functions)))
 
 
 def _read_yaml(path: Path, pipe: bool) -> Mapping[str, Any]:

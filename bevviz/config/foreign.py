@@ -10,7 +10,7 @@ from pydantic.fields import FieldInfo
 
 from bevviz import plugins
 from bevviz.config.methods import OURS, STAGES
-from bevviz.config.sections import Config
+from bevviz.config.sections import Config, Functions
 from bevviz.errors import UserError
 from bevviz.pillar_params import PillarParams, is_network
 from bevviz.plugins import TOPIC
@@ -22,18 +22,30 @@ def plugin_of(config: Config, section: str) -> plugins.Plugin | None:
     Raises:
         UserError: it cannot be had.
     """
-    key = STAGES[section]
-    return _plugin(section, getattr(getattr(config, section), key))
+    return _plugin(section, getattr(getattr(config, section), STAGES[section]), config.functions)
 
 
-def _plugin(section: str, method: str) -> plugins.Plugin | None:
-    if method in OURS or (section == "detector" and Path(method).exists()):
-        return None
-    name = method if ":" in method else plugins.registered().get(method, "")
-    if not plugins.is_foreign(name):
+def names_function(section: str, method: object) -> bool:
+    """Whether a stage's section names ``module:function``."""
+    if not isinstance(method, str) or not plugins.is_foreign(method):
+        return False
+    return section != "detector" or not Path(method).exists()
+
+
+def _plugin(section: str, method: str, functions: Functions) -> plugins.Plugin | None:
+    folder: str | None = None
+    name = method
+    if names_function(section, method):
+        if (section, method) not in functions:  # this configuration was not made by ``load``
+            raise UserError(f"{section}.{STAGES[section]} {method}: no function that the user has named")
+        folder = functions[section, method]
+    else:
+        ours = method in OURS or (section == "detector" and Path(method).exists())
+        name = "" if ours else plugins.registered().get(method, "")
+    if not name:
         return None
     try:
-        return plugins.find(name)
+        return plugins.find(name, folder)
     except UserError as error:
         raise UserError(f"{section}.{STAGES[section]} {method}: {error}") from error.__cause__
 
@@ -69,11 +81,17 @@ def with_object_files(config: Config, named: Callable[[str], str]) -> Config:
     return config.model_copy(update={"objects": config.objects.model_copy(update=changed)})
 
 
-def params_model(section: str, method: str) -> type[BaseModel] | None:
-    """Of the parameters that a stage has beside its own."""
+def params_model(section: str, method: str, functions: Functions) -> type[BaseModel] | None:
+    """Of the parameters that a stage has beside its own.
+
+    Args:
+        section: of the stage.
+        method: that the section names.
+        functions: ``Config.functions``.
+    """
     if section == "objects" and is_network(method):
         return PillarParams
-    plugin = _plugin(section, method)
+    plugin = _plugin(section, method, functions)
     return None if plugin is None else plugin.params
 
 
@@ -81,5 +99,5 @@ def params_of(config: Config, section: str) -> Mapping[str, FieldInfo]:
     """The parameters that a stage has beside its own: of a function, or of a network on pillars."""
     if section not in STAGES:
         return {}
-    model = params_model(section, getattr(getattr(config, section), STAGES[section]))
+    model = params_model(section, getattr(getattr(config, section), STAGES[section]), config.functions)
     return {} if model is None else model.model_fields

@@ -10,12 +10,13 @@ from pydantic import BaseModel, ValidationError
 
 from bevviz.config.dotted import TUTORIAL_NAMES, flattened, keys, unit, unknown_key, values
 from bevviz.config.files import Layer, read_layer, yaml_value
-from bevviz.config.foreign import params_model
+from bevviz.config.foreign import names_function, params_model
 from bevviz.config.methods import STAGES
-from bevviz.config.sections import Config, Preset
+from bevviz.config.sections import Config, Functions, Preset
 from bevviz.errors import UserError
 from bevviz.pillar_params import UNFIT, is_network
 from bevviz.text import shown
+from bevviz.trust import MESSAGE, RECEIVED, USER, Trust
 
 BASE = "configuration"  # where values are stated that came as a whole
 
@@ -39,51 +40,57 @@ REFERENCE: dict[str, dict[str, Any]] = {
 
 def load(
     file: str | Path | Sequence[Path] | None = None,
-    settings: Iterable[str] = (),
+    settings: Iterable[str | Layer] = (),
     preset: Preset | None = None,
-    base: Config | Mapping[str, Any] | None = None,
+    base: Config | Layer | None = None,
     layers: Iterable[Layer] = (),
+    in_force: Config | None = None,
 ) -> Config:
     """The effective configuration: preset, then the layers, the files, then each ``key=value``, later ones
     winning.
 
+    Functions (``module:function``) run only where the user has named them or has trusted the file that does:
+    each value comes in a layer, whose ``trust`` says so. This is the one place where it is decided.
+
     Args:
         file: YAML files.
-        settings: ``key=value`` each.
+        settings: ``key=value`` each, of the user; what others have sent comes as ``received`` makes it.
         preset: which one; None: as the files say, else ``default``.
         base: a whole configuration that all of this is to change, or its values by dotted key.
         layers: of the project, see ``bevviz.project``.
+        in_force: a configuration whose functions run already, and may go on.
 
     Raises:
-        UserError: unreadable file, unknown key, wrong unit or value out of range, in one line.
+        UserError: unreadable file, unknown key, wrong unit or value out of range, or a function that may not
+            run, in one line.
     """
-    given: list[tuple[str, Any, str]] = []  # key, value, and where it was stated
-    if base is not None:
-        stated_there = values(base) if isinstance(base, Config) else base
-        given += [(key, value, BASE) for key, value in stated_there.items()]
     files = [Path(file)] if isinstance(file, str | Path) else file or ()
-    for layer in (*layers, *map(read_layer, files)):
-        given += [(key, value, layer.where) for key, value in layer.values.items()]
-    for text in settings:
-        key, sep, value = text.partition("=")
-        if not sep:
-            raise UserError(f"--set {text}: expected key=value, for example --set clustering.eps=0.6")
-        parsed = yaml_value(value, f"--set {text}") if value.strip() else ""
-        if isinstance(parsed, int) and _is_text(key.strip()):  # 0001 is a name
-            parsed = value.strip()
-        given.append((key.strip(), parsed, f"--set {text}"))
-    given = [(TUTORIAL_NAMES.get(key, key), value, where) for key, value, where in given]
+    whole = Layer(BASE, values(base)) if isinstance(base, Config) else base
+    sources = [
+        *([whole] if whole is not None else []),
+        *layers,
+        *map(read_layer, files),
+        *(one if isinstance(one, Layer) else _setting(one, USER) for one in settings),
+    ]
+    given = [
+        (TUTORIAL_NAMES.get(key, key), value, layer)
+        for layer in sources
+        for key, value in layer.values.items()
+    ]
     chosen = preset or next((value for key, value, _ in reversed(given) if key == "preset"), "default")
     of_preset = flattened(REFERENCE) if chosen == "reference" else {}
     stated: dict[str, Any] = {}
     origin: dict[str, str] = {}
-    for key, value, where in given:
+    stating: dict[str, Layer] = {}
+    for key, value, layer in given:
         section, _, name = key.partition(".")
         before_it = stated.get(key, value)
         if name == STAGES.get(section) and before_it != value and not _alike(before_it, value):
             stated = {k: v for k, v in stated.items() if not k.startswith(f"{section}.params.")}
-        stated[key], origin[key] = value, where
-    params = _params({**of_preset, **stated}, origin)
+        stated[key], origin[key], stating[key] = value, layer.where, layer
+    running = [config.functions for config in (in_force, base) if isinstance(config, Config)]
+    functions = _functions(given, stated, stating, running)
+    params = _params({**of_preset, **stated}, origin, functions)
     known = [*keys(), *params]
     tree: dict[str, Any] = {"preset": chosen}
     for key, value in {**of_preset, **stated}.items():
@@ -93,11 +100,11 @@ def load(
             full = f"{section}.params.{name}"
             if full not in params:
                 raise UserError(f"{origin[key]}: {unknown_key(key, known)}")
-            origin[full] = origin[key]
+            origin[full], stating[full] = origin[key], stating[key]
         if full != "preset":
             _insert(tree, full, value)
     try:
-        for section, model in _param_models(tree):
+        for section, model in _param_models(tree, functions):
             prefix = f"{section}.params."
             tree[section]["params"] = model.model_validate(tree[section].get("params", {})).model_dump(
                 mode="json"
@@ -120,17 +127,89 @@ def load(
         stated_unit = f", in {unit(key)}" if unit(key) and not silent else ""
         raise UserError(f"{where}: {key} {_lower(first['msg'])}{stated_unit}{value}{hint}") from None
     before = base.stated if isinstance(base, Config) else {}
-    made._stated = {**before, **{key: where for key, where in origin.items() if where != BASE}}
+    made._stated = {**before, **{key: where for key, where in origin.items() if stating[key] is not whole}}
+    made._functions = functions
     return made
 
 
-def revised(config: Config, settings: Iterable[str]) -> Config:
-    """The configuration with other values, ``key=value`` each.
+def revised(config: Config, settings: Iterable[str], trust: Trust = MESSAGE) -> Config:
+    """The configuration with other values.
+
+    Args:
+        config: that is in force.
+        settings: ``key=value`` each.
+        trust: whether functions among the values may run. Those that are in force may.
 
     Raises:
         UserError: as ``load``.
     """
-    return load(settings=settings, base=config)
+    return load(settings=[_setting(setting, trust) for setting in settings], base=config)
+
+
+def received(settings: Iterable[str], where: str = "", trust: Trust = RECEIVED) -> list[Layer]:
+    """Read settings that the user has not typed, for ``load``: functions among them do not run.
+
+    Args:
+        settings: ``key=value`` each.
+        where: they come from, for errors; empty: the setting itself is told.
+        trust: with what the user can do instead.
+
+    Raises:
+        UserError: one of them is no ``key=value``.
+    """
+    return [_setting(setting, trust, where) for setting in settings]
+
+
+def _setting(text: str, trust: Trust, where: str = "") -> Layer:
+    """One ``key=value``."""
+    key, sep, value = text.partition("=")
+    if not sep:
+        raise UserError(f"--set {text}: expected key=value, for example --set clustering.eps=0.6")
+    parsed = yaml_value(value, f"--set {text}") if value.strip() else ""
+    if isinstance(parsed, int) and _is_text(key.strip()):  # 0001 is a name
+        parsed = value.strip()
+    return Layer(where or f"--set {text}", {key.strip(): parsed}, trust)
+
+
+def _functions(
+    given: Iterable[tuple[str, Any, Layer]],
+    stated: Mapping[str, Any],
+    stating: Mapping[str, Layer],
+    running: Iterable[Functions],
+) -> Functions:
+    """Check that the user has named the functions of the stages, or trusts who does.
+
+    A value that was received is kept where a trusted layer, or the configuration in force, has the same.
+
+    Args:
+        given: every key and value with its layer.
+        stated: the values in force.
+        stating: the layer of each.
+        running: functions that are in force already.
+
+    Returns:
+        The functions in force, with the folder of each one's module.
+
+    Raises:
+        UserError: a function may not run.
+    """
+    granted = {function: folder for functions in running for function, folder in functions.items()}
+    for key, value, layer in given:
+        section, _, name = key.partition(".")
+        if layer.trust.granted and name == STAGES.get(section) and isinstance(value, str):
+            granted[section, value] = layer.trust.folder
+    found: dict[tuple[str, str], str] = {}
+    for section, name in STAGES.items():
+        key = f"{section}.{name}"
+        method = stated.get(key)
+        if not names_function(section, method):
+            continue
+        if (section, method) not in granted:
+            layer = stating[key]
+            advice = layer.trust.advice.replace("{setting}", f"{key}={method}")
+            raise UserError(f"{layer.where}: {key} names the function {method}, which may not run: {advice}")
+        found[section, method] = granted[section, method]
+    return found
 
 
 def _unfit_network(where: str, method: str, key: str, about: Mapping[str, str]) -> str:
@@ -153,7 +232,7 @@ def _is_text(key: str) -> bool:
     return name in getattr(model, "model_fields", {}) and model.model_fields[name].annotation is str  # type: ignore[union-attr]
 
 
-def _params(stated: Mapping[str, Any], origin: Mapping[str, str]) -> dict[str, str]:
+def _params(stated: Mapping[str, Any], origin: Mapping[str, str], functions: Functions) -> dict[str, str]:
     """Dotted keys and descriptions of the parameters of the plugins and networks that are named."""
     found: dict[str, str] = {}
     for section, key in STAGES.items():
@@ -161,7 +240,7 @@ def _params(stated: Mapping[str, Any], origin: Mapping[str, str]) -> dict[str, s
         if not isinstance(method, str):
             continue
         try:
-            model = params_model(section, method)
+            model = params_model(section, method, functions)
         except UserError as error:
             raise UserError(f"{origin[f'{section}.{key}']}: {error}") from error.__cause__
         if model is not None:
@@ -170,10 +249,10 @@ def _params(stated: Mapping[str, Any], origin: Mapping[str, str]) -> dict[str, s
     return found
 
 
-def _param_models(tree: Mapping[str, Any]) -> Iterator[tuple[str, type[BaseModel]]]:
+def _param_models(tree: Mapping[str, Any], functions: Functions) -> Iterator[tuple[str, type[BaseModel]]]:
     """The sections whose functions or networks have parameters of their own, with the model of these."""
     for section, key in STAGES.items():
-        model = params_model(section, str(tree.get(section, {}).get(key, "")))
+        model = params_model(section, str(tree.get(section, {}).get(key, "")), functions)
         if model is not None:
             yield section, model
 

@@ -22,6 +22,7 @@ from bevviz.config.sizes import SIZES, ClassSize, _with_known
 from bevviz.config.units import Degrees, Megabytes, Metres, Pixels, Seconds
 
 Preset = Literal["default", "reference"]
+Functions = Mapping[tuple[str, str], str]  # section and module:function -> folder of the module
 Keep = Literal["everything", "inspect", "report"]
 Quantity = Literal["height", "intensity", "ring", "time", "distance"]  # of a point
 
@@ -383,12 +384,31 @@ class Config(Section):
     live: LiveConfig = LiveConfig()
 
     _stated: Mapping[str, str] = PrivateAttr(default_factory=dict)
+    _functions: Functions = PrivateAttr(default_factory=dict)
 
     @property
     def stated(self) -> Mapping[str, str]:
         """Where each dotted key was stated that was: an option, a file, a variable. It is no part of what
         two configurations have in common."""
         return self._stated
+
+    @property
+    def functions(self) -> Functions:
+        """Functions that the user has named or trusted; no other one is imported. ``load`` states them.
+
+        The folder of a module is empty for the working directory.
+        """
+        return self._functions
+
+    def restated(self, tree: Mapping[str, Any]) -> Config:
+        """Make the configuration of other values, which may run the same functions.
+
+        Raises:
+            ValidationError: of pydantic.
+        """
+        made = Config.model_validate(tree)
+        made._functions = self._functions
+        return made
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, Config) and self.__dict__ == other.__dict__

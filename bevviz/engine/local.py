@@ -6,7 +6,8 @@ import os
 import signal
 import sys
 from collections import Counter, deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from multiprocessing import get_context
 from multiprocessing.connection import Connection, wait
@@ -20,6 +21,7 @@ from bevviz.engine.task import JobResult, JobResults, Task
 
 SIGNALS = {signal.SIGINT, signal.SIGTERM, signal.SIGHUP}
 TICK = 0.2  # seconds
+SAFE_PATH = "PYTHONSAFEPATH"  # variable of Python itself
 
 
 @dataclass
@@ -116,7 +118,8 @@ class Processes(Closing):
         # interrupted itself between a worker's start and its name.
         before = signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)
         try:
-            process.start()
+            with _safe_path():
+                process.start()
         finally:
             signal.pthread_sigmask(signal.SIG_SETMASK, before)
         theirs.close()  # so that its end is seen as soon as the process has gone
@@ -135,6 +138,20 @@ class Processes(Closing):
         fresh = self._start()
         fresh.pipe.send(job)
         return _Worker(fresh.process, fresh.pipe, job)
+
+
+@contextmanager
+def _safe_path() -> Iterator[None]:
+    """Let a new process look for Python's own modules where they are, not in the working directory first."""
+    before = os.environ.get(SAFE_PATH)
+    os.environ[SAFE_PATH] = "1"
+    try:
+        yield
+    finally:
+        if before is None:
+            del os.environ[SAFE_PATH]
+        else:
+            os.environ[SAFE_PATH] = before
 
 
 _FRAME = "frame"

@@ -6,7 +6,6 @@ import json
 import os
 import signal
 import socket
-import stat
 import struct
 import tempfile
 import threading
@@ -17,6 +16,7 @@ from typing import BinaryIO
 
 from bevviz.closing import Closing
 from bevviz.errors import UserError
+from bevviz.files import check_owned
 
 ANSWER = 5.0  # seconds until a process that is well has said that it heard
 PATIENCE = 120.0  # seconds that saving may take
@@ -166,17 +166,6 @@ def folders() -> Iterator[Path]:
 
 def _temporary() -> Path:
     return Path(tempfile.gettempdir(), f"bevviz-{os.getuid()}")
-
-
-def check_owned(folder: Path) -> None:
-    """Raises UserError where others could put something there: a folder of temporary files is everybody's."""
-    found = folder.lstat()
-    if not stat.S_ISDIR(found.st_mode):
-        raise UserError(f"{folder} is not a folder")
-    if found.st_uid != os.getuid():
-        raise UserError(f"{folder} belongs to another user: set XDG_RUNTIME_DIR to a folder of yours")
-    if found.st_mode & 0o022:
-        raise UserError(f"{folder} can be written by others: chmod 700 it")
 
 
 def _running() -> dict[int, socket.socket]:

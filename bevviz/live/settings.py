@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from bevviz.config import Config, Layer, Preset, load
+from bevviz.config import Config, Layer, Preset, load, received
+from bevviz.trust import MESSAGE
 
 AT_START = (
     "source.",
@@ -22,6 +23,9 @@ AT_START = (
 class Settings:
     """Preset, project, file and ``key=value`` settings, later ones winning; what ``update`` brings wins.
 
+    Functions run where the user has named them here, or trusts the file that does. Those that run may go on
+    after an edit of the file. Settings that come later are messages of other programs: they name none anew.
+
     Raises:
         UserError: as ``bevviz.config.load``.
     """
@@ -29,16 +33,16 @@ class Settings:
     def __init__(
         self,
         file: Path | None = None,
-        settings: Sequence[str] = (),
+        settings: Sequence[str | Layer] = (),
         preset: Preset | None = None,
         layers: Sequence[Layer] = (),
     ) -> None:
         self.file = file
-        self._settings = list(settings)
+        self._settings: list[str | Layer] = list(settings)
         self._preset = preset
         self._layers = layers
         self._version = self._stat()
-        self.config = self.read()
+        self.config = load(file, settings, preset, layers=layers)
 
     def changed(self) -> bool:
         """Whether the file was saved since the last call."""
@@ -58,7 +62,8 @@ class Settings:
         Raises:
             UserError: as ``bevviz.config.load``.
         """
-        return load(self.file, self._with(more, without), self._preset, layers=self._layers)
+        settings = self._with(more, without)
+        return load(self.file, settings, self._preset, layers=self._layers, in_force=self.config)
 
     def take(self, more: Sequence[str]) -> None:
         """More settings, before anything runs with them.
@@ -72,11 +77,11 @@ class Settings:
         self.config = config
         self._settings = self._with(more, without)
 
-    def _with(self, more: Sequence[str], without: Sequence[str]) -> list[str]:
+    def _with(self, more: Sequence[str], without: Sequence[str]) -> list[str | Layer]:
         newest_first = self._settings[::-1]
-        for setting in without:
+        for setting in received(without, trust=MESSAGE):
             newest_first.remove(setting)
-        return [*newest_first[::-1], *more]
+        return [*newest_first[::-1], *received(more, trust=MESSAGE)]
 
     def _stat(self) -> tuple[int, int, int] | None:
         """Editors write in place or put another file there; None while it is missing."""

@@ -75,7 +75,7 @@ def remote(url: str, recording_id: str) -> Program:
         UserError: no such URL, or no viewer answers there.
     """
     host, port = check_viewer(url)
-    command = [sys.executable, "-m", "bevviz.live.relay", url, recording_id]
+    command = [sys.executable, "-P", "-m", "bevviz.live.relay", url, recording_id]
     return Program("remote", command, framed=True, is_ready=lambda: answers(host, port))
 
 

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from rerun.chunk import RrdReader
 
-from bevviz.config import Config, changes, flat_yaml, load, object_files
+from bevviz.config import Config, Layer, changes, flat_yaml, load, object_files
 from bevviz.errors import UserError
 from bevviz.files import Scratch
 from bevviz.logging import entities
@@ -21,7 +21,6 @@ from bevviz.logging.reading import check_decodes, readable
 from bevviz.progress import Progress
 from bevviz.protocols import Observer
 from bevviz.provenance import differences, file_hash, model_path, provenance
-from bevviz.recorded import check_functions
 from bevviz.report.digest import (
     ROUNDING,
     DigestDifference,
@@ -209,11 +208,11 @@ def _configs(
     rrd: Path, stored: StoredReport, model: Path | None, settings: Sequence[str], folder: Path
 ) -> tuple[Config, Config]:
     """The configuration as it is stored, and as it is to be run on this machine."""
-    info, file, names = stored.info, folder / "config.yaml", folder / "names.txt"
-    file.write_text(stored.config)
+    info, names = stored.info, folder / "names.txt"
     names.write_bytes(info.names.encode())
-    check_functions(rrd, flat_yaml(stored.config, str(rrd)), "check it", settings)
-    then = load(file)
+    recorded = Layer(str(rrd), flat_yaml(stored.config, str(rrd)))
+    same = [text for text in settings if _is_in(recorded, text)]  # the user names its functions, too
+    then = load(settings=same, layers=[recorded])
     needed = model_path(then)
     here = [f"detector.names={names}"] if info.names else []
     if model is not None:
@@ -231,7 +230,13 @@ def _configs(
         if not beside.exists():
             raise UserError(f"{rrd}: it was made with {name}, which is not beside it: add --set {key}=FILE")
         here.append(f"{key}={beside}")
-    return then, load(file, [*here, *settings])
+    return then, load(settings=[*here, *settings], layers=[recorded])
+
+
+def _is_in(layer: Layer, setting: str) -> bool:
+    """Whether a ``key=value`` is what the layer states anyway."""
+    key, _, value = setting.partition("=")
+    return str(layer.values.get(key)) == value
 
 
 def _other(bag: Path) -> str:

@@ -192,7 +192,7 @@ def changed(config: Config, change: Change) -> Config:
         for part in path:
             section = section[part]
         section[name] = value
-    return Config.model_validate(tree)
+    return config.restated(tree)
 
 
 def _outcome(

@@ -86,7 +86,7 @@ class NativeViewer(Closing):
         return relay
 
     def _start_relay(self, url: str) -> rerun_cli.Process:
-        relay = [sys.executable, "-m", "bevviz.live.relay", url, self._recording_id]
+        relay = [sys.executable, "-P", "-m", "bevviz.live.relay", url, self._recording_id]
         return rerun_cli.spawn(rerun_cli.tied(relay))
 
     def _start(self) -> str:

@@ -1,0 +1,98 @@
+"""``bevviz trust``."""
+
+from __future__ import annotations
+
+import argparse
+import os
+from pathlib import Path
+
+from bevviz.cli.options import Commands
+from bevviz.errors import UserError
+
+EXAMPLES = """examples:
+  bevviz trust                     the bevviz.toml of this folder, or of one above
+  bevviz trust robot.yaml          a file that --config takes
+  bevviz trust --list              what is trusted, and what has changed since
+  bevviz trust --revoke robot.yaml"""
+
+
+def add(commands: Commands) -> None:
+    trust = commands.add_parser(
+        "trust",
+        help="let the functions of a project file, or of a YAML file, run",
+        description="A project file or a YAML file can name functions (module:function), which are code. "
+        "They run once you trust the file. After an edit of the file or of a module beside it, bevviz asks "
+        "again. Read both first.",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        epilog=EXAMPLES,
+    )
+    trust.add_argument(
+        "path",
+        nargs="?",
+        type=Path,
+        metavar="PATH",
+        help="project file, YAML file, or folder (default: the project of this folder)",
+    )
+    instead = trust.add_mutually_exclusive_group()
+    instead.add_argument("--list", action="store_true", help="print what is trusted")
+    instead.add_argument("--revoke", action="store_true", help="trust PATH no longer")
+    trust.set_defaults(run=_trust)
+
+
+def _trust(options: argparse.Namespace) -> int:
+    from bevviz.project import named_code
+    from bevviz.trust import allow, revoke
+
+    if options.list:
+        if options.path is not None:
+            raise UserError("--list prints all that is trusted: leave PATH out")
+        return _list()
+    path = _file(options.path)
+    if options.revoke:
+        if not revoke(path):
+            raise UserError(f"{path}: is not trusted; 'bevviz trust --list' says what is")
+        print(f"{path}: no longer trusted")
+        return 0
+    code = named_code(path)
+    if not code.functions:
+        print(f"{path}: names no function, so that there is nothing to trust")
+        return 0
+    if not code.is_regular:
+        raise UserError(f"{path}: is no file that can be trusted: name the function by --set")
+    allow(code)
+    print(f"{path}: trusted, with {code}")
+    return 0
+
+
+def _list() -> int:
+    from bevviz.trust import records
+
+    found = list(records())
+    for record in found:
+        print(f"{record.path}: {', '.join(record.functions)}{_state(record.path, record.sha256)}")
+    if not found:
+        print("nothing is trusted")
+    return 0
+
+
+def _state(path: Path, sha256: str) -> str:
+    from bevviz.project import named_code
+
+    try:
+        same = named_code(path).digest() == sha256
+    except UserError:
+        return " (cannot be read any more)"
+    return "" if same else " (changed since: not trusted as it is now)"
+
+
+def _file(path: Path | None) -> Path:
+    """The file that is meant."""
+    from bevviz.project import NAME, find
+
+    if path is not None and not path.is_dir():
+        return path
+    folder = Path.cwd() if path is None else path.absolute()
+    found = find(folder)
+    if found is None:
+        raise UserError(f"{os.path.relpath(folder)}: there is no {NAME} in this folder, or in one above")
+    return found
