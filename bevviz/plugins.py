@@ -159,11 +159,13 @@ def _fault(target: Callable[..., Any], *, has_params: bool) -> str:
     what is in it.
     """
     if isinstance(target, type):
-        made = target.__init__ if _plain(target.__init__) else None
-        call = next((vars(base)["__call__"] for base in target.__mro__ if "__call__" in vars(base)), None)
+        made, call = (
+            next((vars(base)[name] for base in target.__mro__ if name in vars(base)), None)
+            for name in ("__init__", "__call__")
+        )
         if not _is_ours(target) or not _plain(call):
             return f"a class needs a method __call__(self, points) of its own; {HOW}"
-        if made is not None and (fault := _misfit(made, 1, 1 + has_params)):
+        if _plain(made) and (fault := _misfit(made, 1, 1 + has_params)):
             return f"{fault}; {HOW}"
         return _unlike_a_stage(call, 1, 0)
     if not _plain(target) or not _is_ours(target):

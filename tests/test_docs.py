@@ -79,9 +79,16 @@ def test_the_page_of_projects_explains_as_the_command_does(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     Path("bevviz.toml").write_text("[clustering]\neps = 0.6\n")
-    ((command, shown),) = examples("docs/project.md")
+    (command, shown), refused, trusted = examples("docs/project.md")
     assert main(shlex.split(command)[1:]) == 0
     assert capsys.readouterr().out == shown
+    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "data"))
+    Path("bevviz.toml").write_text('[clustering]\nmethod = "tools:cells"\n')
+    Path("tools.py").touch()
+    assert main(shlex.split(refused[0])[1:]) == 2
+    assert capsys.readouterr().err == refused[1]
+    assert main(shlex.split(trusted[0])[1:]) == 0
+    assert capsys.readouterr().out == trusted[1]
 
 
 def test_the_project_file_that_is_shown_is_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,6 +1,6 @@
-"""The page on security is true: each row of its table of inputs is held to what bevviz does.
+"""The page on security is true: a test holds each row of its table of inputs.
 
-To add an input: a row in docs/security.md, and a function of ``INPUTS`` under the row's first cell. The function
+To add an input: a row in docs/security.md, and a function of ``INPUTS`` under the first cell. The function
 makes an input that names ``FUNCTION``, and lets bevviz read it.
 """
 

@@ -18,7 +18,7 @@ import pytest
 import bevviz
 from bevviz import plugins
 from bevviz.cli import main
-from bevviz.config import Config, Layer, load, revised
+from bevviz.config import Config, Layer, dump, load, revised
 from bevviz.errors import UserError
 from bevviz.live.settings import Settings
 from bevviz.project import layers, named_code
@@ -118,10 +118,10 @@ def test_a_recording_does_not_run_the_pickle_in_its_bag(
     with monkeypatch.context() as patch:
         patch.setattr(Origin, "of", sly)
         if through == "yaml":
-            from bevviz.logging import origin
-
-            written = origin.dump
-            patch.setattr(origin, "dump", lambda c: written(c).replace('model: ""', 'model: "pickle:loads"'))
+            sly_yaml = 'model: "pickle:loads"'
+            patch.setattr(
+                "bevviz.logging.origin.dump", lambda config: dump(config).replace('model: ""', sly_yaml)
+            )
         assert main(["bag", "bug.mcap", "--save", "bug.rrd"]) == 0
     for command in (["why", "bug.rrd", "--at", "0.1"], ["bag", "bug.rrd", "--save", "x.rrd"]):
         status = main(command)
@@ -379,9 +379,11 @@ def test_a_ros_parameter_names_no_function(received: Path, monkeypatch: pytest.M
 def test_a_page_names_no_function(received: Path) -> None:
     """Every message of the workbench goes by ``revised``, or by the settings of a live run."""
     write_project(received, "")
-    for way in (lambda s: revised(load(), s), lambda s: Settings().read(s)):
-        with pytest.raises(UserError, match="start bevviz with --set ground"):
-            way(["ground.method=drive_tools:segment"])
+    message = ["ground.method=drive_tools:segment"]
+    with pytest.raises(UserError, match="start bevviz with --set ground"):
+        revised(load(), message)
+    with pytest.raises(UserError, match="start bevviz with --set ground"):
+        Settings().read(message)
     assert not has_run(received)
     opened = load(settings=["ground.method=drive_tools:segment"])
     tried = revised(opened, ["ground.method=drive_tools:segment", "clustering.eps=0.7"])

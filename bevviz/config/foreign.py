@@ -25,9 +25,9 @@ def plugin_of(config: Config, section: str) -> plugins.Plugin | None:
     return _plugin(section, getattr(getattr(config, section), STAGES[section]), config.functions)
 
 
-def names_function(section: str, method: object) -> bool:
+def names_function(section: str, method: str) -> bool:
     """Whether a stage's section names ``module:function``."""
-    if not isinstance(method, str) or not plugins.is_foreign(method):
+    if not plugins.is_foreign(method):
         return False
     return section != "detector" or not Path(method).exists()
 

@@ -202,7 +202,7 @@ def _functions(
     for section, name in STAGES.items():
         key = f"{section}.{name}"
         method = stated.get(key)
-        if not names_function(section, method):
+        if not isinstance(method, str) or not names_function(section, method):
             continue
         if (section, method) not in granted:
             layer = stating[key]
