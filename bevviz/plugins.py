@@ -277,7 +277,8 @@ def _imports(file: Path, package: Sequence[str]) -> Iterator[str]:
 class _FolderFinder(MetaPathFinder):
     """Finder of modules in a trusted folder: only of those sources that the trust is about.
 
-    It does not look at compiled files beside them (``.pyc``, ``.so``): the user cannot have read these.
+    They come before installed modules of the same name. It does not look at compiled files beside them
+    (``.pyc``, ``.so``): the user cannot have read these.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -288,26 +289,28 @@ class _FolderFinder(MetaPathFinder):
     def find_spec(
         self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None
     ) -> ModuleSpec | None:
+        if not self.has(fullname):
+            return None
         file = _file_of(fullname, self.folder)
-        place = self.folder.joinpath(*fullname.split("."))
-        if file not in self.files and not any(place in inner.parents for inner in self.files):
-            return None
-        if path is None and (not self.is_importing or _is_installed(fullname)):
-            return None
-        if path is not None and not self._is_within(path):
+        if not (self.is_importing if path is None else self._is_within(path)):
             return None
         if file is None or file not in self.files:
             spec = ModuleSpec(fullname, None, is_package=True)  # a folder without __init__.py
-            spec.submodule_search_locations = [str(place)]
+            spec.submodule_search_locations = [str(self.folder.joinpath(*fullname.split(".")))]
             return spec
         places = [str(file.parent)] if file.name == "__init__.py" else None
         loader = _SourceLoader(fullname, str(file))
         return spec_from_file_location(fullname, file, loader=loader, submodule_search_locations=places)
 
+    def has(self, name: str) -> bool:
+        """Whether a module, or a package, is among the files."""
+        place = self.folder.joinpath(*name.split("."))
+        return _file_of(name, self.folder) in self.files or any(place in file.parents for file in self.files)
+
     def check(self, name: str) -> None:
         """Raise UserError where another module of the same name has been imported already."""
         module = sys.modules.get(name)
-        if module is None or _is_installed(name):
+        if module is None or not self.has(name):
             return
         file = getattr(module, "__file__", None)
         places = [file] if file else list(getattr(module, "__path__", []))
@@ -316,13 +319,6 @@ class _FolderFinder(MetaPathFinder):
 
     def _is_within(self, paths: Iterable[str]) -> bool:
         return any(Path(path).is_relative_to(self.folder) for path in paths)
-
-
-def _is_installed(module: str) -> bool:
-    """Whether a module is found without a trusted folder and without the working directory."""
-    finders = [finder for finder in sys.meta_path if not isinstance(finder, _FolderFinder)]
-    with _without_here():
-        return any(finder.find_spec(module, None) for finder in finders if hasattr(finder, "find_spec"))
 
 
 class _SourceLoader(SourceFileLoader):

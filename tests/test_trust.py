@@ -304,6 +304,22 @@ def test_modules_of_a_trusted_file_lie_beside_it(received: Path, monkeypatch: py
     assert not has_run(below)
 
 
+def test_modules_beside_a_trusted_file_come_first(received: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What was trusted is what runs, whatever is installed; two of one name are not mixed up."""
+    installed = received.parent / "installed"
+    installed.mkdir()
+    (installed / "drive_tools.py").write_text(TOOLS)
+    monkeypatch.syspath_prepend(installed)
+    allow(named_code(write_project(received)))
+    load(layers=layers(received, {}))
+    assert has_run(received) and not has_run(installed)
+    del sys.modules["drive_tools"]
+    plugins.find.cache_clear()
+    __import__("drive_tools")
+    with pytest.raises(UserError, match="another module 'drive_tools' is in use already, of "):
+        load(layers=layers(received, {}))
+
+
 def test_compiled_files_beside_a_trusted_source_do_not_run(received: Path) -> None:
     """A ``__pycache__`` that came with the folder may hold anything."""
     import importlib.util
