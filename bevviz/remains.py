@@ -5,6 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 
+# Name of threads that run compiled code which may never end. An exit in the usual way takes the memory that
+# they work on away, and ends in a segmentation fault.
+ENDLESS_THREAD = "bevviz endless"
+
 _unfinished: list[object] = []
 _removals: dict[object, Callable[[], None]] = {}
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -258,6 +260,40 @@ def test_a_file_that_does_not_load_in_time_is_left(tmp_path: Path, monkeypatch: 
     monkeypatch.setattr("onnxruntime.InferenceSession", lambda *_, **__: time.sleep(3))
     line = refused(constant(tmp_path / "m.onnx", {}))
     assert "does not load within 0.2 s; use a smaller network" in line
+
+
+def functions(path: Path, depth: int) -> str:
+    """Functions that call one another twice each: 2 ** depth nodes."""
+    versions = [helper.make_opsetid("", 13), helper.make_opsetid("local", 1)]
+    model = onnx.load(constant(path, {}))
+    for level in range(depth):
+        called = {"op_type": f"f{level - 1}", "domain": "local"} if level else {"op_type": "Identity"}
+        calls = [helper.make_node(inputs=[x], outputs=[y], **called) for x, y in (("x", "a"), ("a", "y"))]
+        model.functions.append(helper.make_function("local", f"f{level}", ["x"], ["y"], calls, versions))
+    model.opset_import.append(versions[1])
+    model.graph.node.append(helper.make_node(f"f{depth - 1}", ["images"], ["o"], domain="local"))
+    model.graph.output.append(helper.make_tensor_value_info("o", FLOAT, None))
+    path.write_bytes(model.SerializeToString())
+    return str(path)
+
+
+def test_a_command_ends_well_while_a_network_still_loads(tmp_path: Path) -> None:
+    """A thread of onnxruntime cannot be ended, and must not crash the process that leaves."""
+    model = functions(tmp_path / "m.onnx", 28)
+    script = f"""
+import sys
+from bevviz.cli import main
+from bevviz.stages.detector import session
+session.SECONDS = 3.0
+sys.argv = ["bevviz", "demo", "--frames", "1", "--save", "x.rrd", "--set", "detector.model={model}"]
+sys.exit(main())
+"""
+    ended = subprocess.run(
+        [sys.executable, "-c", script], cwd=tmp_path, capture_output=True, text=True, timeout=120, check=False
+    )
+    assert ended.returncode == 2, ended.stderr
+    assert ended.stderr.startswith(f"bevviz: error: detector.model {model}: does not load within 3 s")
+    assert len(ended.stderr.splitlines()) == 1
 
 
 # --- files -------------------------------------------------------------------------------------

@@ -37,11 +37,14 @@ def ignore() -> None:
 
 
 def leave(status: int) -> None:
-    """At the end of an interrupted command, by the shortest way where a thread is still in the midst of work.
+    """End the process at once where a thread is still at work in compiled code.
 
-    One that compiles a stage meanwhile would find half of its compiler gone, and abort.
+    After an interrupt, a thread that compiles a stage would find half of its compiler gone, and abort.
+    A thread with a network that exceeded its limits would end in a segmentation fault.
     """
-    if came() and any(thread.daemon for thread in threading.enumerate()):
+    threads = threading.enumerate()
+    is_endless = any(thread.name == remains.ENDLESS_THREAD for thread in threads)
+    if is_endless or (came() and any(thread.daemon for thread in threads)):
         for stream in (sys.stdout, sys.stderr):
             with suppress(OSError, ValueError):
                 stream.flush()

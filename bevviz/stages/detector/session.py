@@ -21,6 +21,7 @@ import numpy as np
 import onnxruntime as ort
 
 from bevviz.errors import UserError, first_line
+from bevviz.remains import ENDLESS_THREAD
 
 # Seconds to load a network, and for each answer. Ten times what the largest detectors take on a small board.
 SECONDS = 120.0
@@ -290,7 +291,7 @@ def _watch(work: Callable[[], T], end: Callable[[], None], seconds: float, verb:
             result.set_exception(error)
 
     # The thread must not keep the process alive: one operation may take hours.
-    threading.Thread(target=thread, daemon=True, name="bevviz network").start()
+    threading.Thread(target=thread, daemon=True, name=ENDLESS_THREAD).start()
     start, before, reason = time.monotonic(), _resident(), ""
     try:
         while not (reason or wait([result], CHECK).done):
