@@ -17,8 +17,9 @@ from pathlib import Path
 import pytest
 
 from bevviz.errors import UserError
+from bevviz.files import check_owned
 from bevviz.live import control
-from bevviz.live.control import Control, check_owned, snap
+from bevviz.live.control import Control, snap
 
 
 @pytest.fixture(autouse=True)
