@@ -350,3 +350,13 @@ def test_a_time_of_json_that_no_date_has_is_one_line(tmp_path: Path, wrong: obje
     with BagSource([path], load()) as source:
         assert len(list(source)) == 2
         assert any("2 message(s) of /tf could not be used" in text for text in source.warnings)
+
+
+@pytest.mark.parametrize("kind", ["PointCloud", "CompressedImage", "RawImage"])
+def test_a_number_in_place_of_data_takes_no_memory(kind: str) -> None:
+    from bevviz.ros.foxglove import as_ros, parse
+
+    name = f"foxglove.{kind}"
+    message = parse(b'{"data": 2147483648, "point_stride": 16}', name, "json", "")
+    with pytest.raises(ValueError, match="its data are a number, 2147483648"):
+        as_ros(message, name)

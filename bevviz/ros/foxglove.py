@@ -144,6 +144,8 @@ def _data(message: Any) -> bytes:
     data = message.data
     if data is None:
         return b""
+    if isinstance(data, int):  # so many zero bytes to Python
+        raise ValueError(f"its data are a number, {data}, and no text in base64")
     return base64.b64decode(data) if isinstance(data, str) else bytes(data)
 
 
