@@ -29,7 +29,7 @@ def decompress(msg: Any) -> Any:
     Raises:
         ValueError: a format that is not read here, or damaged data.
     """
-    data = bytes(msg.compressed_data)
+    data = memoryview(msg.compressed_data).tobytes()  # of a number, bytes() would make so many zeros
     if msg.format == "cloudini":
         return _of_cloudini(msg, data)
     width, height = int(msg.width), int(msg.height)

@@ -76,7 +76,7 @@ def decode_packet(msg: Any, topic: str, received: int) -> Packet:
     """
     header = getattr(msg, "header", msg)  # foxglove's has its two fields itself
     stamp = stamp_ns(header.stamp if hasattr(header, "stamp") else header.timestamp)
-    data = bytes(msg.data)
+    data = memoryview(msg.data).tobytes()  # of a number, bytes() would make so many zeros
     if hasattr(msg, "granulepos"):
         first, key = data[:1] >= b"\x80", is_key("theora", data)
         frame_id = frame_name(header.frame_id)
