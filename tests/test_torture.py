@@ -142,10 +142,12 @@ def test_messages_of_other_kinds() -> None:
     assert total.well, total.examples
 
 
-def test_a_case_is_known_by_its_seed_and_number() -> None:
-    rows = messages.KINDS["MarkerArray"].rows()
-    assert messages.case("MarkerArray", rows, 7, 0) == messages.case("MarkerArray", rows, 7, 0)
-    changed = {messages.case("MarkerArray", rows, 7, seed)[1] for seed in range(5)}
+@pytest.mark.parametrize("name", ["MarkerArray", "foxglove.SceneUpdate, json"])
+def test_a_case_is_known_by_its_seed_and_number(name: str) -> None:
+    rows = messages.KINDS[name].rows()
+    first = [messages.case(name, rows, number, 0) for number in range(60)]
+    assert first == [messages.case(name, rows, number, 0) for number in range(60)]
+    changed = {messages.case(name, rows, 7, seed)[1] for seed in range(5)}
     assert len(changed) > 3
 
 

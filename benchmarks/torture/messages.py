@@ -15,6 +15,7 @@ import traceback
 import zlib
 from base64 import b64decode
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from copy import deepcopy
 from dataclasses import dataclass, field, replace
 from functools import cache, partial
 from pathlib import Path
@@ -483,7 +484,7 @@ def _reworded(text: bytes, rng: random.Random) -> bytes:
         elif what == 1 and isinstance(holder, list):
             holder.extend(holder * 3)
         else:
-            holder[key] = rng.choice(ODD)
+            holder[key] = deepcopy(rng.choice(ODD))
     return json.dumps(tree).encode()
 
 
