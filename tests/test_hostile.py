@@ -195,6 +195,7 @@ def test_a_scan_beyond_the_limit_is_not_read() -> None:
         ("preset = 0x" + "f" * 5000, "a number of thousands of digits"),
         ('config = "/dev/zero"', "/dev/zero: cannot read the configuration: it is no file"),
         ('config = "pipe"', "it is no file"),
+        ("a." * 100_000 + "a = 1", "a line has more than 1000 dots"),
         ("#" * (CONFIG_LIMIT + 1), "has more than 1,048,576 bytes"),
         ("[voxel]\nsize = '" + "x" * 100_000 + "'", "voxel.size"),
     ],
@@ -231,3 +232,11 @@ def test_a_line_without_end_is_not_read() -> None:
         read_table(Path("times.txt"), 1)
     assert tracemalloc.get_traced_memory()[1] < 10_000_000
     tracemalloc.stop()
+
+
+@pytest.mark.parametrize("name", ["pipe", "/dev/zero"])
+def test_a_network_that_is_no_file_is_not_read(name: str, capsys: Capture) -> None:
+    os.mkfifo("pipe")
+    assert main(["info", "drive", "--model", name]) == 0
+    assert "it is no file" in capsys.readouterr().out
+    assert "no such file" in error_of(capsys, "bag", "drive", "--model", name, "--save", "out.rrd")

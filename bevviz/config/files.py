@@ -17,6 +17,7 @@ from bevviz.files import CONFIG_LIMIT, read_text
 from bevviz.plugins import is_foreign
 from bevviz.trust import RECEIVED, NamedCode, Trust, trust_in
 
+MOST_DOTS = 1000  # of a line of TOML: the time that tomllib takes grows with their square
 MOST_VALUES = 1_000_000  # of a YAML file, with each alias counted as often as it is used
 
 
@@ -115,6 +116,8 @@ def toml_tree(path: Path, problem: str) -> dict[str, Any]:
         UserError: it cannot be read, or is no TOML.
     """
     text = read_text(path, CONFIG_LIMIT, problem=problem)
+    if any(line.count(".") > MOST_DOTS for line in text.splitlines()):
+        raise UserError(f"{path}: is no TOML for a configuration: a line has more than {MOST_DOTS} dots")
     try:
         return tomllib.loads(text)
     except RecursionError:

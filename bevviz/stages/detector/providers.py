@@ -59,6 +59,8 @@ def _opened(
     path: Path, asked: str, options: ort.SessionOptions, where: str
 ) -> tuple[NetworkSession, dict[str, str]]:
     """Open the session, and say why each provider that would be better does not work."""
+    if path.exists() and not path.is_file():  # onnxruntime would wait for a pipe
+        raise UserError(f"{where}: it is no file")
     available = [name.removesuffix(SUFFIX) for name in ort.get_available_providers()]
     if asked.lower() != "auto":
         wanted = asked.lower().removesuffix(SUFFIX.lower())
