@@ -21,7 +21,9 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
 from bevviz import geometry
+from bevviz.live.message import LiveMessage
 from bevviz.ros import cameras, clouds, detections, images, transforms, vision_msgs
+from bevviz.ros.guard import guard
 from bevviz.ros.messages import MessageError
 
 SEC, NANOSEC = 1_700_000_000, 123_456_789
@@ -745,8 +747,11 @@ def test_detections_that_are_not_finite_are_left_out() -> None:
 
 
 def test_an_unknown_layout_of_a_detection_is_named() -> None:
-    with pytest.raises(MessageError, match="/boxes: unknown version of vision_msgs"):
-        detections.decode_detections_3d(array_of(Message(results=[], box=None)), "/boxes", 0)
+    kind = "vision_msgs/msg/Detection3DArray"
+    received = LiveMessage("/boxes", kind, 0, b"")
+    with pytest.raises(MessageError, match=rf"^/boxes: not a {kind}: .*bbox"):
+        msg = array_of(Message(results=[], box=None))
+        guard(received, detections.decode_detections_3d, msg, "/boxes", 0)
 
 
 # --- what a message may hold ---------------------------------------------------------------------
@@ -842,6 +847,6 @@ DECODERS: dict[str, Callable[[Any], object]] = {
     ],
 )
 def test_a_definition_with_other_fields_is_the_failure_of_its_messages(kind: str, msg: Message) -> None:
-    with pytest.raises(MessageError, match=r"^(/t|message \w+)\b.*\S$") as caught:
-        DECODERS[kind](msg)
+    with pytest.raises(MessageError, match=r"^/t: .*\S$") as caught:
+        guard(LiveMessage("/t", "some/msg/Kind", 0, b""), DECODERS[kind], msg)
     assert "\n" not in str(caught.value)

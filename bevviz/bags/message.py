@@ -8,9 +8,9 @@ from typing import Any
 from backports import zstd
 from rosbags.interfaces import Connection, ConnectionExtRosbag1
 
-from bevviz.bags.reader import LONGEST, ZSTD
-from bevviz.errors import first_line
+from bevviz.bags.reader import LONGEST, ZSTD, normalized
 from bevviz.ros import foxglove
+from bevviz.ros.guard import guard
 from bevviz.ros.messages import MessageError, read_header
 
 
@@ -21,6 +21,10 @@ class RawMessage:
     data: bytes | memoryview
     connection: Connection
     packets: tuple[tuple[int, bytes | memoryview], ...] = ()  # with the time of each: a scan, see ``scans``
+
+    @property
+    def type(self) -> str:
+        return normalized(self.connection.msgtype)
 
     def content(self) -> bytes | memoryview:
         """The serialised message; a compressed one is unpacked.
@@ -47,11 +51,7 @@ class RawMessage:
         except zstd.ZstdError:
             raise MessageError(f"{self.topic}: a message of {len(self.data)} bytes is damaged") from None
         if form_of(self.connection):
-            parsed = self.parsed(data)
-            try:
-                return foxglove.header(parsed, self.connection.msgtype)
-            except Exception as error:  # JSON may have anything in the place of a time
-                raise MessageError(f"{self.topic}: no time in its message: {first_line(error)}") from None
+            return guard(self, foxglove.header, self.parsed(data), self.connection.msgtype)
         little = is_ros1(self.connection) or data[1:2] != b"\0"
         return read_header(data, "<" if little else ">", self.topic)
 
@@ -62,10 +62,7 @@ class RawMessage:
             MessageError: they are none.
         """
         about = self.connection
-        try:
-            return foxglove.parse(data, about.msgtype, form_of(about), about.msgdef.data)
-        except Exception as error:  # the parsers have errors of their own
-            raise MessageError(f"{self.topic}: not a {about.msgtype}: {first_line(error)}") from None
+        return guard(self, foxglove.parse, data, about.msgtype, form_of(about), about.msgdef.data)
 
 
 def form_of(connection: Connection) -> str:

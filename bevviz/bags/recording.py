@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
-from functools import cached_property
+from functools import cached_property, partial
 from itertools import islice
 from operator import attrgetter, itemgetter
 from pathlib import Path, PurePath
@@ -35,7 +35,9 @@ from bevviz.errors import UserError
 from bevviz.files import Scratch, bag_files, drive_files, full_disk, read_text
 from bevviz.frame import I64
 from bevviz.ros import foxglove, ouster, vision_msgs
+from bevviz.ros.around import decode_mark
 from bevviz.ros.compressed import decompress, is_compressed
+from bevviz.ros.guard import guard
 from bevviz.ros.livox import fields_of, is_livox, read_custom
 from bevviz.ros.messages import MessageError
 from bevviz.ros.packets import is_packets, read_scan
@@ -234,8 +236,8 @@ class Recording(Closing):
         name = ouster.metadata_of(topic)
         message = self.first(name)
         try:
-            return (str(self.decode(message).data), name) if message else None
-        except (MessageError, AttributeError):
+            return (guard(message, decode_mark, self.decode(message)), name) if message else None
+        except MessageError:
             return None
 
     def _lacks(self, connection: Connection) -> str:
@@ -272,7 +274,7 @@ class Recording(Closing):
     def _packets(self, topic: str, start: int | None, stop: int | None) -> Iterator[Packet]:
         for message in self.messages([topic], start, stop):
             with suppress(MessageError):  # counted when its turn comes
-                yield decode_packet(self.decode(message), topic, message.received)
+                yield guard(message, decode_packet, self.decode(message), topic, message.received)
 
     def decode(self, message: RawMessage) -> Any:
         """The message as an object with the fields of its definition; LiDAR drivers' own as a PointCloud2.
@@ -281,37 +283,38 @@ class Recording(Closing):
             MessageError: the data does not fit the definition, or there is none.
             UserError: a file that the configuration names for the topic cannot be used.
         """
-        connection = message.connection
-        msgtype = normalized(connection.msgtype)
         if message.packets:
-            return ouster.decode(self._sensors[message.topic], message.packets)
+            return guard(message, partial(ouster.decode, self._sensors[message.topic]), message.packets)
+        if form_of(message.connection):
+            return guard(message, foxglove.as_ros, self._parsed(message), message.connection.msgtype)
+        found = guard(message, self._deserialized, message)
+        if is_compressed(message.type):
+            return guard(message, decompress, found)
+        if foxglove.short_of(message.type):
+            return guard(message, foxglove.as_ros, found, message.type)
+        return found
+
+    def _parsed(self, message: RawMessage) -> Any:
+        return message.parsed(guard(message, RawMessage.content, message))
+
+    def _deserialized(self, message: RawMessage) -> Any:
+        """Return the message as its definition has it; the messages of LiDAR drivers as a PointCloud2."""
+        connection, msgtype, data = message.connection, message.type, message.content()
+        store = self.types.store(connection)
+        if is_livox(msgtype):
+            fields = fields_of(store.fielddefs, msgtype)
+            return read_custom(data, ros1=is_ros1(connection), fields=fields)
+        if is_packets(msgtype):
+            calibration = self.calibrations.get(message.topic, "")
+            return read_scan(data, msgtype, ros1=is_ros1(connection), calibration=calibration)
         try:
-            data = message.content()
-            if form_of(connection):
-                return foxglove.as_ros(message.parsed(data), connection.msgtype)
-            store = self.types.store(connection)
-            if is_livox(msgtype):
-                fields = fields_of(store.fielddefs, msgtype)
-                return read_custom(data, ros1=is_ros1(connection), fields=fields)
-            if is_packets(msgtype):
-                calibration = self.calibrations.get(message.topic, "")
-                return read_scan(data, msgtype, ros1=is_ros1(connection), calibration=calibration)
             if is_ros1(connection):
-                found = store.deserialize_ros1(data, msgtype)
-            else:
-                found = vision_msgs.deserialize(store, data, msgtype)
-            if is_compressed(msgtype):
-                return decompress(found)
-            return foxglove.as_ros(found, msgtype) if foxglove.short_of(msgtype) else found
+                return store.deserialize_ros1(data, msgtype)
+            return vision_msgs.deserialize(store, data, msgtype)
         except KeyError:
             raise MessageError(
                 f"{message.topic}: the bag does not say what a {msgtype} is made of, and neither does bevviz"
             ) from None
-        except UserError:
-            raise
-        except Exception as error:  # generated decoders raise whatever the bytes lead them to
-            reason = str(error) or type(error).__name__
-            raise MessageError(f"{message.topic}: not a {msgtype}: {reason}") from None
 
     def encode(self, message: RawMessage, content: Any) -> memoryview:
         """``content``, as ``decode`` gave it and changed since, serialised as the message was."""
@@ -341,8 +344,8 @@ class Recording(Closing):
         """Whether images are packets of video."""
         message = self.first(topic)
         try:
-            return message is not None and is_video(self.decode(message))
-        except (MessageError, AttributeError, TypeError):
+            return message is not None and guard(message, is_video, self.decode(message))
+        except MessageError:
             return False
 
     def _open(self, path: Path) -> None:

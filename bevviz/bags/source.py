@@ -17,6 +17,7 @@ from bevviz.closing import Closing
 from bevviz.config import Config, stage_topics
 from bevviz.errors import UserError
 from bevviz.frame import F64, I64, Frame, Scene
+from bevviz.ros.guard import guard
 from bevviz.ros.messages import MessageError
 from bevviz.ros.roles import find_roles
 from bevviz.ros.transforms import decode_transforms
@@ -134,8 +135,11 @@ class BagSource(Closing):
 
     @property
     def doubts(self) -> Sequence[str]:
-        """What of the frames read so far may make all of them wrong, one sentence each."""
-        return [*self._damage, *(self._state.sync.report.doubts() if self._state else ())]
+        """What could not be used of the frames read so far, and what may make all of them wrong."""
+        if self._state is None:
+            return []
+        report = self._state.sync.report
+        return [*self._damage, *report.losses(), *report.doubts()]
 
     @property
     def span(self) -> tuple[int, int]:
@@ -267,7 +271,8 @@ class BagSource(Closing):
         static = {}
         for message in self.recording.messages(self.roles.tf_static):
             try:
-                for transform in decode_transforms(self.recording.decode(message), message.topic):
+                content = self.recording.decode(message)
+                for transform in guard(message, decode_transforms, content, message.topic):
                     if message.received <= low or transform.child not in static:
                         static[transform.child] = transform
             except MessageError:

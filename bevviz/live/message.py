@@ -4,14 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from types import MappingProxyType
 from typing import Any
 
 from bevviz.ros import ouster
 from bevviz.ros.compressed import decompress, is_compressed
 from bevviz.ros.definitions import store_of
+from bevviz.ros.guard import guard
 from bevviz.ros.livox import is_livox, read_custom
-from bevviz.ros.messages import MessageError, read_header
+from bevviz.ros.messages import read_header
 from bevviz.ros.packets import is_packets, read_scan
 from bevviz.ros.vision_msgs import deserialize
 
@@ -36,17 +38,12 @@ class LiveMessage:
         Raises:
             MessageError: the data does not fit the definition.
         """
-        try:
-            if self.sensor is not None:
-                return ouster.decode(self.sensor, self.packets)
-            if is_livox(self.type):
-                return read_custom(self.data, ros1=False)
-            if is_packets(self.type):
-                return read_scan(
-                    self.data, self.type, ros1=False, calibration=calibration.get(self.topic, "")
-                )
-            found = deserialize(store_of(self.type), self.data, self.type)
-            return decompress(found) if is_compressed(self.type) else found
-        except Exception as error:  # generated decoders raise whatever the bytes lead them to
-            reason = str(error) or type(error).__name__
-            raise MessageError(f"{self.topic}: not a {self.type}: {reason}") from None
+        if self.sensor is not None:
+            return guard(self, partial(ouster.decode, self.sensor), self.packets)
+        if is_livox(self.type):
+            return guard(self, partial(read_custom, ros1=False), self.data)
+        if is_packets(self.type):
+            file = calibration.get(self.topic, "")
+            return guard(self, partial(read_scan, ros1=False, calibration=file), self.data, self.type)
+        found = guard(self, partial(deserialize, store_of(self.type)), self.data, self.type)
+        return guard(self, decompress, found) if is_compressed(self.type) else found

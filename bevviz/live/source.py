@@ -24,8 +24,8 @@ from bevviz.queues import NewestQueue
 from bevviz.ros import around, ouster
 from bevviz.ros.definitions import store_of
 from bevviz.ros.graph import PublishedTopic, full_name, matched_qos, mismatches, published_topics
+from bevviz.ros.guard import guard
 from bevviz.ros.livox import is_livox
-from bevviz.ros.messages import MessageError
 from bevviz.ros.node import Node
 from bevviz.ros.objects import holds_boxes
 from bevviz.ros.packets import is_packets
@@ -315,7 +315,7 @@ class LiveSource(Closing):
             if (handler := self._handlers.get(topic)) is not None:
                 handler(message)
             self._watch.usable(topic)
-        except MessageError as error:
+        except UserError as error:
             self._watch.unusable(topic, str(error))
         if before is not None:
             self._compare(topic, before, self._sync.cameras.intrinsics[topic])
@@ -466,7 +466,8 @@ class LiveSource(Closing):
         return self._ousters.look(found, stated.lidar_calibration)
 
     def _add_metadata(self, message: LiveMessage) -> None:
-        if self._ousters.add_metadata(message.topic, message.decode().data):
+        text = guard(message, around.decode_mark, message.decode())
+        if self._ousters.add_metadata(message.topic, text):
             self._watch.tell(f"the metadata on {message.topic} have changed")
         self._assign()
 

@@ -32,6 +32,7 @@ from bevviz.report.contents import (
 from bevviz.report.window import Edited
 from bevviz.ros.encode import encode_compressed_image, typestore
 from bevviz.ros.foxglove import short_of
+from bevviz.ros.guard import guard
 from bevviz.ros.images import decode_compressed_image, decode_image
 from bevviz.ros.messages import MessageError
 from bevviz.ros.video import decode_packet
@@ -144,7 +145,7 @@ class Redactor:
             return data
         content = self._recording.decode(message)
         if msgtype in (CLOUD, OLD_CLOUD):
-            if is_coloured(content):
+            if guard(message, is_coloured, content):
                 raise MessageError("its points have the colours of a picture")
             return data
         stripped, pictures = contents.without_pictures(content, lenient=asked)
@@ -159,7 +160,7 @@ class Redactor:
     ) -> bytes | memoryview:
         decode = decode_compressed_image if compressed else decode_image
         content = self._recording.decode(message)
-        bgr = decode(content, message.topic, message.received).bgr
+        bgr = guard(message, decode, content, message.topic, message.received).bgr
         self.images += 1
         boxes = self.find(bgr)
         if not len(boxes):
@@ -181,7 +182,8 @@ class Redactor:
         return self._recording.encode(message, replace(content, **values))
 
     def _picture(self, message: RawMessage, video: Video) -> Edited:
-        packet = decode_packet(self._recording.decode(message), message.topic, message.received)
+        content = self._recording.decode(message)
+        packet = guard(message, decode_packet, content, message.topic, message.received)
         video.add(packet)
         if packet.is_header:
             return None

@@ -13,7 +13,7 @@ from bevviz.ros.clouds import decode_cloud
 from bevviz.ros.description import links
 from bevviz.ros.grid_map import decode_grid_map
 from bevviz.ros.images import decode_image
-from bevviz.ros.messages import MessageError, stamp_ns
+from bevviz.ros.messages import MessageError, stamp_ns, text_of
 
 LEVELS: tuple[Literal["ok", "warning", "error", "stale"], ...] = ("ok", "warning", "error", "stale")
 TYPES = frozenset(
@@ -32,12 +32,18 @@ TYPES = frozenset(
 )
 
 
+def decode_mark(msg: Any) -> str:
+    """Return the text of a std_msgs/String."""
+    return text_of(msg.data)
+
+
 def decode_statuses(msg: Any) -> list[Status]:
-    """Of a diagnostic_msgs/DiagnosticArray."""
+    """Return the statuses of a diagnostic_msgs/DiagnosticArray."""
     found = []
     for status in msg.status:
-        level = int(status.level)
-        found.append(Status(status.name, LEVELS[level] if level < len(LEVELS) else "error", status.message))
+        number = int(status.level)
+        level = LEVELS[number] if 0 <= number < len(LEVELS) else "error"
+        found.append(Status(text_of(status.name), level, text_of(status.message)))
     return found
 
 
@@ -59,7 +65,9 @@ def decode_shapes(msg: Any, short: str, topic: str) -> list[Shape]:
     if short == "Image":
         image = decode_image(msg, topic, 0)
         return [Shape(topic, image.frame_id.lstrip("/"), image.stamp, picture=image.bgr)]
-    header = msg.header if hasattr(msg, "header") else msg.info.header  # ROS 1 has the one of a GridMap there
+    header = (
+        msg.info.header if short == "GridMap" and not hasattr(msg, "header") else msg.header
+    )  # as in ROS 1
     about = topic, header.frame_id.lstrip("/"), stamp_ns(header.stamp)
     if short == "GridMap":
         surface = decode_grid_map(msg, _pose(msg.info.pose), topic)

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from bevviz.frame import F64, Intrinsics
-from bevviz.ros.messages import MessageError, either, guarded
+from bevviz.ros.messages import MessageError, either
 
 _DISTORTION = {
     "plumb_bob": "plumb_bob",
@@ -20,7 +20,6 @@ _DISTORTION = {
 }
 
 
-@guarded
 def decode_camera_info(msg: Any, rectified: bool, topic: str = "camera_info") -> Intrinsics:
     """The camera model of a sensor_msgs/CameraInfo, for images as they are published.
 

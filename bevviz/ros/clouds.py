@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bevviz.frame import F32, Cloud
-from bevviz.ros.messages import MessageError, frame_name, guarded, stamp_ns
+from bevviz.ros.messages import MessageError, frame_name, stamp_ns
 
 MOST_POINTS = 100_000_000  # of a cloud
 MOST_FIELDS = 1024  # of a point; each element of a field counts
@@ -29,7 +29,6 @@ SCALARS = {
 }  # by the datatype of a PointField
 
 
-@guarded
 def decode_cloud(msg: Any, topic: str, received: int) -> Cloud:
     """Points and extra fields of a sensor_msgs/PointCloud2.
 

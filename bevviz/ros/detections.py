@@ -8,13 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from bevviz.errors import first_line
 from bevviz.frame import F32, F64, ImageLabels, LabelledBoxes2D, LabelledBoxes3D
-from bevviz.ros.messages import MessageError, either, frame_name, guarded, stamp_ns
+from bevviz.ros.messages import either, frame_name, stamp_ns
 from bevviz.ros.objects import decode_objects, turned_boxes
 
 
-@guarded
 def decode_detections_2d(msg: Any, topic: str, received: int) -> LabelledBoxes2D:
     """The image boxes of a vision_msgs/Detection2DArray, of ROS 1 or any version of ROS 2.
 
@@ -44,7 +42,6 @@ def decode_detections_2d(msg: Any, topic: str, received: int) -> LabelledBoxes2D
     )
 
 
-@guarded
 def decode_boxes(msg: Any, topic: str, received: int, stated: Mapping[str, str]) -> LabelledBoxes3D:
     """The boxes of a Detection3DArray, or of another message, see ``bevviz.ros.objects``.
 
@@ -53,13 +50,9 @@ def decode_boxes(msg: Any, topic: str, received: int, stated: Mapping[str, str])
     """
     if hasattr(msg, "detections") and not stated:
         return decode_detections_3d(msg, topic, received)
-    try:
-        return decode_objects(msg, topic, received, stated)
-    except (ValueError, TypeError, AttributeError) as error:
-        raise MessageError(f"{topic}: no boxes in a {type(msg).__name__}: {first_line(error)}") from None
+    return decode_objects(msg, topic, received, stated)
 
 
-@guarded
 def decode_detections_3d(msg: Any, topic: str, received: int) -> LabelledBoxes3D:
     """The boxes of a vision_msgs/Detection3DArray, of ROS 1 or any version of ROS 2, or of bevviz_msgs.
 
@@ -109,10 +102,7 @@ def _rows(
     msg: Any, row: Callable[[Any], tuple[float, ...]], width: int, topic: str
 ) -> tuple[F64, tuple[str, ...], F32, tuple[str, ...], tuple[str, ...]]:
     """(K, width) numbers, labels, scores, ids and frames of the detections whose numbers are all finite."""
-    try:
-        rows = [(row(d), *_hypothesis(d.results), _identity(d), _frame(d)) for d in msg.detections]
-    except AttributeError as error:
-        raise MessageError(f"{topic}: unknown version of vision_msgs: {error}") from None
+    rows = [(row(d), *_hypothesis(d.results), _identity(d), _frame(d)) for d in msg.detections]
     rows = [r for r in rows if all(map(math.isfinite, r[0]))]
     values = np.array([r[0] for r in rows], np.float64).reshape(-1, width)
     scores = np.nan_to_num(np.array([r[2] for r in rows], np.float32))

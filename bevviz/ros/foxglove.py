@@ -19,6 +19,7 @@ import numpy as np
 from bevviz import geometry
 from bevviz.frame import F64, U8
 from bevviz.ros.encode import encode_box_3d, encode_camera, encode_pose_edges, make
+from bevviz.ros.messages import nanoseconds
 
 ENCODINGS = ("protobuf", "json")
 TYPE = re.compile(r"^foxglove(?:_msgs)?[./](?:msg/)?(\w+)$")
@@ -129,10 +130,10 @@ def _stamp(message: Any) -> int:
     if time is None:
         return 0
     seconds, rest = _first(time, "seconds", "sec"), _first(time, "nanos", "nsec", "nanosec")
-    stamp = int(seconds or 0) * 1_000_000_000 + int(rest or 0)
-    if abs(stamp) >= 1 << 63:  # JSON has numbers of any size
-        raise ValueError(f"a timestamp of {seconds} seconds, which no date has")
-    return stamp
+    try:
+        return nanoseconds(seconds or 0, rest or 0)
+    except (TypeError, ValueError, OverflowError):
+        raise ValueError(f"the field 'timestamp' is no time: {seconds!r} s and {rest!r} ns") from None
 
 
 def _first(message: Any, *names: str) -> Any:
@@ -144,8 +145,8 @@ def _data(message: Any) -> bytes:
     data = message.data
     if data is None:
         return b""
-    if isinstance(data, int):  # so many zero bytes to Python
-        raise ValueError(f"its data are a number, {data}, and no text in base64")
+    if isinstance(data, int | float):  # of which bytes() would make as many zeros
+        raise ValueError(f"the field 'data' is the number {data}")
     return base64.b64decode(data) if isinstance(data, str) else bytes(data)
 
 
@@ -156,13 +157,13 @@ def _header(message: Any) -> Any:
 
 
 def _cloud(message: Any) -> Any:
-    data, step = _data(message), int(message.point_stride or 0)
+    data, step = _data(message), _whole(message, "point_stride")
     fields = [
         make(
             "sensor_msgs/msg/PointField",
             name=str(field.name),
-            offset=int(field.offset or 0),
-            datatype=_POINT_FIELD.get(int(field.type or 0), 0),
+            offset=_whole(field, "offset"),
+            datatype=_POINT_FIELD.get(_whole(field, "type"), 0),
             count=1,
         )
         for field in message.fields or ()
@@ -221,11 +222,11 @@ def _raw(message: Any) -> Any:
     return make(
         "sensor_msgs/msg/Image",
         header=_header(message),
-        height=int(message.height or 0),
-        width=int(message.width or 0),
+        height=_whole(message, "height"),
+        width=_whole(message, "width"),
         encoding=str(message.encoding or ""),
         is_bigendian=0,
-        step=int(message.step or 0),
+        step=_whole(message, "step"),
         data=np.frombuffer(_data(message), np.uint8),
     )
 
@@ -235,7 +236,7 @@ def _calibration(message: Any) -> Any:
     if k.size != 9:
         raise ValueError("K has not the nine numbers of a matrix")
     model = str(message.distortion_model or "")
-    size = int(message.width or 0), int(message.height or 0)
+    size = _whole(message, "width"), _whole(message, "height")
     return encode_camera(_header(message), size, _MODELS.get(model, model), d, k, p)
 
 
@@ -294,7 +295,20 @@ def _pose_of(position: Any, orientation: Any) -> F64:
 
 def _numbers(message: Any, names: str) -> list[float]:
     """The fields of a message; 0 where they, or all of it, are left out."""
-    return [float(getattr(message, name, None) or 0) for name in names]
+    return [_number(message, name, float) for name in names]
+
+
+def _whole(message: Any, name: str) -> int:
+    return int(_number(message, name, int))
+
+
+def _number(message: Any, name: str, kind: Callable[[Any], float]) -> float:
+    """Return a field as a number; 0 if the field, or the message, is left out."""
+    value = (None if message is None else getattr(message, name)) or 0
+    try:
+        return kind(value)
+    except (TypeError, ValueError, OverflowError):
+        raise ValueError(f"the field '{name}' is no number: {value!r:.60}") from None
 
 
 _CONVERT: Mapping[str, Callable[[Any], Any]] = {

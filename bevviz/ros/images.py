@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bevviz.frame import U8, Image
-from bevviz.ros.messages import MessageError, frame_name, guarded, stamp_ns
+from bevviz.ros.messages import MessageError, frame_name, stamp_ns
 from bevviz.ros.topics import VIDEO
 
 MOST_PIXELS = 100_000_000  # of an image
@@ -53,7 +53,6 @@ _ENCODINGS: Mapping[str, _Encoding] = {
 }
 
 
-@guarded
 def decode_image(msg: Any, topic: str, received: int) -> Image:
     """A sensor_msgs/Image as BGR; bgr8 without row padding is a view of the message's data.
 
@@ -123,7 +122,6 @@ _MOSAIC = re.compile(r"(bayer_(?:rggb|bggr|gbrg|grbg)(?:8|16)); \w+ compressed\s
 _ANNEX_B = (b"\0\0\0\1", b"\0\0\1")  # what every unit of an H.264 or H.265 stream begins with
 
 
-@guarded
 def decode_compressed_image(msg: Any, topic: str, received: int) -> Image:
     """A JPEG, PNG or WebP in a sensor_msgs/CompressedImage, decoded.
 

@@ -1,52 +1,44 @@
 """What decoding ROS messages into arrays has in common.
 
 ``clouds``, ``images``, ``cameras``, ``transforms`` and ``detections`` read only attributes, never types, so
-that what rosbags deserialises and what rclpy delivers are both welcome, whichever the ROS version. Each
-function raises MessageError and nothing else, whatever is in the message, and none takes more memory than a
-message of reasonable size asks for.
+that what rosbags deserialises and what rclpy delivers are both welcome, whichever the ROS version. They raise
+MessageError for content that contradicts itself, and any other exception for fields that are missing or
+wrong: ``guard``, which calls them, makes a MessageError of it. None takes more memory than a message of
+reasonable size asks for.
 """
 
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable
-from functools import wraps
-from typing import Any, ParamSpec, TypeVar
+from typing import Any
 
-from bevviz.errors import UserError, first_line
-from bevviz.loggers import logger
+from bevviz.errors import UserError
 
-_log = logger(__name__)
-
-P = ParamSpec("P")
-R = TypeVar("R")
+LATEST = 2**63 - 1  # nanoseconds that a stamp can have
 
 
 class MessageError(UserError):
     """A message that cannot be used: its topic, what is wrong with it, and what would be accepted."""
 
 
-def guarded(decode: Callable[P, R]) -> Callable[P, R]:
-    """Whatever else ``decode`` raises, as a MessageError: a message may hold anything, even other fields."""
-
-    @wraps(decode)
-    def guarded(*args: P.args, **kwargs: P.kwargs) -> R:
-        try:
-            return decode(*args, **kwargs)
-        except MessageError:
-            raise
-        except Exception as error:
-            topic = next((value for value in (*args, *kwargs.values()) if isinstance(value, str)), "message")
-            _log.debug("%s cannot be used", topic, exc_info=True)
-            what = f"{type(error).__name__}: {first_line(error)}"
-            raise MessageError(f"{topic}: cannot be used ({what})") from None
-
-    return guarded
-
-
 def stamp_ns(stamp: Any) -> int:
     """Nanoseconds of a builtin_interfaces/Time."""
-    return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
+    return nanoseconds(stamp.sec, stamp.nanosec)
+
+
+def nanoseconds(seconds: Any, rest: Any) -> int:
+    """Add up a stamp. Raise ValueError if it is later than any clock of 64 bits."""
+    found = int(seconds) * 1_000_000_000 + int(rest)
+    if abs(found) > LATEST:
+        raise ValueError(f"a stamp of {seconds} s is too large")
+    return found
+
+
+def text_of(value: Any) -> str:
+    """Return a field that must be a text. Raise TypeError if it is something else."""
+    if not isinstance(value, str):
+        raise TypeError(f"a text is a {type(value).__name__}")
+    return value
 
 
 def read_header(data: bytes | memoryview, order: str, topic: str) -> tuple[int, str]:
@@ -73,8 +65,13 @@ def frame_name(name: str) -> str:
 
 
 def either(msg: Any, *names: str) -> Any:
-    """The first attribute that exists: message definitions differ between versions of ROS."""
+    """Return the first attribute that exists: message definitions differ between versions of ROS.
+
+    Raises:
+        AttributeError: there is none of them.
+    """
     for name in names:
         if hasattr(msg, name):
             return getattr(msg, name)
-    raise MessageError(f"message {type(msg).__name__} has no field {' or '.join(names)}")
+    wanted = " or ".join(names)
+    raise AttributeError(f"no field {wanted}", name=wanted, obj=msg)

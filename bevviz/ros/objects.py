@@ -8,15 +8,18 @@ from __future__ import annotations
 import difflib
 import math
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
 from bevviz.errors import UserError
 from bevviz.frame import F64, Boxes3D, LabelledBoxes3D
+from bevviz.ros.guard import field_names, kind_of
 from bevviz.ros.messages import frame_name, stamp_ns
+
+T = TypeVar("T")
 
 CUBE, CYLINDER, TEXT, ADD = 1, 3, 9, 0  # of visualization_msgs/Marker
 POLYGON = 2  # of Autoware's Shape
@@ -91,7 +94,7 @@ def decode_objects(msg: Any, topic: str, received: int, stated: Mapping[str, str
         return _markers(msg.markers, topic, received)
     known = RADAR if hasattr(msg, "tracks") else AUTOWARE
     where = Fields(**paths) if paths else known
-    items = list(_follow(msg, where.objects)[1] if where.objects else _only_list(msg))
+    items = _read(list, msg, where.objects) if where.objects else list(_only_list(msg))
     rows, labels, scores, ids = [], list[str](), list[float](), list[str]()
     header = getattr(msg, "header", None)
     headers = list[Any]()
@@ -103,7 +106,7 @@ def decode_objects(msg: Any, topic: str, received: int, stated: Mapping[str, str
         own = getattr(item, "header", None)
         headers.append(header if own is None or (header and header.frame_id) else own)
         labels.append(_label(item, where.label) if where.label else "")
-        scores.append(float(_follow(item, where.score)[1]) if _has(item, where.score) else 1.0)
+        scores.append(_read(float, item, where.score) if _has(item, where.score) else 1.0)
         ids.append(_identity(_follow(item, where.id)[1]) if _has(item, where.id) else "")
     if None in headers:
         raise ValueError("neither the message nor its objects have a header, which says the frame")
@@ -112,17 +115,17 @@ def decode_objects(msg: Any, topic: str, received: int, stated: Mapping[str, str
 
 def _row(item: Any, where: Fields) -> tuple[float, ...]:
     """Centre, size and quaternion."""
-    holder, center = _follow(item, where.center)
-    x, y, z = _vector(center)
+    holder, _ = _follow(item, where.center)
+    x, y, z = _read(_vector, item, where.center)
     turn = 0.0, 0.0, 0.0, 1.0
     if where.yaw:
-        half = float(_follow(item, where.yaw)[1]) / 2
+        half = _read(float, item, where.yaw) / 2
         turn = 0.0, 0.0, math.sin(half), math.cos(half)
     elif where.orientation:
-        turn = _quaternion(_follow(item, where.orientation)[1])
+        turn = _read(_quaternion, item, where.orientation)
     elif hasattr(holder, "orientation"):
         turn = _quaternion(holder.orientation)
-    length, width, height = _vector(_follow(item, where.size)[1])
+    length, width, height = _read(_vector, item, where.size)
     shape = getattr(item, "shape", None)
     if shape is not None and getattr(shape, "type", None) == POLYGON and hasattr(shape, "footprint"):
         outline = np.array([(p.x, p.y) for p in shape.footprint.points], np.float64).reshape(-1, 2)
@@ -204,9 +207,24 @@ def _follow(item: Any, path: str) -> tuple[Any, Any]:
         holder = _likeliest(value)
         found = next((one for one in name.split("|") if hasattr(holder, one)), None)
         if found is None:
-            raise ValueError(f"no field {name} (of {path}); there are {', '.join(_names(holder)) or 'none'}")
+            raise ValueError(
+                f"no field {name} (of {path}); there are {', '.join(field_names(holder) or ['none'])}"
+            )
         value = getattr(holder, found)
     return holder, value
+
+
+def _read(kind: Callable[[Any], T], item: Any, path: str) -> T:
+    """Return the field at a path as what it must be.
+
+    Raises:
+        ValueError: it is not there, or something else.
+    """
+    value = _follow(item, path)[1]
+    try:
+        return kind(value)
+    except (TypeError, ValueError, AttributeError):
+        raise ValueError(f"the field '{path}' cannot be used: it is {kind_of(value)}") from None
 
 
 def _has(item: Any, path: str) -> bool:
@@ -226,18 +244,12 @@ def _likeliest(value: Any) -> Any:
 
 
 def _only_list(msg: Any) -> Any:
-    lists = {name: value for name in _names(msg) if isinstance(value := getattr(msg, name), list)}
+    lists = {name: value for name in field_names(msg) or () if isinstance(value := getattr(msg, name), list)}
     if len(lists) != 1:
         raise ValueError(
             f"objects is not stated, and there are {len(lists)} lists: {', '.join(lists) or 'none'}"
         )
     return next(iter(lists.values()))
-
-
-def _names(item: Any) -> list[str]:
-    """The fields of a message, as rosbags or rclpy have it."""
-    stated = getattr(item, "__dataclass_fields__", None) or getattr(item, "_fields_and_field_types", {})
-    return [name for name in stated if not name.startswith("__")]
 
 
 def _vector(value: Any) -> tuple[float, float, float]:

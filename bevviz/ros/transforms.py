@@ -10,7 +10,7 @@ import numpy as np
 
 from bevviz import geometry
 from bevviz.frame import F64
-from bevviz.ros.messages import MessageError, frame_name, guarded, stamp_ns
+from bevviz.ros.messages import MessageError, frame_name, stamp_ns
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,7 +23,6 @@ class StampedTransform:
     parent_from_child: F64  # (4, 4)
 
 
-@guarded
 def decode_transforms(msg: Any, topic: str = "/tf") -> list[StampedTransform]:
     """The transforms of a tf2_msgs/TFMessage; one that is no rigid transform is left out.
 
@@ -44,7 +43,6 @@ def decode_transforms(msg: Any, topic: str = "/tf") -> list[StampedTransform]:
     return transforms
 
 
-@guarded
 def decode_odometry(msg: Any, topic: str = "odometry") -> StampedTransform:
     """The pose of a nav_msgs/Odometry: header.frame_id from child_frame_id.
 
@@ -77,7 +75,9 @@ def decode_acceleration(msg: Any, topic: str = "imu") -> Acceleration:
         raise MessageError(f"{topic}: its covariance says that no acceleration is measured")
     felt = msg.linear_acceleration
     return Acceleration(
-        stamp_ns(msg.header.stamp), frame_name(msg.header.frame_id), np.array([felt.x, felt.y, felt.z])
+        stamp_ns(msg.header.stamp),
+        frame_name(msg.header.frame_id),
+        np.array([felt.x, felt.y, felt.z], np.float64),
     )
 
 
@@ -86,8 +86,10 @@ def decode_motion(msg: Any) -> tuple[Vector, Vector, int]:
     none = (math.nan, math.nan, math.nan)
     turn, felt = msg.angular_velocity, msg.linear_acceleration
     return (
-        none if msg.angular_velocity_covariance[0] == -1 else (turn.x, turn.y, turn.z),
-        none if msg.linear_acceleration_covariance[0] == -1 else (felt.x, felt.y, felt.z),
+        none if msg.angular_velocity_covariance[0] == -1 else (float(turn.x), float(turn.y), float(turn.z)),
+        none
+        if msg.linear_acceleration_covariance[0] == -1
+        else (float(felt.x), float(felt.y), float(felt.z)),
         stamp_ns(msg.header.stamp),
     )
 

@@ -10,7 +10,7 @@ from rosbags.typesys import get_types_from_msg
 from rosbags.typesys.store import Typestore
 
 from bevviz.ros.bitstream import is_key
-from bevviz.ros.messages import MessageError, frame_name, guarded, stamp_ns
+from bevviz.ros.messages import MessageError, frame_name, stamp_ns
 
 DEFINITIONS = {  # of types that bags of older releases do not define
     "foxglove_msgs/msg/CompressedVideo": (
@@ -67,7 +67,6 @@ def is_video(message: Any) -> bool:
     return bytes(message.data[:4]).startswith(ANNEX_B)
 
 
-@guarded
 def decode_packet(msg: Any, topic: str, received: int) -> Packet:
     """The packet of a foxglove CompressedVideo, an FFMPEGPacket, a Theora Packet or a CompressedImage.
 
@@ -76,7 +75,7 @@ def decode_packet(msg: Any, topic: str, received: int) -> Packet:
     """
     header = getattr(msg, "header", msg)  # foxglove's has its two fields itself
     stamp = stamp_ns(header.stamp if hasattr(header, "stamp") else header.timestamp)
-    data = memoryview(msg.data).tobytes()  # of a number, bytes() would make so many zeros
+    data = bytes(memoryview(msg.data))  # of a number, bytes() would make as many zeros
     if hasattr(msg, "granulepos"):
         first, key = data[:1] >= b"\x80", is_key("theora", data)
         frame_id = frame_name(header.frame_id)

@@ -5,13 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, Generic, Protocol, TypeVar
+from typing import Any, Concatenate, Generic, ParamSpec, Protocol, TypeVar
 
-from bevviz.frame import LabelledBoxes3D
-from bevviz.ros.around import decode_shapes, decode_statuses
+from bevviz.frame import Cloud, LabelledBoxes3D
+from bevviz.ros.around import decode_mark, decode_shapes, decode_statuses
 from bevviz.ros.cameras import decode_camera_info
 from bevviz.ros.clouds import decode_cloud
 from bevviz.ros.detections import decode_boxes, decode_detections_2d, decode_detections_3d
+from bevviz.ros.guard import TypedMessage, guard
 from bevviz.ros.images import decode_compressed_image, decode_image
 from bevviz.ros.messages import MessageError
 from bevviz.ros.roles import Roles
@@ -28,11 +29,8 @@ from bevviz.sync.synchronizer import Synchronizer
 from bevviz.sync.video import Rewind, Video, VideoLoader
 
 
-class Message(Protocol):
+class Message(TypedMessage, Protocol):
     """A serialised message as it was received."""
-
-    @property
-    def topic(self) -> str: ...
 
     @property
     def received(self) -> int: ...
@@ -44,6 +42,7 @@ class Message(Protocol):
 
 M = TypeVar("M", bound=Message)
 T = TypeVar("T")
+P = ParamSpec("P")
 Handler = Callable[[M], None]
 
 
@@ -60,7 +59,8 @@ class Loader(Generic[M, T]):
     read: Callable[[Any, str, int], T]
 
     def __call__(self) -> T:
-        return self.read(self.decode(self.message), self.message.topic, self.message.received)
+        message = self.message
+        return guard(message, self.read, self.decode(message), message.topic, message.received)
 
 
 def make_handlers(
@@ -73,8 +73,14 @@ def make_handlers(
     The handlers raise MessageError for what cannot be used, and so does ``decode``.
     """
 
+    def read(message: M, decoder: Callable[Concatenate[Any, P], T], *args: P.args, **kwargs: P.kwargs) -> T:
+        return guard(message, decoder, decode(message), *args, **kwargs)
+
+    def read_cloud(message: M) -> Cloud:
+        return read(message, decode_cloud, message.topic, message.received)
+
     def add_transforms(message: M, static: bool) -> None:
-        for transform in decode_transforms(decode(message), message.topic):
+        for transform in read(message, decode_transforms, message.topic):
             sync.add_transform(clocked(message, transform), static, held=message.topic in roles.tf_held)
 
     def clocked(message: M, transform: StampedTransform) -> StampedTransform:
@@ -84,11 +90,11 @@ def make_handlers(
 
     def add_image(message: M, camera: CameraRole) -> None:
         stamp, frame_id = message.header()
-        read = decode_compressed_image if camera.kind == "CompressedImage" else decode_image
-        sync.add_image(message.topic, stamp, frame_id, message.received, Loader(message, decode, read))
+        decoder = decode_compressed_image if camera.kind == "CompressedImage" else decode_image
+        sync.add_image(message.topic, stamp, frame_id, message.received, Loader(message, decode, decoder))
 
     def add_packet(message: M) -> None:
-        packet = decode_packet(decode(message), message.topic, message.received)
+        packet = read(message, decode_packet, message.topic, message.received)
         video = sync.videos[packet.topic]
         if video.add(packet):
             sync.report.untold[packet.topic, packet.codec] += 1
@@ -98,7 +104,7 @@ def make_handlers(
 
     def add_info(message: M, rectified: bool) -> None:
         try:
-            info = decode_camera_info(decode(message), rectified, message.topic)
+            info = read(message, decode_camera_info, rectified, message.topic)
         except MessageError as error:
             sync.refuse_camera_info(message.topic, str(error))
             raise
@@ -107,17 +113,17 @@ def make_handlers(
     def add_odometry(message: M) -> None:
         if sync.followed and not sync.tf.needs_odometry(sync.followed):
             return
-        transform = decode_odometry(decode(message), message.topic)
+        transform = read(message, decode_odometry, message.topic)
         sync.followed = transform.child
         sync.add_transform(clocked(message, transform), fallback=True)
 
     def add_imu(message: M) -> None:
         content = decode(message)
-        rotation, acceleration, stamp = decode_motion(content)
+        rotation, acceleration, stamp = guard(message, decode_motion, content)
         at = sync.clocks.stamp(message.topic, stamp, message.received)
         sync.around.add_motion(message.topic, at, message.received, rotation, acceleration)
         if sync.upright.needs_gravity:
-            sync.upright.add_acceleration(decode_acceleration(content, message.topic))
+            sync.upright.add_acceleration(guard(message, decode_acceleration, content, message.topic))
 
     def add_truth(message: M) -> None:
         topic, received = message.topic, message.received
@@ -130,11 +136,11 @@ def make_handlers(
 
     def read_boxes(message: M) -> LabelledBoxes3D:
         stated = roles.boxes if roles.boxes.get("topic") == message.topic else {}
-        return decode_boxes(decode(message), message.topic, message.received, stated)
+        return read(message, decode_boxes, message.topic, message.received, stated)
 
     handlers: dict[str, Handler[M]] = {}
     for topic in roles.lidars:
-        handlers[topic] = lambda m: sync.add_cloud(decode_cloud(decode(m), m.topic, m.received))
+        handlers[topic] = lambda m: sync.add_cloud(read_cloud(m))
     for camera in roles.cameras:
         if camera.kind == "CompressedVideo":
             sync.videos.setdefault(camera.topic, Video(camera.topic, rewind))
@@ -152,9 +158,9 @@ def make_handlers(
     for topic in roles.imus:
         handlers[topic] = add_imu
     for topic in roles.robot_clouds:
-        handlers[topic] = lambda m: sync.add_robot_cloud(decode_cloud(decode(m), m.topic, m.received))
+        handlers[topic] = lambda m: sync.add_robot_cloud(read_cloud(m))
     for topic in roles.robot_detections_2d:
-        handlers[topic] = lambda m: sync.add_detections(decode_detections_2d(decode(m), m.topic, m.received))
+        handlers[topic] = lambda m: sync.add_detections(read(m, decode_detections_2d, m.topic, m.received))
     for topic in roles.robot_detections_3d:
         handlers[topic] = lambda m: sync.add_boxes(read_boxes(m))
     if roles.truth:
@@ -170,10 +176,11 @@ def make_around_handlers(
     def add(message: M, kind: str, short: str) -> None:
         content = decode(message)
         if kind == "mark":
-            sync.around.add_mark(content.data)
+            sync.around.add_mark(guard(message, decode_mark, content))
         elif kind == "status":
-            sync.around.add_statuses(decode_statuses(content))
+            sync.around.add_statuses(guard(message, decode_statuses, content))
         else:
-            sync.around.add_shapes(message.topic, decode_shapes(content, short, message.topic))
+            shapes = guard(message, decode_shapes, content, short, message.topic)
+            sync.around.add_shapes(message.topic, shapes)
 
     return {topic: partial(add, kind=kind, short=short) for topic, kind, short in roles.around}

@@ -55,6 +55,15 @@ class SyncReport:
         """One sentence for whatever may make every frame wrong: clocks, units, which way is up."""
         return (*self.clocks.doubts(self.clocked), *self.oddities.values(), *self.upright.values())
 
+    def losses(self) -> list[str]:
+        """Return one sentence for each camera and topic with content that could not be used."""
+        images = [
+            f"camera '{camera}': an image could not be decoded {_times(n)}, the first: "
+            f"{self.first_undecodable[camera]}"
+            for camera, n in self.undecodable.items()
+        ]
+        return [*images, *self.damage.sentences]
+
     def warnings(self) -> tuple[str, ...]:
         """One sentence each."""
         counted = [
@@ -88,16 +97,13 @@ class SyncReport:
             )
         for camera, n in self.without_image.items():
             found.append(f"{n} of {self.frames} frames have no image of camera '{camera}'")
-        for camera, n in self.undecodable.items():
-            first = self.first_undecodable[camera]
-            found.append(f"camera '{camera}': an image could not be decoded {_times(n)}, the first: {first}")
+        found += self.losses()
         for (topic, codec), n in self.untold.items():
             gaps = "1 gap" if n == 1 else f"{n} gaps"
             found.append(
                 f"{topic}: {gaps} between the stamps of its {codec.upper()} video, whose packets do not tell "
                 "whether one is lost: pictures from a lost one to the next key frame are wrong"
             )
-        found += self.damage.sentences
         found += [f"{text} ({n} of {self.frames} frames)" for text, n in self.problems.items()]
         return (*self.doubts(), *found, *self.tf.problems)
 
