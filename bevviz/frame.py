@@ -179,6 +179,7 @@ class LabelledBoxes3D:
     # Until they are placed:
     turns: F64 | None = None  # (K, 4) quaternions xyzw, where some lean: ``yaw`` does not say enough then
     frames: tuple[str, ...] = ()  # of each; (): all are in frame_id
+    unusable: tuple[str, ...] = ()  # a sentence for each box that was stated and left out
 
 
 @dataclass(frozen=True, slots=True)
@@ -203,6 +204,7 @@ class LabelledBoxes2D:
     scores: F32  # (K,)
     camera: str = ""  # name of the camera they belong to, where known
     received: int = 0
+    unusable: tuple[str, ...] = ()  # a sentence for each box that was stated and left out
 
 
 # --- around perception -------------------------------------------------------------------------

@@ -19,9 +19,14 @@ from bevviz.ros.encode import (
     encode_points,
     encode_transforms,
 )
+from bevviz.ros.objects import LARGEST
 
 LIDAR, IMU, MAP = "velodyne", "imu_link", "map"
 CLOUDS = "/velodyne_points"
+COLUMNS = (
+    *("truncation", "occlusion", "alpha", "image box's left", "image box's top", "image box's right"),
+    *("image box's bottom", "height", "width", "length", "x", "y", "z", "rotation_y"),
+)
 EARTH = 6378137.0  # metres, the radius that KITTI's development kit has
 
 
@@ -65,11 +70,13 @@ def labelled_boxes(
         rectified_from_lidar: (4, 4).
         ids: of each line.
 
+    A label whose numbers are not finite, or whose size is negative, is left out and told in ``unusable``.
+
     Raises:
         UserError: a line is none of KITTI's.
     """
     lidar_from_camera = geometry.inverse(rectified_from_lidar)
-    labels, rows, dont_care, kept = [], [], [], []
+    labels, rows, dont_care, kept, unusable = [], [], [], [], []
     for at, (number, line) in enumerate(lines):
         kind, *values = line.split() or [""]
         if kind in ("", "Misc"):
@@ -80,6 +87,9 @@ def labelled_boxes(
             row = [float(value) for value in values[:14]]
         except ValueError:
             raise UserError(f"{file}: line {number} has something that is no number") from None
+        if why := _why_unusable(kind, row):
+            unusable.append(f"{file}: line {number} ({kind}): {why}")
+            continue
         if kind == "DontCare":
             dont_care.append(row[3:7])
             continue
@@ -107,7 +117,21 @@ def labelled_boxes(
     )
     ones = np.ones(len(labels), np.float32)
     names = tuple(ids[at] for at in kept) if ids else ()
-    return LabelledBoxes3D(str(file), 0, "", boxes, tuple(labels), ones, ids=names, image=image)
+    return LabelledBoxes3D(
+        str(file), 0, "", boxes, tuple(labels), ones, ids=names, image=image, unusable=tuple(unusable)
+    )
+
+
+def _why_unusable(kind: str, row: Sequence[float]) -> str:
+    """Say what is wrong with the 14 numbers of a label; empty: it can be used."""
+    needed = COLUMNS[3:7] if kind == "DontCare" else COLUMNS
+    for name, value in zip(COLUMNS, row, strict=True):
+        if name in needed and name != "alpha" and not abs(value) < LARGEST:  # NaN is not, either
+            return f"its {name} is {value}"
+    size = row[7:10]
+    if kind != "DontCare" and min(size) < 0:
+        return f"its size is negative: {' '.join(map(str, size))}"
+    return ""
 
 
 # --- calibration -------------------------------------------------------------------------------
@@ -245,6 +269,7 @@ def truth(message_type: str, times: I64, label: Any) -> Stream:
 
     def make(row: int) -> Any:
         there: LabelledBoxes3D = label(row)
-        return encode_labels(int(times[row]), LIDAR, there.boxes, there.labels, there.ids, there.image)
+        about = there.labels, there.ids, there.image, there.unusable
+        return encode_labels(int(times[row]), LIDAR, there.boxes, *about)
 
     return Stream("/ground_truth", message_type, times, make)

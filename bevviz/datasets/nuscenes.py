@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 from collections import defaultdict
 from collections.abc import Collection, Iterator, Mapping, Sequence
@@ -204,9 +205,11 @@ class NuScenes(Dataset):
             ]
             known = [(row, CATEGORIES.get(name, name)) for row, name in rows if name not in NOT_DETECTED]
             boxes = Boxes3D(
-                np.array([row["translation"] for row, _ in known], np.float64).reshape(-1, 3),
-                np.array([np.array(row["size"])[[1, 0, 2]] for row, _ in known], np.float32).reshape(-1, 3),
-                np.array([geometry.yaw(_pose(row)) for row, _ in known], np.float32),
+                np.array([_numbers(row["translation"], 3) for row, _ in known]).reshape(-1, 3),
+                np.array([_numbers(row["size"], 3)[[1, 0, 2]] for row, _ in known], np.float32).reshape(
+                    -1, 3
+                ),
+                np.array([_yaw(row["rotation"]) for row, _ in known], np.float32),
             )
             ids = [row["instance_token"] for row, _ in known]
             return encode_labels(stamp, MAP, boxes, [label for _, label in known], ids)
@@ -230,6 +233,23 @@ def _pose(row: Record) -> F64:
     """(4, 4) of a translation and a quaternion w, x, y, z."""
     w, x, y, z = row["rotation"]
     return geometry.transform(row["translation"], (x, y, z, w))
+
+
+def _numbers(values: Any, count: int) -> F64:
+    """(count,) numbers of a label; NaN in place of what is none, so that the label is told as unusable."""
+    try:
+        return np.array(values, np.float64).reshape(count)
+    except (TypeError, ValueError):
+        return np.full(count, np.nan)
+
+
+def _yaw(rotation: Any) -> float:
+    """Turn about z of a quaternion w, x, y, z; NaN where it is none."""
+    w, x, y, z = _numbers(rotation, 4)
+    try:
+        return geometry.yaw(geometry.transform(np.zeros(3), (x, y, z, w)))
+    except ValueError:
+        return math.nan
 
 
 def _quarter_turns(number: int) -> F64:

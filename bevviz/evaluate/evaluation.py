@@ -25,6 +25,9 @@ if TYPE_CHECKING:
     from pandas import DataFrame
 
 
+EXAMPLES = 10  # labels that cannot be used, in the JSON
+
+
 @dataclass(frozen=True, slots=True)
 class JudgedFrame:
     """One frame against its truth. Rows of the truth, and of the objects."""
@@ -54,6 +57,7 @@ class Evaluation(Observer[FrameResult]):
         self._truth = truth
         self.judged: list[JudgedFrame] = []
         self.without = 0  # frames without truth
+        self.unusable: list[str] = []  # a sentence for each label that nothing can be held to
         self.last: tuple[FrameResult, Truth, Matches] | None = None
         self._score = Score()
         self._rows: list[tuple[str, str, float]] = []  # what became of it, class, metres away
@@ -70,6 +74,7 @@ class Evaluation(Observer[FrameResult]):
         if truth is None:
             self.without += 1
             return
+        self.unusable += [f"frame {result.frame.index}: {why}" for why in truth.unusable]
         objects = result.objects if result.objects is not None else _nothing()
         matches = self._score.add(objects, truth)
         self.last = result, truth, matches
@@ -203,6 +208,8 @@ class Evaluation(Observer[FrameResult]):
         return {
             "frames": len(self.judged),
             "frames_without_truth": self.without,
+            "unusable_labels": len(self.unusable),
+            "unusable_examples": self.unusable[:EXAMPLES],
             "metrics": {name: _plain(value) for name, value in self.metrics.items()},
             "worst": self.worst,
         }

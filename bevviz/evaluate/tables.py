@@ -37,6 +37,9 @@ def _lines(
     there = found.counts()
     without = f", {found.without} without truth left out" if found.without else ""
     yield f"{len(found.judged)} frames{without}; {there['true'] + there['missed']} objects had to be found"
+    if found.unusable:
+        count = "1 label is" if len(found.unusable) == 1 else f"{len(found.unusable)} labels are"
+        yield f"{count} left out, the first: {found.unusable[0]}"
     for rows in tables(found):
         yield ""
         yield from laid_out(rows)

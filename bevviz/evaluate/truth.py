@@ -14,6 +14,7 @@ from bevviz.datasets.kitti import label_files, read_labels
 from bevviz.datasets.names import ACCEPTED
 from bevviz.errors import UserError
 from bevviz.frame import Bool, Boxes3D, Camera, Frame, ImageLabels, LabelledBoxes3D
+from bevviz.ros.objects import name_box
 from bevviz.ros.roles import Roles
 from bevviz.stages.robot import in_points_frame
 
@@ -39,6 +40,7 @@ class Truth:
     ids: tuple[str, ...] = ()  # (K,) the same from frame to frame; (): not known
     image: ImageLabels | None = None  # what was labelled in the image, in a data set that has that
     camera: Camera | None = None  # whose image that is
+    unusable: tuple[str, ...] = ()  # a sentence for each label that nothing can be held to
 
     def unlabelled(self, boxes: Boxes3D) -> Bool:
         """(J,) which boxes have their centre, in the image, where nothing was labelled (KITTI's DontCare)."""
@@ -127,7 +129,8 @@ def truth_of(frame: Frame, labelled: LabelledBoxes3D) -> Truth:
     """Labelled boxes as truth for a frame.
 
     An object must be found if its centre lies within 40 m and in the image of some camera, where there is
-    one, and if 10 LiDAR points or more lie in its box.
+    one, and if 10 LiDAR points or more lie in its box. In a box without a size there are none: it is told in
+    ``unusable``.
 
     Args:
         frame: the frame.
@@ -139,6 +142,10 @@ def truth_of(frame: Frame, labelled: LabelledBoxes3D) -> Truth:
     must[must] = [
         geometry.inside(frame.points, boxes, k).sum() >= MIN_HITS for k in np.flatnonzero(must).tolist()
     ]
+    flat = [
+        f"{name_box(k, labelled.labels[k], '')}: a side of it is 0 m long"
+        for k in np.flatnonzero((boxes.size <= 0).any(axis=1)).tolist()
+    ]
     accepted = {label: ACCEPTED.get(label, frozenset((label.lower(),))) for label in labelled.labels}
     camera = next((camera for camera in frame.cameras if _can_see(camera)), None)
     return Truth(
@@ -149,6 +156,7 @@ def truth_of(frame: Frame, labelled: LabelledBoxes3D) -> Truth:
         labelled.ids,
         labelled.image,
         camera,
+        (*labelled.unusable, *flat),
     )
 
 

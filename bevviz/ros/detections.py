@@ -3,23 +3,21 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping
-from typing import Any
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from bevviz.frame import F32, F64, ImageLabels, LabelledBoxes2D, LabelledBoxes3D
+from bevviz.frame import F32, F64, Bool, ImageLabels, LabelledBoxes2D, LabelledBoxes3D
 from bevviz.ros.messages import either, frame_name, stamp_ns
-from bevviz.ros.objects import decode_objects, turned_boxes
+from bevviz.ros.objects import decode_objects, name_box, turned_boxes, why_unusable
 
 
 def decode_detections_2d(msg: Any, topic: str, received: int) -> LabelledBoxes2D:
     """The image boxes of a vision_msgs/Detection2DArray, of ROS 1 or any version of ROS 2.
 
-    A turned box becomes the upright one around it. Boxes that are not finite are left out.
-
-    Raises:
-        MessageError: not laid out as any known version of the message.
+    A turned box becomes the upright one around it. Boxes that are not finite, or of a negative size, are left
+    out, and told in ``unusable``.
     """
 
     def row(detection: Any) -> tuple[float, ...]:
@@ -27,18 +25,23 @@ def decode_detections_2d(msg: Any, topic: str, received: int) -> LabelledBoxes2D
         position = getattr(center, "position", center)  # flat up to ROS 2 Galactic
         return position.x, position.y, center.theta, box.size_x, box.size_y
 
-    values, labels, scores, _, frames = _rows(msg, row, 5, topic)
-    x, y, theta, w, h = values.T
+    def why(values: Sequence[float]) -> str:
+        x, y, theta, w, h = values
+        return why_unusable((x, y, theta, w, h, 0.0))
+
+    found = _rows(msg, row, 5, why)
+    x, y, theta, w, h = found.values.T
     cos, sin = np.abs(np.cos(theta)), np.abs(np.sin(theta))
     dx, dy = (w * cos + h * sin) / 2, (w * sin + h * cos) / 2
     return LabelledBoxes2D(
         topic=topic,
         stamp=stamp_ns(msg.header.stamp),
-        frame_id=frame_name(msg.header.frame_id) or next(iter(frames), ""),
+        frame_id=frame_name(msg.header.frame_id) or next(iter(found.frames), ""),
         xyxy=np.stack([x - dx, y - dy, x + dx, y + dy], axis=1).astype(np.float32),
-        labels=labels,
-        scores=scores,
+        labels=found.labels,
+        scores=found.scores,
         received=received,
+        unusable=found.unusable,
     )
 
 
@@ -56,11 +59,8 @@ def decode_boxes(msg: Any, topic: str, received: int, stated: Mapping[str, str])
 def decode_detections_3d(msg: Any, topic: str, received: int) -> LabelledBoxes3D:
     """The boxes of a vision_msgs/Detection3DArray, of ROS 1 or any version of ROS 2, or of bevviz_msgs.
 
-    An orientation left at zero is none. Boxes that are not finite are left out. Where the array's header
-    states no frame, those of the detections count.
-
-    Raises:
-        MessageError: not laid out as any known version of the message.
+    An orientation left at zero is none. Boxes that are not finite, or of a negative size, are left out, and
+    told in ``unusable``. Where the array's header states no frame, those of the detections count.
     """
 
     def row(detection: Any) -> tuple[float, ...]:
@@ -68,45 +68,70 @@ def decode_detections_3d(msg: Any, topic: str, received: int) -> LabelledBoxes3D
         p, q = center.position, center.orientation
         return p.x, p.y, p.z, size.x, size.y, size.z, q.x, q.y, q.z, q.w
 
-    values, labels, scores, ids, frames = _rows(msg, row, 10, topic)
+    found = _rows(msg, row, 10, why_unusable)
     stated = frame_name(msg.header.frame_id)
-    boxes, turns = turned_boxes(values)
+    boxes, turns = turned_boxes(found.values)
     return LabelledBoxes3D(
         topic=topic,
         stamp=stamp_ns(msg.header.stamp) or (0 if len(boxes) else received),
-        frame_id=stated or next(iter(frames), ""),
+        frame_id=stated or next(iter(found.frames), ""),
         boxes=boxes,
-        labels=labels,
-        scores=scores,
+        labels=found.labels,
+        scores=found.scores,
         received=received,
-        ids=ids if all(ids) else (),
-        image=_image_labels(msg, len(labels)),
+        ids=found.ids if all(found.ids) else (),
+        image=_image_labels(msg, found.usable),
         turns=turns,
-        frames=frames if not stated and len(set(frames)) > 1 else (),
+        frames=found.frames if not stated and len(set(found.frames)) > 1 else (),
+        unusable=(*map(str, getattr(msg, "unusable", ())), *found.unusable),
     )
 
 
-def _image_labels(msg: Any, boxes: int) -> ImageLabels | None:
+def _image_labels(msg: Any, usable: Bool) -> ImageLabels | None:
     """What a data set says of the image, see ``encode_labels``; None: it says nothing."""
-    if not hasattr(msg, "image_boxes") or len(msg.truncated) != boxes:
+    if not hasattr(msg, "image_boxes") or len(msg.truncated) != len(usable):
         return None
     return ImageLabels(
-        np.array(msg.image_boxes, np.float32).reshape(boxes, 4),
-        np.array(msg.truncated, np.float32),
-        np.array(msg.occluded, np.int32),
+        np.array(msg.image_boxes, np.float32).reshape(-1, 4)[usable],
+        np.array(msg.truncated, np.float32)[usable],
+        np.array(msg.occluded, np.int32)[usable],
         np.array(msg.dont_care, np.float32).reshape(-1, 4),
     )
 
 
+class _Rows(NamedTuple):
+    """The usable detections of a message."""
+
+    values: F64  # (K, width)
+    labels: tuple[str, ...]
+    scores: F32
+    ids: tuple[str, ...]
+    frames: tuple[str, ...]
+    usable: Bool  # of all detections
+    unusable: tuple[str, ...]  # a sentence for each of the others
+
+
 def _rows(
-    msg: Any, row: Callable[[Any], tuple[float, ...]], width: int, topic: str
-) -> tuple[F64, tuple[str, ...], F32, tuple[str, ...], tuple[str, ...]]:
-    """(K, width) numbers, labels, scores, ids and frames of the detections whose numbers are all finite."""
+    msg: Any, row: Callable[[Any], tuple[float, ...]], width: int, why: Callable[[Sequence[float]], str]
+) -> _Rows:
+    """Read the detections of a message; ``why`` says why the numbers of one cannot be used."""
     rows = [(row(d), *_hypothesis(d.results), _identity(d), _frame(d)) for d in msg.detections]
-    rows = [r for r in rows if all(map(math.isfinite, r[0]))]
-    values = np.array([r[0] for r in rows], np.float64).reshape(-1, width)
-    scores = np.nan_to_num(np.array([r[2] for r in rows], np.float32))
-    return values, tuple(r[1] for r in rows), scores, tuple(r[3] for r in rows), tuple(r[4] for r in rows)
+    reasons = [why(values) for values, *_ in rows]
+    unusable = [
+        f"{name_box(number, label, identity)}: {reason}"
+        for number, ((_, label, _, identity, _), reason) in enumerate(zip(rows, reasons, strict=True))
+        if reason
+    ]
+    kept = [found for found, reason in zip(rows, reasons, strict=True) if not reason]
+    return _Rows(
+        np.array([values for values, *_ in kept], np.float64).reshape(-1, width),
+        tuple(label for _, label, *_ in kept),
+        np.nan_to_num(np.array([score for _, _, score, *_ in kept], np.float32)),
+        tuple(identity for *_, identity, _ in kept),
+        tuple(frame for *_, frame in kept),
+        np.array([not reason for reason in reasons], bool),
+        tuple(unusable),
+    )
 
 
 def _frame(detection: Any) -> str:

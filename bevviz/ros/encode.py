@@ -23,6 +23,7 @@ float32[] image_boxes
 float32[] truncated
 int32[] occluded
 float32[] dont_care
+string[] unusable
 """
 
 
@@ -172,9 +173,13 @@ def encode_boxes_3d(
     for center, size, yaw, hypotheses, name in zip(
         boxes.center, boxes.size, boxes.yaw, results, names, strict=True
     ):
-        half = float(yaw) / 2
+        turned = bool(np.isfinite(yaw))
+        half = float(yaw) / 2 if turned else 0.0
         place = turn @ geometry.transform(center, np.array([0, 0, np.sin(half), np.cos(half)]))
-        detections.append(encode_box_3d(about, place, size, hypotheses, name))
+        box = encode_box_3d(about, place, size, hypotheses, name)
+        if not turned:  # for whoever reads the message to tell
+            box.bbox.center.orientation.w = np.nan
+        detections.append(box)
     return make("vision_msgs/msg/Detection3DArray", header=about, detections=detections)
 
 
@@ -194,8 +199,12 @@ def encode_labels(
     labels: Sequence[str],
     ids: Sequence[str] = (),
     image: ImageLabels | None = None,
+    unusable: Sequence[str] = (),
 ) -> Any:
-    """What somebody has labelled: a vision_msgs/Detection3DArray, with ``image`` one of bevviz_msgs."""
+    """What somebody has labelled: a vision_msgs/Detection3DArray, with ``image`` one of bevviz_msgs.
+
+    ``unusable``: a sentence for each label that was left out, with ``image``.
+    """
     results = [[(label, 1.0)] for label in labels]
     message = encode_boxes_3d(stamp, frame_id, boxes, results, ids=ids)
     if image is None:
@@ -208,6 +217,7 @@ def encode_labels(
         truncated=image.truncated.astype(np.float32),
         occluded=image.occluded.astype(np.int32),
         dont_care=image.dont_care.astype(np.float32).reshape(-1),
+        unusable=list(unusable),
     )
 
 

@@ -23,6 +23,7 @@ T = TypeVar("T")
 
 CUBE, CYLINDER, TEXT, ADD = 1, 3, 9, 0  # of visualization_msgs/Marker
 POLYGON = 2  # of Autoware's Shape
+LARGEST = 1e9  # metres of a coordinate or size; what is larger is no number that anybody has measured
 LEAN = math.radians(1)  # a box that leans by less is upright
 
 
@@ -97,20 +98,23 @@ def decode_objects(msg: Any, topic: str, received: int, stated: Mapping[str, str
     items = _read(list, msg, where.objects) if where.objects else list(_only_list(msg))
     rows, labels, scores, ids = [], list[str](), list[float](), list[str]()
     header = getattr(msg, "header", None)
-    headers = list[Any]()
-    for item in items:
+    headers, unusable = list[Any](), list[str]()
+    for number, item in enumerate(items):
         row = _row(item, where)
-        if not all(map(math.isfinite, row)):
+        label = _label(item, where.label) if where.label else ""
+        identity = _identity(_follow(item, where.id)[1]) if _has(item, where.id) else ""
+        if why := why_unusable(row):
+            unusable.append(f"{name_box(number, label, identity)}: {why}")
             continue
         rows.append(row)
         own = getattr(item, "header", None)
         headers.append(header if own is None or (header and header.frame_id) else own)
-        labels.append(_label(item, where.label) if where.label else "")
+        labels.append(label)
         scores.append(_read(float, item, where.score) if _has(item, where.score) else 1.0)
-        ids.append(_identity(_follow(item, where.id)[1]) if _has(item, where.id) else "")
+        ids.append(identity)
     if None in headers:
         raise ValueError("neither the message nor its objects have a header, which says the frame")
-    return _boxes(headers or [header], topic, received, rows, labels, scores, ids)
+    return _boxes(headers or [header], topic, received, rows, labels, scores, ids, unusable)
 
 
 def _row(item: Any, where: Fields) -> tuple[float, ...]:
@@ -140,6 +144,7 @@ def _row(item: Any, where: Fields) -> tuple[float, ...]:
 
 def _markers(markers: Iterable[Any], topic: str, received: int) -> LabelledBoxes3D:
     rows, labels, ids, headers = list[tuple[float, ...]](), list[str](), list[str](), list[Any]()
+    unusable = list[str]()
     shown = [marker for marker in markers if marker.action == ADD]
     solids = [marker for marker in shown if marker.type in (CUBE, CYLINDER)]
     texts = {(marker.ns, marker.id): str(marker.text) for marker in shown if marker.type == TEXT}
@@ -147,13 +152,16 @@ def _markers(markers: Iterable[Any], topic: str, received: int) -> LabelledBoxes
     others = {number: text for (ns, number), text in texts.items() if ns not in of_solids}
     for marker in solids:
         row = *_vector(marker.pose.position), *_vector(marker.scale), *_quaternion(marker.pose.orientation)
-        if all(map(math.isfinite, row)):
-            rows.append(row)
-            headers.append(marker.header)
-            text = texts.get((marker.ns, marker.id)) or others.get(marker.id)
-            labels.append(text or str(marker.ns))
-            ids.append(f"{marker.ns}/{marker.id}")
-    return _boxes(headers, topic, received, rows, labels, [1.0] * len(rows), ids)
+        identity = f"{marker.ns}/{marker.id}"
+        if why := why_unusable(row):
+            unusable.append(f"marker {identity}: {why}")
+            continue
+        rows.append(row)
+        headers.append(marker.header)
+        text = texts.get((marker.ns, marker.id)) or others.get(marker.id)
+        labels.append(text or str(marker.ns))
+        ids.append(identity)
+    return _boxes(headers, topic, received, rows, labels, [1.0] * len(rows), ids, unusable)
 
 
 def _boxes(
@@ -164,6 +172,7 @@ def _boxes(
     labels: list[str],
     scores: list[float],
     ids: list[str],
+    unusable: list[str],
 ) -> LabelledBoxes3D:
     """``headers``: of each row; the first one's stamp counts."""
     boxes, turns = turned_boxes(np.array(rows, np.float64).reshape(-1, 10))
@@ -181,7 +190,29 @@ def _boxes(
         ids=tuple(ids) if all(ids) else (),
         turns=turns,
         frames=frames if len(set(frames)) > 1 else (),
+        unusable=tuple(unusable),
     )
+
+
+def why_unusable(row: Sequence[float]) -> str:
+    """Say what is wrong with the centre, size and quaternion of a box; empty: it can be used."""
+    for name, values in (("centre", row[:3]), ("size", row[3:6]), ("orientation", row[6:])):
+        if not all(abs(value) < LARGEST for value in values):  # NaN is not, either
+            return f"its {name} is not finite: {_numbers(values)}"
+    if min(row[3:6]) < 0:
+        return f"its size is negative: {_numbers(row[3:6])}"
+    return ""
+
+
+def name_box(number: int, label: str, identity: str) -> str:
+    """Name a box of a message: ``box 3 (Car, id 17)``; numbers count from 0."""
+    words = [label, f"id {identity}" if identity else ""]
+    about = ", ".join(filter(None, words))
+    return f"box {number}{f' ({about})' if about else ''}"
+
+
+def _numbers(values: Iterable[float]) -> str:
+    return ", ".join(f"{value:.6g}" for value in values)
 
 
 def turned_boxes(values: F64) -> tuple[Boxes3D, F64 | None]:

@@ -1,4 +1,4 @@
-"""Messages that could not be used: counted by topic, with the reason of the first."""
+"""Messages and boxes that could not be used: counted by topic, with the reason of the first."""
 
 from __future__ import annotations
 
@@ -6,9 +6,14 @@ from collections import Counter
 
 
 class Damage:
-    """Of a bag as of a robot."""
+    """Of a bag as of a robot.
 
-    def __init__(self) -> None:
+    Args:
+        noun: what is counted.
+    """
+
+    def __init__(self, noun: str = "message(s)") -> None:
+        self._noun = noun
         self._counts: Counter[str] = Counter()
         self._first: dict[str, str] = {}
 
@@ -27,6 +32,6 @@ class Damage:
     def sentences(self) -> list[str]:
         """One for each topic."""
         return [
-            f"{count} message(s) of {topic} could not be used, the first: {self._first[topic]}"
+            f"{count} {self._noun} of {topic} could not be used, the first: {self._first[topic]}"
             for topic, count in self._counts.items()
         ]

@@ -6,8 +6,10 @@ import re
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import partial
 
 from bevviz.config import Config
+from bevviz.frame import LabelledBoxes2D, LabelledBoxes3D
 from bevviz.plugins import TOPIC
 from bevviz.ros.roles import Roles
 from bevviz.sync.clocks import Clocks
@@ -37,6 +39,7 @@ class SyncReport:
     first_undecodable: dict[str, str] = field(default_factory=dict)  # camera -> why the first was
     untold: Counter[tuple[str, str]] = field(default_factory=Counter)  # topic, codec -> gaps in its video
     damage: Damage = field(default_factory=Damage)  # ground truth that could not be decoded
+    boxes: Damage = field(default_factory=partial(Damage, "box(es)"))  # of ground truth and the robot
     problems: Counter[str] = field(default_factory=Counter)  # missing transforms and CameraInfo -> frames
     tf: TransformBuffer = field(default_factory=TransformBuffer)  # for what looked wrong in the transforms
     upright: Mapping[str, str] = field(default_factory=dict)  # for what is doubtful about the vertical
@@ -45,6 +48,11 @@ class SyncReport:
     oddities: dict[str, str] = field(default_factory=dict)  # topic -> what its messages should not say
     overtaken: Counter[str] = field(default_factory=Counter)  # topic -> results whose frame had gone on
     slowest: dict[str, float] = field(default_factory=dict)  # topic -> seconds after its stamp, at worst
+
+    def note_boxes(self, found: LabelledBoxes2D | LabelledBoxes3D) -> None:
+        """Count the boxes of a message that were left out."""
+        for why in found.unusable:
+            self.boxes.add(found.topic, why)
 
     def complain(self, problems: list[str], text: str) -> None:
         """Tell a frame, and count here, where sentences that differ in a number are one."""
@@ -62,7 +70,7 @@ class SyncReport:
             f"{self.first_undecodable[camera]}"
             for camera, n in self.undecodable.items()
         ]
-        return [*images, *self.damage.sentences]
+        return [*images, *self.damage.sentences, *self.boxes.sentences]
 
     def warnings(self) -> tuple[str, ...]:
         """One sentence each."""

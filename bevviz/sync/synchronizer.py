@@ -230,6 +230,7 @@ class Synchronizer:
         """Place a result of the robot's where no frame takes it."""
         self.report.overtaken[result.topic] += 1
         late = (result.received - result.stamp) * 1e-9
+        self.report.note_boxes(result)
         self.report.slowest[result.topic] = max(self.report.slowest.get(result.topic, late), late)
         if not self._places:
             return
@@ -414,6 +415,8 @@ class Synchronizer:
         first, last = self._window(cloud.stamp)
         boxes = [track.take(cloud.stamp, first, last) for track in self._boxes.values()]
         placed = [self.placing.placed(b, place, problems) for b in boxes if b is not None]
+        for robot_boxes in placed:
+            self.report.note_boxes(robot_boxes)
         truth = self._taken_truth(cloud.stamp, first, last)
         frame = Frame(
             index=self._index,
@@ -497,9 +500,12 @@ class Synchronizer:
         for topic, track in self._truth.items():
             while (found := track.take(stamp, first, last)) is not None:
                 try:
-                    return replace(found.load(), stamp=found.stamp)
+                    truth = found.load()
                 except UserError as error:
                     self.report.damage.add(topic, str(error))
+                else:
+                    self.report.note_boxes(truth)
+                    return replace(truth, stamp=found.stamp)
         return None
 
     def _robot_detections(
@@ -507,10 +513,11 @@ class Synchronizer:
     ) -> tuple[LabelledBoxes2D, ...]:
         """The robot's image boxes of this time, each told its camera by the image's frame."""
         names = {c.image.frame_id: c.name for c in cameras if c.image is not None}
-        found = (track.take(stamp, first, last) for track in self._detections.values())
-        return tuple(
-            d if d.camera else replace(d, camera=names.get(d.frame_id, "")) for d in found if d is not None
-        )
+        taken = (track.take(stamp, first, last) for track in self._detections.values())
+        found = [detections for detections in taken if detections is not None]
+        for detections in found:
+            self.report.note_boxes(detections)
+        return tuple(d if d.camera else replace(d, camera=names.get(d.frame_id, "")) for d in found)
 
     def _taken_clouds(self, place: Place, first: int, last: int, problems: list[str]) -> tuple[Cloud, ...]:
         """The robot's clouds of this time, in the frame of the points."""
