@@ -358,5 +358,5 @@ def test_a_number_in_place_of_data_takes_no_memory(kind: str) -> None:
 
     name = f"foxglove.{kind}"
     message = parse(b'{"data": 2147483648, "point_stride": 16}', name, "json", "")
-    with pytest.raises(ValueError, match="its data are a number, 2147483648"):
+    with pytest.raises(ValueError, match="the field 'data' is the number 2147483648"):
         as_ros(message, name)
