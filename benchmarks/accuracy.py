@@ -18,9 +18,9 @@ from benchmarks import kitti
 from benchmarks.tracking import Tallies, TrackTally, add_tracks, truth_of
 from bevviz.config import Preset, load
 from bevviz.evaluate import MAX_DISTANCE, MIN_HITS, RANGE, pair_in_order
-from bevviz.geometry import iou
-from bevviz.results import DetectionState, FrameResult
-from bevviz.session import Session
+from bevviz.model.geometry import iou
+from bevviz.model.results import DetectionState, FrameResult
+from bevviz.pipeline.session import Session
 from bevviz.synthetic import Snapshot, SyntheticSource
 
 PRESETS: tuple[Preset, ...] = ("reference", "default")

@@ -18,13 +18,13 @@ import numpy as np
 from tqdm import tqdm
 
 from benchmarks.pages import write_section
-from bevviz import geometry
 from bevviz.anomalies import Onsets
 from bevviz.config import Config, load
-from bevviz.frame import Bool, Camera, Frame
-from bevviz.results import Anomaly, Detections, FrameResult
-from bevviz.session import Session
-from bevviz.stage_loader import StageLoader
+from bevviz.model import geometry
+from bevviz.model.frame import Bool, Camera, Frame
+from bevviz.model.results import Anomaly, Detections, FrameResult
+from bevviz.pipeline.session import Session
+from bevviz.pipeline.stage_loader import StageLoader
 from bevviz.synthetic import Snapshot, SyntheticSource
 
 CHOSEN_ON = (2000, 2001, 2011)  # seeds that rules and limits were looked at on

@@ -18,10 +18,10 @@ import cv2
 import numpy as np
 from tqdm import tqdm
 
-from bevviz import geometry
 from bevviz.calib import AXES, Axis, Calibration, Finding, calibrate, gather
-from bevviz.calib.axes import SCALES, TIME, error_pose
-from bevviz.frame import F64, Camera, Cloud, Frame, Image, Intrinsics
+from bevviz.calib.offsets import SCALES, TIME, error_pose
+from bevviz.model import geometry
+from bevviz.model.frame import F64, Camera, Cloud, Frame, Image, Intrinsics
 from bevviz.synthetic import SyntheticSource
 
 BEGIN, END = "<!-- benchmarks.calib: begin -->", "<!-- benchmarks.calib: end -->"

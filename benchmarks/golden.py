@@ -291,10 +291,10 @@ def _workbench(drive: Sequence[str], folder: Path) -> Hashes:
 
 def _live(folder: Path) -> Hashes:
     """Run the live path over replayed frames, slowly enough that none is dropped."""
+    from bevviz.config.reloading import Settings
     from bevviz.live.notes import Notes
     from bevviz.live.replay import Replay
     from bevviz.live.runtime import Live, Outputs
-    from bevviz.live.settings import Settings
     from bevviz.synthetic import SyntheticSource
 
     path = folder / f"live_{time.time_ns()}.rrd"

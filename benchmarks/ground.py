@@ -17,10 +17,10 @@ from tqdm import tqdm
 
 from benchmarks.kitti import DATA, shots
 from benchmarks.pages import write_section
-from bevviz import geometry
 from bevviz.config import Config, load
-from bevviz.evaluate.ground import GROUND_LABELS
-from bevviz.frame import F32, Bool, Boxes3D
+from bevviz.evaluate.ground_score import GROUND_LABELS
+from bevviz.model import geometry
+from bevviz.model.frame import F32, Bool, Boxes3D
 from bevviz.stages.clustering import cluster
 from bevviz.stages.ground import segment_ground
 from bevviz.stages.voxel import voxel_grid

@@ -17,10 +17,10 @@ from shapely import Polygon
 from tqdm import tqdm
 
 from bevviz.config import Config, load
-from bevviz.frame import Camera, Frame, Image, Intrinsics
-from bevviz.results import Detections, FrameResult
-from bevviz.session import Session
-from bevviz.stage_loader import Detect, StageLoader
+from bevviz.model.frame import Camera, Frame, Image, Intrinsics
+from bevviz.model.results import Detections, FrameResult
+from bevviz.pipeline.session import Session
+from bevviz.pipeline.stage_loader import Detect, StageLoader
 
 DATA = Path(os.environ.get("BEVVIZ_DATA") or Path(__file__).resolve().parents[2] / "shared/data")
 RANGE = 40.0  # metres, on the ground, of an object that must be found

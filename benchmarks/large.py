@@ -25,12 +25,12 @@ from tqdm import tqdm
 import bevviz
 from benchmarks.measure import machine
 from benchmarks.pages import write_section
-from bevviz.logging import entities, rerun_cli
-from bevviz.logging.logger import Logger
-from bevviz.logging.ports import LOOPBACK, answers, free_port
-from bevviz.logging.sinks import open_recording
-from bevviz.logging.writer import WAIT
-from bevviz.results import FrameResult
+from bevviz.model.results import FrameResult
+from bevviz.recording import entities, rerun_cli
+from bevviz.recording.frame_logger import Logger
+from bevviz.recording.ports import LOOPBACK, answers, free_port
+from bevviz.recording.sinks import open_recording
+from bevviz.recording.writer import WAIT
 
 LOOKS = 6  # pictures at most, of which the last is taken: on a busy machine plots go on to move
 PERIOD = 100_000_000  # nanoseconds from one frame to the next

@@ -17,8 +17,8 @@ from pathlib import Path
 
 import numpy as np
 
-from bevviz.ros import ouster
-from bevviz.ros.clouds import decode_cloud
+from bevviz.drivers import ouster
+from bevviz.messages.clouds import decode_cloud
 
 FILES = (  # of packets, and of metadata
     ("OS-1-32-G_v2.1.1_1024x10", "OS-1-32-G_v2.1.1_1024x10"),

@@ -16,10 +16,10 @@ from typing import Any
 import numpy as np
 import open3d as o3d
 
-from bevviz.bags.recording import Recording
+from bevviz.bags.bag import Recording
 from bevviz.config import SourceConfig
-from bevviz.frame import F32, F64
-from bevviz.ros.clouds import decode_cloud
+from bevviz.messages.clouds import decode_cloud
+from bevviz.model.frame import F32, F64
 
 ANGLES = {  # of the folders, in nebula's calibration
     "40p": "Pandar40P",

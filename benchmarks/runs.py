@@ -9,9 +9,9 @@ from rerun.chunk import RrdReader
 from tqdm import tqdm
 
 from benchmarks.measure import Finished, Times, run
-from bevviz.bags.recording import Recording
-from bevviz.logging import entities
-from bevviz.ros.clouds import decode_cloud
+from bevviz.bags.bag import Recording
+from bevviz.messages.clouds import decode_cloud
+from bevviz.recording import entities
 
 
 def compare(bag: Path, repetitions: int) -> list[str]:

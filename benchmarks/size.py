@@ -17,7 +17,7 @@ from tqdm import tqdm
 from benchmarks import bags
 from benchmarks.measure import machine, run
 from benchmarks.pages import write_section
-from bevviz.logging import entities
+from bevviz.recording import entities
 
 KEEPS = ("everything", "inspect", "report")
 DECIDED = (entities.EXPLAIN, entities.FUSED, entities.TRACKS, entities.ANOMALY_LOG)

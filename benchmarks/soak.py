@@ -17,10 +17,10 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
+from bevviz.config.reloading import Settings
 from bevviz.live.notes import Notes
 from bevviz.live.replay import Replay
 from bevviz.live.runtime import Live, Outputs, Status
-from bevviz.live.settings import Settings
 from bevviz.synthetic import SyntheticSource
 
 WARM = 10.0  # seconds at the start that are left out: kernels are loaded, buffers fill

@@ -19,12 +19,12 @@ from tqdm import tqdm
 from benchmarks import tutorial
 from benchmarks.measure import Times, interleaved
 from bevviz.config import load
-from bevviz.frame import F32, I32, Camera, Frame, Scene
-from bevviz.logging.logger import Logger
-from bevviz.logging.sinks import open_recording
-from bevviz.results import Detections
-from bevviz.ros.clouds import decode_cloud
-from bevviz.session import Session
+from bevviz.messages.clouds import decode_cloud
+from bevviz.model.frame import F32, I32, Camera, Frame, Scene
+from bevviz.model.results import Detections
+from bevviz.pipeline.session import Session
+from bevviz.recording.frame_logger import Logger
+from bevviz.recording.sinks import open_recording
 from bevviz.stages.bev import bev
 from bevviz.stages.clustering import cluster, dbscan
 from bevviz.stages.ground import segment_ground

@@ -7,9 +7,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from bevviz import geometry
-from bevviz.frame import F32, F64, I32, Bool
-from bevviz.results import Tracks
+from bevviz.model import geometry
+from bevviz.model.frame import F32, F64, I32, Bool
+from bevviz.model.results import Tracks
 from bevviz.stages.fusion import assign
 from bevviz.synthetic import Snapshot, SyntheticSource
 from bevviz.synthetic.drive import START

@@ -12,9 +12,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bevviz import geometry
-from bevviz.frame import F32, F64, I32, I64
-from bevviz.results import ClusterState, Decision, Detections, DetectionState, FrameResult, Fusion
+from bevviz.model import geometry
+from bevviz.model.frame import F32, F64, I32, I64
+from bevviz.model.results import (
+    ClusterState,
+    Decision,
+    Detections,
+    DetectionState,
+    FrameResult,
+    Fusion,
+)
 from bevviz.synthetic import Snapshot, SyntheticSource
 from bevviz.synthetic.drive import IMAGE_DELAY, START, TRUTH_RANGE
 from bevviz.synthetic.mesh import Material, Mesh, merge

@@ -20,8 +20,8 @@ from tqdm import tqdm
 from benchmarks.truth import Cause, Rule, Scene, scene_of
 from bevviz.config import Config, load, revised
 from bevviz.evaluate import MIN_HITS, RANGE
-from bevviz.session import Session
-from bevviz.stage_loader import StageLoader
+from bevviz.pipeline.session import Session
+from bevviz.pipeline.stage_loader import StageLoader
 from bevviz.synthetic import Snapshot, SyntheticSource
 from bevviz.why import Answer, Questioner, Selection
 from bevviz.why.verdict import HOPELESS, Reason

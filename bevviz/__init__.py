@@ -7,7 +7,7 @@
 
 import os
 
-from bevviz.version import __version__
+from bevviz.support.version import __version__
 
 # Neither ``typing`` nor ``__future__``: to an interrupt among these imports Python gives a traceback.
 TYPE_CHECKING = False
@@ -18,8 +18,8 @@ if TYPE_CHECKING:
     from bevviz.drive import Drive, simulate
     from bevviz.drive import open_drive as open  # bevviz.open
     from bevviz.errors import UserError
-    from bevviz.frame import Frame
-    from bevviz.results import FrameResult
+    from bevviz.model.frame import Frame
+    from bevviz.model.results import FrameResult
 
 __all__ = ["Config", "Drive", "Frame", "FrameResult", "UserError", "__version__", "open", "simulate"]
 
@@ -29,8 +29,8 @@ os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
 _HOMES = {
     "Config": ("bevviz.config", "Config"),
     "Drive": ("bevviz.drive", "Drive"),
-    "Frame": ("bevviz.frame", "Frame"),
-    "FrameResult": ("bevviz.results", "FrameResult"),
+    "Frame": ("bevviz.model.frame", "Frame"),
+    "FrameResult": ("bevviz.model.results", "FrameResult"),
     "UserError": ("bevviz.errors", "UserError"),
     "open": ("bevviz.drive", "open_drive"),
     "simulate": ("bevviz.drive", "simulate"),

@@ -10,14 +10,14 @@ from typing import TYPE_CHECKING, Any, overload
 
 import numpy as np
 
-from bevviz.closing import Closing
 from bevviz.config import Config, ParameterChange, Preset, load
 from bevviz.errors import UserError
-from bevviz.frame import F64, Frame, Scene
-from bevviz.protocols import Frames, Observer
-from bevviz.results import FrameResult
-from bevviz.run import RunEnd, results, run
-from bevviz.session import Session
+from bevviz.model.frame import F64, Frame, Scene
+from bevviz.model.protocols import Frames, Observer
+from bevviz.model.results import FrameResult
+from bevviz.pipeline.run import RunEnd, results, run
+from bevviz.pipeline.session import Session
+from bevviz.support.contexts import Closing
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -235,7 +235,7 @@ class Drive(Closing):
             UserError: an unknown key or a wrong value; nothing is changed then.
         """
         from bevviz.config import revised
-        from bevviz.trust import USER
+        from bevviz.config.trust import USER
 
         return self.session.configure(revised(self.config, [*settings, *_settings(more)], USER))
 
@@ -258,7 +258,7 @@ class Drive(Closing):
         return Session(self.config, loader=self.session.loader)
 
     def run(self, observers: Sequence[Observer[FrameResult]]) -> RunEnd:
-        """Show every frame in order to the observers, see ``bevviz.run.run``."""
+        """Show every frame in order to the observers, see ``bevviz.pipeline.run.run``."""
         return run(self.frames, self.new_session(), observers)
 
     def evaluate(
@@ -277,7 +277,7 @@ class Drive(Closing):
             >>> drive.evaluate().metrics["recall.person@0-10"]
         """
         from bevviz.evaluate.evaluation import Evaluation
-        from bevviz.evaluate.truth import truth_in
+        from bevviz.evaluate.ground_truth import truth_in
 
         labels = None if kitti_labels is None else Path(kitti_labels)
         evaluation = Evaluation(truth_in(self.frames, truth, labels))
@@ -294,9 +294,9 @@ class Drive(Closing):
         Raises:
             UserError: the file cannot be written, or there is no such blueprint.
         """
-        from bevviz.logging.recorder import DiskWatch, Recorder
-        from bevviz.logging.sinks import open_recording
-        from bevviz.progress import Progress
+        from bevviz.pipeline.progress_bar import Progress
+        from bevviz.recording.recorder import DiskWatch, Recorder
+        from bevviz.recording.sinks import open_recording
 
         target = Path(path)
         with open_recording(self.scene, self.config, save=target, blueprint=blueprint) as sinks:
@@ -318,9 +318,9 @@ class Drive(Closing):
         Raises:
             UserError: no viewer can be shown.
         """
-        from bevviz.logging.recorder import Recorder
-        from bevviz.logging.sinks import open_recording
         from bevviz.notebook import NotebookViewer, in_notebook
+        from bevviz.recording.recorder import Recorder
+        from bevviz.recording.sinks import open_recording
 
         if in_notebook():
             self._shown = NotebookViewer(self.scene, self.config, blueprint or "workbench")
@@ -331,8 +331,8 @@ class Drive(Closing):
 
     def to_pandas(self) -> DataFrame:
         """Run the whole drive into a table: a row a frame, with counts, times and what went wrong."""
-        from bevviz.batch.table import row
-        from bevviz.frame import data_frame
+        from bevviz.fleet.table import row
+        from bevviz.model.frame import data_frame
 
         return data_frame([row(result, result.config) for result in self])
 
@@ -380,7 +380,7 @@ def open_drive(
     paths = [Path(p) for p in ([path] if isinstance(path, str | PathLike) else path)]
     settings, notes = _given(model, set), tuple[str, ...]()
     if len(paths) == 1 and paths[0].suffix == ".rrd":
-        from bevviz.recorded import follow
+        from bevviz.recording.source_lookup import follow
 
         recorded = follow(paths[0], [] if bag is None else [Path(bag)], settings)
         paths, notes = list(recorded.paths), recorded.warnings

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from bevviz.text import printable
+from bevviz.support.text import printable
 
 LONGEST = 4000  # characters of a line
 

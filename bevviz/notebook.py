@@ -11,15 +11,15 @@ import rerun as rr
 from rerun.blueprint import Blueprint
 
 from bevviz.errors import UserError
-from bevviz.frame import Scene
-from bevviz.logging import blueprints, entities
-from bevviz.logging.logger import Logger
-from bevviz.logging.recorder import Recorder
-from bevviz.logging.sinks import APPLICATION
-from bevviz.results import FrameResult, Tracks
+from bevviz.model.frame import Scene
+from bevviz.model.results import FrameResult, Tracks
+from bevviz.recording import blueprints, entities
+from bevviz.recording.frame_logger import Logger
+from bevviz.recording.recorder import Recorder
+from bevviz.recording.sinks import APPLICATION
 from bevviz.why.log import mark_answers
-from bevviz.workbench.answers import selection
-from bevviz.workbench.pick import Pick, pick
+from bevviz.why.pick import Pick, pick
+from bevviz.why.pick_answers import selection
 
 if TYPE_CHECKING:
     from rerun.notebook import Viewer, ViewerEvent

@@ -5,8 +5,8 @@ from __future__ import annotations
 import rerun.blueprint as rrb
 
 from bevviz.calib.views import alignment, calibration, score_curves
-from bevviz.frame import Scene
-from bevviz.logging import views
+from bevviz.model.frame import Scene
+from bevviz.recording import views
 
 
 def blueprint(scene: Scene) -> rrb.Blueprint:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import rerun.blueprint as rrb
 
 from bevviz.compare import views as compare
-from bevviz.frame import Scene
-from bevviz.logging import views
+from bevviz.model.frame import Scene
+from bevviz.recording import views
 
 
 def blueprint(scene: Scene) -> rrb.Blueprint:

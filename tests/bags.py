@@ -12,9 +12,9 @@ from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from bevviz import geometry
-from bevviz.frame import F32, F64, Intrinsics
-from bevviz.ros import vision_msgs
+from bevviz.messages import vision_msgs
+from bevviz.model import geometry
+from bevviz.model.frame import F32, F64, Intrinsics
 
 START = 1_700_000_000_000_000_000
 PERIOD = 100_000_000

@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 
+from bevviz.config.reloading import Settings
 from bevviz.live.notes import Notes
 from bevviz.live.replay import Replay
 from bevviz.live.runtime import Live, Outputs
-from bevviz.live.settings import Settings
-from bevviz.results import FrameResult
+from bevviz.model.results import FrameResult
 from bevviz.synthetic import SyntheticSource
-from bevviz.workbench.live_bench import LiveBench
+from bevviz.workbench.live_session import LiveBench
 
 
 @contextmanager

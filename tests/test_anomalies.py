@@ -8,11 +8,20 @@ from typing import Any
 import numpy as np
 import pytest
 
-from bevviz import geometry
 from bevviz.anomalies import AnomalyDetector, AnomalySummary, Onsets
 from bevviz.config import AnomaliesConfig, load
-from bevviz.frame import F32, Boxes3D, Camera, Image, Intrinsics
-from bevviz.results import Anomaly, CameraResult, Decision, Detections, Failure, FrameResult, Fusion, Pairs
+from bevviz.model import geometry
+from bevviz.model.frame import F32, Boxes3D, Camera, Image, Intrinsics
+from bevviz.model.results import (
+    Anomaly,
+    CameraResult,
+    Decision,
+    Detections,
+    Failure,
+    FrameResult,
+    Fusion,
+    Pairs,
+)
 from bevviz.stages.fusion import in_view
 from bevviz.stages.tracking import Tracker
 from tests.test_tracking import CAR, PERSON, scene

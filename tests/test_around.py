@@ -12,16 +12,16 @@ import pytest
 import rerun as rr
 
 from bevviz.config import SourceConfig, load
-from bevviz.frame import Frame, Image, Scene, Shape, Status
-from bevviz.logging.logger import Logger
-from bevviz.results import FrameResult
-from bevviz.ros.around import decode_shapes, decode_statuses
-from bevviz.ros.description import mesh_file
-from bevviz.ros.encode import encode_cloud, encode_image, typestore
-from bevviz.ros.messages import MessageError
-from bevviz.ros.roles import find_roles, kind_of
-from bevviz.ros.topics import Topic
-from bevviz.sync.around import MANY, SAMPLES, Surroundings
+from bevviz.messages.decoding import MessageError
+from bevviz.messages.encode import encode_cloud, encode_image, typestore
+from bevviz.messages.robot_description import mesh_file
+from bevviz.messages.roles import find_roles, kind_of
+from bevviz.messages.surroundings import decode_shapes, decode_statuses
+from bevviz.messages.topics import Topic
+from bevviz.model.frame import Frame, Image, Scene, Shape, Status
+from bevviz.model.results import FrameResult
+from bevviz.recording.frame_logger import Logger
+from bevviz.sync.surroundings import MANY, SAMPLES, Surroundings
 from bevviz.synthetic import SyntheticSource
 from bevviz.synthetic.sensors import Lidar, PinholeCamera
 from tests.recordings import Recording

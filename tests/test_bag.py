@@ -14,12 +14,12 @@ import pytest
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
-from bevviz import geometry
-from bevviz.bags.recording import Recording
+from bevviz.bags.bag import Recording
 from bevviz.bags.source import BagSource, iso, parse_time
 from bevviz.config import Config, load
 from bevviz.errors import UserError
-from bevviz.frame import Frame
+from bevviz.model import geometry
+from bevviz.model.frame import Frame
 from tests import bags
 
 FORMATS = [

@@ -25,15 +25,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from bevviz.bags.source import BagSource, FrameSelection
-from bevviz.batch.batch import claimed, left_to_do, whole_results
-from bevviz.batch.jobs import PARTIAL, Job, find_bags, make_jobs, name_bags, tables
-from bevviz.batch.table import SEVERITIES, row, severity
-from bevviz.batch.work import run
 from bevviz.cli import main
 from bevviz.config import Config, load
 from bevviz.errors import UserError
-from bevviz.results import DetectionState
-from bevviz.session import Session
+from bevviz.fleet.batch import claimed, left_to_do, whole_results
+from bevviz.fleet.jobs import PARTIAL, Job, find_bags, make_jobs, name_bags, tables
+from bevviz.fleet.table import SEVERITIES, row, severity
+from bevviz.fleet.work import run
+from bevviz.model.results import DetectionState
+from bevviz.pipeline.session import Session
 from tests import bags
 from tests.pages import Page
 from tests.recordings import Recording, verify
@@ -379,7 +379,7 @@ def test_a_query_across_the_recordings_of_a_catalog(
 
 def test_a_recording_made_anew_takes_the_place_of_the_old_one(batch: Batch, tmp_path: Path) -> None:
     pytest.importorskip("datafusion", reason="needs datafusion: pip install 'bevviz[catalog]'")
-    from bevviz.batch.catalog import register
+    from bevviz.fleet.catalog import register
 
     with rr.server.Server(host="127.0.0.1") as server:
         ((table, about), *_) = tables(batch.folder)

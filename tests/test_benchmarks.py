@@ -14,9 +14,9 @@ from benchmarks.runs import counted, logged_points
 from benchmarks.stages import same_clusters, side_by_side
 from benchmarks.truth import Rule, scene_of
 from benchmarks.why import Bench, ask_all, configurations, section_of
-from bevviz.bags.recording import Recording
+from bevviz.bags.bag import Recording
 from bevviz.cli import main
-from bevviz.stage_loader import StageLoader
+from bevviz.pipeline.stage_loader import StageLoader
 from bevviz.stages.clustering import dbscan
 from bevviz.why.verdict import HOPELESS, Reason
 from tests import bags

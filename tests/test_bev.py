@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from bevviz.config import BevConfig, load
-from bevviz.frame import F32, I32, U8, Boxes3D
-from bevviz.results import Clusters, Objects
+from bevviz.model.frame import F32, I32, U8, Boxes3D
+from bevviz.model.results import Clusters, Objects
 from bevviz.stages.bev import _ground_shades, _obstacle_shades, bev
 
 REFERENCE = load(preset="reference").bev

@@ -15,8 +15,8 @@ from rerun.chunk import RrdReader
 
 from bevviz.config import load
 from bevviz.errors import UserError
-from bevviz.frame import Scene
-from bevviz.logging import blueprints
+from bevviz.model.frame import Scene
+from bevviz.recording import blueprints
 
 SCENES = {
     "lidar only": Scene("a", "lidar", ("lidar",)),
@@ -139,7 +139,7 @@ def test_a_users_own_python_file(tmp_path: Path) -> None:
     own.write_text(
         textwrap.dedent("""
             import rerun.blueprint as rrb
-            from bevviz.logging import views
+            from bevviz.recording import views
 
             def blueprint(scene):
                 cameras = [views.camera(scene, name) for name in scene.cameras]

@@ -11,17 +11,17 @@ import numpy as np
 import pytest
 
 from benchmarks.calib import Drive, stated_wrongly
-from bevviz import geometry
 from bevviz.bags.source import BagSource
 from bevviz.calib import AXES, Calibration, Finding, Shots, calibrate, gather
-from bevviz.calib.axes import SCALES, TIME, error_pose
 from bevviz.calib.edges import cloud_edges
+from bevviz.calib.offsets import SCALES, TIME, error_pose
 from bevviz.calib.result import configuration
 from bevviz.calib.score import Scorer
 from bevviz.cli import main
 from bevviz.config import Config, load
 from bevviz.errors import UserError
-from bevviz.frame import F64, I64, U8, Camera, Cloud, Frame, Image, Intrinsics
+from bevviz.model import geometry
+from bevviz.model.frame import F64, I64, U8, Camera, Cloud, Frame, Image, Intrinsics
 from bevviz.synthetic import SyntheticSource, write_bag
 from bevviz.synthetic.drive import PERIOD, START
 from tests import bags, forms

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from bevviz.frame import F32, I64
+from bevviz.model.frame import F32, I64
 from bevviz.stages.cells import cell_keys, group, sort_by_key
 
 near = hnp.arrays(np.float32, st.tuples(st.integers(1, 60), st.just(3)), elements=st.floats(-9, 9, width=32))

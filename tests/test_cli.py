@@ -20,9 +20,9 @@ from rosbags.typesys import get_types_from_msg
 
 from bevviz.cli import main
 from bevviz.cli.options import with_negatives
-from bevviz.files import unfinished_files
-from bevviz.logging.logger import Logger
-from bevviz.results import FrameResult
+from bevviz.model.results import FrameResult
+from bevviz.recording.frame_logger import Logger
+from bevviz.support.files import unfinished_files
 from tests import bags
 from tests.recordings import Recording
 from tests.waiting import PATIENCE

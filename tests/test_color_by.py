@@ -18,10 +18,10 @@ from rerun.chunk import RrdReader
 import bevviz
 from bevviz.config import load
 from bevviz.config.sections import Quantity
-from bevviz.frame import F32, Scene
 from bevviz.live.thinning import chosen, is_cloud, thin_cloud
-from bevviz.logging import blueprints
-from bevviz.logging.color_by import ColoredPoints, annotation_context, class_ids
+from bevviz.model.frame import F32, Scene
+from bevviz.recording import blueprints
+from bevviz.recording.color_by import ColoredPoints, annotation_context, class_ids
 
 QUANTITIES: tuple[Quantity, ...] = get_args(Quantity)
 XYZ: F32 = np.array([[3.0, 4.0, 0.0], [30.0, 40.0, 0.0], [0.0, 0.0, 1.0]], np.float32)

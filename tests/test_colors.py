@@ -7,8 +7,16 @@ from itertools import combinations
 import numpy as np
 import pytest
 
-from bevviz.colors import CLASS_COLORS, FATES, SIDES, TRUTH, Color, State, class_color
-from bevviz.frame import F64
+from bevviz.model.colors import (
+    CLASS_COLORS,
+    FATES,
+    SIDES,
+    TRUTH,
+    Color,
+    State,
+    class_color,
+)
+from bevviz.model.frame import F64
 
 # Machado, Oliveira & Fernandes (2009), severity 1, of linear RGB.
 SEEN = {

@@ -28,16 +28,16 @@ from bevviz.compare.sides import published, robot_topic
 from bevviz.compare.views import side_space
 from bevviz.config import load
 from bevviz.errors import UserError
-from bevviz.frame import Boxes3D, Frame, LabelledBoxes3D
-from bevviz.geometry import transform
-from bevviz.logging import entities
-from bevviz.perceive import describe
-from bevviz.results import FrameResult
-from bevviz.session import Session
-from bevviz.stage_log import Memo
+from bevviz.model.frame import Boxes3D, Frame, LabelledBoxes3D
+from bevviz.model.geometry import transform
+from bevviz.model.results import FrameResult
+from bevviz.pipeline.perceive import describe
+from bevviz.pipeline.session import Session
+from bevviz.pipeline.stage_log import Memo
+from bevviz.pipeline.variants import Variants, check_same_frames, without_motion
+from bevviz.recording import entities
 from bevviz.stages import detector
 from bevviz.synthetic import SyntheticSource, write_bag
-from bevviz.variants import Variants, check_same_frames, without_motion
 from tests import bags, forms
 from tests.recordings import Recording, verify
 

@@ -18,12 +18,12 @@ from hypothesis import strategies as st
 from bevviz.bags.source import BagSource
 from bevviz.cli import main
 from bevviz.config import Config
-from bevviz.frame import F32
-from bevviz.live.message import LiveMessage
-from bevviz.ros import cloudini, point_cloud_interfaces
-from bevviz.ros.clouds import decode_cloud
-from bevviz.ros.messages import MessageError
-from bevviz.ros.point_cloud_interfaces import COMPRESSED
+from bevviz.drivers import cloudini, point_cloud_interfaces
+from bevviz.drivers.point_cloud_interfaces import COMPRESSED
+from bevviz.live.live_message import LiveMessage
+from bevviz.messages.clouds import decode_cloud
+from bevviz.messages.decoding import MessageError
+from bevviz.model.frame import F32
 from tests import bags
 
 # Twelve points, (4 + i, i % 4 - 1.5, -1.5 + i / 16), intensity 10 i, ring i % 3, rgb 0x102030 + i, encoded by

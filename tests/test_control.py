@@ -17,9 +17,9 @@ from pathlib import Path
 import pytest
 
 from bevviz.errors import UserError
-from bevviz.files import check_owned
 from bevviz.live import control
 from bevviz.live.control import Control, snap
+from bevviz.support.files import check_owned
 
 
 @pytest.fixture(autouse=True)

@@ -18,13 +18,13 @@ import zstandard
 from benchmarks.torture.judges import judges, taken
 from benchmarks.torture.samples import FORMATS, items
 from bevviz.bags import chunks, mcap
-from bevviz.bags.info import describe, render
+from bevviz.bags.bag import Recording
 from bevviz.bags.reader import LEAST, Bytes, DamageError, unpack
-from bevviz.bags.recording import Recording
+from bevviz.bags.rescue.sqlite_pages import checksum_of
 from bevviz.bags.source import BagSource
-from bevviz.bags.sqlite_pages import checksum_of
 from bevviz.config import Config
 from bevviz.errors import UserError
+from bevviz.pipeline.bag_info import describe, render
 
 Found = list[tuple[str, int, bytes]]
 

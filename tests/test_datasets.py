@@ -11,12 +11,12 @@ import pykitti  # type: ignore[import-untyped]
 import pytest
 
 import bevviz
-from bevviz import geometry
-from bevviz.batch.jobs import find_bags
 from bevviz.cli import main
 from bevviz.drive import Drive
 from bevviz.evaluate import truth_in
-from bevviz.frame import F64, Boxes3D, Frame
+from bevviz.fleet.jobs import find_bags
+from bevviz.model import geometry
+from bevviz.model.frame import F64, Boxes3D, Frame
 from tests import datasets
 
 Capture = pytest.CaptureFixture[str]

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from bevviz.config import DetectorConfig
 from bevviz.errors import UserError
-from bevviz.geometry import iou
-from bevviz.results import Detections, DetectionState
+from bevviz.model.geometry import iou
+from bevviz.model.results import Detections, DetectionState
 from bevviz.stages.detector import COCO, Detector, nms
 from bevviz.stages.detector.names import COCO_CATEGORIES
 from tests import networks

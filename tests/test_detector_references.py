@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from bevviz.config import DetectorConfig
 from bevviz.errors import UserError
-from bevviz.results import DetectionState
+from bevviz.model.results import DetectionState
 from bevviz.stages.detector import Detector
 from tests import networks
 

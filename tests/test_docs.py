@@ -93,7 +93,7 @@ def test_the_page_of_projects_explains_as_the_command_does(
 
 def test_the_project_file_that_is_shown_is_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from bevviz.config import load
-    from bevviz.project import layers
+    from bevviz.config.project import layers
 
     monkeypatch.chdir(tmp_path)
     Path("bevviz.toml").write_text(project_on("docs/project.md"))

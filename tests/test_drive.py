@@ -13,7 +13,7 @@ import pytest
 
 import bevviz
 from bevviz.cli import main
-from bevviz.results import FrameResult
+from bevviz.model.results import FrameResult
 from bevviz.synthetic import BagWriter, SyntheticSource
 from bevviz.why import Selection
 from tests.recordings import Recording, verify

@@ -15,17 +15,17 @@ import pyarrow.parquet as pq
 import pytest
 
 import bevviz
-from bevviz import geometry
 from bevviz.cli import main
-from bevviz.datasets.names import accepted_names
 from bevviz.evaluate import Truth, judge, truth_in, truth_of
+from bevviz.evaluate.average_precision import DIFFICULTIES, AveragePrecision, Found
 from bevviz.evaluate.evaluation import Evaluation
-from bevviz.evaluate.identity import Identities
-from bevviz.evaluate.precision import DIFFICULTIES, AveragePrecision, Found
-from bevviz.evaluate.score import Score
-from bevviz.frame import Boxes3D, ImageLabels
-from bevviz.results import Objects
-from bevviz.stages.robot import in_points_frame
+from bevviz.evaluate.matching import Score
+from bevviz.evaluate.tracking_score import Identities
+from bevviz.model import geometry
+from bevviz.model.class_names import accepted_names
+from bevviz.model.frame import Boxes3D, ImageLabels
+from bevviz.model.results import Objects
+from bevviz.stages.robot_results import in_points_frame
 from bevviz.synthetic import SyntheticSource, write_bag
 from tests import bags, forms
 from tests.recordings import Recording, verify

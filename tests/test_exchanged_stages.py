@@ -18,16 +18,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from bevviz import plugins
 from bevviz.bags.source import BagSource
 from bevviz.cli import main
-from bevviz.config import Config, changes, dump, keys, load
+from bevviz.config import Config, changes, dump, keys, load, plugins
+from bevviz.config.project import named_code
+from bevviz.config.trust import allow
 from bevviz.errors import StageError, UserError
-from bevviz.frame import Boxes3D, Camera, Frame, LabelledBoxes2D
-from bevviz.geometry import inverse
-from bevviz.project import named_code
-from bevviz.results import ClusterState, DetectionState, FrameResult
-from bevviz.ros.encode import (
+from bevviz.messages.encode import (
     encode_boxes_2d,
     encode_boxes_3d,
     encode_camera_info,
@@ -35,11 +32,13 @@ from bevviz.ros.encode import (
     encode_image,
     encode_transforms,
 )
-from bevviz.session import Session
-from bevviz.stages import foreign
-from bevviz.stages.robot import detect
+from bevviz.model.frame import Boxes3D, Camera, Frame, LabelledBoxes2D
+from bevviz.model.geometry import inverse
+from bevviz.model.results import ClusterState, DetectionState, FrameResult
+from bevviz.pipeline.session import Session
+from bevviz.stages import user_stages
+from bevviz.stages.robot_results import detect
 from bevviz.synthetic import SyntheticSource
-from bevviz.trust import allow
 from tests import bags
 from tests.waiting import PATIENCE
 
@@ -168,7 +167,7 @@ def test_heights_are_those_above_the_ground_around(frame: Frame) -> None:
     """On the drive's own ground, known exactly, they are close to what our own stage tells."""
     ours = Session(load()).run(frame)
     assert ours.voxels is not None and ours.ground is not None
-    derived = foreign.heights(ours.voxels.points, ours.ground.mask)
+    derived = user_stages.heights(ours.voxels.points, ours.ground.mask)
     near = np.hypot(*ours.voxels.points[:, :2].T) < 30
     away = np.abs(derived - ours.ground.height)[near]
     assert np.median(away) < 0.05
@@ -179,11 +178,11 @@ def test_heights_are_those_above_the_ground_around(frame: Frame) -> None:
     hnp.arrays(np.float32, st.tuples(st.integers(1, 50), st.just(3)), elements=st.floats(-300, 300, width=32))
 )
 def test_heights_of_any_points(points: Any) -> None:
-    everywhere = foreign.heights(points, np.ones(len(points), bool))
+    everywhere = user_stages.heights(points, np.ones(len(points), bool))
     assert np.isfinite(everywhere).all()
-    lowest = foreign.heights(points, points[:, 2] == points[:, 2].min())
+    lowest = user_stages.heights(points, points[:, 2] == points[:, 2].min())
     assert (lowest >= -1e-3).all()
-    assert np.isnan(foreign.heights(points, np.zeros(len(points), bool))).all()
+    assert np.isnan(user_stages.heights(points, np.zeros(len(points), bool))).all()
 
 
 def test_nobody_changes_the_points_of_a_frame(here: Path, frame: Frame) -> None:
@@ -223,7 +222,7 @@ def test_somebodys_objects_have_the_clusters_in_their_boxes(here: Path, frame: F
         assert clusters.state[objects.cluster[0]] == ClusterState.KEPT
     car = clusters.centroid[int(np.flatnonzero(clusters.state == ClusterState.KEPT)[0])]
     box = Boxes3D(car[None], np.array([[5, 5, 5]], np.float32), np.zeros(1, np.float32))
-    placed = foreign.placed(box, ("car",), np.ones(1, np.float32), result.obstacles, clusters)
+    placed = user_stages.placed(box, ("car",), np.ones(1, np.float32), result.obstacles, clusters)
     inside = clusters.labels[(np.abs(result.obstacles - car) <= 2.5).all(axis=1)]
     kept = inside[(inside >= 0) & (clusters.state[inside] == ClusterState.KEPT)]
     assert placed.cluster[0] == np.bincount(kept).argmax()
@@ -503,7 +502,7 @@ def test_a_scan_that_the_robot_says_nothing_of(frame: Frame) -> None:
     (failure,) = result.failures
     assert failure.reason == "the robot published no boxes on /clusters at the time of this scan"
     with pytest.raises(StageError, match="no detections on /d"):
-        from bevviz.stages import robot as published
+        from bevviz.stages import robot_results as published
 
         published.detect(frame, frame.cameras[0], "/d")
 

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from bevviz.config import Config, load
-from bevviz.explain import explain
-from bevviz.frame import F32, Camera, Image
-from bevviz.geometry import apply, project
-from bevviz.results import (
+from bevviz.model.decisions import explain
+from bevviz.model.frame import F32, Camera, Image
+from bevviz.model.geometry import apply, project
+from bevviz.model.results import (
     CameraResult,
     Clusters,
     ClusterState,

@@ -12,15 +12,15 @@ import numpy as np
 import pytest
 
 import bevviz
-from bevviz import geometry
 from bevviz.cli import main
 from bevviz.datasets.kitti import read_labels
 from bevviz.errors import UserError
 from bevviz.export.folder import rectified
 from bevviz.export.kitti import KittiExport, labels
 from bevviz.export.nuscenes import TABLES, VERSION, NuScenesExport
-from bevviz.frame import Boxes3D, Intrinsics
-from bevviz.results import FrameResult, Objects
+from bevviz.model import geometry
+from bevviz.model.frame import Boxes3D, Intrinsics
+from bevviz.model.results import FrameResult, Objects
 from tests import bags
 
 OPTICAL = geometry.inverse(geometry.transform(np.array([0.2, 0.1, -0.3]), np.array([-0.5, 0.5, -0.5, 0.5])))

@@ -11,9 +11,9 @@ import pytest
 from bevviz.cli import demo, main
 from bevviz.config import load
 from bevviz.errors import UserError
-from bevviz.frame import I32
-from bevviz.results import Decision, FrameResult
-from bevviz.session import Session
+from bevviz.model.frame import I32
+from bevviz.model.results import Decision, FrameResult
+from bevviz.pipeline.session import Session
 from bevviz.synthetic import FAULTS, SENSOR_FAULTS, Snapshot, SyntheticSource
 
 

@@ -24,8 +24,8 @@ from rosbags.interfaces import Connection, ConnectionExtRosbag2, MessageDefiniti
 from bevviz.bags.mcap_writer import McapWriter, complete
 from bevviz.cli import main
 from bevviz.errors import UserError
-from bevviz.files import Scratch, claim, save, unfinished_files, written
-from bevviz.workbench.film import Film
+from bevviz.support.files import Scratch, claim, save, unfinished_files, written
+from bevviz.workbench.recording_buffer import Film
 from tests import bags
 from tests.recordings import Recording, verify
 from tests.test_cli import Capture, environment, error_of
@@ -280,7 +280,7 @@ def test_a_temporary_folder_does_not_outlive_its_process_for_long(
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     script = (
         "import os, signal, tempfile; tempfile.tempdir = os.getcwd()\n"
-        "from bevviz.files import Scratch\n"
+        "from bevviz.support.files import Scratch\n"
         "s = Scratch(); s.new(); os.kill(os.getpid(), signal.SIGKILL)\n"
     )
     done = subprocess.run([sys.executable, "-c", script], env=environment(), timeout=PATIENCE)
@@ -377,7 +377,7 @@ def test_a_link_to_a_file_of_another_kind_is_refused() -> None:
 
 def test_of_two_that_begin_together_one_goes_on() -> None:
     script = (
-        "import sys, time; from pathlib import Path; from bevviz.files import claim\n"
+        "import sys, time; from pathlib import Path; from bevviz.support.files import claim\n"
         "from bevviz.errors import UserError\n"
         "sys.stdin.readline()\n"
         "try: claim(Path('a.rrd'), 'recording'); print('mine', flush=True); sys.stdin.readline()\n"

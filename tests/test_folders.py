@@ -15,10 +15,10 @@ from bevviz import UserError
 from bevviz.datasets.columns import are_doubles, count_columns
 from bevviz.datasets.folder import Folder, read_cloud
 from bevviz.datasets.stamps import sensors_of
-from bevviz.geometry import is_bent
-from bevviz.o3d import load
-from bevviz.ros.cameras import decode_camera_info
-from bevviz.ros.encode import encode_points
+from bevviz.messages.camera_info import decode_camera_info
+from bevviz.messages.encode import encode_points
+from bevviz.model.geometry import is_bent
+from bevviz.support.open3d import load
 
 
 def cloud(columns: int, points: int = 3000, seed: int = 0) -> np.ndarray:

@@ -14,14 +14,14 @@ from mcap.writer import IndexType, Writer
 from rosbags.typesys import Stores, get_typestore
 
 import bevviz
-from bevviz import geometry
 from bevviz.bags.source import BagSource
 from bevviz.cli import main
 from bevviz.config import load
-from bevviz.frame import F64, Intrinsics
-from bevviz.ros.encode import encode_points
-from bevviz.ros.objects import decode_objects
-from bevviz.stages.robot import in_points_frame
+from bevviz.messages.encode import encode_points
+from bevviz.messages.foreign_boxes import decode_objects
+from bevviz.model import geometry
+from bevviz.model.frame import F64, Intrinsics
+from bevviz.stages.robot_results import in_points_frame
 from tests import bags
 
 LINE = "=" * 80 + "\n"

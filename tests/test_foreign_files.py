@@ -7,16 +7,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bevviz.bags.recording import Recording
+from bevviz.bags.bag import Recording
 from bevviz.datasets import open_dataset
 from bevviz.datasets.folder import read_cloud
 from bevviz.datasets.kitti import CLOUDS, read_labels
 from bevviz.errors import UserError
-from bevviz.frame import Boxes3D
-from bevviz.geometry import inverse, moved, transform
-from bevviz.ros.clouds import decode_cloud
-from bevviz.ros.detections import decode_detections_3d
-from bevviz.ros.encode import encode_labels
+from bevviz.messages.clouds import decode_cloud
+from bevviz.messages.detections import decode_detections_3d
+from bevviz.messages.encode import encode_labels
+from bevviz.model.frame import Boxes3D
+from bevviz.model.geometry import inverse, moved, transform
 from tests.datasets import TR, kitti_odometry, kitti_raw, nuscenes
 
 OLD = """# .PCD v.5 - Point Cloud Data file format

@@ -15,13 +15,13 @@ import pytest
 foxglove = pytest.importorskip("foxglove", reason="needs Foxglove's SDK")
 from foxglove import channels, messages  # noqa: E402
 
-from bevviz import geometry  # noqa: E402
 from bevviz.bags.source import BagSource  # noqa: E402
 from bevviz.cli import main  # noqa: E402
 from bevviz.config import load  # noqa: E402
-from bevviz.frame import F32, F64  # noqa: E402
-from bevviz.report.window import choose_topics, cut, find_window, open_window  # noqa: E402
-from bevviz.stages.robot import in_points_frame  # noqa: E402
+from bevviz.model import geometry  # noqa: E402
+from bevviz.model.frame import F32, F64  # noqa: E402
+from bevviz.report.bag_window import choose_topics, cut, find_window, open_window  # noqa: E402
+from bevviz.stages.robot_results import in_points_frame  # noqa: E402
 from tests import bags, videos  # noqa: E402
 
 SCANS = 6
@@ -187,7 +187,7 @@ def test_json_says_the_same(tmp_path: Path) -> None:
     from google.protobuf.json_format import MessageToDict
     from mcap.reader import make_reader
 
-    from bevviz.ros.foxglove import parse
+    from bevviz.messages.foxglove import parse
 
     source, path, context = write(tmp_path / "protobuf.mcap"), tmp_path / "json.mcap", foxglove.Context()
     made: dict[str, Any] = {}
@@ -354,7 +354,7 @@ def test_a_time_of_json_that_no_date_has_is_one_line(tmp_path: Path, wrong: obje
 
 @pytest.mark.parametrize("kind", ["PointCloud", "CompressedImage", "RawImage"])
 def test_a_number_in_place_of_data_takes_no_memory(kind: str) -> None:
-    from bevviz.ros.foxglove import as_ros, parse
+    from bevviz.messages.foxglove import as_ros, parse
 
     name = f"foxglove.{kind}"
     message = parse(b'{"data": 2147483648, "point_stride": 16}', name, "json", "")

@@ -14,10 +14,18 @@ from hypothesis import strategies as st
 from benchmarks import kitti
 from bevviz.config import SIZES, ClusteringConfig, FusionConfig, ObjectsConfig, load
 from bevviz.errors import UserError
-from bevviz.frame import F32, F64, Camera
-from bevviz.geometry import apply, project
-from bevviz.results import CameraResult, Claims, Clusters, ClusterState, Decision, Detections, Splits
-from bevviz.stages.boxfit import MAX_SPREAD, NO_EDGE, fit
+from bevviz.model.frame import F32, F64, Camera
+from bevviz.model.geometry import apply, project
+from bevviz.model.results import (
+    CameraResult,
+    Claims,
+    Clusters,
+    ClusterState,
+    Decision,
+    Detections,
+    Splits,
+)
+from bevviz.stages.box_fit import MAX_SPREAD, NO_EDGE, fit
 from bevviz.stages.clustering import cluster
 from bevviz.stages.frustum import claim
 from bevviz.stages.fusion import fuse, merge

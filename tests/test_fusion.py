@@ -13,9 +13,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from bevviz.config import ClusteringConfig, Config, FusionConfig, load
-from bevviz.frame import F32, F64, Boxes3D, Camera, Intrinsics
-from bevviz.geometry import apply, inverse, iou, project
-from bevviz.results import CameraResult, Clusters, ClusterState, Decision, Detections, DetectionState, Fusion
+from bevviz.model.frame import F32, F64, Boxes3D, Camera, Intrinsics
+from bevviz.model.geometry import apply, inverse, iou, project
+from bevviz.model.results import (
+    CameraResult,
+    Clusters,
+    ClusterState,
+    Decision,
+    Detections,
+    DetectionState,
+    Fusion,
+)
 from bevviz.stages.clustering import cluster
 from bevviz.stages.detector import Detector
 from bevviz.stages.fusion import assign, fuse, merge

@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from bevviz import geometry
-from bevviz.frame import F64, Boxes3D, Intrinsics
+from bevviz.model import geometry
+from bevviz.model.frame import F64, Boxes3D, Intrinsics
 
 K = np.array([[320.0, 0, 310], [0, 330, 170], [0, 0, 1]])
 CAMERAS = {

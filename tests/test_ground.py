@@ -14,11 +14,11 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from bevviz.config import GroundConfig
-from bevviz.frame import F32, F64, Bool
-from bevviz.o3d import load
-from bevviz.results import Ground
+from bevviz.model.frame import F32, F64, Bool
+from bevviz.model.results import Ground
 from bevviz.stages.clustering import dbscan
 from bevviz.stages.ground import RING_COUNT, RING_SCALE, _place, segment_ground
+from bevviz.support.open3d import load
 
 Terrain = Callable[[F64, F64], F64]
 

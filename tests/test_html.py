@@ -9,11 +9,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from jinja2 import UndefinedError
 
-from bevviz.batch.page import BagTotals, page
-from bevviz.batch.table import RunInfo
-from bevviz.frame import Scene
-from bevviz.html import environment, render
+from bevviz.fleet.page import BagTotals, page
+from bevviz.fleet.table import RunInfo
+from bevviz.model.frame import Scene
 from bevviz.report.plots import plot
+from bevviz.support.html import environment, render
 from tests.pages import Page
 
 EVIL = "</style></script><script>alert('x')</script>\"'><img src=x onerror=alert(1)> &amp; {{ 7 * 7 }}"

@@ -11,13 +11,13 @@ from pathlib import Path
 
 import pytest
 
-from bevviz import importer
-from bevviz.importer import NOT_OURS, run
+from bevviz.cli import importer
+from bevviz.cli.importer import NOT_OURS, run
 from tests import bags
 from tests.recordings import Recording, verify
 from tests.waiting import PATIENCE
 
-COMMAND = [sys.executable, "-c", "from bevviz.importer import main; main()"]
+COMMAND = [sys.executable, "-c", "from bevviz.cli.importer import main; main()"]
 
 
 @pytest.fixture(scope="module")
@@ -52,7 +52,7 @@ def test_what_is_none_of_ours_is_said_so(drive: Path, tmp_path: Path) -> None:
     other.touch()
     assert run([str(other)]) == NOT_OURS
     assert run([str(tmp_path)]) == NOT_OURS
-    loaded = "import sys; from bevviz.importer import run; run(['x.png']); print('numpy' in sys.modules)"
+    loaded = "import sys; from bevviz.cli.importer import run; run(['x.png']); print('numpy' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", loaded], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "False"
 

@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bevviz.bags.info import WIDTH, describe, render
 from bevviz.bags.source import BagSource
 from bevviz.config import Config, load
 from bevviz.errors import UserError
-from bevviz.stage_loader import StageLoader
+from bevviz.pipeline.bag_info import WIDTH, describe, render
+from bevviz.pipeline.stage_loader import StageLoader
 from bevviz.stages.detector import DEMO_MODEL
 from tests import bags
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from bevviz import remains
+from bevviz.support import cleanup
 from tests.test_cli import environment
 from tests.waiting import PATIENCE
 
@@ -49,7 +49,7 @@ def test_a_signal_ends_what_has_nothing_to_end(tmp_path: Path, number: signal.Si
     script = (
         "import os, tempfile; tempfile.tempdir = os.getcwd()\n"
         "from bevviz.cli import interrupts\n"
-        "from bevviz.files import Scratch\n"
+        "from bevviz.support.files import Scratch\n"
         "interrupts.install(); Scratch().new()\n"
         "assert os.listdir()\n"
         "try:\n"
@@ -67,7 +67,7 @@ def test_a_file_that_is_being_written_gets_its_end(tmp_path: Path, number: signa
     script = (
         "import os; from pathlib import Path\n"
         "from bevviz.cli import interrupts\n"
-        "from bevviz.files import written\n"
+        "from bevviz.support.files import written\n"
         "interrupts.install()\n"
         "try:\n"
         "    with written(Path('a.txt'), 'file') as given:\n"
@@ -95,15 +95,15 @@ def test_what_is_ignored_from_the_start_stays_ignored(tmp_path: Path, number: si
 
 def test_what_remains_is_forgotten_in_time() -> None:
     removed: list[str] = []
-    remains.remember("mine", lambda: removed.append("mine"))
-    remains.remember("other", lambda: removed.append("other"))
-    remains.forget("mine")
-    remains.remove()
-    remains.forget("other")
+    cleanup.remember("mine", lambda: removed.append("mine"))
+    cleanup.remember("other", lambda: removed.append("other"))
+    cleanup.forget("mine")
+    cleanup.remove()
+    cleanup.forget("other")
     assert removed == ["other"]
-    with remains.unfinished(), remains.unfinished():
-        assert remains.any_unfinished()
-    assert not remains.any_unfinished()
+    with cleanup.unfinished(), cleanup.unfinished():
+        assert cleanup.any_unfinished()
+    assert not cleanup.any_unfinished()
 
 
 def test_a_bar_leaves_no_semaphore_where_its_process_is_killed() -> None:
@@ -120,7 +120,7 @@ INTERRUPTED_AT = """
 import faulthandler, os, sys
 from pathlib import Path
 from bevviz import remains
-from bevviz.logging import sinks
+from bevviz.recording import sinks
 
 FILES = {sinks.__file__}
 
@@ -157,8 +157,8 @@ def test_an_interrupt_at_any_line_ends_an_open_recording(tmp_path: Path) -> None
     script = INTERRUPTED_AT + (
         "import rerun as rr\n"
         "from bevviz.config import load\n"
-        "from bevviz.frame import Scene\n"
-        "from bevviz.recorded import Origin\n"
+        "from bevviz.model.frame import Scene\n"
+        "from bevviz.recording.source_lookup import Origin\n"
         "SCENE = Scene('test', 'lidar', ('lidar',))\n"
         "def work():\n"
         "    with sinks.open_recording(SCENE, load(), save=Path('a.rrd')) as opened:\n"

@@ -14,11 +14,11 @@ from rerun.chunk import RrdReader
 
 import bevviz
 from bevviz.config import LoggingConfig
-from bevviz.frame import F32, U8
-from bevviz.logging import entities
-from bevviz.logging.keep import Around, Held
-from bevviz.logging.shown import too_large_for_web
-from bevviz.logging.video import GOP, VideoEncoder, decode
+from bevviz.model.frame import F32, U8
+from bevviz.recording import entities
+from bevviz.recording.retention import Around, Held
+from bevviz.recording.saved_viewer import too_large_for_web
+from bevviz.recording.video import GOP, VideoEncoder, decode
 from tests import bags
 from tests.recordings import Recording, verify, without_nan
 

@@ -10,8 +10,8 @@ from types import SimpleNamespace
 
 import numba
 
-from bevviz import announce
-from bevviz.stages.kernel import _Announcing, clock, common_clock
+from bevviz.support import progress
+from bevviz.support.kernel import _Announcing, clock, common_clock
 
 NOWHERE = """
 from numba.core.caching import CacheImpl
@@ -61,12 +61,12 @@ def test_other_threads_compile_on_their_own_time() -> None:
 
 def test_that_stages_are_compiled_is_said_once() -> None:
     said: list[str] = []
-    announce.to(said.append)
+    progress.to(said.append)
     try:
         listener = _Announcing()
         for module in ("somebody.else", "bevviz.stages.voxel", "bevviz.stages.ground"):
             listener.on_start(SimpleNamespace(data={"dispatcher": SimpleNamespace(__module__=module)}))
     finally:
-        announce.to(lambda text: None)
+        progress.to(lambda text: None)
     (line,) = said
     assert line.startswith("compiling the stages for this machine")

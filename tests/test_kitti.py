@@ -7,12 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bevviz import geometry
 from bevviz.bags.source import BagSource
 from bevviz.config import load
-from bevviz.frame import F64
-from bevviz.results import Decision, DetectionState, FrameResult
-from bevviz.session import Session
+from bevviz.model import geometry
+from bevviz.model.frame import F64
+from bevviz.model.results import Decision, DetectionState, FrameResult
+from bevviz.pipeline.session import Session
 from tests import bags
 from tests.recordings import Recording
 

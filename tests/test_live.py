@@ -24,22 +24,29 @@ from hypothesis import strategies as st
 
 from bevviz.anomalies import AnomalyDetector
 from bevviz.config import load
+from bevviz.config.reloading import Settings
 from bevviz.errors import UserError
-from bevviz.files import lock
-from bevviz.frame import Frame, Mark, Scene
 from bevviz.live.encoder import WHOLE, Encoder, Packet
 from bevviz.live.files import INDEX, Indexer, Saver, remove_leftovers, unused_names
-from bevviz.live.flight import FlightRecorder
+from bevviz.live.flight_recorder import FlightRecorder
 from bevviz.live.notes import Notes
 from bevviz.live.replay import Replay
 from bevviz.live.runtime import Live, Outputs
-from bevviz.live.settings import Settings
 from bevviz.live.thinning import Thinned, thin
 from bevviz.live.triggers import Triggers
 from bevviz.live.viewers import RETRY, Program, Viewer
-from bevviz.queues import NewestQueue
-from bevviz.results import CameraResult, Decision, Detections, FrameResult, Fusion, Pairs
-from bevviz.session import Session
+from bevviz.model.frame import Frame, Mark, Scene
+from bevviz.model.results import (
+    CameraResult,
+    Decision,
+    Detections,
+    FrameResult,
+    Fusion,
+    Pairs,
+)
+from bevviz.pipeline.session import Session
+from bevviz.support.files import lock
+from bevviz.support.queues import NewestQueue
 from bevviz.synthetic import SyntheticSource
 from bevviz.synthetic.sensors import Lidar, PinholeCamera
 from tests.graphs import alone
@@ -471,7 +478,7 @@ def test_thinned_frames_are_consistent(first: int, second: int, points: int) -> 
 
 def merged(first: int, second: int) -> Frame:
     """A frame of two LiDARs whose points are numbered."""
-    from bevviz.frame import Cloud
+    from bevviz.model.frame import Cloud
 
     number = np.arange(first + second, dtype=np.float32)
     points = np.repeat(number[:, None], 3, 1)

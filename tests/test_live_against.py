@@ -9,9 +9,9 @@ import pytest
 
 from bevviz.compare.differences import Change
 from bevviz.config import load
-from bevviz.frame import Boxes3D, Frame, LabelledBoxes2D, LabelledBoxes3D
-from bevviz.live.against import WAITING, AgainstRobot
-from bevviz.results import FrameResult, Objects
+from bevviz.live.robot_comparison import WAITING, AgainstRobot
+from bevviz.model.frame import Boxes3D, Frame, LabelledBoxes2D, LabelledBoxes3D
+from bevviz.model.results import FrameResult, Objects
 from bevviz.synthetic import SyntheticSource
 from bevviz.synthetic.sensors import Lidar, PinholeCamera
 

@@ -13,10 +13,10 @@ import pytest
 
 from bevviz.bags.source import BagSource
 from bevviz.config import load
-from bevviz.frame import Frame
-from bevviz.results import FrameResult
-from bevviz.ros.encode import typestore
-from bevviz.session import Session
+from bevviz.messages.encode import typestore
+from bevviz.model.frame import Frame
+from bevviz.model.results import FrameResult
+from bevviz.pipeline.session import Session
 from bevviz.synthetic import SyntheticSource
 from bevviz.synthetic.drive import TRUTH_TOPIC
 from tests.graphs import own_graph, playing
@@ -26,14 +26,14 @@ from tests.waiting import PATIENCE, until
 
 pytest.importorskip("rclpy", reason="needs rclpy: pip install 'bevviz[ros]'")
 
+from bevviz.config.reloading import Settings
+from bevviz.live.diagnostics import TYPE, Diagnostics
+from bevviz.live.node import Node
 from bevviz.live.notes import Notes
-from bevviz.live.raw import RawRecorder
+from bevviz.live.raw_recorder import RawRecorder
 from bevviz.live.runtime import Live, Outputs
-from bevviz.live.settings import Settings
 from bevviz.live.source import LiveSource
-from bevviz.ros.diagnostics import TYPE, Diagnostics
-from bevviz.ros.node import Node
-from bevviz.ros.typesupport import message_type
+from bevviz.live.typesupport import message_type
 
 BOXES = "vision_msgs/msg/Detection3DArray"
 MARK = "the person behind the van"

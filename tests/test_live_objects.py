@@ -17,9 +17,9 @@ from rosbags.typesys.store import Typestore
 
 from bevviz.config import load
 from bevviz.errors import UserError
-from bevviz.ros import definitions
-from bevviz.ros.definitions import store_of
-from bevviz.ros.encode import encode_cloud, typestore
+from bevviz.messages import definitions
+from bevviz.messages.definitions import store_of
+from bevviz.messages.encode import encode_cloud, typestore
 from bevviz.synthetic import SyntheticSource
 from tests import bags
 from tests.graphs import own_graph
@@ -40,9 +40,9 @@ from tests.waiting import until
 
 pytest.importorskip("rclpy", reason="needs rclpy: pip install 'bevviz[ros]'")
 
+from bevviz.live.node import Node
 from bevviz.live.source import LiveSource
-from bevviz.ros.node import Node
-from bevviz.ros.typesupport import message_type
+from bevviz.live.typesupport import message_type
 
 CLOUD = "sensor_msgs/msg/PointCloud2"
 STATED = "source.boxes={topic: my/things, size: dimensions, yaw: heading, label: class_name, id: number}"

@@ -17,9 +17,9 @@ from tests.waiting import until
 
 pytest.importorskip("rclpy", reason="needs rclpy: pip install 'bevviz[ros]'")
 
+from bevviz.live.node import Node
 from bevviz.live.source import LiveSource
-from bevviz.ros.node import Node
-from bevviz.ros.typesupport import message_type
+from bevviz.live.typesupport import message_type
 
 PROFILE = "RNG19_RFL8_SIG16_NIR16"
 THERE = [(c, p) for c in range(COLUMNS) for p in range(PIXELS) if millimetres(c, p)]

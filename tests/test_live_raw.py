@@ -23,18 +23,18 @@ from rosbags.highlevel import AnyReader
 from rosbags.interfaces import Connection, ConnectionExtRosbag2, MessageDefinition, MessageDefinitionFormat
 from ruamel.yaml import YAML
 
-from bevviz.bags.info import describe
 from bevviz.bags.mcap_writer import McapWriter
 from bevviz.bags.source import BagSource
 from bevviz.config import load
 from bevviz.errors import UserError
-from bevviz.files import unfinished_files, write_all
-from bevviz.protocols import Observer
-from bevviz.recorded import read
-from bevviz.report.digest import compare, digest
-from bevviz.results import FrameResult
-from bevviz.run import run as run_frames
-from bevviz.session import Session
+from bevviz.model.protocols import Observer
+from bevviz.model.results import FrameResult
+from bevviz.pipeline.bag_info import describe
+from bevviz.pipeline.run import run as run_frames
+from bevviz.pipeline.session import Session
+from bevviz.recording.source_lookup import read
+from bevviz.report.fingerprints import compare, digest
+from bevviz.support.files import unfinished_files, write_all
 from bevviz.synthetic import SyntheticSource
 from bevviz.synthetic.bag import TOPICS
 from bevviz.synthetic.drive import LIDAR_TOPIC
@@ -46,13 +46,13 @@ from tests.waiting import PATIENCE, until
 
 pytest.importorskip("rclpy", reason="needs rclpy: pip install 'bevviz[ros]'")
 
+from bevviz.config.reloading import Settings
+from bevviz.live.node import Node
 from bevviz.live.notes import Notes
-from bevviz.live.raw import Earlier, RawMessage, RawRecorder, children, define
+from bevviz.live.raw_recorder import Earlier, RawMessage, RawRecorder, children, define
 from bevviz.live.runtime import Live, Outputs
-from bevviz.live.settings import Settings
 from bevviz.live.source import LiveSource
-from bevviz.ros.encode import encode_transforms, typestore
-from bevviz.ros.node import Node
+from bevviz.messages.encode import encode_transforms, typestore
 
 WAIT = ["sync.max_wait=10 s", "sync.queue=100"]  # on a busy machine messages come late: they are waited for
 SECONDS = 3.0  # that the flight recorder holds: less than the run takes

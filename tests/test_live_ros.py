@@ -21,15 +21,20 @@ import pytest
 
 from bevviz.config import Config, keys, load
 from bevviz.errors import UserError
-from bevviz.frame import Boxes3D, Frame, LateResult
-from bevviz.results import CameraResult, Detections, FrameResult, Objects
-from bevviz.ros.clouds import decode_cloud
-from bevviz.ros.detections import decode_detections_2d, decode_detections_3d
-from bevviz.ros.encode import encode_boxes_3d, encode_camera_info, encode_cloud, typestore
-from bevviz.ros.images import decode_image
-from bevviz.ros.messages import read_header
-from bevviz.run import Dropping, run
-from bevviz.session import Session
+from bevviz.messages.clouds import decode_cloud
+from bevviz.messages.decoding import read_header
+from bevviz.messages.detections import decode_detections_2d, decode_detections_3d
+from bevviz.messages.encode import (
+    encode_boxes_3d,
+    encode_camera_info,
+    encode_cloud,
+    typestore,
+)
+from bevviz.messages.images import decode_image
+from bevviz.model.frame import Boxes3D, Frame, LateResult
+from bevviz.model.results import CameraResult, Detections, FrameResult, Objects
+from bevviz.pipeline.run import Dropping, run
+from bevviz.pipeline.session import Session
 from bevviz.synthetic import SyntheticSource
 from bevviz.synthetic.bag import TOPICS
 from bevviz.synthetic.drive import CAMERA_INFO_TOPIC, LIDAR_TOPIC, TRUTH_TOPIC
@@ -40,13 +45,23 @@ from tests.waiting import PATIENCE, until
 
 pytest.importorskip("rclpy", reason="needs rclpy: pip install 'bevviz[ros]'")
 
-from bevviz.live import info
+from bevviz.live import graph_info as info
+from bevviz.live import typesupport
+from bevviz.live.node import Node
+from bevviz.live.publish import (
+    BEV,
+    CLUSTERS,
+    DETECTIONS,
+    FUSED,
+    MARKERS,
+    OBSTACLES,
+    SPEED,
+    TRACKS,
+    Publisher,
+)
+from bevviz.live.publish import TOPICS as TOPICS_PUBLISHED
+from bevviz.live.remote_requests import Orders
 from bevviz.live.source import LiveSource, remedy
-from bevviz.ros import typesupport
-from bevviz.ros.node import Node
-from bevviz.ros.orders import Orders
-from bevviz.ros.publish import BEV, CLUSTERS, DETECTIONS, FUSED, MARKERS, OBSTACLES, SPEED, TRACKS, Publisher
-from bevviz.ros.publish import TOPICS as TOPICS_PUBLISHED
 
 LIGHT = Play(frames=3, points=20_000)
 

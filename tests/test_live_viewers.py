@@ -9,18 +9,18 @@ import numpy as np
 import pytest
 
 import bevviz
+from bevviz.config.reloading import Settings
 from bevviz.live.encoder import Packet
-from bevviz.live.flight import FlightRecorder
+from bevviz.live.flight_recorder import FlightRecorder
 from bevviz.live.notes import Notes
 from bevviz.live.replay import Replay
 from bevviz.live.runtime import Live, Outputs
-from bevviz.live.settings import Settings
-from bevviz.logging import entities
-from bevviz.results import FrameResult
+from bevviz.model.results import FrameResult
+from bevviz.recording import entities
 from bevviz.synthetic import SyntheticSource
-from bevviz.workbench.live_bench import LiveBench
-from bevviz.workbench.live_film import AHEAD, WHOLE
-from bevviz.workbench.site import Heard
+from bevviz.workbench.live_buffer import AHEAD, WHOLE
+from bevviz.workbench.live_session import LiveBench
+from bevviz.workbench.routes import Heard
 from tests.live_bench import live_bench
 from tests.recordings import Recording
 

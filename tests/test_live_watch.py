@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from bevviz.live.watch import AGAIN, Watch
+from bevviz.live.arrival_watch import AGAIN, Watch
 
 
 class Watched:

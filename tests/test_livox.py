@@ -13,9 +13,9 @@ from rosbags.typesys import get_types_from_msg
 from bevviz.bags.source import BagSource
 from bevviz.cli import main
 from bevviz.config import Config
-from bevviz.live.message import LiveMessage
-from bevviz.ros.clouds import decode_cloud
-from bevviz.ros.messages import MessageError
+from bevviz.live.live_message import LiveMessage
+from bevviz.messages.clouds import decode_cloud
+from bevviz.messages.decoding import MessageError
 from tests import bags
 
 POINT = """uint32 offset_time      # offset time relative to the base time

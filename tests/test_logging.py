@@ -20,13 +20,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bevviz import geometry
 from bevviz.anomalies import KINDS
 from bevviz.config import Config, load
 from bevviz.errors import UserError
-from bevviz.explain import explain
-from bevviz.files import unfinished_files
-from bevviz.frame import (
+from bevviz.model import geometry
+from bevviz.model.decisions import explain
+from bevviz.model.frame import (
     Boxes3D,
     Camera,
     Cloud,
@@ -38,14 +37,7 @@ from bevviz.frame import (
     LateResult,
     Scene,
 )
-from bevviz.logging.cloud import quantised
-from bevviz.logging.decisions import page
-from bevviz.logging.entities import DEPTH_BINS, DEPTH_RANGE, TRACK_COLORS, ClassId
-from bevviz.logging.health import Rates
-from bevviz.logging.logger import Logger
-from bevviz.logging.sinks import open_recording
-from bevviz.logging.tracks import LANES, Lanes
-from bevviz.results import (
+from bevviz.model.results import (
     Anomaly,
     CameraResult,
     Clusters,
@@ -61,9 +53,17 @@ from bevviz.results import (
     Tracks,
     Voxels,
 )
+from bevviz.recording.cloud import quantised
+from bevviz.recording.decisions import page
+from bevviz.recording.entities import DEPTH_BINS, DEPTH_RANGE, TRACK_COLORS, ClassId
+from bevviz.recording.frame_logger import Logger
+from bevviz.recording.health import Rates
+from bevviz.recording.sinks import open_recording
+from bevviz.recording.tracks import LANES, Lanes
 from bevviz.stages.bev import bev
 from bevviz.stages.fusion import in_view
 from bevviz.stages.tracking import Tracker
+from bevviz.support.files import unfinished_files
 from tests.recordings import Recording, verify
 from tests.waiting import PATIENCE
 
@@ -833,8 +833,8 @@ def test_a_killed_process_leaves_what_it_had_logged(tmp_path: Path) -> None:
         import os, signal, time
         from pathlib import Path
         from bevviz.config import load
-        from bevviz.logging.logger import Logger
-        from bevviz.logging.sinks import open_recording
+        from bevviz.recording.frame_logger import Logger
+        from bevviz.recording.sinks import open_recording
         from tests.test_logging import SCENE, make
         with open_recording(SCENE, load(), save=Path({str(path)!r})) as sinks:
             logger = Logger(sinks.recording, load(), SCENE)

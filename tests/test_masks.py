@@ -11,17 +11,17 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from bevviz.config import FusionConfig, load
-from bevviz.explain import in_mask
-from bevviz.frame import F32, Bool
-from bevviz.logging import entities
-from bevviz.logging.camera import log_detections
-from bevviz.logging.writer import Writer
-from bevviz.report.digest import detections_of as recorded
-from bevviz.report.digest import digest, pack, unpack
-from bevviz.results import Detections, FrameResult, Fusion, Masks
+from bevviz.model.decisions import in_mask
+from bevviz.model.frame import F32, Bool
+from bevviz.model.results import Detections, FrameResult, Fusion, Masks
+from bevviz.recording import entities
+from bevviz.recording.camera import log_detections
+from bevviz.recording.writer import Writer
+from bevviz.report.fingerprints import detections_of as recorded
+from bevviz.report.fingerprints import digest, pack, unpack
 from bevviz.stages.clustering import cluster
-from bevviz.stages.cover import cover
 from bevviz.stages.fusion import fuse
+from bevviz.stages.mask_lookup import cover
 from bevviz.synthetic import SyntheticSource
 from tests.recordings import Recording
 from tests.test_frustum import CLUSTERING, claimed, looked

@@ -20,11 +20,18 @@ from numpy.typing import NDArray
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
-from bevviz import geometry
-from bevviz.live.message import LiveMessage
-from bevviz.ros import cameras, clouds, detections, images, transforms, vision_msgs
-from bevviz.ros.guard import guard
-from bevviz.ros.messages import MessageError
+from bevviz.live.live_message import LiveMessage
+from bevviz.messages import (
+    camera_info,
+    clouds,
+    detections,
+    images,
+    transforms,
+    vision_msgs,
+)
+from bevviz.messages.decoding import MessageError
+from bevviz.messages.guard import guard
+from bevviz.model import geometry
 
 SEC, NANOSEC = 1_700_000_000, 123_456_789
 STAMP = SEC * 1_000_000_000 + NANOSEC
@@ -530,17 +537,17 @@ def info_message(model: str = "plumb_bob", d: Any = (0.1, -0.2, 0.01, 0.02, 0.03
 @pytest.mark.parametrize("ros", STORES)
 def test_camera_info_of_both_ros_versions(ros: str) -> None:
     msg = through(STORES[ros], "sensor_msgs/msg/CameraInfo", info_message())
-    raw = cameras.decode_camera_info(msg, rectified=False)
+    raw = camera_info.decode_camera_info(msg, rectified=False)
     assert (raw.width, raw.height, raw.distortion_model) == (640, 360, "plumb_bob")
     np.testing.assert_array_equal(raw.K, np.reshape(K, (3, 3)))
     np.testing.assert_array_equal(raw.D, [0.1, -0.2, 0.01, 0.02, 0.03])
-    rectified = cameras.decode_camera_info(msg, rectified=True)
+    rectified = camera_info.decode_camera_info(msg, rectified=True)
     np.testing.assert_array_equal(rectified.K, [[450, 0, 310], [0, 455, 175], [0, 0, 1]])
     assert not rectified.D.size and not rectified.distortion_model
 
 
 def test_a_rectified_camera_without_p_keeps_k() -> None:
-    intrinsics = cameras.decode_camera_info(info_message(p=np.zeros(12), P=np.zeros(12)), rectified=True)
+    intrinsics = camera_info.decode_camera_info(info_message(p=np.zeros(12), P=np.zeros(12)), rectified=True)
     np.testing.assert_array_equal(intrinsics.K, np.reshape(K, (3, 3)))
 
 
@@ -556,31 +563,31 @@ def test_a_rectified_camera_without_p_keeps_k() -> None:
 )
 def test_distortion_models(given_model: str, coefficients: int, model: str) -> None:
     d = np.linspace(0.01, 0.02, coefficients)
-    intrinsics = cameras.decode_camera_info(info_message(given_model, d), rectified=False)
+    intrinsics = camera_info.decode_camera_info(info_message(given_model, d), rectified=False)
     assert intrinsics.distortion_model == model
     np.testing.assert_array_equal(intrinsics.D, d)
 
 
 @pytest.mark.parametrize("model", ["", "plumb_bob", "whatever"])
 def test_coefficients_of_zero_are_no_distortion(model: str) -> None:
-    intrinsics = cameras.decode_camera_info(info_message(model, np.zeros(5)), rectified=False)
+    intrinsics = camera_info.decode_camera_info(info_message(model, np.zeros(5)), rectified=False)
     assert not intrinsics.distortion_model and not intrinsics.D.size
 
 
 def test_an_equidistant_lens_without_coefficients_is_no_pinhole() -> None:
-    intrinsics = cameras.decode_camera_info(info_message("equidistant", np.zeros(4)), rectified=False)
+    intrinsics = camera_info.decode_camera_info(info_message("equidistant", np.zeros(4)), rectified=False)
     points = np.array([[3.0, 1.0, 2.0], [-1.0, 0.5, 4.0]])
     expected, _ = cv2.fisheye.projectPoints(
         points[:, None], np.zeros(3), np.zeros(3), intrinsics.K, np.zeros(4)
     )
     np.testing.assert_allclose(geometry.project(points, intrinsics)[0], expected[:, 0], atol=1e-3)
-    assert not cameras.decode_camera_info(info_message("equidistant", np.zeros(4)), True).distortion_model
+    assert not camera_info.decode_camera_info(info_message("equidistant", np.zeros(4)), True).distortion_model
 
 
 def test_region_of_interest_and_binning() -> None:
     roi = Message(x_offset=100, y_offset=60, width=320, height=200, do_rectify=False)
     msg = info_message(binning_x=2, binning_y=4, roi=roi)
-    intrinsics = cameras.decode_camera_info(msg, rectified=False)
+    intrinsics = camera_info.decode_camera_info(msg, rectified=False)
     assert (intrinsics.width, intrinsics.height) == (160, 50)
     np.testing.assert_allclose(intrinsics.K, np.array([[250, 0, 110], [0, 127.5, 30], [0, 0, 1]]))
     assert msg.k[2] == 320  # the message is another reader's too
@@ -589,16 +596,16 @@ def test_region_of_interest_and_binning() -> None:
 def test_bad_camera_infos_are_named() -> None:
     zero = np.zeros(9)
     with pytest.raises(MessageError, match="/cam/camera_info: the camera is uncalibrated"):
-        cameras.decode_camera_info(info_message(k=zero, K=zero), False, "/cam/camera_info")
+        camera_info.decode_camera_info(info_message(k=zero, K=zero), False, "/cam/camera_info")
     with pytest.raises(
         MessageError,
         match="/info: distortion model 'mei' is not supported; supported are equidistant, plumb_bob",
     ):
-        cameras.decode_camera_info(info_message("mei"), False, "/info")
+        camera_info.decode_camera_info(info_message("mei"), False, "/info")
     with pytest.raises(MessageError, match=r"/info: coefficients after the eighth \(OpenCV's thin prism"):
-        cameras.decode_camera_info(info_message("rational_polynomial", np.full(14, 0.01)), False, "/info")
+        camera_info.decode_camera_info(info_message("rational_polynomial", np.full(14, 0.01)), False, "/info")
     with pytest.raises(MessageError, match=r"/info: .* are no coefficients"):
-        cameras.decode_camera_info(info_message(d=[math.nan]), False, "/info")
+        camera_info.decode_camera_info(info_message(d=[math.nan]), False, "/info")
 
 
 # --- transforms --------------------------------------------------------------------------------
@@ -827,7 +834,7 @@ DECODERS: dict[str, Callable[[Any], object]] = {
     "cloud": lambda m: clouds.decode_cloud(m, "/t", 0),
     "image": lambda m: images.decode_image(m, "/t", 0),
     "compressed": lambda m: images.decode_compressed_image(m, "/t", 0),
-    "info": lambda m: cameras.decode_camera_info(m, True, "/t"),
+    "info": lambda m: camera_info.decode_camera_info(m, True, "/t"),
     "transforms": lambda m: transforms.decode_transforms(m, "/t"),
     "odometry": lambda m: transforms.decode_odometry(m, "/t"),
     "boxes": lambda m: detections.decode_detections_2d(m, "/t", 0),

@@ -14,8 +14,8 @@ from pathlib import Path
 import pytest
 
 from bevviz.errors import UserError
-from bevviz.logging import rerun_cli
-from bevviz.logging.ports import answers, host_for, origins, own_address
+from bevviz.recording import rerun_cli
+from bevviz.recording.ports import answers, host_for, origins, own_address
 from tests import bags
 from tests.waiting import PATIENCE, until
 
@@ -160,7 +160,7 @@ def test_the_window_is_for_this_machine(start: str, tmp_path: Path, monkeypatch:
     if start == "run":
         arguments: list[str] = []
         monkeypatch.setattr(rerun_cli, "start", lambda given, *_, **__: arguments.extend(given))
-        from bevviz.logging.sinks import _viewer
+        from bevviz.recording.sinks import _viewer
 
         _viewer()
         command = [rerun_cli.program(), *arguments]
@@ -194,8 +194,8 @@ def test_libraries_neither_store_nor_send_who_uses_them(
     script = f"""
 import time
 from bevviz.config import load
-from bevviz.frame import Scene
-from bevviz.logging.sinks import open_recording
+from bevviz.model.frame import Scene
+from bevviz.recording.sinks import open_recording
 import bevviz.stages.detector
 with open_recording(Scene("drive", "lidar"), load(), serve={a_port()}):
     time.sleep(1)

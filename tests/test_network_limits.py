@@ -17,7 +17,7 @@ from onnx import TensorProto, helper, numpy_helper
 
 from bevviz.config import DetectorConfig, load
 from bevviz.errors import UserError
-from bevviz.stage_loader import StageLoader
+from bevviz.pipeline.stage_loader import StageLoader
 from bevviz.stages.detector import Detector, session
 from tests import networks
 from tests.networks import FLOAT, INT64, Input, image_input, node

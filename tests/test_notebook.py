@@ -14,9 +14,9 @@ import pytest
 import bevviz
 from bevviz.drive import Drive
 from bevviz.errors import UserError
-from bevviz.logging import entities
 from bevviz.notebook import NotebookViewer
-from bevviz.workbench.pick import Pick
+from bevviz.recording import entities
+from bevviz.why.pick import Pick
 
 pytest.importorskip("rerun_notebook")
 

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from bevviz.errors import UserError
-from bevviz.notes import Note, Notes
+from bevviz.pipeline.notes import Note, Notes
 
 LATE, EARLY = Note(200, 210, "later"), Note(100, 110, "Größe: 3 m", "car at 3 m", "truth//1")
 

@@ -12,7 +12,7 @@ from rosbags.typesys import get_types_from_msg
 from bevviz.bags.source import BagSource
 from bevviz.cli import main
 from bevviz.config import load
-from bevviz.frame import LabelledBoxes3D
+from bevviz.model.frame import LabelledBoxes3D
 from tests import bags
 
 AUTOWARE = {

@@ -17,36 +17,36 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from bevviz import geometry
 from bevviz.bags.source import BagSource
-from bevviz.colors import OPINIONS as OPINION_COLORS
 from bevviz.config import OpinionsConfig, load, revised
-from bevviz.counts import OPINIONS
+from bevviz.config.trust import USER
 from bevviz.datasets.kitti import label_files, read_labels
-from bevviz.datasets.names import accepted_names
-from bevviz.explain import explain
-from bevviz.frame import F32, Boxes3D, Camera, LabelledBoxes3D
-from bevviz.logging import entities
-from bevviz.logging.logger import Logger
-from bevviz.logging.pieces import image_outlines
-from bevviz.logging.sinks import open_recording
-from bevviz.results import Explanation, FrameResult, Objects, Opinion, Opinions
-from bevviz.session import Session
+from bevviz.model import geometry
+from bevviz.model.class_names import accepted_names
+from bevviz.model.colors import OPINIONS as OPINION_COLORS
+from bevviz.model.counts import OPINIONS
+from bevviz.model.decisions import explain
+from bevviz.model.frame import F32, Boxes3D, Camera, LabelledBoxes3D
+from bevviz.model.results import Explanation, FrameResult, Objects, Opinion, Opinions
+from bevviz.pipeline.session import Session
+from bevviz.recording import entities
+from bevviz.recording.frame_logger import Logger
+from bevviz.recording.primitives import image_outlines
+from bevviz.recording.sinks import open_recording
 from bevviz.stages.detector.names import COCO
-from bevviz.stages.foreign import placed
 from bevviz.stages.opinions import opinions, right_names
+from bevviz.stages.user_stages import placed
 from bevviz.stages.visibility import image_boxes, range_image, visible
 from bevviz.sweep.run import Outcome
 from bevviz.synthetic import SyntheticSource
-from bevviz.trust import USER
 from bevviz.why import Questioner, Selection
-from bevviz.why.origin import origin
+from bevviz.why.pick import Pick, pick
+from bevviz.why.pick_answers import selection
+from bevviz.why.stage_owner import origin
 from bevviz.why.verdict import Reason
-from bevviz.workbench.answers import selection
-from bevviz.workbench.missed import finds
-from bevviz.workbench.parameters import controls
-from bevviz.workbench.pick import Pick, pick
-from bevviz.workbench.trial import attempt
+from bevviz.workbench.controls import controls
+from bevviz.workbench.findings import finds
+from bevviz.workbench.trials import attempt
 from tests.recordings import Recording
 
 Drive = list[tuple[FrameResult, LabelledBoxes3D]]

@@ -24,15 +24,15 @@ from rosbags.typesys.store import Typestore
 from bevviz.bags.source import BagSource
 from bevviz.cli import main
 from bevviz.config import Config, SourceConfig
-from bevviz.frame import Cloud, Intrinsics
-from bevviz.live.message import LiveMessage
-from bevviz.ros import video
-from bevviz.ros.around import decode_shapes
-from bevviz.ros.encode import typestore
-from bevviz.ros.guard import guard
-from bevviz.ros.messages import MessageError, stamp_ns
-from bevviz.ros.roles import find_roles
-from bevviz.ros.topics import Topic
+from bevviz.drivers import video
+from bevviz.live.live_message import LiveMessage
+from bevviz.messages.decoding import MessageError, stamp_ns
+from bevviz.messages.encode import typestore
+from bevviz.messages.guard import guard
+from bevviz.messages.roles import find_roles
+from bevviz.messages.surroundings import decode_shapes
+from bevviz.messages.topics import Topic
+from bevviz.model.frame import Cloud, Intrinsics
 from bevviz.sync.feed import make_handlers
 from bevviz.sync.synchronizer import Synchronizer
 from tests import bags

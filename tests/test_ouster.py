@@ -15,8 +15,8 @@ from rosbags.typesys import get_types_from_msg
 from bevviz.bags.source import BagSource
 from bevviz.cli import main
 from bevviz.config import Config
+from bevviz.drivers import ouster
 from bevviz.errors import UserError
-from bevviz.ros import ouster
 from tests import bags
 
 PIXELS, COLUMNS, PACKETS = 16, 64, 4  # of a scan, in packets of 16 columns

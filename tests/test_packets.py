@@ -17,11 +17,11 @@ from rosbags.typesys import get_types_from_msg
 from bevviz.bags.source import BagSource
 from bevviz.cli import main
 from bevviz.config import Config
-from bevviz.live.message import LiveMessage
-from bevviz.ros import packets
-from bevviz.ros.clouds import decode_cloud
-from bevviz.ros.hesai import MODELS, NOMINAL, Model
-from bevviz.ros.messages import MessageError
+from bevviz.drivers import packets
+from bevviz.drivers.hesai import MODELS, NOMINAL, Model
+from bevviz.live.live_message import LiveMessage
+from bevviz.messages.clouds import decode_cloud
+from bevviz.messages.decoding import MessageError
 from tests import bags
 
 SCAN, PACKET = "pandar_msgs/msg/PandarScan", "pandar_msgs/msg/PandarPacket"

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from bevviz.config import load
-from bevviz.frame import Frame
-from bevviz.session import Session
+from bevviz.model.frame import Frame
+from bevviz.pipeline.session import Session
 from bevviz.synthetic import SyntheticSource
 
 
@@ -76,7 +76,7 @@ def test_a_failing_stage_is_a_reason_and_not_the_end(frame: Frame, monkeypatch: 
     def broken(*args: object) -> None:
         raise ZeroDivisionError("planted")
 
-    monkeypatch.setattr("bevviz.perceive.cluster", broken)
+    monkeypatch.setattr("bevviz.pipeline.perceive.cluster", broken)
     session = Session(load(settings=["detector.model=demo"]))
     result = session.run(frame)
     assert [(f.stage, f.reason) for f in result.failures] == [("clustering", "ZeroDivisionError: planted")]

@@ -17,21 +17,21 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from shapely import Polygon
 
-from bevviz import geometry
 from bevviz.config import Config, dump, load, object_network
+from bevviz.config.descriptions import explain
+from bevviz.config.pillars import Feature, PillarParams
 from bevviz.errors import UserError
-from bevviz.frame import Boxes3D
-from bevviz.parameters import explain
-from bevviz.perceive import perceive
-from bevviz.pillar_params import Feature, PillarParams
-from bevviz.stage_loader import StageLoader
-from bevviz.stage_log import Memo
+from bevviz.model import geometry
+from bevviz.model.frame import Boxes3D
+from bevviz.pipeline.perceive import perceive
+from bevviz.pipeline.stage_loader import StageLoader
+from bevviz.pipeline.stage_log import Memo
 from bevviz.stages.pillars import ObjectNetwork
 from bevviz.stages.pillars.group import Pillars, group, scatter
 from bevviz.stages.pillars.heads import decoded, places
 from bevviz.stages.pillars.nms import survivors
 from bevviz.synthetic import SyntheticSource
-from bevviz.workbench.parameters import controls
+from bevviz.workbench.controls import controls
 from tests.networks import FLOAT, INT64, Input, answer, node, save
 
 REFERENCES = Path(__file__).parent / "references/pillars"

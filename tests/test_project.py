@@ -9,8 +9,8 @@ import pytest
 
 from bevviz.cli import main
 from bevviz.config import load, stated_lines
+from bevviz.config.project import layers
 from bevviz.errors import UserError
-from bevviz.project import layers
 from tests import bags
 from tests.recordings import Recording
 
@@ -158,7 +158,7 @@ def test_one_parameter_is_explained(capsys: Capture, project: Path) -> None:
 @pytest.mark.parametrize("preset", ["default", "reference"])
 def test_every_parameter_can_be_explained(preset: str, project: Path, capsys: Capture) -> None:
     from bevviz.config import keys
-    from bevviz.parameters import explain
+    from bevviz.config.descriptions import explain
 
     config = load(preset=preset)  # type: ignore[arg-type]
     for key in keys():

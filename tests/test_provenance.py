@@ -17,7 +17,7 @@ from pydantic import TypeAdapter
 
 import bevviz
 from bevviz.config import load
-from bevviz.provenance import (
+from bevviz.recording.provenance import (
     Dependency,
     Provenance,
     dependencies_of,
@@ -70,7 +70,7 @@ def test_every_package_that_results_depend_on_is_listed() -> None:
     ours = {name for name in top if not any(o.startswith("ros-") for o in owners.get(name, ["ros-"]))}
     assert "numba" in ours
     unlisted = {name: owners[name] for name in ours if listed.isdisjoint(owners[name])}
-    assert not unlisted, "in bevviz/provenance.py, or in NEUTRAL if it can change no result"
+    assert not unlisted, "in bevviz/recording/provenance.py, or in NEUTRAL if it can change no result"
 
 
 def test_the_simulator_is_no_part_of_what_the_pipeline_makes() -> None:

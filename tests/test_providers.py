@@ -9,11 +9,11 @@ from typing import Any
 import onnxruntime as ort
 import pytest
 
-from bevviz import announce
-from bevviz.bags.info import network_of
 from bevviz.config import load
 from bevviz.errors import UserError
+from bevviz.pipeline.bag_info import network_of
 from bevviz.stages.detector import DEMO_MODEL, providers
+from bevviz.support import progress
 
 
 @pytest.fixture
@@ -49,7 +49,7 @@ def test_a_missing_library_is_told_once_and_the_processor_takes_over(
 ) -> None:
     libraries(monkeypatch, MISSING)
     said: list[str] = []
-    monkeypatch.setattr(announce, "_say", said.append)
+    monkeypatch.setattr(progress, "_say", said.append)
     for _ in range(2):
         assert providers.open_session(DEMO_MODEL, "auto", ort.SessionOptions()).provider == "CPU"
     assert said == [
@@ -68,7 +68,7 @@ def test_a_gpu_that_does_not_start(gpu_package: Path, monkeypatch: pytest.Monkey
     """All libraries are there, the driver is not."""
     libraries(monkeypatch, "")
     said: list[str] = []
-    monkeypatch.setattr(announce, "_say", said.append)
+    monkeypatch.setattr(progress, "_say", said.append)
     real = ort.InferenceSession
 
     def session(path: Path, options: Any, chosen: list[str], **more: Any) -> Any:

@@ -11,15 +11,15 @@ from pathlib import Path
 import pytest
 
 import bevviz
-from bevviz.bags.recording import Recording
+from bevviz.bags.bag import Recording
 from bevviz.bags.source import BagSource
 from bevviz.cli import main
 from bevviz.config import load, object_files
 from bevviz.errors import UserError
-from bevviz.logging.logger import Logger
-from bevviz.logging.sinks import open_recording
-from bevviz.recorded import fingerprint, follow, read
-from bevviz.ros.roles import find_roles
+from bevviz.messages.roles import find_roles
+from bevviz.recording.frame_logger import Logger
+from bevviz.recording.sinks import open_recording
+from bevviz.recording.source_lookup import fingerprint, follow, read
 from bevviz.stages.detector import DEMO_MODEL
 
 EPS = 0.437

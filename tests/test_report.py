@@ -22,19 +22,19 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import bevviz
+from bevviz.bags.bag import Recording as Bag
 from bevviz.bags.mcap_writer import McapWriter
 from bevviz.bags.message import RawMessage
-from bevviz.bags.recording import Recording as Bag
 from bevviz.cli import main
 from bevviz.config import DetectorConfig
-from bevviz.frame import Frame
-from bevviz.provenance import Dependency, Provenance
+from bevviz.model.frame import Frame
+from bevviz.model.results import Detections, FrameResult
+from bevviz.pipeline.session import Session
+from bevviz.recording.provenance import Dependency, Provenance
 from bevviz.report.check import CheckResult
-from bevviz.report.digest import StageDigest, compare, detections_of, pack, unpack
+from bevviz.report.fingerprints import StageDigest, compare, detections_of, pack, unpack
 from bevviz.report.page import spans
 from bevviz.report.plots import ticks
-from bevviz.results import Detections, FrameResult
-from bevviz.session import Session
 from bevviz.stages.detector import Detector
 from tests import bags
 from tests.recordings import Recording, verify
@@ -366,7 +366,7 @@ def test_an_interrupted_run_is_a_shorter_report(
 
 
 def stages(**arrays: Any) -> tuple[StageDigest, ...]:
-    from bevviz.report.digest import _stage
+    from bevviz.report.fingerprints import _stage
 
     return (_stage("part", {name: np.asarray(value) for name, value in arrays.items()}),)
 
@@ -388,7 +388,7 @@ def stages(**arrays: Any) -> tuple[StageDigest, ...]:
     ],
 )
 def test_differences_in_words(then: dict[str, Any], now: dict[str, Any], text: str, rounding: bool) -> None:
-    from bevviz.report.digest import ROUNDING
+    from bevviz.report.fingerprints import ROUNDING
 
     found = compare(stages(**then), stages(**now))
     assert found is not None and text in found.text
@@ -406,7 +406,7 @@ def test_a_stage_that_only_one_run_has() -> None:
     st.integers(0, 2**62),
 )
 def test_detections_survive_packing(rows: list[tuple[float, str]], stamp: int) -> None:
-    from bevviz.report.digest import _arrays, _stage
+    from bevviz.report.fingerprints import _arrays, _stage
 
     n = len(rows)
     scores = np.array([score for score, _ in rows], np.float32)

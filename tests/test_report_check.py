@@ -18,7 +18,7 @@ import rerun as rr
 
 from bevviz.cli import main
 from bevviz.config import Config, dump
-from bevviz.logging import entities, rerun_cli
+from bevviz.recording import entities, rerun_cli
 from tests import bags
 from tests.recordings import Recording
 from tests.test_cli import Capture, error_of
@@ -111,7 +111,7 @@ def damage_that_breaks_the_reader(recording: Path) -> None:
         verify = [rerun_cli.program(), "rrd", "verify", str(recording)]
         if subprocess.run(verify, capture_output=True, check=False).returncode > 100:
             return
-    pytest.fail("nothing breaks the reader: is there need of bevviz.logging.reading.check_decodes?")
+    pytest.fail("nothing breaks the reader: is there need of bevviz.recording.decoding.check_decodes?")
 
 
 @pytest.mark.parametrize(

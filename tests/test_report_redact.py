@@ -15,16 +15,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from bevviz.bags.recording import Recording as Bag
+from bevviz.bags.bag import Recording as Bag
 from bevviz.cli import main
 from bevviz.config import DetectorConfig
-from bevviz.frame import F32, U8
-from bevviz.report.contents import Contents
+from bevviz.messages.decoding import MessageError
+from bevviz.messages.images import decode_compressed_image, decode_image
+from bevviz.model.frame import F32, U8
+from bevviz.report.image_fields import Contents
 from bevviz.report.pictures import shrink
 from bevviz.report.redact import CELLS, Redactor, _encoded, grown, hide
 from bevviz.report.summary import STRIP_WIDTH
-from bevviz.ros.images import decode_compressed_image, decode_image
-from bevviz.ros.messages import MessageError
 from bevviz.synthetic import SyntheticSource
 from tests import bags, videos
 from tests.recordings import Recording, verify

@@ -14,12 +14,12 @@ import pytest
 from rosbags.interfaces import Qos
 from rosbags.rosbag2 import Reader, StoragePlugin, Writer
 
-from bevviz.bags.recording import Recording
+from bevviz.bags.bag import Recording
 from bevviz.bags.source import MARGIN, SECOND, BagSource
 from bevviz.config import Config, load
 from bevviz.errors import UserError
-from bevviz.report.digest import StageDigest, compare, digest
-from bevviz.report.window import (
+from bevviz.pipeline.session import Session
+from bevviz.report.bag_window import (
     Cut,
     Edit,
     Edited,
@@ -30,7 +30,7 @@ from bevviz.report.window import (
     find_window,
     open_window,
 )
-from bevviz.session import Session
+from bevviz.report.fingerprints import StageDigest, compare, digest
 from bevviz.synthetic.bag import _qos
 from tests import bags
 from tests.waiting import PATIENCE

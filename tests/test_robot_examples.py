@@ -16,7 +16,7 @@ from typing import Any
 import pytest
 
 from bevviz.cli import _parser
-from bevviz.live.settings import Settings
+from bevviz.config.reloading import Settings
 from tests.graphs import own_graph
 from tests.waiting import PATIENCE
 

@@ -10,9 +10,9 @@ from hypothesis import strategies as st
 
 from bevviz.config import SourceConfig
 from bevviz.errors import UserError
-from bevviz.logging import entities
-from bevviz.ros.roles import Roles, find_roles
-from bevviz.ros.topics import RESERVED, Topic, entity_name
+from bevviz.messages.roles import Roles, find_roles
+from bevviz.messages.topics import RESERVED, Topic, entity_name
+from bevviz.recording import entities
 
 CLOUD = "sensor_msgs/msg/PointCloud2"
 IMAGE = "sensor_msgs/msg/Image"

@@ -14,10 +14,10 @@ from typing import Any
 
 import pytest
 
-import bevviz.run
-from bevviz.frame import Scene
-from bevviz.protocols import Items, Observer
-from bevviz.run import Dropping, RunEnd, overlapped, results, run
+import bevviz.pipeline.run
+from bevviz.model.frame import Scene
+from bevviz.model.protocols import Items, Observer
+from bevviz.pipeline.run import Dropping, RunEnd, overlapped, results, run
 from tests.waiting import PATIENCE, until
 
 
@@ -170,12 +170,12 @@ def test_a_signal_between_two_looks_ends_it_after_the_result_at_hand(monkeypatch
                     raise KeyboardInterrupt
             return super().is_set()
 
-    class Loop(bevviz.run._Loop[int, int]):
+    class Loop(bevviz.pipeline.run._Loop[int, int]):
         def __init__(self, *args: Any) -> None:
             super().__init__(*args)
             self.over = Asked()
 
-    monkeypatch.setattr(bevviz.run, "_Loop", Loop)
+    monkeypatch.setattr(bevviz.pipeline.run, "_Loop", Loop)
     end = run(Numbers(100_000), Squares(0.01), [seen])
     assert end.interrupted
     assert seen.seen == finished(end.frames)

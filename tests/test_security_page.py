@@ -15,13 +15,12 @@ from pathlib import Path
 import pytest
 
 import bevviz
-from bevviz import importer, plugins
-from bevviz.cli import main
-from bevviz.config import load, revised
+from bevviz.cli import importer, main
+from bevviz.config import load, plugins, revised
+from bevviz.config.project import layers, named_code
+from bevviz.config.reloading import Settings
+from bevviz.config.trust import allow
 from bevviz.errors import UserError
-from bevviz.live.settings import Settings
-from bevviz.project import layers, named_code
-from bevviz.trust import allow
 from tests import bags
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "security.md"

@@ -7,10 +7,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
-from bevviz.frame import F32
-from bevviz.logging.spoken import NEAR, apart, named_from_above, named_in_space
-from bevviz.logging.states import COLORS, StateLanes
-from bevviz.logging.writer import Writer
+from bevviz.model.frame import F32
+from bevviz.recording.labels import NEAR, apart, named_from_above, named_in_space
+from bevviz.recording.states import COLORS, StateLanes
+from bevviz.recording.writer import Writer
 
 NUMBERS = st.floats(-50, 50, width=32)
 PLACES = arrays.arrays(np.float32, st.tuples(st.integers(0, 20), st.just(3)), elements=NUMBERS)

@@ -17,10 +17,10 @@ from bevviz.config import load
 from bevviz.datasets.kitti import label_files, read_labels
 from bevviz.errors import UserError
 from bevviz.evaluate import Score, Truth, pair_in_order, truth_of
-from bevviz.frame import Boxes3D, Frame, LabelledBoxes3D
-from bevviz.geometry import apply as move
-from bevviz.geometry import corners, project
-from bevviz.results import Objects
+from bevviz.model.frame import Boxes3D, Frame, LabelledBoxes3D
+from bevviz.model.geometry import apply as move
+from bevviz.model.geometry import corners, project
+from bevviz.model.results import Objects
 from bevviz.sweep import Parameter, Sweep, combine, parse
 from bevviz.sweep.chart import HEIGHT, WIDTH, scale
 from bevviz.synthetic import SyntheticSource, write_bag

@@ -14,14 +14,23 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from bevviz import geometry
 from bevviz.config import Config, load
 from bevviz.errors import UserError
-from bevviz.frame import F64, Boxes3D, Cloud, Frame, Image, Intrinsics, LabelledBoxes2D, LabelledBoxes3D
-from bevviz.ros.messages import MessageError
-from bevviz.ros.roles import Roles
-from bevviz.ros.sensors import CameraRole
-from bevviz.ros.transforms import StampedTransform
+from bevviz.messages.decoding import MessageError
+from bevviz.messages.roles import Roles
+from bevviz.messages.sensors import CameraRole
+from bevviz.messages.transforms import StampedTransform
+from bevviz.model import geometry
+from bevviz.model.frame import (
+    F64,
+    Boxes3D,
+    Cloud,
+    Frame,
+    Image,
+    Intrinsics,
+    LabelledBoxes2D,
+    LabelledBoxes3D,
+)
 from bevviz.sync.clocks import Clocks
 from bevviz.sync.feed import make_handlers
 from bevviz.sync.synchronizer import Synchronizer

@@ -12,14 +12,14 @@ import numpy as np
 import pytest
 from rosbags.highlevel import AnyReader
 
-from bevviz import geometry
 from bevviz.bags.mcap_writer import McapWriter
 from bevviz.bags.source import BagSource
 from bevviz.config import Config, DetectorConfig, load
 from bevviz.errors import UserError
-from bevviz.frame import Source
-from bevviz.results import DetectionState
-from bevviz.session import Session
+from bevviz.model import geometry
+from bevviz.model.frame import Source
+from bevviz.model.results import DetectionState
+from bevviz.pipeline.session import Session
 from bevviz.stages.detector import Detector
 from bevviz.synthetic import BagWriter, Snapshot, SyntheticSource, write_bag
 from bevviz.synthetic.bag import TOPICS

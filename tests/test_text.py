@@ -11,10 +11,10 @@ from hypothesis import strategies as st
 from markdown_it import MarkdownIt
 from markdown_it.token import Token
 
-from bevviz import table
 from bevviz.cli import main
 from bevviz.errors import UserError
-from bevviz.text import fenced, markdown, printable
+from bevviz.support import table
+from bevviz.support.text import fenced, markdown, printable
 from tests import bags
 from tests.recordings import Recording
 

@@ -9,10 +9,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from bevviz import geometry
-from bevviz.frame import F64
-from bevviz.ros.transforms import StampedTransform
-from bevviz.sync.tf import Origin, TransformBuffer, TransformError
+from bevviz.messages.transforms import StampedTransform
+from bevviz.model import geometry
+from bevviz.model.frame import F64
+from bevviz.sync.transform_tree import Origin, TransformBuffer, TransformError
 
 SECOND = 1_000_000_000
 

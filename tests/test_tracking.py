@@ -11,11 +11,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from benchmarks.tracking import Tallies, TrackTally, Truth, add_tracks, truth_of
-from bevviz import geometry
 from bevviz.config import TrackingConfig, load
-from bevviz.frame import F32, F64, Boxes3D, Frame, LabelledBoxes3D
-from bevviz.results import Clusters, Objects, Tracks
-from bevviz.session import Session
+from bevviz.model import geometry
+from bevviz.model.frame import F32, F64, Boxes3D, Frame, LabelledBoxes3D
+from bevviz.model.results import Clusters, Objects, Tracks
+from bevviz.pipeline.session import Session
 from bevviz.stages.tracking import Tracker
 from bevviz.synthetic import SyntheticSource
 from bevviz.synthetic.sensors import Lidar, PinholeCamera

@@ -16,16 +16,15 @@ import numpy as np
 import pytest
 
 import bevviz
-from bevviz import plugins
 from bevviz.cli import main
-from bevviz.config import Config, Layer, dump, load, revised
+from bevviz.config import Config, Layer, dump, load, plugins, revised
+from bevviz.config.project import layers, named_code
+from bevviz.config.reloading import Settings
+from bevviz.config.trust import RECEIVED, allow, records
 from bevviz.errors import UserError
-from bevviz.live.settings import Settings
-from bevviz.project import layers, named_code
-from bevviz.recorded import Origin, Recorded
-from bevviz.ros.orders import Orders
-from bevviz.trust import RECEIVED, allow, records
-from bevviz.why.whatif import changed
+from bevviz.live.remote_requests import Orders
+from bevviz.recording.source_lookup import Origin, Recorded
+from bevviz.why.hints import changed
 from tests import bags
 
 Capture = pytest.CaptureFixture[str]
@@ -120,7 +119,7 @@ def test_a_recording_does_not_run_the_pickle_in_its_bag(
         if through == "yaml":
             sly_yaml = 'model: "pickle:loads"'
             patch.setattr(
-                "bevviz.logging.origin.dump", lambda config: dump(config).replace('model: ""', sly_yaml)
+                "bevviz.recording.properties.dump", lambda config: dump(config).replace('model: ""', sly_yaml)
             )
         assert main(["bag", "bug.mcap", "--save", "bug.rrd"]) == 0
     for command in (["why", "bug.rrd", "--at", "0.1"], ["bag", "bug.rrd", "--save", "x.rrd"]):
@@ -158,7 +157,7 @@ def test_entering_a_folder_runs_nothing(received: Path, capsys: Capture) -> None
 def test_the_importer_runs_nothing_even_of_a_trusted_project(
     received: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    from bevviz.importer import run
+    from bevviz.cli.importer import run
 
     bags.write(received / "drive", bags.small_items(scans=3), form="sqlite3")
     (bag,) = (received / "drive").glob("*.db3")
@@ -344,7 +343,7 @@ def test_workers_find_no_python_of_the_folder(received: Path) -> None:
     program = (
         f"import sys; sys.path[:] = {path!r}\n"
         "if __name__ == '__main__':\n"
-        "    from bevviz.engine.local import Processes\n"
+        "    from bevviz.fleet.engine.local import Processes\n"
         "    workers = Processes(1)\n"
         "    workers._idle[0].process.join(3)\n"
         "    workers.close()\n"
@@ -422,7 +421,7 @@ def test_an_edited_file_goes_on_with_the_functions_in_force(received: Path) -> N
 
 
 def test_a_configuration_that_load_did_not_make_runs_nothing(received: Path) -> None:
-    from bevviz.session import Session
+    from bevviz.pipeline.session import Session
 
     write_project(received, "")
     config = Config.model_validate({"ground": {"method": "drive_tools:segment"}})

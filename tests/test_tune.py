@@ -17,14 +17,14 @@ import pytest
 from bevviz.cli import main
 from bevviz.compare.differences import Change
 from bevviz.config import dump, load
+from bevviz.config.reloading import Settings
 from bevviz.errors import UserError
-from bevviz.frame import Frame
-from bevviz.live.settings import Settings
-from bevviz.logging.sinks import open_recording
-from bevviz.run import Dropping, run
+from bevviz.model.frame import Frame
+from bevviz.pipeline.run import Dropping, run
+from bevviz.recording.sinks import open_recording
 from bevviz.stages import detector
+from bevviz.sweep.tune import OneFrame, Saves, Version, VersionRecorder, create
 from bevviz.synthetic import SyntheticSource
-from bevviz.tune import OneFrame, Saves, Version, VersionRecorder, create
 from tests import bags
 from tests.recordings import Recording, verify
 from tests.waiting import PATIENCE

@@ -15,9 +15,9 @@ from bevviz.bags.source import BagSource
 from bevviz.cli import main
 from bevviz.config import Config, SourceConfig
 from bevviz.datasets.kitti import read_labels
-from bevviz.frame import Boxes3D
-from bevviz.ros.detections import decode_detections_2d, decode_detections_3d
-from bevviz.ros.encode import encode_boxes_3d, typestore
+from bevviz.messages.detections import decode_detections_2d, decode_detections_3d
+from bevviz.messages.encode import encode_boxes_3d, typestore
+from bevviz.model.frame import Boxes3D
 from tests import bags, datasets, forms
 
 GOOD = "Car 0.00 0 -1.57 120 40 180 80 1.5 1.6 4.0 0.0 1.5 10.0 -1.57"

@@ -14,19 +14,19 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from bevviz import geometry
 from bevviz.config import load
-from bevviz.frame import F32, F64, Cloud, Frame
-from bevviz.perceive import perceive
-from bevviz.results import FrameResult
-from bevviz.ros.clouds import decode_cloud
-from bevviz.ros.encode import encode_boxes_3d, encode_cloud
-from bevviz.ros.roles import Roles, find_roles
-from bevviz.ros.topics import Topic
-from bevviz.ros.transforms import Acceleration, StampedTransform
-from bevviz.stage_loader import StageLoader
+from bevviz.messages.clouds import decode_cloud
+from bevviz.messages.encode import encode_boxes_3d, encode_cloud
+from bevviz.messages.roles import Roles, find_roles
+from bevviz.messages.topics import Topic
+from bevviz.messages.transforms import Acceleration, StampedTransform
+from bevviz.model import geometry
+from bevviz.model.frame import F32, F64, Cloud, Frame
+from bevviz.model.results import FrameResult
+from bevviz.pipeline.perceive import perceive
+from bevviz.pipeline.stage_loader import StageLoader
+from bevviz.sync.gravity import _least_turn, ground_normal
 from bevviz.sync.synchronizer import Synchronizer
-from bevviz.sync.upright import _least_turn, ground_normal
 from bevviz.synthetic import SyntheticSource
 
 LIDAR, BASE, ODOM, IMU = "rslidar", "base_link", "odom", "imu_link"

@@ -17,9 +17,9 @@ import pytest
 from bevviz.bags.source import BagSource
 from bevviz.cli import main
 from bevviz.config import load
-from bevviz.frame import Frame, Image
-from bevviz.report.window import choose_topics, cut, find_window, open_window
-from bevviz.ros.bitstream import Continuity, is_key
+from bevviz.drivers.bitstream import Continuity, is_key
+from bevviz.model.frame import Frame, Image
+from bevviz.report.bag_window import choose_topics, cut, find_window, open_window
 from bevviz.sync import video
 from tests import bags, videos
 from tests.networks import FLOAT, answer

@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from bevviz.config import VoxelConfig
-from bevviz.frame import F32
-from bevviz.o3d import load
+from bevviz.model.frame import F32
 from bevviz.stages.voxel import voxel_grid
+from bevviz.support.open3d import load
 
 clouds = hnp.arrays(
     np.float32, st.tuples(st.integers(1, 200), st.just(3)), elements=st.floats(-20, 20, width=32)

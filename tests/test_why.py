@@ -11,19 +11,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bevviz import geometry
 from bevviz.bags.source import BagSource
 from bevviz.cli import main
 from bevviz.config import Config, load
 from bevviz.errors import UserError
-from bevviz.frame import Boxes3D, LabelledBoxes3D
-from bevviz.results import DetectionState, FrameResult
-from bevviz.session import Session
+from bevviz.model import geometry
+from bevviz.model.frame import Boxes3D, LabelledBoxes3D
+from bevviz.model.results import DetectionState, FrameResult
+from bevviz.pipeline.session import Session
 from bevviz.synthetic import BagWriter, SyntheticSource
 from bevviz.why import Answer, Questioner, Selection, why
+from bevviz.why.answer_text import summary
+from bevviz.why.frame_index import Fate, Traces
 from bevviz.why.subject import projected
-from bevviz.why.text import summary
-from bevviz.why.traces import Fate, Traces
 from bevviz.why.verdict import Reason
 from tests import bags, forms
 from tests.recordings import Recording

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from bevviz.config import load
-from bevviz.session import Session
+from bevviz.pipeline.session import Session
 from bevviz.why import Answer, Questioner, Selection
+from bevviz.why.hints import SURE, Hint, Search
 from bevviz.why.verdict import Reason
-from bevviz.why.whatif import SURE, Hint, Search
 from tests.test_faults import at, run
 
 CLASSES = ("car", "person", "cyclist")

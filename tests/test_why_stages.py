@@ -12,11 +12,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bevviz import plugins
-from bevviz.config import load
-from bevviz.frame import Boxes3D, Frame, LabelledBoxes2D, LabelledBoxes3D
-from bevviz.results import FrameResult
-from bevviz.session import Session
+from bevviz.config import load, plugins
+from bevviz.model.frame import Boxes3D, Frame, LabelledBoxes2D, LabelledBoxes3D
+from bevviz.model.results import FrameResult
+from bevviz.pipeline.session import Session
 from bevviz.why import Answer, Questioner, Selection
 from bevviz.why.verdict import Reason
 from tests.test_faults import at

@@ -28,18 +28,18 @@ from bevviz.cli import main
 from bevviz.config import revised
 from bevviz.errors import UserError
 from bevviz.evaluate import match, truth_of
-from bevviz.frame import Frame
-from bevviz.logging import entities
-from bevviz.notes import Note, Notes
-from bevviz.results import FrameResult
-from bevviz.session import Session
-from bevviz.stages.robot import in_points_frame
+from bevviz.model.frame import Frame
+from bevviz.model.results import FrameResult
+from bevviz.pipeline.notes import Note, Notes
+from bevviz.pipeline.session import Session
+from bevviz.recording import entities
+from bevviz.stages.robot_results import in_points_frame
+from bevviz.why.pick import Pick, pick
 from bevviz.why.subject import one_of, projected
-from bevviz.workbench.bench import Bench
-from bevviz.workbench.film import Film
-from bevviz.workbench.missed import finds
-from bevviz.workbench.parameters import controls
-from bevviz.workbench.pick import Pick, pick
+from bevviz.workbench.controls import controls
+from bevviz.workbench.findings import finds
+from bevviz.workbench.recording_buffer import Film
+from bevviz.workbench.session import Bench
 from bevviz.workbench.token import kept_token
 from tests import waiting
 from tests.test_files import small_disk

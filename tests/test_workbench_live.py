@@ -20,11 +20,11 @@ import pytest
 import bevviz
 from bevviz.errors import UserError
 from bevviz.live.encoder import Encoder
-from bevviz.logging import entities
-from bevviz.results import FrameResult
-from bevviz.workbench.live_bench import KEPT, LiveBench
-from bevviz.workbench.live_film import WHOLE, LiveFilm
-from bevviz.workbench.pick import Pick
+from bevviz.model.results import FrameResult
+from bevviz.recording import entities
+from bevviz.why.pick import Pick
+from bevviz.workbench.live_buffer import WHOLE, LiveFilm
+from bevviz.workbench.live_session import KEPT, LiveBench
 from tests.graphs import own_graph, playing
 from tests.live_bench import live_bench
 from tests.ros_player import Play
@@ -60,7 +60,7 @@ def robot(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[str, Path]
 
 def _address(said: Path, live: subprocess.Popen[bytes]) -> str:
     """What it prints, once it can be reached."""
-    from bevviz.logging.ports import answers
+    from bevviz.recording.ports import answers
 
     end = time.monotonic() + PATIENCE
     while time.monotonic() < end and live.poll() is None:

@@ -14,8 +14,8 @@ import pytest
 from rerun.experimental import ViewerClient
 
 from bevviz.cli import main
-from bevviz.logging import entities, rerun_cli
-from bevviz.logging.ports import LOOPBACK, answers, free_port
+from bevviz.recording import entities, rerun_cli
+from bevviz.recording.ports import LOOPBACK, answers, free_port
 from tests.test_workbench import FRAMES, bag, browser, serving, state, until, verdict  # noqa: F401
 
 if TYPE_CHECKING:

@@ -12,7 +12,7 @@ import numpy as np
 from mcap.writer import Writer
 from rosbags.typesys import get_types_from_msg
 
-from bevviz.frame import U8
+from bevviz.model.frame import U8
 from tests import bags
 
 VIDEO = "/camera/image_rect_color/foxglove"

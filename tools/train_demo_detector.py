@@ -32,8 +32,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F  # noqa: N812
 
-from bevviz import geometry
-from bevviz.frame import F32, I32, U8
+from bevviz.model import geometry
+from bevviz.model.frame import F32, I32, U8
 from bevviz.synthetic.sensors import Caster, PinholeCamera, View, optical
 from bevviz.synthetic.world import SECTION, World
 
@@ -362,7 +362,7 @@ def export(network: Network, path: Path) -> None:
 def evaluate(path: Path, data: Sequence[tuple[U8, Labels]], threshold: float = 0.25) -> dict[str, Any]:
     """Precision and recall at IoU 0.5 through bevviz's own detector, for objects higher than 20 pixels."""
     from bevviz.config import DetectorConfig
-    from bevviz.results import DetectionState
+    from bevviz.model.results import DetectionState
     from bevviz.stages.detector import Detector
 
     detector = Detector(DetectorConfig(model=str(path), conf_threshold=threshold))

@@ -225,15 +225,15 @@ def write(path: Path, rows: Sequence[Row]) -> None:
 
 def read_messages(path: Path) -> Outcome:
     """Decode every message of a bag by itself. ``said``: the slowest one's seconds, and the lines."""
-    from bevviz.bags.recording import Recording
-    from bevviz.ros import cameras, clouds, detections, images, transforms
-    from bevviz.ros.messages import MessageError
+    from bevviz.bags.bag import Recording
+    from bevviz.messages import camera_info, clouds, detections, images, transforms
+    from bevviz.messages.decoding import MessageError
 
     of_type: dict[str, Callable[[Any, str], object]] = {
         "PointCloud2": lambda m, topic: clouds.decode_cloud(m, topic, 0),
         "Image": lambda m, topic: images.decode_image(m, topic, 0),
         "CompressedImage": lambda m, topic: images.decode_compressed_image(m, topic, 0),
-        "CameraInfo": lambda m, topic: cameras.decode_camera_info(m, False, topic),
+        "CameraInfo": lambda m, topic: camera_info.decode_camera_info(m, False, topic),
         "TFMessage": lambda m, topic: transforms.decode_transforms(m, topic),
         "Odometry": lambda m, topic: transforms.decode_odometry(m, topic),
         "Detection2DArray": lambda m, topic: detections.decode_detections_2d(m, topic, 0),

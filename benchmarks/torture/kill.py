@@ -18,7 +18,7 @@ from pathlib import Path
 
 from tqdm import tqdm
 
-from bevviz.files import unfinished_files
+from bevviz.support.files import unfinished_files
 from tests import bags
 
 SCANS = 40

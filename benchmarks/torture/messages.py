@@ -30,7 +30,8 @@ from tqdm import tqdm
 
 from benchmarks.torture import fuzz
 from benchmarks.torture.worker import Outcome, Worker
-from bevviz.ros import driver_msgs, grid_map_msgs, point_cloud_interfaces
+from bevviz.drivers import driver_msgs, point_cloud_interfaces
+from bevviz.messages import grid_map_msgs
 from tests import bags, videos
 
 SCANS = 52  # of a drive
@@ -320,7 +321,7 @@ def _foxglove(image: str, encoding: str) -> list[Row]:
     """The drive of Foxglove's own SDK, prolonged, in protobuf or JSON."""
     from google.protobuf.json_format import MessageToDict, ParseDict
 
-    from bevviz.ros.foxglove import parse
+    from bevviz.messages.foxglove import parse
     from tests import test_foxglove
 
     with tempfile.TemporaryDirectory(prefix="bevviz-torture-") as folder:
@@ -561,10 +562,10 @@ def read_frames(argument: tuple[Path, Sequence[str]]) -> Outcome:
 
     ``said`` has the seconds, the number of frames, what ended the reading, and the warnings.
     """
-    from bevviz.bags.info import describe, render
     from bevviz.bags.source import BagSource
     from bevviz.config import load
     from bevviz.errors import UserError
+    from bevviz.pipeline.bag_info import describe, render
 
     path, settings = argument
     outcome, frames, ended = Outcome(), 0, ""

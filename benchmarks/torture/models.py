@@ -515,7 +515,7 @@ def _limited(outcome: Outcome) -> bool:
 
 def _load_and_run(case: Case) -> None:
     from bevviz.config import load
-    from bevviz.stage_loader import StageLoader
+    from bevviz.pipeline.stage_loader import StageLoader
 
     rng = np.random.default_rng(0)
     config = load(settings=list(case.settings))

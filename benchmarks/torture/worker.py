@@ -30,10 +30,10 @@ def read_bag(path: Path) -> Outcome:
     """Everything that commands do with a bag before a frame goes through the pipeline."""
     from backports import zstd
 
-    from bevviz.bags.info import describe, render
-    from bevviz.bags.recording import Recording
+    from bevviz.bags.bag import Recording
     from bevviz.config import Config
     from bevviz.errors import UserError
+    from bevviz.pipeline.bag_info import describe, render
 
     outcome = Outcome()
     try:

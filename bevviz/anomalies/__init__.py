@@ -1,4 +1,4 @@
-"""What is worth a look in a drive."""
+"""Detection of anomalies in a drive. Imports `stages` and below."""
 
 from bevviz.anomalies.detector import KINDS, AnomalyDetector
 from bevviz.anomalies.objects import label

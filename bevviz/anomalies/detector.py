@@ -12,12 +12,12 @@ from typing import get_args
 
 import numpy as np
 
-from bevviz import geometry
 from bevviz.anomalies.objects import ObjectWatch
 from bevviz.config import AnomaliesConfig, AnomalyKind
-from bevviz.frame import F32
-from bevviz.geometry import iou
-from bevviz.results import Anomaly, CameraResult, Decision, FrameResult
+from bevviz.model import geometry
+from bevviz.model.frame import F32
+from bevviz.model.geometry import iou
+from bevviz.model.results import Anomaly, CameraResult, Decision, FrameResult
 
 KINDS: tuple[AnomalyKind, ...] = get_args(AnomalyKind)
 UNMATCHED = (Decision.NO_CLUSTER, Decision.TOO_FEW_POINTS, Decision.LOW_OVERLAP, Decision.MISFIT)

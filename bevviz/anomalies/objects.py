@@ -16,10 +16,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bevviz import geometry
 from bevviz.config import AnomaliesConfig
-from bevviz.frame import F32, Bool, Boxes3D
-from bevviz.results import Anomaly, CameraResult, FrameResult, Tracks
+from bevviz.model import geometry
+from bevviz.model.frame import F32, Bool, Boxes3D
+from bevviz.model.results import Anomaly, CameraResult, FrameResult, Tracks
 from bevviz.stages.fusion import in_view
 from bevviz.stages.visibility import range_image, visible
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 
-from bevviz.protocols import Observer
-from bevviz.results import Anomaly, FrameResult
+from bevviz.model.protocols import Observer
+from bevviz.model.results import Anomaly, FrameResult
 
 
 class Onsets:

@@ -1,1 +1,1 @@
-"""Recorded bags: MCAP, sqlite3 and ROS 1, sound or damaged, as messages and as frames."""
+"""Readers of recorded bags, sound or damaged. Imports `datasets` and below."""

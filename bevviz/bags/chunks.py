@@ -15,7 +15,6 @@ import rosbags.rosbag1
 import rosbags.rosbag2
 from rosbags.interfaces import Connection
 
-from bevviz import announce
 from bevviz.bags.reader import (
     LAST,
     Bytes,
@@ -26,8 +25,9 @@ from bevviz.bags.reader import (
     megabytes,
     public_messages,
 )
-from bevviz.frame import I64
-from bevviz.loggers import logger
+from bevviz.model.frame import I64
+from bevviz.support import progress
+from bevviz.support.loggers import logger
 
 _log = logger(__name__)
 
@@ -380,7 +380,7 @@ def rescue(path: Path, form: Form) -> IndexedChunks:
     """A reader of what is found by looking through a file from front to back."""
     found, file = Scan(), Bytes(path)
     try:
-        bar = announce.bar(total=file.size, unit="B", unit_scale=True, desc=f"rescue {path.name}", delay=1)
+        bar = progress.bar(total=file.size, unit="B", unit_scale=True, desc=f"rescue {path.name}", delay=1)
         with bar:
             form.scan(file, found, lambda offset: bar.update(offset - bar.n))
     finally:

@@ -16,8 +16,8 @@ from rosbags.interfaces import Connection, ConnectionExtRosbag2, MessageDefiniti
 
 from bevviz.bags.chunks import Chunk, Index
 from bevviz.bags.reader import LAST, Bytes, DamageError, UnindexedError, unpack
-from bevviz.frame import I64
-from bevviz.loggers import logger
+from bevviz.model.frame import I64
+from bevviz.support.loggers import logger
 
 _log = logger(__name__)
 

@@ -25,7 +25,6 @@ from rosbags.interfaces import (
 )
 from ruamel.yaml import YAML
 
-from bevviz import remains
 from bevviz.bags.mcap import (
     ATTACHMENT,
     ATTACHMENT_INDEX,
@@ -42,8 +41,9 @@ from bevviz.bags.mcap import (
     SCHEMA,
 )
 from bevviz.errors import UserError, first_line
-from bevviz.files import claim, lock, rename_new, write_all
-from bevviz.version import __version__
+from bevviz.support import cleanup
+from bevviz.support.files import claim, lock, rename_new, write_all
+from bevviz.support.version import __version__
 
 HEADER, CHUNK_INDEX, STATISTICS = 1, 8, 0x0B
 CHUNK_SIZE = 1 << 22  # bytes that a chunk is closed at
@@ -102,11 +102,11 @@ class McapWriter:
     def __enter__(self) -> Self:
         unfinished = claim(self._path, "bag")
         self._part, self._file = unfinished.path, unfinished.handle
-        remains.remember(self, partial(self._part.unlink, missing_ok=True))
+        cleanup.remember(self, partial(self._part.unlink, missing_ok=True))
         try:
             self._put(MAGIC + _record(HEADER, _text(self._profile) + _text(f"bevviz {__version__}")))
         except OSError as error:
-            remains.forget(self)
+            cleanup.forget(self)
             unfinished.discard()
             raise UserError(f"{self._path}: cannot write the bag: {error.strerror}") from None
         return self
@@ -130,7 +130,7 @@ class McapWriter:
         finally:
             if not keep:
                 self._part.unlink(missing_ok=True)
-            remains.forget(self)
+            cleanup.forget(self)
             os.close(self._file)  # and with it the lock
 
     @property

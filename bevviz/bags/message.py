@@ -9,9 +9,9 @@ from backports import zstd
 from rosbags.interfaces import Connection, ConnectionExtRosbag1
 
 from bevviz.bags.reader import LONGEST, ZSTD, normalized
-from bevviz.ros import foxglove
-from bevviz.ros.guard import guard
-from bevviz.ros.messages import MessageError, read_header
+from bevviz.messages import foxglove
+from bevviz.messages.decoding import MessageError, read_header
+from bevviz.messages.guard import guard
 
 
 @dataclass(frozen=True, slots=True)

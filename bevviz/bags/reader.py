@@ -21,8 +21,8 @@ from lz4.frame import LZ4FrameDecompressor  # type: ignore[import-untyped]
 from rosbags.interfaces import Connection
 
 from bevviz.errors import first_line
-from bevviz.frame import I64
-from bevviz.loggers import logger
+from bevviz.model.frame import I64
+from bevviz.support.loggers import logger
 
 _log = logger(__name__)
 

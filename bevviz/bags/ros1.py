@@ -16,7 +16,7 @@ from rosbags.rosbag1 import Reader
 
 from bevviz.bags.chunks import Chunk, ChunkMessage, Form, Index, Scan
 from bevviz.bags.reader import LAST, Bytes, Content, DamageError, normalized, unpack
-from bevviz.frame import I64
+from bevviz.model.frame import I64
 
 MAGIC = b"#ROSBAG V2.0\n"
 OPCODE = re.compile(rb"(?=\x04\0\0\0op=)")  # every header has one

@@ -11,20 +11,20 @@ from pathlib import Path
 
 import numpy as np
 
+from bevviz.bags.bag import Recording
 from bevviz.bags.message import RawMessage
-from bevviz.bags.recording import Recording
-from bevviz.closing import Closing
 from bevviz.config import Config, stage_topics
 from bevviz.errors import UserError
-from bevviz.frame import F64, I64, Frame, Scene
-from bevviz.ros.guard import guard
-from bevviz.ros.messages import MessageError
-from bevviz.ros.roles import find_roles
-from bevviz.ros.transforms import decode_transforms
-from bevviz.sync.damage import Damage
+from bevviz.messages.decoding import MessageError
+from bevviz.messages.guard import guard
+from bevviz.messages.roles import find_roles
+from bevviz.messages.transforms import decode_transforms
+from bevviz.model.frame import F64, I64, Frame, Scene
+from bevviz.support.contexts import Closing
 from bevviz.sync.feed import Handler, make_handlers
 from bevviz.sync.report import blindness
 from bevviz.sync.synchronizer import Synchronizer
+from bevviz.sync.unusable_messages import Damage
 
 SECOND = 1_000_000_000
 MARGIN = 2 * SECOND  # what else belongs to the first and the last cloud is looked for this far outside

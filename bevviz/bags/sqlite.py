@@ -12,10 +12,18 @@ import numpy as np
 from rosbags.interfaces import Connection
 from rosbags.rosbag2 import Reader as PublicReader
 
-from bevviz.bags.reader import LAST, DamageError, Message, Reader, as_damage, megabytes, public_messages
-from bevviz.bags.sqlite_pages import LOG_HEAD, log_of, page_size_of
-from bevviz.bags.sqlite_rescue import SqliteRescuer
-from bevviz.frame import I64
+from bevviz.bags.reader import (
+    LAST,
+    DamageError,
+    Message,
+    Reader,
+    as_damage,
+    megabytes,
+    public_messages,
+)
+from bevviz.bags.rescue.sqlite import SqliteRescuer
+from bevviz.bags.rescue.sqlite_pages import LOG_HEAD, log_of, page_size_of
+from bevviz.model.frame import I64
 
 
 class SoundSqlite:

@@ -1,8 +1,8 @@
-"""Is it the calibration or the clock? Where the edges of cloud and image meet best, and how surely."""
+"""Check of calibration and clocks. Imports `pipeline` and below."""
 
-from bevviz.calib.axes import AXES, Axis
+from bevviz.calib.offsets import AXES, Axis
 from bevviz.calib.result import AxisResult, Calibration, Finding
-from bevviz.calib.shots import Shot, Shots, gather
+from bevviz.calib.samples import Shot, Shots, gather
 from bevviz.calib.solve import calibrate
 
 __all__ = [

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from bevviz.frame import F32, F64, I64, RING_FIELDS, U8, Bool, Cloud
+from bevviz.model.frame import F32, F64, I64, RING_FIELDS, U8, Bool, Cloud
 
 ROW = np.radians(0.4)  # height of a row of beams where the cloud does not tell its rings
 JUMP = 0.12  # least share by which the inverse range falls at a border

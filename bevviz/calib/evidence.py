@@ -14,7 +14,7 @@ import numpy as np
 
 from bevviz.calib.score import Scorer
 from bevviz.calib.search import Peak, climb
-from bevviz.frame import F64, Bool
+from bevviz.model.frame import F64, Bool
 
 REPLICATES = 24
 SETTLED = 0.05  # pixels, of the climb of a replicate

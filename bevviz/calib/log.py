@@ -7,17 +7,18 @@ from collections.abc import Sequence
 import numpy as np
 import rerun as rr
 
-from bevviz import geometry, table
-from bevviz.calib.axes import TIME, error_pose
+from bevviz.calib.offsets import TIME, error_pose
 from bevviz.calib.result import Calibration, Finding
-from bevviz.calib.shots import Shot
-from bevviz.colors import State, bins
+from bevviz.calib.samples import Shot
 from bevviz.config import LoggingConfig
-from bevviz.frame import F32, F64, Bool, Intrinsics
-from bevviz.logging import entities
-from bevviz.logging.annotations import depth_annotations
-from bevviz.logging.pieces import CORNER, document, encode_image
-from bevviz.text import fenced, markdown
+from bevviz.model import geometry
+from bevviz.model.colors import State, bins
+from bevviz.model.frame import F32, F64, Bool, Intrinsics
+from bevviz.recording import entities
+from bevviz.recording.annotations import depth_annotations
+from bevviz.recording.primitives import CORNER, document, encode_image
+from bevviz.support import table
+from bevviz.support.text import fenced, markdown
 
 _STATED, _CORRECTED = State.BAD.value, State.GOOD.value
 _COLORS = {

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any
 
-from bevviz import geometry
-from bevviz.calib.axes import AXES, TIME, Axis
-from bevviz.frame import F64
+from bevviz.calib.offsets import AXES, TIME, Axis
+from bevviz.model import geometry
+from bevviz.model.frame import F64
 
 
 class Finding(StrEnum):

@@ -16,10 +16,10 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from bevviz.calib.axes import AXES, TIME, error_pose
-from bevviz.calib.shots import CELLS, Shot
-from bevviz.frame import F32, F64, I32, I64, Bool
-from bevviz.stages.kernel import kernel
+from bevviz.calib.offsets import AXES, TIME, error_pose
+from bevviz.calib.samples import CELLS, Shot
+from bevviz.model.frame import F32, F64, I32, I64, Bool
+from bevviz.support.kernel import kernel
 
 SHARE = 0.2  # of the edges of a cloud that an image shows
 AGAINST = 0.25  # what is darker though it reflects more (leaves) counts so much beside what is brighter

@@ -13,12 +13,12 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from bevviz import geometry
-from bevviz.calib.axes import AXES, PRIOR, error_pose
+from bevviz.calib.offsets import AXES, PRIOR, error_pose
+from bevviz.calib.samples import REACH, Shot
 from bevviz.calib.score import SHARE, Scorer, Sums, densities
-from bevviz.calib.shots import REACH, Shot
-from bevviz.frame import F32, F64, I64, Bool
-from bevviz.stages.kernel import kernel
+from bevviz.model import geometry
+from bevviz.model.frame import F32, F64, I64, Bool
+from bevviz.support.kernel import kernel
 
 STEP = np.radians(0.32)  # of the grid about x and y
 ROLL = np.radians(0.7)  # about z, where an error moves the middle of the image little

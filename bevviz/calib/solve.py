@@ -8,15 +8,15 @@ from types import MappingProxyType
 
 import numpy as np
 
-from bevviz import geometry
-from bevviz.calib.axes import AXES, FLOOR, PRIOR, SCALES, TIME, Axis, error_pose
 from bevviz.calib.evidence import LEAD, caution, lead, scatter, views
+from bevviz.calib.offsets import AXES, FLOOR, PRIOR, SCALES, TIME, Axis, error_pose
 from bevviz.calib.result import AxisResult, Calibration, Finding
+from bevviz.calib.samples import REACH, Shot, Shots
 from bevviz.calib.score import Scorer
 from bevviz.calib.search import FINEST, SAMPLE, Peak, climb, search, thin
-from bevviz.calib.shots import REACH, Shot, Shots
 from bevviz.errors import UserError
-from bevviz.frame import F64, Bool
+from bevviz.model import geometry
+from bevviz.model.frame import F64, Bool
 
 SAMPLES = 41  # points of a curve
 EDGES = 500  # fewer say nothing

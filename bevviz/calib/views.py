@@ -1,11 +1,11 @@
-"""The views of a calibration, for layouts; see ``bevviz.logging.views``."""
+"""The views of a calibration, for layouts; see ``bevviz.recording.views``."""
 
 from __future__ import annotations
 
 import rerun.blueprint as rrb
 
-from bevviz.calib.axes import AXES
-from bevviz.logging import entities
+from bevviz.calib.offsets import AXES
+from bevviz.recording import entities
 
 
 def alignment(camera: str) -> rrb.Tabs:

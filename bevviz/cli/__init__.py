@@ -37,7 +37,7 @@ from bevviz.cli.machine import with_json
 from bevviz.cli.options import follow_recording, with_negatives
 from bevviz.cli.parser import COMMAND, Parser
 from bevviz.errors import UserError, first_line, interrupt_in
-from bevviz.version import __version__
+from bevviz.support.version import __version__
 
 if TYPE_CHECKING:
     from logging import Logger
@@ -114,7 +114,7 @@ def _main(arguments: Sequence[str] | None) -> int:
         if interrupt_in(error) or interrupts.came():
             print("bevviz: interrupted", file=sys.stderr)
             return 130
-        from bevviz.files import full_disk
+        from bevviz.support.files import full_disk
 
         if (full := full_disk(error)) is not None:
             _log().debug("what led to the error", exc_info=error)
@@ -173,7 +173,7 @@ def _parser() -> tuple[argparse.ArgumentParser, Collection[str]]:
 
 
 def _log() -> Logger:
-    from bevviz.loggers import logger
+    from bevviz.support.loggers import logger
 
     return logger(__name__)
 

@@ -17,7 +17,7 @@ from bevviz.cli.options import (
 )
 from bevviz.cli.outputs import Outputs
 from bevviz.cli.run import process
-from bevviz.closing import without_collections
+from bevviz.support.contexts import without_collections
 
 
 def add(commands: Commands) -> None:

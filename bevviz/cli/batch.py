@@ -10,7 +10,6 @@ from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from bevviz import announce
 from bevviz.cli.interrupts import terminable, wait_for_interrupt
 from bevviz.cli.options import (
     TIMES,
@@ -26,12 +25,13 @@ from bevviz.cli.options import (
 )
 from bevviz.cli.outputs import hint, say, warn
 from bevviz.errors import UserError
+from bevviz.support import progress
 
 if TYPE_CHECKING:
-    from bevviz.batch.jobs import Job
-    from bevviz.batch.table import RunInfo
-    from bevviz.engine.task import Engine, JobResults
     from bevviz.evaluate.gate import Limit
+    from bevviz.fleet.engine.task import Engine, JobResults
+    from bevviz.fleet.jobs import Job
+    from bevviz.fleet.table import RunInfo
 
 
 def add(commands: Commands) -> None:
@@ -91,7 +91,7 @@ def add(commands: Commands) -> None:
 
 
 def _batch(options: argparse.Namespace) -> int:
-    from bevviz.batch.batch import claimed, whole_results
+    from bevviz.fleet.batch import claimed, whole_results
 
     limits = _limits(options)
     if options.catalog and options.serve_catalog:
@@ -119,9 +119,9 @@ def _limits(options: argparse.Namespace) -> list[Limit]:
 
 def _jobs(options: argparse.Namespace) -> list[Job]:
     from bevviz.bags.source import FrameSelection
-    from bevviz.batch.jobs import make_jobs
-    from bevviz.frame import Scene
-    from bevviz.logging import blueprints
+    from bevviz.fleet.jobs import make_jobs
+    from bevviz.model.frame import Scene
+    from bevviz.recording import blueprints
     from bevviz.stages.detector import Detector
 
     config = load_config(options)
@@ -138,7 +138,7 @@ def _jobs(options: argparse.Namespace) -> list[Job]:
 def _run(jobs: list[Job], options: argparse.Namespace, failed: list[tuple[str, str]]) -> bool:
     """Do what is left. Returns whether it was interrupted."""
 
-    from bevviz.batch.batch import left_to_do
+    from bevviz.fleet.batch import left_to_do
 
     todo = left_to_do(jobs, options.force, _warn)
     if len(todo) < len(jobs):
@@ -147,7 +147,7 @@ def _run(jobs: list[Job], options: argparse.Namespace, failed: list[tuple[str, s
     try:
         with (
             terminable() as ended,
-            announce.bar(total=len(jobs), initial=len(jobs) - len(todo), unit="bag") as bar,
+            progress.bar(total=len(jobs), initial=len(jobs) - len(todo), unit="bag") as bar,
         ):
 
             def on_frame() -> None:
@@ -184,11 +184,11 @@ def _execute(
     with ExitStack() as stack:
         engine: Engine
         if options.dask:
-            from bevviz.engine.dask import Cluster
+            from bevviz.fleet.engine.dask import Cluster
 
             engine = stack.enter_context(Cluster(options.dask))
         else:
-            from bevviz.engine.local import Processes
+            from bevviz.fleet.engine.local import Processes
 
             workers = options.jobs or max(1, (os.cpu_count() or 1) // 2)
             engine = stack.enter_context(Processes(min(workers, len(todo))))
@@ -203,7 +203,7 @@ def _sum_up(
     interrupted: bool,
 ) -> int:
     """Summary and catalog of what is complete."""
-    from bevviz.batch.summary import write_summary
+    from bevviz.fleet.summary import write_summary
 
     folder: Path = options.output
     recordings = [(table.with_suffix(".rrd"), info) for table, info in complete]
@@ -212,11 +212,11 @@ def _sum_up(
         if interrupted:
             url = None
         elif options.serve_catalog:
-            from bevviz.batch.catalog import served
+            from bevviz.fleet.catalog import served
 
             url, viewer = stack.enter_context(served(options.serve_catalog, options.bind))
         if url:
-            from bevviz.batch.catalog import register
+            from bevviz.fleet.catalog import register
 
             dataset = options.dataset or folder.resolve().name
             link = register(url, dataset, recordings, options.blueprint)

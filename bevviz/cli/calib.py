@@ -6,15 +6,23 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from bevviz import announce
 from bevviz.cli.machine import add_json, give, on_stdout
-from bevviz.cli.options import Commands, add_bag, add_config, add_output, add_selection, load_config, open_bag
+from bevviz.cli.options import (
+    Commands,
+    add_bag,
+    add_config,
+    add_output,
+    add_selection,
+    load_config,
+    open_bag,
+)
 from bevviz.cli.outputs import Outputs, say, warn
+from bevviz.support import progress
 
 if TYPE_CHECKING:
     from bevviz.calib import Calibration, Shots
     from bevviz.config import Config
-    from bevviz.frame import Scene
+    from bevviz.model.frame import Scene
 
 FRAMES = 30  # that are taken where --every does not say
 
@@ -51,13 +59,13 @@ def _calib(options: argparse.Namespace) -> int:
         names = _cameras(scene, options.camera, source.roles.no_camera)
     options.every = chosen or max(1, total // FRAMES)
     with open_bag(options, config) as source:
-        bar = announce.bar(source, total=source.total, unit="frame", desc="find edges")
+        bar = progress.bar(source, total=source.total, unit="frame", desc="find edges")
         shots = gather(bar, names, source.pose)
         warn(source.warnings)
     results = []
     for name in names:
         form = "{desc}: {percentage:3.0f}%|{bar}| {elapsed}{postfix}"
-        with announce.bar(total=100, desc=f"align {name}", bar_format=form) as steps:
+        with progress.bar(total=100, desc=f"align {name}", bar_format=form) as steps:
 
             def show(done: float, what: str, steps: Any = steps) -> None:
                 steps.set_postfix_str(what, refresh=False)
@@ -98,7 +106,7 @@ def _print(results: list[Calibration]) -> None:
 
 def _write(results: list[Calibration], path: Path) -> None:
     from bevviz.calib.result import configuration
-    from bevviz.files import save
+    from bevviz.support.files import save
 
     save(path, configuration(results), "--write")
     say(f"configuration in {path}{'' if any(r.moved for r in results) else ': all as it is stated'}")

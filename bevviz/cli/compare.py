@@ -30,8 +30,8 @@ if TYPE_CHECKING:
     from bevviz.compare.summary import ComparisonSummary
     from bevviz.config import Config, Preset
     from bevviz.evaluate import Truth
-    from bevviz.frame import Frame
-    from bevviz.protocols import Observer, Processor
+    from bevviz.model.frame import Frame
+    from bevviz.model.protocols import Observer, Processor
 
 DESCRIPTION = """Run two configurations on the same frames and show how the results differ: objects that only
 A or only B has, that have moved, or that have another class. Without --a, --b, --set-a, --set-b, --preset
@@ -85,7 +85,7 @@ def _compare(options: argparse.Namespace) -> int:
 
 def _configurations(options: argparse.Namespace) -> int:
     from bevviz.compare.sides import ComparedSessions
-    from bevviz.variants import check_same_frames, common_frames
+    from bevviz.pipeline.variants import check_same_frames, common_frames
 
     names, (a, b) = _sides(options)
     check_same_frames({"A": a, "B": b})
@@ -98,7 +98,7 @@ def _configurations(options: argparse.Namespace) -> int:
 def _robot(options: argparse.Namespace) -> int:
     from bevviz.cli.options import load_config
     from bevviz.compare.sides import ComparedRobot, robot_topic
-    from bevviz.session import Session
+    from bevviz.pipeline.session import Session
 
     if options.a or options.b or options.set_a or options.set_b:
         raise UserError("--robot: A is bevviz as --set, --config and --preset say; leave --a and --b out")
@@ -151,7 +151,7 @@ def _run(
 
 
 def _saved(options: argparse.Namespace) -> int:
-    from bevviz.compare.saved import SavedPair, SavedPairRecorder
+    from bevviz.compare.saved_runs import SavedPair, SavedPairRecorder
     from bevviz.config import Config
 
     own = options.robot is not None or options.a or options.b or options.set_a or options.set_b

@@ -62,6 +62,6 @@ def _keys(prefix: str, action: argparse.Action, **_: Any) -> list[str]:
 
 
 def _blueprints(**_: Any) -> list[str]:
-    from bevviz.logging.blueprints import names
+    from bevviz.recording.blueprints import names
 
     return list(names())

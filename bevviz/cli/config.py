@@ -28,7 +28,7 @@ def add(commands: Commands) -> None:
 
 def _config(options: argparse.Namespace) -> int:
     from bevviz.config import dump, stated_lines
-    from bevviz.parameters import explain
+    from bevviz.config.descriptions import explain
 
     config = load_config(options)
     if options.key is not None:

@@ -5,10 +5,10 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from bevviz import announce
 from bevviz.cli.options import Commands, add_config, add_keep, add_output, positive
 from bevviz.cli.outputs import Outputs
 from bevviz.cli.run import process
+from bevviz.support import progress
 
 # Held to bevviz.synthetic.faults by a test: importing that takes as long as a command should.
 PLANTS = """faults to --plant:
@@ -64,7 +64,7 @@ def _demo(options: argparse.Namespace) -> int:
 
     source = SyntheticSource(options.frames, options.seed, plant=options.plant, weave=options.weave)
     if options.bag is not None:
-        write_bag(source, options.bag, announce.bar(source, total=source.total, unit="scan", desc="simulate"))
+        write_bag(source, options.bag, progress.bar(source, total=source.total, unit="scan", desc="simulate"))
         print(f"{options.bag}: {source.total} scans; 'bevviz bag {options.bag} --model demo' runs on it")
         return 0
     # A project's sensors and network are not the demo's: it is the same everywhere.

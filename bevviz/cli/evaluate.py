@@ -28,8 +28,8 @@ if TYPE_CHECKING:
     from bevviz.config import Config
     from bevviz.evaluate.evaluation import Evaluation
     from bevviz.evaluate.gate import Limit
-    from bevviz.protocols import Frames, Observer
-    from bevviz.results import FrameResult
+    from bevviz.model.protocols import Frames, Observer
+    from bevviz.model.results import FrameResult
 
 DESCRIPTION = """Hold the results to what is really there: precision and recall by class and range, average
 precision as KITTI defines it, tracks (HOTA, MOTA, IDF1), image boxes, ground. PATH is a bag, or a
@@ -64,7 +64,7 @@ def add(commands: Commands) -> None:
 def _evaluate(options: argparse.Namespace) -> int:
     from bevviz.evaluate.evaluation import Evaluation
     from bevviz.evaluate.gate import parse_limits
-    from bevviz.evaluate.truth import truth_in
+    from bevviz.evaluate.ground_truth import truth_in
 
     limits = parse_limits(options.min, options.max)
     config = load_config(options)
@@ -79,7 +79,7 @@ def _evaluate(options: argparse.Namespace) -> int:
 def _run(frames: Frames, config: Config, evaluation: Evaluation, outputs: Outputs, *, table: bool) -> int:
     """The exit status of the run."""
     from bevviz.anomalies import FailureSummary
-    from bevviz.session import Session
+    from bevviz.pipeline.session import Session
 
     session, failures = Session(config), FailureSummary()
     if not outputs:
@@ -91,7 +91,7 @@ def _run(frames: Frames, config: Config, evaluation: Evaluation, outputs: Output
             return 130
         return 0 if end.frames else 1
     from bevviz.evaluate.log import EvaluationRecorder
-    from bevviz.logging.recorder import Recorder
+    from bevviz.recording.recorder import Recorder
 
     def observers(recording: RecordingStream) -> list[Observer[FrameResult]]:
         hint(frames.scene, config)

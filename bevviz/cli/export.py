@@ -5,7 +5,14 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from bevviz.cli.options import Commands, add_bag, add_config, add_selection, load_config, open_bag
+from bevviz.cli.options import (
+    Commands,
+    add_bag,
+    add_config,
+    add_selection,
+    load_config,
+    open_bag,
+)
 from bevviz.cli.outputs import hint, say, warn
 from bevviz.cli.run import through
 

@@ -6,7 +6,14 @@ import argparse
 from pathlib import Path
 
 from bevviz.cli.machine import add_json, give, on_stdout
-from bevviz.cli.options import Commands, add_config, add_dataset, add_ros_args, load_config, positive
+from bevviz.cli.options import (
+    Commands,
+    add_config,
+    add_dataset,
+    add_ros_args,
+    load_config,
+    positive,
+)
 from bevviz.errors import UserError
 
 
@@ -36,10 +43,10 @@ def add(commands: Commands) -> None:
 
 
 def _info(options: argparse.Namespace) -> int:
-    from bevviz.bags.info import as_tree, describe, render
+    from bevviz.pipeline.bag_info import as_tree, describe, render
 
     if options.live:
-        from bevviz.live import info
+        from bevviz.live import graph_info as info
 
         seconds = options.seconds or info.LISTEN
         live = info.describe(load_config(options), options.ros_args, seconds)

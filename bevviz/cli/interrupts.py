@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from threading import Event
 
-from bevviz import remains
+from bevviz.support import cleanup
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
@@ -43,7 +43,7 @@ def leave(status: int) -> None:
     A thread with a network that exceeded its limits would end in a segmentation fault.
     """
     threads = threading.enumerate()
-    is_endless = any(thread.name == remains.ENDLESS_THREAD for thread in threads)
+    is_endless = any(thread.name == cleanup.ENDLESS_THREAD for thread in threads)
     if is_endless or (came() and any(thread.daemon for thread in threads)):
         for stream in (sys.stdout, sys.stderr):
             with suppress(OSError, ValueError):
@@ -53,8 +53,8 @@ def leave(status: int) -> None:
 
 def _interrupt(number: int, stack: object) -> None:
     """An exception only where a file needs its end: imports and libraries may swallow one."""
-    if not remains.any_unfinished():
-        remains.remove()
+    if not cleanup.any_unfinished():
+        cleanup.remove()
         signal.signal(number, signal.SIG_DFL)
         os.kill(os.getpid(), number)
     _came.set()

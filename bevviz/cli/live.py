@@ -11,7 +11,6 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from bevviz import announce
 from bevviz.cli.interrupts import terminable
 from bevviz.cli.options import (
     Commands,
@@ -25,19 +24,20 @@ from bevviz.cli.options import (
 )
 from bevviz.cli.outputs import has_display, say, warn
 from bevviz.errors import UserError
+from bevviz.support import progress
 
 if TYPE_CHECKING:
     from bevviz.config import Config
-    from bevviz.frame import Source
+    from bevviz.config.reloading import Settings
     from bevviz.live.control import Control
     from bevviz.live.notes import Notes
-    from bevviz.live.raw import RawRecorder
+    from bevviz.live.raw_recorder import RawRecorder
     from bevviz.live.replay import Replay
     from bevviz.live.runtime import Live, Status
-    from bevviz.live.settings import Settings
     from bevviz.live.source import LiveSource
-    from bevviz.results import FrameResult
-    from bevviz.stage_loader import StageLoader
+    from bevviz.model.frame import Source
+    from bevviz.model.results import FrameResult
+    from bevviz.pipeline.stage_loader import StageLoader
 
 
 def add(commands: Commands) -> None:
@@ -117,9 +117,9 @@ def _split(text: str) -> str:
 def _live(options: argparse.Namespace) -> int:
     # What Rerun would warn of is meant: files are indexed when they are complete.
     os.environ.setdefault("RUST_LOG", "warn,re_log_encoding=error")
+    from bevviz.config.reloading import Settings
     from bevviz.live.notes import Notes
-    from bevviz.live.settings import Settings
-    from bevviz.stage_loader import StageLoader
+    from bevviz.pipeline.stage_loader import StageLoader
 
     given = {
         "detector.model": options.model,
@@ -150,7 +150,7 @@ def _live(options: argparse.Namespace) -> int:
     notes = Notes(say)
     if options.synthetic:
         return _watch(_replay(options.synthetic), settings, options, notes, loader)
-    from bevviz.live.raw import RawRecorder
+    from bevviz.live.raw_recorder import RawRecorder
     from bevviz.live.source import LiveSource
 
     raw = RawRecorder(settings.config.live)
@@ -162,10 +162,10 @@ def _live(options: argparse.Namespace) -> int:
 
 def _check_outputs(options: argparse.Namespace) -> None:
     """What cannot work is said before a robot is waited for."""
-    from bevviz.frame import Scene
-    from bevviz.logging import blueprints
-    from bevviz.logging.ports import check_port, own_address
-    from bevviz.logging.sinks import check_viewer
+    from bevviz.model.frame import Scene
+    from bevviz.recording import blueprints
+    from bevviz.recording.ports import check_port, own_address
+    from bevviz.recording.sinks import check_viewer
 
     if options.serve is not None:
         own_address(options.bind)
@@ -185,10 +185,10 @@ def _watch_robot(
 ) -> int:
     """Publish back and take orders, as far as that is asked for."""
     from bevviz.live.control import Control, unasked
-    from bevviz.live.warm import warm_up
-    from bevviz.ros.diagnostics import Diagnostics
-    from bevviz.ros.orders import Orders
-    from bevviz.ros.publish import Publisher
+    from bevviz.live.diagnostics import Diagnostics
+    from bevviz.live.publish import Publisher
+    from bevviz.live.remote_requests import Orders
+    from bevviz.live.warm_up import warm_up
 
     def refuse(path: Path | None = None) -> Path:
         raise UserError(f"there is nothing to save yet; waiting: {source.missing}")
@@ -247,7 +247,7 @@ def _replay(frames: int) -> Replay:
     from bevviz.synthetic import SyntheticSource
 
     source = SyntheticSource(frames=frames)
-    drive = list(announce.bar(source, total=source.total, unit="scan", desc="simulate"))
+    drive = list(progress.bar(source, total=source.total, unit="scan", desc="simulate"))
     return Replay(drive, source.scene)
 
 
@@ -295,7 +295,7 @@ def _watch(
         suppress(KeyboardInterrupt),
         terminable(),
         _page(options, live),
-        announce.bar(unit="frame", desc=source.scene.name) as bar,
+        progress.bar(unit="frame", desc=source.scene.name) as bar,
     ):
 
         def show(status: Status) -> None:
@@ -325,8 +325,8 @@ def _page(options: argparse.Namespace, live: Live) -> AbstractContextManager[obj
     if options.workbench is None:
         return nullcontext()
     try:
-        from bevviz.workbench.live_bench import LiveBench
         from bevviz.workbench.live_page import LivePage
+        from bevviz.workbench.live_session import LiveBench
     except ImportError as error:
         raise UserError(
             f"the workbench needs further packages ({error.name}): pip install 'bevviz[workbench]'"

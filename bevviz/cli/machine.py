@@ -53,7 +53,7 @@ def give(options: argparse.Namespace, form: str, tree: Mapping[str, Any]) -> Non
         return
     import json
 
-    from bevviz.files import save
+    from bevviz.support.files import save
 
     text = json.dumps({"form": f"bevviz.{form}/1", **_plain(tree)}, indent=1, allow_nan=False)
     if on_stdout(options):

@@ -13,7 +13,7 @@ from bevviz.errors import UserError
 if TYPE_CHECKING:
     from bevviz.bags.source import BagSource
     from bevviz.config import Config, Layer, Preset
-    from bevviz.recorded import Recorded
+    from bevviz.recording.source_lookup import Recorded
 
 Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
 
@@ -271,9 +271,9 @@ def project_layers(options: argparse.Namespace) -> list[Layer]:
     """What is stated for the working directory, looked for once; for a recording, its own is taken.
 
     Raises:
-        UserError: as ``bevviz.project.layers``.
+        UserError: as ``bevviz.config.project.layers``.
     """
-    from bevviz.project import layers
+    from bevviz.config.project import layers
 
     if getattr(options, "recorded", None) is not None:
         return []
@@ -289,7 +289,7 @@ def follow_recording(options: argparse.Namespace) -> None:
     One that has none behind it is ``options.shown``, for the command that can show it as it is.
 
     Raises:
-        UserError: as ``bevviz.recorded.follow``; ``--bag`` without a recording.
+        UserError: as ``bevviz.recording.source_lookup.follow``; ``--bag`` without a recording.
     """
     if not hasattr(options, "bags") or getattr(options, "check", False):
         return
@@ -299,7 +299,7 @@ def follow_recording(options: argparse.Namespace) -> None:
             raise UserError("--bag says where the bag of a recording is: PATH has to be one .rrd file")
         return
     from bevviz.cli.outputs import say, warn
-    from bevviz.recorded import NoBagError, follow
+    from bevviz.recording.source_lookup import NoBagError, follow
 
     try:
         recorded = follow(given[0], options.bags, given_settings(options))

@@ -15,17 +15,17 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 from urllib.parse import unquote
 
-from bevviz import announce
 from bevviz.cli import style
 from bevviz.cli.interrupts import wait_for_interrupt
-from bevviz.text import printable
+from bevviz.support import progress
+from bevviz.support.text import printable
 
 if TYPE_CHECKING:
     from rerun.blueprint import Blueprint
 
     from bevviz.config import Config
-    from bevviz.frame import Scene
-    from bevviz.logging.sinks import Sinks
+    from bevviz.model.frame import Scene
+    from bevviz.recording.sinks import Sinks
 
 
 class Outputs(NamedTuple):
@@ -61,7 +61,7 @@ class Outputs(NamedTuple):
         if chosen:
             return chosen
         if has_browser():
-            from bevviz.logging.ports import free_port
+            from bevviz.recording.ports import free_port
 
             return chosen._replace(serve=free_port(9090), browser=True)
         say(f"no display: saving {default}")
@@ -70,7 +70,7 @@ class Outputs(NamedTuple):
     @contextmanager
     def opened(self, scene: Scene, config: Config) -> Iterator[Sinks]:
         """A recording that goes there; addresses are said."""
-        from bevviz.logging.sinks import open_recording
+        from bevviz.recording.sinks import open_recording
 
         with open_recording(
             scene,
@@ -92,7 +92,7 @@ class Outputs(NamedTuple):
     def keep_serving(self, sinks: Sinks, what: str = "") -> None:
         """Until the user ends it, where a server was asked for."""
         if self.serve is not None:
-            from bevviz.logging.shown import too_large_for_web
+            from bevviz.recording.saved_viewer import too_large_for_web
 
             if self.save is not None and sinks.file is not None and sinks.file.exists():
                 warn(filter(None, [too_large_for_web(self.save, sinks.file.stat().st_size)]))
@@ -108,7 +108,7 @@ def speak(*, quiet: bool) -> None:
     """Of a process that is a command: what is announced is said, unless it is to be ``quiet``."""
     global _quiet
     _quiet = quiet
-    announce.to(None if quiet else say, bars=not quiet)
+    progress.to(None if quiet else say, bars=not quiet)
 
 
 def say(line: str, *, always: bool = False) -> None:
@@ -124,7 +124,7 @@ def warn(warnings: Iterable[str]) -> None:
 
 def hint(scene: Scene, config: Config) -> None:
     """Say what would give the user more."""
-    from bevviz.stages.kernel import CACHED
+    from bevviz.support.kernel import CACHED
 
     if not CACHED:
         say(

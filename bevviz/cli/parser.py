@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import NoReturn
 
 from bevviz.cli import style
-from bevviz.text import printable
+from bevviz.support.text import printable
 
 COMMAND = "COMMAND"
 _CHOICE = re.compile(r"invalid choice: '(?P<given>.*)' \(choose from (?P<known>.*)\)$", re.DOTALL)

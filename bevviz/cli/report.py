@@ -8,7 +8,7 @@ from pathlib import Path
 from bevviz.cli.options import Commands, add_bag, add_config, add_keep, load_config
 from bevviz.cli.outputs import say, warn
 from bevviz.errors import UserError
-from bevviz.files import CONFIG_LIMIT, read_text
+from bevviz.support.files import CONFIG_LIMIT, read_text
 
 
 def add(commands: Commands) -> None:
@@ -63,7 +63,7 @@ def _report(options: argparse.Namespace) -> int:
     if options.check:
         return _check(options)
     from bevviz.bags.reader import megabytes
-    from bevviz.notes import Notes
+    from bevviz.pipeline.notes import Notes
     from bevviz.report.make import ReportRequest, make
 
     if options.at is None:

@@ -15,9 +15,9 @@ if TYPE_CHECKING:
 
     from bevviz.config import Config
     from bevviz.drive import Drive
-    from bevviz.protocols import Items, Observer, Processor
-    from bevviz.results import FrameResult
-    from bevviz.run import RunEnd
+    from bevviz.model.protocols import Items, Observer, Processor
+    from bevviz.model.results import FrameResult
+    from bevviz.pipeline.run import RunEnd
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -25,8 +25,8 @@ R = TypeVar("R")
 
 def through(items: Items[T], processor: Processor[T, R], observers: Sequence[Observer[R]]) -> RunEnd:
     """The run, with a progress bar; a signal ends it after the frame at hand."""
-    from bevviz.progress import Progress
-    from bevviz.run import run
+    from bevviz.pipeline.progress_bar import Progress
+    from bevviz.pipeline.run import run
 
     with terminable() as ended:
         return run(items, processor, [*observers, Progress()], stop=ended)
@@ -41,7 +41,7 @@ def process(drive: Drive, outputs: Outputs, default: Path) -> int:
         default: file where there is no display.
     """
     from bevviz.anomalies import AnomalySummary, FailureSummary
-    from bevviz.logging.recorder import Recorder
+    from bevviz.recording.recorder import Recorder
 
     anomalies, failures = AnomalySummary(), FailureSummary()
     session = drive.new_session()
@@ -81,7 +81,7 @@ def logged(
     Returns:
         The exit status.
     """
-    from bevviz.logging.recorder import DiskWatch
+    from bevviz.recording.recorder import DiskWatch
 
     with outputs.opened(items.scene, config) as sinks:
         seen = [*observers(sinks.recording), DiskWatch(sinks)]

@@ -45,9 +45,9 @@ def add(commands: Commands) -> None:
 def _sweep(options: argparse.Namespace) -> int:
     from bevviz.config import flattened
     from bevviz.evaluate import truth_source
+    from bevviz.pipeline.variants import common_frames
     from bevviz.sweep import Sweep, combine, parse
     from bevviz.sweep.log import layout, log_sweep
-    from bevviz.variants import common_frames
 
     parameters, constant = parse(options.set)
     model = [f"detector.model={options.model}"] if options.model else []

@@ -40,8 +40,8 @@ def add(commands: Commands) -> None:
 
 
 def _trust(options: argparse.Namespace) -> int:
-    from bevviz.project import named_code
-    from bevviz.trust import allow, revoke
+    from bevviz.config.project import named_code
+    from bevviz.config.trust import allow, revoke
 
     if options.list:
         if options.path is not None:
@@ -65,7 +65,7 @@ def _trust(options: argparse.Namespace) -> int:
 
 
 def _list() -> int:
-    from bevviz.trust import records
+    from bevviz.config.trust import records
 
     found = list(records())
     for record in found:
@@ -76,7 +76,7 @@ def _list() -> int:
 
 
 def _state(path: Path, sha256: str) -> str:
-    from bevviz.project import named_code
+    from bevviz.config.project import named_code
 
     try:
         same = named_code(path).digest() == sha256
@@ -87,7 +87,7 @@ def _state(path: Path, sha256: str) -> str:
 
 def _file(path: Path | None) -> Path:
     """The file that is meant."""
-    from bevviz.project import NAME, find
+    from bevviz.config.project import NAME, find
 
     if path is not None and not path.is_dir():
         return path

@@ -23,8 +23,8 @@ from bevviz.errors import UserError
 
 if TYPE_CHECKING:
     from bevviz.config import Layer
-    from bevviz.frame import Frame, Scene
-    from bevviz.live.settings import Settings
+    from bevviz.config.reloading import Settings
+    from bevviz.model.frame import Frame, Scene
 
 
 def add(commands: Commands) -> None:
@@ -44,10 +44,10 @@ def add(commands: Commands) -> None:
 
 def _tune(options: argparse.Namespace) -> int:
     from bevviz.config import dump, load
-    from bevviz.live.settings import Settings
-    from bevviz.logging.ports import free_port
-    from bevviz.run import Dropping, run
-    from bevviz.tune import OneFrame, Saves, Version, VersionRecorder, create
+    from bevviz.config.reloading import Settings
+    from bevviz.pipeline.run import Dropping, run
+    from bevviz.recording.ports import free_port
+    from bevviz.sweep.tune import OneFrame, Saves, Version, VersionRecorder, create
 
     given = given_settings(options)
     known: list[Layer] = []

@@ -7,7 +7,6 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
-from bevviz import announce
 from bevviz.cli.machine import add_json, give, on_stdout
 from bevviz.cli.options import (
     Commands,
@@ -20,12 +19,13 @@ from bevviz.cli.options import (
     positive,
 )
 from bevviz.cli.outputs import Outputs, say, warn
-from bevviz.closing import without_collections
 from bevviz.errors import UserError
+from bevviz.support import progress
+from bevviz.support.contexts import without_collections
 
 if TYPE_CHECKING:
-    from bevviz.frame import Scene
-    from bevviz.results import FrameResult
+    from bevviz.model.frame import Scene
+    from bevviz.model.results import FrameResult
     from bevviz.why import Answer, Questioner, Selection
 
 EXAMPLES = """examples:
@@ -113,11 +113,11 @@ def _metres(text: str) -> float:
 @without_collections()
 def _why(options: argparse.Namespace) -> int:
     from bevviz.bags.source import BagSource
-    from bevviz.session import Session
-    from bevviz.stage_loader import StageLoader
-    from bevviz.text import printable
+    from bevviz.pipeline.session import Session
+    from bevviz.pipeline.stage_loader import StageLoader
+    from bevviz.support.text import printable
     from bevviz.why import Questioner
-    from bevviz.why.text import plain
+    from bevviz.why.answer_text import plain
 
     config, selection = load_config(options), _selection(options)
     with BagSource(options.paths, config, at=options.at) as source:
@@ -171,8 +171,8 @@ def _beside(questioner: Questioner, selection: Selection, answers: Sequence[Answ
 
 def _in_short(questioner: Questioner, selection: Selection) -> str:
     """What was asked about in one line; why there is nothing to say where there is not."""
+    from bevviz.why.answer_text import summary
     from bevviz.why.sentences import not_run
-    from bevviz.why.text import summary
 
     found = questioner.ask(selection)
     if selection.one:
@@ -190,7 +190,7 @@ def _in_short(questioner: Questioner, selection: Selection) -> str:
 
 def _progress(answers: Sequence[Answer]) -> Iterable[Answer]:
 
-    yield from announce.bar(answers, unit="object", desc="what would change it", leave=False)
+    yield from progress.bar(answers, unit="object", desc="what would change it", leave=False)
 
 
 def _tree(
@@ -203,7 +203,7 @@ def _tree(
 
 
 def _show(result: FrameResult, answers: Sequence[Answer], scene: Scene, outputs: Outputs, limit: int) -> None:
-    from bevviz.logging.logger import Logger
+    from bevviz.recording.frame_logger import Logger
     from bevviz.why.log import focus, log_answers
 
     if answers and (place := focus(result.frame, answers[0])) is not None:

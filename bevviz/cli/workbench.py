@@ -9,12 +9,20 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from bevviz.cli.interrupts import terminable, wait_for_interrupt
-from bevviz.cli.options import Commands, add_at, add_bag, add_config, add_truth, load_config, port
+from bevviz.cli.options import (
+    Commands,
+    add_at,
+    add_bag,
+    add_config,
+    add_truth,
+    load_config,
+    port,
+)
 from bevviz.cli.outputs import has_display, hint, say, tell_of_browser, warn
 from bevviz.errors import UserError
 
 if TYPE_CHECKING:
-    from bevviz.workbench.bench import Bench
+    from bevviz.workbench.session import Bench
 
 EXAMPLES = """examples:
   bevviz drive.mcap                                     the same as bevviz open drive.mcap
@@ -76,7 +84,7 @@ def _open(options: argparse.Namespace) -> int:
             hint(source.scene, config)
             bench = made()
             if beside:
-                from bevviz.workbench.native import NativeViewer
+                from bevviz.workbench.native_viewer import NativeViewer
 
                 bench.native = NativeViewer((bench.film, bench.desk), bench.recording_id, options.connect)
             return bench
@@ -84,8 +92,8 @@ def _open(options: argparse.Namespace) -> int:
         def made() -> Bench:
             from bevviz.drive import Drive
             from bevviz.evaluate import truth_source
-            from bevviz.workbench.bench import Bench
-            from bevviz.workbench.labelled import Labelled
+            from bevviz.workbench.session import Bench
+            from bevviz.workbench.truth_frames import Labelled
 
             truth_of = truth_source(source.roles, options.truth, options.kitti_labels, len(source.scans))
             if truth_of is None or (options.truth is None and options.kitti_labels is None):
@@ -109,7 +117,7 @@ def _open(options: argparse.Namespace) -> int:
 
 def _show(recording: Path, options: argparse.Namespace) -> int:
     """A recording without a bag: nothing can be asked, but all of it looked at."""
-    from bevviz.logging import shown
+    from bevviz.recording import saved_viewer as shown
 
     say(f"{recording}: no bag behind it, shown as it is")
     if has_display():
@@ -126,7 +134,7 @@ def _show(recording: Path, options: argparse.Namespace) -> int:
 def _beside(options: argparse.Namespace) -> bool:
     """Whether Rerun's own viewer is shown beside the page; what stands against it is told now."""
     if options.connect is not None:
-        from bevviz.logging.sinks import check_viewer
+        from bevviz.recording.sinks import check_viewer
 
         check_viewer(options.connect)
     elif options.viewer and not has_display():

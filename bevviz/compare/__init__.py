@@ -1,1 +1,1 @@
-"""What if? Two results of the same frames: what is in one only, what has moved, what has another class."""
+"""Comparison of two results of the same frames. Imports `evaluate` and below."""

@@ -9,10 +9,10 @@ from enum import StrEnum
 
 import numpy as np
 
-from bevviz import geometry
-from bevviz.compare.truth import Judged
-from bevviz.frame import F32, F64, Boxes3D
-from bevviz.results import FrameResult
+from bevviz.compare.truth_score import Judged
+from bevviz.model import geometry
+from bevviz.model.frame import F32, F64, Boxes3D
+from bevviz.model.results import FrameResult
 from bevviz.stages.fusion import assign
 
 REACH = 2.0  # metres between the centres of one object, seen from above

@@ -7,18 +7,24 @@ from collections.abc import Iterator, Mapping, Set
 import numpy as np
 import rerun as rr
 
-from bevviz import table
-from bevviz.colors import SIDES, State
-from bevviz.compare.differences import DIFFERENT, WORST_FIRST, Change, Difference, FrameDifferences
-from bevviz.compare.truth import Judged
-from bevviz.frame import F64
-from bevviz.logging import entities
-from bevviz.logging.camera import over_image
-from bevviz.logging.pieces import OUTLINE, boxes2d, boxes3d, document, transform
-from bevviz.logging.spoken import named_in_space
-from bevviz.logging.states import StateLanes
-from bevviz.logging.writer import Writer
-from bevviz.text import markdown
+from bevviz.compare.differences import (
+    DIFFERENT,
+    WORST_FIRST,
+    Change,
+    Difference,
+    FrameDifferences,
+)
+from bevviz.compare.truth_score import Judged
+from bevviz.model.colors import SIDES, State
+from bevviz.model.frame import F64
+from bevviz.recording import entities
+from bevviz.recording.camera import over_image
+from bevviz.recording.labels import named_in_space
+from bevviz.recording.primitives import OUTLINE, boxes2d, boxes3d, document, transform
+from bevviz.recording.states import StateLanes
+from bevviz.recording.writer import Writer
+from bevviz.support import table
+from bevviz.support.text import markdown
 
 COLORS = {
     Change.SAME: SIDES["same"],

@@ -13,18 +13,18 @@ from bevviz.anomalies import FailureSummary
 from bevviz.compare.differences import FrameDifferences, differences, seen
 from bevviz.compare.log import DifferenceLogger
 from bevviz.compare.summary import ComparisonSummary
-from bevviz.compare.truth import judge
+from bevviz.compare.truth_score import judge
 from bevviz.config import Config
 from bevviz.errors import UserError
 from bevviz.evaluate import Truth
-from bevviz.frame import Camera, Frame, LabelledBoxes3D
-from bevviz.logging import entities
-from bevviz.logging.logger import Logger
-from bevviz.protocols import Items, Observer
-from bevviz.results import CameraResult, FrameResult, Objects
-from bevviz.session import Session
-from bevviz.stages.robot import detections_of, in_points_frame
-from bevviz.variants import Sessions, check_same_frames
+from bevviz.model.frame import Camera, Frame, LabelledBoxes3D
+from bevviz.model.protocols import Items, Observer
+from bevviz.model.results import CameraResult, FrameResult, Objects
+from bevviz.pipeline.session import Session
+from bevviz.pipeline.variants import Sessions, check_same_frames
+from bevviz.recording import entities
+from bevviz.recording.frame_logger import Logger
+from bevviz.stages.robot_results import detections_of, in_points_frame
 
 
 @dataclass(frozen=True, slots=True)

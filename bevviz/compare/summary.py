@@ -11,14 +11,20 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from bevviz import table
-from bevviz.compare.differences import DIFFERENT, WORST_FIRST, Change, Difference, FrameDifferences
+from bevviz.compare.differences import (
+    DIFFERENT,
+    WORST_FIRST,
+    Change,
+    Difference,
+    FrameDifferences,
+)
 from bevviz.compare.log import place
-from bevviz.compare.truth import Judged
+from bevviz.compare.truth_score import Judged
 from bevviz.config import ParameterChange
-from bevviz.files import save
-from bevviz.protocols import Observer
-from bevviz.text import fenced, printable
+from bevviz.model.protocols import Observer
+from bevviz.support import table
+from bevviz.support.files import save
+from bevviz.support.text import fenced, printable
 
 WORST = 10  # frames in the table
 EXAMPLES = 2  # of each

@@ -1,13 +1,13 @@
-"""The views of two runs that are compared, for layouts; see ``bevviz.logging.views``."""
+"""The views of two runs that are compared, for layouts; see ``bevviz.recording.views``."""
 
 from __future__ import annotations
 
 import rerun.blueprint as rrb
 
 from bevviz.compare.differences import DIFFERENT, Change
-from bevviz.frame import Scene
-from bevviz.logging import entities
-from bevviz.logging.views import HIDDEN, LINKED, birds_eye, plot, space, text_log
+from bevviz.model.frame import Scene
+from bevviz.recording import entities
+from bevviz.recording.views import HIDDEN, LINKED, birds_eye, plot, space, text_log
 
 _SIDES = {"": ("A", Change.ONLY_A), entities.B: ("B", Change.ONLY_B)}
 

@@ -5,7 +5,9 @@ computes. The tutorial's own parameter names (``cluster_tolerance`` ...) are acc
 stage is somebody else's, its parameters are those of the model beside it, under ``SECTION.params``.
 """
 
-from bevviz.config.dotted import (
+from bevviz.config.class_sizes import SIZES
+from bevviz.config.files import Layer, dump, flat_yaml, read_layer, stated_lines
+from bevviz.config.keys import (
     TUTORIAL_NAMES,
     ParameterChange,
     changes,
@@ -15,15 +17,6 @@ from bevviz.config.dotted import (
     unit_spellings,
     unknown_key,
     values,
-)
-from bevviz.config.files import Layer, dump, flat_yaml, read_layer, stated_lines
-from bevviz.config.foreign import (
-    object_files,
-    object_network,
-    params_of,
-    plugin_of,
-    stage_topics,
-    with_object_files,
 )
 from bevviz.config.loading import load, received, revised
 from bevviz.config.methods import OURS, STAGES
@@ -46,7 +39,14 @@ from bevviz.config.sections import (
     TrackingConfig,
     VoxelConfig,
 )
-from bevviz.config.sizes import SIZES
+from bevviz.config.user_stages import (
+    object_files,
+    object_network,
+    params_of,
+    plugin_of,
+    stage_topics,
+    with_object_files,
+)
 
 __all__ = [
     "OURS",

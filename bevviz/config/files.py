@@ -9,13 +9,13 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from bevviz.config.dotted import flattened, keys, unit
+from bevviz.config.keys import flattened, keys, unit
 from bevviz.config.methods import STAGES
+from bevviz.config.plugins import is_foreign
 from bevviz.config.sections import Config
+from bevviz.config.trust import RECEIVED, NamedCode, Trust, trust_in
 from bevviz.errors import UserError, first_line
-from bevviz.files import CONFIG_LIMIT, read_text
-from bevviz.plugins import is_foreign
-from bevviz.trust import RECEIVED, NamedCode, Trust, trust_in
+from bevviz.support.files import CONFIG_LIMIT, read_text
 
 MOST_DOTS = 1000  # of a line of TOML: the time that tomllib takes grows with their square
 MOST_VALUES = 1_000_000  # of a YAML file, with each alias counted as often as it is used

@@ -8,15 +8,15 @@ from typing import Any
 
 from pydantic import BaseModel, ValidationError
 
-from bevviz.config.dotted import TUTORIAL_NAMES, flattened, keys, unit, unknown_key, values
 from bevviz.config.files import Layer, read_layer, yaml_value
-from bevviz.config.foreign import names_function, params_model
+from bevviz.config.keys import TUTORIAL_NAMES, flattened, keys, unit, unknown_key, values
 from bevviz.config.methods import STAGES
+from bevviz.config.pillars import UNFIT, is_network
 from bevviz.config.sections import Config, Functions, Preset
+from bevviz.config.trust import MESSAGE, RECEIVED, USER, Trust
+from bevviz.config.user_stages import names_function, params_model
 from bevviz.errors import UserError
-from bevviz.pillar_params import UNFIT, is_network
-from bevviz.text import shown
-from bevviz.trust import MESSAGE, RECEIVED, USER, Trust
+from bevviz.support.text import shown
 
 BASE = "configuration"  # where values are stated that came as a whole
 
@@ -57,7 +57,7 @@ def load(
         settings: ``key=value`` each, of the user; what others have sent comes as ``received`` makes it.
         preset: which one; None: as the files say, else ``default``.
         base: a whole configuration that all of this is to change, or its values by dotted key.
-        layers: of the project, see ``bevviz.project``.
+        layers: of the project, see ``bevviz.config.project``.
         in_force: a configuration whose functions run already, and may go on.
 
     Raises:

@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 
 from pydantic_core import PydanticCustomError
 
-from bevviz import plugins
-from bevviz.pillar_params import is_network
+from bevviz.config import plugins
+from bevviz.config.pillars import is_network
 
 
 @dataclass(frozen=True, slots=True)

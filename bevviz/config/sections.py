@@ -17,8 +17,8 @@ from pydantic import (
 )
 from pydantic_core import PydanticCustomError
 
+from bevviz.config.class_sizes import SIZES, ClassSize, _with_known
 from bevviz.config.methods import CLUSTERING, GROUND, OBJECTS
-from bevviz.config.sizes import SIZES, ClassSize, _with_known
 from bevviz.config.units import Degrees, Megabytes, Metres, Pixels, Seconds
 
 Preset = Literal["default", "reference"]

@@ -1,8 +1,4 @@
-"""Data sets on disk, each read by a small loader class in a file of its own.
-
-A loader is a subclass of ``dataset.Dataset`` in a module of this package. It is found by scanning the
-package, takes the folders that it recognises, and gives the topics that a bag of the same drive would have.
-"""
+"""Readers of data set folders as streams of messages. Imports `sync` and below."""
 
 from __future__ import annotations
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from bevviz.frame import F32, F64, I64
+from bevviz.model.frame import F32, F64, I64
 
 MOST = 12
 BINS = 64

@@ -16,10 +16,17 @@ from numpy.typing import NDArray
 
 from bevviz.datasets.columns import are_doubles, are_whole, count_columns
 from bevviz.errors import UserError, first_line
-from bevviz.files import LFS_HINT, LFS_POINTER, SENSOR_LIMIT, TABLE_LIMIT, read_head, read_lines
-from bevviz.files import read_bytes as read_limited
-from bevviz.frame import F32, I64
-from bevviz.ros.encode import encode_compressed_image
+from bevviz.messages.encode import encode_compressed_image
+from bevviz.model.frame import F32, I64
+from bevviz.support.files import (
+    LFS_HINT,
+    LFS_POINTER,
+    SENSOR_LIMIT,
+    TABLE_LIMIT,
+    read_head,
+    read_lines,
+)
+from bevviz.support.files import read_bytes as read_limited
 
 SECOND = 1_000_000_000
 LOOKED_AT = 500_000  # bytes of a BIN file, for the number of its columns
@@ -51,7 +58,7 @@ class Stream:
         topic: as a driver would call it, so that roles are found as in a bag.
         type: ROS 2 type of its messages.
         times: (N,) stamps in nanoseconds, sorted; what is made has them in its header.
-        make: the message of a row of ``times``, from ``bevviz.ros.encode``; may raise UserError.
+        make: the message of a row of ``times``, from ``bevviz.messages.encode``; may raise UserError.
         aside: why the topic plays no role unless it is asked for; "": it plays.
         files: of clouds that may be cut, each that of a message.
     """

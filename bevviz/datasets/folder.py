@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bevviz import geometry
 from bevviz.config.files import yaml_value
 from bevviz.datasets.columns import are_whole
 from bevviz.datasets.dataset import (
@@ -34,9 +33,17 @@ from bevviz.datasets.dataset import (
 from bevviz.datasets.pcd import read_pcd
 from bevviz.datasets.ply import read_ply
 from bevviz.datasets.stamps import sensors_of, stamps_in, told_by
-from bevviz.datasets.unread import unread
+from bevviz.datasets.unread_files import unread
 from bevviz.errors import UserError, first_line
-from bevviz.files import (
+from bevviz.messages.encode import (
+    POINT_FIELD,
+    encode_intrinsics,
+    encode_points,
+    encode_transforms,
+)
+from bevviz.model import geometry
+from bevviz.model.frame import F64, I64, Intrinsics
+from bevviz.support.files import (
     CONFIG_LIMIT,
     LFS_HINT,
     SENSOR_LIMIT,
@@ -45,13 +52,6 @@ from bevviz.files import (
     read_head,
     read_lines,
     read_text,
-)
-from bevviz.frame import F64, I64, Intrinsics
-from bevviz.ros.encode import (
-    POINT_FIELD,
-    encode_intrinsics,
-    encode_points,
-    encode_transforms,
 )
 
 MOST_COLUMNS = 64  # of an NPY file; a grid of heights has more, and so has a table the other way round

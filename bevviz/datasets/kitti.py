@@ -8,18 +8,18 @@ from typing import Any
 
 import numpy as np
 
-from bevviz import geometry
 from bevviz.datasets.dataset import Stream, files_in, read_points
 from bevviz.errors import UserError
-from bevviz.files import read_text
-from bevviz.frame import F64, I64, Boxes3D, ImageLabels, Intrinsics, LabelledBoxes3D
-from bevviz.ros.encode import (
+from bevviz.messages.encode import (
     encode_intrinsics,
     encode_labels,
     encode_points,
     encode_transforms,
 )
-from bevviz.ros.objects import LARGEST
+from bevviz.messages.foreign_boxes import LARGEST
+from bevviz.model import geometry
+from bevviz.model.frame import F64, I64, Boxes3D, ImageLabels, Intrinsics, LabelledBoxes3D
+from bevviz.support.files import read_text
 
 LIDAR, IMU, MAP = "velodyne", "imu_link", "map"
 CLOUDS = "/velodyne_points"

@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 
-from bevviz import geometry
 from bevviz.datasets.dataset import BOXES, IMAGES, SECOND, Dataset, Stream, files_in, pictures
 from bevviz.datasets.kitti import (
     LIDAR,
@@ -21,8 +20,9 @@ from bevviz.datasets.kitti import (
     truth,
 )
 from bevviz.errors import UserError
-from bevviz.frame import Intrinsics
-from bevviz.ros.encode import encode_intrinsics, encode_transforms
+from bevviz.messages.encode import encode_intrinsics, encode_transforms
+from bevviz.model import geometry
+from bevviz.model.frame import Intrinsics
 
 CAMERA = "image_2"
 APART = 100 * SECOND  # of single frames: nothing in one is in the next

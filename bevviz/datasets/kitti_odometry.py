@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 
-from bevviz import geometry
 from bevviz.datasets.dataset import (
     IMAGES,
     SECOND,
@@ -32,8 +31,9 @@ from bevviz.datasets.kitti import (
     truth,
 )
 from bevviz.errors import UserError
-from bevviz.frame import F64, I64, Boxes3D, LabelledBoxes3D
-from bevviz.ros.encode import encode_points
+from bevviz.messages.encode import encode_points
+from bevviz.model import geometry
+from bevviz.model.frame import F64, I64, Boxes3D, LabelledBoxes3D
 
 RATE = 10.0  # Hz, where there is no times.txt
 # Numbers of its labels that are objects; from 252 on the moving ones.

@@ -10,7 +10,6 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from bevviz import geometry
 from bevviz.datasets.dataset import IMAGES, Dataset, Stream, files_in, pictures, read_table
 from bevviz.datasets.kitti import (
     IMU,
@@ -24,10 +23,11 @@ from bevviz.datasets.kitti import (
     split_projection,
     truth,
 )
-from bevviz.datasets.names import KITTI
 from bevviz.errors import UserError
-from bevviz.files import read_text
-from bevviz.frame import F64, I64, Boxes3D, LabelledBoxes3D
+from bevviz.model import geometry
+from bevviz.model.class_names import KITTI
+from bevviz.model.frame import F64, I64, Boxes3D, LabelledBoxes3D
+from bevviz.support.files import read_text
 
 CAMERAS = {
     "image_02": "",

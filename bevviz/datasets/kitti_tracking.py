@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections import defaultdict
 from pathlib import Path
 
-from bevviz import geometry
 from bevviz.datasets.dataset import (
     BOXES,
     IMAGES,
@@ -29,7 +28,8 @@ from bevviz.datasets.kitti import (
     truth,
 )
 from bevviz.errors import UserError
-from bevviz.files import read_text
+from bevviz.model import geometry
+from bevviz.support.files import read_text
 
 RATE = 10.0  # Hz; the benchmark has no stamps
 CAMERAS = {"image_02": "", "image_03": "the right eye of a stereo pair"}

@@ -14,19 +14,20 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bevviz import announce, geometry
 from bevviz.datasets.dataset import Dataset, Stream, pictures
 from bevviz.datasets.folder import read_cloud
-from bevviz.datasets.names import CATEGORIES, NOT_DETECTED
 from bevviz.errors import UserError, first_line
-from bevviz.files import open_regular
-from bevviz.frame import F64, I64, Boxes3D, Intrinsics
-from bevviz.ros.encode import (
+from bevviz.messages.encode import (
     encode_intrinsics,
     encode_labels,
     encode_points,
     encode_transforms,
 )
+from bevviz.model import geometry
+from bevviz.model.class_names import CATEGORIES, NOT_DETECTED
+from bevviz.model.frame import F64, I64, Boxes3D, Intrinsics
+from bevviz.support import progress
+from bevviz.support.files import open_regular
 
 MAP, BASE = "map", "base_link"
 TABLES = "sample_data.json"
@@ -139,7 +140,7 @@ class NuScenes(Dataset):
             lidars = {r["token"] for r in records(tables / "sensor.json") if r["modality"] == "lidar"}
             mounted = _by_token(tables, "calibrated_sensor", lambda r, of=lidars: r["sensor_token"] in of)
             scene_of = {row["token"]: row["scene_token"] for row in records(tables / "sample.json")}
-            for row in announce.bar(
+            for row in progress.bar(
                 records(tables / "sample_data.json"), desc=f"files of {tables.name}", unit="row", delay=1
             ):
                 scene = scene_of.get(row["sample_token"], "")

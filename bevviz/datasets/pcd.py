@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bevviz.errors import first_line
-from bevviz.files import SENSOR_LIMIT, read_bytes
-from bevviz.ros.clouds import MOST_POINTS
+from bevviz.messages.clouds import MOST_POINTS
+from bevviz.support.files import SENSOR_LIMIT, read_bytes
 
 MOST_LINES = 50  # of a header
 MOST_BYTES = 1 << 30

@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from bevviz.files import SENSOR_LIMIT, read_bytes
-from bevviz.ros.clouds import MOST_POINTS
+from bevviz.messages.clouds import MOST_POINTS
+from bevviz.support.files import SENSOR_LIMIT, read_bytes
 
 MOST_HEADER = 1 << 16  # bytes
 TYPES = {

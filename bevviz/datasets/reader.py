@@ -10,8 +10,8 @@ from rosbags.interfaces import Connection, ConnectionExtRosbag2, MessageDefiniti
 
 from bevviz.datasets.dataset import NOT_AS_DOCUMENTED, Dataset, describe
 from bevviz.errors import UserError
-from bevviz.frame import I64
-from bevviz.ros.encode import typestore
+from bevviz.messages.encode import typestore
+from bevviz.model.frame import I64
 
 
 class DatasetReader:

@@ -1,7 +1,15 @@
-"""How right the results are, where it is known what is really there."""
+"""Evaluation against ground truth. Imports `pipeline` and below."""
 
-from bevviz.evaluate.score import Matches, Score, judge, match, pair_in_order
-from bevviz.evaluate.truth import MAX_DISTANCE, MIN_HITS, RANGE, Truth, truth_in, truth_of, truth_source
+from bevviz.evaluate.ground_truth import (
+    MAX_DISTANCE,
+    MIN_HITS,
+    RANGE,
+    Truth,
+    truth_in,
+    truth_of,
+    truth_source,
+)
+from bevviz.evaluate.matching import Matches, Score, judge, match, pair_in_order
 
 __all__ = [
     "MAX_DISTANCE",

@@ -6,11 +6,11 @@ from collections import Counter, defaultdict
 
 import numpy as np
 
-from bevviz import geometry
-from bevviz.evaluate.score import Classes, accepts, pair_in_order
-from bevviz.evaluate.truth import Truth
-from bevviz.frame import F32, Bool
-from bevviz.results import CameraResult
+from bevviz.evaluate.ground_truth import Truth
+from bevviz.evaluate.matching import Classes, accepts, pair_in_order
+from bevviz.model import geometry
+from bevviz.model.frame import F32, Bool
+from bevviz.model.results import CameraResult
 
 DETECTION_OVERLAP = 0.5  # least IoU in the image of a detection and what it is
 

@@ -10,16 +10,16 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from bevviz.evaluate.average_precision import AveragePrecision, found_objects
 from bevviz.evaluate.detections import DetectionScore
-from bevviz.evaluate.ground import count_ground
-from bevviz.evaluate.identity import TrackScore
-from bevviz.evaluate.names import base_of, ranges
-from bevviz.evaluate.precision import AveragePrecision, found_objects
-from bevviz.evaluate.score import Matches, Score, share
-from bevviz.evaluate.truth import Truth, Truths
-from bevviz.frame import Boxes3D, Frame
-from bevviz.protocols import Observer
-from bevviz.results import FrameResult, Objects
+from bevviz.evaluate.ground_score import count_ground
+from bevviz.evaluate.ground_truth import Truth, Truths
+from bevviz.evaluate.matching import Matches, Score, share
+from bevviz.evaluate.metric_names import base_of, ranges
+from bevviz.evaluate.tracking_score import TrackScore
+from bevviz.model.frame import Boxes3D, Frame
+from bevviz.model.protocols import Observer
+from bevviz.model.results import FrameResult, Objects
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -216,7 +216,7 @@ class Evaluation(Observer[FrameResult]):
 
     def to_pandas(self) -> DataFrame:
         """A row for each metric: its name, class, range and value."""
-        from bevviz.frame import data_frame
+        from bevviz.model.frame import data_frame
 
         rows = []
         for name, value in self.metrics.items():

@@ -11,7 +11,7 @@ from typing import Literal
 from xml.etree import ElementTree
 
 from bevviz.errors import UserError
-from bevviz.evaluate.names import METRICS, base_of
+from bevviz.evaluate.metric_names import METRICS, base_of
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,18 +8,18 @@ from typing import TypeAlias
 import numpy as np
 import rerun as rr
 
-from bevviz.colors import TRUTH
 from bevviz.evaluate.evaluation import Evaluation
+from bevviz.evaluate.ground_truth import Truth
 from bevviz.evaluate.tables import page
-from bevviz.evaluate.truth import Truth
-from bevviz.frame import Boxes3D
-from bevviz.logging import entities
-from bevviz.logging.pieces import boxes3d, document, transform
-from bevviz.logging.spoken import log_spoken, log_spoken_looks, named_in_space
-from bevviz.logging.writer import WAIT, Writer
-from bevviz.protocols import Items, Observer
-from bevviz.results import FrameResult
-from bevviz.text import markdown
+from bevviz.model.colors import TRUTH
+from bevviz.model.frame import Boxes3D
+from bevviz.model.protocols import Items, Observer
+from bevviz.model.results import FrameResult
+from bevviz.recording import entities
+from bevviz.recording.labels import log_spoken, log_spoken_looks, named_in_space
+from bevviz.recording.primitives import boxes3d, document, transform
+from bevviz.recording.writer import WAIT, Writer
+from bevviz.support.text import markdown
 
 # What became of them, boxes, the rows of these that are meant, and the names of all.
 Judged: TypeAlias = tuple[str, Boxes3D, Sequence[int], Sequence[str]]

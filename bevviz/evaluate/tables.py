@@ -6,11 +6,11 @@ import math
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import TYPE_CHECKING
 
-from bevviz import table
-from bevviz.evaluate.identity import HINT
-from bevviz.evaluate.names import base_of, ranges
-from bevviz.evaluate.precision import OVERLAPS, RECALL_POINTS, VIEWS
-from bevviz.text import printable
+from bevviz.evaluate.average_precision import OVERLAPS, RECALL_POINTS, VIEWS
+from bevviz.evaluate.metric_names import base_of, ranges
+from bevviz.evaluate.tracking_score import HINT
+from bevviz.support import table
+from bevviz.support.text import printable
 
 if TYPE_CHECKING:
     from bevviz.evaluate.evaluation import Evaluation

@@ -1,1 +1,1 @@
-"""``bevviz export``: a drive in the form of a data set, with what was found as labels to begin with."""
+"""Export of a drive as a data set. Imports `pipeline` and below."""

@@ -11,9 +11,9 @@ import cv2
 import numpy as np
 
 from bevviz.errors import UserError
-from bevviz.frame import U8, Intrinsics
-from bevviz.protocols import Items, Observer
-from bevviz.results import FrameResult
+from bevviz.model.frame import U8, Intrinsics
+from bevviz.model.protocols import Items, Observer
+from bevviz.model.results import FrameResult
 
 
 class FolderExport(Observer[FrameResult]):

@@ -7,10 +7,10 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
-from bevviz import geometry
 from bevviz.export.folder import FolderExport, rectified
-from bevviz.frame import F32, F64, U8, Camera, Intrinsics
-from bevviz.results import FrameResult, Objects
+from bevviz.model import geometry
+from bevviz.model.frame import F32, F64, U8, Camera, Intrinsics
+from bevviz.model.results import FrameResult, Objects
 
 KINDS = {  # of a detector, as KITTI calls them; what is not here is Misc
     "car": "Car",

@@ -14,11 +14,11 @@ from typing import Any
 import cv2
 import numpy as np
 
-from bevviz import geometry
 from bevviz.export.folder import FolderExport, rectified
-from bevviz.frame import F32, F64, Camera, Frame
-from bevviz.protocols import Items
-from bevviz.results import FrameResult, Objects, Tracks
+from bevviz.model import geometry
+from bevviz.model.frame import F32, F64, Camera, Frame
+from bevviz.model.protocols import Items
+from bevviz.model.results import FrameResult, Objects, Tracks
 
 VERSION = "v1.0-bevviz"
 TABLES = (

@@ -1,1 +1,1 @@
-"""Beside a running robot: receiving, stages and logging decoupled, outputs that cannot stop each other."""
+"""Live runs beside a robot, and everything that imports rclpy. Imports `compare` and below."""

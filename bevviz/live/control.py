@@ -14,9 +14,9 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import BinaryIO
 
-from bevviz.closing import Closing
 from bevviz.errors import UserError
-from bevviz.files import check_owned
+from bevviz.support.contexts import Closing
+from bevviz.support.files import check_owned
 
 ANSWER = 5.0  # seconds until a process that is well has said that it heard
 PATIENCE = 120.0  # seconds that saving may take

@@ -15,16 +15,16 @@ from types import MappingProxyType
 import rerun as rr
 import rerun.blueprint as rrb
 
-from bevviz.closing import Closing
 from bevviz.compare.log import DifferenceLogger
 from bevviz.config import Config
-from bevviz.frame import LateResult, Scene
-from bevviz.live.against import AgainstRobot, Compared
+from bevviz.live.robot_comparison import AgainstRobot, Compared
 from bevviz.live.thinning import is_cloud, thin_cloud
-from bevviz.logging import blueprints
-from bevviz.logging.logger import Context, Logger
-from bevviz.logging.sinks import APPLICATION
-from bevviz.results import FrameResult
+from bevviz.model.frame import LateResult, Scene
+from bevviz.model.results import FrameResult
+from bevviz.recording import blueprints
+from bevviz.recording.frame_logger import Context, Logger
+from bevviz.recording.sinks import APPLICATION
+from bevviz.support.contexts import Closing
 
 WHOLE = 1.0  # seconds from one frame that needs none before it to the next
 

@@ -14,11 +14,11 @@ from pathlib import Path
 from bevviz.bags.mcap_writer import complete
 from bevviz.config import LiveConfig
 from bevviz.errors import UserError
-from bevviz.files import create, is_locked, lock, rename_new, write_all
 from bevviz.live.encoder import Encoder, Packet
 from bevviz.live.notes import Notes
 from bevviz.live.output import Output
-from bevviz.logging import rerun_cli
+from bevviz.recording import rerun_cli
+from bevviz.support.files import create, is_locked, lock, rename_new, write_all
 
 MEGABYTE = 1_000_000
 INDEX = ".bevviz-index-"  # and eight digits: how a file ends while its index is made

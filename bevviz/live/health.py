@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from bevviz.logging import entities
+from bevviz.recording import entities
 
 RECENT = 100  # frames that percentiles are taken over
 SAMPLE = 1.0  # seconds between two looks at CPU and memory

@@ -6,7 +6,7 @@ import threading
 from abc import ABC, abstractmethod
 
 from bevviz.live.encoder import Packet
-from bevviz.queues import NewestQueue
+from bevviz.support.queues import NewestQueue
 
 
 class Output(ABC):

@@ -7,7 +7,7 @@ import time
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
-from bevviz.frame import Frame, Scene
+from bevviz.model.frame import Frame, Scene
 
 
 class Replay:

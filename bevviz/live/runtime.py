@@ -13,30 +13,36 @@ from pathlib import Path
 from typing import Any
 
 from bevviz.config import Config
+from bevviz.config.reloading import AT_START, Settings
 from bevviz.errors import UserError
-from bevviz.frame import Around, Frame, Scene, Source
-from bevviz.live.against import AgainstRobot
 from bevviz.live.control import Control
 from bevviz.live.encoder import WHOLE, Encoder, Packet
-from bevviz.live.files import Indexer, Saver, check_name, complete_leftovers, unused_names
-from bevviz.live.flight import FlightRecorder
+from bevviz.live.files import (
+    Indexer,
+    Saver,
+    check_name,
+    complete_leftovers,
+    unused_names,
+)
+from bevviz.live.flight_recorder import FlightRecorder
 from bevviz.live.health import Health, set_nice
 from bevviz.live.notes import Notes
 from bevviz.live.output import Output
-from bevviz.live.raw import RawRecorder
-from bevviz.live.rawsaver import RawSaver
-from bevviz.live.settings import AT_START, Settings
+from bevviz.live.raw_recorder import RawRecorder
+from bevviz.live.raw_saver import RawSaver
+from bevviz.live.robot_comparison import AgainstRobot
 from bevviz.live.snapshots import Snapshots
 from bevviz.live.thinning import Thinned
 from bevviz.live.triggers import Triggers
 from bevviz.live.viewers import LATE, Viewer, remote, server, window
-from bevviz.live.warm import warm_up
-from bevviz.logging import entities
-from bevviz.protocols import Items, Observer
-from bevviz.results import FrameResult
-from bevviz.run import Dropping, run
-from bevviz.session import Session
-from bevviz.stage_loader import StageLoader
+from bevviz.live.warm_up import warm_up
+from bevviz.model.frame import Around, Frame, Scene, Source
+from bevviz.model.protocols import Items, Observer
+from bevviz.model.results import FrameResult
+from bevviz.pipeline.run import Dropping, run
+from bevviz.pipeline.session import Session
+from bevviz.pipeline.stage_loader import StageLoader
+from bevviz.recording import entities
 
 BEHIND = 3.0  # seconds that a viewer lags when it is told
 LOOK = 1.0  # seconds between two looks at the configuration file and the clock

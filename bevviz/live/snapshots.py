@@ -6,14 +6,14 @@ import threading
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
-from bevviz.closing import Closing
 from bevviz.errors import UserError
 from bevviz.live.encoder import Packet
-from bevviz.live.flight import FlightRecorder
+from bevviz.live.flight_recorder import FlightRecorder
 from bevviz.live.health import give_way
 from bevviz.live.notes import Notes
-from bevviz.live.raw import RawMessage, RawRecorder, write_bag
-from bevviz.logging import entities
+from bevviz.live.raw_recorder import RawMessage, RawRecorder, write_bag
+from bevviz.recording import entities
+from bevviz.support.contexts import Closing
 
 
 class Snapshots(Closing):

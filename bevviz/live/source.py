@@ -10,34 +10,41 @@ from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
-from bevviz.closing import Closing
 from bevviz.config import Config, SourceConfig, stage_topics
+from bevviz.drivers import ouster
+from bevviz.drivers.livox import is_livox
+from bevviz.drivers.packets import is_packets
+from bevviz.drivers.point_cloud_interfaces import COMPRESSED
 from bevviz.errors import UserError
-from bevviz.frame import Frame, Intrinsics, LateResult, Mark, Scene
-from bevviz.live.message import LiveMessage
-from bevviz.live.ousters import Ousters
-from bevviz.live.raw import RawRecorder
-from bevviz.live.rawtopics import RawTopics
-from bevviz.live.stated import resolved, stated_topics, without_absent
-from bevviz.live.watch import SILENCE, Watch
-from bevviz.queues import NewestQueue
-from bevviz.ros import around, ouster
-from bevviz.ros.definitions import store_of
-from bevviz.ros.graph import PublishedTopic, full_name, matched_qos, mismatches, published_topics
-from bevviz.ros.guard import guard
-from bevviz.ros.livox import is_livox
-from bevviz.ros.node import Node
-from bevviz.ros.objects import holds_boxes
-from bevviz.ros.packets import is_packets
-from bevviz.ros.point_cloud_interfaces import COMPRESSED
-from bevviz.ros.roles import MARK, Roles, find_roles
-from bevviz.ros.topics import Topic, foreign
-from bevviz.ros.type_sources import TypeSources
-from bevviz.ros.typesupport import message_type
-from bevviz.run import BURST
-from bevviz.sync.around import MARKS
+from bevviz.live.arrival_watch import SILENCE, Watch
+from bevviz.live.graph import (
+    PublishedTopic,
+    full_name,
+    matched_qos,
+    mismatches,
+    published_topics,
+)
+from bevviz.live.live_message import LiveMessage
+from bevviz.live.node import Node
+from bevviz.live.ouster_sensors import Ousters
+from bevviz.live.raw_recorder import RawRecorder
+from bevviz.live.raw_topics import RawTopics
+from bevviz.live.stated_topics import resolved, stated_topics, without_absent
+from bevviz.live.type_sources import TypeSources
+from bevviz.live.typesupport import message_type
+from bevviz.messages import surroundings
+from bevviz.messages.definitions import store_of
+from bevviz.messages.foreign_boxes import holds_boxes
+from bevviz.messages.guard import guard
+from bevviz.messages.roles import MARK, Roles, find_roles
+from bevviz.messages.topics import Topic, foreign
+from bevviz.model.frame import Frame, Intrinsics, LateResult, Mark, Scene
+from bevviz.pipeline.run import BURST
+from bevviz.support.contexts import Closing
+from bevviz.support.queues import NewestQueue
 from bevviz.sync.feed import Handler, make_around_handlers, make_handlers
 from bevviz.sync.report import blindness
+from bevviz.sync.surroundings import MARKS
 from bevviz.sync.synchronizer import OVERTAKEN, Synchronizer
 
 LOOK = 0.5  # seconds between two looks at the graph
@@ -59,7 +66,7 @@ KINDS = {
     "sensor_msgs/msg/Imu",
     "vision_msgs/msg/Detection2DArray",
     "vision_msgs/msg/Detection3DArray",
-    *around.TYPES,
+    *surroundings.TYPES,
 }
 
 
@@ -466,7 +473,7 @@ class LiveSource(Closing):
         return self._ousters.look(found, stated.lidar_calibration)
 
     def _add_metadata(self, message: LiveMessage) -> None:
-        text = guard(message, around.decode_mark, message.decode())
+        text = guard(message, surroundings.decode_mark, message.decode())
         if self._ousters.add_metadata(message.topic, text):
             self._watch.tell(f"the metadata on {message.topic} have changed")
         self._assign()

@@ -11,8 +11,8 @@ import pyarrow as pa
 import rerun as rr
 
 from bevviz.config import Config
-from bevviz.frame import I64, Frame, LateResult, Mark, Scene, Source
-from bevviz.logging.color_by import ColoredPoints
+from bevviz.model.frame import I64, Frame, LateResult, Mark, Scene, Source
+from bevviz.recording.color_by import ColoredPoints
 
 
 class Thinned:

@@ -7,7 +7,7 @@ import time
 
 from bevviz.anomalies import Onsets
 from bevviz.config import LiveConfig
-from bevviz.results import FrameResult
+from bevviz.model.results import FrameResult
 
 
 class Triggers:

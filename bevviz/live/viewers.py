@@ -11,9 +11,9 @@ from dataclasses import dataclass
 from bevviz.live.encoder import Encoder, Packet
 from bevviz.live.notes import Notes
 from bevviz.live.output import Output
-from bevviz.logging import rerun_cli
-from bevviz.logging.logger import Context
-from bevviz.logging.ports import (
+from bevviz.recording import rerun_cli
+from bevviz.recording.frame_logger import Context
+from bevviz.recording.ports import (
     FIRST_DATA_PORT,
     LOOPBACK,
     answers,
@@ -24,7 +24,7 @@ from bevviz.logging.ports import (
     own_address,
     viewer_address,
 )
-from bevviz.logging.sinks import check_viewer
+from bevviz.recording.sinks import check_viewer
 
 RETRY = 3.0  # seconds until a viewer that is gone is tried again
 LATE = 1.0  # seconds behind from which on nothing old is sent
@@ -75,7 +75,7 @@ def remote(url: str, recording_id: str) -> Program:
         UserError: no such URL, or no viewer answers there.
     """
     host, port = check_viewer(url)
-    command = [sys.executable, "-P", "-m", "bevviz.live.relay", url, recording_id]
+    command = [sys.executable, "-P", "-m", "bevviz.live.viewer_relay", url, recording_id]
     return Program("remote", command, framed=True, is_ready=lambda: answers(host, port))
 
 

@@ -1,1 +1,1 @@
-"""A report that stands on its own: a window of a bag, what came of it, and the proof that it does again."""
+"""Bug reports: a window of a bag, its results, and their check. Imports `pipeline` and below."""

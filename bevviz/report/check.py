@@ -15,13 +15,16 @@ from rerun.chunk import RrdReader
 
 from bevviz.config import Config, Layer, changes, flat_yaml, load, object_files
 from bevviz.errors import UserError
-from bevviz.files import Scratch
-from bevviz.logging import entities
-from bevviz.logging.reading import check_decodes, readable
-from bevviz.progress import Progress
-from bevviz.protocols import Observer
-from bevviz.provenance import differences, file_hash, model_path, provenance
-from bevviz.report.digest import (
+from bevviz.model.protocols import Observer
+from bevviz.model.results import FrameResult
+from bevviz.pipeline.progress_bar import Progress
+from bevviz.pipeline.run import run
+from bevviz.pipeline.session import Session
+from bevviz.recording import entities
+from bevviz.recording.decoding import check_decodes, readable
+from bevviz.recording.provenance import differences, file_hash, model_path, provenance
+from bevviz.report.bag_window import open_window
+from bevviz.report.fingerprints import (
     ROUNDING,
     DigestDifference,
     StageDigest,
@@ -31,13 +34,10 @@ from bevviz.report.digest import (
     unpack,
 )
 from bevviz.report.make import replay
-from bevviz.report.origin import ReportInfo
+from bevviz.report.report_info import ReportInfo
 from bevviz.report.seal import check_seal
-from bevviz.report.window import open_window
-from bevviz.results import FrameResult
-from bevviz.run import run
-from bevviz.session import Session
 from bevviz.stages.detector import DEMO_MODEL
+from bevviz.support.files import Scratch
 
 UNREADABLE = "cannot be read as a report"
 

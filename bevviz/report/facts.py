@@ -12,10 +12,10 @@ from pathlib import Path
 
 from bevviz.bags.source import SECOND, iso
 from bevviz.config import Config, ParameterChange, changes, load
-from bevviz.provenance import Dependency
-from bevviz.report.window import Window
-from bevviz.text import fenced, markdown
-from bevviz.version import __version__
+from bevviz.recording.provenance import Dependency
+from bevviz.report.bag_window import Window
+from bevviz.support.text import fenced, markdown
+from bevviz.support.version import __version__
 
 TRACEBACKS = 5  # that are told
 _FOLDERS = re.compile(r'(?<=File ").*?([^/\\"]+[/\\][^/\\"]+)(?=")')

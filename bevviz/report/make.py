@@ -14,31 +14,32 @@ from typing import TYPE_CHECKING
 
 import rerun as rr
 
-from bevviz import announce, remains
 from bevviz.bags.message import RawMessage
 from bevviz.bags.reader import megabytes
 from bevviz.bags.source import MARGIN, SECOND, BagSource
 from bevviz.config import Config, changes, load
 from bevviz.errors import UserError
-from bevviz.files import claim, save
-from bevviz.files import written as write_beside
-from bevviz.frame import Camera, Frame
-from bevviz.logging import entities
-from bevviz.logging.pieces import document
-from bevviz.logging.recorder import DiskWatch, Recorder
-from bevviz.logging.sinks import open_recording
-from bevviz.notes import Note
-from bevviz.progress import Progress
-from bevviz.protocols import Observer
-from bevviz.provenance import Provenance, file_hash, model_path, names_path, provenance, versions
-from bevviz.recorded import Origin
-from bevviz.report.digest import digest, pack
-from bevviz.report.facts import Asked, Facts, commands, file_lines, traceback_texts, window_text
-from bevviz.report.origin import ReportInfo, shareable
-from bevviz.report.page import page
-from bevviz.report.redact import Redactor
-from bevviz.report.summary import WindowSummary
-from bevviz.report.window import (
+from bevviz.model.frame import Camera, Frame
+from bevviz.model.protocols import Observer
+from bevviz.model.results import Detections, FrameResult
+from bevviz.pipeline.notes import Note
+from bevviz.pipeline.progress_bar import Progress
+from bevviz.pipeline.run import run
+from bevviz.pipeline.session import Session
+from bevviz.recording import entities
+from bevviz.recording.primitives import document
+from bevviz.recording.provenance import (
+    Provenance,
+    file_hash,
+    model_path,
+    names_path,
+    provenance,
+    versions,
+)
+from bevviz.recording.recorder import DiskWatch, Recorder
+from bevviz.recording.sinks import open_recording
+from bevviz.recording.source_lookup import Origin
+from bevviz.report.bag_window import (
     Cut,
     Edited,
     Window,
@@ -49,10 +50,23 @@ from bevviz.report.window import (
     fits,
     open_window,
 )
-from bevviz.results import Detections, FrameResult
-from bevviz.run import run
-from bevviz.session import Session
+from bevviz.report.facts import (
+    Asked,
+    Facts,
+    commands,
+    file_lines,
+    traceback_texts,
+    window_text,
+)
+from bevviz.report.fingerprints import digest, pack
+from bevviz.report.page import page
+from bevviz.report.redact import Redactor
+from bevviz.report.report_info import ReportInfo, shareable
+from bevviz.report.summary import WindowSummary
 from bevviz.stages.detector import Detector
+from bevviz.support import cleanup, progress
+from bevviz.support.files import claim, save
+from bevviz.support.files import written as write_beside
 
 if TYPE_CHECKING:
     from bevviz.why import Answer
@@ -142,8 +156,8 @@ def make(
         detect = None if found is None else replay(found)
         session = Session(request.config, detect)
         part = _cut(whole, window, topics, bag, redactor)
-        remains.remember(bag, partial(bag.unlink, missing_ok=True))  # alone it is no report
-        stack.callback(remains.forget, bag)
+        cleanup.remember(bag, partial(bag.unlink, missing_ok=True))  # alone it is no report
+        stack.callback(cleanup.forget, bag)
         written.files.append(bag)
         written.warnings += [*whole.recording.warnings, *part.left_out, *(redactor.notes if redactor else ())]
         if model is not None:
@@ -160,7 +174,7 @@ def make(
         sinks = stack.enter_context(
             open_recording(scene, public, save=rrd, blueprint="bug_report", origin=origin)
         )
-        remains.forget(bag)
+        cleanup.forget(bag)
         recording = sinks.recording
         written.files.insert(0, rrd)
         summary = WindowSummary(window.at, source.total, len(whole.scene.cameras))
@@ -271,7 +285,7 @@ def _cut(
     low, high = window.low - MARGIN, window.high + MARGIN
     times = [source.recording.times(name) for name in topics]
     total = sum(int(((t >= low) & (t < high)).sum()) for t in times)
-    with announce.bar(total=total, unit="message", desc="cut") as bar:
+    with progress.bar(total=total, unit="message", desc="cut") as bar:
 
         def edit(message: RawMessage, data: bytes | memoryview) -> Edited:
             bar.update()

@@ -7,13 +7,13 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 from bevviz.bags.source import SECOND
-from bevviz.html import render
-from bevviz.logging import entities
+from bevviz.model.results import Explanation, FrameResult
+from bevviz.recording import entities
 from bevviz.report.facts import Facts
 from bevviz.report.pictures import camera_picture, jpeg, shrink
 from bevviz.report.plots import Plot, Series, plot
 from bevviz.report.summary import WindowSummary
-from bevviz.results import Explanation, FrameResult
+from bevviz.support.html import render
 
 PICTURE_WIDTH = 960
 COMMON = 5  # problems that are listed

@@ -5,10 +5,10 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from bevviz.colors import bins, class_color, turbo
-from bevviz.frame import U8, Bool
-from bevviz.logging.entities import DEPTH_BINS, DEPTH_RANGE
-from bevviz.results import Bev, CameraResult, Decision
+from bevviz.model.colors import bins, class_color, turbo
+from bevviz.model.frame import U8, Bool
+from bevviz.model.results import Bev, CameraResult, Decision
+from bevviz.recording.entities import DEPTH_BINS, DEPTH_RANGE
 
 
 def camera_picture(

@@ -13,13 +13,20 @@ import cv2
 import numpy as np
 from rosbags.interfaces import ConnectionExtRosbag2, MessageDefinition, MessageDefinitionFormat
 
+from bevviz.bags.bag import Recording
 from bevviz.bags.message import RawMessage
 from bevviz.bags.reader import normalized
-from bevviz.bags.recording import Recording
 from bevviz.config import DetectorConfig
+from bevviz.drivers.video import decode_packet
 from bevviz.errors import UserError
-from bevviz.frame import F32, U8
-from bevviz.report.contents import (
+from bevviz.messages.decoding import MessageError
+from bevviz.messages.encode import encode_compressed_image, typestore
+from bevviz.messages.foxglove import short_of
+from bevviz.messages.guard import guard
+from bevviz.messages.images import decode_compressed_image, decode_image
+from bevviz.model.frame import F32, U8
+from bevviz.report.bag_window import Edited
+from bevviz.report.image_fields import (
     CLOUD,
     COMPRESSED,
     IMAGE,
@@ -29,13 +36,6 @@ from bevviz.report.contents import (
     is_coloured,
     is_known,
 )
-from bevviz.report.window import Edited
-from bevviz.ros.encode import encode_compressed_image, typestore
-from bevviz.ros.foxglove import short_of
-from bevviz.ros.guard import guard
-from bevviz.ros.images import decode_compressed_image, decode_image
-from bevviz.ros.messages import MessageError
-from bevviz.ros.video import decode_packet
 from bevviz.stages.detector import MAX_CANDIDATES, Detector
 from bevviz.sync.video import Video
 

@@ -6,7 +6,7 @@ import re
 from pathlib import Path
 
 from bevviz.errors import UserError
-from bevviz.provenance import file_hash
+from bevviz.recording.provenance import file_hash
 
 _SEAL = re.compile(rb'id="seal">SHA-256 of the recording: ([0-9a-f]{64})<')
 

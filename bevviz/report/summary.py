@@ -6,10 +6,10 @@ from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from bevviz.frame import Frame
-from bevviz.logging.health import Rates, health
+from bevviz.model.frame import Frame
+from bevviz.model.results import FrameResult
+from bevviz.recording.health import Rates, health
 from bevviz.report.pictures import camera_picture, jpeg, shrink
-from bevviz.results import FrameResult
 
 STRIP_PICTURES = 48  # of all cameras and the bird's-eye view together
 STRIP_WIDTH = 400

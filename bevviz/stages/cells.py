@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from bevviz.frame import F32, F64, I32, I64
-from bevviz.stages.kernel import kernel
+from bevviz.model.frame import F32, F64, I32, I64
+from bevviz.support.kernel import kernel
 
 DIGIT = 11  # bits that one pass of a radix sort looks at: its counters stay in the first cache
 

@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bevviz.config import ClusteringConfig
-from bevviz.frame import F32, F64, I32, I64, Boxes3D
-from bevviz.results import Clusters, ClusterState
+from bevviz.model.frame import F32, F64, I32, I64, Boxes3D
+from bevviz.model.results import Clusters, ClusterState
 from bevviz.stages.cells import cell_keys, sort_by, sort_by_key
-from bevviz.stages.kernel import kernel, unordered_kernel
+from bevviz.support.kernel import kernel, unordered_kernel
 
 MIN_SIZE = 0.01  # metres: no box is thinner, so that each has a volume and can be drawn and hit
 

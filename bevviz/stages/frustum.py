@@ -8,16 +8,24 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from bevviz import geometry
 from bevviz.config import ClusteringConfig, FusionConfig, ObjectsConfig
-from bevviz.frame import F32, F64, I64, Bool, Intrinsics
-from bevviz.results import CameraResult, Claims, Clusters, ClusterState, Detections, DetectionState, Splits
-from bevviz.stages.boxfit import NO_EDGE
-from bevviz.stages.candidates import MARGIN, choose, fit_from, leftover, points_inside
+from bevviz.model import geometry
+from bevviz.model.frame import F32, F64, I64, Bool, Intrinsics
+from bevviz.model.results import (
+    CameraResult,
+    Claims,
+    Clusters,
+    ClusterState,
+    Detections,
+    DetectionState,
+    Splits,
+)
+from bevviz.stages.box_fit import NO_EDGE
 from bevviz.stages.cells import sort_by
+from bevviz.stages.cluster_relabel import Part, relabelled
 from bevviz.stages.clustering import MIN_SIZE
-from bevviz.stages.cover import cover
-from bevviz.stages.relabel import Part, relabelled
+from bevviz.stages.frustum_points import MARGIN, choose, fit_from, leftover, points_inside
+from bevviz.stages.mask_lookup import cover
 
 EDGE_PIXELS = 2.0  # one sigma of the edges of an image box,
 EDGE_SHARE = 0.03  # or this share of its width, where that is more

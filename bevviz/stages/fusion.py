@@ -7,11 +7,20 @@ from collections.abc import Sequence
 import numpy as np
 
 from bevviz.config import ClusteringConfig, FusionConfig
-from bevviz.frame import F32, F64, I32, I64, Bool, Boxes3D, Intrinsics
-from bevviz.geometry import apply, iou
-from bevviz.results import CameraResult, Claims, Clusters, Decision, Detections, Fusion, Objects, Pairs
-from bevviz.stages.cover import cover
-from bevviz.stages.kernel import kernel
+from bevviz.model.frame import F32, F64, I32, I64, Bool, Boxes3D, Intrinsics
+from bevviz.model.geometry import apply, iou
+from bevviz.model.results import (
+    CameraResult,
+    Claims,
+    Clusters,
+    Decision,
+    Detections,
+    Fusion,
+    Objects,
+    Pairs,
+)
+from bevviz.stages.mask_lookup import cover
+from bevviz.support.kernel import kernel
 
 # What makes a cluster look like a detection, each from 0 to 1 (see ``fuse``).
 IOU_WEIGHT, SHARE_WEIGHT, NEARNESS_WEIGHT = 0.6, 0.25, 0.15

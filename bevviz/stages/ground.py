@@ -7,10 +7,10 @@ import math
 import numpy as np
 
 from bevviz.config import GroundConfig
-from bevviz.frame import F32, F64, I32, Bool
-from bevviz.results import Ground
+from bevviz.model.frame import F32, F64, I32, Bool
+from bevviz.model.results import Ground
 from bevviz.stages.cells import sort_by
-from bevviz.stages.kernel import kernel
+from bevviz.support.kernel import kernel
 
 # Rings are as wide as sqrt(r^2 + RING_SCALE^2) / RING_COUNT: half a metre near the sensor, 4% of the range
 # far away, where the beams are sparse.

@@ -7,11 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bevviz import geometry
 from bevviz.config import OpinionsConfig
-from bevviz.datasets.names import accepted_names
-from bevviz.frame import F32, I32, I64, Bool, Boxes3D
-from bevviz.results import (
+from bevviz.model import geometry
+from bevviz.model.class_names import accepted_names
+from bevviz.model.frame import F32, I32, I64, Bool, Boxes3D
+from bevviz.model.results import (
     CameraResult,
     Clusters,
     Decision,

@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bevviz import geometry
 from bevviz.config import TrackingConfig
-from bevviz.frame import F32, F64, I32, I64, Bool, Boxes3D, Frame
-from bevviz.results import Clusters, Objects, Tracks
+from bevviz.model import geometry
+from bevviz.model.frame import F32, F64, I32, I64, Bool, Boxes3D, Frame
+from bevviz.model.results import Clusters, Objects, Tracks
 from bevviz.stages.fusion import assign
-from bevviz.stages.kernel import kernel
+from bevviz.support.kernel import kernel
 
 INITIAL_SPEED = 5.0  # m/s, one sigma of what is seen for the first time
 SHAPE_GAIN = 0.2  # share of the newest box in the smoothed size and heading

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from bevviz import geometry
-from bevviz.frame import F32, F64, Boxes3D, Camera
-from bevviz.stages.kernel import kernel
+from bevviz.model import geometry
+from bevviz.model.frame import F32, F64, Boxes3D, Camera
+from bevviz.support.kernel import kernel
 
 STEP = np.float32(np.radians(0.8))  # radians: edge of a cell of the range image
 NEARER = np.float32(0.7)  # metres that a return must be nearer than the box to hide it

@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bevviz.config import VoxelConfig
-from bevviz.frame import F32, I32, I64
-from bevviz.results import Voxels
+from bevviz.model.frame import F32, I32, I64
+from bevviz.model.results import Voxels
 from bevviz.stages.cells import cell_keys, group
-from bevviz.stages.kernel import kernel
+from bevviz.support.kernel import kernel
 
 S = TypeVar("S", bound=np.generic)
 

@@ -1,4 +1,4 @@
-"""A parameter or two over a range: every value on the same frames, counted, timed and held against truth."""
+"""Sweeps over parameters, and tuning on one frame. Imports `evaluate` and below."""
 
 from bevviz.sweep.parameters import Parameter, combine, parse
 from bevviz.sweep.run import Outcome, Sweep

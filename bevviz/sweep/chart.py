@@ -12,9 +12,9 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from bevviz.colors import SERIES, Color, State
-from bevviz.frame import F64, U8
-from bevviz.logging.pieces import png
+from bevviz.model.colors import SERIES, Color, State
+from bevviz.model.frame import F64, U8
+from bevviz.recording.primitives import png
 
 Log = Callable[..., None]  # name below the chart, archetypes
 

@@ -9,14 +9,14 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from bevviz import table
-from bevviz.frame import F64
-from bevviz.logging import entities
-from bevviz.logging.pieces import document
+from bevviz.model.frame import F64
+from bevviz.recording import entities
+from bevviz.recording.primitives import document
+from bevviz.support import table
+from bevviz.support.text import markdown
 from bevviz.sweep.chart import chart_view, log_chart, log_map
 from bevviz.sweep.parameters import Parameter, Values
 from bevviz.sweep.run import COUNTS, OPINIONS, SCORES, STAGES, Sweep
-from bevviz.text import markdown
 
 
 def log_sweep(recording: rr.RecordingStream, sweep: Sweep, name: str, present: Mapping[str, str]) -> None:

@@ -12,8 +12,8 @@ import numpy as np
 
 from bevviz.config import Config
 from bevviz.errors import UserError
-from bevviz.frame import F64
-from bevviz.variants import check_same_frames
+from bevviz.model.frame import F64
+from bevviz.pipeline.variants import check_same_frames
 
 MOST = 500  # combinations of values
 

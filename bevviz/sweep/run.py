@@ -14,16 +14,17 @@ from typing import Any
 
 import numpy as np
 
-from bevviz import counts, table
 from bevviz.config import Config
-from bevviz.counts import counts_of
 from bevviz.evaluate import Score, Truth
-from bevviz.files import save
-from bevviz.frame import Frame
-from bevviz.results import FrameResult
+from bevviz.model import counts
+from bevviz.model.counts import counts_of
+from bevviz.model.frame import Frame
+from bevviz.model.results import FrameResult
+from bevviz.pipeline.variants import Variants
+from bevviz.support import table
+from bevviz.support.files import save
+from bevviz.support.text import printable
 from bevviz.sweep.parameters import Parameter, Values
-from bevviz.text import printable
-from bevviz.variants import Variants
 
 STAGES = ("voxel", "ground", "clustering", "fusion")  # each has its own time
 COUNTS = ("clusters", "detections", "matches", "objects")

@@ -1,1 +1,1 @@
-"""From messages to frames: what belongs to the time of a scan, and where everything is then."""
+"""Synchronisation of messages into frames. Imports `drivers` and below."""

@@ -9,16 +9,16 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from bevviz import geometry
 from bevviz.config import Config
 from bevviz.errors import UserError
-from bevviz.frame import F64, Camera, Image, Intrinsics
-from bevviz.ros.roles import Roles
-from bevviz.ros.sensors import CameraRole
-from bevviz.sync.place import Place, Placing
+from bevviz.messages.roles import Roles
+from bevviz.messages.sensors import CameraRole
+from bevviz.model import geometry
+from bevviz.model.frame import F64, Camera, Image, Intrinsics
+from bevviz.sync.pose_lookup import Place, Placing
 from bevviz.sync.report import SyncReport
-from bevviz.sync.tf import TransformError
-from bevviz.sync.track import Track, too_far
+from bevviz.sync.topic_buffer import Track, too_far
+from bevviz.sync.transform_tree import TransformError
 
 TUTORIAL_K = np.array([[267.0, 0.0, 320.0], [0.0, 267.0, 180.0], [0.0, 0.0, 1.0]])
 MOST_OFF = 0.2  # of the image: how far from its middle a principal point may be before it is told

@@ -7,24 +7,24 @@ from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, Concatenate, Generic, ParamSpec, Protocol, TypeVar
 
-from bevviz.frame import Cloud, LabelledBoxes3D
-from bevviz.ros.around import decode_mark, decode_shapes, decode_statuses
-from bevviz.ros.cameras import decode_camera_info
-from bevviz.ros.clouds import decode_cloud
-from bevviz.ros.detections import decode_boxes, decode_detections_2d, decode_detections_3d
-from bevviz.ros.guard import TypedMessage, guard
-from bevviz.ros.images import decode_compressed_image, decode_image
-from bevviz.ros.messages import MessageError
-from bevviz.ros.roles import Roles
-from bevviz.ros.sensors import CameraRole
-from bevviz.ros.transforms import (
+from bevviz.drivers.video import decode_packet
+from bevviz.messages.camera_info import decode_camera_info
+from bevviz.messages.clouds import decode_cloud
+from bevviz.messages.decoding import MessageError
+from bevviz.messages.detections import decode_boxes, decode_detections_2d, decode_detections_3d
+from bevviz.messages.guard import TypedMessage, guard
+from bevviz.messages.images import decode_compressed_image, decode_image
+from bevviz.messages.roles import Roles
+from bevviz.messages.sensors import CameraRole
+from bevviz.messages.surroundings import decode_mark, decode_shapes, decode_statuses
+from bevviz.messages.transforms import (
     StampedTransform,
     decode_acceleration,
     decode_motion,
     decode_odometry,
     decode_transforms,
 )
-from bevviz.ros.video import decode_packet
+from bevviz.model.frame import Cloud, LabelledBoxes3D
 from bevviz.sync.synchronizer import Synchronizer
 from bevviz.sync.video import Rewind, Video, VideoLoader
 

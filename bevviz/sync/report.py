@@ -9,12 +9,12 @@ from dataclasses import dataclass, field
 from functools import partial
 
 from bevviz.config import Config
-from bevviz.frame import LabelledBoxes2D, LabelledBoxes3D
-from bevviz.plugins import TOPIC
-from bevviz.ros.roles import Roles
+from bevviz.config.plugins import TOPIC
+from bevviz.messages.roles import Roles
+from bevviz.model.frame import LabelledBoxes2D, LabelledBoxes3D
 from bevviz.sync.clocks import Clocks
-from bevviz.sync.damage import Damage
-from bevviz.sync.tf import TransformBuffer
+from bevviz.sync.transform_tree import TransformBuffer
+from bevviz.sync.unusable_messages import Damage
 
 
 @dataclass(slots=True)

@@ -12,10 +12,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bevviz import geometry
 from bevviz.config import Config
 from bevviz.errors import UserError
-from bevviz.frame import (
+from bevviz.messages.roles import Roles
+from bevviz.messages.topics import entity_name
+from bevviz.messages.transforms import StampedTransform
+from bevviz.model import geometry
+from bevviz.model.frame import (
     F32,
     F64,
     Camera,
@@ -27,17 +30,14 @@ from bevviz.frame import (
     LabelledBoxes3D,
     LateResult,
 )
-from bevviz.ros.roles import Roles
-from bevviz.ros.topics import entity_name
-from bevviz.ros.transforms import StampedTransform
-from bevviz.sync.around import Surroundings
 from bevviz.sync.cameras import Cameras
 from bevviz.sync.clocks import Clocks
-from bevviz.sync.place import Place, Placing
+from bevviz.sync.gravity import Upright
+from bevviz.sync.pose_lookup import Place, Placing
 from bevviz.sync.report import SyncReport
-from bevviz.sync.tf import Origin, TransformError
-from bevviz.sync.track import JUMP, Track, too_far
-from bevviz.sync.upright import Upright
+from bevviz.sync.surroundings import Surroundings
+from bevviz.sync.topic_buffer import JUMP, Track, too_far
+from bevviz.sync.transform_tree import Origin, TransformError
 from bevviz.sync.video import Video
 
 SECOND = 1_000_000_000

@@ -11,12 +11,12 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
+from bevviz.drivers.bitstream import Continuity
+from bevviz.drivers.video import Packet
 from bevviz.errors import first_line
-from bevviz.frame import U8, Clip, Codec, Image
-from bevviz.ros.bitstream import Continuity
-from bevviz.ros.images import MOST_PIXELS
-from bevviz.ros.messages import MessageError
-from bevviz.ros.video import Packet
+from bevviz.messages.decoding import MessageError
+from bevviz.messages.images import MOST_PIXELS
+from bevviz.model.frame import U8, Clip, Codec, Image
 
 if TYPE_CHECKING:
     import av

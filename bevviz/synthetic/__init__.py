@@ -1,4 +1,4 @@
-"""A synthetic drive: a street, its traffic, a LiDAR and a camera by ray casting, seeded and reproducible."""
+"""Synthetic drive: a street, its traffic, and sensors by ray casting. Imports `bags` and below."""
 
 from bevviz.synthetic.bag import BagWriter, write_bag
 from bevviz.synthetic.drive import Snapshot, SyntheticSource

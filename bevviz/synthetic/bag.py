@@ -20,11 +20,9 @@ from rosbags.interfaces import (
     QosTime,
 )
 
-from bevviz import geometry
 from bevviz.bags.mcap_writer import McapWriter
 from bevviz.errors import UserError
-from bevviz.frame import Frame
-from bevviz.ros.encode import (
+from bevviz.messages.encode import (
     encode_boxes_3d,
     encode_camera_info,
     encode_cloud,
@@ -33,6 +31,8 @@ from bevviz.ros.encode import (
     encode_transforms,
     typestore,
 )
+from bevviz.model import geometry
+from bevviz.model.frame import Frame
 from bevviz.synthetic import drive
 from bevviz.synthetic.drive import SyntheticSource
 

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bevviz import geometry
 from bevviz.errors import UserError
-from bevviz.frame import (
+from bevviz.model import geometry
+from bevviz.model.frame import (
     F64,
     I32,
     I64,

@@ -12,8 +12,8 @@ from enum import IntEnum
 import numpy as np
 from numpy.typing import ArrayLike
 
-from bevviz import geometry
-from bevviz.frame import F32, F64, I32, U8
+from bevviz.model import geometry
+from bevviz.model.frame import F32, F64, I32, U8
 
 
 class Material(IntEnum):

@@ -8,8 +8,9 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from bevviz import geometry, o3d
-from bevviz.frame import F32, F64, I32, U8, Intrinsics
+from bevviz.model import geometry
+from bevviz.model.frame import F32, F64, I32, U8, Intrinsics
+from bevviz.support import open3d
 from bevviz.synthetic.mesh import Material, Mesh
 from bevviz.synthetic.world import Light
 
@@ -29,8 +30,8 @@ class Caster:
     """Open3D's RaycastingScene (Embree; Wald et al. 2014) with what each triangle is made of."""
 
     def __init__(self, mesh: Mesh) -> None:
-        self._core = o3d.load().core
-        self._scene = o3d.load().t.geometry.RaycastingScene()
+        self._core = open3d.load().core
+        self._scene = open3d.load().t.geometry.RaycastingScene()
         self.mesh = mesh
         a, b, c = (mesh.uv[mesh.triangles[:, i]] for i in range(3))
         self.uv = np.concatenate([a, b - a, c - a], axis=1)  # (T, 6): first corner and the two edges

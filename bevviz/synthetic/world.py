@@ -14,8 +14,8 @@ from itertools import chain
 
 import numpy as np
 
-from bevviz import geometry
-from bevviz.frame import F32, F64
+from bevviz.model import geometry
+from bevviz.model.frame import F32, F64
 from bevviz.synthetic import models
 from bevviz.synthetic.mesh import Material, Mesh, grid, merge
 

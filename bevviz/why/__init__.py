@@ -1,8 +1,8 @@
-"""Why an object was reported, or was not: its chain through the stages, with numbers."""
+"""Answers to why an object was reported or missed. Imports `compare` and below."""
 
 from bevviz.why.answer import Answer, Questioner, why
 from bevviz.why.chain import Step
+from bevviz.why.hints import Hint
 from bevviz.why.subject import Selection, Subject
-from bevviz.why.whatif import Hint
 
 __all__ = ["Answer", "Hint", "Questioner", "Selection", "Step", "Subject", "why"]

@@ -9,18 +9,18 @@ from typing import Any
 import numpy as np
 
 from bevviz.evaluate import MIN_HITS, RANGE
-from bevviz.frame import U8
-from bevviz.results import FrameResult
-from bevviz.stage_loader import StageLoader
+from bevviz.model.frame import U8
+from bevviz.model.results import FrameResult
+from bevviz.pipeline.stage_loader import StageLoader
 from bevviz.why.chain import Step, chain
+from bevviz.why.collect import gather
 from bevviz.why.evidence import Evidence
-from bevviz.why.gather import gather
-from bevviz.why.select import at_place, select
+from bevviz.why.frame_index import Traces
+from bevviz.why.hints import Hint, Search, WhatIf
+from bevviz.why.selection import at_place, select
 from bevviz.why.sentences import verdict_of
 from bevviz.why.subject import Selection, Subject
-from bevviz.why.traces import Traces
 from bevviz.why.verdict import HOPELESS, Reason, Verdict, find_reason
-from bevviz.why.whatif import Hint, Search, WhatIf
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,12 +8,12 @@ from typing import Any
 
 import numpy as np
 
-from bevviz.results import Decision, DetectionState, Opinion
+from bevviz.model.results import Decision, DetectionState, Opinion
 from bevviz.why.evidence import Candidate, Evidence, fusion_of
-from bevviz.why.named import find_fused, in_box_of, opinion_on
+from bevviz.why.frame_index import Traces
+from bevviz.why.outcome import find_fused, in_box_of, opinion_on
 from bevviz.why.sentences import label, not_run, state_text
 from bevviz.why.subject import Subject, projected
-from bevviz.why.traces import Traces
 from bevviz.why.verdict import detector_ran, name_of
 
 _SHOWN = 5  # candidates that the chain names

@@ -4,8 +4,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from bevviz.frame import F32, I64, U8
-from bevviz.results import CameraResult, ClusterState, Decision, DetectionState, FrameResult, Fusion
+from bevviz.model.frame import F32, I64, U8
+from bevviz.model.results import (
+    CameraResult,
+    ClusterState,
+    Decision,
+    DetectionState,
+    FrameResult,
+    Fusion,
+)
 
 MOST = 0.5  # share from which something is called the cause, or a cluster is mostly of an object
 

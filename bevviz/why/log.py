@@ -7,19 +7,19 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 import rerun as rr
 
-from bevviz import geometry
-from bevviz.colors import FATES
 from bevviz.config import BevConfig
-from bevviz.frame import F32, U8, Camera, Frame
-from bevviz.logging import entities
-from bevviz.logging.bev import footprints, seen_from_above
-from bevviz.logging.camera import over_image
-from bevviz.logging.pieces import boxes2d, document, edges, transform
-from bevviz.logging.writer import Writer
+from bevviz.model import geometry
+from bevviz.model.colors import FATES
+from bevviz.model.frame import F32, U8, Camera, Frame
+from bevviz.recording import entities
+from bevviz.recording.bev import footprints, seen_from_above
+from bevviz.recording.camera import over_image
+from bevviz.recording.primitives import boxes2d, document, edges, transform
+from bevviz.recording.writer import Writer
 from bevviz.why.answer import Answer
+from bevviz.why.answer_text import page
+from bevviz.why.frame_index import Fate
 from bevviz.why.subject import projected
-from bevviz.why.text import page
-from bevviz.why.traces import Fate
 
 COLORS = {
     Fate.GROUND: FATES["ground"],

@@ -6,13 +6,13 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from bevviz import geometry
-from bevviz.frame import F32, I64, Bool
+from bevviz.model import geometry
+from bevviz.model.frame import F32, I64, Bool
 from bevviz.stages.clustering import dbscan
-from bevviz.stages.kernel import kernel
+from bevviz.support.kernel import kernel
 from bevviz.why.evidence import MOST
+from bevviz.why.frame_index import FEW, PART, Traces
 from bevviz.why.subject import LINK, Subject
-from bevviz.why.traces import FEW, PART, Traces
 
 FINER = (0.9, 0.8, 0.7, 0.6, 0.5, 0.4, 0.3, 0.2)  # of clustering.eps, tried to tell merged objects apart
 LOOKED_AT = 2000  # points of a large set of which distances are measured

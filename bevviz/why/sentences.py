@@ -7,13 +7,13 @@ from collections.abc import Iterator
 import numpy as np
 
 from bevviz.config import Config
-from bevviz.explain import in_mask
-from bevviz.results import ClusterState, Decision, FrameResult
+from bevviz.model.decisions import in_mask
+from bevviz.model.results import ClusterState, Decision, FrameResult
 from bevviz.why.evidence import Candidate, Evidence, fusion_of
-from bevviz.why.named import find_fused, in_box_of, opinion_on
-from bevviz.why.origin import StageOrigin
+from bevviz.why.frame_index import Fate, Traces
+from bevviz.why.outcome import find_fused, in_box_of, opinion_on
+from bevviz.why.stage_owner import StageOrigin
 from bevviz.why.subject import Subject, count
-from bevviz.why.traces import Fate, Traces
 from bevviz.why.verdict import Reason, Verdict, cameras_of, name_of, pair_reason
 
 _ONLY = ("nothing", "only ground", "mostly ground")  # that there is at a place where no object is

@@ -7,8 +7,8 @@ from typing import Literal
 
 import numpy as np
 
-from bevviz.datasets.names import CATEGORIES, accepted_names
-from bevviz.frame import F32, I64, Bool, Boxes3D, Camera
+from bevviz.model.class_names import CATEGORIES, accepted_names
+from bevviz.model.frame import F32, I64, Bool, Boxes3D, Camera
 from bevviz.stages.visibility import image_boxes
 
 LINK = 0.3  # IoU from which a box is taken for one of a projected object

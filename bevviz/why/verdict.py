@@ -7,11 +7,19 @@ from enum import StrEnum
 
 import numpy as np
 
-from bevviz.results import CameraResult, ClusterState, Decision, DetectionState, FrameResult, Fusion, Opinion
+from bevviz.model.results import (
+    CameraResult,
+    ClusterState,
+    Decision,
+    DetectionState,
+    FrameResult,
+    Fusion,
+    Opinion,
+)
 from bevviz.why.evidence import MOST, Candidate, Evidence, Named, fusion_of
-from bevviz.why.named import find_fused
+from bevviz.why.frame_index import FEW, PART, Traces
+from bevviz.why.outcome import find_fused
 from bevviz.why.subject import Subject
-from bevviz.why.traces import FEW, PART, Traces
 
 WHOLE = 0.7  # share of an object's clustered points that its named cluster has at least, if it is whole
 

@@ -1,1 +1,1 @@
-"""The workbench: a page with Rerun's viewer and a panel that answers what is clicked."""
+"""Page that answers clicks, over a bag or a robot. Imports every package except `cli`."""

@@ -18,17 +18,17 @@ from starlette.responses import Response
 from starlette.routing import WebSocketRoute
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
-from bevviz.closing import Closing
 from bevviz.errors import UserError
-from bevviz.workbench.guard import HOSTS, Guard
-from bevviz.workbench.live_bench import LiveBench
+from bevviz.support.contexts import Closing
+from bevviz.workbench.access import HOSTS, Guard
+from bevviz.workbench.live_session import LiveBench
+from bevviz.workbench.page_connection import Visit, listening
+from bevviz.workbench.routes import Site, heard_on, routes_of
 from bevviz.workbench.server import Server, bound, viewer_folder
-from bevviz.workbench.site import Site, heard_on, routes_of
-from bevviz.workbench.visit import Visit, listening
 
 if TYPE_CHECKING:
-    from bevviz.workbench.bench import Bench
-    from bevviz.workbench.opening import Opening
+    from bevviz.workbench.session import Bench
+    from bevviz.workbench.startup import Opening
 
 PATIENCE = 3.0  # seconds that the page's threads may take to end
 

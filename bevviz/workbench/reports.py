@@ -12,11 +12,11 @@ from typing import TYPE_CHECKING, Any
 from bevviz.bags.source import iso
 from bevviz.config import revised
 from bevviz.errors import UserError, first_line
-from bevviz.protocols import Items, Observer
-from bevviz.results import FrameResult
+from bevviz.model.protocols import Items, Observer
+from bevviz.model.results import FrameResult
 
 if TYPE_CHECKING:
-    from bevviz.workbench.bench import Bench, Settings
+    from bevviz.workbench.session import Bench, Settings
 
 LONGEST = 600.0  # seconds on either side
 

@@ -12,15 +12,15 @@ from typing import TYPE_CHECKING
 import uvicorn
 
 from bevviz.errors import UserError
-from bevviz.workbench.guard import HOSTS
-from bevviz.workbench.opening import Opening
-from bevviz.workbench.site import VIEWER, Kind, application
+from bevviz.workbench.access import HOSTS
+from bevviz.workbench.routes import VIEWER, Kind, application
+from bevviz.workbench.startup import Opening
 from bevviz.workbench.token import kept_token
 
 if TYPE_CHECKING:
     from starlette.types import ASGIApp
 
-    from bevviz.workbench.bench import Bench
+    from bevviz.workbench.session import Bench
 
 PORT = 9880  # where it is free: browsers keep the viewer, compiled, by the address that they had it from
 

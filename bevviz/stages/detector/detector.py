@@ -13,8 +13,8 @@ import onnxruntime as ort
 
 from bevviz.config import DetectorConfig
 from bevviz.errors import UserError
-from bevviz.frame import I32, U8
-from bevviz.results import Detections, DetectionState
+from bevviz.model.frame import I32, U8
+from bevviz.model.results import Detections, DetectionState
 from bevviz.stages.detector.image import Placement
 from bevviz.stages.detector.layouts import Facts, find_head
 from bevviz.stages.detector.masks import masks as make_masks

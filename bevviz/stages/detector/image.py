@@ -9,7 +9,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from bevviz.frame import F32, U8
+from bevviz.model.frame import F32, U8
 
 GREY = 114  # of the letterbox's border, the same in all these families
 

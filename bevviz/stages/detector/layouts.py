@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from bevviz.frame import I64
+from bevviz.model.frame import I64
 from bevviz.stages.detector import outputs as read
 from bevviz.stages.detector.image import Feed, Fit, Resampling
 from bevviz.stages.detector.names import COCO, COCO_CATEGORIES, MAX_CLASSES, default_names

@@ -5,8 +5,8 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from bevviz.frame import F32, I64
-from bevviz.results import Masks
+from bevviz.model.frame import F32, I64
+from bevviz.model.results import Masks
 from bevviz.stages.detector.image import Placement
 
 

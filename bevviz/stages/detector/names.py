@@ -7,9 +7,9 @@ from pathlib import Path
 
 from bevviz.config.methods import CLASS_LISTS
 from bevviz.errors import UserError
-from bevviz.files import CONFIG_LIMIT, read_text
 from bevviz.stages.detector.metadata import literal
 from bevviz.stages.detector.session import clip
+from bevviz.support.files import CONFIG_LIMIT, read_text
 
 MAX_CLASSES = 100_000  # the largest set of classes, ImageNet-21k, has 21,841
 MAX_NAME = 200  # characters of a class name, which stands in every frame of a recording

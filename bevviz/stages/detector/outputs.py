@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from bevviz.frame import F32, I32, I64
+from bevviz.model.frame import F32, I32, I64
 from bevviz.stages.detector.names import MAX_CLASSES
 
 SLACK = 0.01  # by which half precision and quantisation may take a score above 1 ...

@@ -10,9 +10,9 @@ from pathlib import Path
 
 import onnxruntime as ort
 
-from bevviz import announce
 from bevviz.errors import UserError
 from bevviz.stages.detector.session import SUFFIX, NetworkSession
+from bevviz.support import progress
 
 # TensorRT compiles each network for minutes before its first frame: where it is asked for by name alone.
 PREFERRED = ("CUDA", "MIGraphX", "ROCM", "OpenVINO", "CoreML", "CPU")
@@ -117,4 +117,4 @@ def obstacle(name: str) -> str:
 @lru_cache
 def tell(line: str) -> None:
     """Once."""
-    announce.say(line)
+    progress.say(line)

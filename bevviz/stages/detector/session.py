@@ -21,7 +21,7 @@ import numpy as np
 import onnxruntime as ort
 
 from bevviz.errors import UserError, first_line
-from bevviz.remains import ENDLESS_THREAD
+from bevviz.support.cleanup import ENDLESS_THREAD
 
 # Seconds to load a network, and for each answer. Ten times what the largest detectors take on a small board.
 SECONDS = 120.0

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from bevviz.frame import F32, I32, I64
-from bevviz.stages.kernel import kernel
+from bevviz.model.frame import F32, I32, I64
+from bevviz.support.kernel import kernel
 
 
 def nms(xyxy: F32, class_id: I32, threshold: float, class_offset: float = 0.0) -> tuple[I32, F32]:

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bevviz.frame import F32, F64, I32
-from bevviz.pillar_params import Feature
-from bevviz.stages.kernel import kernel
+from bevviz.config.pillars import Feature
+from bevviz.model.frame import F32, F64, I32
+from bevviz.support.kernel import kernel
 
 
 @dataclass(frozen=True, slots=True, eq=False)

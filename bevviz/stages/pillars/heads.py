@@ -14,8 +14,8 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
-from bevviz.frame import F32, F64, I64
-from bevviz.pillar_params import PillarParams
+from bevviz.config.pillars import PillarParams
+from bevviz.model.frame import F32, F64, I64
 from bevviz.stages.detector.session import listed
 
 MOST_LOG = 10.0  # of a size that is e to the power of this: what is more is no size

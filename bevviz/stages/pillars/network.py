@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 import onnxruntime as ort
 
+from bevviz.config.pillars import MAX_POINTS, PillarParams
 from bevviz.errors import UserError
-from bevviz.frame import F32, Boxes3D
-from bevviz.pillar_params import MAX_POINTS, PillarParams
+from bevviz.model.frame import F32, Boxes3D
 from bevviz.stages.detector.providers import open_session, tell
 from bevviz.stages.detector.session import NetworkSession, clip, listed, reading
 from bevviz.stages.pillars.group import Pillars, group, scatter

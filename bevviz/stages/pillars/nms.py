@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from bevviz.frame import F64, I64, Bool
-from bevviz.stages.kernel import kernel
+from bevviz.model.frame import F64, I64, Bool
+from bevviz.support.kernel import kernel
 
 
 def survivors(boxes: F64, group: I64, iou: float, distance: float) -> Bool:

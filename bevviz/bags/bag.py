@@ -1,0 +1,471 @@
+"""One recording on disk, whatever its files: MCAP, sqlite3 or ROS 1, compressed, split or cut."""
+
+from __future__ import annotations
+
+import heapq
+from collections import Counter
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import replace
+from functools import cached_property, partial
+from itertools import islice
+from operator import attrgetter, itemgetter
+from pathlib import Path, PurePath
+from typing import Any
+
+import numpy as np
+from backports import zstd
+from rosbags.interfaces import Connection
+from rosbags.typesys import Stores
+
+from bevviz.bags import mcap
+from bevviz.bags.file_types import open_file
+from bevviz.bags.message import RawMessage, form_of, is_ros1
+from bevviz.bags.reader import BagFile, normalized
+from bevviz.bags.sidecar import bag_beside
+from bevviz.bags.type_store import MessageTypes
+from bevviz.config import SourceConfig
+from bevviz.config.files import yaml_value
+from bevviz.datasets import find_loader, open_dataset
+from bevviz.datasets.reader import DatasetReader
+from bevviz.datasets.unread_files import unread
+from bevviz.drivers import ouster
+from bevviz.drivers.calibration_file import read_calibration
+from bevviz.drivers.compressed_clouds import decompress, is_compressed
+from bevviz.drivers.livox import fields_of, is_livox, read_custom
+from bevviz.drivers.packets import is_packets, read_scan
+from bevviz.drivers.video import Packet, decode_packet, is_video
+from bevviz.errors import UserError
+from bevviz.messages import foxglove, vision_msgs
+from bevviz.messages.decoding import MessageError
+from bevviz.messages.guard import guard
+from bevviz.messages.surroundings import decode_mark
+from bevviz.messages.topics import Topic
+from bevviz.model.frame import I64
+from bevviz.support import progress
+from bevviz.support.contexts import Closing
+from bevviz.support.files import Scratch, bag_files, drive_files, full_disk, read_text
+from bevviz.support.text import path_text
+
+ATTACHED = "lidar_calibration"  # then the topic and the file: what an attachment with one is called
+METADATA = "metadata.yaml"
+COMPRESSED = "sensor_msgs/msg/CompressedImage"
+STAMPED = ["timestamp", "frame_id"]  # what foxglove's messages begin with, which are laid out as a Header
+REWIND = 2_000_000_000  # nanoseconds that a key frame is looked for in first
+LONGEST_SCAN = 1_000_000_000  # nanoseconds from its first packet to its last
+MOST_HEADERS = 16  # messages that a video begins with and are no pictures
+
+
+class Recording(Closing):
+    """The messages of one or several bags, or data sets, as a single stream in order of log time.
+
+    Args:
+        paths: bag files and folders, and folders of data sets, in any order.
+        config: which data set they are, and which drive of it, where that is stated.
+
+    Attributes:
+        single_frames: nothing in one scan is in the next, and their times are made up.
+        calibrations: files of LiDARs by their topics, as ``source.lidar_calibration`` states them, or as they
+            are in the bag.
+        is_dataset: messages are made of a data set's files; what cannot be is empty, and among ``warnings``.
+        types: of the messages.
+
+    Raises:
+        UserError: a path that does not exist, cannot be read, is empty or is neither.
+    """
+
+    def __init__(self, paths: Sequence[Path], config: SourceConfig | None = None) -> None:
+        if not paths:
+            raise UserError("no bag given")
+        self.paths = tuple(map(bag_beside, paths))
+        self.single_frames = self.is_dataset = False
+        self._config = config or SourceConfig()
+        self._aside: dict[str, str] = {}
+        self._scan_times: dict[str, I64] = {}
+        self.files: list[BagFile] = []
+        self._notes: list[str] = []
+        self.types = MessageTypes(self._notes.append)
+        self._scratch = Scratch()
+        try:
+            for path in self.paths:
+                self._open(path)
+            self.calibrations = {**self._config.lidar_calibration, **self._attached()}
+            if not self.message_count:
+                raise UserError("; ".join([f"{self.name}: there are no messages in it", *self.warnings]))
+        except BaseException:
+            self.close()
+            raise
+
+    def close(self) -> None:
+        while self.files:
+            self.files.pop().close()
+        self._scratch.close()
+
+    @property
+    def name(self) -> str:
+        return path_text(self.paths[0].resolve().name)
+
+    @cached_property
+    def size(self) -> int:
+        """Bytes on disk."""
+        files = [f for p in self.paths for f in (drive_files(p) if p.is_dir() else [p])]
+        return sum(f.stat().st_size for f in files)
+
+    @cached_property
+    def start(self) -> int:
+        """Log time of the first message, in nanoseconds."""
+        return min(f.span[0] for f in self.files if f.span[1])
+
+    @cached_property
+    def end(self) -> int:
+        """Log time of the last message, in nanoseconds."""
+        return max(f.span[1] for f in self.files) - 1
+
+    @property
+    def message_count(self) -> int:
+        return sum(c.msgcount for f in self.files for c in f.connections)
+
+    @property
+    def warnings(self) -> list[str]:
+        """What is missing or damaged, as far as it was met."""
+        return [*self._notes, *(text for file in self.files for text in file.warnings)]
+
+    @cached_property
+    def topics(self) -> tuple[Topic, ...]:
+        """Every topic by name, with the frame_id of its first message."""
+        counts: Counter[str] = Counter()
+        first: dict[str, Connection] = {}
+        for connection in (c for f in self.files for c in f.connections):
+            known = first.setdefault(connection.topic, connection)
+            counts[connection.topic] += connection.msgcount
+            if known.msgtype != connection.msgtype:
+                self._notes.append(
+                    f"{connection.topic} is recorded both as {known.msgtype} and as {connection.msgtype}: "
+                    "only the former is used"
+                )
+        duration = (self.end - self.start) / 1e9
+        self._aside |= {name: why for name in first if (why := self._lacks(first[name]))}
+        return tuple(
+            Topic(
+                name,
+                normalized(first[name].msgtype),
+                counts[name],
+                ouster.FRAME
+                if name in self._sensors
+                else self._frame_id(name)
+                if counts[name] and self._has_header(first[name])
+                else "",
+                (counts[name] - 1) / duration if counts[name] > 1 and duration else None,
+                self._aside.get(name, ""),
+                video=normalized(first[name].msgtype) == COMPRESSED and self._holds_video(name),
+                scans=name in self._sensors,
+            )
+            for name in sorted(first)
+        )
+
+    def messages(
+        self, topics: Collection[str], start: int | None = None, stop: int | None = None
+    ) -> Iterator[RawMessage]:
+        """Messages of ``topics`` with start <= log time < stop (nanoseconds), in order of log time."""
+        sources = [_lazily(f, topics, start, stop) for f in self.files]
+        for _, message in heapq.merge(*sources, key=itemgetter(0)):
+            if message is not None:
+                yield message
+
+    def scans(
+        self, topics: Collection[str], start: int | None = None, stop: int | None = None
+    ) -> Iterator[RawMessage]:
+        """As ``messages``, but of a LiDAR whose messages are single packets one for each scan.
+
+        It is received when its last packet is, see ``ouster.Scans``.
+        """
+        single = [topic for topic in topics if topic in self._sensors]
+        others = [topic for topic in topics if topic not in self._sensors]
+        parts = [self.messages(others, start, stop), *(self._scans(name, start, stop) for name in single)]
+        yield from heapq.merge(*parts, key=attrgetter("received"))
+
+    def _scans(self, topic: str, start: int | None, stop: int | None) -> Iterator[RawMessage]:
+        sensor = self._sensors[topic]
+        low = None if start is None else start - LONGEST_SCAN
+        high = None if stop is None else stop + LONGEST_SCAN
+        scans = ouster.Scans(sensor)
+        message: RawMessage | None = None
+
+        def given(found: Iterator[tuple[ouster.Packet, ...]]) -> Iterator[RawMessage]:
+            for packets in found:
+                received = packets[-1][0]
+                if message and (start is None or start <= received) and (stop is None or received < stop):
+                    yield replace(message, data=b"", received=received, packets=packets)
+
+        for message in self.messages([topic], low, high):
+            try:
+                packet = ouster.payload(message.content(), ros1=is_ros1(message.connection))
+            except zstd.ZstdError:
+                continue
+            if len(packet) == sensor.size:  # else it counts as lost
+                yield from given(scans.add(message.received, packet))
+        yield from given(scans.rest())
+
+    def scan_times(self, topic: str) -> I64:
+        """As ``times``, of what ``scans`` gives. Where messages are single packets, all are read, once."""
+        if topic not in self._sensors:
+            return self.times(topic)
+        if topic not in self._scan_times:
+            bar = progress.bar(self._scans(topic, None, None), desc=f"scans of {topic}", unit="scan", delay=1)
+            self._scan_times[topic] = np.array([scan.received for scan in bar], np.int64)
+        return self._scan_times[topic]
+
+    @cached_property
+    def _sensors(self) -> Mapping[str, ouster.Sensor]:
+        """The topics whose messages are single packets of a LiDAR, with the metadata to decode them."""
+        found = {}
+        for connection in {c.topic: c for f in self.files for c in f.connections}.values():
+            if (
+                ouster.is_packet(connection.msgtype)
+                and (text := self._metadata(connection.topic)) is not None
+            ):
+                sensor = ouster.read_sensor(*text)
+                message = self.first(connection.topic)
+                if message and len(message.data) > ouster.SMALLEST:
+                    found[connection.topic] = sensor
+        return found
+
+    def _metadata(self, topic: str) -> tuple[str, str] | None:
+        """The metadata of an Ouster and where they are; None: there are none."""
+        if file := self.calibrations.get(topic, ""):
+            return read_calibration(Path(file)), f"source.lidar_calibration: {file}"
+        name = ouster.metadata_of(topic)
+        message = self.first(name)
+        try:
+            return (guard(message, decode_mark, self.decode(message)), name) if message else None
+        except MessageError:
+            return None
+
+    def _lacks(self, connection: Connection) -> str:
+        """Why packets of an Ouster are not read; empty: they are, or it is another topic."""
+        if not ouster.is_packet(connection.msgtype) or connection.topic in self._sensors:
+            return ""
+        message = self.first(connection.topic)
+        small = message is not None and len(message.data) <= ouster.SMALLEST
+        return ouster.NOT_LIDAR if small else ouster.LACKS
+
+    def first(self, topic: str) -> RawMessage | None:
+        return next(self.messages([topic]), None)
+
+    def times(self, topic: str) -> I64:
+        """Log times of all messages of a topic in nanoseconds, sorted, without reading them."""
+        parts = [f.times([c for c in f.connections if c.topic == topic]) for f in self.files]
+        return np.sort(np.concatenate(parts))
+
+    def packets(self, topic: str, received: int) -> list[Packet]:
+        """The packets of a topic with video that the one received at that time needs, and that one.
+
+        They begin with the last key frame before it, or with the recording where there is none, and what a
+        stream says before its first picture.
+        """
+        start, found = received + 1, list[Packet]()
+        back = REWIND
+        while start > self.start and not any(packet.is_key for packet in found):
+            stop, start, back = start, max(self.start, start - back), 4 * back
+            found = [*self._packets(topic, start, stop), *found]
+        keys = [row for row, packet in enumerate(found) if packet.is_key]
+        first = islice(self._packets(topic, None, None), MOST_HEADERS)
+        return [*(packet for packet in first if packet.is_header), *found[keys[-1] if keys else 0 :]]
+
+    def _packets(self, topic: str, start: int | None, stop: int | None) -> Iterator[Packet]:
+        for message in self.messages([topic], start, stop):
+            with suppress(MessageError):  # counted when its turn comes
+                yield guard(message, decode_packet, self.decode(message), topic, message.received)
+
+    def decode(self, message: RawMessage) -> Any:
+        """The message as an object with the fields of its definition; LiDAR drivers' own as a PointCloud2.
+
+        Raises:
+            MessageError: the data does not fit the definition, or there is none.
+            UserError: a file that the configuration names for the topic cannot be used.
+        """
+        if message.packets:
+            return guard(message, partial(ouster.decode, self._sensors[message.topic]), message.packets)
+        if form_of(message.connection):
+            return guard(message, foxglove.as_ros, self._parsed(message), message.connection.msgtype)
+        found = guard(message, self._deserialized, message)
+        if is_compressed(message.type):
+            return guard(message, decompress, found)
+        if foxglove.short_of(message.type):
+            return guard(message, foxglove.as_ros, found, message.type)
+        return found
+
+    def _parsed(self, message: RawMessage) -> Any:
+        return message.parsed(guard(message, RawMessage.content, message))
+
+    def _deserialized(self, message: RawMessage) -> Any:
+        """Return the message as its definition has it; the messages of LiDAR drivers as a PointCloud2."""
+        connection, msgtype, data = message.connection, message.type, message.content()
+        store = self.types.store(connection)
+        if is_livox(msgtype):
+            fields = fields_of(store.fielddefs, msgtype)
+            return read_custom(data, ros1=is_ros1(connection), fields=fields)
+        if is_packets(msgtype):
+            calibration = self.calibrations.get(message.topic, "")
+            return read_scan(data, msgtype, ros1=is_ros1(connection), calibration=calibration)
+        try:
+            if is_ros1(connection):
+                return store.deserialize_ros1(data, msgtype)
+            return vision_msgs.deserialize(store, data, msgtype)
+        except KeyError:
+            raise MessageError(
+                f"{message.topic}: the bag does not say what a {msgtype} is made of, and neither does bevviz"
+            ) from None
+
+    def encode(self, message: RawMessage, content: Any) -> memoryview:
+        """``content``, as ``decode`` gave it and changed since, serialised as the message was."""
+        store, msgtype = self.types.store(message.connection), normalized(message.connection.msgtype)
+        if is_ros1(message.connection):
+            return store.serialize_ros1(content, msgtype)
+        return store.serialize_cdr(content, msgtype)
+
+    def _has_header(self, connection: Connection) -> bool:
+        if form_of(connection):
+            return True
+        try:
+            _, fields = self.types.store(connection).fielddefs[normalized(connection.msgtype)]
+        except KeyError:
+            return is_livox(connection.msgtype) or is_packets(connection.msgtype)
+        names = [name for name, _ in fields[:2]]
+        return bool(fields) and (fields[0][1][1] == "std_msgs/msg/Header" or names == STAMPED)
+
+    def _frame_id(self, topic: str) -> str:
+        message = self.first(topic)
+        try:
+            return message.header()[1] if message else ""
+        except MessageError:
+            return ""
+
+    def _holds_video(self, topic: str) -> bool:
+        """Whether images are packets of video."""
+        message = self.first(topic)
+        try:
+            return message is not None and guard(message, is_video, self.decode(message))
+        except MessageError:
+            return False
+
+    def _open(self, path: Path) -> None:
+        try:
+            if path.name == METADATA:
+                path = path.parent
+            if path.is_dir():
+                self._open_folder(path)
+            elif self._config.dataset and path.exists():
+                open_dataset(path, self._config.dataset)
+            else:
+                self.files.append(open_file(path, self._scratch, self._notes.append))
+        except FileNotFoundError:
+            raise UserError(f"{path}: no such file or folder") from None
+        except PermissionError:
+            raise UserError(f"{path}: permission denied: you may not read it") from None
+        except OSError as error:
+            if (full := full_disk(error)) is not None:  # of the temporary folder: a file is unpacked there
+                raise full from None
+            raise UserError(f"{path}: cannot be read: {error.strerror or error}") from None
+
+    def _attached(self) -> dict[str, str]:
+        """Files of LiDARs' calibrations that are in the bag, by topic, where the stated ones are not here.
+
+        So that a bag that was cut out runs anywhere, with the configuration of where it comes from, too.
+        """
+        found = dict[str, str]()
+        stated = self._config.lidar_calibration
+        for file in self.files:
+            for name, data in mcap.read_attachments(file.path).items() if file.path.is_file() else ():
+                topic, _, base = name.removeprefix(ATTACHED).rpartition("/")
+                known = Path(stated.get(topic, base))
+                here = topic in stated and known.exists()
+                if name.startswith(ATTACHED) and known.name == base and base.strip(".") and not here:
+                    found[topic] = str(self._scratch.new() / base)
+                    Path(found[topic]).write_bytes(data)
+        return found
+
+    def _open_folder(self, folder: Path) -> None:
+        files = bag_files(folder)
+        stated = self._config.dataset
+        if (stated or not files) and self._open_dataset(folder, stated):
+            return
+        if not files:
+            within = sorted(d.name for d in folder.iterdir() if d.is_dir() and bag_files(d))
+            hint = f"; there are bags in its folders: {', '.join(within[:5])}" if within else ""
+            if drives := [] if within else [d.name for d in sorted(folder.iterdir()) if find_loader(d)]:
+                hint = f"; its folders that are one: {', '.join(drives[:5])}{' ...' if drives[5:] else ''}"
+            hint += f"; {others}" if (others := unread(folder)) else ""
+            raise UserError(
+                f"{folder}: a folder without a bag (no .mcap, .db3 or .bag file), and no data set that is "
+                f"recognised (--dataset NAME){hint}"
+            )
+        metadata = self._read_metadata(folder)
+        failed: list[UserError] = []
+        before = self.message_count
+        for file in files:
+            try:
+                self.files.append(open_file(file, self._scratch, self._notes.append))
+            except UserError as error:
+                failed.append(error)
+        if len(failed) == len(files):
+            raise failed[0]
+        self._notes += map(str, failed)
+        try:
+            expected = int(metadata.get("message_count", 0))
+            listed = {PurePath(p).name for p in metadata.get("relative_file_paths", ())}
+        except (TypeError, ValueError):
+            expected, listed = 0, set()
+        if missing := sorted(listed - {f.name for f in files}):
+            self._notes.append(f"{folder}: {', '.join(missing)} of {METADATA} is missing: read without")
+        found = self.message_count - before
+        if found < expected:
+            self._notes.append(
+                f"{folder}: {METADATA} counts {expected} messages, {found} were found: "
+                f"{expected - found} are lost"
+            )
+
+    def _open_dataset(self, folder: Path, name: str) -> bool:
+        """Whether it is one."""
+        dataset = open_dataset(folder, name, self._config.sequence)
+        if dataset is None:
+            return False
+        reader = DatasetReader(dataset)
+        self.files.append(BagFile(folder, dataset.about, lambda: reader, lambda: reader))
+        self.single_frames |= dataset.single_frames
+        self.is_dataset = True
+        self._aside |= reader.aside
+        return True
+
+    def _read_metadata(self, folder: Path) -> Mapping[str, Any]:
+        path = folder / METADATA
+        if not path.exists():
+            if not any(f.suffix == ".bag" for f in bag_files(folder)):
+                self._notes.append(
+                    f"{folder}: {METADATA} is missing: read without ('ros2 bag reindex' makes one)"
+                )
+            return {}
+        try:
+            content = yaml_value(read_text(path), str(path))["rosbag2_bagfile_information"]
+            distro = content.get("ros_distro")
+            if f"ros2_{distro}" in {s.value for s in Stores}:
+                self.types.release = Stores(f"ros2_{distro}")
+            return dict(content)
+        except (UserError, KeyError, TypeError, AttributeError, ValueError):
+            self._notes.append(f"{path}: not readable as {METADATA}: read without")
+            return {}
+
+
+def _lazily(
+    file: BagFile, topics: Collection[str], start: int | None, stop: int | None
+) -> Iterator[tuple[int, RawMessage | None]]:
+    """The messages of one file behind an empty item, so that a merge reads a file only at its time."""
+    types: dict[str, str] = {}
+    connections = [
+        c for c in file.connections if c.topic in topics and types.setdefault(c.topic, c.msgtype) == c.msgtype
+    ]
+    if not connections:
+        return
+    yield file.span[0], None
+    for connection, time, data in file.messages(connections, start, stop):
+        yield time, RawMessage(connection.topic, time, data, connection)

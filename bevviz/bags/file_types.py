@@ -1,0 +1,155 @@
+"""What a file is by its first bytes, and what reads it."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from backports import zstd
+
+from bevviz.bags import mcap, ros1
+from bevviz.bags.chunks import Form, SoundChunks, rescue
+from bevviz.bags.reader import PIECE, ZSTD, BagFile, Bytes, Reader, SoundReader, megabytes
+from bevviz.bags.rescue import mcap as mcap_rescue
+from bevviz.bags.rescue import sqlite_pages
+from bevviz.bags.rescue.sqlite import SqliteRescuer
+from bevviz.bags.sqlite import SoundSqlite
+from bevviz.datasets.dataset import CLOUDS, IMAGES
+from bevviz.datasets.unread_files import KINDS as UNREAD
+from bevviz.errors import UserError
+from bevviz.support import progress
+from bevviz.support.files import LFS_HINT, LFS_POINTER, Scratch
+
+FRAME = re.compile(re.escape(ZSTD))
+
+
+@dataclass(frozen=True, slots=True)
+class Kind:
+    """A format of files."""
+
+    name: str
+    magic: bytes
+    suffix: str  # that rosbags knows it by
+    sound: Callable[[Path, Path], SoundReader]  # of the file, and of the same by a name with that suffix
+    rescue: Callable[[Path], Reader]
+
+
+def _of_chunks(name: str, magic: bytes, suffix: str, form: Form) -> Kind:
+    return Kind(
+        name,
+        magic,
+        suffix,
+        lambda path, public: SoundChunks(path, form, public),
+        lambda path: rescue(path, form),
+    )
+
+
+SQLITE = Kind("sqlite3", sqlite_pages.MAGIC, ".db3", SoundSqlite, SqliteRescuer)
+KINDS = (
+    _of_chunks("MCAP", mcap.MAGIC, ".mcap", mcap_rescue.FORM),
+    _of_chunks("ROS 1 bag", ros1.MAGIC, ".bag", ros1.FORM),
+    SQLITE,
+)
+HEAD = 16  # bytes that tell what a file is
+OTHERS = {
+    b"RRF": "a Rerun recording: open it with 'rerun'",
+    b"PK\x03\x04": "a zip archive: unpack it first",
+    b"\x1f\x8b": "a gzip archive: unpack it first",
+    b"BZh": "a bzip2 archive: unpack it first",
+    b"\xfd7zXZ": "an xz archive: unpack it first",
+    b"\xd4\xc3\xb2\xa1": "a packet capture, not a bag: record the driver's topics instead",
+    LFS_POINTER[:HEAD]: LFS_HINT,
+    b"#ROSBAG V1": "a bag of ROS before 1.2: 'rosbag fix' converts it",
+}
+
+
+def open_file(path: Path, scratch: Scratch, tell: Callable[[str], object]) -> BagFile:
+    """A file of a recording, by its first bytes; a compressed one is unpacked.
+
+    Args:
+        path: of the file.
+        scratch: where it is unpacked.
+        tell: gets a sentence on what could not be unpacked.
+
+    Raises:
+        OSError: it is not there, or cannot be read.
+        UserError: it is no bag, or there is nothing in it.
+    """
+    if path.exists() and not path.is_file():  # a pipe would be waited for
+        raise UserError(f"{path}: no bag: it is no file")
+    with path.open("rb") as file:
+        head = file.read(HEAD)
+    if head.startswith(ZSTD):
+        path = _unpack(path, scratch, tell)
+        with path.open("rb") as file:
+            head = file.read(HEAD)
+    if kind := next((kind for kind in KINDS if head.startswith(kind.magic)), None):
+        return _open_as(kind, path, scratch)
+    what = next((text for magic, text in OTHERS.items() if head.startswith(magic)), None)
+    # The first bytes may be damaged; and of a database all may still lie in its log.
+    kind = next((kind for kind in KINDS if path.suffix == kind.suffix), None)
+    if not head and not (kind is SQLITE and sqlite_pages.log_of(path).exists()):
+        raise UserError(f"{path}: the file is empty")
+    if kind and not what:
+        opened = _open_as(kind, path, scratch)
+        if any(c.msgcount for c in opened.connections):
+            return opened
+        opened.close()
+    if not what and path.suffix.lower() in (*CLOUDS, *IMAGES):
+        what = f"one cloud or image, no drive: give the folder that it is in ({path.parent})"
+    if not what and (hint := UNREAD.get(path.suffix.lower())):
+        what = f"{path.suffix.lower()} files are not read: {hint}"
+    raise UserError(f"{path}: {what or 'not a bag: neither MCAP, nor sqlite3, nor ROS 1 by its first bytes'}")
+
+
+def _open_as(kind: Kind, path: Path, scratch: Scratch) -> BagFile:
+    public = path
+    if path.suffix != kind.suffix or set("?#%") & set(str(path)):  # the latter mean something in a URI
+        public = scratch.new() / f"bag{kind.suffix}"
+        public.symlink_to(path.resolve())
+    return BagFile(path, kind.name, lambda: kind.sound(path, public), lambda: kind.rescue(path))
+
+
+def _unpack(path: Path, scratch: Scratch, tell: Callable[[str], object]) -> Path:
+    target = scratch.new() / path.stem
+    damaged, whole = unpack_file(path, target)
+    if damaged or not whole:
+        what = f"{damaged} damaged place(s) in it" if damaged else "its end is missing"
+        tell(
+            f"{path.name}: the compressed file is damaged ({what}): "
+            f"{megabytes(target.stat().st_size)} could be unpacked"
+        )
+    return target
+
+
+def unpack_file(path: Path, target: Path) -> tuple[int, bool]:
+    """Unpack a zstd file; behind a damaged place its next frame is searched for.
+
+    Returns:
+        How many places are damaged, and whether the last frame is whole.
+    """
+    source, damaged, stream = Bytes(path), 0, zstd.ZstdDecompressor()
+    bar = progress.bar(total=source.size, unit="B", unit_scale=True, desc=f"unpack {path.name}", delay=1)
+    try:
+        with target.open("wb") as out, bar:
+            offset = 0
+            while offset < source.size:
+                # In small pieces: what the decompressor makes of the one that it stumbles over is lost.
+                piece = source.read(offset, PIECE)
+                try:
+                    out.write(stream.decompress(piece))
+                    offset += len(piece) - len(stream.unused_data)
+                    found = offset if stream.eof else None
+                except zstd.ZstdError:
+                    damaged += 1
+                    found = next(source.search(FRAME, offset + 1), source.size)
+                bar.update(offset - bar.n)
+                if found is not None and found < source.size:
+                    offset, stream = found, zstd.ZstdDecompressor()
+                elif found is not None:
+                    break
+    finally:
+        source.close()
+    return damaged, stream.eof

@@ -1,0 +1,166 @@
+"""What a calibration is made from: for each frame and camera the edges of both, and how the robot moved."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+
+import cv2
+import numpy as np
+
+from bevviz.calib.edges import Edges, cloud_edges, image_edges
+from bevviz.model import geometry
+from bevviz.model.frame import F32, F64, I32, U8, Bool, Camera, Frame, Intrinsics
+
+CELLS = (8, 4)  # along u and v: parts of the image, whose edges err together
+PIXELS = 500_000  # larger images are scaled down to this size
+REACH = np.radians(3.5)  # edges that project this far outside the image may still come in
+NEAREST, FARTHEST = 2.0, 60.0  # metres: the robot itself; an edge of more than a pixel
+STEPS = np.arange(-15, 16) * 10_000_000  # nanoseconds around the image at which the pose is looked up
+
+Pose = Callable[[Frame, int], F64 | None]  # fixed_from_points at a stamp; None: not known
+
+
+@dataclass(frozen=True, slots=True)
+class Shot:
+    """One image and the cloud that goes with it."""
+
+    frame: Frame
+    camera: Camera
+    K: F64  # (3, 3) of the image that the edges are from, free of distortion
+    maps: U8  # (4, H, W) see ``image_edges``
+    xyz: F32  # (E, 3) edges of the cloud, in Frame.points_frame
+    change: U8  # (E,) what each edge should be in the image: a row of ``score.CHANGES``
+    cell: I32  # (E,) where it is in the image, as stated
+    mounting: F64  # (4, 4) camera_from_points as stated, the robot standing still
+    motion: F64 | None  # (T, 4, 4) points at the image's stamp + STEPS from points at the cloud's
+
+    def camera_from_points(self, late: float) -> F64:
+        """As stated, for an image that was taken ``late`` seconds before its stamp."""
+        if self.motion is None:
+            return self.mounting
+        at = min(max((-late * 1e9 - STEPS[0]) / (STEPS[1] - STEPS[0]), 0.0), len(STEPS) - 1.0)
+        i = min(int(at), len(STEPS) - 2)
+        moved = (i + 1 - at) * self.motion[i] + (at - i) * self.motion[i + 1]  # all but rigid: 10 ms apart
+        return np.asarray(self.mounting @ moved, np.float64)
+
+
+@dataclass(slots=True)
+class Shots:
+    """All shots of one camera, and why other frames gave none."""
+
+    camera: str
+    shots: list[Shot] = field(default_factory=list)
+    refused: Counter[str] = field(default_factory=Counter)
+
+    @property
+    def edges(self) -> int:
+        return sum(len(shot.xyz) for shot in self.shots)
+
+
+def gather(frames: Iterable[Frame], cameras: Iterable[str], pose: Pose) -> dict[str, Shots]:
+    """Find the edges in all frames.
+
+    Args:
+        frames: in order of stamp.
+        cameras: names of those that are looked at.
+        pose: where the points' frame was at a stamp up to 0.15 s from an image's; asked for a frame only when
+            the next one has come, so that a source that reads a bag has the transforms after it.
+
+    Returns:
+        the shots of each camera, by name.
+    """
+    found = {name: Shots(name) for name in cameras}
+    last: Frame | None = None
+    for frame in frames:
+        if last is not None:
+            _take(last, found, pose)
+        last = frame
+    if last is not None:
+        _take(last, found, pose)
+    return found
+
+
+def _take(frame: Frame, found: dict[str, Shots], pose: Pose) -> None:
+    parts = []
+    for cloud, points_from_cloud in zip(frame.clouds, frame.points_from_clouds, strict=True):
+        edges = cloud_edges(cloud)
+        parts.append(
+            Edges(
+                geometry.apply(points_from_cloud, edges.xyz),
+                edges.towards @ points_from_cloud[:3, :3].T.astype(np.float32),
+                edges.bright,
+            )
+        )
+    together = Edges(*(np.concatenate(columns) for columns in zip(*map(_columns, parts), strict=True)))
+    for camera in frame.cameras:
+        if camera.name not in found:
+            continue
+        shots = found[camera.name]
+        if camera.image is None or camera.intrinsics is None or camera.camera_from_points is None:
+            reason = camera.problems[0] if camera.problems else "no image, calibration or transform"
+            shots.refused[reason] += 1
+            continue
+        shots.shots.append(_shot(frame, camera, together, pose))
+
+
+def _columns(edges: Edges) -> tuple[F32, F32, Bool]:
+    return edges.xyz, edges.towards, edges.bright
+
+
+def _shot(frame: Frame, camera: Camera, edges: Edges, pose: Pose) -> Shot:
+    assert camera.image is not None and camera.intrinsics is not None
+    assert camera.camera_from_points is not None
+    motion = _motion(frame, camera.image.stamp, pose)
+    mounting = camera.camera_from_points
+    if camera.motion_compensated and motion is not None:
+        mounting = mounting @ geometry.inverse(motion[len(STEPS) // 2])
+    picture, K = _flatten(camera.image.bgr, camera.intrinsics)
+    height, width = picture.shape[:2]
+    size = np.array([width, height], np.float32)
+    flat = Intrinsics(width, height, K)
+    uv, depth = geometry.project(geometry.apply(camera.camera_from_points, edges.xyz), flat)
+    margin = np.tan(REACH) * np.array([K[0, 0], K[1, 1]], np.float32)
+    with np.errstate(invalid="ignore"):
+        inside = ((uv > -margin) & (uv < size + margin)).all(axis=1)
+    inside &= (depth > NEAREST) & (depth < FARTHEST)
+    xyz, towards, bright, uv = edges.xyz[inside], edges.towards[inside], edges.bright[inside], uv[inside]
+    beside = xyz + towards * np.linalg.norm(xyz, axis=1, keepdims=True)
+    away = geometry.project(geometry.apply(camera.camera_from_points, beside), flat)[0] - uv
+    column, row = np.clip(uv / size * CELLS, 0, np.array(CELLS) - 1).astype(np.int32).T
+    cell = row * CELLS[0] + column
+    return Shot(frame, camera, K, image_edges(picture), xyz, _change(away, bright), cell, mounting, motion)
+
+
+def _change(away: F32, bright: Bool) -> U8:
+    """Row of ``score.CHANGES`` of edges with (E, 2) directions in the image."""
+    along_v = np.abs(away[:, 1]) > np.abs(away[:, 0])
+    negative = np.where(along_v, away[:, 1], away[:, 0]) < 0
+    return np.where(bright, 2 + 2 * along_v + negative, along_v).astype(np.uint8)
+
+
+def _motion(frame: Frame, stamp: int, pose: Pose) -> F64 | None:
+    """None where the way of the robot is not known all around the image's stamp."""
+    here = pose(frame, frame.stamp)
+    there = [pose(frame, stamp + int(step)) for step in STEPS] if here is not None else []
+    known = [geometry.inverse(p) @ here for p in there if p is not None and here is not None]
+    return np.stack(known) if len(known) == len(STEPS) else None
+
+
+def _flatten(bgr: U8, intrinsics: Intrinsics) -> tuple[U8, F64]:
+    """The image without distortion and not larger than need be, and its camera matrix."""
+    picture, K = bgr, intrinsics.K
+    if geometry.is_bent(intrinsics):
+        if intrinsics.distortion_model in geometry.FISHEYE:
+            picture = cv2.fisheye.undistortImage(picture, K, intrinsics.D[:4], Knew=K)
+        else:
+            picture = cv2.undistort(picture, K, intrinsics.D)
+    height, width = picture.shape[:2]
+    scale = np.sqrt(PIXELS / (height * width))
+    if scale >= 1:
+        return picture, K
+    size = round(width * scale), round(height * scale)
+    sx, sy = size[0] / width, size[1] / height
+    shrink = np.array([[sx, 0, (sx - 1) / 2], [0, sy, (sy - 1) / 2], [0, 0, 1]])
+    return cv2.resize(picture, size, interpolation=cv2.INTER_AREA), shrink @ K

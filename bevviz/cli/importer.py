@@ -1,0 +1,118 @@
+"""``rerun-importer-bevviz``: Rerun's viewer runs it on the files that it opens, and shows what it writes.
+
+Arguments and exit code are those of the external importers (rerun.io/docs/concepts/logging-and-ingestion): a
+recording on standard output, or ``NOT_OURS``. Rerun asks every importer about every file, so that one that is
+none of ours is answered before anything is imported.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import select
+import sys
+import threading
+from dataclasses import replace
+from pathlib import Path
+
+from bevviz.support import cleanup
+
+NOT_OURS = 66
+BAGS = (".db3", ".bag")
+METADATA = "metadata.yaml"  # in a folder that is one bag
+
+
+def main() -> None:
+    """The executable."""
+    threading.Thread(target=_end_with_viewer, daemon=True).start()
+    sys.exit(run(sys.argv[1:]))
+
+
+def run(arguments: list[str]) -> int:
+    """Returns the exit code."""
+    parser = argparse.ArgumentParser(
+        prog="rerun-importer-bevviz",
+        description="Rerun's viewer runs this on what it opens: 'rerun drive.db3', or a bag dropped on it. "
+        "Model and parameters are those of the bevviz.toml in the file's folder or above. An MCAP file Rerun "
+        "reads itself, and asks nobody.",
+    )
+    parser.add_argument("path", type=Path, metavar="PATH", help="bag that the viewer opens")
+    parser.add_argument("--application-id", default="", metavar="ID", help="that the viewer proposes")
+    parser.add_argument("--recording-id", default=None, metavar="ID", help="that the viewer proposes")
+    options, _ = parser.parse_known_args(arguments)
+    path = options.path.absolute()
+    # What is asked with a folder has the folder's name for its application, else the file's own.
+    with_folder = options.application_id in ("", path.parent.name) and options.application_id != path.stem
+    if not _is_ours(path, with_folder):
+        return NOT_OURS
+    if _comes_with_another(path, with_folder):
+        return 0
+    from bevviz.errors import UserError
+
+    proposed = (options.application_id, options.recording_id)
+    try:
+        # Bags of a folder would be laid over each other in the one recording that is proposed.
+        _import(path, *((path.stem, None) if with_folder and path.is_file() else proposed))
+    except UserError as error:
+        print(f"bevviz: error: {error}", file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        return 1
+    return 0
+
+
+def _end_with_viewer() -> None:
+    """When nobody reads standard output any more, ends at once: the SDK would go on, or wait for ever."""
+    pipe = select.poll()
+    pipe.register(sys.stdout, 0)  # errors and hang-ups are told in any case
+    pipe.poll()
+    cleanup.remove()
+    os._exit(1)
+
+
+def _import(path: Path, application_id: str, recording_id: str | None) -> None:
+    import rerun as rr
+
+    from bevviz.bags.source import BagSource
+    from bevviz.cli.outputs import hint, warn
+    from bevviz.config import load
+    from bevviz.config.project import layers
+    from bevviz.config.trust import Trust
+    from bevviz.drive import Drive
+    from bevviz.recording import blueprints
+    from bevviz.recording.recorder import Recorder
+    from bevviz.recording.source_lookup import Origin
+
+    # A viewer opens files of anybody: no function is run, whoever trusts it.
+    never = Trust(advice="Rerun's viewer runs none; 'bevviz' does, on the command line")
+    stated = layers(path if path.is_dir() else path.parent)
+    config = load(layers=[replace(layer, trust=never) for layer in stated])
+    with BagSource([path], config) as source:
+        drive = Drive(source, config)
+        hint(drive.scene, config)
+        recording = rr.RecordingStream(application_id or "bevviz", recording_id=recording_id)
+        recording.set_log_time_enabled(False)
+        recording.stdout(default_blueprint=blueprints.load("debug", drive.scene, config))
+        origin = Origin.of(drive.scene, config, None)
+        if origin is not None:
+            origin.log(recording)
+        drive.run([Recorder(recording, config)])
+        recording.flush()
+        recording.disconnect()
+        warn(drive.warnings)
+
+
+def _is_ours(path: Path, with_folder: bool) -> bool:
+    return path.suffix in BAGS or (path / METADATA).is_file() or (with_folder and path.name == METADATA)
+
+
+def _comes_with_another(path: Path, with_folder: bool) -> bool:
+    """Whether Rerun asks about the same bag once more: of a folder it does, and of every file in it."""
+    if path.is_dir():
+        return len(_files(path)) == 1
+    of_folder = path.name == METADATA or ((path.parent / METADATA).is_file() and len(_files(path.parent)) > 1)
+    return with_folder and of_folder
+
+
+def _files(folder: Path) -> list[Path]:
+    return [path for path in folder.iterdir() if path.suffix in BAGS]

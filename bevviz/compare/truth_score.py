@@ -1,0 +1,65 @@
+"""Which of two sides is right: what each finds of the objects that are really there."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from bevviz.evaluate import Truth
+from bevviz.evaluate import judge as judge_objects
+from bevviz.model.frame import Bool, Boxes3D
+from bevviz.model.results import FrameResult, Objects
+
+
+@dataclass(frozen=True, slots=True)
+class Judged:
+    """A frame of both sides against the truth. Row i is the i-th object that had to be found."""
+
+    labels: tuple[str, ...]
+    boxes: Boxes3D  # in the frame of the points
+    a: Bool  # found by A
+    b: Bool
+    wrong_a: tuple[str, ...]  # names of A's objects that are none
+    wrong_b: tuple[str, ...]
+    names: frozenset[str]  # that the labels of this frame accept: others are not judged
+
+    @property
+    def fixed(self) -> Sequence[int]:
+        """Rows that only B finds."""
+        rows: list[int] = np.flatnonzero(self.b & ~self.a).tolist()
+        return rows
+
+    @property
+    def broken(self) -> Sequence[int]:
+        """Rows that only A finds."""
+        rows: list[int] = np.flatnonzero(self.a & ~self.b).tolist()
+        return rows
+
+    def text(self, row: int) -> str:
+        """``person at 12.3 m``."""
+        return f"{self.labels[row].lower()} at {np.hypot(*self.boxes.center[row, :2]):.1f} m"
+
+
+def judge(a: FrameResult, b: FrameResult, truth: Truth) -> Judged:
+    """What either side finds of one frame's objects."""
+    must = np.flatnonzero(truth.must)
+    (found_a, wrong_a), (found_b, wrong_b) = (_side(side.objects, truth) for side in (a, b))
+    return Judged(
+        labels=tuple(truth.labels[k] for k in must),
+        boxes=truth.boxes.chosen(must),
+        a=found_a[must],
+        b=found_b[must],
+        wrong_a=wrong_a,
+        wrong_b=wrong_b,
+        names=frozenset().union(*truth.accepted),
+    )
+
+
+def _side(objects: Objects | None, truth: Truth) -> tuple[Bool, tuple[str, ...]]:
+    """(K,) which boxes of the truth are found, and the names of the objects that are none of them."""
+    if objects is None:
+        return np.zeros(len(truth.labels), bool), ()
+    matches = judge_objects(objects, truth)
+    return ~matches.missed, tuple(objects.names[j].lower() for j in np.flatnonzero(matches.false))

@@ -1,0 +1,118 @@
+"""One parameter in words: what it is, in which unit and range, what it is now and where that was stated."""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Iterator
+from typing import Any, Literal, get_args, get_origin
+
+import annotated_types
+from pydantic.fields import FieldInfo
+
+from bevviz.config import (
+    TUTORIAL_NAMES,
+    Config,
+    Section,
+    keys,
+    load,
+    params_of,
+    unit,
+    unit_spellings,
+    unknown_key,
+    values,
+)
+from bevviz.errors import UserError
+from bevviz.support.text import printable
+
+WIDTH = 100
+
+
+def field_of(key: str, config: Config | None = None) -> FieldInfo | None:
+    """Of a dotted key; None: there is none, or only with the stages that a configuration names."""
+    section, _, name = key.partition(".")
+    if config is not None and name.startswith("params."):
+        return params_of(config, section).get(name.removeprefix("params."))
+    model = Config.model_fields[section].annotation if section in Config.model_fields else None
+    if not (isinstance(model, type) and issubclass(model, Section)):
+        return Config.model_fields.get(key)
+    return model.model_fields.get(name)
+
+
+def explain(asked: str, config: Config) -> str:
+    """A parameter, or the parameters of a section.
+
+    Args:
+        asked: dotted key, name of the tutorial's, or section.
+        config: in force.
+
+    Raises:
+        UserError: there is none of that name; the nearest is told.
+    """
+    about = keys(config)
+    key = TUTORIAL_NAMES.get(asked, asked)
+    if key in about:
+        return "\n".join(_lines(key, config, about[key]))
+    inside = [one for one in about if one.startswith(f"{key}.")]
+    if not inside:
+        raise UserError(unknown_key(asked, [*about]))
+    now = values(config)
+    return "\n".join(_wrapped(f"{one} = {_value(now[one])}", about[one]) for one in inside)
+
+
+def _lines(key: str, config: Config, about: str) -> Iterator[str]:
+    yield f"{key} = {_value(values(config)[key])}"
+    if about:
+        yield textwrap.fill(about, WIDTH, initial_indent="  ", subsequent_indent="  ")
+    info, everywhere = field_of(key, config), field_of(key) is not None
+    if spellings := unit_spellings(key):
+        yield f"  unit       {unit(key)}; a unit can be given: {', '.join(spellings)}"
+    if info is not None and (allowed := _allowed(info)):
+        yield f"  allowed    {allowed}"
+    presets = {name: values(load(preset=name)).get(key) for name in ("default", "reference")}
+    if everywhere and key != "preset":
+        yield "  presets    " + ", ".join(f"{name}: {_value(value)}" for name, value in presets.items())
+    if names := [name for name, own in TUTORIAL_NAMES.items() if own == key]:
+        yield f"  tutorial   {', '.join(names)}, which is accepted, too"
+    yield f"  stated by  {printable(config.stated.get(key, '')) or f'the preset, {config.preset}'}"
+    if key == "preset":
+        yield "  change it  --preset NAME, or in a file 'preset: NAME'"
+        return
+    section, _, name = key.partition(".")
+    in_yaml, table = f"{section}: {{{name}: VALUE}}", section
+    if name.startswith("params."):
+        in_yaml, table = (
+            f"{section}: {{params: {{{name.removeprefix('params.')}: VALUE}}}}",
+            f"{section}.params",
+        )
+    yield f"  change it  --set {key}=VALUE, in YAML '{in_yaml}', in bevviz.toml under [{table}]"
+
+
+def _allowed(info: FieldInfo) -> str:
+    """Choices, or the range, in words."""
+    annotation = info.annotation
+    options = [a for a in (annotation, *get_args(annotation)) if get_origin(a) is Literal]
+    if options:
+        return ", ".join(map(str, get_args(options[0])))
+    rules = [*info.metadata, *(r for part in get_args(annotation) for r in getattr(part, "__metadata__", ()))]
+    words = []
+    for rule in rules:
+        words += [f"at least {rule.ge}"] if isinstance(rule, annotated_types.Ge) else []
+        words += [f"above {rule.gt}"] if isinstance(rule, annotated_types.Gt) else []
+        words += [f"at most {rule.le}"] if isinstance(rule, annotated_types.Le) else []
+        words += [f"below {rule.lt}"] if isinstance(rule, annotated_types.Lt) else []
+    empty = ["or empty"] if type(None) in get_args(annotation) else []
+    return ", ".join([*words, *empty])
+
+
+def _value(value: Any) -> str:
+    import json
+
+    def plain(one: Any) -> Any:
+        return dict(one) if hasattr(one, "items") else str(one)
+
+    text = "empty" if value in (None, "", ()) else json.dumps(value, default=plain)
+    return text if len(text) <= WIDTH else f"{text[: WIDTH - 4]} ..."
+
+
+def _wrapped(head: str, about: str) -> str:
+    return f"{head}\n{textwrap.fill(about, WIDTH, initial_indent='  ', subsequent_indent='  ')}"

@@ -1,0 +1,208 @@
+"""Trust in files that name functions: the user grants it once, for a path and a content.
+
+A project file or a YAML file may name ``module:function``, which is code. Such a function runs only after
+``bevviz trust FILE``. An edit of the file, of a YAML file that it names, or of a module beside it takes the
+trust away.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import shlex
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+from bevviz.config import plugins
+from bevviz.errors import UserError
+from bevviz.support.files import CONFIG_LIMIT, check_owned, read_bytes, save
+
+
+@dataclass(frozen=True, slots=True)
+class Trust:
+    """Whether the functions that a source of values names may run.
+
+    Attributes:
+        granted: the user has named the functions, or has trusted the file that names them.
+        folder: where the modules lie that are not installed. Empty: the working directory.
+        advice: how to run functions that may not run. ``{setting}`` stands for the setting that names one.
+    """
+
+    granted: bool = False
+    folder: str = ""
+    advice: str = "if you trust it, add --set {setting}"
+
+
+USER = Trust(granted=True)  # the command line, the environment, Python
+RECEIVED = Trust()  # a recording, a report, a data set, any file that is not trusted
+MESSAGE = Trust(advice="if you trust it, start bevviz with --set {setting}")  # of another program
+
+
+@dataclass(frozen=True)
+class NamedCode:
+    """Functions that a file names, and the files that decide what these functions do.
+
+    Attributes:
+        files: the file, then the YAML files that it names.
+        functions: ``module:function`` each.
+    """
+
+    files: tuple[Path, ...]
+    functions: tuple[str, ...]
+
+    @cached_property
+    def path(self) -> Path:
+        """The file itself, without links."""
+        return self.files[0].resolve()
+
+    @property
+    def folder(self) -> Path:
+        """Where local modules lie."""
+        return self.path.parent
+
+    @cached_property
+    def modules(self) -> tuple[Path, ...]:
+        """Python files of the folder that the functions need."""
+        return plugins.local_files(self.functions, self.folder)
+
+    @property
+    def is_regular(self) -> bool:
+        """Whether the files can be read twice: a shell's ``<(...)`` cannot."""
+        return all(file.is_file() for file in self.files)
+
+    def digest(self) -> str:
+        """SHA-256 (hexadecimal) of all that decides what the functions do.
+
+        Raises:
+            UserError: a file cannot be read.
+        """
+        content = hashlib.sha256()
+        for file in (*self.files, *self.modules):
+            data = read_bytes(file, CONFIG_LIMIT)
+            name = os.path.relpath(file.resolve(), self.folder)
+            content.update(f"{name}\0{hashlib.sha256(data).hexdigest()}\n".encode(errors="surrogateescape"))
+        return content.hexdigest()
+
+    def __str__(self) -> str:
+        """What would be loaded, for a sentence."""
+        files = ", ".join(str(file.relative_to(self.folder)) for file in self.modules)
+        local = f" ({files})" if files else ""
+        return f"{', '.join(self.functions)}{local}"
+
+
+@dataclass(frozen=True, slots=True)
+class TrustRecord:
+    """A file that the user has trusted.
+
+    Attributes:
+        path: of the file, without links.
+        sha256: ``NamedCode.digest`` at that time.
+        functions: that the file named.
+    """
+
+    path: Path
+    sha256: str
+    functions: tuple[str, ...]
+
+
+def trust_in(code: NamedCode) -> Trust:
+    """Look up whether the user has trusted a file as it is now."""
+    if not code.functions:
+        return RECEIVED
+    shown = shlex.quote(os.path.relpath(code.files[0]))
+    if not code.is_regular:
+        return Trust(advice=f"{shown} is no file that can be trusted: add --set {{setting}}")
+    record = _record(code.path)
+    if record is not None and record.sha256 == code.digest():
+        return Trust(granted=True, folder=str(code.folder))
+    state = "has changed since you trusted it" if record is not None else "is not trusted"
+    return Trust(
+        advice=f"{shown} {state} and would load {code}; read it, then run 'bevviz trust {shown}', or put "
+        "another method in its place by --set"
+    )
+
+
+def allow(code: NamedCode) -> None:
+    """Trust a file as it is now.
+
+    Raises:
+        UserError: the user's data folder cannot be used.
+    """
+    folder = _folder()
+    try:
+        for place in (folder.parent, folder):
+            place.mkdir(mode=0o700, parents=True, exist_ok=True)
+    except OSError as error:
+        raise UserError(f"{folder}: cannot keep what is trusted: {error.strerror}") from None
+    _check(folder)
+    about = {"path": str(code.path), "sha256": code.digest(), "functions": list(code.functions)}
+    save(folder / _name(code.path), json.dumps(about, indent=1) + "\n", "trust")
+
+
+def revoke(path: Path) -> bool:
+    """Take the trust in a file away. Returns whether it was trusted.
+
+    Raises:
+        UserError: the user's data folder cannot be used.
+    """
+    file = _folder() / _name(path.resolve())
+    try:
+        file.unlink()
+    except FileNotFoundError:
+        return False
+    except OSError as error:
+        raise UserError(f"{file}: cannot be removed: {error.strerror}") from None
+    return True
+
+
+def records() -> Iterator[TrustRecord]:
+    """Iterate over all files that the user has trusted, by path."""
+    folder = _folder()
+    found = [record for file in folder.glob("*.json") if (record := _read(file)) is not None]
+    yield from sorted(found, key=lambda record: record.path)
+
+
+def _record(path: Path) -> TrustRecord | None:
+    try:
+        record = _read(_folder() / _name(path))
+    except UserError:  # there is no data folder
+        return None
+    return record if record is not None and record.path == path else None
+
+
+def _read(file: Path) -> TrustRecord | None:
+    """A record; None: there is none that this user has written."""
+    try:
+        _check(file.parent)
+        about = json.loads(file.read_text(encoding="utf-8"))
+        functions = tuple(str(function) for function in about["functions"])
+        return TrustRecord(Path(about["path"]), str(about["sha256"]), functions)
+    except (OSError, ValueError, KeyError, TypeError, UserError):
+        return None
+
+
+def _check(folder: Path) -> None:
+    """Raise UserError where others could put a record."""
+    for place in (folder.parent, folder):
+        check_owned(place, "XDG_DATA_HOME")
+
+
+def _folder() -> Path:
+    """Return the folder of the records. A relative XDG_DATA_HOME does not count: its specification says so.
+
+    Raises:
+        UserError: the user has no home folder.
+    """
+    stated = Path(os.environ.get("XDG_DATA_HOME", ""))
+    try:
+        data = stated if stated.is_absolute() else Path.home() / ".local" / "share"
+    except RuntimeError:
+        raise UserError("there is no folder for what you trust: set XDG_DATA_HOME") from None
+    return data / "bevviz" / "trusted"
+
+
+def _name(path: Path) -> str:
+    return f"{hashlib.sha256(os.fsencode(path)).hexdigest()[:32]}.json"

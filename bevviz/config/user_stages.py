@@ -1,0 +1,103 @@
+"""What a configuration names that is not ours: functions, networks and topics, and their parameters."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+from pydantic import BaseModel
+from pydantic.fields import FieldInfo
+
+from bevviz.config import plugins
+from bevviz.config.methods import OURS, STAGES
+from bevviz.config.pillars import PillarParams, is_network
+from bevviz.config.plugins import TOPIC
+from bevviz.config.sections import Config, Functions
+from bevviz.errors import UserError
+
+
+def plugin_of(config: Config, section: str) -> plugins.Plugin | None:
+    """The function of somebody else's that a stage's section names; None: it is ours, or a topic's.
+
+    Raises:
+        UserError: it cannot be had.
+    """
+    return _plugin(section, getattr(getattr(config, section), STAGES[section]), config.functions)
+
+
+def names_function(section: str, method: str) -> bool:
+    """Whether a stage's section names ``module:function``."""
+    if not plugins.is_foreign(method):
+        return False
+    return section != "detector" or not Path(method).exists()
+
+
+def _plugin(section: str, method: str, functions: Functions) -> plugins.Plugin | None:
+    folder: str | None = None
+    name = method
+    if names_function(section, method):
+        if (section, method) not in functions:  # this configuration was not made by ``load``
+            raise UserError(f"{section}.{STAGES[section]} {method}: no function that the user has named")
+        folder = functions[section, method]
+    else:
+        ours = method in OURS or (section == "detector" and Path(method).exists())
+        name = "" if ours else plugins.registered().get(method, "")
+    if not name:
+        return None
+    try:
+        return plugins.find(name, folder)
+    except UserError as error:
+        raise UserError(f"{section}.{STAGES[section]} {method}: {error}") from error.__cause__
+
+
+def stage_topics(config: Config) -> dict[str, str]:
+    """The robot's topics that stages are taken from, by the dotted key that names each."""
+    named = {f"{s}.{key}": str(getattr(getattr(config, s), key)) for s, key in STAGES.items()}
+    return {key: name.removeprefix(TOPIC) for key, name in named.items() if name.startswith(TOPIC)}
+
+
+def object_network(config: Config) -> PillarParams | None:
+    """The parameters of the 3D detector that ``objects.method`` names as a file; None: it names none."""
+    return PillarParams.model_validate(config.objects.params) if is_network(config.objects.method) else None
+
+
+def object_files(config: Config) -> dict[str, str]:
+    """The files of that detector, by the dotted key that names each."""
+    params = object_network(config)
+    if params is None:
+        return {}
+    files = {"objects.method": config.objects.method, "objects.params.encoder": params.encoder}
+    return {key: file for key, file in files.items() if file}
+
+
+def with_object_files(config: Config, named: Callable[[str], str]) -> Config:
+    """The configuration with the files of that detector named otherwise."""
+    files = object_files(config)
+    if not files:
+        return config
+    encoder = named(files.get("objects.params.encoder", "")) if len(files) > 1 else ""
+    params = {**config.objects.params, "encoder": encoder}
+    changed = {"method": named(files["objects.method"]), "params": params}
+    return config.model_copy(update={"objects": config.objects.model_copy(update=changed)})
+
+
+def params_model(section: str, method: str, functions: Functions) -> type[BaseModel] | None:
+    """Of the parameters that a stage has beside its own.
+
+    Args:
+        section: of the stage.
+        method: that the section names.
+        functions: ``Config.functions``.
+    """
+    if section == "objects" and is_network(method):
+        return PillarParams
+    plugin = _plugin(section, method, functions)
+    return None if plugin is None else plugin.params
+
+
+def params_of(config: Config, section: str) -> Mapping[str, FieldInfo]:
+    """The parameters that a stage has beside its own: of a function, or of a network on pillars."""
+    if section not in STAGES:
+        return {}
+    model = params_model(section, getattr(getattr(config, section), STAGES[section]), config.functions)
+    return {} if model is None else model.model_fields

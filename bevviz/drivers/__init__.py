@@ -1,0 +1,1 @@
+"""Decoders of LiDAR packets, compressed clouds and video. Imports `messages` and below."""

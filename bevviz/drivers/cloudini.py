@@ -1,0 +1,391 @@
+"""Clouds that cloudini compressed (github.com/facontidavide/cloudini), in its formats 3 to 5.
+
+A header says what the fields are; then come chunks of points. Of each field a chunk holds the differences
+from point to point as zigzag varints, floats as multiples of their resolution; what is kept exactly is stored
+as it is, or as its exclusive or with the value before it. All of a chunk is compressed again by zstd or LZ4.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from backports import zstd
+from lz4.block import LZ4BlockError  # type: ignore[import-untyped]
+from lz4.block import decompress as lz4_decompress
+from numpy.typing import NDArray
+
+from bevviz.errors import first_line
+from bevviz.model.frame import F64, I64, U8
+from bevviz.support.kernel import kernel
+
+MAGIC = b"CLOUDINI_V"
+CHUNK = 32 * 1024  # points
+MOST_BYTES = 1 << 30  # of a cloud
+LONGEST_HEADER = 1 << 13  # bytes in YAML: those of 20 fields take 1.5 kB, and it is read slowly
+TYPES = ("", "INT8", "UINT8", "INT16", "UINT16", "INT32", "UINT32", "FLOAT32", "FLOAT64", "INT64", "UINT64")
+SIZES = (0, 1, 1, 2, 2, 4, 4, 4, 8, 8, 8)
+FLOAT32, FLOAT64 = 7, 8
+NOWHERE = 0xFFFFFFFF  # offset of a field that is encoded and not kept
+U64 = NDArray[np.uint64]
+ENCODINGS = ("NONE", "LOSSY", "LOSSLESS")
+COMPRESSIONS = ("NONE", "LZ4", "ZSTD")
+COPIED, DELTAS, MULTIPLES, XORED, PACKED = range(5)  # how a field is encoded
+CUT = -1  # what the kernels return where the data ends, or is none of theirs
+
+
+@dataclass(frozen=True, slots=True)
+class Field:
+    """``type`` as a PointField has it, 9 and 10 being int64 and uint64; ``resolution`` of 0: none."""
+
+    name: str
+    offset: int
+    type: int
+    resolution: float
+
+    @property
+    def size(self) -> int:
+        return SIZES[self.type]
+
+
+@dataclass(frozen=True, slots=True)
+class Header:
+    """What the data say of themselves. ``encoding`` and ``compression``: by ENCODINGS, COMPRESSIONS."""
+
+    version: int
+    width: int
+    height: int
+    point_step: int
+    encoding: int
+    compression: int
+    fields: Sequence[Field]
+
+    @property
+    def points(self) -> int:
+        return self.width * self.height
+
+    @property
+    def adaptive(self) -> Sequence[Field]:
+        """Integers that stand behind all points of a chunk, each encoded as it takes least room."""
+        if self.version < 5 or ENCODINGS[self.encoding] != "LOSSY":
+            return ()
+        return [f for f in self.fields if f.type not in (FLOAT32, FLOAT64) and f.size > 1]
+
+
+EMPTY = Header(5, 0, 1, 0, 0, 0, ())  # of a cloud without points, of which there are no data
+
+
+def decode(data: bytes) -> tuple[Header, U8]:
+    """The header, and the (points * point_step,) bytes of the points.
+
+    Raises:
+        ValueError: no data of cloudini's, of a version that is not known here, or damaged.
+    """
+    header, at = read_header(data)
+    fields, adaptive = header.fields, header.adaptive
+    if (
+        header.points * header.point_step > MOST_BYTES
+        or header.point_step > 1 << 16
+        or any(f.offset + f.size > header.point_step for f in fields if f in adaptive or f.offset != NOWHERE)
+    ):
+        raise ValueError("its cloudini header is damaged: no field may end behind the point, 1 GiB is most")
+    together = [f for f in fields if f not in adaptive]
+    ways = np.array([_way(header, field) for field in together], np.int64)
+    sizes, offsets = (np.array([getattr(f, n) for f in together], np.int64) for n in ("size", "offset"))
+    resolutions = np.array([f.resolution for f in together], np.float64)
+    out = np.zeros(header.points * header.point_step, np.uint8)
+    first = 0
+    while first < header.points:
+        count = min(CHUNK, header.points - first)
+        (length,) = struct.unpack_from("<I", data, at) if len(data) >= at + 4 else (len(data),)
+        chunk = _unpacked(header, data[at + 4 : at + 4 + length])
+        if len(data) < at + 4 + length:
+            raise ValueError("its cloudini data are cut")
+        at += 4 + length
+        points = out[first * header.point_step :]
+        done = _points(chunk, count, ways, sizes, offsets, resolutions, points, header.point_step)
+        for field in adaptive:
+            if done != CUT:
+                done = _column(chunk, done, count, field.size, field.offset, points, header.point_step)
+        if done != len(chunk):
+            raise ValueError("its cloudini data are damaged")
+        first += count
+    return header, out
+
+
+def read_header(data: bytes) -> tuple[Header, int]:
+    """The header, and the byte where the chunks begin.
+
+    Raises:
+        ValueError: it is none.
+    """
+    if not data.startswith(MAGIC) or not data[10:12].isdigit():
+        raise ValueError("its data do not begin as cloudini's do")
+    version = int(data[10:12])
+    if not 3 <= version <= 5:
+        raise ValueError(f"its data are of cloudini's format {version}; 3 to 5 are read")
+    try:
+        if data[12:13] == b"\n" and data[13:14] != b"{":
+            end = data.index(b"\0", 13, 13 + LONGEST_HEADER)
+            return _of_yaml(version, data[13:end].decode()), end + 1
+        return _of_binary(version, data)
+    except (ValueError, LookupError, TypeError, struct.error) as error:
+        raise ValueError(f"its cloudini header is damaged ({first_line(error)})") from None
+
+
+@lru_cache(
+    maxsize=64
+)  # all messages of a topic have the same one, which takes longer to read than the points
+def _of_yaml(version: int, text: str) -> Header:
+    from ruamel.yaml import YAML
+    from ruamel.yaml.error import YAMLError
+
+    try:
+        told = YAML(typ="safe", pure=True).load(text)
+    except YAMLError as error:
+        raise ValueError(first_line(error)) from None
+    fields = [
+        Field(str(f["name"]), int(f["offset"]), TYPES.index(f["type"], 1), _single(f["resolution"]))
+        for f in told["fields"] or ()
+    ]
+    width, height, step = (int(told[name]) for name in ("width", "height", "point_step"))
+    encoding, compression = told["encoding_opt"], told["compression_opt"]
+    return Header(
+        version, width, height, step, ENCODINGS.index(encoding), COMPRESSIONS.index(compression), fields
+    )
+
+
+def _single(resolution: object) -> float:
+    """As cloudini holds it, in single precision; 0: none."""
+    return float(np.float32(0 if resolution is None else str(resolution)))
+
+
+def _of_binary(version: int, data: bytes) -> tuple[Header, int]:
+    width, height, step, encoding, compression, count = struct.unpack_from("<IIIBBH", data, 12)
+    at, fields = 28, list[Field]()
+    for _ in range(count):
+        (length,) = struct.unpack_from("<H", data, at)
+        name = data[at + 2 : at + 2 + length].decode()
+        offset, kind, resolution = struct.unpack_from("<IBf", data, at + 2 + length)
+        at += 2 + length + 9
+        fields.append(Field(name, offset, kind, max(resolution, 0.0)))
+    if max(encoding, compression) > 2 or any(not 0 < field.type < len(TYPES) for field in fields):
+        raise ValueError("a type, an encoding or a compression that there is none of")
+    return Header(version, width, height, step, encoding, compression, fields), at
+
+
+def _way(header: Header, field: Field) -> int:
+    encoding = ENCODINGS[header.encoding]
+    if encoding == "NONE" or field.size == 1:
+        return COPIED
+    if field.type not in (FLOAT32, FLOAT64):
+        return DELTAS
+    if field.resolution and encoding == "LOSSY":
+        return MULTIPLES
+    if field.type == FLOAT32:
+        return XORED if encoding == "LOSSLESS" else COPIED
+    return XORED if field.resolution or header.version < 4 else PACKED
+
+
+def _unpacked(header: Header, chunk: bytes) -> U8:
+    compression = COMPRESSIONS[header.compression]
+    most = CHUNK * (sum(11 for _ in header.fields) + header.point_step) + 4096
+    try:
+        if compression == "LZ4":
+            chunk = lz4_decompress(chunk, uncompressed_size=most)
+        elif compression == "ZSTD":
+            stream = zstd.ZstdDecompressor()
+            chunk = stream.decompress(chunk, most)
+            if not stream.eof:
+                raise ValueError("it is cut, or too long")
+    except (LZ4BlockError, zstd.ZstdError, ValueError) as error:
+        raise ValueError(f"its compressed data is damaged ({first_line(error)})") from None
+    return np.frombuffer(chunk, np.uint8)
+
+
+@kernel
+def _varint(data: U8, at: int) -> tuple[np.uint64, int]:
+    """An unsigned number of seven bits a byte, lowest first, and the byte behind it."""
+    value, shift = np.uint64(0), np.uint64(0)
+    while 0 <= at < len(data) and shift < 64:
+        byte = np.uint64(data[at])
+        at += 1
+        value |= (byte & np.uint64(0x7F)) << shift
+        if not byte & np.uint64(0x80):
+            return value, at
+        shift += np.uint64(7)
+    return value, CUT
+
+
+@kernel
+def _difference(value: np.uint64) -> np.int64:
+    """Of a zigzag number that is one more, 0 being NaN."""
+    value -= np.uint64(1)
+    return np.int64(value >> np.uint64(1)) ^ -np.int64(value & np.uint64(1))
+
+
+@kernel
+def _points(
+    data: U8,
+    count: int,
+    ways: I64,
+    sizes: I64,
+    offsets: I64,
+    resolutions: F64,
+    out: U8,
+    step: int,
+) -> int:
+    """Decode the fields that stand together, point after point; the byte behind them."""
+    at, fields = 0, len(ways)
+    before, bits = np.zeros(fields, np.int64), np.zeros(fields, np.uint64)
+    leading, meaningful = np.zeros(fields, np.int64), np.zeros(fields, np.int64)
+    single, double = np.zeros(1, np.float32), np.zeros(1, np.float64)
+    single_bits, double_bits = single.view(np.uint32), double.view(np.uint64)
+    for point in range(count):
+        for field in range(fields):
+            way, size = ways[field], sizes[field]
+            if way in (COPIED, XORED):
+                if at + size > len(data):
+                    return CUT
+                value = _load(data, at, size)
+                at += size
+                if way == XORED:
+                    bits[field] ^= value
+                    value = bits[field]
+            elif way == PACKED:
+                at = _packed(data, at, point == 0, field, bits, leading, meaningful)
+                value = bits[field]
+            else:
+                value, at = _varint(data, at)
+                if at == CUT or (value == 0 and way == DELTAS):
+                    return CUT
+                missing = value == 0
+                before[field] = 0 if missing else before[field] + _difference(value)
+                if way == DELTAS:
+                    value = np.uint64(before[field])
+                elif size == 4:
+                    number = np.float32(before[field]) * np.float32(resolutions[field])
+                    single[0] = np.float32(np.nan) if missing else number
+                    value = np.uint64(single_bits[0])
+                else:
+                    double[0] = np.nan if missing else before[field] * resolutions[field]
+                    value = double_bits[0]
+            if at == CUT:
+                return CUT
+            if offsets[field] != NOWHERE:
+                _store(out, point * step + offsets[field], size, value)
+    return at
+
+
+@kernel
+def _packed(data: U8, at: int, first: bool, field: int, bits: U64, leading: I64, meaningful: I64) -> int:
+    """A double by Gorilla (Pelkonen et al. 2015), whose bits begin with a byte; the byte behind it."""
+    place = at * 8
+    if first:
+        value, place = _bits(data, place, 64)
+        bits[field] = value
+        return place // 8 if place != CUT else CUT
+    changed, place = _bits(data, place, 1)
+    if place != CUT and changed:
+        fresh, place = _bits(data, place, 1)
+        if place != CUT and fresh:
+            lead, place = _bits(data, place, 5)
+            length, place = _bits(data, place, 6)
+            leading[field], meaningful[field] = np.int64(lead), np.int64(length) + 1
+        trailing = 64 - leading[field] - meaningful[field]
+        if place == CUT or meaningful[field] == 0 or trailing < 0:
+            return CUT
+        value, place = _bits(data, place, meaningful[field])
+        bits[field] ^= value << np.uint64(trailing)
+    return (place + 7) // 8 if place != CUT else CUT
+
+
+@kernel
+def _bits(data: U8, place: int, count: int) -> tuple[np.uint64, int]:
+    """A number of so many bits, the lowest first, at a bit of the data; the bit behind it."""
+    value = np.uint64(0)
+    if place == CUT or place + count > len(data) * 8:
+        return value, CUT
+    done = 0
+    while done < count:
+        shift = (place + done) & 7
+        some = min(8 - shift, count - done)
+        part = (np.uint64(data[(place + done) >> 3]) >> np.uint64(shift)) & np.uint64((1 << some) - 1)
+        value |= part << np.uint64(done)
+        done += some
+    return value, place + count
+
+
+@kernel
+def _column(data: U8, at: int, count: int, size: int, offset: int, out: U8, step: int) -> int:
+    """Decode one integer of all points of a chunk: differences, a palette, or runs of either."""
+    if at >= len(data):
+        return CUT
+    mode = data[at]
+    at += 1
+    value, row = np.uint64(0), 0
+    if mode == 0:
+        for row in range(count):
+            number, at = _varint(data, at)
+            if at == CUT or number == 0:
+                return CUT
+            value += np.uint64(_difference(number))
+            _store(out, row * step + offset, size, value)
+        return at
+    if mode == 1:
+        if at + 2 > len(data):
+            return CUT
+        many, width = np.int64(_load(data, at, 2)), 0
+        palette = at + 2
+        at = int(palette + many * size)
+        while (many - 1) >> width > 0:
+            width += 1
+        place, end = at * 8, at + (width * count + 7) // 8
+        if many == 0 or end > len(data):
+            return CUT
+        for row in range(count):
+            index, place = _bits(data, place, width)
+            if np.int64(index) >= many:
+                return CUT
+            _store(out, row * step + offset, size, _load(data, palette + int(index) * size, size))
+        return end
+    if mode > 3 or at + 4 > len(data):
+        return CUT
+    runs = np.int64(_load(data, at, 4))
+    at += 4
+    for _ in range(runs):
+        if mode == 2:
+            if at + size > len(data):
+                return CUT
+            value, by = _load(data, at, size), np.uint64(0)
+            at += size
+        else:
+            number, at = _varint(data, at)
+            if at == CUT or number == 0:
+                return CUT
+            by = np.uint64(_difference(number))
+        length, at = _varint(data, at)
+        if at == CUT or length > np.uint64(count - row):
+            return CUT
+        for _ in range(np.int64(length)):
+            value += by
+            _store(out, row * step + offset, size, value)
+            row += 1
+    return at if row == count else CUT
+
+
+@kernel
+def _load(data: U8, at: int, size: int) -> np.uint64:
+    value = np.uint64(0)
+    for i in range(size):
+        value |= np.uint64(data[at + i]) << np.uint64(8 * i)
+    return value
+
+
+@kernel
+def _store(out: U8, at: int, size: int, value: np.uint64) -> None:
+    for i in range(size):
+        out[at + i] = np.uint8((value >> np.uint64(8 * i)) & np.uint64(0xFF))

@@ -1,0 +1,123 @@
+"""Clouds that point_cloud_transport compressed: CompressedPointCloud2 of its plugins, cloudini among them."""
+
+from __future__ import annotations
+
+import re
+import zlib
+from typing import Any
+
+import numpy as np
+from backports import zstd
+
+from bevviz.drivers import cloudini
+from bevviz.errors import first_line
+from bevviz.messages.clouds import MOST_POINTS, SCALARS
+from bevviz.messages.encode import make
+
+LEAST, LONGEST = 1 << 24, 1 << 30  # bytes that a cloud may be unpacked to, whatever it says
+DRACO = "which DracoPy reads: pip install 'bevviz[draco]'"
+_NAME = re.compile(r"point_cloud_interfaces/(msg/)?CompressedPointCloud2$")
+
+
+def is_compressed(msgtype: str) -> bool:
+    return _NAME.search(msgtype) is not None
+
+
+def decompress(msg: Any) -> Any:
+    """The sensor_msgs/PointCloud2 that a CompressedPointCloud2 stands for.
+
+    Raises:
+        ValueError: a format that is not read here, or damaged data.
+    """
+    data = memoryview(msg.compressed_data).tobytes()  # of a number, bytes() would make so many zeros
+    if msg.format == "cloudini":
+        return _of_cloudini(msg, data)
+    width, height = int(msg.width), int(msg.height)
+    size = height * max(int(msg.row_step), width * int(msg.point_step))
+    if msg.format == "zstd":
+        unpacked = np.frombuffer(_unpacked(zstd.ZstdDecompressor(), data, size), np.uint8)
+    elif msg.format == "zlib":
+        unpacked = np.frombuffer(
+            _unpacked(zlib.decompressobj(47), data, size), np.uint8
+        )  # of zlib or of gzip
+    elif msg.format == "draco":
+        unpacked = _of_draco(msg, data)
+        width, height = len(unpacked) // max(int(msg.point_step), 1), 1
+    else:
+        raise ValueError(
+            f"a cloud compressed by '{msg.format}' is not read: zstd, zlib, draco and cloudini are"
+        )
+    return make(
+        "sensor_msgs/msg/PointCloud2",
+        header=msg.header,
+        height=height,
+        width=width,
+        fields=msg.fields,
+        is_bigendian=msg.is_bigendian,
+        point_step=msg.point_step,
+        row_step=width * int(msg.point_step) if msg.format == "draco" else msg.row_step,
+        data=unpacked,
+        is_dense=msg.is_dense,
+    )
+
+
+def _of_cloudini(msg: Any, data: bytes) -> Any:
+    """What its header says holds: points may be fewer than the message has."""
+    told, points = cloudini.decode(data) if data else (cloudini.EMPTY, np.zeros(0, np.uint8))
+    fields = [
+        make("sensor_msgs/msg/PointField", name=f.name, offset=f.offset, datatype=f.type, count=1)
+        for f in told.fields
+        if f.type in SCALARS and f.offset != cloudini.NOWHERE
+    ]
+    return make(
+        "sensor_msgs/msg/PointCloud2",
+        header=msg.header,
+        height=told.height,
+        width=told.width,
+        fields=fields if data else msg.fields,
+        is_bigendian=False,
+        point_step=told.point_step or msg.point_step,
+        row_step=told.width * told.point_step,
+        data=points,
+        is_dense=msg.is_dense,
+    )
+
+
+def _unpacked(stream: Any, data: bytes, size: int) -> bytes:
+    """Unpack a cloud that has ``size`` bytes by its own word, with as much memory as that takes."""
+    try:
+        found: bytes = stream.decompress(data, min(max(size, LEAST), LONGEST))
+    except (zlib.error, zstd.ZstdError) as error:
+        raise ValueError(f"its compressed data is damaged ({first_line(error)})") from None
+    if not stream.eof:
+        raise ValueError("the end of its compressed data is missing, or it is too long")
+    return found
+
+
+def _of_draco(msg: Any, data: bytes) -> Any:
+    """(N * point_step,) bytes: the plugin makes an attribute of each field, in their order."""
+    try:
+        import DracoPy
+    except ImportError:
+        raise ValueError(f"it is compressed by draco, {DRACO}") from None
+    try:
+        attributes = DracoPy.decode(data).attributes
+    except Exception as error:  # the library's own, and what its extension makes of C++'s
+        raise ValueError(f"its draco data is damaged ({first_line(error)})") from None
+    step, count = int(msg.point_step), len(attributes[0]["data"]) if attributes else 0
+    if len(attributes) != len(msg.fields) or count > MOST_POINTS or not 0 < step < 1 << 16:
+        raise ValueError(
+            f"its draco data has {len(attributes)} attributes of {count} points, but {len(msg.fields)} fields"
+        )
+    points = np.zeros(count * step, np.uint8)
+    for field, attribute in zip(msg.fields, attributes, strict=True):
+        values = np.asarray(attribute["data"]).reshape(count, -1)
+        kind = np.dtype(SCALARS.get(int(field.datatype), "u1"))
+        if values.dtype == np.uint8 and values.shape[1] == kind.itemsize:  # rgb, as its four bytes
+            kind = np.dtype(np.uint8)
+        end = int(field.offset) + values.shape[1] * kind.itemsize
+        if end > step:
+            raise ValueError(f"its field {field.name} ends at byte {end} of {step}")
+        shape, steps = values.shape, (step, kind.itemsize)
+        np.ndarray(shape, kind, points, int(field.offset), steps)[...] = values
+    return points

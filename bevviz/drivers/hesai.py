@@ -1,0 +1,232 @@
+"""Packets of Hesai's mechanical LiDARs, by the layouts of their manuals."""
+
+from __future__ import annotations
+
+import csv
+from dataclasses import dataclass
+from functools import cache
+from io import StringIO
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from bevviz.drivers.calibration_file import read_calibration
+from bevviz.errors import UserError
+from bevviz.messages.encode import encode_points
+from bevviz.model.frame import F32, I64
+
+if TYPE_CHECKING:
+    from bevviz.drivers.packets import Packets
+
+NOMINAL = Path(__file__).parents[1] / "data" / "hesai_angles.csv"  # as Hesai's own drivers bring them
+AZIMUTHS = 36_000  # units of a circle
+POINT = np.dtype([(n, "<f4") for n in ("x", "y", "z", "intensity", "time")] + [("ring", "<u2")])
+
+
+@dataclass(frozen=True, slots=True)
+class Model:
+    """Where what is in a packet.
+
+    Attributes:
+        name: as Hesai has it.
+        head: what its packets begin with; a None is any byte.
+        first: bytes before the first block.
+        start: bytes of a block before its azimuth.
+        blocks: in a packet.
+        channels: of a block.
+        unit: bytes of a measurement: distance (2), reflectivity (1), and what is not read.
+        behind: bytes between the last block and the tail.
+        mode: byte of the return mode, in the tail.
+        clock: byte of the microseconds of the clock, in the tail.
+        tail: bytes of the tail that are read.
+        scale: byte with the millimetres of a unit of distance; None: 4 mm.
+        period: between two blocks, microseconds; negative where the clock tells the time of the last one.
+    """
+
+    name: str
+    head: tuple[int | None, ...]
+    first: int
+    start: int
+    blocks: int
+    channels: int
+    unit: int
+    behind: int
+    mode: int
+    clock: int
+    tail: int
+    scale: int | None
+    period: float
+
+    @property
+    def block(self) -> np.dtype[np.void]:
+        measured = np.dtype(
+            {"names": ["distance", "reflectivity"], "formats": ["<u2", "u1"], "itemsize": self.unit}
+        )
+        return np.dtype(
+            {
+                "names": ["azimuth", "measured"],
+                "formats": ["<u2", (measured, (self.channels,))],
+                "offsets": [self.start, self.start + 2],
+            }
+        )
+
+    @property
+    def end(self) -> int:
+        """Byte where the tail begins."""
+        return self.first + self.blocks * self.block.itemsize + self.behind
+
+    @property
+    def size(self) -> int:
+        """Bytes that a packet has at least."""
+        return self.end + self.tail
+
+
+def _with_header(
+    name: str, version: tuple[int, int], channels: int, blocks: int, period: float, **places: int
+) -> Model:
+    """Of those whose packets say what they hold: version, channels, blocks, unit of distance."""
+    head = (0xEE, 0xFF, *version, None, None, channels, blocks)
+    return Model(name, head, 12, 0, blocks, channels, 4, scale=9, period=period, **places)
+
+
+XT = {"behind": 0, "mode": 10, "clock": 19, "tail": 23}
+MODELS = (
+    Model("Pandar40P", (0xFF, 0xEE), 0, 2, 10, 40, 3, 0, 14, 10, 22, scale=None, period=-55.56),
+    Model("Pandar64", (0xEE, 0xFF, 64, 6), 8, 0, 6, 64, 3, 0, 14, 10, 22, scale=5, period=-55.56),
+    _with_header("PandarQT64", (3, 1), 64, 4, 166.67, behind=0, mode=16, clock=12, tail=18),
+    _with_header("PandarQT128", (3, 2), 128, 2, 111.11, behind=21, mode=12, clock=21, tail=25),
+    _with_header("PandarXT16", (6, 1), 16, 8, -50.0, **XT),
+    _with_header("PandarXT32", (6, 1), 32, 8, -50.0, **XT),
+    _with_header("PandarXT32M", (6, 1), 32, 6, -50.0, **XT),
+)
+# Blocks of one direction, by the return mode: first, second, strongest or last; two of them; three.
+RETURNS = {0x33: 1, 0x34: 1, 0x37: 1, 0x38: 1, 0x39: 2, 0x3A: 2, 0x3B: 2, 0x3C: 2, 0x3D: 3, 0x3E: 2}
+
+
+def decode(packets: Packets, angles: Path | None = None) -> Any:
+    """The sensor_msgs/PointCloud2 of a scan, as Hesai's driver makes it: y is where azimuth 0 is.
+
+    ``ring`` is the number of the channel from 0. ``time`` is in seconds after the stamp of the scan, by the
+    clock of the sensor, and that of a block: its channels fire within 0.15 ms. Of several returns of a beam
+    those at different distances are given. The cloud announces a point for each beam, also for those that met
+    nothing and those in packets that are lost.
+
+    Args:
+        packets: those of another model or return mode than most, and those that are cut, count as lost.
+        angles: elevation and azimuth of each channel in degrees, as the sensor's own CSV states them; without
+            it those of its kind, which may be off by half a degree.
+
+    Raises:
+        ValueError: a model or a return mode that is not known.
+        UserError: angles that cannot be read, or are another model's.
+    """
+    model, usable = _model_of(packets)
+    data = np.ascontiguousarray(packets.data[usable])
+    modes = data[:, model.end + model.mode]
+    mode = int(np.bincount(modes).argmax())
+    returns = RETURNS.get(mode, 0)
+    if not returns:
+        raise ValueError(f"a {model.name} with the return mode 0x{mode:02x} is not known here")
+    usable, data = usable[modes == mode], data[modes == mode]
+    shape, steps = (len(data), model.blocks), (data.strides[0], model.block.itemsize)
+    blocks = np.ndarray(shape, model.block, data, model.first, steps)
+    metres = 0.004 if model.scale is None else int(data[0, model.scale]) * 1e-3
+    elevation, offset = _read(angles, model) if angles else _nominal()[model.name]
+
+    distance = np.ascontiguousarray(blocks["measured"]["distance"])  # (N, blocks, channels)
+    grouped = distance[:, : model.blocks // returns * returns].reshape(len(data), -1, returns, model.channels)
+    for first in range(returns - 1):
+        same = (grouped[:, :, first, None] == grouped[:, :, first + 1 :]).any(axis=2)
+        grouped[:, :, first][same] = 0
+    met = np.asarray(grouped.any(axis=2))
+    packet, group, which, channel = np.nonzero(grouped)
+    block = group * returns + which
+
+    azimuth = np.deg2rad(blocks["azimuth"] * (360 / AZIMUTHS))  # (N, blocks)
+    sine, cosine = (np.asarray(f(azimuth), np.float32)[packet, block] for f in (np.sin, np.cos))
+    turn, tilt = (np.deg2rad(a) for a in (offset, elevation))
+    far = grouped[packet, group, which, channel] * np.float32(metres)
+    flat = far * np.cos(tilt)[channel]
+    points = np.empty(len(far), POINT)
+    points["x"] = flat * (sine * np.cos(turn)[channel] + cosine * np.sin(turn)[channel])
+    points["y"] = flat * (cosine * np.cos(turn)[channel] - sine * np.sin(turn)[channel])
+    points["z"] = far * np.sin(tilt)[channel]
+    points["intensity"] = blocks["measured"]["reflectivity"][packet, block, channel]
+    points["ring"] = channel
+    points["time"] = _times(packets, usable, model, returns)[packet, group]
+    lost = packets.lost + len(packets.data) - len(data)
+    announced = len(points) + int((~met).sum()) + lost * met[0].size
+    return encode_points(packets.stamp, packets.frame_id, points, announced)
+
+
+def _model_of(packets: Packets) -> tuple[Model, I64]:
+    """What most of the packets are of, and which these are."""
+    most = np.zeros(0, np.int64)
+    found = None
+    for model in MODELS:
+        wanted = [i for i, byte in enumerate(model.head) if byte is not None]
+        head = np.array([byte for byte in model.head if byte is not None], np.uint8)
+        fit = np.flatnonzero((packets.data[:, wanted] == head).all(axis=1))
+        if len(fit) > len(most):
+            most, found = fit, model
+    if found is None:
+        size, begin = int(packets.sizes[0]), bytes(packets.data[0, :12]).hex()
+        raise ValueError(
+            f"packets of {size} bytes that begin with {begin} are of no model that is decoded here "
+            f"({', '.join(m.name for m in MODELS)}): play them through the driver and record its cloud"
+        )
+    whole = most[packets.sizes[most] >= found.size]
+    if not len(whole):
+        size = int(packets.sizes[most].max())
+        raise ValueError(f"a packet of {size} bytes is too short for a {found.name}'s {found.size}")
+    return found, whole
+
+
+def _times(packets: Packets, usable: I64, model: Model, returns: int) -> F32:
+    """(N, directions) seconds after the scan's stamp.
+
+    The clock of the sensor goes on from when the first packet was received: it may be set wrongly.
+    """
+    at = model.end + model.clock
+    clock = np.ascontiguousarray(packets.data[usable, at : at + 4]).view("<u4")[:, 0].astype(np.int64)
+    steps = np.diff(clock, prepend=clock[0])
+    steps[steps < 0] += 1_000_000  # it counts within a second
+    since = (int(packets.received[usable[0]]) - packets.stamp) * 1e-9 + np.cumsum(steps) * 1e-6
+    groups = model.blocks // returns
+    number = np.arange(groups) if model.period > 0 else np.arange(groups) - (groups - 1)
+    return np.asarray(since[:, None] + number * abs(model.period) * 1e-6, np.float32)
+
+
+Angles = tuple[F32, F32]  # elevation and azimuth of each channel, degrees
+
+
+@cache
+def _nominal() -> dict[str, Angles]:
+    rows = list(csv.reader(NOMINAL.read_text().splitlines()))[1:]
+    return {
+        model.name: _angles([[float(v) for v in row[1:]] for row in rows if row[0] == model.name])
+        for model in MODELS
+    }
+
+
+def _angles(rows: list[list[float]]) -> Angles:
+    _, elevation, azimuth = np.array(sorted(rows), np.float32).T
+    return elevation, azimuth
+
+
+def _read(path: Path, model: Model) -> Angles:
+    """A CSV as the sensor's web page gives it: number of the channel, elevation, azimuth."""
+    rows = list[list[float]]()
+    for row in csv.reader(StringIO(read_calibration(path))):
+        try:
+            rows.append([float(value) for value in row[:3]])
+        except ValueError:
+            continue  # the names of the columns, a comment, a checksum
+    rows = [row for row in rows if len(row) == 3]
+    if [row[0] for row in sorted(rows)] != list(range(1, model.channels + 1)):
+        raise UserError(
+            f"source.lidar_calibration: {path}: has {len(rows)} rows of channel, elevation and azimuth, but "
+            f"the packets are a {model.name}'s, which has {model.channels} channels, numbered from 1"
+        )
+    return _angles(rows)

@@ -1,0 +1,284 @@
+"""Packets of Ouster's LiDARs, by the layouts of the sensors' manuals and with the metadata of the one sensor.
+
+ouster-sdk, which does the same, is bound to an old release of rosbags; ours is held against it in
+benchmarks/ouster.py.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections import deque
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from bevviz.errors import UserError
+from bevviz.messages.encode import encode_points
+from bevviz.model.frame import F32, U8
+
+PACKET = re.compile(r"(ouster_sensor_msgs|ouster_msgs|ouster_ros)/(msg/)?PacketMsg$")
+FRAME = "os_lidar"  # of the clouds that Ouster's driver publishes
+LACKS = (
+    "packets of an Ouster without its metadata: record its metadata topic (std_msgs/String) with them, "
+    "--set 'source.lidar_calibration={TOPIC: metadata.json}', or play them through its driver"
+)
+NOT_LIDAR = "packets of an Ouster's IMU"
+SMALLEST = 1000  # bytes: those of the IMU have 48
+MINUTE = 60_000_000_000
+Packet = tuple[int, bytes | memoryview]  # when it was received, nanoseconds, and its bytes
+POINT = np.dtype(
+    [(n, "<f4") for n in ("x", "y", "z", "intensity", "time")] + [("reflectivity", "<u2"), ("ring", "<u2")]
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Profile:
+    """Where what is in a packet: in bytes, and of a measurement as little-endian numbers.
+
+    Attributes:
+        head: of a packet.
+        column: of a column before its measurements.
+        status: type and byte of what tells whether a column is valid; negative: from its end.
+        valid: the bits that are set then.
+        number: byte of the number of the scan, in the packet.
+        measured: of a measurement.
+        mask: bits of the distance, a 32 bit number at its beginning.
+        scale: millimetres of its unit.
+        reflectivity: its byte.
+        signal: byte of its intensity; None: there is none, and the reflectivity is taken.
+    """
+
+    head: int
+    column: int
+    status: tuple[str, int]
+    valid: int
+    number: int
+    measured: int
+    mask: int
+    scale: float
+    reflectivity: int
+    signal: int | None
+    foot: int  # of a packet
+    after: int  # of a column
+
+
+_NEW: dict[str, Any] = {
+    "head": 32, "column": 12, "status": ("<u2", 10), "valid": 1, "number": 2, "foot": 32, "after": 0
+}  # fmt: skip
+PROFILES = {
+    "LEGACY": Profile(0, 16, ("<u4", -4), 0xFFFFFFFF, 10, 12, 0xFFFFF, 1.0, 4, 6, 0, 4),
+    "RNG19_RFL8_SIG16_NIR16": Profile(**_NEW, measured=12, mask=0x7FFFF, scale=1.0, reflectivity=4, signal=6),
+    "RNG19_RFL8_SIG16_NIR16_DUAL": Profile(
+        **_NEW, measured=16, mask=0x7FFFF, scale=1.0, reflectivity=3, signal=8
+    ),
+    "RNG15_RFL8_NIR8": Profile(**_NEW, measured=4, mask=0x7FFF, scale=8.0, reflectivity=2, signal=None),
+}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sensor:
+    """What the metadata of one sensor say.
+
+    Attributes:
+        columns: of a whole turn.
+        per_packet: columns.
+        sent: packets of a whole scan; fewer than a turn's where the sensor measures a part of it.
+        directions: (pixels, 2) altitude and azimuth of the beams, radians.
+        origin: (2,) where beams begin, metres from the axis and above its origin.
+    """
+
+    profile: Profile
+    columns: int
+    per_packet: int
+    sent: int
+    directions: F32
+    origin: F32
+
+    @property
+    def pixels(self) -> int:
+        return len(self.directions)
+
+    @property
+    def step(self) -> int:
+        """Bytes of a column."""
+        return self.profile.column + self.pixels * self.profile.measured + self.profile.after
+
+    @property
+    def size(self) -> int:
+        """Bytes of a packet."""
+        return self.profile.head + self.per_packet * self.step + self.profile.foot
+
+    def number(self, packet: bytes | memoryview) -> int:
+        """The number of the scan that a packet is of."""
+        at = self.profile.number
+        return int.from_bytes(packet[at : at + 2], "little")
+
+    def begin(self, packet: bytes | memoryview) -> int:
+        """The number of its first column."""
+        at = self.profile.head + 8
+        return int.from_bytes(packet[at : at + 2], "little")
+
+
+class Scans:
+    """Scans of the packets of one sensor, as these come.
+
+    A scan is whole with its last packet; where some are lost, when the next one begins. What comes later, or
+    a second time, is left out.
+    """
+
+    def __init__(self, sensor: Sensor) -> None:
+        self.sensor = sensor
+        self._current = -1
+        self._gone: deque[int] = deque(maxlen=2)  # numbers of the scans before
+        self._held: dict[int, Packet] = {}  # first column -> packet
+
+    def add(self, received: int, packet: bytes | memoryview) -> Iterator[tuple[Packet, ...]]:
+        """The scans that are whole now: of a packet of ``sensor.size`` bytes, received at that time."""
+        number, begin = self.sensor.number(packet), self.sensor.begin(packet)
+        if number in self._gone or begin >= self.sensor.columns:
+            return
+        if number != self._current:
+            yield from self.rest()
+            self._current = number
+        self._held.setdefault(begin, (received, packet))
+        if len(self._held) == self.sensor.sent:
+            yield from self.rest()
+
+    def rest(self) -> Iterator[tuple[Packet, ...]]:
+        """What there is of the scan that is not whole; another packet of it is one that comes too late."""
+        if self._held:
+            found, self._held = tuple(self._held.values()), {}
+            self._gone.append(self._current)
+            self._current = -1
+            yield found
+
+
+def is_packet(msgtype: str) -> bool:
+    return PACKET.search(msgtype) is not None
+
+
+def metadata_of(topic: str) -> str:
+    """The topic beside that of packets on which the driver gives the metadata, as a std_msgs/String."""
+    return f"{topic.rpartition('/')[0]}/metadata"
+
+
+def waits(topic: str) -> str:
+    """What is said beside a robot of packets whose metadata are not there yet."""
+    return (
+        f"packets of an Ouster whose metadata are waited for on {metadata_of(topic)} (std_msgs/String); "
+        f"--set 'source.lidar_calibration={{{topic}: metadata.json}}' gives them from a file"
+    )
+
+
+def read_sensor(text: str, where: str) -> Sensor:
+    """What metadata as the sensor gives them (JSON, of firmware 2 and 3) say.
+
+    Raises:
+        UserError: they are none, or of a sensor whose packets are not decoded here.
+    """
+    try:
+        told = json.loads(text)
+        beams = told.get("beam_intrinsics", told)
+        form = told.get("lidar_data_format") or told.get("data_format") or {}
+        profile = str(form.get("udp_profile_lidar", "LEGACY"))
+        mode = str(told.get("lidar_mode") or told.get("config_params", {}).get("lidar_mode", ""))
+        columns = int(form.get("columns_per_frame") or mode.partition("x")[0])
+        angles = [beams["beam_altitude_angles"], beams["beam_azimuth_angles"]]
+        directions = np.deg2rad(np.array(angles, np.float64)).T
+        placed = np.array(beams.get("beam_to_lidar_transform") or np.eye(4), np.float64).reshape(4, 4)
+        origin = placed[[0, 2], 3]
+        if "beam_to_lidar_transform" not in beams:
+            origin = np.array([float(beams["lidar_origin_to_beam_origin_mm"]), 0.0])
+        per_packet = int(form.get("columns_per_packet", 16))
+        first, last = form.get("column_window") or (0, columns - 1)
+        if directions.ndim != 2 or not len(directions) or not 0 < per_packet <= columns <= 1 << 14:
+            raise ValueError
+        measured = (int(first) + np.arange((int(last) - int(first)) % columns + 1)) % columns
+    except (ValueError, KeyError, TypeError, AttributeError):
+        raise UserError(f"{where}: is not the metadata (JSON) of an Ouster") from None
+    if profile not in PROFILES:
+        raise UserError(
+            f"{where}: an Ouster with packets of the profile {profile}, which is not decoded here "
+            f"({', '.join(PROFILES)} are): play them through its driver and record its PointCloud2"
+        )
+    return Sensor(
+        PROFILES[profile],
+        columns,
+        per_packet,
+        len(np.unique(measured // per_packet)),
+        directions.astype(np.float32),
+        (origin * 1e-3).astype(np.float32),
+    )
+
+
+def payload(data: bytes | memoryview, *, ros1: bool) -> memoryview:
+    """The packet in a serialised PacketMsg, whose only field is its bytes."""
+    at = 0 if ros1 else 4
+    big = not ros1 and data[1:2] == b"\0"
+    length = int.from_bytes(data[at : at + 4], "big" if big else "little")
+    return memoryview(data)[at + 4 : at + 4 + length]
+
+
+def decode(sensor: Sensor, packets: Sequence[Packet]) -> Any:
+    """The sensor_msgs/PointCloud2 of the packets of one scan, in the frame os_lidar.
+
+    The stamp is that of the first column: by the sensor's clock where this is within a minute of the time of
+    receipt, else (it counts from its start) the time when its packet was received. ``time`` is in seconds
+    after it. Of two returns the first one is taken. The cloud announces a point for each measurement of a
+    whole turn, so that those that met nothing, and those in lost packets, are counted.
+
+    Args:
+        packets: each of ``sensor.size`` bytes.
+    """
+    received, contents = zip(*packets, strict=True)
+    profile, pixels = sensor.profile, sensor.pixels
+    kind, at = profile.status
+    measured = np.dtype(
+        {
+            "names": ["range", "reflectivity", "signal"],
+            "formats": ["<u4", "u1", "u1" if profile.signal is None else "<u2"],
+            "offsets": [0, profile.reflectivity, profile.signal or profile.reflectivity],
+            "itemsize": profile.measured,
+        }
+    )
+    column = np.dtype(
+        {
+            "names": ["clock", "number", "status", "measured"],
+            "formats": ["<u8", "<u2", kind, (measured, (pixels,))],
+            "offsets": [0, 8, at % sensor.step, profile.column],
+            "itemsize": sensor.step,
+        }
+    )
+    data: U8 = np.frombuffer(b"".join(contents), np.uint8).reshape(len(packets), sensor.size)
+    shape, steps = (len(packets), sensor.per_packet), (sensor.size, sensor.step)
+    columns = np.ndarray(shape, column, data, profile.head, steps).reshape(-1)
+    usable = (columns["status"] & profile.valid == profile.valid) & (columns["number"] < sensor.columns)
+    which = np.flatnonzero(usable)
+    columns = columns[usable]
+    stamp, times = int(received[0]), np.zeros(len(columns))
+    if len(columns):
+        clock = columns["clock"].astype(np.int64)
+        times = (clock - clock[0]) * 1e-9
+        first = int(received[which[0] // sensor.per_packet])
+        stamp = int(clock[0]) if abs(int(clock[0]) - first) < MINUTE else first
+    ranges = (columns["measured"]["range"] & profile.mask) * np.float32(profile.scale * 1e-3)
+    row, pixel = np.nonzero(ranges)
+    encoder = 2 * np.pi * (1 - columns["number"] / sensor.columns)
+    altitude, azimuth = sensor.directions.T
+    out, up = sensor.origin
+    turned = encoder[row] - azimuth[pixel]
+    # From where the beam begins, which goes round the axis.
+    length = ranges[row, pixel] - np.hypot(out, up)
+    flat = length * np.cos(altitude)[pixel]
+    points = np.empty(len(row), POINT)
+    points["x"] = flat * np.cos(turned) + out * np.cos(encoder)[row]
+    points["y"] = flat * np.sin(turned) + out * np.sin(encoder)[row]
+    points["z"] = length * np.sin(altitude)[pixel] + up
+    points["reflectivity"] = columns["measured"]["reflectivity"][row, pixel]
+    points["intensity"] = columns["measured"]["signal"][row, pixel]
+    points["ring"] = pixel
+    points["time"] = times[row]
+    return encode_points(stamp, FRAME, points, sensor.columns * pixels)

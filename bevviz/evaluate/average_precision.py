@@ -1,0 +1,258 @@
+"""Average precision as the KITTI object benchmark defines it, in the image, from above and in 3D.
+
+Geiger, Lenz and Urtasun 2012, with the 40 recall points of Simonelli et al. 2019. What follows is the rule of
+the benchmark's own development kit: which labels and detections count, which are only not held against
+anybody, and at which scores the curve is sampled.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bevviz.evaluate.ground_truth import Truth
+from bevviz.evaluate.matching import Classes, accepts
+from bevviz.model import geometry
+from bevviz.model.frame import F32, Bool
+from bevviz.model.results import FrameResult
+from bevviz.support.kernel import kernel
+
+RECALL_POINTS = 40
+COUNTS, IGNORED, OTHER = 0, 1, -1  # what a label or a detection is to a class and difficulty
+
+Roles = NDArray[np.int8]  # of these
+Key: TypeAlias = tuple[str, float, str, str]  # view, overlap, class, difficulty
+
+
+class Difficulty(NamedTuple):
+    height: float  # pixels that an object is high, at least
+    occluded: int  # at most
+    truncated: float  # at most
+
+
+DIFFICULTIES = {
+    "easy": Difficulty(40, 0, 0.15),
+    "moderate": Difficulty(25, 1, 0.3),
+    "hard": Difficulty(25, 2, 0.5),
+}
+OVERLAPS = (0.5, 0.7)
+VIEWS = ("bev", "3d")
+KITTI_CLASSES = {  # label -> labels that are neither right nor wrong, names that detectors give it
+    "Car": (("Van",), ("car",)),
+    "Pedestrian": (("Person_sitting",), ("pedestrian", "person")),
+    "Cyclist": ((), ("cyclist", "bicycle")),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Found:
+    """Objects of a frame, or detections in its image, against its truth."""
+
+    names: tuple[str, ...]  # (D,) in lower case
+    score: F32  # (D,)
+    height: F32  # (D,) pixels; inf where there is no image box
+    overlaps: dict[str, F32]  # (D, K) IoU with each label, by view
+    excused: dict[str, F32]  # (D,) largest share in a region where nothing is labelled, by view
+
+
+def found_objects(result: FrameResult, truth: Truth) -> Found:
+    """The fused objects of a frame."""
+    objects = result.objects
+    assert objects is not None
+    above, volume = geometry.box_iou(objects.boxes, truth.boxes)
+    detections = {camera.camera.name: camera.detections for camera in result.cameras}
+    height = np.full(len(objects), np.inf, np.float32)
+    for j, (camera, row) in enumerate(zip(objects.camera, objects.detection.tolist(), strict=True)):
+        if row >= 0 and (found := detections.get(camera)) is not None:
+            height[j] = found.xyxy[row, 3] - found.xyxy[row, 1]
+    names = tuple(name.lower() for name in objects.names)
+    return Found(names, objects.score, height, {"bev": above, "3d": volume}, {})
+
+
+@dataclass
+class Curve:
+    """One class, at one difficulty: frame after frame, then ``average``."""
+
+    view: str
+    min_overlap: float
+
+    def __post_init__(self) -> None:
+        self._frames: list[tuple[F32, F32, Roles, Roles, Bool]] = []
+
+    def add(self, found: Found, det: Roles, label: Roles) -> None:
+        """``det`` (D,) and ``label`` (K,): COUNTS, IGNORED or OTHER."""
+        rows, columns = np.flatnonzero(det != OTHER), np.flatnonzero(label != OTHER)
+        if len(rows) == 0 and not (label == COUNTS).any():
+            return
+        excused = found.excused.get(self.view, np.zeros(len(det), np.float32)) > self.min_overlap
+        self._frames.append(
+            (
+                np.ascontiguousarray(found.overlaps[self.view][np.ix_(rows, columns)]),
+                np.ascontiguousarray(found.score[rows]),
+                det[rows],
+                label[columns],
+                excused[rows],
+            )
+        )
+
+    @property
+    def labels(self) -> int:
+        """That have to be found."""
+        return sum(int((frame[3] == COUNTS).sum()) for frame in self._frames)
+
+    def average(self) -> float:
+        """Mean precision over the recall points; NaN where nothing has to be found."""
+        total = self.labels
+        if not total:
+            return float("nan")
+        found = [_matched(*frame, self.min_overlap, -np.inf, False)[2] for frame in self._frames]
+        precision = np.zeros(RECALL_POINTS + 1)
+        for i, threshold in enumerate(_thresholds(np.concatenate(found), total)):
+            counts = [_matched(*frame, self.min_overlap, threshold, True)[:2] for frame in self._frames]
+            right, wrong = np.sum(counts, axis=0)
+            precision[i] = right / (right + wrong) if right + wrong else 0.0
+        precision = np.maximum.accumulate(precision[::-1])[::-1]
+        return float(precision[1:].mean())
+
+
+def _thresholds(scores: F32, total: int) -> Iterable[float]:
+    """Scores of right ones at which recall comes nearest to each of its points."""
+    scores = np.sort(scores)[::-1]
+    recall = 0.0
+    chosen = []
+    for i, score in enumerate(scores.tolist()):
+        left = (i + 1) / total
+        last = i == len(scores) - 1
+        right = left if last else (i + 2) / total
+        if right - recall < recall - left and not last:
+            continue
+        chosen.append(score)
+        recall += 1 / RECALL_POINTS
+    return chosen
+
+
+@kernel
+def _matched(
+    overlap: F32,
+    score: F32,
+    det: Roles,
+    label: Roles,
+    excused: Bool,
+    min_overlap: float,
+    threshold: float,
+    count_false: bool,
+) -> tuple[int, int, F32]:
+    """Right ones, false ones, and the scores of the right ones.
+
+    Each label in turn takes of what is left the best overlap or, where scores are sampled, the best score.
+    """
+    taken = np.zeros(len(score), np.bool_)
+    scores = np.empty(len(label), np.float32)
+    right = 0
+    for k in range(len(label)):
+        best, value, ignored = -1, 0.0, False
+        for d in range(len(score)):
+            if taken[d] or score[d] < threshold or overlap[d, k] <= min_overlap:
+                continue
+            if not count_false:
+                if best < 0 or score[d] > value:
+                    best, value = d, score[d]
+            elif det[d] == 0:
+                if best < 0 or ignored or overlap[d, k] > value:
+                    best, value, ignored = d, overlap[d, k], False
+            elif best < 0:
+                best, ignored = d, True
+        if best < 0:
+            continue
+        taken[best] = True
+        if label[k] == 0 and det[best] == 0:
+            scores[right] = score[best]
+            right += 1
+    false = 0
+    if count_false:
+        for d in range(len(score)):
+            false += not (taken[d] or det[d] != 0 or score[d] < threshold or excused[d])
+    return right, false, scores[:right]
+
+
+class AveragePrecision:
+    """Of all classes of a drive: for KITTI's labels by its difficulties, else of what must be found."""
+
+    def __init__(self, views: Sequence[str] = VIEWS) -> None:
+        self._views = views
+        self._curves: dict[Key, Curve] = {}
+        self._frames: list[tuple[Found, Truth]] = []  # of other labels than KITTI's
+        self._judged = Classes()  # of these
+
+    def add(self, found: Found, truth: Truth) -> None:
+        """One frame."""
+        if truth.image is None:
+            self._judged.add(truth)
+            self._frames.append((found, truth))
+            return
+        labels = np.array(truth.labels, object)
+        size = truth.image.xyxy[:, 3] - truth.image.xyxy[:, 1]
+        for kind, (neighbours, names) in KITTI_CLASSES.items():
+            own, near = labels == kind, np.isin(labels.astype(str), neighbours)
+            mine = np.isin(np.array(found.names, str), names)
+            for name, limit in DIFFICULTIES.items():
+                within = (truth.image.occluded <= limit.occluded) & (truth.image.truncated <= limit.truncated)
+                counts = own & within & (size > limit.height)
+                label = _roles(counts, own | near)
+                small = found.height < limit.height
+                det = _roles(mine & ~small, mine | small)
+                self._add(self._curves, (kind.lower(), name), found, det, label)
+
+    def _by_label(self) -> dict[Key, Curve]:
+        """Of labels that are not KITTI's: what each detection is is known when all labels are."""
+        curves: dict[Key, Curve] = {}
+        names = {label.lower() for _, truth in self._frames for label in truth.labels}
+        for found, truth in self._frames:
+            labels = np.array([label.lower() for label in truth.labels], object)
+            classes = np.array(_classes(found, truth, self._judged), object)
+            for name in sorted(names):
+                own, mine = labels == name, classes == name
+                self._add(curves, (name, ""), found, _roles(mine, mine), _roles(own & truth.must, own))
+        return curves
+
+    def _add(
+        self, curves: dict[Key, Curve], of: tuple[str, str], found: Found, det: Roles, label: Roles
+    ) -> None:
+        for view in self._views:
+            for overlap in OVERLAPS:
+                curves.setdefault((view, overlap, *of), Curve(view, overlap)).add(found, det, label)
+
+    @property
+    def labels(self) -> dict[tuple[str, str], int]:
+        """(class, difficulty) -> labels that had to be found."""
+        found = {key[2:]: curve.labels for key, curve in self._curves.items()}
+        must = ((k, truth) for _, truth in self._frames for k in np.flatnonzero(truth.must).tolist())
+        found |= Counter((truth.labels[k].lower(), "") for k, truth in must)
+        return {of: count for of, count in found.items() if count}
+
+    def results(self) -> dict[Key, float]:
+        """(view, overlap, class, difficulty) -> average precision; only where there was something to find.
+
+        The kit takes one score for each right object at most: with 40 labels or fewer it has fewer than 40
+        points, and the average is (labels - 1) / 40 at best.
+        """
+        curves = self._curves | self._by_label()
+        return {key: curve.average() for key, curve in curves.items() if curve.labels}
+
+
+def _roles(counts: Bool, ignored: Bool) -> Roles:
+    return np.where(counts, COUNTS, np.where(ignored, IGNORED, OTHER)).astype(np.int8)
+
+
+def _classes(found: Found, truth: Truth, judged: Classes) -> list[str | None]:
+    """Of each detection: that of the label it overlaps most of those it may be, else what it is judged as."""
+    overlap = np.where(accepts(truth, list(found.names)), found.overlaps[VIEWS[0]], 0)
+    classes = [judged.of(name) for name in found.names]
+    for d in np.flatnonzero((overlap > 0).any(axis=1)).tolist():
+        classes[d] = truth.labels[int(overlap[d].argmax())].lower()
+    return classes

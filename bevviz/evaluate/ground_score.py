@@ -1,0 +1,31 @@
+"""Ground against labelled points."""
+
+from __future__ import annotations
+
+from collections import Counter
+
+import numpy as np
+
+from bevviz.model.results import FrameResult
+from bevviz.stages.voxel import of_points
+
+# SemanticKITTI's numbers (Behley et al. 2019), in the field ``label`` of a cloud.
+GROUND_LABELS = (40, 44, 48, 49, 60, 72)  # road, parking, pavement, other ground, marking, terrain
+OBJECT_LABELS = (10, 11, 13, 15, 16, 18, 20, 30, 31, 32, 99, *range(252, 260))
+UNLABELLED = (0, 1)
+
+
+def count_ground(counts: Counter[str], result: FrameResult) -> None:
+    """Points, where the cloud says in its field ``label`` what each is of."""
+    labels = result.frame.fields.get("label")
+    if labels is None or labels.dtype.kind not in "ui" or result.ground is None or result.voxels is None:
+        return
+    kind = labels.astype(np.int64) & 0xFFFF
+    known = ~np.isin(kind, UNLABELLED)
+    called = of_points(result.ground.mask, result.voxels.inverse)
+    ground, thing = np.isin(kind, GROUND_LABELS), np.isin(kind, OBJECT_LABELS)
+    counts["true"] += int((called & ground).sum())
+    counts["false"] += int((called & ~ground & known).sum())
+    counts["missed"] += int((~called & ground).sum())
+    counts["kept"] += int((~called & thing).sum())
+    counts["lost"] += int((called & thing).sum())

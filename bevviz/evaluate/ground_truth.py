@@ -1,0 +1,183 @@
+"""What is really there in a frame, and which of it must be found."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, TypeAlias
+
+import numpy as np
+
+from bevviz.datasets.kitti import label_files, read_labels
+from bevviz.errors import UserError
+from bevviz.messages.foreign_boxes import name_box
+from bevviz.messages.roles import Roles
+from bevviz.model import geometry
+from bevviz.model.class_names import ACCEPTED
+from bevviz.model.frame import Bool, Boxes3D, Camera, Frame, ImageLabels, LabelledBoxes3D
+from bevviz.stages.robot_results import in_points_frame
+
+if TYPE_CHECKING:
+    from bevviz.model.protocols import Frames
+
+MIN_HITS = 10  # LiDAR points on an object that must be found
+MAX_DISTANCE = 2.0  # metres between the centres, on the ground plane, of a box and its object
+RANGE = 40.0  # metres
+
+
+Truths: TypeAlias = "Callable[[Frame], Truth | None]"
+
+
+@dataclass(frozen=True, slots=True)
+class Truth:
+    """What is really there, in the frame of the points."""
+
+    boxes: Boxes3D
+    labels: tuple[str, ...]
+    accepted: tuple[frozenset[str], ...]  # names that are right for each, in lower case
+    must: Bool  # (K,) has to be found; the others may be
+    ids: tuple[str, ...] = ()  # (K,) the same from frame to frame; (): not known
+    image: ImageLabels | None = None  # what was labelled in the image, in a data set that has that
+    camera: Camera | None = None  # whose image that is
+    unusable: tuple[str, ...] = ()  # a sentence for each label that nothing can be held to
+
+    def unlabelled(self, boxes: Boxes3D) -> Bool:
+        """(J,) which boxes have their centre, in the image, where nothing was labelled (KITTI's DontCare)."""
+        none = np.zeros(len(boxes), bool)
+        if self.image is None or self.camera is None or len(self.image.dont_care) == 0:
+            return none
+        assert self.camera.camera_from_points is not None
+        assert self.camera.intrinsics is not None
+        seen = geometry.apply(self.camera.camera_from_points, boxes.center)
+        uv, _ = geometry.project(seen, self.camera.intrinsics)
+        low, high = self.image.dont_care[:, :2], self.image.dont_care[:, 2:]
+        with np.errstate(invalid="ignore"):
+            inside = ((uv[:, None] >= low) & (uv[:, None] <= high)).all(axis=2)
+        return np.asarray(np.any(inside, axis=1), bool)
+
+
+def truth_source(roles: Roles, topic: str | None, kitti: Path | None, scans: int) -> Truths | None:
+    """Where the truth of each frame comes from; None: there is none.
+
+    Args:
+        roles: of the bag's topics.
+        topic: Detection3DArray that was asked for; None: the one that is called ground truth.
+        kitti: label file or folder that was asked for.
+        scans: how many the bag has, each of which has its labels.
+
+    Raises:
+        UserError: no such topic or file, or not as many label files as scans.
+    """
+    if kitti is not None:
+        files = label_files(kitti)
+        if len(files) != scans:
+            count = f"{len(files)} label file{'s' * (len(files) > 1)}"
+            raise UserError(
+                f"--kitti-labels {kitti}: {count} and {scans} scans: one for each scan, in order, is needed"
+            )
+
+        def of_kitti(frame: Frame) -> Truth | None:
+            return truth_of(frame, read_labels(files[frame.index]))
+
+        return of_kitti
+    there = (*roles.robot_detections_3d, *([roles.truth] if roles.truth else []))
+    if topic is not None and topic not in there:
+        raise UserError(
+            f"--truth {topic}: no such Detection3DArray topic; there are: {', '.join(there) or 'none'}"
+        )
+    if topic is None and not roles.truth:
+        return None
+
+    def published(frame: Frame) -> Truth | None:
+        labelled = frame.truth if topic in (None, roles.truth) else None
+        labelled = labelled or next((boxes for boxes in frame.robot_boxes if boxes.topic == topic), None)
+        return None if labelled is None else truth_of(frame, labelled)
+
+    return published
+
+
+def truth_in(frames: Frames, topic: str | None = None, kitti: Path | None = None) -> Truths:
+    """Where the truth of a drive's frames comes from.
+
+    Args:
+        frames: a bag, or frames that come with their own truth.
+        topic, kitti: as of ``truth_source``.
+
+    Raises:
+        UserError: as of ``truth_source``, and where there is no truth.
+    """
+    roles: Roles | None = getattr(frames, "roles", None)
+    if roles is None and (topic or kitti):
+        option = f"--truth {topic}" if topic else f"--kitti-labels {kitti}"
+        raise UserError(f"{option}: {frames.scene.name} has its own truth, leave it out")
+    if roles is None:
+        if not frames.scene.truth:
+            raise UserError(f"{frames.scene.name}: there is no ground truth")
+        return lambda frame: None if frame.truth is None else truth_of(frame, frame.truth)
+    found = truth_source(roles, topic, kitti, len(frames.scans))
+    if found is None:
+        there = ", ".join(roles.robot_detections_3d) or "none"
+        raise UserError(
+            f"{frames.scene.name}: no .../ground_truth in it; give --truth TOPIC (Detection3DArray there: "
+            f"{there}) or --kitti-labels"
+        )
+    return found
+
+
+def truth_of(frame: Frame, labelled: LabelledBoxes3D) -> Truth:
+    """Labelled boxes as truth for a frame.
+
+    An object must be found if its centre lies within 40 m and in the image of some camera, where there is
+    one, and if 10 LiDAR points or more lie in its box. In a box without a size there are none: it is told in
+    ``unusable``.
+
+    Args:
+        frame: the frame.
+        labelled: boxes, in any frame whose pose they come with. Labels of data sets accept the names
+            that detectors of COCO's classes have for them, others their own alone.
+    """
+    boxes = in_points_frame(frame, labelled)
+    must = (np.hypot(*boxes.center[:, :2].T) <= RANGE) & _in_view(frame, boxes)
+    must[must] = [
+        geometry.inside(frame.points, boxes, k).sum() >= MIN_HITS for k in np.flatnonzero(must).tolist()
+    ]
+    flat = [
+        f"{name_box(k, labelled.labels[k], '')}: a side of it is 0 m long"
+        for k in np.flatnonzero((boxes.size <= 0).any(axis=1)).tolist()
+    ]
+    accepted = {label: ACCEPTED.get(label, frozenset((label.lower(),))) for label in labelled.labels}
+    camera = next((camera for camera in frame.cameras if _can_see(camera)), None)
+    return Truth(
+        boxes,
+        labelled.labels,
+        tuple(accepted[label] for label in labelled.labels),
+        must,
+        labelled.ids,
+        labelled.image,
+        camera,
+        (*labelled.unusable, *flat),
+    )
+
+
+def _in_view(frame: Frame, boxes: Boxes3D) -> Bool:
+    """(K,) whether some camera has the centre in its image; every box where no camera has a place."""
+    seen, asked = np.zeros(len(boxes), bool), False
+    for camera in frame.cameras:
+        if not _can_see(camera):
+            continue
+        assert camera.intrinsics is not None
+        assert camera.camera_from_points is not None
+        asked = True
+        uv, _ = geometry.project(geometry.apply(camera.camera_from_points, boxes.center), camera.intrinsics)
+        size = np.array([camera.intrinsics.width, camera.intrinsics.height], np.float32)
+        with np.errstate(invalid="ignore"):
+            seen |= ((uv >= -0.5) & (uv < size - 0.5)).all(axis=1)
+    return seen if asked else ~seen
+
+
+def _can_see(camera: Camera) -> bool:
+    """Whether it has an image and a place."""
+    return (
+        camera.image is not None and camera.intrinsics is not None and camera.camera_from_points is not None
+    )

@@ -1,0 +1,155 @@
+"""How well objects keep their ids: CLEAR MOT and IDF1 by py-motmetrics, and HOTA.
+
+The two libraries that have HOTA (TrackEval, trackers) bring opencv-python, which writes over the headless
+OpenCV that bevviz stands on; so HOTA is here, and held to TrackEval's numbers by a test.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import defaultdict
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from bevviz.evaluate.ground_truth import MAX_DISTANCE, Truth
+from bevviz.evaluate.matching import Classes, accepts
+from bevviz.model import geometry
+from bevviz.model.frame import F64, I32
+from bevviz.model.results import FrameResult
+from bevviz.stages.fusion import assign
+
+ALPHAS = np.arange(0.05, 0.99, 0.05)  # similarities from which on a pair is one, as HOTA has them
+CLEAR = {
+    "mota": "mota",
+    "motp_m": "motp",
+    "idf1": "idf1",
+    "id_switches": "num_switches",
+    "fragmentations": "num_fragmentations",
+}
+HINT = "MOTA and IDF1 need py-motmetrics: pip install 'bevviz[evaluate]'"
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """One class in one frame: numbers of the objects and tracks in it, and metres between them."""
+
+    objects: I32  # (G,)
+    tracks: I32  # (T,)
+    distance: F64  # (G, T) on the ground, inf beyond 2 m
+
+
+@dataclass
+class Identities:
+    """One class of a drive."""
+
+    def __post_init__(self) -> None:
+        self.steps: list[Step] = []
+        self._objects: dict[str, int] = {}
+        self._tracks: dict[int, int] = {}
+
+    def add(self, objects: Sequence[str], tracks: Sequence[int], distance: F64) -> None:
+        """One frame; ``distance`` (G, T) in metres."""
+        shape = len(objects), len(tracks)
+        self.steps.append(
+            Step(
+                np.array([self._objects.setdefault(name, len(self._objects)) for name in objects], np.int32),
+                np.array([self._tracks.setdefault(name, len(self._tracks)) for name in tracks], np.int32),
+                np.where(distance <= MAX_DISTANCE, distance, np.inf).reshape(shape),
+            )
+        )
+
+    def hota(self) -> dict[str, float]:
+        """Higher order tracking accuracy, and its parts for detection and association.
+
+        Luiten et al. 2021, with the similarity ``1 - distance / 2 m``. NaN where there is nothing.
+        """
+        size = len(self._objects), len(self._tracks)
+        similar = [np.where(np.isfinite(s.distance), 1 - s.distance / MAX_DISTANCE, 0.0) for s in self.steps]
+        together, of_object, of_track = np.zeros(size), np.zeros(size[0]), np.zeros(size[1])
+        for step, similarity in zip(self.steps, similar, strict=True):
+            whole = similarity.sum(0)[None] + similarity.sum(1)[:, None] - similarity
+            shared = np.divide(similarity, whole, out=np.zeros(whole.shape), where=whole > 0)
+            together[np.ix_(step.objects, step.tracks)] += shared
+            of_object[step.objects] += 1
+            of_track[step.tracks] += 1
+        if not of_object.sum() + of_track.sum():
+            return dict.fromkeys(("hota", "deta", "assa"), math.nan)
+        aligned = together / np.maximum(of_object[:, None] + of_track[None] - together, 1e-9)
+        matches = np.zeros((len(ALPHAS), *size))
+        for step, similarity in zip(self.steps, similar, strict=True):
+            worth = aligned[np.ix_(step.objects, step.tracks)] * similarity
+            column = assign(np.where(worth > 0, -worth, np.inf), unmatched=0.0)
+            row = np.flatnonzero(column >= 0)
+            own, other = step.objects[row], step.tracks[column[row]]
+            good = similarity[row, column[row]] >= ALPHAS[:, None] - 1e-9
+            matches[:, own, other] += good
+        right = matches.sum(axis=(1, 2))
+        deta = right / (of_object.sum() + of_track.sum() - right)
+        kept = matches / np.maximum(of_object[:, None] + of_track[None] - matches, 1)
+        assa = (matches * kept).sum(axis=(1, 2)) / np.maximum(right, 1)
+        return {
+            "hota": float(np.sqrt(deta * assa).mean()),
+            "deta": float(deta.mean()),
+            "assa": float(assa.mean()),
+        }
+
+    def clear(self) -> dict[str, float] | None:
+        """CLEAR MOT and IDF1; None where py-motmetrics is not installed."""
+        try:
+            import motmetrics
+        except ImportError:
+            return None
+        accumulator = motmetrics.MOTAccumulator(auto_id=True)
+        for step in self.steps:
+            distance = np.where(np.isfinite(step.distance), step.distance, np.nan)
+            accumulator.update(step.objects.tolist(), step.tracks.tolist(), distance)
+        host = motmetrics.metrics.create()
+        row = host.compute(accumulator, metrics=list(CLEAR.values()), return_dataframe=False)
+        return {ours: float(row[theirs]) for ours, theirs in CLEAR.items()}
+
+
+class TrackScore:
+    """Of all classes: tracks that are shown and seen, against the objects that have to be found.
+
+    A track on an object that need not be found counts neither way.
+    """
+
+    def __init__(self) -> None:
+        self.classes: dict[str, Identities] = defaultdict(Identities)
+
+    def add(self, result: FrameResult, truth: Truth, judged: Classes) -> None:
+        """One frame; nothing where the objects have no ids, or nothing is tracked."""
+        tracks = result.tracks
+        if tracks is None or not truth.ids:
+            return
+        boxes = truth.boxes.center
+        if tracks.absolute:
+            boxes = geometry.apply(result.frame.pose, boxes)
+        shown = np.flatnonzero(tracks.confirmed & (tracks.cluster >= 0))
+        names = [tracks.names[t].lower() for t in shown]
+        away = boxes[:, None, :2] - tracks.boxes.center[shown][None, :, :2]
+        right = accepts(truth, names).T
+        distance = np.where(right, np.linalg.norm(away, axis=2), np.inf)
+        distance[distance > MAX_DISTANCE] = np.inf
+        column = assign(distance, unmatched=MAX_DISTANCE + 1)
+        free = np.setdiff1d(np.arange(len(shown)), column[~truth.must & (column >= 0)])
+        labels = [label.lower() for label in truth.labels]
+        classes = [judged.of(name) for name in names]
+        for k in np.flatnonzero(column >= 0).tolist():
+            classes[column[k]] = labels[k]
+        for name in {"", *labels, *(cls for cls in classes if cls)}:
+            rows = [k for k in np.flatnonzero(truth.must) if name in ("", labels[k])]
+            mine = [t for t in free if name in ("", classes[t])]
+            self.classes[name].add(
+                [truth.ids[k] for k in rows], tracks.id[shown[mine]].tolist(), distance[np.ix_(rows, mine)]
+            )
+
+    def results(self) -> dict[str, dict[str, float]]:
+        """Class -> metric -> value, of those that had something to be found; "" is all of them."""
+        found = {}
+        for name, identities in sorted(self.classes.items()):
+            if any(len(step.objects) for step in identities.steps):
+                found[name] = {**identities.hota(), **(identities.clear() or {})}
+        return found

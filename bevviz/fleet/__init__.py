@@ -1,0 +1,1 @@
+"""Runs over many bags, on this machine or on a cluster. Imports `report` and below."""

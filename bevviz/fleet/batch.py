@@ -1,0 +1,108 @@
+"""A batch: what is left to do, and that nobody else does it at the same time."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import shutil
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from functools import partial
+from pathlib import Path
+from typing import TypeVar, cast
+
+from bevviz.errors import UserError
+from bevviz.fleet.jobs import PARTIAL, Job
+from bevviz.fleet.summary import NAME
+from bevviz.fleet.table import RunInfo, find_damage, read_info
+from bevviz.support import cleanup, progress
+
+T = TypeVar("T")
+
+
+@contextmanager
+def claimed(folder: Path) -> Iterator[None]:
+    """The folder for one batch alone. What an interrupted one left unfinished is removed, before and after.
+
+    Raises:
+        UserError: the folder cannot be made, or another batch works in it.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        handle = os.open(folder, os.O_RDONLY)
+    except OSError as error:
+        raise UserError(f"-o {folder}: {error.strerror}") from None
+    try:
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise UserError(f"-o {folder}: another batch is running in it") from None
+        except OSError:
+            pass  # a network file system without locks on folders
+        remove = partial(shutil.rmtree, folder / PARTIAL, ignore_errors=True)
+        remove()
+        cleanup.remember(folder, remove)
+        try:
+            yield
+        finally:
+            remove()
+            cleanup.forget(folder)
+    finally:
+        os.close(handle)
+
+
+def left_to_do(jobs: Sequence[Job], force: bool, warn: Callable[[str], None] = lambda _: None) -> list[Job]:
+    """Those without a result that is complete and up to date; all of them where ``force`` is set.
+
+    The table of a damaged result is deleted, so that nothing vouches for it. ``warn`` gets one line for each.
+    The largest bags go first, so that no worker is left alone with one at the end.
+    """
+    for job in jobs:
+        if force:
+            job.table.unlink(missing_ok=True)
+    _delete_damaged([job for job in jobs if job.table.exists()], warn)
+    return sorted((job for job in jobs if not job.complete()), key=lambda job: -job.size)
+
+
+def whole_results(folder: Path, warn: Callable[[str], None]) -> list[tuple[Path, RunInfo]]:
+    """Return table and description of each result in a folder. Leave out damaged ones and warn of them."""
+    found: list[tuple[Path, RunInfo]] = []
+    unchecked = 0
+    for table in _checking([path for path in sorted(folder.glob("*.parquet")) if path.stem != NAME]):
+        info = read_info(table)
+        if damage := find_damage(table, table.with_suffix(".rrd")):
+            warn(f"{table.stem}: {damage}; it is left out until its bag is run again")
+        elif info is not None:
+            found.append((table, info))
+            unchecked += not info.recording_sha256
+    if unchecked:
+        warn(f"{unchecked} tables of an older version hold no checksum: their recordings are not checked")
+    return found
+
+
+def _delete_damaged(jobs: Sequence[Job], warn: Callable[[str], None]) -> None:
+    """Delete the tables of damaged results, and those of an older version, which hold no checksum.
+
+    Args:
+        jobs: that have a table.
+        warn: gets a line for each damaged result, and one for all tables of an older version.
+    """
+    older = 0
+    for job in _checking(jobs):
+        info = read_info(job.table)
+        if info is not None and info.key != job.key:
+            continue  # it is out of date in any case
+        if damage := find_damage(job.table, job.recording):
+            warn(f"{job.name}: {damage}; its bag is run again")
+        elif info is not None and info.recording_sha256:
+            continue
+        else:
+            older += 1
+        job.table.unlink()
+    if older:
+        warn(f"{older} tables of an older version hold no checksum of a recording; their bags are run again")
+
+
+def _checking(results: Iterable[T]) -> Iterable[T]:
+    """Show a bar, as recordings are read from end to end."""
+    return cast(Iterable[T], progress.bar(results, desc="check", unit="bag", delay=1, leave=False))

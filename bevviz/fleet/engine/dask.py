@@ -1,0 +1,103 @@
+"""Workers of a Dask cluster, which share the file system with this machine."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from itertools import islice
+from typing import Any
+from urllib.parse import urlsplit
+
+from bevviz.errors import UserError, first_line
+from bevviz.fleet.engine.task import JobResult, JobResults, Task
+from bevviz.recording.ports import answers
+from bevviz.support.contexts import Closing
+
+WAITING = 2  # jobs for each thread of the cluster, so that none waits for us
+TICK = 0.2  # seconds
+
+
+class Cluster(Closing):
+    """An existing cluster. A job whose worker dies is run again on another one, as often as its setting
+    ``distributed.scheduler.allowed-failures`` has it.
+
+    Args:
+        address: of the scheduler, tcp://host:8786.
+
+    Raises:
+        UserError: Dask is not installed, or nobody answers at the address.
+    """
+
+    def __init__(self, address: str) -> None:
+        try:
+            from distributed import Client
+        except ImportError:
+            raise UserError("--dask needs Dask: pip install 'bevviz[dask]'") from None
+        where = urlsplit(address)
+        if where.hostname and where.port and not answers(where.hostname, where.port):
+            raise UserError(f"--dask {address}: nobody answers there; 'dask scheduler' starts one")
+        try:
+            self._client = Client(address, timeout="10s")
+        except (OSError, ValueError, TimeoutError) as error:
+            raise UserError(f"--dask {address}: no scheduler answers there ({first_line(error)})") from None
+
+    def close(self) -> None:
+        self._client.close()
+
+    @property
+    def count(self) -> int:
+        """Threads of all workers that are there now."""
+        return max(1, sum(map(int, self._client.nthreads().values())))
+
+    def run(
+        self,
+        jobs: Iterable[Task],
+        retries: int,
+        on_frame: Callable[[], None],
+        tick: Callable[[], None] = lambda: None,
+    ) -> JobResults:
+        """See ``Engine``. The frames of a job are told when it has ended."""
+        from distributed import wait
+
+        coming, running = iter(jobs), dict[Any, Task]()
+
+        def submit(count: int) -> None:
+            # The scheduler runs nothing twice that has the same key, not even for two clients.
+            for job in islice(coming, count):
+                key = f"bevviz-{job.identity}"
+                running[self._client.submit(_work, job, key=key, retries=retries)] = job
+
+        try:
+            submit(WAITING * self.count)
+            while running:
+                try:
+                    ended = wait(list(running), timeout=TICK, return_when="FIRST_COMPLETED").done
+                except TimeoutError:
+                    ended = set()
+                tick()
+                for future in ended:
+                    job = running.pop(future)
+                    submit(1)
+                    result = _result(job, future)
+                    for _ in range(result.frames):
+                        on_frame()
+                    future.release()
+                    yield result
+        finally:
+            self._client.cancel(list(running))
+
+
+def _result(job: Task, future: Any) -> JobResult:
+    if future.status == "finished":
+        result: JobResult = future.result()
+        return result
+    error = future.exception() if future.status == "error" else None
+    if type(error).__name__ == "KilledWorker":
+        return JobResult(job.name, error="the workers that ran it died; out of memory?")
+    return JobResult(job.name, error=f"{type(error).__name__}: {error}" if error else "cancelled")
+
+
+def _work(job: Task) -> JobResult:
+    """On the worker."""
+    from distributed import get_worker
+
+    return job.run(get_worker().state.nthreads, lambda: None)

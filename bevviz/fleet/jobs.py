@@ -1,0 +1,226 @@
+"""Which bags, under which name, and what makes the result of one out of date."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import re
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from bevviz.bags.bag import METADATA
+from bevviz.bags.source import FrameSelection
+from bevviz.config import Config, with_object_files
+from bevviz.datasets import find_loader
+from bevviz.errors import UserError
+from bevviz.fleet.engine.task import JobResult
+from bevviz.fleet.table import RunInfo, read_info
+from bevviz.recording.provenance import dependencies_of, file_hash, model_path
+from bevviz.support.files import bag_files, sampled_files
+from bevviz.support.text import path_text
+
+PARTIAL = ".bevviz-partial"  # folder of what is not complete
+
+
+@dataclass(frozen=True)
+class Job:
+    """One bag. Everything that a worker needs, also one on another machine that shares the file system."""
+
+    name: str
+    bag: Path  # absolute
+    folder: Path  # absolute, for the results
+    config: Config
+    selection: FrameSelection
+    blueprint: str
+    truth: str | None = None  # topic that results are held to, "" the bag's own; None: they are not
+
+    @property
+    def recording(self) -> Path:
+        return self.folder / f"{self.name}.rrd"
+
+    @property
+    def table(self) -> Path:
+        """The frames as rows. It is written last: where it is, the recording is complete."""
+        return self.folder / f"{self.name}.parquet"
+
+    @property
+    def size(self) -> int:
+        """Bytes of the bag."""
+        return sum(file.stat().st_size for file in _files(self.bag))
+
+    @cached_property
+    def key(self) -> str:
+        """Another one for another bag, selection, configuration, model, layout or version."""
+        files = {"detector": {"model", "names"}}  # they count by their content, below
+        content: dict[str, Any] = {
+            "bag": [
+                [path_text(file.name), file.stat().st_size, file.stat().st_mtime_ns]
+                for file in _files(self.bag)
+            ],
+            "selection": asdict(self.selection),
+            "config": self.config.model_dump(mode="json", exclude={"live": True, **files}),
+            "blueprint": file_hash(Path(self.blueprint)) if _is_file(self.blueprint) else self.blueprint,
+            "dependencies": {name: [d.version, d.sha256] for name, d in dependencies_of(self.config).items()},
+        }
+        if self.truth is not None:
+            content["truth"] = self.truth
+        return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+
+    @property
+    def recording_id(self) -> str:
+        """Another one for another result: a viewer takes recordings with the same one for the same."""
+        return f"{self.name}-{self.key[:8]}"
+
+    @property
+    def identity(self) -> str:
+        return f"{self.folder}-{self.name}-{self.key}"
+
+    def run(self, threads: int, on_frame: Callable[[], None] = lambda: None) -> JobResult:
+        """See ``bevviz.fleet.work.run``."""
+        from bevviz.fleet.work import run
+
+        return run(self, threads, on_frame)
+
+    def complete(self) -> RunInfo | None:
+        """What is known of the result, None where it is missing or out of date."""
+        info = read_info(self.table)
+        if info is None or info.key != self.key or not self.recording.is_file():
+            return None
+        return info
+
+
+def make_jobs(
+    paths: Sequence[Path],
+    folder: Path,
+    config: Config,
+    selection: FrameSelection,
+    blueprint: str,
+    truth: str | None = None,
+) -> list[Job]:
+    """A job for each bag that the paths name; the arguments are those of ``Job``.
+
+    Raises:
+        UserError: a path that does not exist, or no bag at all.
+    """
+    bags = find_bags(paths)
+    detector, model = config.detector, model_path(config)
+    files = {"names": _absolute(detector.names)}
+    if model is not None and detector.model != "demo":
+        files["model"] = str(model.resolve())
+    config = with_object_files(config, _absolute).model_copy(
+        update={"detector": detector.model_copy(update=files)}
+    )
+    folder = folder.resolve()
+    blueprint = _absolute(blueprint)
+    owners = {info.bag: table.stem for table, info in tables(folder)}
+    names = name_bags(bags, owners)
+    return [Job(names[bag], bag, folder, config, selection, blueprint, truth) for bag in bags]
+
+
+def tables(folder: Path) -> Iterator[tuple[Path, RunInfo]]:
+    """The results of all bags in a folder, by name."""
+    for path in sorted(folder.glob("*.parquet")):
+        if (info := read_info(path)) is not None:
+            yield path, info
+
+
+# --- bags --------------------------------------------------------------------------------------
+
+
+def find_bags(paths: Sequence[Path]) -> list[Path]:
+    """Bag files and folders: those given, those that a pattern fits, those somewhere in a folder.
+
+    A folder with a metadata.yaml is one bag; in any other one each bag file is a bag of its own.
+
+    Raises:
+        UserError: a path that does not exist, or a folder without bags.
+    """
+    found: dict[Path, None] = {}
+    for path in paths:
+        matches = (
+            [path] if path.exists() else sorted(Path(path.anchor).glob(str(path.relative_to(path.anchor))))
+        )
+        if not matches:
+            raise UserError(f"{path}: no such file or folder")
+        for match in matches:
+            bags = [bag.resolve() for bag in _bags(match)]
+            if not bags and match == path:
+                raise UserError(f"{path}: no bag in this folder (no .mcap, .db3 or .bag file)")
+            found.update(dict.fromkeys(bags))
+    if not found:
+        raise UserError("no bag among " + ", ".join(map(str, paths)))
+    return list(found)
+
+
+def _bags(path: Path) -> Iterator[Path]:
+    if path.name == METADATA:
+        path = path.parent
+    if not path.is_dir() or (path / METADATA).is_file():
+        yield path
+        return
+    bags, loader = bag_files(path), find_loader(path)
+    if not bags and loader is not None and not loader.any_folder:
+        yield from loader.drives(path)
+        return
+    yield from bags
+    for inner in sorted(path.iterdir()):
+        if inner.is_dir() and not inner.name.startswith("."):
+            yield from _bags(inner)
+
+
+def name_bags(bags: Sequence[Path], owners: Mapping[str, str]) -> dict[Path, str]:
+    """A name for each bag, which stays with it from run to run.
+
+    A bag that already has a result keeps its name. Of bags with the same name, each is named with as many of
+    its folders as tell them apart.
+
+    Args:
+        bags: absolute paths, each once.
+        owners: bag -> name of the results that are there.
+    """
+    names = {bag: owners[path_text(bag)] for bag in bags if path_text(bag) in owners}
+    taken = {"summary", *owners.values()}
+    new = [bag for bag in bags if bag not in names]
+    deepest = max((len(bag.parts) for bag in new), default=0)
+    for depth in range(1, deepest + 1):
+        candidates = {bag: _name(bag, depth) for bag in new}
+        often = Counter(candidates.values())
+        names |= {bag: n for bag, n in candidates.items() if often[n] == 1 and n not in taken}
+        new = [bag for bag in new if bag not in names]
+        taken |= set(names.values())
+    for bag in new:  # same letters, apart from those that no file name should have
+        names[bag] = f"{_name(bag, 1)}-{hashlib.sha256(os.fsencode(bag)).hexdigest()[:8]}"
+    return names
+
+
+def _name(bag: Path, depth: int) -> str:
+    stem = bag.name if bag.is_dir() else re.sub(r"(\.(mcap|db3|bag|active|zstd|zst))+$", "", bag.name)
+    parts = [*bag.parts[-depth:-1], stem]
+    return re.sub(r"[^\w.-]+", "_", "-".join(parts), flags=re.ASCII).strip("._") or "bag"
+
+
+# --- content -----------------------------------------------------------------------------------
+
+
+def _files(bag: Path) -> list[Path]:
+    if not bag.is_dir():
+        return [bag]
+    metadata = bag / METADATA
+    if not bag_files(bag):
+        return sampled_files(bag)[1]
+    return [*bag_files(bag), *([metadata] if metadata.is_file() else [])]
+
+
+def _absolute(text: str) -> str:
+    """Of a file; a name that something is known by stays as it is."""
+    return str(Path(text).resolve()) if _is_file(text) else text
+
+
+def _is_file(text: str) -> bool:
+    """Whether it is a path; "debug" and "demo" are names, whatever lies in the working directory."""
+    return bool(Path(text).suffix) and Path(text).is_file()

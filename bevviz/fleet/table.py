@@ -1,0 +1,244 @@
+"""The frames of a recording as the rows of a table: counts, times and what went wrong."""
+
+from __future__ import annotations
+
+import hashlib
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+from pydantic import TypeAdapter
+
+from bevviz.config import Config
+from bevviz.model.counts import counts_of
+from bevviz.model.frame import Scene
+from bevviz.model.results import Decision, DetectionState, FrameResult
+from bevviz.recording.decisions import remarks
+from bevviz.recording.provenance import file_hash
+
+DECISIONS = tuple(d.name.lower() for d in Decision if d.value in (0, 1, 2, 3, 4, 8))  # what a kept one can be
+STAGES = (
+    *("voxel", "ground", "clustering", "detector", "projection", "fusion", "tracking", "bev", "explain"),
+    "total",
+)
+
+FAILURE, PROBLEM, ANOMALY, WRONG = 10.0, 3.0, 0.5, 1.0
+UNMATCHED = {
+    "no_cluster": 2.0,
+    "too_few_points": 1.5,
+    "low_overlap": 1.0,
+    "misfit": 1.0,
+    "taken": 1.0,
+    "too_far": 0.5,
+}
+
+_integers = (
+    *("points", "invalid_points", "voxels", "ground_points", "obstacle_points", "clusters", "set_aside"),
+    *("detections", "below_threshold", "suppressed", *DECISIONS, "not_compared", "objects"),
+    *("problems", "failures", "anomalies"),
+)
+SCHEMA = pa.schema(
+    [
+        ("bag", pa.string()),
+        ("recording", pa.string()),
+        ("frame", pa.int64()),
+        ("stamp", pa.timestamp("ns", "UTC")),
+        *((name, pa.int32()) for name in _integers),
+        ("sync_error_ms", pa.float64()),
+        ("tf_age_ms", pa.float64()),
+        *((f"time_ms_{stage}", pa.float64()) for stage in STAGES),
+        ("unmatched", pa.list_(pa.string())),
+        ("remarks", pa.list_(pa.string())),
+        ("badness", pa.float64()),
+        ("missed", pa.int64()),
+        ("false", pa.int64()),
+        (
+            "picture",
+            pa.binary(),
+        ),  # JPEG, of the worst frames alone: the first camera's image with what was found
+        ("above", pa.binary()),  # JPEG, of these too: the bird's-eye view
+    ]
+)
+
+
+SEVERITIES = {  # of a frame, the gravest first: what is wrong in it
+    "failed": "a stage failed",
+    "lacking": "an input is missing",
+    "wrong": "an object is missed or false",
+    "strange": "an anomaly",
+    "unmatched": "a detection has no match",
+    "well": "nothing is wrong",
+}
+
+
+def severity(row: Mapping[str, Any]) -> str:
+    """The gravest thing in a frame; one of ``SEVERITIES``."""
+    found = {
+        "failed": row["failures"],
+        "lacking": row["problems"],
+        "wrong": (row["missed"] or 0) + (row["false"] or 0),
+        "strange": row["anomalies"],
+        "unmatched": len(row["unmatched"]),
+    }
+    return next((kind for kind, number in found.items() if number), "well")
+
+
+@dataclass(frozen=True, slots=True)
+class RunInfo:
+    """What a table was made from and how; kept in it."""
+
+    key: str
+    bag: str
+    recording_id: str
+    frames: int
+    seconds: float  # that the run took
+    scene: Scene
+    warnings: tuple[str, ...] = ()
+    metrics: dict[str, float | None] | None = None  # None: it was not held to the truth
+    recording_size: int = 0  # bytes
+    # Of every byte: samples would miss damage between them. A core hashes about 1 GB/s, far faster than a
+    # recording is made. Rerun writes the file, so it is read once more when it is complete.
+    recording_sha256: str = ""  # empty: the table is of a version that did not keep it
+
+
+_INFO = TypeAdapter(RunInfo)
+_ABOUT, _CHECKSUM = b"bevviz", b"bevviz_sha256"  # metadata of a table: the RunInfo as JSON, and its checksum
+_UNREADABLE = (OSError, LookupError, ValueError, MemoryError, pa.ArrowException)  # errors of damaged tables
+
+
+def row(result: FrameResult, config: Config) -> dict[str, Any]:
+    """One frame. ``bag`` and ``recording`` are for the caller to say.
+
+    ``sync_error_ms`` and ``tf_age_ms`` are those of the worst sensor, None where no sensor has one.
+    """
+    frame = result.frame
+    found: Counter[str] = Counter(dict.fromkeys(_integers, 0))
+    found.update(counts_of(result))
+    if result.ground is not None:
+        found["ground_points"] = int(result.ground.mask.sum())
+    if result.clusters is not None:
+        found["set_aside"] = int((~result.clusters.kept).sum())
+    if result.objects is not None:
+        found["objects"] = len(result.objects)
+    found["anomalies"] = len(result.anomalies)
+    unmatched: list[str] = []
+    weights = 0.0
+    for camera in result.cameras:
+        if camera.detections is None:
+            continue
+        for d, state in enumerate(camera.detections.state.tolist()):
+            if state != DetectionState.KEPT:
+                found[DetectionState(state).name.lower()] += 1
+            elif camera.fusion is None:
+                found["not_compared"] += 1
+            else:
+                decision = Decision(int(camera.fusion.detection_decision[d])).name.lower()
+                found[decision] += 1
+                if decision in UNMATCHED:
+                    unmatched.append(camera.detections.names[d])
+                    weights += UNMATCHED[decision] * float(camera.detections.score[d])
+    sync = _worst([abs(c.camera.sync_error) for c in result.cameras])
+    tf_age = _worst([frame.tf_age, *(c.camera.tf_age for c in result.cameras)])
+    badness = (
+        FAILURE * found["failures"]
+        + PROBLEM * found["problems"]
+        + ANOMALY * found["anomalies"]
+        + weights
+        + (sync or 0) / config.sync.tolerance
+        + (tf_age or 0) / max(config.sync.tf_tolerance, 0.001)
+    )
+    return {
+        "frame": frame.index,
+        "stamp": frame.stamp,
+        **{name: found[name] for name in _integers},
+        "sync_error_ms": None if sync is None else 1e3 * sync,
+        "tf_age_ms": None if tf_age is None else 1e3 * tf_age,
+        **{f"time_ms_{s}": 1e3 * result.timings[s] for s in STAGES if s in result.timings},
+        "unmatched": unmatched,
+        "remarks": [text for _, text in remarks(result)] + [anomaly.text for anomaly in result.anomalies],
+        "badness": round(badness, 6),
+    }
+
+
+def judged(row: Mapping[str, Any], missed: Sequence[str], false: Sequence[str]) -> dict[str, Any]:
+    """The row of a frame that was held to the truth; ``missed`` and ``false``: its objects, in words."""
+    wrong = [*(f"missed {text}" for text in missed), *(f"false {text}" for text in false)]
+    return {
+        **row,
+        "missed": len(missed),
+        "false": len(false),
+        "remarks": [*wrong, *row["remarks"]],
+        "badness": row["badness"] + WRONG * len(wrong),
+    }
+
+
+def write(path: Path, rows: Sequence[Mapping[str, Any]], info: RunInfo) -> None:
+    """Write a table with checksums of its pages and of ``info``, which ``find_damage`` verifies."""
+    table = pa.Table.from_pylist([dict(r) for r in rows], schema=SCHEMA)
+    about = _INFO.dump_json(info)
+    metadata = {_ABOUT: about, _CHECKSUM: hashlib.sha256(about).hexdigest()}
+    # Statistics of a page lie outside its checksum. A table of one bag needs none.
+    pq.write_table(
+        table.replace_schema_metadata(metadata), path, write_page_checksum=True, write_statistics=False
+    )
+
+
+def read_info(path: Path) -> RunInfo | None:
+    """What is known of a table; None where there is none, or a broken or foreign one."""
+    try:
+        metadata = pq.read_schema(path).metadata or {}
+        return _INFO.validate_json(metadata[_ABOUT])
+    except _UNREADABLE:
+        return None
+
+
+def find_damage(table: Path, recording: Path) -> str:
+    """Say what is damaged in the result of a bag; an empty text means nothing is.
+
+    A table of an older version says nothing of its recording: any file is accepted there.
+
+    Args:
+        table: of the frames, an existing file.
+        recording: that was made with it.
+    """
+    info = read_info(table)
+    if info is None or not _is_whole(table, info):
+        return f"{table.name} is damaged"
+    try:
+        size = recording.stat().st_size
+        if not info.recording_sha256:
+            return ""
+        if size != info.recording_size:
+            return f"{recording.name} has {size} bytes instead of {info.recording_size}"
+        if file_hash(recording) != info.recording_sha256:
+            return f"{recording.name} was changed or damaged (SHA-256)"
+    except FileNotFoundError:
+        return f"{recording.name} is missing"
+    except OSError as error:
+        return f"{recording.name} cannot be read ({error.strerror})"
+    return ""
+
+
+def _is_whole(table: Path, info: RunInfo) -> bool:
+    """Return whether a table can be read to its end and fits its checksums, where it has some."""
+    try:
+        with pq.ParquetFile(table, page_checksum_verification=True) as file:
+            file.read()
+            if not info.recording_sha256:
+                return True
+            metadata = file.schema_arrow.metadata
+            checksum = hashlib.sha256(metadata[_ABOUT]).hexdigest()
+            # Names of columns have no checksum; one that is damaged would be read as a missing column.
+            return bool(file.schema_arrow.equals(SCHEMA)) and metadata[_CHECKSUM] == checksum.encode()
+    except _UNREADABLE:
+        return False
+
+
+def _worst(seconds: Sequence[float]) -> float | None:
+    known = [s for s in seconds if np.isfinite(s)]
+    return max(known) if known else None

@@ -1,0 +1,234 @@
+"""What a worker does: one bag from beginning to end. The same on this machine and on a cluster."""
+
+from __future__ import annotations
+
+import heapq
+import os
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import AbstractContextManager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, TypeAlias
+from uuid import uuid4
+
+from bevviz.bags.source import BagSource
+from bevviz.errors import UserError
+from bevviz.evaluate.evaluation import Evaluation
+from bevviz.evaluate.ground_truth import truth_in
+from bevviz.evaluate.log import EvaluationRecorder
+from bevviz.fleet.engine.task import JobResult
+from bevviz.fleet.jobs import PARTIAL, Job
+from bevviz.fleet.table import RunInfo, judged, row, write
+from bevviz.model.protocols import Observer
+from bevviz.model.results import FrameResult
+from bevviz.pipeline.run import run as run_frames
+from bevviz.pipeline.session import Session
+from bevviz.recording.provenance import file_hash
+from bevviz.recording.recorder import DiskWatch, Recorder
+from bevviz.recording.sinks import Sinks, open_recording
+from bevviz.report.pictures import ahead, camera_picture, jpeg, shrink
+from bevviz.support.contexts import Closing
+from bevviz.support.files import unfinished_files
+from bevviz.support.text import path_text
+
+
+class WithdrawnError(Exception):
+    """The batch does not want the result any more: it was interrupted."""
+
+    def __init__(self) -> None:
+        super().__init__("its unfinished recording was removed")
+
+
+def run(job: Job, threads: int, on_frame: Callable[[], None] = lambda: None) -> JobResult:
+    """Run the pipeline over a bag. Recording and table get their names when both are complete.
+
+    Args:
+        job: what to do.
+        threads: at most so many for the network, where the configuration does not say.
+        on_frame: called after each frame.
+
+    Raises:
+        WithdrawnError: the unfinished recording was removed.
+    """
+    if info := job.complete():  # by a worker that died before it could say so
+        return JobResult(job.name, info.frames, info.seconds)
+    detector = job.config.detector
+    detector = detector.model_copy(update={"threads": detector.threads or threads})
+    config = job.config.model_copy(update={"detector": detector})  # of the stages alone
+    with Output(job) as output:
+        try:
+            with job.selection.source([job.bag], job.config) as source:
+                session = Session(config)
+                with output.opened(source) as sinks:
+                    recorder = Recorder(sinks.recording, job.config, session.stages.provider)
+                    observers = output.observers(source, sinks, recorder, on_frame, pictures)
+                    if run_frames(source, session, observers).interrupted:
+                        raise KeyboardInterrupt
+                return output.complete(source)
+        except UserError as error:
+            return output.failed(error)
+
+
+class Output(Closing):
+    """What is made of a bag: unfinished, until it is complete. It is removed where it does not come to that.
+
+    The unfinished recording is a licence to go on: whoever removes it ends the job.
+    """
+
+    def __init__(self, job: Job) -> None:
+        self._job, self._start = job, time.perf_counter()
+        self._recording = job.folder / PARTIAL / f"{job.name}-{os.getpid()}-{uuid4().hex[:8]}.rrd"
+        self._table = self._recording.with_suffix(".parquet")
+        self._rows: _Rows | None = None
+        self._evaluation: Evaluation | None = None
+
+    def close(self) -> None:
+        for path in (self._recording, *unfinished_files(self._recording), self._table):
+            path.unlink(missing_ok=True)
+
+    def opened(self, source: BagSource) -> AbstractContextManager[Sinks]:
+        """The recording."""
+        self._recording.parent.mkdir(parents=True, exist_ok=True)
+        return open_recording(
+            source.scene,
+            source.config,
+            save=self._recording,
+            blueprint=self._job.blueprint,
+            recording_id=self._job.recording_id,
+            place=self._job.recording,
+        )
+
+    def observers(
+        self,
+        source: BagSource,
+        sinks: Sinks,
+        recorder: Recorder,
+        on_frame: Callable[[], None],
+        pictures: Pictures,
+    ) -> list[Observer[FrameResult]]:
+        """Of every frame, in order.
+
+        Args:
+            source: the bag.
+            sinks: the recording.
+            recorder: what writes to it.
+            on_frame: called after each frame.
+            pictures: of a frame.
+        """
+        observers: list[Observer[FrameResult]] = [recorder]
+        if self._job.truth is not None:
+            self._evaluation = Evaluation(truth_in(source, self._job.truth or None))
+            observers += [self._evaluation, EvaluationRecorder(sinks.recording, self._evaluation)]
+        assert sinks.file is not None
+        self._rows = _Rows(self._job, sinks.file, on_frame, self._evaluation, pictures)
+        return [*observers, self._rows, DiskWatch(sinks)]
+
+    @property
+    def frames(self) -> int:
+        return 0 if self._rows is None else len(self._rows.rows)
+
+    @property
+    def seconds(self) -> float:
+        return time.perf_counter() - self._start
+
+    def failed(self, error: UserError) -> JobResult:
+        return JobResult(self._job.name, self.frames, self.seconds, str(error))
+
+    def complete(self, source: BagSource) -> JobResult:
+        """When all frames were observed and the recording is closed.
+
+        Raises:
+            UserError: there was no frame.
+        """
+        job, warnings = self._job, tuple(source.warnings)
+        if self._rows is None or not self._rows.rows:
+            raise UserError("; ".join([f"{job.bag.name}: no frame in it", *warnings]))
+        info = RunInfo(
+            job.key,
+            path_text(job.bag),
+            job.recording_id,
+            self.frames,
+            self.seconds,
+            replace(source.scene, bag=(), topics=()),
+            warnings,
+            None if self._evaluation is None else self._evaluation.as_tree()["metrics"],
+            self._recording.stat().st_size,
+            file_hash(self._recording),
+        )
+        write(self._table, self._rows.rows, info)
+        job.table.unlink(missing_ok=True)  # of an older result: it must not vouch for the new recording
+        self._recording.replace(job.recording)
+        self._table.replace(job.table)
+        return JobResult(job.name, info.frames, info.seconds)
+
+
+Pictures: TypeAlias = Callable[[FrameResult], Mapping[str, bytes]]
+
+WIDTH, ABOVE = 240, 150  # pixels of a camera's picture, of the bird's-eye view's
+
+
+def pictures(result: FrameResult) -> Mapping[str, bytes]:
+    """Two JPEGs of a frame, by column of the table: the first camera's, and the bird's-eye view."""
+    found = {}
+    cameras = (camera_picture(camera, WIDTH) for camera in result.cameras)
+    if (picture := next((c for c in cameras if c is not None), None)) is not None:
+        found["picture"] = jpeg(picture)
+    if result.bev is not None:
+        found["above"] = jpeg(shrink(ahead(result.bev), ABOVE)[0])
+    return found
+
+
+class _Worst:
+    """Pictures of the worst frames so far."""
+
+    COUNT = 12
+
+    def __init__(self, pictures: Pictures) -> None:
+        self._pictures = pictures
+        self._worst: list[tuple[float, int, Mapping[str, bytes]]] = []  # a heap: badness, row, pictures
+
+    def see(self, badness: float, row: int, result: FrameResult) -> None:
+        place = (badness, -row)
+        if len(self._worst) == self.COUNT and place <= self._worst[0][:2]:
+            return
+        entry = (*place, self._pictures(result))
+        if len(self._worst) == self.COUNT:
+            heapq.heapreplace(self._worst, entry)
+        else:
+            heapq.heappush(self._worst, entry)
+
+    def __iter__(self) -> Iterator[tuple[int, Mapping[str, bytes]]]:
+        return ((-row, pictures) for _, row, pictures in self._worst)
+
+
+class _Rows(Observer[FrameResult]):
+    """A row of the table for each frame; ends the run where its recording was removed."""
+
+    def __init__(
+        self,
+        job: Job,
+        recording: Path,
+        on_frame: Callable[[], None],
+        evaluation: Evaluation | None,
+        pictures: Pictures,
+    ) -> None:
+        self.rows: list[dict[str, Any]] = []
+        self._job, self._recording, self._on_frame = job, recording, on_frame
+        self._evaluation = evaluation
+        self._worst = _Worst(pictures)
+
+    def see(self, result: FrameResult) -> None:
+        found = row(result, result.config)
+        if self._evaluation is not None and self._evaluation.last is not None:
+            wrong = self._evaluation.now
+            found = judged(found, wrong["missed"], wrong["false"])
+        self._worst.see(found["badness"], len(self.rows), result)
+        self.rows.append({**found, "bag": path_text(self._job.bag), "recording": self._job.name})
+        self._on_frame()
+        if not self._recording.exists():
+            raise WithdrawnError
+
+    def end(self) -> None:
+        for place, pictures in self._worst:
+            self.rows[place] |= pictures

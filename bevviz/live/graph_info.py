@@ -1,0 +1,119 @@
+"""What is on a running graph: topics, sensors, transforms, and what is missing for a full run."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import deque
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+
+from bevviz.config import Config, stated_lines
+from bevviz.live.graph import PublishedTopic, describe_qos
+from bevviz.live.source import LiveSource
+from bevviz.model.frame import Frame
+from bevviz.pipeline.bag_info import (
+    Contents,
+    TopicInfo,
+    find_missing,
+    networks_of,
+    render_contents,
+)
+
+LISTEN = 3.0  # seconds
+PATIENCE = 10.0  # seconds until what is there so far is shown
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LiveInfo(Contents):
+    """What ``bevviz info --live`` prints."""
+
+    domain: int
+    middleware: str
+    seconds: float  # that were listened for
+
+
+def describe(
+    config: Config,
+    arguments: Sequence[str] = (),
+    seconds: float = LISTEN,
+    patience: float = PATIENCE,
+) -> LiveInfo:
+    """Listen to the graph for ``seconds``, counted from when the topics have their roles. Ctrl-C ends it.
+
+    After ``patience`` seconds what is there by then is shown.
+
+    Raises:
+        UserError: no working rclpy, or arguments that it refuses.
+    """
+    # Under a name of its own: what another bevviz publishes is shown, too.
+    with LiveSource(config, arguments=arguments, name="bevviz_info") as source:
+        with suppress(KeyboardInterrupt):
+            source.wait(patience)
+        before, volume = source.received, source.volume
+        start = time.monotonic()
+        frame = _last_frame(source, seconds)
+        seconds = time.monotonic() - start
+        counts, volume = source.received - before, source.volume - volume
+        absent = source.missing
+        missing = [absent] if absent else find_missing(source.roles, frame, config)
+        networks, lacking = networks_of(config)
+        missing += lacking
+        return LiveInfo(
+            domain=source.domain,
+            middleware=source.middleware,
+            seconds=seconds,
+            topics=tuple(
+                _topic(topic, source, counts[topic.name], volume[topic.name], seconds)
+                for topic in sorted(source.topics.values(), key=lambda t: t.name)
+            ),
+            lidars=source.roles.lidar_names,
+            cameras=frame.cameras if frame else (),
+            tree=source.tree,
+            points_frame=frame.points_frame if frame else "",
+            world_frame=frame.world_frame if frame and frame.world_from_points is not None else "",
+            network=networks["detector"],
+            object_network=networks["objects"],
+            configured=tuple(stated_lines(config)),
+            missing=tuple(missing),
+            warnings=tuple(source.warnings),
+        )
+
+
+def _last_frame(source: LiveSource, seconds: float) -> Frame | None:
+    timer = threading.Timer(seconds, source.stop)
+    timer.start()
+    last: deque[Frame] = deque(maxlen=1)
+    try:
+        last.extend(source)
+    except KeyboardInterrupt:
+        source.stop()
+    timer.cancel()
+    timer.join()
+    return last[0] if last else None
+
+
+def _topic(topic: PublishedTopic, source: LiveSource, count: int, volume: int, seconds: float) -> TopicInfo:
+    heard = topic.name in source.received
+    stream = heard and topic.name not in source.roles.tf_static
+    role = source.roles.notes.get(topic.name, "")
+    return TopicInfo(
+        name=topic.name,
+        type=topic.type,
+        count=count if heard else None,
+        frame_id=source.frame_ids.get(topic.name, ""),
+        rate=count / seconds if stream else None,
+        size=volume / count if count else None,
+        delay=source.delay(topic.name) if stream else None,
+        role=f"{role}; {describe_qos(topic)}" if role else "",
+    )
+
+
+def render(info: LiveInfo) -> str:
+    """The description as text for a terminal of 100 columns."""
+    about = {
+        "graph": f"ROS_DOMAIN_ID {info.domain}, {info.middleware}",
+        "time": f"{info.seconds:.1f} s listened, {sum(t.count or 0 for t in info.topics)} messages",
+    }
+    return render_contents(about, info)

@@ -1,0 +1,131 @@
+"""What the tutorial's four nodes publish, from bevviz's results, and tracks: for RViz, and to stand in."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from bevviz.config import Config
+from bevviz.errors import UserError
+from bevviz.live.typesupport import message_type
+from bevviz.messages.encode import (
+    encode_boxes_2d,
+    encode_boxes_3d,
+    encode_cloud,
+    encode_image,
+    encode_markers,
+    typestore,
+)
+from bevviz.model import geometry
+from bevviz.model.frame import F32, F64, I64, Boxes3D, Cloud, Image
+from bevviz.model.results import FrameResult, Tracks
+
+BEV = "/visualization/bev_image"
+OBSTACLES = "/lidar/points_no_ground"
+CLUSTERS = "/detection/lidar_clusters"
+DETECTIONS = "/detection/camera_2d"
+FUSED = "/detection/fused_3d"
+TRACKS = "/detection/tracks_3d"
+MARKERS = "/visualization/tracks"
+SPEED = "speed_m_s"  # class of a track's second result, whose score it is
+TOPICS = {
+    BEV: "sensor_msgs/msg/Image",
+    OBSTACLES: "sensor_msgs/msg/PointCloud2",
+    CLUSTERS: "vision_msgs/msg/Detection3DArray",
+    DETECTIONS: "vision_msgs/msg/Detection2DArray",
+    FUSED: "vision_msgs/msg/Detection3DArray",
+    TRACKS: "vision_msgs/msg/Detection3DArray",
+    MARKERS: "visualization_msgs/msg/MarkerArray",
+}
+
+
+class Publisher:
+    """Publishes each result that somebody subscribes to, under the header of its cloud or image.
+
+    Clusters are those that were kept, with ``cluster_<row>`` as their class. Fused boxes are the named
+    ones; the class follows behind ``cluster_<row>``, where the tutorial's nodes look for it. Tracks have
+    their number as ``id`` and behind the class their speed; as markers any RViz shows them.
+
+    Args:
+        node: an rclpy node, whose remaps hold.
+        config: which boxes clusters have.
+        tell: called with one sentence each, for topics that cannot be published.
+    """
+
+    def __init__(self, node: Any, config: Config, tell: Callable[[str], None] = lambda text: None) -> None:
+        self._config = config
+        self._publishers: dict[str, Any] = {}
+        for topic, kind in TOPICS.items():
+            try:
+                self._publishers[topic] = node.create_publisher(message_type(kind), topic, 10)
+            except UserError as error:
+                tell(f"{topic} is not published: {error}")
+
+    def configure(self, config: Config) -> None:
+        self._config = config
+
+    def publish(self, result: FrameResult) -> None:
+        """Send what there is of a frame. Several cameras take turns on one topic."""
+        frame = result.frame
+        stamp, frame_id = frame.stamp, frame.points_frame
+        back = None if frame.upright is None else geometry.inverse(frame.upright)
+        if result.bev is not None and self._wanted(BEV):
+            self._send(BEV, encode_image(Image(stamp, frame_id, result.bev.image)))
+        if result.obstacles is not None and self._wanted(OBSTACLES):
+            self._send(OBSTACLES, encode_cloud(Cloud(stamp, frame_id, _moved(result.obstacles, back))))
+        if result.clusters is not None and self._wanted(CLUSTERS):
+            rows = np.flatnonzero(result.clusters.kept)
+            boxes = _rows(result.clusters.boxes(self._config.clustering), rows)
+            names = [[(f"cluster_{row}", 1.0)] for row in rows]
+            self._send(CLUSTERS, encode_boxes_3d(stamp, frame_id, boxes, names, back))
+        if self._wanted(DETECTIONS):
+            self._send_detections(result)
+        if result.objects is not None and self._wanted(FUSED):
+            objects = result.objects
+            scored = zip(objects.cluster.tolist(), objects.names, objects.score.tolist(), strict=True)
+            results = [[(f"cluster_{row}", 1.0), (name, score)] for row, name, score in scored]
+            self._send(FUSED, encode_boxes_3d(stamp, frame_id, objects.boxes, results, back))
+
+        if result.tracks is not None:
+            self._send_tracks(result, result.tracks, back)
+
+    def _send_tracks(self, result: FrameResult, tracks: Tracks, back: F64 | None) -> None:
+        """Those that have a name, in the fixed frame where there is one."""
+        stamp, pose = result.frame.stamp, None if tracks.absolute else back
+        rows = np.flatnonzero(tracks.confirmed)
+        boxes, speed = _rows(tracks.boxes, rows), tracks.speed
+        if self._wanted(TRACKS):
+            results = [[(tracks.names[t], 1.0), (SPEED, float(speed[t]))] for t in rows.tolist()]
+            ids = [str(number) for number in tracks.id[rows].tolist()]
+            self._send(TRACKS, encode_boxes_3d(stamp, tracks.frame_id, boxes, results, pose, ids))
+        if self._wanted(MARKERS):
+            texts = [f"{tracks.names[t]} #{tracks.id[t]} {speed[t]:.1f} m/s" for t in rows.tolist()]
+            velocity, ids_ = tracks.velocity[rows], tracks.id[rows]
+            markers = encode_markers(stamp, tracks.frame_id, boxes, velocity, ids_, texts, pose)
+            self._send(MARKERS, markers)
+
+    def _send_detections(self, result: FrameResult) -> None:
+        for camera in result.cameras:
+            image, found = camera.camera.image, camera.detections
+            if image is None or found is None:
+                continue
+            rows = np.flatnonzero(found.kept)
+            results = [[(found.names[row], float(found.score[row]))] for row in rows]
+            self._send(DETECTIONS, encode_boxes_2d(image.stamp, image.frame_id, found.xyxy[rows], results))
+
+    def _wanted(self, topic: str) -> bool:
+        publisher = self._publishers.get(topic)
+        return publisher is not None and publisher.get_subscription_count() > 0
+
+    def _send(self, topic: str, message: Any) -> None:
+        self._publishers[topic].publish(bytes(typestore().serialize_cdr(message, TOPICS[topic])))
+
+
+def _moved(points: F32, pose: F64 | None) -> F32:
+    return points if pose is None else geometry.apply(pose, points)
+
+
+def _rows(boxes: Boxes3D, rows: I64) -> Boxes3D:
+    return Boxes3D(boxes.center[rows], boxes.size[rows], boxes.yaw[rows])

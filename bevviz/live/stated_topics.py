@@ -1,0 +1,65 @@
+"""The topics that a configuration states: by their names on a running graph, and while they are absent."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from bevviz.config import Config, SourceConfig, stage_topics
+from bevviz.messages.roles import STAGE_KINDS
+from bevviz.messages.topics import Topic
+
+
+def stated_topics(config: Config, resolve: Callable[[str], str]) -> dict[str, tuple[str, tuple[str, ...]]]:
+    """The topics that the configuration names: where, and which types they may have; none: any."""
+    source, images = resolved(config.source, resolve), ("Image", "CompressedImage")
+    found: dict[str, tuple[str, tuple[str, ...]]] = {}
+    for key, names, kinds in (
+        ("source.lidar_topics", source.lidar_topics, ("PointCloud2",)),
+        ("source.camera_topics", source.camera_topics, images),
+        ("source.camera_info_topics", source.camera_info_topics, images),
+        ("source.camera_info_topics", source.camera_info_topics.values(), ("CameraInfo",)),
+        ("source.odometry_topic", filter(None, [source.odometry_topic]), ("Odometry",)),
+        ("source.boxes", filter(None, [source.boxes.get("topic", "")]), ()),
+    ):
+        found |= dict.fromkeys(names, (key, kinds))
+    stages = stage_topics(config)
+    return found | {resolve(name): (key, (STAGE_KINDS[key],)) for key, name in stages.items()}
+
+
+def resolved(config: SourceConfig, resolve: Callable[[str], str]) -> SourceConfig:
+    """The configuration with the topics' names on the graph."""
+    infos, boxes = config.camera_info_topics, config.boxes
+    return config.model_copy(
+        update={
+            "lidar_topics": tuple(map(resolve, config.lidar_topics)),
+            "camera_topics": tuple(map(resolve, config.camera_topics)),
+            "camera_info_topics": {resolve(image): resolve(info) for image, info in infos.items()},
+            "odometry_topic": config.odometry_topic and resolve(config.odometry_topic),
+            "boxes": {key: resolve(path) if key == "topic" else path for key, path in boxes.items()},
+            "lidar_calibration": {resolve(name): file for name, file in config.lidar_calibration.items()},
+        }
+    )
+
+
+def without_absent(topics: list[Topic], config: SourceConfig) -> tuple[list[Topic], SourceConfig]:
+    """A given topic that is not there yet is waited for; no other one may take its role meanwhile."""
+    names = {topic.name for topic in topics}
+    changes: dict[str, Any] = {}
+    for key, kinds in (("lidar_topics", {"PointCloud2"}), ("camera_topics", {"Image", "CompressedImage"})):
+        given = getattr(config, key)
+        changes[key] = tuple(name for name in given if name in names)
+        if given and not changes[key]:
+            topics = [topic for topic in topics if topic.kind not in kinds]
+    changes["camera_info_topics"] = {
+        image: info for image, info in config.camera_info_topics.items() if {image, info} <= names
+    }
+    if config.boxes.get("topic", "") not in names:
+        changes["boxes"] = {}
+    changes["lidar_calibration"] = {
+        name: file for name, file in config.lidar_calibration.items() if name in names
+    }
+    if config.odometry_topic and config.odometry_topic not in names:
+        changes["odometry_topic"] = ""
+        topics = [topic for topic in topics if topic.kind != "Odometry"]
+    return topics, config.model_copy(update=changes)

@@ -1,0 +1,73 @@
+"""Relay frames to a remote viewer in a process of its own: ``python -m bevviz.live.viewer_relay URL ID``.
+
+Rerun's connection waits for ever once its peer is gone. Whoever feeds this process only sees it end.
+
+Standard input holds pieces of a recording, each after its length (8 bytes, little endian): first the header
+that every file begins with, then preludes, which have it, and packets, which have not.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import suppress
+from pathlib import Path
+from typing import BinaryIO, NoReturn
+
+import rerun as rr
+from rerun.chunk import RrdReader
+
+from bevviz.recording.blueprints import Saved
+from bevviz.recording.ports import answers
+from bevviz.recording.sinks import APPLICATION, check_viewer
+
+PROBE = 2.0  # seconds between two looks whether the viewer is there
+MAGIC = 4  # bytes that tell a recording
+
+
+def main(url: str, recording_id: str) -> NoReturn:
+    host, port = check_viewer(url)
+    threading.Thread(target=_watch, args=(host, port), daemon=True).start()
+    recording = rr.RecordingStream(APPLICATION, recording_id=recording_id)
+    recording.set_log_time_enabled(False)
+    recording.set_sinks(rr.GrpcSink(url))
+    pieces = _pieces(sys.stdin.buffer)
+    header = next(pieces, b"")
+    for piece in pieces:
+        _forward(piece if piece[:MAGIC] == header[:MAGIC] else header + piece, recording)
+    with suppress(RuntimeError):
+        recording.flush(timeout_sec=PROBE)
+    os._exit(0)  # leaving in the usual way would wait for a viewer that hangs
+
+
+def _pieces(stream: BinaryIO) -> Iterator[bytes]:
+    while length := stream.read(8):
+        yield stream.read(int.from_bytes(length, "little"))
+
+
+def _forward(data: bytes, recording: rr.RecordingStream) -> None:
+    file = os.memfd_create("piece")
+    try:
+        with open(file, "wb", closefd=False) as whole:
+            whole.write(data)
+        path = Path(f"/proc/self/fd/{file}")
+        reader = RrdReader(path)
+        if reader.blueprints():
+            recording.send_blueprint(Saved(path))
+        for store in reader.recordings():
+            recording.send_chunks(reader.stream(store=store))
+    finally:
+        os.close(file)
+
+
+def _watch(host: str, port: int) -> None:
+    while answers(host, port):
+        time.sleep(PROBE)
+    os._exit(1)
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])

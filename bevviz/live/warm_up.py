@@ -1,0 +1,87 @@
+"""Runs everything once before the first frame: what is compiled and loaded then holds no frame up later."""
+
+from __future__ import annotations
+
+from contextlib import closing
+from typing import Any
+
+import numpy as np
+
+from bevviz.config import Config
+from bevviz.live.encoder import Encoder
+from bevviz.model.frame import F64, Camera, Cloud, Frame, Image, Intrinsics, Scene
+from bevviz.model.geometry import inverse
+from bevviz.model.results import Detections, DetectionState, FrameResult, Masks
+from bevviz.pipeline.session import Session
+from bevviz.pipeline.stage_loader import StageLoader
+
+SCENE = Scene("warm", "lidar", ("lidar",), ("camera",))
+PERIOD = 100_000_000  # nanoseconds
+CAMERA_FROM_LIDAR: F64 = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
+
+
+def warm_up(config: Config, loader: StageLoader) -> None:
+    """Run the stages, the network and the logging on two small frames, whose results nobody sees.
+
+    Stages of the user's own are left out: nobody says that they stand to be called with what is not there.
+
+    Args:
+        config: how the frames to come are made.
+        loader: has the network.
+    """
+    config = _ours(config)
+    network, seen = Session(config, loader=loader), Session(config, lambda camera: _one_car())
+    network.run(_frame(0))
+    results = [seen.run(_frame(index)) for index in range(2)]
+    with closing(Encoder(config, SCENE, "live")) as encoder:
+        for result in (*results, FrameResult.unprocessed(_frame(2), config)):
+            encoder.encode(result, SCENE, {}, ())
+
+
+def _ours(config: Config) -> Config:
+    """The configuration without what others have written or publish."""
+    changes: dict[str, Any] = {
+        name: getattr(Config(), name)
+        for name in ("ground", "clustering", "objects")
+        if ":" in getattr(config, name).method
+    }
+    if ":" in config.detector.model:
+        changes["detector"] = config.detector.model_copy(update={"model": ""})
+    return config.model_copy(update=changes)
+
+
+def _frame(index: int) -> Frame:
+    """A level ground, and on it a box of points before the camera."""
+    ground = np.mgrid[-20:20:0.5, -20:20:0.5, -1.8:-1.7:1].reshape(3, -1).T
+    car = np.mgrid[8:10:0.1, -1:1:0.1, -1.5:0:0.2].reshape(3, -1).T
+    points = np.concatenate([ground, car]).astype(np.float32)
+    fields = {"intensity": np.ones(len(points), np.float32)}
+    stamp = PERIOD * (1 + index)
+    image = Image(stamp, "camera", np.zeros((360, 640, 3), np.uint8))
+    intrinsics = Intrinsics(640, 360, np.array([[300.0, 0, 320], [0, 300, 180], [0, 0, 1]]))
+    return Frame(
+        index,
+        stamp,
+        stamp,
+        "lidar",
+        points,
+        "lidar",
+        fields,
+        world_frame="map",
+        world_from_points=np.eye(4),
+        clouds=(Cloud(stamp, "lidar", points, fields, name="lidar"),),
+        points_from_clouds=(np.eye(4),),
+        cameras=(Camera("camera", image, intrinsics, CAMERA_FROM_LIDAR, inverse(CAMERA_FROM_LIDAR)),),
+    )
+
+
+def _one_car() -> Detections:
+    first = np.zeros(1, np.int32)
+    box = np.array([[260, 170, 380, 240]], np.float32)
+    one = np.ones(1, np.float32)
+    cells = Masks(
+        np.packbits(np.ones(120 * 70, np.uint8)),
+        np.array([[260, 170, 120, 70]], np.int32),
+        np.array([1, 1, 0, 0], np.float32),
+    )
+    return Detections(box, one, first, ("car",), first + DetectionState.KEPT, first - 1, 0 * one, cells)

@@ -1,0 +1,1 @@
+"""ROS and Foxglove messages as arrays, and the roles of topics. Imports `model` and below, no rclpy."""

@@ -1,0 +1,75 @@
+"""Camera models of ROS messages."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from bevviz.messages.decoding import MessageError, either
+from bevviz.model.frame import F64, Intrinsics
+
+_DISTORTION = {
+    "plumb_bob": "plumb_bob",
+    "": "plumb_bob",  # coefficients without a name
+    "rational_polynomial": "rational_polynomial",
+    "equidistant": "equidistant",
+    "fisheye": "equidistant",
+    "kannala_brandt": "equidistant",  # foxglove's name
+    "kannala_brandt4": "equidistant",  # librealsense's
+}
+
+
+def decode_camera_info(msg: Any, rectified: bool, topic: str = "camera_info") -> Intrinsics:
+    """The camera model of a sensor_msgs/CameraInfo, for images as they are published.
+
+    The region of interest and binning are applied as image_geometry does: first the offset, then the
+    scale. K of a message is for the full sensor.
+
+    Args:
+        msg: ROS 1 (upper-case K, D, P) or ROS 2.
+        rectified: the images are rectified: the left 3 x 3 of P and no distortion. Without P, K.
+        topic: for the error messages.
+
+    Raises:
+        MessageError: an uncalibrated camera, or a distortion model that is not known.
+    """
+    K, D, P = (np.asarray(either(msg, n, n.lower()), np.float64) for n in "KDP")
+    matrix, baseline = K.reshape(3, 3), (0.0, 0.0)
+    if rectified and P[0]:
+        matrix = P.reshape(3, 4)[:, :3]
+        baseline = -float(P[3] / P[0]), -float(P[7] / P[5] if P[5] else 0.0)
+    if not np.isfinite(matrix).all() or matrix[0, 0] <= 0 or matrix[1, 1] <= 0:
+        raise MessageError(f"{topic}: the camera is uncalibrated (K is zero or not finite); calibrate it")
+    model = ""
+    if not rectified and (np.any(D) or (len(D) and _is_fisheye(msg.distortion_model))):
+        model = _distortion(msg.distortion_model, D, topic)
+    matrix = matrix.copy()
+    matrix[0, 2] -= msg.roi.x_offset
+    matrix[1, 2] -= msg.roi.y_offset
+    binning = np.array([max(int(msg.binning_x), 1), max(int(msg.binning_y), 1)])
+    matrix[:2] /= binning[:, None]
+    width, height = np.array([msg.roi.width or msg.width, msg.roi.height or msg.height], int) // binning
+    return Intrinsics(int(width), int(height), matrix, model, D if model else np.zeros(0), baseline)
+
+
+def _is_fisheye(name: str) -> bool:
+    """Whether coefficients of zero are a lens all the same: r = f theta."""
+    return _DISTORTION.get(name.lower()) == "equidistant"
+
+
+def _distortion(name: str, D: F64, topic: str) -> str:
+    model = _DISTORTION.get(name.lower())
+    if model is None:
+        raise MessageError(
+            f"{topic}: distortion model '{name}' is not supported; supported are "
+            f"{', '.join(sorted(set(_DISTORTION.values())))}"
+        )
+    if np.any(D[8:]) and np.isfinite(D).all() and model != "equidistant":
+        raise MessageError(
+            f"{topic}: coefficients after the eighth (OpenCV's thin prism and tilt) are not supported; "
+            "calibrate without them"
+        )
+    if not np.isfinite(D).all() or np.any(D[8:]) or (model == "equidistant" and len(D) < 4):
+        raise MessageError(f"{topic}: {D.tolist()} are no coefficients of the distortion model '{name}'")
+    return model

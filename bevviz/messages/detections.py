@@ -1,0 +1,163 @@
+"""Boxes of ROS messages: what a robot has found, or what is known to be there."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from bevviz.messages.decoding import either, frame_name, stamp_ns
+from bevviz.messages.foreign_boxes import decode_objects, name_box, turned_boxes, why_unusable
+from bevviz.model.frame import (
+    F32,
+    F64,
+    Bool,
+    ImageLabels,
+    LabelledBoxes2D,
+    LabelledBoxes3D,
+)
+
+
+def decode_detections_2d(msg: Any, topic: str, received: int) -> LabelledBoxes2D:
+    """The image boxes of a vision_msgs/Detection2DArray, of ROS 1 or any version of ROS 2.
+
+    A turned box becomes the upright one around it. Boxes that are not finite, or of a negative size, are left
+    out, and told in ``unusable``.
+    """
+
+    def row(detection: Any) -> tuple[float, ...]:
+        center, box = detection.bbox.center, detection.bbox
+        position = getattr(center, "position", center)  # flat up to ROS 2 Galactic
+        return position.x, position.y, center.theta, box.size_x, box.size_y
+
+    def why(values: Sequence[float]) -> str:
+        x, y, theta, w, h = values
+        return why_unusable((x, y, theta, w, h, 0.0))
+
+    found = _rows(msg, row, 5, why)
+    x, y, theta, w, h = found.values.T
+    cos, sin = np.abs(np.cos(theta)), np.abs(np.sin(theta))
+    dx, dy = (w * cos + h * sin) / 2, (w * sin + h * cos) / 2
+    return LabelledBoxes2D(
+        topic=topic,
+        stamp=stamp_ns(msg.header.stamp),
+        frame_id=frame_name(msg.header.frame_id) or next(iter(found.frames), ""),
+        xyxy=np.stack([x - dx, y - dy, x + dx, y + dy], axis=1).astype(np.float32),
+        labels=found.labels,
+        scores=found.scores,
+        received=received,
+        unusable=found.unusable,
+    )
+
+
+def decode_boxes(msg: Any, topic: str, received: int, stated: Mapping[str, str]) -> LabelledBoxes3D:
+    """The boxes of a Detection3DArray, or of another message, see ``bevviz.messages.foreign_boxes``.
+
+    Raises:
+        MessageError: they cannot be found in it.
+    """
+    if hasattr(msg, "detections") and not stated:
+        return decode_detections_3d(msg, topic, received)
+    return decode_objects(msg, topic, received, stated)
+
+
+def decode_detections_3d(msg: Any, topic: str, received: int) -> LabelledBoxes3D:
+    """The boxes of a vision_msgs/Detection3DArray, of ROS 1 or any version of ROS 2, or of bevviz_msgs.
+
+    An orientation left at zero is none. Boxes that are not finite, or of a negative size, are left out, and
+    told in ``unusable``. Where the array's header states no frame, those of the detections count.
+    """
+
+    def row(detection: Any) -> tuple[float, ...]:
+        center, size = detection.bbox.center, detection.bbox.size
+        p, q = center.position, center.orientation
+        return p.x, p.y, p.z, size.x, size.y, size.z, q.x, q.y, q.z, q.w
+
+    found = _rows(msg, row, 10, why_unusable)
+    stated = frame_name(msg.header.frame_id)
+    boxes, turns = turned_boxes(found.values)
+    return LabelledBoxes3D(
+        topic=topic,
+        stamp=stamp_ns(msg.header.stamp) or (0 if len(boxes) else received),
+        frame_id=stated or next(iter(found.frames), ""),
+        boxes=boxes,
+        labels=found.labels,
+        scores=found.scores,
+        received=received,
+        ids=found.ids if all(found.ids) else (),
+        image=_image_labels(msg, found.usable),
+        turns=turns,
+        frames=found.frames if not stated and len(set(found.frames)) > 1 else (),
+        unusable=(*map(str, getattr(msg, "unusable", ())), *found.unusable),
+    )
+
+
+def _image_labels(msg: Any, usable: Bool) -> ImageLabels | None:
+    """What a data set says of the image, see ``encode_labels``; None: it says nothing."""
+    if not hasattr(msg, "image_boxes") or len(msg.truncated) != len(usable):
+        return None
+    return ImageLabels(
+        np.array(msg.image_boxes, np.float32).reshape(-1, 4)[usable],
+        np.array(msg.truncated, np.float32)[usable],
+        np.array(msg.occluded, np.int32)[usable],
+        np.array(msg.dont_care, np.float32).reshape(-1, 4),
+    )
+
+
+class _Rows(NamedTuple):
+    """The usable detections of a message."""
+
+    values: F64  # (K, width)
+    labels: tuple[str, ...]
+    scores: F32
+    ids: tuple[str, ...]
+    frames: tuple[str, ...]
+    usable: Bool  # of all detections
+    unusable: tuple[str, ...]  # a sentence for each of the others
+
+
+def _rows(
+    msg: Any, row: Callable[[Any], tuple[float, ...]], width: int, why: Callable[[Sequence[float]], str]
+) -> _Rows:
+    """Read the detections of a message; ``why`` says why the numbers of one cannot be used."""
+    rows = [(row(d), *_hypothesis(d.results), _identity(d), _frame(d)) for d in msg.detections]
+    reasons = [why(values) for values, *_ in rows]
+    unusable = [
+        f"{name_box(number, label, identity)}: {reason}"
+        for number, ((_, label, _, identity, _), reason) in enumerate(zip(rows, reasons, strict=True))
+        if reason
+    ]
+    kept = [found for found, reason in zip(rows, reasons, strict=True) if not reason]
+    return _Rows(
+        np.array([values for values, *_ in kept], np.float64).reshape(-1, width),
+        tuple(label for _, label, *_ in kept),
+        np.nan_to_num(np.array([score for _, _, score, *_ in kept], np.float32)),
+        tuple(identity for *_, identity, _ in kept),
+        tuple(frame for *_, frame in kept),
+        np.array([not reason for reason in reasons], bool),
+        tuple(unusable),
+    )
+
+
+def _frame(detection: Any) -> str:
+    return frame_name(getattr(getattr(detection, "header", None), "frame_id", ""))
+
+
+def _identity(detection: Any) -> str:
+    return str(getattr(detection, "id", getattr(detection, "tracking_id", "")))  # the latter up to ROS 2 Foxy
+
+
+def _hypothesis(results: Iterable[Any]) -> tuple[str, float]:
+    """Label and score of the best result.
+
+    Fusion nodes append the class to the hypotheses of the cluster, whose own ``cluster_<i>`` has score 1:
+    such a name counts only where there is no other.
+    """
+    hypotheses = [getattr(result, "hypothesis", result) for result in results]  # flat up to ROS 2 Foxy
+    if not hypotheses:
+        return "", 0.0
+    labels = [(str(either(h, "class_id", "id")), float(h.score)) for h in hypotheses]
+    named = [item for item in labels if not item[0].startswith("cluster_")]
+    return max(named, key=lambda item: 0.0 if math.isnan(item[1]) else item[1]) if named else labels[0]

@@ -1,0 +1,401 @@
+"""Arrays into ROS 2 messages, as objects that rosbags serialises: the other way round than ``messages``."""
+
+from __future__ import annotations
+
+import colorsys
+from collections.abc import Iterable, Mapping, Sequence
+from functools import cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from rosbags.typesys.store import Typestore
+
+from bevviz.drivers import driver_msgs, point_cloud_interfaces
+from bevviz.messages import grid_map_msgs, vision_msgs
+from bevviz.model import geometry
+from bevviz.model.frame import (
+    F32,
+    F64,
+    I64,
+    Boxes3D,
+    Cloud,
+    Image,
+    ImageLabels,
+    Intrinsics,
+)
+
+# A vision_msgs/Detection3DArray that also says what was labelled in an image, see frame.ImageLabels.
+_LABELLED = """std_msgs/Header header
+vision_msgs/Detection3D[] detections
+float32[] image_boxes
+float32[] truncated
+int32[] occluded
+float32[] dont_care
+string[] unusable
+"""
+
+
+@cache
+def typestore() -> Typestore:
+    """The definitions of ROS 2 Jazzy, those that it lacks, and what labelled data sets say beyond."""
+    store = get_typestore(Stores.ROS2_JAZZY)
+    vision_msgs.register(store)
+    grid_map_msgs.register(store)
+    point_cloud_interfaces.register(store)
+    driver_msgs.register(store)
+    store.register(get_types_from_msg(_LABELLED, "bevviz_msgs/msg/Detection3DArray"))
+    return store
+
+
+Hypotheses = Sequence[tuple[str, float]]  # class and score, the first one being the box's own
+
+
+def encode_cloud(cloud: Cloud) -> Any:
+    """A sensor_msgs/PointCloud2 with the points' own fields."""
+    columns = dict(zip("xyz", cloud.xyz.T, strict=True)) | dict(cloud.fields)
+    layout = np.dtype([(name, values.dtype) for name, values in columns.items()], align=True)
+    points = np.zeros(len(cloud.xyz), layout)
+    for name, values in columns.items():
+        points[name] = values
+    return encode_points(cloud.stamp, cloud.frame_id, points)
+
+
+def encode_points(stamp: int, frame_id: str, points: NDArray[np.void], announced: int = 0) -> Any:
+    """A sensor_msgs/PointCloud2 of (N,) points with fields of numbers, which is not copied.
+
+    Args:
+        stamp: nanoseconds.
+        frame_id: of the header.
+        points: what there is of the cloud.
+        announced: points that it says to have, where that is more: the rest counts as lost.
+    """
+    layout, width = points.dtype, max(len(points), announced)
+    fields = [
+        make(
+            "sensor_msgs/msg/PointField",
+            name=name,
+            offset=int(layout.fields[name][1]),  # type: ignore[index]
+            datatype=POINT_FIELD[layout[name].str[1:]],
+            count=1,
+        )
+        for name in layout.names or ()
+    ]
+    return make(
+        "sensor_msgs/msg/PointCloud2",
+        header=_header(stamp, frame_id),
+        height=1,
+        width=width,
+        fields=fields,
+        is_bigendian=False,
+        point_step=layout.itemsize,
+        row_step=layout.itemsize * width,
+        data=points.view(np.uint8),
+        is_dense=True,
+    )
+
+
+# Datatypes of a PointField.
+POINT_FIELD: Mapping[str, int] = {"i1": 1, "u1": 2, "i2": 3, "u2": 4, "i4": 5, "u4": 6, "f4": 7, "f8": 8}
+
+
+def encode_image(image: Image) -> Any:
+    """A sensor_msgs/Image in bgr8."""
+    height, width = image.bgr.shape[:2]
+    return make(
+        "sensor_msgs/msg/Image",
+        header=_header(image.stamp, image.frame_id),
+        height=height,
+        width=width,
+        encoding="bgr8",
+        is_bigendian=0,
+        step=3 * width,
+        data=np.ascontiguousarray(image.bgr).reshape(-1),
+    )
+
+
+def encode_compressed_image(stamp: int, frame_id: str, encoded: bytes, kind: str) -> Any:
+    """A sensor_msgs/CompressedImage of the bytes of a file; ``kind``: png, jpeg."""
+    return make(
+        "sensor_msgs/msg/CompressedImage",
+        header=_header(stamp, frame_id),
+        format=kind,
+        data=np.frombuffer(encoded, np.uint8),
+    )
+
+
+def encode_camera_info(image: Image, intrinsics: Intrinsics) -> Any:
+    """The sensor_msgs/CameraInfo that belongs to an image."""
+    return encode_intrinsics(image.stamp, image.frame_id, intrinsics)
+
+
+def encode_intrinsics(stamp: int, frame_id: str, intrinsics: Intrinsics) -> Any:
+    """The same by stamp and frame."""
+    k, size = intrinsics.K, (intrinsics.width, intrinsics.height)
+    p = np.column_stack([k, np.zeros(3)]).reshape(-1)
+    d = np.asarray(intrinsics.D, np.float64)
+    return encode_camera(_header(stamp, frame_id), size, intrinsics.distortion_model, d, k.reshape(-1), p)
+
+
+def encode_camera(header: Any, size: tuple[int, int], model: str, d: F64, k: F64, p: F64) -> Any:
+    """A sensor_msgs/CameraInfo of numbers that are stated; ``size``: width and height."""
+    region = make(
+        "sensor_msgs/msg/RegionOfInterest", x_offset=0, y_offset=0, height=0, width=0, do_rectify=False
+    )
+    return make(
+        "sensor_msgs/msg/CameraInfo",
+        header=header,
+        width=size[0],
+        height=size[1],
+        distortion_model=model,
+        d=d,
+        k=k,
+        r=np.eye(3).reshape(-1),
+        p=p if p.size == 12 else np.zeros(12),
+        binning_x=0,
+        binning_y=0,
+        roi=region,
+    )
+
+
+def encode_boxes_3d(
+    stamp: int,
+    frame_id: str,
+    boxes: Boxes3D,
+    results: Iterable[Hypotheses],
+    pose: F64 | None = None,
+    ids: Sequence[str] = (),
+) -> Any:
+    """A vision_msgs/Detection3DArray.
+
+    Args:
+        stamp, frame_id: of the header.
+        boxes: in a frame of theirs.
+        results: the hypotheses of each box.
+        pose: (4, 4) frame_id from the frame of the boxes; None: it is the same.
+        ids: of each box; (): they have none.
+    """
+    turn = np.eye(4) if pose is None else pose
+    about = _header(stamp, frame_id)
+    detections = []
+    names = ids or [""] * len(boxes)
+    for center, size, yaw, hypotheses, name in zip(
+        boxes.center, boxes.size, boxes.yaw, results, names, strict=True
+    ):
+        turned = bool(np.isfinite(yaw))
+        half = float(yaw) / 2 if turned else 0.0
+        place = turn @ geometry.transform(center, np.array([0, 0, np.sin(half), np.cos(half)]))
+        box = encode_box_3d(about, place, size, hypotheses, name)
+        if not turned:  # for whoever reads the message to tell
+            box.bbox.center.orientation.w = np.nan
+        detections.append(box)
+    return make("vision_msgs/msg/Detection3DArray", header=about, detections=detections)
+
+
+def encode_box_3d(header: Any, pose: F64, size: Iterable[float], results: Hypotheses, name: str = "") -> Any:
+    """A vision_msgs/Detection3D; ``pose``: (4, 4) the header's frame from the box."""
+    place = _pose(pose)
+    box = make("vision_msgs/msg/BoundingBox3D", center=place, size=_vector("Vector3", size))
+    return make(
+        "vision_msgs/msg/Detection3D", header=header, results=_results(results, place), bbox=box, id=name
+    )
+
+
+def encode_labels(
+    stamp: int,
+    frame_id: str,
+    boxes: Boxes3D,
+    labels: Sequence[str],
+    ids: Sequence[str] = (),
+    image: ImageLabels | None = None,
+    unusable: Sequence[str] = (),
+) -> Any:
+    """What somebody has labelled: a vision_msgs/Detection3DArray, with ``image`` one of bevviz_msgs.
+
+    ``unusable``: a sentence for each label that was left out, with ``image``.
+    """
+    results = [[(label, 1.0)] for label in labels]
+    message = encode_boxes_3d(stamp, frame_id, boxes, results, ids=ids)
+    if image is None:
+        return message
+    return make(
+        "bevviz_msgs/msg/Detection3DArray",
+        header=message.header,
+        detections=message.detections,
+        image_boxes=image.xyxy.astype(np.float32).reshape(-1),
+        truncated=image.truncated.astype(np.float32),
+        occluded=image.occluded.astype(np.int32),
+        dont_care=image.dont_care.astype(np.float32).reshape(-1),
+        unusable=list(unusable),
+    )
+
+
+def encode_markers(
+    stamp: int, frame_id: str, boxes: Boxes3D, velocity: F32, ids: I64, texts: Iterable[str], pose: F64 | None
+) -> Any:
+    """A visualization_msgs/MarkerArray: of each box a cube, its way within a second, and its text.
+
+    They go by themselves where no others follow. Arguments as of ``encode_boxes_3d``; velocity: (N, 3) m/s.
+    """
+    turn, markers = np.eye(4) if pose is None else pose, []
+    about = _header(stamp, frame_id)
+    lasting = make("builtin_interfaces/msg/Duration", sec=0, nanosec=500_000_000)
+    for center, size, yaw, way, number, text in zip(
+        boxes.center, boxes.size, boxes.yaw, velocity, ids.tolist(), texts, strict=True
+    ):
+        half, color = float(yaw) / 2, _hue(number)
+        box = turn @ geometry.transform(center, np.array([0, 0, np.sin(half), np.cos(half)]))
+        above = center + np.array([0, 0, size[2] / 2 + 0.3])
+        top = turn @ geometry.transform(above, np.array([0, 0, 0, 1.0]))
+        ends = geometry.apply(turn, np.stack([center, center + way]).astype(np.float32))
+        shapes: list[tuple[str, int, Any, Any, float, list[Any], str]] = [
+            ("boxes", 1, _pose(box), size, 0.4, [], ""),
+            ("names", 9, _pose(top), np.array([0, 0, 0.4]), 1.0, [], text),
+        ]
+        if np.linalg.norm(way) > 0.1:
+            points = [_vector("Point", end) for end in ends]
+            shapes.append(("ways", 0, _pose(np.eye(4)), np.array([0.1, 0.25, 0]), 1.0, points, ""))
+        for space, kind, place, scale, alpha, points, words in shapes:
+            markers.append(
+                make(
+                    "visualization_msgs/msg/Marker",
+                    header=about,
+                    ns=space,
+                    id=number % 2**31,
+                    type=kind,
+                    action=0,
+                    pose=place,
+                    scale=_vector("Vector3", scale),
+                    color=make("std_msgs/msg/ColorRGBA", r=color[0], g=color[1], b=color[2], a=alpha),
+                    lifetime=lasting,
+                    frame_locked=False,
+                    points=points,
+                    colors=[],
+                    texture_resource="",
+                    texture=make(
+                        "sensor_msgs/msg/CompressedImage", header=about, format="", data=np.zeros(0, np.uint8)
+                    ),
+                    uv_coordinates=[],
+                    text=words,
+                    mesh_resource="",
+                    mesh_file=make(
+                        "visualization_msgs/msg/MeshFile", filename="", data=np.zeros(0, np.uint8)
+                    ),
+                    mesh_use_embedded_materials=False,
+                )
+            )
+    return make("visualization_msgs/msg/MarkerArray", markers=markers)
+
+
+def _hue(number: int) -> tuple[float, float, float]:
+    """Colours of neighbouring numbers are far apart."""
+    return colorsys.hsv_to_rgb(number * 0.618034 % 1, 0.6, 1.0)
+
+
+def encode_boxes_2d(stamp: int, frame_id: str, xyxy: F32, results: Iterable[Hypotheses]) -> Any:
+    """A vision_msgs/Detection2DArray; ``results`` has the hypotheses of each box."""
+    about, nowhere = _header(stamp, frame_id), _pose(np.eye(4))
+    detections = []
+    for (x0, y0, x1, y1), hypotheses in zip(xyxy.tolist(), results, strict=True):
+        middle = make("vision_msgs/msg/Point2D", x=(x0 + x1) / 2, y=(y0 + y1) / 2)
+        box = make(
+            "vision_msgs/msg/BoundingBox2D",
+            center=make("vision_msgs/msg/Pose2D", position=middle, theta=0.0),
+            size_x=x1 - x0,
+            size_y=y1 - y0,
+        )
+        detections.append(
+            make(
+                "vision_msgs/msg/Detection2D",
+                header=about,
+                results=_results(hypotheses, nowhere),
+                bbox=box,
+                id="",
+            )
+        )
+    return make("vision_msgs/msg/Detection2DArray", header=about, detections=detections)
+
+
+def _results(hypotheses: Hypotheses, place: Any) -> list[Any]:
+    covered = make("geometry_msgs/msg/PoseWithCovariance", pose=place, covariance=np.zeros(36))
+    return [
+        make(
+            "vision_msgs/msg/ObjectHypothesisWithPose",
+            hypothesis=make("vision_msgs/msg/ObjectHypothesis", class_id=name, score=float(score)),
+            pose=covered,
+        )
+        for name, score in hypotheses
+    ]
+
+
+def encode_transforms(stamp: int, edges: Iterable[tuple[str, str, F64]]) -> Any:
+    """A tf2_msgs/TFMessage of (parent, child, parent_from_child)."""
+    return encode_pose_edges((_header(stamp, parent), child, pose) for parent, child, pose in edges)
+
+
+def encode_pose_edges(edges: Iterable[tuple[Any, str, F64]]) -> Any:
+    """The same of (header, child, header.frame_id from child)."""
+    transforms = [
+        make(
+            "geometry_msgs/msg/TransformStamped",
+            header=header,
+            child_frame_id=child,
+            transform=make(
+                "geometry_msgs/msg/Transform",
+                translation=_vector("Vector3", pose[:3, 3]),
+                rotation=_rotation(pose),
+            ),
+        )
+        for header, child, pose in edges
+    ]
+    return make("tf2_msgs/msg/TFMessage", transforms=transforms)
+
+
+def encode_odometry(
+    stamp: int, parent: str, child: str, parent_from_child: F64, later: F64, dt: float
+) -> Any:
+    """A nav_msgs/Odometry, its velocities being those of the way to the pose ``dt`` seconds later."""
+    step = geometry.inverse(parent_from_child) @ later
+    turn = np.array([step[2, 1] - step[1, 2], step[0, 2] - step[2, 0], step[1, 0] - step[0, 1]]) / 2
+    twist = make(
+        "geometry_msgs/msg/Twist",
+        linear=_vector("Vector3", step[:3, 3] / dt),
+        angular=_vector("Vector3", turn / dt),
+    )
+    none = np.zeros(36)
+    return make(
+        "nav_msgs/msg/Odometry",
+        header=_header(stamp, parent),
+        child_frame_id=child,
+        pose=make("geometry_msgs/msg/PoseWithCovariance", pose=_pose(parent_from_child), covariance=none),
+        twist=make("geometry_msgs/msg/TwistWithCovariance", twist=twist, covariance=none),
+    )
+
+
+# --- parts -------------------------------------------------------------------------------------
+
+
+def make(kind: str, **values: Any) -> Any:
+    """A message of a type that ``typestore`` has."""
+    return typestore().types[kind](**values)
+
+
+def _header(stamp: int, frame_id: str) -> Any:
+    time = make("builtin_interfaces/msg/Time", sec=stamp // 10**9, nanosec=stamp % 10**9)
+    return make("std_msgs/msg/Header", stamp=time, frame_id=frame_id)
+
+
+def _vector(kind: str, xyz: Iterable[float]) -> Any:
+    x, y, z = map(float, xyz)
+    return make(f"geometry_msgs/msg/{kind}", x=x, y=y, z=z)
+
+
+def _rotation(a_from_b: F64) -> Any:
+    x, y, z, w = map(float, geometry.quaternion(a_from_b))
+    return make("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w)
+
+
+def _pose(a_from_b: F64) -> Any:
+    position = _vector("Point", a_from_b[:3, 3])
+    return make("geometry_msgs/msg/Pose", position=position, orientation=_rotation(a_from_b))

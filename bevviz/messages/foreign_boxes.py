@@ -1,0 +1,319 @@
+"""Boxes in messages other than vision_msgs': Autoware's, radars', markers, and private ones by stated fields.
+
+What a message is made of is read from the bag; here are only the names of the fields, as paths of attributes.
+"""
+
+from __future__ import annotations
+
+import difflib
+import math
+import re
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, fields
+from typing import Any, TypeVar
+
+import numpy as np
+
+from bevviz.errors import UserError
+from bevviz.messages.decoding import frame_name, stamp_ns
+from bevviz.messages.guard import field_names, kind_of
+from bevviz.model.frame import F64, Boxes3D, LabelledBoxes3D
+
+T = TypeVar("T")
+
+CUBE, CYLINDER, TEXT, ADD = 1, 3, 9, 0  # of visualization_msgs/Marker
+POLYGON = 2  # of Autoware's Shape
+LARGEST = 1e9  # metres of a coordinate or size; what is larger is no number that anybody has measured
+LEAN = math.radians(1)  # a box that leans by less is upright
+
+
+@dataclass(frozen=True, slots=True)
+class Fields:
+    """Where things are in a message: paths ``a.b.c``, with ``|`` between names that versions differ in."""
+
+    objects: str = ""  # the list, in the message; "": the message's only list of messages
+    center: str = "pose.position"  # with x, y, z
+    size: str = "size"  # with x, y, z, or three numbers: lengths along the box's own axes
+    orientation: str = ""  # quaternion; "": what is beside the centre, else none
+    yaw: str = ""  # radians, instead
+    label: str = ""  # a text, or a number that the definition names
+    score: str = ""
+    id: str = ""
+
+
+AUTOWARE = Fields(
+    objects="objects",
+    center="kinematics.pose_with_covariance|initial_pose_with_covariance.pose.position",
+    size="shape.dimensions",
+    label="classification.label",
+    score="existence_probability",
+    id="object_id|id|uuid",
+)
+RADAR = Fields(objects="tracks", center="position", size="size", label="classification", id="uuid")
+TYPES = re.compile(
+    r"autoware(_auto)?_perception_msgs/(msg/)?(Detected|Tracked|Predicted)Objects$|radar_msgs/(msg/)?RadarTracks$"
+)
+
+
+def holds_boxes(msgtype: str) -> bool:
+    """Whether the boxes in a message of that type are known."""
+    return TYPES.search(msgtype) is not None
+
+
+def check(stated: Mapping[str, str]) -> None:
+    """Of ``source.boxes``.
+
+    Raises:
+        UserError: a name that is none, or something is missing.
+    """
+    known = ["topic", *(field.name for field in fields(Fields))]
+    for name in stated:
+        if name not in known:
+            near = difflib.get_close_matches(name, known, n=1)
+            hint = f", did you mean {near[0]}? There are" if near else "; there are"
+            raise UserError(f"source.boxes: {name} is not known{hint} {', '.join(known)}")
+    if stated and "topic" not in stated:
+        raise UserError("source.boxes: topic is missing: of which the boxes are")
+
+
+def decode_objects(msg: Any, topic: str, received: int, stated: Mapping[str, str]) -> LabelledBoxes3D:
+    """The boxes of a message that is no Detection3DArray.
+
+    Of markers, each CUBE or CYLINDER that is added is a box; its label is the text of a TEXT_VIEW_FACING
+    marker with the same id, in its namespace or in one that has no boxes, else its namespace.
+
+    Args:
+        msg: with a header, or objects that have one.
+        topic, received: for the result.
+        stated: ``source.boxes`` where it is of this topic; empty: known kinds alone.
+
+    Raises:
+        ValueError: a field is missing; which, and what there is.
+    """
+    paths = {name: path for name, path in stated.items() if name != "topic"}
+    if hasattr(msg, "markers") and not paths:
+        return _markers(msg.markers, topic, received)
+    known = RADAR if hasattr(msg, "tracks") else AUTOWARE
+    where = Fields(**paths) if paths else known
+    items = _read(list, msg, where.objects) if where.objects else list(_only_list(msg))
+    rows, labels, scores, ids = [], list[str](), list[float](), list[str]()
+    header = getattr(msg, "header", None)
+    headers, unusable = list[Any](), list[str]()
+    for number, item in enumerate(items):
+        row = _row(item, where)
+        label = _label(item, where.label) if where.label else ""
+        identity = _identity(_follow(item, where.id)[1]) if _has(item, where.id) else ""
+        if why := why_unusable(row):
+            unusable.append(f"{name_box(number, label, identity)}: {why}")
+            continue
+        rows.append(row)
+        own = getattr(item, "header", None)
+        headers.append(header if own is None or (header and header.frame_id) else own)
+        labels.append(label)
+        scores.append(_read(float, item, where.score) if _has(item, where.score) else 1.0)
+        ids.append(identity)
+    if None in headers:
+        raise ValueError("neither the message nor its objects have a header, which says the frame")
+    return _boxes(headers or [header], topic, received, rows, labels, scores, ids, unusable)
+
+
+def _row(item: Any, where: Fields) -> tuple[float, ...]:
+    """Centre, size and quaternion."""
+    holder, _ = _follow(item, where.center)
+    x, y, z = _read(_vector, item, where.center)
+    turn = 0.0, 0.0, 0.0, 1.0
+    if where.yaw:
+        half = _read(float, item, where.yaw) / 2
+        turn = 0.0, 0.0, math.sin(half), math.cos(half)
+    elif where.orientation:
+        turn = _read(_quaternion, item, where.orientation)
+    elif hasattr(holder, "orientation"):
+        turn = _quaternion(holder.orientation)
+    length, width, height = _read(_vector, item, where.size)
+    shape = getattr(item, "shape", None)
+    if shape is not None and getattr(shape, "type", None) == POLYGON and hasattr(shape, "footprint"):
+        outline = np.array([(p.x, p.y) for p in shape.footprint.points], np.float64).reshape(-1, 2)
+        if len(outline):  # in the object's own axes
+            low, high = outline.min(axis=0), outline.max(axis=0)
+            (length, width), (dx, dy) = (high - low).tolist(), ((low + high) / 2).tolist()
+            yaw = float(_yaw(np.array(turn)))
+            c, s = math.cos(yaw), math.sin(yaw)
+            x, y = x + c * dx - s * dy, y + s * dx + c * dy
+    return x, y, z, length, width, height, *turn
+
+
+def _markers(markers: Iterable[Any], topic: str, received: int) -> LabelledBoxes3D:
+    rows, labels, ids, headers = list[tuple[float, ...]](), list[str](), list[str](), list[Any]()
+    unusable = list[str]()
+    shown = [marker for marker in markers if marker.action == ADD]
+    solids = [marker for marker in shown if marker.type in (CUBE, CYLINDER)]
+    texts = {(marker.ns, marker.id): str(marker.text) for marker in shown if marker.type == TEXT}
+    of_solids = {marker.ns for marker in solids}
+    others = {number: text for (ns, number), text in texts.items() if ns not in of_solids}
+    for marker in solids:
+        row = *_vector(marker.pose.position), *_vector(marker.scale), *_quaternion(marker.pose.orientation)
+        identity = f"{marker.ns}/{marker.id}"
+        if why := why_unusable(row):
+            unusable.append(f"marker {identity}: {why}")
+            continue
+        rows.append(row)
+        headers.append(marker.header)
+        text = texts.get((marker.ns, marker.id)) or others.get(marker.id)
+        labels.append(text or str(marker.ns))
+        ids.append(identity)
+    return _boxes(headers, topic, received, rows, labels, [1.0] * len(rows), ids, unusable)
+
+
+def _boxes(
+    headers: Sequence[Any],
+    topic: str,
+    received: int,
+    rows: list[tuple[float, ...]],
+    labels: list[str],
+    scores: list[float],
+    ids: list[str],
+    unusable: list[str],
+) -> LabelledBoxes3D:
+    """``headers``: of each row; the first one's stamp counts."""
+    boxes, turns = turned_boxes(np.array(rows, np.float64).reshape(-1, 10))
+    header = next(iter(headers), None)
+    stamp = received if header is None else stamp_ns(header.stamp)
+    frames = tuple("" if one is None else frame_name(str(one.frame_id)) for one in headers)
+    return LabelledBoxes3D(
+        topic=topic,
+        stamp=stamp,
+        frame_id=next(iter(frames), ""),
+        boxes=boxes,
+        labels=tuple(labels),
+        scores=np.nan_to_num(np.array(scores, np.float32)),
+        received=received,
+        ids=tuple(ids) if all(ids) else (),
+        turns=turns,
+        frames=frames if len(set(frames)) > 1 else (),
+        unusable=tuple(unusable),
+    )
+
+
+def why_unusable(row: Sequence[float]) -> str:
+    """Say what is wrong with the centre, size and quaternion of a box; empty: it can be used."""
+    for name, values in (("centre", row[:3]), ("size", row[3:6]), ("orientation", row[6:])):
+        if not all(abs(value) < LARGEST for value in values):  # NaN is not, either
+            return f"its {name} is not finite: {_numbers(values)}"
+    if min(row[3:6]) < 0:
+        return f"its size is negative: {_numbers(row[3:6])}"
+    return ""
+
+
+def name_box(number: int, label: str, identity: str) -> str:
+    """Name a box of a message: ``box 3 (Car, id 17)``; numbers count from 0."""
+    words = [label, f"id {identity}" if identity else ""]
+    about = ", ".join(filter(None, words))
+    return f"box {number}{f' ({about})' if about else ''}"
+
+
+def _numbers(values: Iterable[float]) -> str:
+    return ", ".join(f"{value:.6g}" for value in values)
+
+
+def turned_boxes(values: F64) -> tuple[Boxes3D, F64 | None]:
+    """Boxes of (K, 10) centre, size and quaternion, and the quaternions where some of them lean.
+
+    A quaternion left at zero is no turn.
+    """
+    turns = values[:, 6:].copy()
+    turns[~turns.any(axis=1)] = 0, 0, 0, 1
+    x, y, z, w = turns.T
+    leans = x * x + y * y > math.sin(LEAN / 2) ** 2 * (x * x + y * y + z * z + w * w)
+    boxes = Boxes3D(values[:, :3], values[:, 3:6].astype(np.float32), _yaw(turns).astype(np.float32))
+    return boxes, turns if leans.any() else None
+
+
+# --- fields ------------------------------------------------------------------------------------
+
+
+def _follow(item: Any, path: str) -> tuple[Any, Any]:
+    """What has the last attribute of a path, and its value; of a list the likeliest is followed."""
+    holder, value = item, item
+    for name in path.split("."):
+        holder = _likeliest(value)
+        found = next((one for one in name.split("|") if hasattr(holder, one)), None)
+        if found is None:
+            raise ValueError(
+                f"no field {name} (of {path}); there are {', '.join(field_names(holder) or ['none'])}"
+            )
+        value = getattr(holder, found)
+    return holder, value
+
+
+def _read(kind: Callable[[Any], T], item: Any, path: str) -> T:
+    """Return the field at a path as what it must be.
+
+    Raises:
+        ValueError: it is not there, or something else.
+    """
+    value = _follow(item, path)[1]
+    try:
+        return kind(value)
+    except (TypeError, ValueError, AttributeError):
+        raise ValueError(f"the field '{path}' cannot be used: it is {kind_of(value)}") from None
+
+
+def _has(item: Any, path: str) -> bool:
+    try:
+        _follow(item, path if path else "-")
+    except ValueError:
+        return False
+    return True
+
+
+def _likeliest(value: Any) -> Any:
+    if not isinstance(value, list | tuple):
+        return value
+    if not value:
+        return None
+    return max(value, key=lambda one: float(getattr(one, "probability", getattr(one, "score", 0.0))))
+
+
+def _only_list(msg: Any) -> Any:
+    lists = {name: value for name in field_names(msg) or () if isinstance(value := getattr(msg, name), list)}
+    if len(lists) != 1:
+        raise ValueError(
+            f"objects is not stated, and there are {len(lists)} lists: {', '.join(lists) or 'none'}"
+        )
+    return next(iter(lists.values()))
+
+
+def _vector(value: Any) -> tuple[float, float, float]:
+    if hasattr(value, "x"):
+        return float(value.x), float(value.y), float(value.z)
+    x, y, z = value
+    return float(x), float(y), float(z)
+
+
+def _quaternion(q: Any) -> tuple[float, float, float, float]:
+    return float(q.x), float(q.y), float(q.z), float(q.w)
+
+
+def _yaw(turns: F64) -> F64:
+    """(...) turns about z of (..., 4) quaternions xyzw of any length; one of zero is none."""
+    x, y, z, w = np.moveaxis(turns, -1, 0)
+    yaw: F64 = np.arctan2(2 * (w * z + x * y), w * w + x * x - y * y - z * z)
+    return yaw
+
+
+def _label(item: Any, path: str) -> str:
+    """A text as it is; a number by the constant of that value beside the field, in lower case."""
+    if not _has(item, path):
+        return ""  # of a list of classes that is empty
+    holder, value = _follow(item, path)
+    if not isinstance(value, int | np.integer):
+        return str(value)
+    field = path.rpartition(".")[2].upper()
+    named = [name for name in dir(type(holder)) if name.isupper() and getattr(type(holder), name) == value]
+    named = [name for name in named if name.startswith(field)] or named
+    return named[0].removeprefix(f"{field}_").lower() if len(named) == 1 else str(value)
+
+
+def _identity(value: Any) -> str:
+    inner = getattr(value, "uuid", value)
+    return bytes(inner).hex() if isinstance(inner, np.ndarray | bytes | list) else str(inner)

@@ -1,0 +1,160 @@
+"""The one place where messages are handed to decoders: whatever a decoder raises becomes a MessageError."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import MISSING, fields, is_dataclass
+from numbers import Integral, Real
+from typing import Any, Concatenate, ParamSpec, Protocol, TypeVar
+
+import numpy as np
+from rosbags.interfaces import Nodetype
+
+from bevviz.errors import UserError, first_line
+from bevviz.messages.decoding import MessageError
+from bevviz.messages.encode import typestore
+from bevviz.support.loggers import logger
+
+NO_FIELD = "structure_needs_at_least_one_member"  # as ROS calls the byte of an empty message
+_log = logger(__name__)
+
+C = TypeVar("C")
+P = ParamSpec("P")
+R = TypeVar("R")
+
+
+class TypedMessage(Protocol):
+    """What an error says of a message."""
+
+    @property
+    def topic(self) -> str: ...
+
+    @property
+    def type(self) -> str: ...
+
+
+def guard(
+    message: TypedMessage,
+    decoder: Callable[Concatenate[C, P], R],
+    content: C,
+    *args: P.args,
+    **kwargs: P.kwargs,
+) -> R:
+    """Return ``decoder(content, ...)``, for a message that may hold anything, even other fields.
+
+    Args:
+        message: names the topic and the type in the error.
+        decoder: turns the content into something of ours.
+        content: the message, serialised or as an object with its fields.
+        args, kwargs: further arguments of the decoder.
+
+    Raises:
+        MessageError: the decoder has raised any exception. The error names the topic, the type and, where
+            that can be told, the field that is missing or wrong.
+        UserError: the decoder has raised this one.
+    """
+    try:
+        return decoder(content, *args, **kwargs)
+    except UserError:
+        raise
+    except Exception as error:
+        _log.debug("%s: a %s cannot be used", message.topic, message.type, exc_info=True)
+        reason = _reason(error, content, message.type)
+        raise MessageError(f"{message.topic}: not a {message.type}: {reason}") from None
+
+
+def _reason(error: Exception, content: Any, msgtype: str) -> str:
+    """Say what is wrong with the content of a message, in a few words."""
+    if isinstance(error, AttributeError) and (names := field_names(error.obj)) is not None:
+        there = ", ".join(names) or "none"
+        part = "it" if error.obj is content else f"a {_type_of(error.obj) or 'message'} in it"
+        return f"{part} has no field '{error.name}'; there are {there}"
+    if wrong := next(_wrong_fields(content, msgtype, ""), ""):
+        return wrong
+    kind = "" if isinstance(error, ValueError) else f"{type(error).__name__}: "
+    return f"{kind}{first_line(error)}"
+
+
+def field_names(content: Any) -> list[str] | None:
+    """Return the field names of a message of rosbags, rclpy or protobuf; None for any other object."""
+    if (descriptor := getattr(content, "DESCRIPTOR", None)) is not None:
+        return [field.name for field in descriptor.fields]
+    if is_dataclass(content):  # of rosbags, which has constants as fields with a default
+        return [
+            field.name for field in fields(content) if field.default is MISSING and field.name != NO_FIELD
+        ]
+    stated = getattr(content, "_fields_and_field_types", None)
+    return None if stated is None else [*stated]
+
+
+def _type_of(content: Any) -> str:
+    """Return the type of a message, as ``sensor_msgs/msg/Image``."""
+    descriptor = getattr(content, "DESCRIPTOR", None)
+    return str(getattr(content, "__msgtype__", "") or getattr(descriptor, "full_name", ""))
+
+
+# --- fields that are not as ROS defines them ---------------------------------------------------
+
+
+def _wrong_fields(content: Any, msgtype: str, path: str) -> Iterator[str]:
+    """Compare a message with the definition that is known here. Yield a sentence for each difference.
+
+    A field that the definition does not have is none. ROS 1 spells some fields in upper case.
+    """
+    definition = typestore().fielddefs.get(msgtype)
+    if definition is None or field_names(content) is None:
+        return
+    for name, (node, about) in definition[1]:
+        value = getattr(content, name, getattr(content, name.upper(), None))
+        if value is None:
+            yield f"the field '{path}{name}' is missing"
+        else:
+            yield from _wrong_values([value], (node, about), f"{path}{name}")
+
+
+def _wrong_values(values: Iterable[Any], kind: tuple[Any, Any], path: str) -> Iterator[str]:
+    """Do the same for the values of a field."""
+    node, about = kind
+    for value in values:
+        if node == Nodetype.NAME:
+            if field_names(value) is None:
+                yield f"the field '{path}' is {kind_of(value)}, not a {about}"
+            yield from _wrong_fields(value, about, f"{path}.")
+        elif node == Nodetype.BASE:
+            if not _is_base(value, about[0]):
+                yield f"the field '{path}' is {kind_of(value)}, not a {about[0]}"
+        elif not isinstance(value, list | tuple | np.ndarray | bytes):
+            yield f"the field '{path}' is {kind_of(value)}, not a list"
+        elif isinstance(value, np.ndarray):
+            if about[0][0] != Nodetype.BASE or about[0][1][0] == "string":
+                yield f"the field '{path}' is a list of {value.dtype} numbers, not of {_name_of(about[0])}"
+        elif not isinstance(value, bytes):
+            yield from _wrong_values(value, about[0], path)
+
+
+def _name_of(kind: tuple[Any, Any]) -> str:
+    node, about = kind
+    return str(about[0] if node == Nodetype.BASE else about)
+
+
+def _is_base(value: Any, name: str) -> bool:
+    """Whether a value can be one of a basic type of ROS."""
+    if name in ("string", "wstring"):
+        return isinstance(value, str)
+    if name.startswith("float"):
+        return isinstance(value, Real)
+    return isinstance(value, Integral | np.bool_)
+
+
+def kind_of(value: Any) -> str:
+    """Name the kind of a value, for the middle of a sentence."""
+    if field_names(value) is not None:
+        return f"a {_type_of(value) or 'message'}"
+    if isinstance(value, bool | np.bool_):
+        return "a bool"
+    if isinstance(value, Integral):
+        return "a whole number"
+    if isinstance(value, Real):
+        return "a number with a fraction"
+    names = {str: "a string", np.ndarray: "a list of numbers"}
+    return names.get(type(value), f"a {type(value).__name__}")

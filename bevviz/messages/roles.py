@@ -1,0 +1,279 @@
+"""Which topic plays which role: found by type, name and frame, or set by hand."""
+
+from __future__ import annotations
+
+import difflib
+import json
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from types import MappingProxyType
+from typing import Literal
+
+from bevviz.config import SourceConfig
+from bevviz.drivers import ouster
+from bevviz.errors import UserError
+from bevviz.messages.foreign_boxes import check
+from bevviz.messages.foxglove import short_of
+from bevviz.messages.sensors import CameraRole, camera_role, find_images, find_lidars
+from bevviz.messages.topics import (
+    IMAGES,
+    Topic,
+    entity_name,
+    foreign,
+    names_of,
+    note,
+    of_kind,
+    stated_topic,
+    unique_names,
+)
+from bevviz.model.frame import Scene
+
+
+@dataclass(frozen=True, slots=True)
+class Roles:
+    """The topics that play. ``notes`` says of every topic, in a few words, why it does or does not."""
+
+    lidars: tuple[str, ...] = ()
+    lidar_names: tuple[str, ...] = ()  # entity name of each
+    cameras: tuple[CameraRole, ...] = ()
+    tf: tuple[str, ...] = ()
+    tf_static: tuple[str, ...] = ()
+    tf_held: tuple[str, ...] = ()  # of tf, those whose transforms hold until there are others, as Foxglove's
+    odometry: str = ""
+    imus: tuple[str, ...] = ()  # tell which way is up, where transforms do not
+    robot_detections_2d: tuple[str, ...] = ()
+    robot_detections_3d: tuple[str, ...] = ()
+    robot_clouds: tuple[str, ...] = ()  # of obstacles, where the ground stage is the robot's
+    stages: tuple[str, ...] = ()  # the robot's results that our stages are taken from
+    truth: str = ""
+    boxes: Mapping[str, str] = field(default_factory=dict)  # as source.boxes has it
+    around: tuple[tuple[str, str, str], ...] = field(default=(), compare=False)  # topic, what it tells, type
+    # What follows is for sentences: it changes with topics that play no role.
+    camera_infos: tuple[str, ...] = field(default=(), compare=False)  # all of them, whoever uses them
+    no_lidar: str = field(default="", compare=False)  # why there is none, and what would help
+    no_camera: str = field(default="", compare=False)  # the same of cameras
+    notes: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def driver(self) -> str:
+        """The topic whose messages make the frames: the first LiDAR's, without one the first camera's."""
+        return next(iter((*self.lidars, *(camera.topic for camera in self.cameras))), "")
+
+    @property
+    def settings(self) -> tuple[str, ...]:
+        """``key=value`` each, which give the sensors' topics the same roles whatever others there are."""
+        infos = {camera.topic: camera.info_topic for camera in self.cameras if camera.info_topic}
+        chosen = {
+            "lidar_topics": list(self.lidars),
+            "camera_topics": [camera.topic for camera in self.cameras],
+            "camera_info_topics": infos,
+            "odometry_topic": self.odometry,
+        }
+        return tuple(f"source.{key}={json.dumps(value)}" for key, value in chosen.items() if value)
+
+    def scene(self, name: str) -> Scene:
+        """What a source with these topics delivers."""
+        lidars = self.lidar_names
+        return Scene(
+            name=name,
+            lidar="lidars" if len(lidars) > 1 else "".join(lidars),
+            lidars=lidars,
+            cameras=tuple(camera.name for camera in self.cameras),
+            robot=bool(self.robot_detections_2d or self.robot_detections_3d),
+            truth=bool(self.truth),
+            imu=bool(self.imus),
+        )
+
+
+MANY = 12  # topics; more are not listed in a sentence
+MARK = "bevviz/mark"  # topic, in the namespace of the node
+_MARK = re.compile(rf"(^|/){MARK}$")
+
+Kind = Literal["mark", "status", "shape"]
+SHAPES = frozenset(
+    {"LaserScan", "Path", "PoseStamped", "OccupancyGrid", "GridMap", "MarkerArray", "Marker", "NavSatFix"}
+)
+RESULTS = {  # of the robot's own pipeline, shown where nothing of ours is
+    "PointCloud2": re.compile(r"(^|/)lidar/points_no_ground$"),
+    "Image": re.compile(r"(^|/)visualization/bev_image$"),
+}
+_DESCRIPTION = re.compile(r"(^|/)robot_description$")
+_AROUND = {
+    "mark": "notes of people",
+    "status": "the robot's diagnostics",
+    "shape": "around perception",
+}
+
+STAGE_KINDS = {  # what the robot publishes as the result of a stage
+    "ground.method": "PointCloud2",
+    "clustering.method": "Detection3DArray",
+    "detector.model": "Detection2DArray",
+    "objects.method": "Detection3DArray",
+}
+
+
+def find_roles(
+    topics: Sequence[Topic],
+    config: SourceConfig,
+    stages: Mapping[str, str] = MappingProxyType({}),
+    *,
+    results: bool = False,
+) -> Roles:
+    """Give each topic its role.
+
+    Topics that are stated in the configuration are taken as they are. Otherwise one frame is one sensor:
+    of several clouds, or several images, with the same frame_id the one nearest to the sensor is taken
+    (images: the rectified one, as the others of a pipeline are made from it).
+
+    Args:
+        topics: all that there are.
+        config: which topics are stated.
+        stages: the robot's topics that stages are taken from, by the dotted key that names each.
+        results: the robot's bird's-eye view and obstacles are shown, too.
+
+    Raises:
+        UserError: a stated topic does not exist, or is of another type.
+    """
+    topics = sorted(topics, key=lambda t: t.name)  # the order of a bag's or a graph's topics is chance
+    topics = _with_boxes(topics, config)
+    notes = {t.name: f"not used: {foreign(t) or f'nothing here reads {t.type}'}" for t in topics}
+    staged = {key: stated_topic(name, topics, key, STAGE_KINDS[key]) for key, name in stages.items()}
+    obstacles = [topic for key, topic in staged.items() if key == "ground.method"]
+    for name in config.lidar_calibration:
+        stated_topic(name, topics, "source.lidar_calibration", "PointCloud2")
+    told = {ouster.metadata_of(t.name) for t in topics if t.scans}
+    note(notes, [t for t in topics if t.name in told], "metadata of the LiDAR")
+    lidars = find_lidars([t for t in topics if t not in obstacles], config, notes)
+    images = find_images(topics, config, notes)
+    names = unique_names(
+        [(entity_name(t.name, t.frame_id), t) for t in lidars] + [(entity_name(t.name), t) for t in images]
+    )
+    cameras = tuple(
+        camera_role(t, name, topics, config, notes)
+        for t, name in zip(images, names[len(lidars) :], strict=True)
+    )
+    for topic in of_kind(topics, "CameraInfo"):
+        used_by = [camera.name for camera in cameras if camera.info_topic == topic.name]
+        notes[topic.name] = (
+            f"calibration of {', '.join(used_by)}" if used_by else "not used: its images are not"
+        )
+
+    transforms = [t for t in topics if t.kind.lower() == "tfmessage"]
+    others = [t for t in transforms if _of_another_robot(t, topics, [*lidars, *images])]
+    note(notes, others, "not used: transforms of another robot, whose sensors are not")
+    transforms = [t for t in transforms if t not in others]
+    static = [t for t in transforms if t.name.endswith("tf_static")]
+    moving = [t for t in transforms if t not in static]
+    note(notes, static, "static transforms")
+    note(notes, moving, "transforms")
+    odometry = _find_odometry(topics, config, notes)
+    imus = [topic for topic in of_kind(topics, "Imu") if topic.count != 0]
+    note(notes, imus, "plotted; gravity, where the transforms have no upright frame")
+    boxes = of_kind(topics, "Detection3DArray")
+    truth = [t for t in boxes if t.name.endswith("ground_truth") and t not in staged.values()][:1]
+    boxes = [t for t in boxes if t not in truth]
+    detections = of_kind(topics, "Detection2DArray")
+    note(notes, truth, "ground truth, by its name")
+    note(notes, [*boxes, *detections], "the robot's own result")
+    for key, topic in staged.items():
+        notes[topic.name] = f"the robot's own result, taken for the stage {key.partition('.')[0]}"
+    around = [(t.name, kind, t.kind) for t in topics if (kind := kind_of(t.name, t.kind)) is not None]
+    if results:
+        free = [t for t in topics if t not in (*lidars, *images, *staged.values()) and t.kind in RESULTS]
+        around += [(t.name, "shape", t.kind) for t in free if RESULTS[t.kind].search(t.name)]
+    helps = {t.name: f"; no LiDAR: {why}" if (why := foreign(t, "LiDAR")) else "" for t in topics}
+    notes.update({name: f"shown: {_AROUND[kind]}{helps[name]}" for name, kind, _ in around})
+    return Roles(
+        boxes=config.boxes,
+        around=tuple(around),
+        lidars=names_of(lidars),
+        lidar_names=tuple(names[: len(lidars)]),
+        cameras=cameras,
+        tf=names_of(moving),
+        tf_static=names_of(static),
+        tf_held=names_of(t for t in moving if short_of(t.type)),
+        odometry=odometry,
+        imus=names_of(imus),
+        robot_detections_2d=names_of(detections),
+        robot_detections_3d=names_of(boxes),
+        robot_clouds=names_of(obstacles),
+        stages=names_of(staged.values()),
+        truth=truth[0].name if truth else "",
+        camera_infos=names_of(of_kind(topics, "CameraInfo")),
+        no_lidar="" if lidars else _no_lidar(topics),
+        no_camera="" if images else _no_camera(topics),
+        notes=notes,
+    )
+
+
+def _of_another_robot(topic: Topic, topics: Sequence[Topic], used: Sequence[Topic]) -> bool:
+    """Whether a namespace has transforms and sensors of its own, and none of these is used.
+
+    Robots of one kind name their frames alike: their transforms are not to be mixed.
+    """
+    namespace = topic.name.rpartition("/")[0] + "/"
+    own = [t for t in of_kind(topics, "PointCloud2", *IMAGES) if t.name.startswith(namespace)]
+    return bool(own and used) and not any(t in used for t in own)
+
+
+def _with_boxes(topics: list[Topic], config: SourceConfig) -> list[Topic]:
+    """The topic that ``source.boxes`` is of is read as boxes."""
+    check(config.boxes)
+    name = config.boxes.get("topic", "")
+    if name and name not in names_of(topics):
+        near = difflib.get_close_matches(name, names_of(topics), n=3, cutoff=0.4)
+        there = f"; the nearest are {', '.join(near)}" if near else ""
+        raise UserError(f"source.boxes: there is no topic {name}{there}")
+    return [replace(topic, boxes=topic.name == name) for topic in topics] if name else topics
+
+
+def _no_lidar(topics: Sequence[Topic]) -> str:
+    said = f"no LiDAR: none of {len(topics)} topics is a sensor_msgs/PointCloud2"
+    if held := [f"{t.name} holds {why}" for t in topics if (why := foreign(t, "LiDAR"))]:
+        return f"{said}; {'; '.join(held)}"
+    if taken := names_of(of_kind(topics, "PointCloud2")):
+        return f"no LiDAR: {', '.join(taken)} is the result of a stage"
+    if len(topics) > MANY:
+        return f"{said}; 'bevviz info' shows them"
+    return f"{said}; there are {', '.join(f'{t.name} ({t.kind})' for t in topics) or 'none'}"
+
+
+def _no_camera(topics: Sequence[Topic]) -> str:
+    images = of_kind(topics, *IMAGES)
+    if held := [f"{t.name} holds {why}" for t in topics if (why := foreign(t, "camera"))]:
+        return f"no camera that can be read: {'; '.join(held)}"
+    if with_messages := names_of(t for t in images if t.count != 0):
+        return f"no camera among the images: --set source.camera_topics=[{with_messages[0]}]"
+    if images:
+        return f"no camera: there are no messages on {', '.join(names_of(images))}"
+    return "no camera: there is no topic of sensor_msgs/Image or CompressedImage"
+
+
+# --- odometry ----------------------------------------------------------------------------------
+
+
+def _find_odometry(topics: Sequence[Topic], config: SourceConfig, notes: dict[str, str]) -> str:
+    candidates = of_kind(topics, "Odometry")
+    if config.odometry_topic:
+        chosen = stated_topic(config.odometry_topic, topics, "source.odometry_topic", "Odometry")
+    elif not candidates:
+        return ""
+    else:
+        chosen = min(candidates, key=lambda t: (t.count == 0, t.name.count("/"), t.name))
+    note(notes, candidates, f"not used: {chosen.name} is")
+    notes[chosen.name] = "odometry, where the transforms have no fixed frame"
+    return chosen.name
+
+
+# --- around perception -------------------------------------------------------------------------
+
+
+def kind_of(topic: str, short: str) -> Kind | None:
+    """What a topic tells, by its name and its type without the package; None: nothing of this."""
+    if short == "String" and _MARK.search(topic):
+        return "mark"
+    if short == "DiagnosticArray":
+        return "status"
+    described = short == "String" and _DESCRIPTION.search(topic)
+    return "shape" if short in SHAPES or described else None

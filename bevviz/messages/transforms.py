@@ -1,0 +1,108 @@
+"""Transforms, odometry and accelerations of ROS messages."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any, TypeAlias
+
+import numpy as np
+
+from bevviz.messages.decoding import MessageError, frame_name, stamp_ns
+from bevviz.model import geometry
+from bevviz.model.frame import F64
+
+
+@dataclass(frozen=True, slots=True)
+class StampedTransform:
+    """One edge of the transform tree at one time."""
+
+    stamp: int  # nanoseconds
+    parent: str
+    child: str
+    parent_from_child: F64  # (4, 4)
+
+
+def decode_transforms(msg: Any, topic: str = "/tf") -> list[StampedTransform]:
+    """The transforms of a tf2_msgs/TFMessage; one that is no rigid transform is left out.
+
+    Raises:
+        MessageError: none of them is one.
+    """
+    transforms, problems = [], []
+    for item in msg.transforms:
+        moved = item.transform
+        try:
+            transforms.append(
+                _stamped(item.header, item.child_frame_id, moved.translation, moved.rotation, topic)
+            )
+        except MessageError as error:
+            problems.append(error)
+    if problems and not transforms:
+        raise problems[0]
+    return transforms
+
+
+def decode_odometry(msg: Any, topic: str = "odometry") -> StampedTransform:
+    """The pose of a nav_msgs/Odometry: header.frame_id from child_frame_id.
+
+    Raises:
+        MessageError: no rigid transform, or no frame names.
+    """
+    pose = msg.pose.pose
+    return _stamped(msg.header, msg.child_frame_id, pose.position, pose.orientation, topic)
+
+
+Vector: TypeAlias = tuple[float, float, float]
+
+
+@dataclass(frozen=True, slots=True)
+class Acceleration:
+    """What an Imu feels, in its own frame: at rest one g upwards."""
+
+    stamp: int
+    frame_id: str
+    acceleration: F64  # (3,) m/s^2, or in g: drivers differ
+
+
+def decode_acceleration(msg: Any, topic: str = "imu") -> Acceleration:
+    """Of a sensor_msgs/Imu.
+
+    Raises:
+        MessageError: the message says that it has none.
+    """
+    if msg.linear_acceleration_covariance[0] == -1:
+        raise MessageError(f"{topic}: its covariance says that no acceleration is measured")
+    felt = msg.linear_acceleration
+    return Acceleration(
+        stamp_ns(msg.header.stamp),
+        frame_name(msg.header.frame_id),
+        np.array([felt.x, felt.y, felt.z], np.float64),
+    )
+
+
+def decode_motion(msg: Any) -> tuple[Vector, Vector, int]:
+    """Rotation rate and acceleration of a sensor_msgs/Imu, NaN where it says it has none, and its stamp."""
+    none = (math.nan, math.nan, math.nan)
+    turn, felt = msg.angular_velocity, msg.linear_acceleration
+    return (
+        none if msg.angular_velocity_covariance[0] == -1 else (float(turn.x), float(turn.y), float(turn.z)),
+        none
+        if msg.linear_acceleration_covariance[0] == -1
+        else (float(felt.x), float(felt.y), float(felt.z)),
+        stamp_ns(msg.header.stamp),
+    )
+
+
+def _stamped(header: Any, child: str, translation: Any, rotation: Any, topic: str) -> StampedTransform:
+    parent, child = frame_name(header.frame_id), frame_name(child)
+    if not parent or not child or parent == child:
+        raise MessageError(f"{topic}: '{parent}' and '{child}' cannot be parent and child frame")
+    xyz = translation.x, translation.y, translation.z
+    try:
+        matrix = geometry.transform(xyz, (rotation.x, rotation.y, rotation.z, rotation.w))
+    except ValueError as error:
+        raise MessageError(f"{topic}: rotation from '{child}' to '{parent}': {error}") from None
+    if not all(map(math.isfinite, xyz)):
+        raise MessageError(f"{topic}: the translation from '{child}' to '{parent}' is not finite")
+    return StampedTransform(stamp_ns(header.stamp), parent, child, matrix)

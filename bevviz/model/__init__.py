@@ -1,0 +1,1 @@
+"""Frames, results and geometry as frozen dataclasses of arrays. Imports `config` and `support`."""

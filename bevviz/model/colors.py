@@ -1,0 +1,122 @@
+"""Colours that stay the same from frame to frame: for classes by name, for ids by number."""
+
+from __future__ import annotations
+
+import colorsys
+import zlib
+from enum import Enum
+from functools import lru_cache
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bevviz.model.frame import F32, U8
+
+Color: TypeAlias = tuple[int, int, int]
+
+# Told apart also by who is colour-blind, after Okabe & Ito (2008), on dark and on light; held by a test.
+CLASS_COLORS: dict[str, Color] = {
+    "person": (230, 110, 30),
+    "pedestrian": (230, 110, 30),
+    "rider": (240, 228, 66),
+    "cyclist": (240, 228, 66),
+    "bicycle": (240, 228, 66),
+    "motorcycle": (225, 140, 190),
+    "car": (86, 180, 233),
+    "van": (190, 235, 250),
+    "truck": (20, 100, 190),
+    "bus": (120, 60, 130),
+}
+
+
+class State(Enum):
+    """What a colour says of anything that can be well or not."""
+
+    GOOD = (86, 180, 233)
+    DOUBTFUL = (255, 200, 50)
+    BAD = (225, 75, 60)
+    OTHER = (170, 90, 160)  # neither: taken by another, of another class
+    UNKNOWN = (120, 125, 135)
+
+
+# Of what is held to the truth, of the two sides of a comparison, of two opinions on an object, and of where
+# points are lost.
+TRUTH: dict[str, Color] = {
+    "true": State.GOOD.value,
+    "missed": State.DOUBTFUL.value,
+    "false": State.BAD.value,
+}
+SIDES: dict[str, Color] = {
+    "same": (125, 135, 140),
+    "moved": (240, 228, 66),
+    "class": (214, 120, 190),
+    "only A": (230, 110, 30),
+    "only B": (70, 170, 240),
+}
+OPINIONS: dict[str, Color] = {
+    "contradicted": State.BAD.value,
+    "named otherwise": State.OTHER.value,
+    "missed": State.DOUBTFUL.value,
+    "confirmed": State.GOOD.value,
+    "unseen": State.UNKNOWN.value,
+}
+FATES: dict[str, Color] = {
+    "ground": (150, 120, 95),
+    "noise": (215, 70, 40),
+    "set aside": (240, 145, 70),
+    "clustered": (250, 230, 80),
+    "reported": (110, 200, 250),
+    "in front": (45, 90, 200),
+}
+
+
+# Of curves in one plot: the ten of Petroff (arXiv 2107.02270), red and purple lighter for a dark background.
+# Any two are 10 apart or more in CAM02-UCS, also for those who lack one of the three kinds of cones.
+SERIES: tuple[Color, ...] = (
+    *((63, 144, 218), (255, 169, 14), (205, 40, 15), (148, 164, 162), (150, 70, 205)),
+    *((169, 107, 89), (231, 99, 0), (185, 172, 112), (113, 117, 129), (146, 218, 221)),
+)
+
+
+@lru_cache(maxsize=4)
+def palette(size: int = 64) -> U8:
+    """(size, 3) RGB colours, neighbours far apart in hue (golden-ratio steps), bright enough on black."""
+    hues = np.arange(size) * 0.6180339887498949 % 1.0
+    rgb = [colorsys.hsv_to_rgb(h, (0.55, 0.8)[i % 2], (1.0, 0.85, 0.95)[i % 3]) for i, h in enumerate(hues)]
+    colors: U8 = np.round(np.array(rgb) * 255).astype(np.uint8)
+    colors.flags.writeable = False
+    return colors
+
+
+def class_color(name: str) -> Color:
+    """RGB colour of a class: the same in every run and on every machine."""
+    known = CLASS_COLORS.get(name.lower())
+    if known is not None:
+        return known
+    r, g, b = palette()[zlib.crc32(name.lower().encode()) % len(palette())].tolist()
+    return r, g, b
+
+
+@lru_cache(maxsize=4)
+def turbo(size: int = 256) -> U8:
+    """(size, 3) RGB of the Turbo colour map, blue to red (polynomial fit of Mikhailov 2019)."""
+    x = np.linspace(0.0, 1.0, size)
+    powers = x[:, None] ** np.arange(6)
+    coefficients = np.array(
+        [
+            [0.13572138, 4.61539260, -42.66032258, 132.13108234, -152.94239396, 59.28637943],
+            [0.09140261, 2.19418839, 4.84296658, -14.18503333, 4.27729857, 2.82956604],
+            [0.10667330, 12.64194608, -60.58204836, 110.36276771, -89.90310912, 27.34824973],
+        ]
+    )
+    colors: U8 = np.round(np.clip(powers @ coefficients.T, 0, 1) * 255).astype(np.uint8)
+    colors.flags.writeable = False
+    return colors
+
+
+def bins(values: F32, low: float, high: float, size: int) -> NDArray[np.uint16]:
+    """(N,) rows of a colour map of ``size`` colours; what is outside low ... high gets the end colour."""
+    scaled = (values - np.float32(low)) * np.float32(size / (high - low))
+    rows: NDArray[np.uint16] = np.clip(scaled, 0, size - 1).astype(np.uint16)
+    return rows

@@ -1,0 +1,50 @@
+"""How much of everything there is in a frame."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping
+
+from bevviz.model.frame import Frame
+from bevviz.model.results import Decision, FrameResult, Opinion
+
+OPINIONS = ("confirmed", "named_otherwise", "contradicted", "unseen", "missed")  # on somebody else's objects
+
+
+def counts_of(result: FrameResult, last: Frame | None = None) -> Mapping[str, int]:
+    """Points, clusters, detections ... by name; what was not made has none.
+
+    Args:
+        result: of the frame.
+        last: the frame before it; None: nothing was skipped.
+    """
+    frame = result.frame
+    counts: Counter[str] = Counter(
+        points=len(frame.points),
+        invalid_points=sum(cloud.dropped for cloud in frame.clouds),
+        problems=len(frame.problems) + sum(len(c.camera.problems) for c in result.cameras),
+        failures=len(result.failures),
+        skipped_frames=max(0, frame.index - last.index - 1) if last is not None else 0,
+    )
+    if result.voxels is not None:
+        counts["voxels"] = len(result.voxels.points)
+    if result.obstacles is not None:
+        counts["obstacle_points"] = len(result.obstacles)
+    if result.clusters is not None:
+        counts["clusters"] = int(result.clusters.kept.sum())
+    for camera in result.cameras:
+        if camera.detections is not None:
+            counts["detections"] += int(camera.detections.kept.sum())
+        if camera.fusion is not None:
+            counts["matches"] += int((camera.fusion.detection_decision == Decision.MATCHED).sum())
+    counts.update(opinions_in(result))
+    return counts
+
+
+def opinions_in(result: FrameResult) -> Mapping[str, int]:
+    """How many objects of somebody else's cameras say what of; empty: they are ours."""
+    if (opinions := result.opinions) is None:
+        return {}
+    said = Counter(Opinion(value).word.replace(" ", "_") for value in opinions.opinion.tolist())
+    said["missed"] = int(opinions.missed.sum())
+    return {what: said[what] for what in OPINIONS}

@@ -1,0 +1,357 @@
+"""Rigid transforms, camera projection, boxes and their overlap. Plain functions of arrays."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator
+from typing import Any
+
+import numpy as np
+from numpy.polynomial import Polynomial
+from numpy.typing import NDArray
+
+from bevviz.model.frame import F32, F64, I64, Bool, Boxes3D, Intrinsics
+
+FloatArray = NDArray[Any]
+
+MIN_DEPTH = 1e-3  # metres; what is nearer to the camera's plane has no meaningful pixel
+WIDEST = (
+    1e8  # squared slope of a ray, 0.006 degrees from the camera's plane: its sixth power fits into float32
+)
+FISHEYE = ("equidistant", "fisheye")
+
+# --- rigid transforms --------------------------------------------------------------------------
+
+
+def transform(translation: Iterable[float], quaternion_xyzw: Iterable[float]) -> F64:
+    """The (4, 4) matrix of a translation in metres and a rotation as quaternion x, y, z, w.
+
+    The quaternion need not be of unit length, as published ones seldom are to the last digit.
+
+    Raises:
+        ValueError: quaternion of zero length or not finite.
+    """
+    q = tuple(map(float, quaternion_xyzw))
+    norm = math.hypot(*q)
+    if not math.isfinite(norm) or norm < 1e-9:
+        raise ValueError(f"{q} is no rotation")
+    # Number by number: a robot publishes hundreds a second, and for so few numbers NumPy's calls are slow.
+    x, y, z, w = (value / norm for value in q)
+    tx, ty, tz = map(float, translation)
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w), tx],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w), ty],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y), tz],
+            [0.0, 0.0, 0.0, 1.0],
+        ]
+    )
+
+
+def inverse(a_from_b: F64) -> F64:
+    """b_from_a of a rigid (4, 4) a_from_b."""
+    rotation = a_from_b[:3, :3].T
+    m = np.eye(4)
+    m[:3, :3] = rotation
+    m[:3, 3] = -rotation @ a_from_b[:3, 3]
+    return m
+
+
+def quaternion(a_from_b: F64) -> F64:
+    """(4,) unit quaternion x, y, z, w, w >= 0, of a (4, 4) transform (Shepperd 1978)."""
+    (a, b, c), (d, e, f), (g, h, i) = a_from_b[:3, :3].tolist()  # number by number, as ``transform``
+    squared = a - e - i, e - a - i, i - a - e, a + e + i
+    largest = squared.index(max(squared))
+    root = squared[largest] + 1
+    q = (
+        (root, b + d, c + g, h - f),
+        (b + d, root, f + h, c - g),
+        (c + g, f + h, root, d - b),
+        (h - f, c - g, d - b, root),
+    )[largest]
+    scale = math.copysign(1 / math.hypot(*q), q[3])
+    return np.array([value * scale for value in q])
+
+
+def interpolate(a_from_b0: F64, a_from_b1: F64, t: float) -> F64:
+    """The pose between two: translation linear, rotation by slerp (Shoemake 1985), t in [0, 1]."""
+    q0, q1 = quaternion(a_from_b0), quaternion(a_from_b1)
+    dot = float(q0 @ q1)
+    if dot < 0:
+        q1, dot = -q1, -dot
+    angle = float(np.arccos(min(dot, 1.0)))
+    if angle < 1e-6:
+        q = q0 + t * (q1 - q0)
+    else:
+        q = (np.sin((1 - t) * angle) * q0 + np.sin(t * angle) * q1) / np.sin(angle)
+    return transform(a_from_b0[:3, 3] * (1 - t) + a_from_b1[:3, 3] * t, q)
+
+
+def apply(a_from_b: F64, points: FloatArray) -> F32:
+    """(N, 3) float32 points of frame b in frame a."""
+    m = np.asarray(a_from_b, np.float32)
+    moved: F32 = np.asarray(points, np.float32) @ m[:3, :3].T
+    moved += m[:3, 3]
+    return moved
+
+
+def yaw(a_from_b: F64) -> float:
+    """Turn about z, in radians."""
+    return float(np.arctan2(a_from_b[1, 0], a_from_b[0, 0]))
+
+
+# --- cameras -----------------------------------------------------------------------------------
+
+
+def project(points: FloatArray, intrinsics: Intrinsics) -> tuple[F32, F32]:
+    """Project points of the optical frame into the image.
+
+    Models as in OpenCV and ROS: plumb_bob (Brown-Conrady), rational_polynomial, equidistant
+    (Kannala-Brandt 2006).
+
+    Args:
+        points: (N, 3) metres in the optical frame.
+        intrinsics: the camera.
+
+    Returns:
+        uv: (N, 2) float32 pixels; NaN behind the camera and where the distortion polynomial has
+            folded over (far outside the calibrated field of view), not clipped to the image.
+        depth: (N,) float32 metres along the optical axis.
+    """
+    p = np.asarray(points)
+    depth = np.asarray(p[:, 2], np.float32)
+    inv = np.full(len(p), np.nan, p.dtype if p.dtype.kind == "f" else np.float64)
+    np.divide(1.0, p[:, 2], out=inv, where=p[:, 2] > MIN_DEPTH)
+    x, y = p[:, 0] * inv, p[:, 1] * inv
+    if is_bent(intrinsics):
+        x, y = _distort(x, y, intrinsics)
+    k = intrinsics.K
+    uv = np.empty((len(p), 2), np.float32)
+    uv[:, 0] = float(k[0, 0]) * x + float(k[0, 2])
+    uv[:, 1] = float(k[1, 1]) * y + float(k[1, 2])
+    return uv, depth
+
+
+def is_bent(intrinsics: Intrinsics) -> bool:
+    """Whether straight lines are curved in the image: an equidistant lens needs no coefficients for it."""
+    return intrinsics.distortion_model in FISHEYE or bool(np.any(intrinsics.D))
+
+
+def rays(uv: FloatArray, intrinsics: Intrinsics) -> F64:
+    """(N, 3) directions in the optical frame, z = 1, of (N, 2) pixels: the inverse of ``project``."""
+    import cv2
+
+    points = np.ascontiguousarray(uv, np.float64).reshape(-1, 1, 2)
+    rays = np.ones((len(points), 3))
+    if len(points) == 0:
+        return rays
+    d, criteria = _coefficients(intrinsics), (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-12)
+    if intrinsics.distortion_model in FISHEYE:
+        flat = cv2.fisheye.undistortPoints(points, intrinsics.K, d[:4], criteria=criteria)
+    else:
+        flat = cv2.undistortPoints(points, intrinsics.K, d, criteria=criteria)
+    rays[:, :2] = flat.reshape(-1, 2)
+    return rays
+
+
+def frustum(
+    xyxy: FloatArray, intrinsics: Intrinsics, near: FloatArray | float, far: FloatArray | float
+) -> F32:
+    """(D, 8, 3) corners, in the optical frame, of what (D, 4) image boxes see between two depths.
+
+    ``near`` and ``far``, one for all or (D,), are metres along the optical axis. The corners run top
+    left, top right, bottom right, bottom left, first at ``near``, then at ``far``.
+    """
+    directions = rays(np.asarray(xyxy)[:, [0, 1, 2, 1, 2, 3, 0, 3]].reshape(-1, 2), intrinsics).reshape(
+        -1, 1, 4, 3
+    )
+    depths = np.stack([np.broadcast_to(d, len(xyxy)) for d in (near, far)], axis=1)
+    return np.asarray(directions * depths[:, :, None, None], np.float32).reshape(-1, 8, 3)
+
+
+def _coefficients(intrinsics: Intrinsics) -> F64:
+    """(8,) the distortion coefficients, zero where not given."""
+    d = np.zeros(8)
+    given = np.ravel(intrinsics.D)[:8]
+    d[: len(given)] = given
+    return d
+
+
+def _distort(x: FloatArray, y: FloatArray, intrinsics: Intrinsics) -> tuple[FloatArray, FloatArray]:
+    k1, k2, p1, p2, k3, k4, k5, k6 = _coefficients(intrinsics).tolist()
+    r2 = x * x + y * y
+    if intrinsics.distortion_model in FISHEYE:
+        k1, k2, k3, k4 = _coefficients(intrinsics)[:4].tolist()
+        r = np.sqrt(r2)
+        theta = np.arctan(r)
+        t2 = theta * theta
+        t2 = np.where(t2 < _first_root(Polynomial([1, 3 * k1, 5 * k2, 7 * k3, 9 * k4])), t2, np.nan)
+        turned = theta * (1 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4))))
+        scale = np.divide(turned, r, out=np.ones_like(r), where=r > 1e-8)
+        return x * scale, y * scale
+    # r * numerator / denominator must grow with r; its derivative, times denominator^2, in r^2:
+    numerator, denominator = Polynomial([1, k1, k2, k3]), Polynomial([1, k4, k5, k6])
+    turns = numerator.deriv() * denominator - numerator * denominator.deriv()
+    slope = numerator * denominator + Polynomial([0, 2]) * turns
+    r2 = np.where(r2 < min(_first_root(slope), _first_root(denominator), WIDEST), r2, np.nan)
+    radial = (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / (1 + r2 * (k4 + r2 * (k5 + r2 * k6)))
+    return (
+        x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
+        y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
+    )
+
+
+def _first_root(polynomial: Polynomial) -> float:
+    """The least positive root, infinite where there is none."""
+    roots = polynomial.trim().roots()
+    real = roots.real[(np.abs(roots.imag) < 1e-9) & (roots.real > 0)]
+    return float(real.min(initial=np.inf))
+
+
+# --- boxes -------------------------------------------------------------------------------------
+
+
+def iou(a: FloatArray, b: FloatArray) -> F32:
+    """(A, B) intersection over union of (A, 4) and (B, 4) image boxes x0, y0, x1, y1.
+
+    Zero with a box that is empty or NaN.
+    """
+    low = np.maximum(a[:, None, :2], b[None, :, :2])
+    high = np.minimum(a[:, None, 2:], b[None, :, 2:])
+    inter = np.prod(np.clip(high - low, 0, None), axis=2)
+    area_a = np.prod(np.clip(a[:, 2:] - a[:, :2], 0, None), axis=1)
+    area_b = np.prod(np.clip(b[:, 2:] - b[:, :2], 0, None), axis=1)
+    union = area_a[:, None] + area_b[None, :] - inter
+    ratio = np.zeros(inter.shape, np.float32)
+    np.divide(inter, union, out=ratio, where=union > 0, casting="same_kind")
+    return ratio
+
+
+def corners(boxes: Boxes3D) -> F32:
+    """(K, 8, 3) corners: the lower four counter-clockwise seen from above, then the upper four."""
+    unit = np.array(
+        [[1, 1, -1], [-1, 1, -1], [-1, -1, -1], [1, -1, -1], [1, 1, 1], [-1, 1, 1], [-1, -1, 1], [1, -1, 1]],
+        np.float32,
+    )
+    local = unit[None] * (boxes.size[:, None] / 2)
+    c, s = np.cos(boxes.yaw)[:, None], np.sin(boxes.yaw)[:, None]
+    turned = np.stack(
+        [c * local[..., 0] - s * local[..., 1], s * local[..., 0] + c * local[..., 1], local[..., 2]], -1
+    )
+    return np.asarray(turned + boxes.center[:, None], np.float32)
+
+
+def moved(boxes: Boxes3D, b_from_a: F64) -> Boxes3D:
+    """Upright boxes of frame a in b, which is upright, too; a may be a map with its origin far away."""
+    turned = boxes.yaw + np.float32(yaw(b_from_a))
+    center = np.asarray(boxes.center, np.float64) @ b_from_a[:3, :3].T + b_from_a[:3, 3]
+    return Boxes3D(center.astype(np.float32), boxes.size, turned)
+
+
+def upright(center: F64, size: F32, turns: F64) -> Boxes3D:
+    """Boxes that are turned in any way as upright ones, which have the same axes up to a lean.
+
+    The axis nearest to the vertical is the height. The heading is that of x, of y where x is the height.
+
+    Args:
+        center: (K, 3).
+        size: (K, 3) along the box's own axes.
+        turns: (K, 3, 3) rotation of each.
+    """
+    rows = np.arange(len(turns))
+    height = np.abs(turns[:, 2]).argmax(axis=1)
+    along = np.where(height == 0, 1, 0)
+    lengths = size[rows[:, None], np.stack([along, 3 - height - along, height], axis=1)]
+    ahead = turns[rows, :, along]
+    heading = np.arctan2(ahead[:, 1], ahead[:, 0])
+    return Boxes3D(center.astype(np.float32), lengths, heading.astype(np.float32))
+
+
+def inside(points: F32, boxes: Boxes3D, k: int) -> Bool:
+    """(N,) which points are in box k, its surface included."""
+    offset = points - boxes.center[k]
+    found = np.zeros(len(points), np.bool_)
+    near = np.flatnonzero((np.abs(offset[:, :2]) <= np.hypot(*boxes.size[k, :2]) / 2).all(axis=1))
+    x, y, z = offset[near].T
+    c, s = np.cos(boxes.yaw[k]), np.sin(boxes.yaw[k])
+    local = np.column_stack([c * x + s * y, c * y - s * x, z])
+    found[near] = (np.abs(local) <= boxes.size[k] / 2).all(axis=1)
+    return found
+
+
+def inside_each(points: F32, boxes: Boxes3D) -> Iterator[tuple[int, I64]]:
+    """Each box that may have points in it, and the rows of those. Of use where boxes are many."""
+    order = np.argsort(points[:, 0])
+    points = points.take(order, axis=0)
+    reach = np.hypot(boxes.size[:, 0], boxes.size[:, 1]) / 2 + np.float32(1e-3)  # no less for being rounded
+    first = np.searchsorted(points[:, 0], boxes.center[:, 0] - reach)
+    last = np.searchsorted(points[:, 0], boxes.center[:, 0] + reach)
+    for k in np.flatnonzero(last > first).tolist():
+        near = slice(first[k], last[k])
+        yield k, order[near][inside(points[near], boxes, k)]
+
+
+def bev_iou(a: Boxes3D, b: Boxes3D) -> F32:
+    """(A, B) intersection over union, seen from above, of A and B upright boxes however they are turned."""
+    shared = _shared_area(a, b)
+    return _ratio(shared, _product(a.size[:, :2])[:, None] + _product(b.size[:, :2])[None] - shared)
+
+
+def box_iou(a: Boxes3D, b: Boxes3D) -> tuple[F32, F32]:
+    """(A, B) intersection over union of A and B upright boxes, seen from above and as volumes."""
+    area = _shared_area(a, b)
+    (low_a, high_a), (low_b, high_b) = (
+        (boxes.center[:, 2] - boxes.size[:, 2] / 2, boxes.center[:, 2] + boxes.size[:, 2] / 2)
+        for boxes in (a, b)
+    )
+    height = np.minimum(high_a[:, None], high_b[None]) - np.maximum(low_a[:, None], low_b[None])
+    volume = area * np.clip(height, 0, None)
+    return (
+        _ratio(area, _product(a.size[:, :2])[:, None] + _product(b.size[:, :2])[None] - area),
+        _ratio(volume, _product(a.size)[:, None] + _product(b.size)[None] - volume),
+    )
+
+
+def _shared_area(a: Boxes3D, b: Boxes3D) -> F64:
+    """(A, B) square metres that both cover, seen from above."""
+    shared = np.zeros((len(a), len(b)))
+    reach_a, reach_b = (np.hypot(boxes.size[:, 0], boxes.size[:, 1]) / 2 for boxes in (a, b))
+    away = np.linalg.norm(a.center[:, None, :2] - b.center[None, :, :2], axis=2)
+    outlines_a, outlines_b = (np.asarray(corners(boxes)[:, :4, :2], np.float64) for boxes in (a, b))
+    for i, j in np.argwhere(away < reach_a[:, None] + reach_b[None, :]):
+        shared[i, j] = _area(_clip(outlines_a[i], outlines_b[j]))
+    return shared
+
+
+def _product(sides: F32) -> F64:
+    return np.asarray(np.prod(sides, axis=1, dtype=np.float64))
+
+
+def _ratio(part: F64, whole: F64) -> F32:
+    """Zero where the whole is nothing."""
+    return np.divide(part, whole, out=np.zeros(part.shape), where=whole > 0).astype(np.float32)
+
+
+def _clip(polygon: F64, window: F64) -> F64:
+    """The part of a convex polygon inside another, counter-clockwise one (Sutherland and Hodgman 1974)."""
+    for start, end in zip(window, np.roll(window, -1, axis=0), strict=True):
+        if len(polygon) == 0:
+            break
+        (dx, dy), offset = end - start, polygon - start
+        inside = dx * offset[:, 1] - dy * offset[:, 0]  # how far to the left of the edge, times its length
+        kept: list[F64] = []
+        for k in range(len(polygon)):
+            before = k - 1
+            if (inside[k] >= 0) != (inside[before] >= 0):
+                t = inside[before] / (inside[before] - inside[k])
+                kept.append(polygon[before] + t * (polygon[k] - polygon[before]))
+            if inside[k] >= 0:
+                kept.append(polygon[k])
+        polygon = np.array(kept).reshape(-1, 2)
+    return polygon
+
+
+def _area(polygon: F64) -> float:
+    """Of a counter-clockwise polygon (shoelace formula)."""
+    x, y = polygon.T
+    return float(x @ np.roll(y, -1) - y @ np.roll(x, -1)) / 2

@@ -1,0 +1,373 @@
+"""What is in a bag: topics, sensors, transforms, and what is missing for a full run."""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, fields
+from itertools import islice
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from bevviz.bags.bag import Recording
+from bevviz.bags.reader import megabytes
+from bevviz.bags.source import SECOND, BagSource, iso
+from bevviz.config import (
+    Config,
+    DetectorConfig,
+    ObjectsConfig,
+    object_network,
+    stage_topics,
+    stated_lines,
+)
+from bevviz.errors import UserError
+from bevviz.messages.roles import Roles, find_roles
+from bevviz.messages.topics import Topic
+from bevviz.model.frame import Camera, Frame
+from bevviz.recording.provenance import model_path
+from bevviz.support import table
+from bevviz.support.text import printable
+
+if TYPE_CHECKING:
+    from bevviz.pipeline.stage_loader import Stages
+
+WIDTH = 100
+TRIAL = 5  # the scan that is tried out: at the first ones a camera or a transform may not have begun
+MANY = 2_000_000  # messages; their times are not gathered, for that would take seconds
+
+
+@dataclass(frozen=True, slots=True)
+class TopicInfo:
+    name: str
+    type: str
+    count: int | None  # None: not listened to
+    frame_id: str
+    rate: float | None  # Hz, between the first and the last message
+    role: str
+    pause: float | None = None  # longest time between two messages, seconds of log time
+    pause_at: float | None = None  # when it begins, seconds from the start
+    size: float | None = None  # bytes of a message, on average
+    delay: float | None = None  # seconds from the stamp to the receipt
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Contents:
+    """What there is to work with, in a bag or on a graph."""
+
+    topics: tuple[TopicInfo, ...]
+    lidars: tuple[str, ...] = ()
+    cameras: tuple[Camera, ...] = ()  # as one scan sees them
+    tree: Mapping[str, str] = field(default_factory=dict)  # child frame -> parent frame
+    points_frame: str = ""
+    world_frame: str = ""  # "": the fixed frame is not connected
+    network: str = ""  # what the detector's runs on; "": there is none
+    object_network: str = ""  # the same of a 3D detector
+    configured: tuple[str, ...] = ()  # where parameters are stated, and which
+    missing: tuple[str, ...] = ()  # for a full run, with the option that gives it
+    warnings: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class BagInfo(Contents):
+    """What ``bevviz info`` prints. Times are log times in nanoseconds."""
+
+    paths: tuple[str, ...]
+    formats: tuple[str, ...]  # of each file
+    size: int  # bytes on disk
+    start: int
+    end: int
+    messages: int
+
+    @property
+    def duration(self) -> float:
+        return (self.end - self.start) / SECOND
+
+
+def describe(paths: Sequence[Path], config: Config) -> BagInfo:
+    """Look at the index of a bag and run one scan through synchronisation.
+
+    Raises:
+        UserError: no readable bag, or a stated topic that is not in it.
+    """
+    try:
+        source = BagSource(paths, config)
+    except UserError as error:
+        with Recording(paths, config.source) as recording:
+            roles = find_roles(recording.topics, config.source, stage_topics(config))
+            return _describe(recording, roles, config, missing=[str(error)])
+    with source:
+        roles = source.roles
+        frame = next(reversed(list(islice(source, min(TRIAL, source.total)))), None)
+        missing = find_missing(roles, frame, config)
+        return _describe(source.recording, roles, config, missing, frame, source)
+
+
+def _describe(
+    recording: Recording,
+    roles: Roles,
+    config: Config,
+    missing: Sequence[str],
+    frame: Frame | None = None,
+    source: BagSource | None = None,
+) -> BagInfo:
+    networks, lacking = networks_of(config)
+    missing = [*missing, *lacking]
+    return BagInfo(
+        paths=tuple(map(str, recording.paths)),
+        formats=tuple(", ".join(filter(None, [f.format, f.compression])) for f in recording.files),
+        size=recording.size,
+        start=recording.start,
+        end=recording.end,
+        messages=recording.message_count,
+        topics=tuple(_topic(recording, topic, roles) for topic in recording.topics),
+        lidars=roles.lidar_names,
+        cameras=frame.cameras if frame else (),
+        tree=dict(source.tree) if source else {},
+        points_frame=frame.points_frame if frame else "",
+        world_frame=frame.world_frame if frame and frame.world_from_points is not None else "",
+        network=networks["detector"],
+        object_network=networks["objects"],
+        configured=tuple(stated_lines(config)),
+        missing=tuple(missing),
+        warnings=(*recording.warnings, *(source.doubts if source else ())),
+    )
+
+
+def network_of(config: Config) -> str:
+    """What the detector's network runs on here, or why it does not; empty: there is none."""
+    path = model_path(config)
+    if path is None:
+        return ""
+    from bevviz.stages.detector.providers import network
+
+    return network(path, config.detector.provider)
+
+
+def networks_of(config: Config) -> tuple[dict[str, str], list[str]]:
+    """What the networks of the sections ``detector`` and ``objects`` run on here, or why they do not.
+
+    Returns:
+        That, empty where there is none, and what a full run lacks: a detector, or a file that can be used.
+    """
+    runs_on = {"detector": network_of(config), "objects": ""}
+    lacking = [] if config.detector.model else ["no detector: --model FILE.onnx"]
+    files = {"detector": model_path(config), "objects": object_network(config)}
+    for section in [section for section, file in files.items() if file is not None]:
+        try:
+            loaded = _alone(config, section).provider
+        except UserError as error:
+            loaded = str(error)
+            lacking.append(loaded)
+        runs_on[section] = runs_on[section] or loaded
+    return runs_on, lacking
+
+
+def _alone(config: Config, section: str) -> Stages:
+    """The stages with this one, and otherwise ours.
+
+    Raises:
+        UserError: it cannot be used.
+    """
+    from bevviz.pipeline.stage_loader import StageLoader
+
+    runs_on = {"provider": config.detector.provider, "threads": config.detector.threads}
+    detector = config.detector if section == "detector" else DetectorConfig().model_copy(update=runs_on)
+    objects = config.objects if section == "objects" else ObjectsConfig()
+    return StageLoader().load(config.restated({"detector": detector, "objects": objects}))
+
+
+def _topic(recording: Recording, topic: Topic, roles: Roles) -> TopicInfo:
+    rate = pause = pause_at = None
+    if (topic.count or 0) > 1 and recording.message_count < MANY:
+        times = recording.times(topic.name)
+        steps = np.diff(times)
+        if len(steps):  # of a damaged bag there may be fewer than were counted
+            longest = int(np.argmax(steps))
+            pause = float(steps[longest]) / SECOND
+            pause_at = float(times[longest] - recording.start) / SECOND
+        if len(steps) and times[-1] > times[0]:
+            rate = float(len(steps) / ((times[-1] - times[0]) / SECOND))
+    return TopicInfo(
+        name=topic.name,
+        type=topic.type,
+        count=topic.count or 0,
+        frame_id=topic.frame_id,
+        rate=rate,
+        pause=pause,
+        pause_at=pause_at,
+        role=roles.notes.get(topic.name, ""),
+    )
+
+
+def find_missing(roles: Roles, frame: Frame | None, config: Config) -> list[str]:
+    """What a full run lacks, judged by one frame, with the option that gives it."""
+    if frame is None:
+        return ["no scan could be read"]
+    found = []
+    if roles.no_camera:
+        found.append(roles.no_camera)
+    if roles.no_lidar:
+        found.append(roles.no_lidar)
+    for role, camera in zip(roles.cameras, frame.cameras, strict=True):
+        about = f"camera '{role.name}'"
+        placed = camera.camera_from_points is not None or camera.image is None
+        if not role.info_topic:
+            helps = "and there is no topic of that kind: record it"
+            if roles.camera_infos:
+                helps = f"--set source.camera_info_topics='{{{role.topic}: {roles.camera_infos[0]}}}'"
+            found.append(f"{about} has no CameraInfo{': ' if roles.camera_infos else ', '}{helps}")
+        if not placed and camera.image is not None and not (frame.points_frame and camera.image.frame_id):
+            what = "its images state" if frame.points_frame else "the points state"
+            found.append(f"{about} is not placed: {what} no frame_id; the driver must")
+        elif not placed and camera.image is not None:
+            between = f"'{frame.points_frame}' to '{camera.image.frame_id}'"
+            edge = f"{frame.points_frame} {camera.image.frame_id}"
+            setting = f"source.extrinsics='{{{edge}: [x, y, z, qx, qy, qz, qw]}}'"
+            found.append(f"{about} is not placed, no transform from {between}: --set {setting}")
+        if role.info_topic and placed:
+            found += [f"{about}: {problem}" for problem in camera.problems]
+    if not frame.lidar:
+        pass
+    elif frame.world_from_points is None and not frame.points_frame:
+        found.append("no fixed frame, so that motion is not compensated: the points state no frame_id")
+    elif frame.world_from_points is None:
+        found.append(
+            f"no fixed frame above '{frame.points_frame}', so that motion is not compensated: "
+            "record nav_msgs/Odometry or the transforms above it, or name another frame that stands still: "
+            "--set source.fixed_frame=name"
+        )
+    return [*found, *frame.problems]
+
+
+def as_tree(info: Contents) -> dict[str, Any]:
+    """For JSON: all but the pictures and clouds."""
+    own = {f.name: getattr(info, f.name) for f in fields(info) if f.name not in ("topics", "cameras", "tree")}
+    return {
+        **own,
+        "topics": [asdict(topic) for topic in info.topics],
+        "cameras": [_camera_tree(camera) for camera in info.cameras],
+        "transforms": dict(info.tree),
+    }
+
+
+def _camera_tree(camera: Camera) -> dict[str, Any]:
+    image, model, placed = camera.image, camera.intrinsics, camera.camera_from_points
+    return {
+        "name": camera.name,
+        "width": None if image is None else image.bgr.shape[1],
+        "height": None if image is None else image.bgr.shape[0],
+        "K": None if model is None else model.K.tolist(),
+        "distortion_model": None if model is None else model.distortion_model,
+        "D": None if model is None else model.D.tolist(),
+        "camera_from_points": None if placed is None else placed.tolist(),
+        "problems": list(camera.problems),
+    }
+
+
+def render(info: BagInfo) -> str:
+    """The description as text for a terminal of 100 columns."""
+    kinds = sorted(set(info.formats))
+    files = f"{len(info.formats)} files of " if len(info.formats) > 1 else ""
+    about = {
+        "bag": ", ".join(info.paths),
+        "format": f"{files}{'; '.join(kinds)}; {megabytes(info.size)}",
+        "time": f"{info.duration:.2f} s from {iso(info.start)}, {info.messages} messages",
+    }
+    return render_contents(about, info)
+
+
+def render_contents(about: Mapping[str, str], info: Contents) -> str:
+    """The contents as text, under what is said about the whole."""
+    lines = [
+        *(_row(name, text) for name, text in about.items()),
+        "",
+        *_topic_table(info.topics),
+        "",
+        *_section("roles", [f"{t.name}: {t.role}" for t in info.topics if t.role]),
+        *_section("cameras", [_camera(camera) for camera in info.cameras]),
+        *_section("transforms", list(_tree(info))),
+        *_section("network runs on", [info.network] if info.network else []),
+        *_section("3D detector runs on", [info.object_network] if info.object_network else []),
+        *_section("configured by", info.configured),
+        *_section("missing for a full run", info.missing or ["nothing"]),
+        *_section("warnings", info.warnings),
+    ]
+    return "\n".join(lines).rstrip()
+
+
+def _row(name: str, text: str) -> str:
+    return textwrap.fill(printable(text), WIDTH, initial_indent=f"{name:<8}", subsequent_indent=" " * 8)
+
+
+def _section(title: str, items: Sequence[str]) -> list[str]:
+    return [title, *(line for item in items for line in _item(item)), ""] if items else []
+
+
+def _item(text: str) -> Iterator[str]:
+    """Wrapped text; an option at its end stays in one piece, to be copied."""
+    sentence, separator, option = printable(text).partition(": --")
+    depth = len(sentence) - len(sentence.lstrip())
+    yield from textwrap.wrap(
+        sentence.lstrip() + separator[:1],
+        WIDTH,
+        initial_indent=" " * (2 + depth),
+        subsequent_indent=" " * (4 + depth),
+        break_on_hyphens=False,
+    )
+    if option:
+        yield f"      --{option}"
+
+
+def _topic_table(topics: Sequence[TopicInfo]) -> Iterator[str]:
+    """What is not known of any topic has no column."""
+    columns: list[tuple[str, str, list[str]]] = [
+        ("topic", "l", [t.name for t in topics]),
+        ("type", "l", [t.type.rpartition("/")[2] for t in topics]),
+        ("count", "r", ["" if t.count is None else str(t.count) for t in topics]),
+        ("Hz", "r", ["" if t.rate is None else f"{t.rate:.1f}" for t in topics]),
+    ]
+    if any(t.size is not None for t in topics):
+        columns.append(("kB", "r", ["" if t.size is None else f"{t.size / 1e3:.1f}" for t in topics]))
+    if any(t.delay is not None for t in topics):
+        columns.append(("delay", "r", ["" if t.delay is None else f"{1e3 * t.delay:.0f} ms" for t in topics]))
+    if any(t.pause is not None for t in topics):
+        pauses = ["" if t.pause is None else f"{t.pause:.2f} s at {t.pause_at:.1f} s" for t in topics]
+        columns.append(("longest gap", "l", pauses))
+    columns.append(("frame_id", "l", [t.frame_id for t in topics]))
+    heads, sides, cells = zip(*columns, strict=True)
+    return table.lines([heads, *zip(*cells, strict=True)], "".join(sides))
+
+
+def _camera(camera: Camera) -> str:
+    parts = [f"{camera.name}:"]
+    if camera.image is not None:
+        height, width = camera.image.bgr.shape[:2]
+        parts.append(f"{width} x {height} {camera.image.media_type or 'uncompressed'},")
+    if camera.intrinsics is None:
+        parts.append("no intrinsics")
+    else:
+        k = camera.intrinsics.K
+        parts.append(f"fx {k[0, 0]:.1f} fy {k[1, 1]:.1f} cx {k[0, 2]:.1f} cy {k[1, 2]:.1f},")
+        parts.append(camera.intrinsics.distortion_model or "no distortion")
+        if camera.intrinsics.assumed:
+            parts.append("(assumed)")
+    parts.append(", not placed" if camera.camera_from_points is None else ", placed by TF")
+    return " ".join(parts).replace(" ,", ",")
+
+
+def _tree(info: Contents) -> Iterator[str]:
+    children: dict[str, list[str]] = {}
+    for child, parent in sorted(info.tree.items()):
+        children.setdefault(parent, []).append(child)
+
+    def below(frame: str, depth: int) -> Iterator[str]:
+        yield "  " * depth + frame
+        for child in children.get(frame, ()):
+            yield from below(child, depth + 1)
+
+    for root in sorted(children.keys() - info.tree.keys()):
+        yield from below(root, 0)
+    if info.points_frame:
+        yield f"fixed frame of '{info.points_frame}': {info.world_frame or 'none'}"

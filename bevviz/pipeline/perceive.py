@@ -1,0 +1,324 @@
+"""The frame step: every stage on one frame with one configuration. No state, no threads of its own."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from concurrent.futures import Executor
+from dataclasses import replace
+
+import numpy as np
+
+from bevviz.config import Config, FusionConfig
+from bevviz.config.plugins import TOPIC
+from bevviz.model import geometry
+from bevviz.model.decisions import explain
+from bevviz.model.frame import F32, Camera, Frame
+from bevviz.model.results import (
+    CameraResult,
+    Claims,
+    Clusters,
+    Detections,
+    Failure,
+    FrameResult,
+    Fusion,
+    Ground,
+    Objects,
+    Opinions,
+    Splits,
+    Voxels,
+)
+from bevviz.pipeline.stage_loader import Stages
+from bevviz.pipeline.stage_log import Memo, StageLog
+from bevviz.stages import robot_results, user_stages
+from bevviz.stages.bev import bev
+from bevviz.stages.clustering import cluster
+from bevviz.stages.frustum import claim
+from bevviz.stages.fusion import fuse, merge
+from bevviz.stages.ground import segment_ground
+from bevviz.stages.opinions import opinions
+from bevviz.stages.pillars import ObjectNetwork
+from bevviz.stages.user_stages import Foreign
+from bevviz.stages.visibility import range_image
+from bevviz.stages.voxel import of_points, voxel_grid
+from bevviz.support.kernel import clock, common_clock
+
+
+def perceive(
+    frame: Frame, config: Config, stages: Stages, memo: Memo | None = None, *, network: Executor | None = None
+) -> FrameResult:
+    """What the stages make of the frame, without what needs other frames (tracks, anomalies).
+
+    Never raises for what the frame holds: what fails is told in ``failures``, the rest goes on.
+
+    Args:
+        frame: the frame.
+        config: the configuration; the result says that it was made with this one.
+        stages: that the configuration names, of ``StageLoader.load``.
+        memo: shared by configurations that run on the same frame.
+        network: where the detector runs beside the LiDAR stages, since it needs no lock of Python's; None:
+            after them.
+    """
+    log, detector_log = StageLog(memo), StageLog(memo)
+    start = common_clock()
+
+    def detect(camera: Camera) -> Detections | None:
+        return _detect(detector_log, frame, camera, config, stages)
+
+    found = [network.submit(detect, camera) for camera in frame.cameras] if network is not None else []
+
+    voxels = ground = obstacles = clusters = None
+    if not frame.lidar:
+        pass
+    elif len(frame.points) == 0:
+        log.failures.append(Failure("cloud", "the cloud holds no finite point"))
+    else:
+        voxels = log.run("voxel", voxel_grid, frame.points, config.voxel)
+    if voxels is not None:
+        ground = _ground(log, frame, voxels, config, stages)
+    if voxels is not None and ground is not None:
+        obstacles = log.run("ground", _obstacles, voxels, ground)
+    if obstacles is not None:
+        clusters = _clusters(log, frame, obstacles, config, stages)
+
+    cameras = []
+    for i, camera in enumerate(frame.cameras):
+        uv = depth = None
+        if obstacles is not None:
+            projected = log.run("projection", _project, obstacles, camera)
+            uv, depth = projected or (None, None)
+        detections = found[i].result() if network is not None else detect(camera)
+        cameras.append(CameraResult(camera, detections, None, uv, depth))
+    splits: Splits | None = None
+    claims: Sequence[Claims | None] = [None] * len(cameras)
+    if obstacles is not None and clusters is not None and _splits(config):
+        height = None if ground is None else ground.height.compress(~ground.mask)
+        seen = tuple(cameras)
+        sections = config.fusion, config.objects, config.clustering
+        made = log.run("fusion", claim, obstacles, height, clusters, seen, *sections)
+        if made is not None:
+            clusters, claims, splits = made
+    for i, (result, claimed) in enumerate(zip(cameras, claims, strict=True)):
+        uv, depth, found_there = result.uv, result.depth, result.detections
+        if uv is not None and depth is not None and clusters is not None and found_there is not None:
+            fusion = log.run(
+                "fusion", _fuse, uv, depth, clusters, found_there, result.camera, config.fusion, claimed
+            )
+            cameras[i] = replace(result, fusion=fusion)
+    log.timings.update(detector_log.timings)
+    log.failures.extend(detector_log.failures)
+
+    objects, said, ranges = _objects(log, frame, obstacles, clusters, cameras, config, stages), None, None
+    if objects is not None and config.objects.method != "frustum" and _detects(config, stages):
+        ranges = log.run("opinions", range_image, frame.points)
+        said = _opinions(log, objects, obstacles, clusters, cameras, ranges, config, stages)
+    wall = common_clock() - start + log.seconds_saved
+    lidar = sum(log.timings.values()) - sum(detector_log.timings.values())
+    log.timings["total"] = max(wall, lidar, sum(detector_log.timings.values()))
+    return FrameResult(
+        frame=frame,
+        config=config,
+        voxels=voxels,
+        ground=ground,
+        obstacles=obstacles,
+        clusters=clusters,
+        cameras=tuple(cameras),
+        objects=objects,
+        splits=splits,
+        bev=None,
+        timings=log.timings,
+        failures=tuple(log.failures),
+        opinions=said,
+        ranges=ranges,
+    )
+
+
+def describe(result: FrameResult, *, seen: bool = True) -> FrameResult:
+    """The result with what makes it understood: the bird's-eye view, where it is to be seen, and the
+    explanations."""
+    config, frame, log = result.config, result.frame, StageLog()
+    start = clock()
+    raw_ground = image = None
+    if seen and result.voxels is not None and result.ground is not None:
+        raw_ground = log.run("bev", of_points, result.ground.mask, result.voxels.inverse)
+    if seen and frame.lidar:
+        image = log.run(
+            "bev",
+            bev,
+            frame.points,
+            frame.fields.get("intensity"),
+            raw_ground,
+            result.objects,
+            result.clusters,
+            config.bev,
+        )
+    explanations = log.run(
+        "explain",
+        explain,
+        result.cameras,
+        result.clusters,
+        config,
+        result.splits,
+        bool(frame.lidar),
+        result.objects,
+        result.opinions,
+    )
+    wall = clock() - start
+    return replace(
+        result,
+        bev=image,
+        explanations=explanations or (),
+        timings={**result.timings, **log.timings, "total": result.timings["total"] + wall},
+        failures=(*result.failures, *log.failures),
+    )
+
+
+# --- the stages, each as the configuration names it --------------------------------------------
+
+
+def _topic(method: str) -> str:
+    """The robot's topic that a stage is taken from, empty where it is none."""
+    return method.removeprefix(TOPIC) if method.startswith(TOPIC) else ""
+
+
+def _ground(log: StageLog, frame: Frame, voxels: Voxels, config: Config, stages: Stages) -> Ground | None:
+    points = voxels.points
+    if topic := _topic(config.ground.method):
+        return log.run("ground", robot_results.segment, points, frame, topic, config.voxel.size)
+    if (function := stages.ground) is not None:
+        return log.guard(
+            "ground", lambda: user_stages.ground_of(points, log.call(function, points), function.name)
+        )
+    return log.run("ground", segment_ground, points, config.ground)
+
+
+def _obstacles(voxels: Voxels, ground: Ground) -> F32:
+    """The voxels that are not ground."""
+    return voxels.points.compress(~ground.mask, axis=0)
+
+
+def _clusters(log: StageLog, frame: Frame, points: F32, config: Config, stages: Stages) -> Clusters | None:
+    section = config.clustering
+    if topic := _topic(section.method):
+        return log.run("clustering", robot_results.cluster, points, frame, topic)
+    if (function := stages.clustering) is not None:
+        return log.guard(
+            "clustering",
+            lambda: user_stages.clusters_of(points, section, log.call(function, points), function.name),
+        )
+    return log.run("clustering", cluster, points, section)
+
+
+def _detect(log: StageLog, frame: Frame, camera: Camera, config: Config, stages: Stages) -> Detections | None:
+    section, image, network, detector = config.detector, camera.image, stages.network, stages.detector
+    if (detect := stages.detect) is not None:
+        return log.guard("detector", lambda: detect(camera))
+    if topic := _topic(section.model):
+        return log.guard("detector", lambda: robot_results.detect(frame, camera, topic))
+    if image is None or network is None:
+        return None
+    if not image.bgr.size:
+        return Detections.empty()
+    if isinstance(network, Foreign):
+        return log.guard(
+            "detector",
+            lambda: user_stages.detections_of(
+                section.conf_threshold, log.call(network, image.bgr), network.name
+            ),
+        )
+    assert detector is not None
+    return log.guard("detector", lambda: detector.interpret(log.call(network.infer, image.bgr)))
+
+
+def _project(points: F32, camera: Camera) -> tuple[F32, F32] | None:
+    """Pixels and depths of the points, NaN outside the image; None where the camera's place is unknown."""
+    if camera.intrinsics is None or camera.camera_from_points is None:
+        return None
+    uv, depth = geometry.project(geometry.apply(camera.camera_from_points, points), camera.intrinsics)
+    u, v = uv.T
+    with np.errstate(invalid="ignore"):
+        seen = (u >= -0.5) & (u < camera.intrinsics.width - 0.5)
+        seen &= (v >= -0.5) & (v < camera.intrinsics.height - 0.5)
+    np.copyto(uv, np.nan, where=~seen[:, None])
+    return uv, depth
+
+
+def _splits(config: Config) -> bool:
+    """Whether detections split clusters: those of the robot stay as it published them."""
+    ours = not _topic(config.clustering.method)
+    return config.fusion.method == "frustum" and config.fusion.split and ours
+
+
+def _fuse(
+    uv: F32,
+    depth: F32,
+    clusters: Clusters,
+    detections: Detections,
+    camera: Camera,
+    config: FusionConfig,
+    claims: Claims | None,
+) -> Fusion | None:
+    if camera.intrinsics is None or camera.camera_from_points is None:
+        return None
+    return fuse(uv, depth, clusters, detections, camera.intrinsics, camera.camera_from_points, config, claims)
+
+
+def _objects(
+    log: StageLog,
+    frame: Frame,
+    obstacles: F32 | None,
+    clusters: Clusters | None,
+    cameras: list[CameraResult],
+    config: Config,
+    stages: Stages,
+) -> Objects | None:
+    if topic := _topic(config.objects.method):
+        return log.guard("objects", lambda: robot_results.find_objects(frame, topic, obstacles, clusters))
+    if len(frame.points) == 0 and stages.objects is not None:
+        return None
+    if isinstance(network := stages.objects, ObjectNetwork):
+        intensity = frame.fields.get("intensity")
+
+        def detect() -> Objects:
+            answer = log.call(network.network.infer, frame.points, intensity)
+            boxes, score, names = network.interpret(answer)
+            return user_stages.placed(boxes, names, score, obstacles, clusters)
+
+        return log.guard("objects", detect)
+    if isinstance(function := stages.objects, Foreign):
+        cloud = user_stages.with_intensity(frame.points, frame.fields.get("intensity"))
+        return log.guard(
+            "objects",
+            lambda: user_stages.objects_of(log.call(function, cloud), function.name, obstacles, clusters),
+        )
+    return None if clusters is None else log.run("fusion", merge, clusters, cameras, config.clustering)
+
+
+def _detects(config: Config, stages: Stages) -> bool:
+    """Whether cameras have anything to say."""
+    return stages.network is not None or stages.detect is not None or bool(_topic(config.detector.model))
+
+
+def _opinions(
+    log: StageLog,
+    objects: Objects,
+    obstacles: F32 | None,
+    clusters: Clusters | None,
+    cameras: list[CameraResult],
+    ranges: F32 | None,
+    config: Config,
+    stages: Stages,
+) -> Opinions | None:
+    """What cameras and clusters say of objects that our fusion did not make."""
+    if ranges is None:
+        return None
+    fused = Objects.empty()
+    if clusters is not None:
+        merged = log.run("opinions", merge, clusters, cameras, config.clustering)
+        if merged is None:
+            return None
+        fused = merged
+    known = stages.class_names
+    return log.guard(
+        "opinions",
+        lambda: opinions(objects, fused, obstacles, clusters, cameras, ranges, config.opinions, known),
+    )

@@ -1,0 +1,1 @@
+"""Rerun recordings: entities, loggers, layouts, sinks and readers. Imports `anomalies` and below."""

@@ -1,0 +1,24 @@
+"""Anomalies: each when it begins, and how many there are."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+
+import rerun as rr
+
+from bevviz.anomalies import KINDS
+from bevviz.model.results import Anomaly, FrameResult
+from bevviz.recording import entities
+from bevviz.recording.writer import Writer
+
+
+def log_anomalies_looks(to: Writer) -> None:
+    to.static(entities.ANOMALY_COUNTS, rr.SeriesLines(names=list(KINDS)))
+
+
+def log_anomalies(to: Writer, result: FrameResult, started: Sequence[Anomaly]) -> None:
+    """``started``: those of the frame that no frame before it had."""
+    to.lines(entities.ANOMALY_LOG, [(a.severity, f"{a.kind}: {a.text}") for a in started])
+    count = Counter(anomaly.kind for anomaly in result.anomalies)
+    to.write(entities.ANOMALY_COUNTS, rr.Scalars([float(count[kind]) for kind in KINDS]))

@@ -1,0 +1,77 @@
+"""The bird's-eye view: its image and channels, and the occupancy laid on the ground."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import numpy as np
+import rerun as rr
+
+from bevviz.config import BevConfig, Config
+from bevviz.model import geometry
+from bevviz.model.frame import F32, F64
+from bevviz.model.results import Bev, FrameResult
+from bevviz.recording import entities, retention
+from bevviz.recording.primitives import blob, jpeg, png
+from bevviz.recording.writer import Writer
+
+_TURNED = np.array([0.0, 0.0, -np.sqrt(0.5), np.sqrt(0.5)])  # by -90 degrees about z, as x, y, z, w
+
+
+def log_bev(to: Writer, bev: Bev, config: Config) -> None:
+    """The image, pixel for pixel where it is to be that of the tutorial, and its channels."""
+    quality = config.logging.jpeg_quality if retention.is_whole(config) else retention.BEV_QUALITY
+    is_reference = config.bev.style == "reference"
+    to.put(entities.BEV, png(bev.image) if is_reference else jpeg(bev.image, quality))
+    for name, grid in bev.channels.items():
+        if name != "occupancy":
+            to.put(entities.channel(name), rr.Image(grid, color_model="L"))
+
+
+def log_grid(to: Writer, result: FrameResult, bev: Bev) -> None:
+    """The occupancy on the ground. The pose of a grid map is that of its lower left corner.
+
+    It has no transform beside it: the viewer holds all transforms of a drive, and with one each grid, as what
+    is in one chunk is held as a whole.
+    """
+    grid = bev.channels.get("occupancy")
+    if grid is None:
+        return
+    level = 0.0
+    if result.ground is not None and result.voxels is not None:
+        heights = result.voxels.points[::32, 2].compress(result.ground.mask[::32])
+        level = float(np.median(heights)) if len(heights) else 0.0
+    corner = np.array([-bev.range_x, bev.range_y, level - 0.05])
+    pose = result.frame.pose @ geometry.transform(corner, _TURNED)
+    to.put(
+        entities.GRID,
+        _grid_looks(*grid.shape, bev.resolution),
+        rr.GridMap.from_fields(
+            data=blob(grid.view(np.uint8).ravel()),
+            translation=pose[:3, 3],
+            quaternion=rr.Quaternion(xyzw=geometry.quaternion(pose)),
+        ),
+    )
+
+
+@lru_cache(maxsize=2)
+def _grid_looks(rows: int, columns: int, resolution: float) -> rr.GridMap:
+    return rr.GridMap.from_fields(
+        format=rr.components.ImageFormat(width=columns, height=rows, color_model="L", channel_datatype="U8"),
+        cell_size=resolution,
+        opacity=0.2,
+        colormap=rr.components.Colormap.RvizMap,
+    )
+
+
+def seen_from_above(config: BevConfig, points_from_those: F64, those: F32) -> F32:
+    """(..., 3) positions as (..., 2) pixels of the bird's-eye image."""
+    reach = np.array([config.range_x, config.range_y], np.float32)
+    xy = geometry.apply(points_from_those, those.reshape(-1, 3))[:, :2]
+    pixels = ((reach - xy) / np.float32(config.resolution))[:, ::-1]
+    return np.asarray(pixels, np.float32).reshape(*those.shape[:-1], 2)
+
+
+def footprints(corners: F32) -> F32:
+    """(K, 5, 3) closed outlines on the ground of (K, 8, 3) corners of boxes."""
+    return corners[:, [0, 1, 2, 3, 0]]

@@ -1,0 +1,107 @@
+"""Finds and loads viewer layouts: the ones that come along by name, a user's own from a file."""
+
+from __future__ import annotations
+
+import difflib
+import importlib.util
+from dataclasses import replace
+from pathlib import Path
+
+import rerun.blueprint as rrb
+from rerun.recording_stream import RecordingStream
+
+from bevviz.config import BevConfig, Config
+from bevviz.errors import UserError
+from bevviz.model.frame import Scene
+from bevviz.recording.decoding import check_decodes
+from bevviz.recording.retention import is_whole
+
+
+def _folder() -> Path:
+    """Beside the package where it is installed, beside the package's folder in a checkout."""
+    package = Path(__file__).parents[1]
+    installed = package / "blueprints"
+    return installed if installed.is_dir() else package.parent / "blueprints"
+
+
+def names() -> list[str]:
+    """The layouts that come along."""
+    return sorted(path.stem for path in _folder().glob("*.py") if not path.stem.startswith("_"))
+
+
+def load(name_or_path: str, scene: Scene, config: Config | None = None) -> rrb.Blueprint:
+    """A layout for the scene.
+
+    Args:
+        name_or_path: one of ``names()``, a .py file with a function ``blueprint(scene)`` that returns an
+            ``rrb.Blueprint``, or a .rbl file that was saved in the viewer.
+        scene: names of the sensors.
+        config: of the run: which raw clouds there are, what they can be coloured by, and where the look from
+            above begins, which is where objects can be expected; None: raw clouds, without colours, from
+            all over.
+
+    Raises:
+        UserError: unknown name, no such file, or a file that makes no layout.
+    """
+    if config is not None:
+        whole, log = is_whole(config), config.logging
+        color_by = log.color_by if whole and log.raw_cloud else ()
+        scene = replace(scene, above=_ahead(config.bev), raw=whole, color_by=color_by)
+    if name_or_path in names():
+        if not scene.lidar and scene.cameras:
+            name_or_path = "cameras"
+        return _from_python(_folder() / f"{name_or_path}.py", scene)
+    path = Path(name_or_path)
+    if path.suffix not in (".py", ".rbl"):
+        near = difflib.get_close_matches(name_or_path, names(), 1, 0.4)
+        hint = f"did you mean '{near[0]}'?" if near else f"there are {', '.join(names())}"
+        raise UserError(f"--blueprint {name_or_path}: unknown; {hint} (or give a .py or .rbl file)")
+    if not path.is_file():
+        raise UserError(f"--blueprint {path}: no such file")
+    if path.suffix == ".py":
+        return _from_python(path, scene)
+    check_decodes(path)
+    return Saved(path)
+
+
+def _ahead(config: BevConfig) -> tuple[float, float, float, float]:
+    """Pixels of what is ahead and not far to the sides."""
+    rows, columns = config.range_x / config.resolution, config.range_y / config.resolution
+    return 0.5 * columns, 0.1 * rows, 1.5 * columns, 1.25 * rows
+
+
+def _from_python(path: Path, scene: Scene) -> rrb.Blueprint:
+    spec = importlib.util.spec_from_file_location(f"bevviz_blueprint_{path.stem}", path)
+    if spec is None or spec.loader is None:
+        raise UserError(f"--blueprint {path}: cannot be loaded")
+    module = importlib.util.module_from_spec(spec)
+    try:
+        spec.loader.exec_module(module)
+        layout = module.blueprint(scene)
+    except Exception as error:  # whatever a user's file may do
+        reason = str(error).splitlines()[0] if str(error) else ""
+        raise UserError(f"--blueprint {path}: {type(error).__name__}: {reason}") from error
+    if not isinstance(layout, rrb.Blueprint):
+        kind = type(layout).__name__
+        raise UserError(f"--blueprint {path}: blueprint(scene) must return an rrb.Blueprint, not {kind}")
+    return layout
+
+
+class Saved(rrb.Blueprint):
+    """A layout that the viewer saved as .rbl: sent on as it is."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(rrb.Grid())
+        from rerun.chunk import RrdReader
+
+        try:
+            reader = RrdReader(path)
+            stores = reader.blueprints()
+            self._chunks = reader.stream(store=stores[0]).to_chunks() if stores else []
+        except Exception as error:
+            raise UserError(f"--blueprint {path}: cannot be read: {str(error).splitlines()[0]}") from None
+        if not self._chunks:
+            raise UserError(f"--blueprint {path}: holds no blueprint")
+
+    def _log_to_stream(self, stream: RecordingStream) -> None:
+        stream.send_chunks(self._chunks)

@@ -1,0 +1,234 @@
+"""A camera: where it is, how it sees, its image, and over it detections and obstacle points."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import TYPE_CHECKING, Any
+
+import cv2
+import numpy as np
+import rerun as rr
+
+from bevviz.model import geometry
+from bevviz.model.colors import bins, class_color
+from bevviz.model.frame import F32, F64, I64, Camera, Frame, Image, Intrinsics
+from bevviz.model.results import (
+    CameraResult,
+    Decision,
+    Detections,
+    DetectionState,
+    Explanation,
+    Masks,
+)
+from bevviz.recording import entities, retention
+from bevviz.recording.annotations import FAINT, depth_annotations
+from bevviz.recording.labels import (
+    IN_IMAGE,
+    apart,
+    log_spoken_in_image,
+    log_spoken_looks_in_image,
+)
+from bevviz.recording.primitives import CORNER, boxes2d, encode_image, scored, transform
+from bevviz.recording.writer import Writer
+
+if TYPE_CHECKING:
+    from bevviz.recording.video import VideoEncoder
+
+
+def log_camera_looks(to: Writer, cameras: Iterable[str]) -> None:
+    for camera in cameras:
+        to.static(
+            entities.projected(camera),
+            depth_annotations(),
+            rr.Points2D.from_fields(radii=rr.Radius.ui_points(1.5), show_labels=False, draw_order=10.0),
+        )
+        to.static(entities.detections(camera), rr.Boxes2D.from_fields(draw_order=30.0, show_labels=False))
+        log_spoken_looks_in_image(to, entities.detections(camera), 31.0)
+        if to.root:
+            log_shared_image(to, camera)
+        to.static(
+            entities.weak(camera),
+            rr.Boxes2D.from_fields(
+                colors=[FAINT], radii=rr.Radius.ui_points(0.5), show_labels=False, draw_order=20.0
+            ),
+        )
+
+
+def log_shared_image(to: Writer, camera: str) -> None:
+    """What is under a root is drawn over the one image that there is."""
+    boxes = entities.detections(camera)
+    over = (entities.projected(camera), boxes, entities.outlines(boxes), entities.names(boxes))
+    for path in (*over, entities.weak(camera)):
+        to.static(path, over_image(camera))
+
+
+def over_image(camera: str) -> rr.CoordinateFrame:
+    """In the space of the camera's image, wherever the entity is."""
+    return rr.CoordinateFrame(entities.space(entities.image(camera)))
+
+
+def camera_pose(frame: Frame, result: CameraResult) -> F64 | None:
+    """(4, 4) ``world_from_camera``, None where nothing says."""
+    camera = result.camera
+    if camera.world_from_camera is not None:
+        return camera.world_from_camera
+    if camera.camera_from_points is not None:
+        return frame.pose @ geometry.inverse(camera.camera_from_points)
+    return None
+
+
+def log_camera(
+    to: Writer, frame: Frame, result: CameraResult, quality: int, videos: Videos | None = None
+) -> None:
+    """Pose and image; the intrinsics are static, see ``log_intrinsics``.
+
+    ``videos``: take what came raw or without loss.
+    """
+    camera, world_from_camera = result.camera, camera_pose(frame, result)
+    if world_from_camera is not None:
+        to.put(entities.sensor(camera.name), transform(world_from_camera))
+    if camera.image is not None:
+        is_video = camera.image.clip is not None and to.streams_video
+        if videos is not None and not is_video and camera.image.media_type not in retention.LOSSY:
+            videos.log(to, camera.name, camera.image)
+        else:
+            log_image(to, camera.name, camera.image, quality)
+
+
+def log_intrinsics(to: Writer, name: str, intrinsics: Intrinsics) -> None:
+    """Static, so that a viewer that joins late has it."""
+    to.static(
+        entities.sensor(name),
+        rr.Pinhole(
+            image_from_camera=intrinsics.K + np.array([[0, 0, CORNER], [0, 0, CORNER], [0, 0, 0]]),
+            resolution=[intrinsics.width, intrinsics.height],
+            camera_xyz=rr.ViewCoordinates.RDF,
+            image_plane_distance=1.5,
+        ),
+    )
+
+
+def log_image(to: Writer, name: str, image: Image, quality: int) -> None:
+    """Once for each image: a camera may be slower than the LiDAR."""
+    path = entities.image(name)
+    if to.keep(path, image.stamp):
+        return
+    if image.clip is not None and to.streams_video:
+        to.video(path, image.clip)
+    else:
+        to.put(path, encode_image(image, quality))
+
+
+class Videos:
+    """Images of cameras as H.264."""
+
+    def __init__(self) -> None:
+        self._encoders: dict[str, VideoEncoder] = {}
+        self._recording: object = None
+
+    def restart(self) -> None:
+        """What comes next needs nothing before it."""
+        for encoder in self._encoders.values():
+            encoder.restart()
+
+    def log(self, to: Writer, name: str, image: Image) -> None:
+        """Once for each image, as ``log_image``."""
+        if self._recording is not to.recording:
+            self._recording = to.recording
+            self.restart()
+        path = entities.image(name)
+        if to.keep(path, image.stamp):
+            return
+        if name not in self._encoders:
+            from bevviz.recording.video import VideoEncoder  # takes its time, and few need it
+
+            self._encoders[name] = VideoEncoder()
+        sample = self._encoders[name](image.bgr, image.stamp)
+        if sample.key:
+            to.put(path, rr.VideoStream.from_fields(codec=rr.VideoCodec.H264, sample=sample.data))
+        else:
+            to.put(path, rr.VideoStream.from_fields(sample=sample.data))
+
+
+def log_detections(to: Writer, result: CameraResult, explanations: Iterable[Explanation]) -> None:
+    """Those that went on to the fusion in the colour of their class, the others faint.
+
+    The names of those that have no match are written beside them, and of those that stand large in the image,
+    as far as names do not meet; what became of any is said by its outline, see ``spoken``.
+    """
+    name, detections = result.camera.name, result.detections
+    if detections is None:
+        return
+    kept, others = np.flatnonzero(detections.kept), np.flatnonzero(~detections.kept)
+    if len(others):
+        to.put(entities.weak(name), _boxes(detections, others))
+    if len(kept):
+        colors = [class_color(detections.names[d]) for d in kept]
+        to.put(entities.detections(name), _boxes(detections, kept, colors=colors))
+        texts = {e.row: e.text for e in explanations if e.subject == "detection" and e.camera == name}
+        if detections.masks is not None:
+            _log_masks(to, name, detections, detections.masks, kept)
+        xyxy = detections.xyxy[kept]
+        labels = scored((detections.names[d] for d in kept), detections.score[kept])
+        lost = np.zeros(len(kept), bool)
+        if result.fusion is not None:
+            lost = result.fusion.detection_decision[kept] != Decision.MATCHED
+        size = _size(result.camera)
+        below = np.stack([xyxy[:, ::2].mean(axis=1), xyxy[:, 3]], axis=1) / size[0]
+        named = apart(below, xyxy[:, 1] - xyxy[:, 3], IN_IMAGE, lost)  # the tallest are what is near
+        log_spoken_in_image(
+            to,
+            entities.detections(name),
+            xyxy,
+            [label if is_named else "" for label, is_named in zip(labels, named, strict=True)],
+            [texts.get(d, label) for d, label in zip(kept.tolist(), labels, strict=True)],
+            colors,
+        )
+
+
+def _size(camera: Camera) -> F32:
+    """(2,) width and height of the image, in pixels; endless where nothing says, so that names meet."""
+    if camera.intrinsics is not None:
+        return np.array([camera.intrinsics.width, camera.intrinsics.height], np.float32)
+    if camera.image is not None:
+        return np.array(camera.image.bgr.shape[1::-1], np.float32)
+    return np.full(2, np.inf, np.float32)
+
+
+def _log_masks(to: Writer, name: str, detections: Detections, masks: Masks, rows: I64) -> None:
+    """Their outlines."""
+    lines, colors = [], []
+    for d in rows.tolist():
+        if not masks.has(d):
+            continue
+        found, _ = cv2.findContours(masks.cells(d).astype(np.uint8), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_SIMPLE)
+        corner = masks.place[d, :2] + np.float32(0.5) - masks.grid[2:]
+        for outline in found:
+            closed = np.concatenate([outline[:, 0], outline[:1, 0]])
+            lines.append((closed + corner) / masks.grid[:2])
+            colors.append(class_color(detections.names[d]))
+    if lines:
+        to.put(entities.masks(name), rr.LineStrips2D(lines, colors=colors))
+
+
+def _boxes(detections: Detections, rows: I64, **looks: Any) -> rr.Boxes2D:
+    return boxes2d(
+        detections.xyxy[rows],
+        scored((detections.names[d] for d in rows), detections.score[rows]),
+        class_ids=[entities.DETECTION_CLASS[DetectionState(s)] for s in detections.state[rows]],
+        **looks,
+    )
+
+
+def log_projected_points(to: Writer, result: CameraResult, *, packed: bool = False) -> None:
+    """The obstacle points in the image, by depth. ``packed``: rounded and sorted as where less is kept."""
+    if result.uv is None or result.depth is None:
+        return
+    seen = np.isfinite(result.uv[:, 0])
+    if seen.any():
+        depth = bins(result.depth[seen], 0, entities.DEPTH_RANGE, entities.DEPTH_BINS)
+        uv = result.uv[seen] + CORNER
+        if packed:
+            rows = retention.sorted_rows(uv, retention.PIXEL)
+            uv, depth = np.rint(uv[rows] * retention.PIXEL) / np.float32(retention.PIXEL), depth[rows]
+        to.put(entities.projected(result.camera.name), rr.Points2D(uv, class_ids=depth))

@@ -1,0 +1,107 @@
+"""The points: as they came, and voxelised as ground and obstacles."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import TypeAlias
+
+import numpy as np
+import rerun as rr
+from numpy.typing import NDArray
+
+from bevviz.config.sections import Quantity
+from bevviz.model.frame import F32, Frame
+from bevviz.model.results import FrameResult
+from bevviz.recording import color_by, entities, retention
+from bevviz.recording.entities import ClassId
+from bevviz.recording.primitives import rounded, transform
+from bevviz.recording.writer import Writer
+from bevviz.stages.voxel import of_points
+
+RawCloud: TypeAlias = tuple[str, F32, NDArray[np.uint16]]  # entity, points, class id of each
+
+
+def log_cloud_looks(to: Writer, lidars: Iterable[str]) -> None:
+    for lidar in lidars:
+        radii = rr.Points3D.from_fields(radii=rr.Radius.ui_points(1.0))
+        to.static(entities.points(lidar), radii, color_by.annotation_context())
+        for path in (entities.ground(lidar), entities.obstacles(lidar)):
+            to.static(path, rr.Points3D.from_fields(radii=rr.Radius.ui_points(1.5)))
+
+
+def log_cloud(to: Writer, result: FrameResult, wanted: Sequence[Quantity]) -> None:
+    """Every raw point, exact, of several LiDARs each in its own frame, with what it can be coloured by."""
+    frame = result.frame
+    log_cloud_poses(to, frame)
+    heights = color_by.height_ids(result) if "height" in wanted else np.zeros(len(frame.points), np.uint8)
+    fields = {entities.points(cloud.name): cloud.fields for cloud in frame.clouds}
+    start = 0
+    for path, points, class_ids in raw_clouds(result):
+        end = start + len(points)
+        own = fields[path] if len(frame.clouds) > 1 else frame.fields
+        further = color_by.class_ids(wanted, points, heights[start:end], own)
+        to.put(path, color_by.ColoredPoints(rr.Points3D(points, class_ids=class_ids), further))
+        start = end
+
+
+def log_cloud_poses(to: Writer, frame: Frame) -> None:
+    """Where the LiDARs are, where there are several."""
+    if len(frame.clouds) > 1:
+        for cloud, points_from_cloud in zip(frame.clouds, frame.points_from_clouds, strict=True):
+            to.put(entities.sensor(cloud.name), transform(frame.pose @ points_from_cloud))
+
+
+def raw_clouds(result: FrameResult) -> list[RawCloud]:
+    """Those that have points."""
+    frame = result.frame
+    class_ids = np.zeros(len(frame.points), np.uint16)
+    if result.voxels is not None and result.ground is not None:
+        of_voxels = np.where(result.ground.mask, ClassId.GROUND, ClassId.OBSTACLE).astype(np.uint16)
+        class_ids = of_points(of_voxels, result.voxels.inverse)
+    if len(frame.clouds) <= 1:
+        return [(entities.points(frame.lidar), frame.points, class_ids)] if len(frame.points) else []
+    found, end = [], 0
+    for cloud in frame.clouds:
+        start, end = end, end + len(cloud.xyz)
+        if len(cloud.xyz):
+            found.append((entities.points(cloud.name), cloud.xyz, class_ids[start:end]))
+    return found
+
+
+def log_ground(to: Writer, result: FrameResult, voxel_size: float, *, packed: bool = False) -> None:
+    """``packed``: rounded and sorted as where less is kept."""
+    if result.voxels is None or result.ground is None:
+        return
+    ground = result.voxels.points.compress(result.ground.mask, axis=0)
+    if packed:
+        scale = retention.step(voxel_size, retention.COARSE)
+        ground = coarse(ground.take(retention.sorted_rows(ground, scale), axis=0), scale)
+    else:
+        ground = quantised(ground, voxel_size)
+    _log_class(to, entities.ground(result.frame.lidar), ground, ClassId.GROUND)
+
+
+def log_obstacles(to: Writer, frame: Frame, obstacles: F32) -> None:
+    """``obstacles`` as of ``quantised``."""
+    _log_class(to, entities.obstacles(frame.lidar), obstacles, ClassId.OBSTACLE)
+
+
+def _log_class(to: Writer, path: str, points: F32, class_id: ClassId) -> None:
+    if len(points):
+        to.put(path, rr.Points3D(points, class_ids=class_id))
+
+
+def quantised(points: F32, voxel_size: float) -> F32:
+    """Voxelised points, rounded, which compresses to half; with size 0 as they are.
+
+    The step is a power of two of a metre, from an eighth to a quarter of a voxel: no coordinate moves by more
+    than an eighth of one.
+    """
+    if voxel_size == 0:
+        return points
+    return rounded(points, 2.0 ** np.floor(np.log2(8 / voxel_size)))
+
+
+def coarse(points: F32, scale: float) -> F32:
+    """Rounded to the nearest 1 / scale; 0: as they are."""
+    return rounded(points, scale) if scale else points

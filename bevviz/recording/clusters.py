@@ -1,0 +1,88 @@
+"""Clusters: boxes and coloured points of those within the size limits, boxes of the others."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import numpy as np
+import rerun as rr
+from numpy.typing import NDArray
+
+from bevviz.config import ClusteringConfig
+from bevviz.model.frame import F32, I32, I64, Bool, Frame
+from bevviz.model.results import Clusters, ClusterState, Tracks
+from bevviz.recording import entities, retention, tracks
+from bevviz.recording.cloud import coarse
+from bevviz.recording.primitives import OUTLINE, boxes3d
+from bevviz.recording.writer import Writer
+
+
+def log_clusters_looks(to: Writer, lidars: Iterable[str]) -> None:
+    for lidar in lidars:
+        to.static(
+            entities.clusters(lidar),
+            rr.Points3D.from_fields(radii=rr.Radius.ui_points(2.0), show_labels=False),
+            rr.Boxes3D.from_fields(radii=rr.Radius.ui_points(1.0), fill_mode=OUTLINE, show_labels=False),
+        )
+        to.static(entities.set_aside(lidar), rr.Boxes3D.from_fields(show_labels=False))
+
+
+def log_clusters(
+    to: Writer,
+    frame: Frame,
+    clusters: Clusters,
+    tracked: Tracks | None,
+    obstacles: F32,
+    config: ClusteringConfig,
+    packed: float | None = None,
+) -> None:
+    """Log clusters in the colours of their tracks.
+
+    Args:
+        to: writer of the recording.
+        frame: frame of the clusters.
+        clusters: all clusters of the frame.
+        tracked: tracks that give the colours; None: there are none.
+        obstacles: (P, 3) points, in the order of ``clusters.labels``.
+        config: parameters of the clustering.
+        packed: steps per metre to which points are rounded (0: none), and points are sorted by cluster, as in
+            recordings that keep less; None: points stay as they are.
+    """
+    boxes = clusters.boxes(config)
+    kept, others = np.flatnonzero(clusters.kept), np.flatnonzero(~clusters.kept)
+    if len(kept):
+        member = in_kept(clusters)
+        points, labels = obstacles.compress(member, axis=0), clusters.labels.compress(member)
+        if packed is not None:
+            rows = retention.sorted_rows(points, packed, labels)
+            points, labels = coarse(points.take(rows, axis=0), packed), labels.take(rows)
+        of_points, of_boxes = _colors(clusters, tracked, labels, kept)
+        to.put(
+            entities.clusters(frame.lidar),
+            rr.Points3D(points, class_ids=of_points),
+            boxes3d(boxes, kept, [f"{k}" for k in kept], class_ids=of_boxes),
+        )
+    if len(others):
+        states = [ClusterState(s) for s in clusters.state[others].tolist()]
+        to.put(
+            entities.set_aside(frame.lidar),
+            boxes3d(
+                boxes,
+                others,
+                [f"{k}: {n} points" for k, n in zip(others, clusters.count[others], strict=True)],
+                class_ids=[entities.CLUSTER_CLASS[s] for s in states],
+            ),
+        )
+
+
+def in_kept(clusters: Clusters) -> Bool:
+    """(P,) obstacle points of the clusters that were kept."""
+    return np.append(clusters.kept, False).take(clusters.labels)  # -1 is noise
+
+
+def _colors(
+    clusters: Clusters, tracked: Tracks | None, labels: I32, kept: I64
+) -> tuple[NDArray[np.uint16], NDArray[np.uint16]]:
+    """Class ids of points of these clusters, and of the boxes of the clusters that were kept."""
+    colors = tracks.class_ids(tracks.of_clusters(tracked, len(clusters)))
+    return colors.take(labels), colors[kept]

@@ -1,0 +1,150 @@
+"""What raw points can be coloured by: of each quantity a class id for each point; a view shows one of them.
+
+One byte a point (two for rings) is all that is logged of a quantity: colours and labels are those of the
+class ids, and a view maps one of these components to the points' own. The positions are there once.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, TypeAlias
+
+import numpy as np
+import pyarrow as pa
+import rerun as rr
+import rerun.blueprint as rrb
+from numpy.typing import NDArray
+from rerun.blueprint.encodings import ComponentSourceKind, VisualizerComponentMapping
+
+from bevviz.config.sections import Quantity
+from bevviz.model.colors import palette, turbo
+from bevviz.model.frame import F32, RING_FIELDS
+from bevviz.model.results import FrameResult
+from bevviz.recording import entities
+from bevviz.recording.annotations import point_classes
+from bevviz.stages.voxel import of_points
+
+ClassIds: TypeAlias = NDArray[np.unsignedinteger]
+
+COMPONENTS = "ColorBy"  # archetype that the components are of
+FIELDS: dict[Quantity, tuple[str, ...]] = {  # of a cloud
+    "intensity": ("intensity", "reflectivity", "i"),
+    "ring": RING_FIELDS,
+    "time": ("time", "t", "offset_time", "timestamp", "time_stamp", "time_offset"),
+}
+TALLEST = 4.0  # metres above the ground that the scale ends at
+
+_ABSENT = 3  # class id: the clouds have no such field
+_HEIGHT, _DISTANCE, _INTENSITY, _TIME, _RING = 16, 80, 144, 176, 256  # first class id of each
+_STEPS, _DEPTHS, _SHARES, _RINGS = 64, entities.DEPTH_BINS, 32, 256  # class ids of each; of the third, two
+
+
+class ColoredPoints(rr.AsComponents):
+    """Points with class ids by further quantities."""
+
+    def __init__(self, points: rr.Points3D, further: Mapping[Quantity, ClassIds]) -> None:
+        self._points, self._further = points, further
+
+    def as_component_batches(self) -> list[rr.DescribedComponentBatch]:
+        batches = self._points.as_component_batches()
+        if self._further:
+            columns: dict[str, Any] = {name: pa.array(ids) for name, ids in self._further.items()}
+            batches += rr.DynamicArchetype(COMPONENTS, components=columns).as_component_batches()
+        return batches
+
+
+@np.errstate(over="ignore", invalid="ignore")  # a field may hold anything
+def class_ids(
+    wanted: Sequence[Quantity], points: F32, heights: NDArray[np.uint8], fields: Mapping[str, NDArray[Any]]
+) -> dict[Quantity, ClassIds]:
+    """Class ids of each point, (N,) by quantity; (1,) where the cloud has no such field.
+
+    Args:
+        wanted: quantities.
+        points: (N, 3) metres from the LiDAR.
+        heights: (N,) of ``height_ids``.
+        fields: further (N,) fields of the cloud.
+    """
+    found: dict[Quantity, ClassIds] = {}
+    for name in wanted:
+        if name == "height":
+            found[name] = heights
+        elif name == "distance":
+            away = np.sqrt(np.einsum("ij,ij->i", points, points))
+            found[name] = _scaled(away, 0.0, entities.DEPTH_RANGE, _DISTANCE, _DEPTHS)
+        elif (values := next((fields[field] for field in FIELDS[name] if field in fields), None)) is None:
+            found[name] = np.array([_ABSENT], np.uint8)
+        elif name == "intensity":
+            found[name] = _scaled(values, 0.0, _brightest(values), _INTENSITY, _SHARES)
+        elif name == "ring":
+            found[name] = (values.astype(np.int64) % _RINGS + _RING).astype(np.uint16)
+        else:
+            some = values[np.isfinite(values)]
+            first, last = (some.min(), some.max()) if len(some) else (0, 0)
+            found[name] = _scaled(values - first, 0.0, float(last - first), _TIME, _SHARES)
+    return found
+
+
+def height_ids(result: FrameResult) -> NDArray[np.uint8]:
+    """(N,) of each point, by the height of its voxel above the ground; without a ground, above the lowest."""
+    if result.voxels is not None and result.ground is not None:
+        of_voxels = _scaled(result.ground.height, 0.0, TALLEST, _HEIGHT, _STEPS)
+        return of_points(of_voxels, result.voxels.inverse)
+    z = result.frame.points[:, 2]
+    lowest = float(np.percentile(z[:: len(z) // 5_000 + 1], 1)) if len(z) else 0.0
+    return _scaled(z, lowest, lowest + TALLEST, _HEIGHT, _STEPS)
+
+
+def annotation_context() -> rr.AnnotationContext:
+    """Colours and labels of all class ids that raw points can have."""
+    steps, shares = _ramp(_STEPS), _ramp(_SHARES)
+    depth = entities.DEPTH_RANGE / _DEPTHS
+    rings = palette().tolist()
+    scales = [
+        *(_info(_HEIGHT + k, f"{k * TALLEST / _STEPS:.1f} m high", color) for k, color in enumerate(steps)),
+        *(_info(_DISTANCE + k, f"{k * depth:.0f} m away", color) for k, color in enumerate(steps[::-1])),
+        *(_info(_INTENSITY + k, f"intensity {100 * k // _SHARES} %", c) for k, c in enumerate(shares)),
+        *(_info(_TIME + k, f"{100 * k // _SHARES} % into the scan", c) for k, c in enumerate(shares)),
+        *(_info(_RING + k, f"ring {k}", rings[k % len(rings)]) for k in range(_RINGS)),
+        _info(_ABSENT, "not in this cloud", (130, 130, 140)),
+    ]
+    return rr.AnnotationContext([*point_classes(), *scales])
+
+
+def visualizer(by: Quantity) -> rrb.Visualizer:
+    """Of a view: the points by that quantity."""
+    return rr.Points3D.from_fields().visualizer(
+        mappings=[
+            VisualizerComponentMapping(
+                "Points3D:class_ids",
+                ComponentSourceKind.SourceComponent,
+                source_component=f"{COMPONENTS}:{by}",
+            ),
+            VisualizerComponentMapping("Points3D:colors", ComponentSourceKind.AnnotationContext),
+        ]
+    )
+
+
+def _info(number: int, label: str, color: Sequence[int]) -> rr.AnnotationInfo:
+    return rr.AnnotationInfo(id=number, label=label, color=color)
+
+
+def _ramp(count: int) -> list[list[int]]:
+    """Without what would be lost on black."""
+    dark = count // 10
+    ramp: list[list[int]] = turbo(count + dark)[dark:].tolist()
+    return ramp
+
+
+def _scaled(values: NDArray[Any], low: float, high: float, base: int, count: int) -> NDArray[np.uint8]:
+    """One of ``count`` ids from ``base``: the last for ``high``, what is more, and what is no number."""
+    rows = (values - low) * np.float32(count / max(high - low, 1e-9))
+    return (np.fmax(np.fmin(rows, np.float32(count - 1)), np.float32(0)) + np.float32(base)).astype(np.uint8)
+
+
+def _brightest(values: NDArray[Any]) -> float:
+    """The 99th percentile, up to the next of 1, 1.4, 2, 2.8 ..., so that it seldom changes between scans."""
+    some = values[:: len(values) // 5_000 + 1]
+    some = some[np.isfinite(some)]
+    share = float(np.percentile(some, 99)) if len(some) else 0.0
+    return float(2.0 ** (np.ceil(np.log2(share) * 2) / 2)) if share > 0 else 1.0

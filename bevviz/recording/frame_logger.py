@@ -1,0 +1,419 @@
+"""Logs a FrameResult: which ``log_*`` function is called when, and what they need of the frames before."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence, Set
+from dataclasses import dataclass, field
+from types import MappingProxyType
+
+import numpy as np
+import rerun as rr
+
+from bevviz.anomalies import Onsets
+from bevviz.config import Config
+from bevviz.model.frame import Frame, Intrinsics, LateResult, Scene
+from bevviz.model.results import FrameResult
+from bevviz.recording import entities
+from bevviz.recording.annotations import log_world
+from bevviz.recording.anomalies import log_anomalies, log_anomalies_looks
+from bevviz.recording.bev import log_bev, log_grid
+from bevviz.recording.camera import (
+    Videos,
+    log_camera,
+    log_camera_looks,
+    log_detections,
+    log_intrinsics,
+    log_projected_points,
+)
+from bevviz.recording.cloud import (
+    coarse,
+    log_cloud,
+    log_cloud_looks,
+    log_cloud_poses,
+    log_ground,
+    log_obstacles,
+    quantised,
+    raw_clouds,
+)
+from bevviz.recording.clusters import in_kept, log_clusters, log_clusters_looks
+from bevviz.recording.decisions import log_decisions
+from bevviz.recording.frustums import log_frustums
+from bevviz.recording.health import Rates, log_health, log_health_looks
+from bevviz.recording.objects import log_objects, log_objects_looks
+from bevviz.recording.opinions import (
+    log_fusion,
+    log_opinions_from_above,
+    log_opinions_in_images,
+    log_opinions_looks,
+)
+from bevviz.recording.primitives import transform
+from bevviz.recording.properties import log_origin
+from bevviz.recording.reference_boxes import (
+    forget_late,
+    log_late,
+    log_robot,
+    log_truth,
+    log_truth_looks,
+)
+from bevviz.recording.retention import COARSE, FINE, Around, Held, is_whole, sorted_rows, step
+from bevviz.recording.states import COLORS, StateLanes, states_of, track_states
+from bevviz.recording.surroundings import (
+    AroundLog,
+    Fixed,
+    diagnostic_states,
+    fixed_parts,
+    log_motions,
+    log_shapes,
+    marks,
+)
+from bevviz.recording.tracks import Lanes, log_speeds, log_tracks, log_tracks_looks
+from bevviz.recording.writer import Writer
+
+STALE = 3_000_000_000  # nanoseconds that the newest late result of the robot is shown
+
+
+@dataclass(frozen=True, slots=True)
+class Context:
+    """What a frame relies on that was logged before it: a recording that starts with it needs this."""
+
+    config: Config
+    scene: Scene
+    clock: tuple[int, int, int] = (0, 0, 0)  # index, stamp and received of the frame
+    intrinsics: Mapping[str, Intrinsics] = field(default_factory=dict)
+    lanes: Mapping[str, str] = field(default_factory=dict)  # state lane -> its state
+    fixed: Mapping[str, Fixed] = field(
+        default_factory=dict
+    )  # entity -> what holds at all times since it came
+
+
+class Logger(Writer):
+    """Writes frames to a recording, on the timelines ``stamp``, ``frame`` and ``received``.
+
+    Call ``log_static`` once, then ``log`` for each frame.
+
+    Args:
+        recording: where to; it may have any number of sinks.
+        config: how the results were made; stored in the recording.
+        scene: names of the sensors.
+        root: entity that everything goes under. With one, this is what else was made of frames that
+            another logger writes: what the sensors and the robot brought is not written twice.
+        wait, stamps: as of ``Writer``.
+        inputs: write what the sensors and the robot brought; default: without a root.
+        network: what the detector's runs on; stored in the recording.
+    """
+
+    def __init__(
+        self,
+        recording: rr.RecordingStream,
+        config: Config,
+        scene: Scene,
+        root: str = "",
+        wait: float = 0.0,
+        stamps: Sequence[str] = (entities.STAMP,),
+        inputs: bool | None = None,
+        network: str = "",
+    ) -> None:
+        super().__init__(recording, root, wait, stamps)
+        self._inputs = not root if inputs is None else inputs
+        self._brought: set[str] = set()  # entities of the sensors and the robot
+        self._config = config
+        self.streams_video = config.logging.video == "stream"
+        self._scene, self._network = scene, network
+        self._intrinsics: dict[str, Intrinsics] = {}
+        self._fixed: dict[str, Fixed] = {}
+        self._track_lanes = Lanes()
+        self._state_lanes = StateLanes(COLORS, plain_lanes=entities.ANOMALY_STATES)
+        self._around = AroundLog()
+        self._onsets = Onsets()
+        self._last: Frame | None = None
+        self._rates = Rates()
+        self._videos, self._around_raw = Videos(), Around()
+        self._raw_shown: set[str] = set()  # entities with the raw clouds of the frame before
+        self._raw_known: set[str] = set()
+        self._watched: dict[str, str] = {}  # state lane of the pipeline or a camera -> its state
+        self._changed = False  # the configuration, before this frame
+        self._late: dict[str, int] = {}  # topic of the robot's results that come late -> stamp of the newest
+
+    @property
+    def context(self) -> Context:
+        """What the frame that was logged last relies on."""
+        last = self._last
+        clock = (0, 0, 0) if last is None else (last.index, last.stamp, last.received)
+        return Context(
+            self._config, self._scene, clock, self._intrinsics, self._state_lanes.states, self._fixed
+        )
+
+    @property
+    def clouds_left_out(self) -> int:
+        """Times that something began and raw clouds around it were not kept, as there were many already."""
+        return self._around_raw.left_out
+
+    @property
+    def results(self) -> frozenset[str]:
+        """Entities that any frame had, but for what the sensors and the robot brought."""
+        return self.known - self._brought
+
+    def refresh(self, known: Set[str] = frozenset()) -> None:
+        """As a ``Writer``; inputs that are not written here are not cleared here either."""
+        super().refresh(known)
+        self._videos.restart()
+        self._raw_shown = set(self._raw_known)
+        if not self._inputs:
+            self._shown -= self._brought
+
+    # --- once ----------------------------------------------------------------------------------
+
+    def log_static(self) -> None:
+        """How the recording was made, the axes, the classes and the looks: what no frame changes."""
+        lidars = list(dict.fromkeys(filter(None, (self._scene.lidar, *self._scene.lidars))))
+        log_origin(self, self._config, self._scene, self._network)
+        log_world(self)
+        log_cloud_looks(self, lidars)
+        log_clusters_looks(self, lidars)
+        log_camera_looks(self, self._scene.cameras)
+        log_objects_looks(self)
+        if self._has_opinions:
+            log_opinions_looks(self, self._scene.cameras)
+        log_tracks_looks(self)
+        log_truth_looks(self)
+        log_anomalies_looks(self)
+        log_health_looks(self)
+
+    def log_context(self, context: Context) -> None:
+        """Static data, calibration and states of a frame, for a recording that starts with it."""
+        self.log_static()
+        for name, intrinsics in context.intrinsics.items():
+            self._log_intrinsics(name, intrinsics)
+        for path, fixed in context.fixed.items():
+            self.static(path, *fixed)
+        if context.lanes:
+            self.set_time(*context.clock)
+            self._state_lanes.log(self, context.lanes)
+
+    def reconfigure(self, config: Config, scene: Scene) -> None:
+        """From here on the results are made in another way, or of other sensors."""
+        had_opinions = self._has_opinions
+        same, self._config, self._scene = scene == self._scene, config, scene
+        self._changed = True
+        self.streams_video = config.logging.video == "stream"
+        if same:  # the viewer loses class colours that are logged twice
+            log_origin(self, config, scene, self._network)
+            if self._has_opinions and not had_opinions:
+                log_opinions_looks(self, scene.cameras)
+        else:
+            self.log_static()
+
+    @property
+    def _has_opinions(self) -> bool:
+        """Whether objects are somebody else's, so that cameras have opinions on them."""
+        return self._config.objects.method != "frustum"
+
+    # --- each frame ----------------------------------------------------------------------------
+
+    def log(
+        self,
+        result: FrameResult,
+        health: Mapping[str, float] = MappingProxyType({}),
+        notes: Sequence[tuple[str, str]] = (),
+        late: Sequence[LateResult] = (),
+        states: Mapping[str, str] = MappingProxyType({}),
+        beside: Callable[[], object] | None = None,
+        cloud: bool = False,
+    ) -> None:
+        """Everything of one frame. What the frame before had and this one has not is cleared.
+
+        Args:
+            result: the frame and what was made of it.
+            health: further scalars, by entity.
+            notes: further lines of the log: level and text.
+            late: what the robot has published since and belongs to frames before.
+            states: of further lanes, by entity.
+            beside: puts something more into the frame.
+            cloud: write the raw cloud, which tells ground from obstacles, also where no inputs are written.
+        """
+        frame = result.frame
+        for found in late:
+            self._late[found.boxes.topic] = found.boxes.stamp
+            log_late(self, found, self._config.bev)
+        self.begin(frame.index, frame.stamp, frame.received)
+        self._log_stages(result, cloud)
+        self._log_changes(result, health, notes, states)
+        if beside is not None:
+            beside()
+        self.end()
+
+    def _log_stages(self, result: FrameResult, cloud: bool) -> None:
+        """Log what the stages computed from this frame alone."""
+        frame = result.frame
+        if frame.lidar:
+            self.put(entities.sensor(frame.lidar), transform(frame.pose))
+        before = set(self._now)
+        if self._inputs:
+            self._log_input(result)
+        elif cloud:
+            log_cloud(self, result, self._config.logging.color_by)
+        self._brought |= self._now - before
+        self._log_lidar_results(result)
+        for camera in result.cameras:
+            log_detections(self, camera, result.explanations)
+            if self._config.logging.projected_points and self._config.logging.keep != "report":
+                log_projected_points(self, camera, packed=not is_whole(self._config))
+        log_opinions_in_images(self, result)
+        log_frustums(self, frame, result.cameras)
+        log_decisions(self, result)
+        if result.bev is not None:
+            log_bev(self, result.bev, self._config)
+            log_opinions_from_above(self, result)
+            if self._config.logging.keep != "report":
+                log_grid(self, result, result.bev)
+        if not self.root:
+            self._log_fixed(frame)
+            log_shapes(self, frame)
+            log_motions(self, frame)
+
+    def _log_changes(
+        self,
+        result: FrameResult,
+        health: Mapping[str, float],
+        notes: Sequence[tuple[str, str]],
+        states: Mapping[str, str],
+    ) -> None:
+        """Log what depends on the frames before: tracks, anomalies, states, rates."""
+        frame = result.frame
+        log_objects(self, result)
+        log_fusion(self, result)
+        if result.tracks is not None:
+            log_tracks(self, frame, result.tracks, self._config.bev)
+        lines = marks(frame) if self.root else self._around.lines(frame)
+        self.lines(entities.EXPLAIN_LOG, [*notes, *lines])
+        started = self._onsets.of(result.anomalies)
+        log_anomalies(self, result, started)
+        self._log_states(result, states)
+        kept = self._config.logging
+        if self._inputs and kept.keep == "inspect" and kept.raw_cloud:
+            self._log_some_clouds(result, strange=bool(started))
+        self._rates.add(frame)
+        log_health(self, result, self._last, self._rates, health)
+        self._last = frame
+
+    def log_meanwhile(
+        self, seconds: float, notes: Sequence[tuple[str, str]], states: Mapping[str, str]
+    ) -> None:
+        """What is to be said while no frame comes, ``seconds`` after the last one was received."""
+        if self._last is None:
+            return
+        later = round(seconds * 1e9)
+        last = self._last
+        self.set_time(last.index, last.stamp + later, last.received + later if last.received else 0)
+        self.lines(entities.EXPLAIN_LOG, notes)
+        self._state_lanes.log(self, {**self._state_lanes.states, **states})
+
+    def _log_input(self, result: FrameResult) -> None:
+        """What the sensors and the robot brought."""
+        frame, config = result.frame, self._config
+        if config.logging.raw_cloud and is_whole(config):
+            log_cloud(self, result, config.logging.color_by)
+        else:
+            log_cloud_poses(self, frame)
+        videos = None if is_whole(config) else self._videos
+        for camera in result.cameras:
+            log_camera(self, frame, camera, config.logging.jpeg_quality, videos)
+            if camera.camera.intrinsics is not None:
+                self._log_intrinsics(camera.camera.name, camera.camera.intrinsics)
+        log_truth(self, frame, config.bev)
+        log_robot(self, frame, config.bev)
+        for topic, stamp in list(self._late.items()):
+            if frame.stamp - stamp > STALE:
+                del self._late[topic]
+                forget_late(self, topic)
+
+    def _log_fixed(self, frame: Frame) -> None:
+        """Where it is new."""
+        for path, make in fixed_parts(frame).items():
+            if path not in self._fixed and (fixed := make()) is not None:
+                self._fixed = {**self._fixed, path: fixed}  # a context may hold the one before
+                self.static(path, *fixed)
+
+    def _log_intrinsics(self, name: str, intrinsics: Intrinsics) -> None:
+        """Where they are new."""
+        last = self._intrinsics.get(name)
+        if last is intrinsics:
+            return
+        self._intrinsics = {**self._intrinsics, name: intrinsics}  # a context may hold the one before
+        size = (intrinsics.width, intrinsics.height)
+        if last is None or (last.width, last.height) != size or not np.array_equal(last.K, intrinsics.K):
+            log_intrinsics(self, name, intrinsics)
+
+    def _log_lidar_results(self, result: FrameResult) -> None:
+        frame, config, clusters = result.frame, self._config, result.clusters
+        if not is_whole(config):
+            self._log_packed_results(result)
+            return
+        log_ground(self, result, config.voxel.size)
+        if result.obstacles is None:
+            return
+        obstacles = quantised(result.obstacles, config.voxel.size)
+        log_obstacles(self, frame, obstacles)
+        if clusters is not None:
+            log_clusters(self, frame, clusters, result.tracks, obstacles, config.clustering)
+
+    def _log_packed_results(self, result: FrameResult) -> None:
+        """Each voxel once: those of clusters with these."""
+        frame, config, clusters = result.frame, self._config, result.clusters
+        size, ground_too = config.voxel.size, config.logging.keep != "report"
+        if ground_too:
+            log_ground(self, result, size, packed=True)
+        if result.obstacles is None:
+            return
+        if ground_too:
+            others = result.obstacles
+            if clusters is not None:
+                others = others.compress(~in_kept(clusters), axis=0)
+            scale = step(size, COARSE)
+            others = coarse(others.take(sorted_rows(others, scale), axis=0), scale)
+            log_obstacles(self, frame, others)
+        if clusters is not None:
+            scale = step(size, FINE)
+            log_clusters(self, frame, clusters, result.tracks, result.obstacles, config.clustering, scale)
+
+    def _log_some_clouds(self, result: FrameResult, *, strange: bool) -> None:
+        """The raw clouds of this frame where they are wanted, and those before it that are wanted with it.
+
+        Needs what the frames before have a part in: anomalies, and states that change.
+        """
+        frame, clouds = result.frame, raw_clouds(result)
+        lanes = [
+            entities.state("pipeline"),
+            *(entities.state(camera.camera.name) for camera in result.cameras),
+        ]
+        watched = {lane: self._state_lanes.states.get(lane, "") for lane in lanes}
+        strange |= any(self._watched.get(lane, state) != state for lane, state in watched.items())
+        asked_for = bool(marks(frame)) or self._changed
+        self._watched, self._changed = watched, False
+        now, left_out = (frame.index, frame.stamp, frame.received), self._around_raw.left_out
+        wanted = self._around_raw.see(
+            Held(now, clouds), self._config.logging, strange=strange, wanted=asked_for
+        )
+        if self._around_raw.left_out > left_out:
+            often = f"logging.raw_share is reached; {self._around_raw.left_out} times so far"
+            self.lines(entities.EXPLAIN_LOG, [("INFO", f"no raw clouds around what begins here: {often}")])
+        for one in wanted:
+            self.set_time(*one.clock)
+            for path, points, class_ids in one.clouds:
+                self.write(path, rr.Points3D(points, class_ids=class_ids))
+        self.set_time(*now)
+        shown = {path for path, _, _ in clouds} if wanted else set()
+        for path in sorted(self._raw_shown - shown):
+            self.write(path, rr.Clear(recursive=False))
+        self._raw_shown = shown
+        self._raw_known |= shown
+
+    def _log_states(self, result: FrameResult, more: Mapping[str, str]) -> None:
+        states = {**states_of(result), **more}
+        rows = self._track_lanes.update(result.tracks)
+        if result.tracks is not None:
+            log_speeds(self, result.tracks, rows)
+            states |= track_states(result.tracks, rows)
+        if not self.root:
+            states |= diagnostic_states(result.frame)
+        self._state_lanes.log(self, states)

@@ -1,0 +1,80 @@
+"""How a frame went, as numbers to plot: times, rates, counts, clocks."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterator, Mapping
+
+import numpy as np
+import rerun as rr
+
+from bevviz.model.colors import SERIES
+from bevviz.model.counts import counts_of
+from bevviz.model.frame import Frame
+from bevviz.model.results import FrameResult
+from bevviz.recording import entities
+from bevviz.recording.writer import Writer
+
+# Curves of one plot, in the order of their colours: the viewer's own may be the same twice.
+STAGES = (
+    *("detector", "clustering", "bev", "ground", "fusion", "tracking", "projection", "voxel", "explain"),
+    "total",
+)
+COUNTS = ("detections", "clusters", "matches", "problems", "failures")
+
+WINDOW = 1_000_000_000  # nanoseconds that a rate is counted over
+LEAST = 250_000_000  # nanoseconds that say something about a rate
+
+
+class Rates:
+    """How often frames come, counted over the last second: two that come together are no frequency."""
+
+    def __init__(self) -> None:
+        self._times: dict[str, deque[int]] = {"sensor": deque(), "received": deque()}
+
+    def add(self, frame: Frame) -> None:
+        for times, now in zip(self._times.values(), (frame.stamp, frame.received), strict=True):
+            if times and now < times[-1]:
+                times.clear()
+            times.append(now)
+            while len(times) > 2 and times[1] <= now - WINDOW:
+                times.popleft()
+
+    def __iter__(self) -> Iterator[tuple[str, float]]:
+        """By what was counted, in Hz; nothing as long as little is known."""
+        for what, times in self._times.items():
+            if len(times) > 1 and times[-1] - times[0] >= LEAST:
+                yield what, (len(times) - 1) * 1e9 / (times[-1] - times[0])
+
+
+def log_health_looks(to: Writer) -> None:
+    for paths in (map(entities.stage_time, STAGES), map(entities.count, COUNTS)):
+        for path, color in zip(paths, SERIES, strict=False):
+            to.static(path, rr.SeriesLines(colors=[color], widths=[1.5]))
+
+
+def log_health(
+    to: Writer, result: FrameResult, last: Frame | None, rates: Rates, more: Mapping[str, float]
+) -> None:
+    """``last``: the frame before it; ``rates``: up to this frame; ``more``: further scalars, by entity."""
+    for path, value in (*health(result, last, rates), *more.items()):
+        if np.isfinite(value):
+            to.scalar(path, float(value))
+
+
+def health(result: FrameResult, last: Frame | None, rates: Rates) -> Iterator[tuple[str, float]]:
+    """Entity and value of every scalar of a frame; ``last`` is the frame before it. NaN: not known."""
+    frame = result.frame
+    for stage, seconds in result.timings.items():
+        yield entities.stage_time(stage), seconds * 1e3
+    if result.timings.get("total"):
+        yield entities.rate("pipeline"), 1 / result.timings["total"]
+    for what, rate in rates:
+        yield entities.rate(what), rate
+    for what, number in counts_of(result, last).items():
+        yield entities.count(what), number
+    if frame.lidar:
+        yield entities.tf_age(frame.lidar), frame.tf_age * 1e3
+    for camera in result.cameras:
+        yield entities.sync_error(camera.camera.name), camera.camera.sync_error * 1e3
+        yield entities.tf_age(camera.camera.name), camera.camera.tf_age * 1e3

@@ -1,0 +1,106 @@
+"""Fused boxes, with the reason of their match."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import rerun as rr
+
+from bevviz import anomalies
+from bevviz.model.colors import class_color
+from bevviz.model.results import SIDES, FrameResult, Objects, Opinion
+from bevviz.recording import entities, tracks
+from bevviz.recording.labels import log_spoken, log_spoken_looks, named_in_space
+from bevviz.recording.opinions import marked
+from bevviz.recording.primitives import boxes3d, scored, transform
+from bevviz.recording.writer import Writer
+
+
+def log_objects_looks(to: Writer) -> None:
+    to.static(entities.FUSED, rr.Boxes3D.from_fields(radii=rr.Radius.ui_points(0.5), show_labels=False))
+    log_spoken_looks(to, entities.FUSED)
+    to.static(entities.MEASURED, rr.Boxes3D.from_fields(radii=rr.Radius.ui_points(1.0), show_labels=False))
+
+
+def log_objects(to: Writer, result: FrameResult) -> None:
+    """Boxes by class, and everything that is known of each as values beside it; in thin what was seen."""
+    objects, tracked = result.objects, result.tracks
+    if objects is None or not len(objects):
+        return
+    reasons = {(e.camera, e.row): e.text for e in result.explanations if e.subject == "detection"}
+    labels = scored(objects.names, objects.score)
+    odd, is_odd = {anomaly.subject for anomaly in result.anomalies}, np.zeros(len(objects), bool)
+    ids, speeds = np.full(len(objects), -1), np.full(len(objects), np.nan, np.float32)
+    for j, row in enumerate(tracks.of_objects(tracked, len(objects))):
+        if row is not None and tracked is not None:
+            labels[j] = tracks.label(tracked, row)
+            is_odd[j] = anomalies.label(tracked, row) in odd
+            ids[j], speeds[j] = tracked.id[row], tracked.speed[row]
+    matches = zip(objects.camera, objects.detection.tolist(), strict=True)
+    why = [reasons.get(match, "") for match in matches]
+    opinions, values = result.opinions, dict[str, Any]()
+    if opinions is not None:
+        said = {e.row: e.text for e in result.explanations if e.subject == "object"}
+        why = [said.get(j, "") for j in range(len(objects))]
+        values["opinion"] = [Opinion(value).word for value in opinions.opinion.tolist()]
+        is_odd |= opinions.opinion == Opinion.CONTRADICTED
+    colors = [class_color(name) for name in objects.names]
+    to.put(
+        entities.FUSED,
+        transform(result.frame.pose),
+        boxes3d(objects.boxes, np.arange(len(objects)), labels, colors=colors),
+        rr.AnyValues(
+            class_name=list(objects.names),
+            score=objects.score,
+            track=ids,
+            speed=speeds,
+            cluster=objects.cluster,
+            camera=list(objects.camera),
+            seen=sides(objects),
+            reason=why,
+            **values,
+        ),
+    )
+    away = np.hypot(*objects.boxes.center[:, :2].T)
+    is_named = named_in_space(objects.boxes.center, is_odd)
+    log_spoken(
+        to,
+        entities.FUSED,
+        objects.boxes,
+        [label if named else "" for label, named in zip(_with_doubts(labels, result), is_named, strict=True)],
+        [
+            f"{label}, {metres:.1f} m away: {reason.partition(': ')[2] or 'an object'}"
+            for label, metres, reason in zip(labels, away, why, strict=True)
+        ],
+        marked(result, colors),
+    )
+    if objects.measured is not None:
+        rows = np.flatnonzero((objects.measured.size != objects.boxes.size).any(axis=1))
+        if len(rows):
+            measured = boxes3d(
+                objects.measured, rows, [labels[j] for j in rows], colors=[colors[j] for j in rows]
+            )
+            to.put(entities.MEASURED, transform(result.frame.pose), measured)
+
+
+def _with_doubts(labels: list[str], result: FrameResult) -> list[str]:
+    """As they are written beside the boxes: what a camera says against one comes with its name."""
+    if result.opinions is None:
+        return labels
+    said = map(Opinion, result.opinions.opinion.tolist())
+    doubts = Opinion.CONTRADICTED, Opinion.NAMED_OTHERWISE
+    return [
+        f"{label}, {opinion.word}" if opinion in doubts else label
+        for label, opinion in zip(labels, said, strict=True)
+    ]
+
+
+def sides(objects: Objects) -> list[str]:
+    """The sides of each box that were seen, in words; empty where that is not known."""
+    if objects.seen is None:
+        return [""] * len(objects)
+    return [
+        ", ".join(side for side, seen in zip(SIDES, row, strict=True) if seen)
+        for row in objects.seen.tolist()
+    ]

@@ -1,0 +1,261 @@
+"""Two opinions: what cameras say of somebody else's objects, and beside them those of our own fusion."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import rerun as rr
+
+from bevviz.model import geometry
+from bevviz.model.colors import OPINIONS, SERIES, Color, State, class_color
+from bevviz.model.counts import OPINIONS as COUNTED
+from bevviz.model.frame import F32, F64, I64, Boxes3D, Camera
+from bevviz.model.results import FrameResult, Objects, Opinion
+from bevviz.recording import entities
+from bevviz.recording.bev import footprints, seen_from_above
+from bevviz.recording.camera import over_image
+from bevviz.recording.health import COUNTS
+from bevviz.recording.labels import (
+    FROM_ABOVE,
+    IN_IMAGE,
+    LETTER,
+    apart,
+    log_names_looks,
+    log_spoken,
+    log_stroked,
+    named_in_space,
+)
+from bevviz.recording.primitives import CORNER, OUTLINE, boxes3d, image_outlines, scored, transform
+from bevviz.recording.writer import Writer
+
+DIM = 0.65  # of the colour of a class, where both have an object
+MISSED = "missed"
+DOUBTS = ("contradicted", "named otherwise", MISSED)  # what has its name beside it
+
+_MARKED = {opinion: OPINIONS[opinion.word] for opinion in (Opinion.CONTRADICTED, Opinion.NAMED_OTHERWISE)}
+
+
+def log_opinions_looks(to: Writer, cameras: Iterable[str]) -> None:
+    """Thinner than the objects that they are beside."""
+    thin = rr.Radius.ui_points(0.5)
+    to.static(entities.FUSION, rr.Boxes3D.from_fields(radii=thin, show_labels=False, fill_mode=OUTLINE))
+    lines = rr.LineStrips3D.from_fields(radii=rr.Radius.ui_points(1.0))
+    to.static(entities.outlines(entities.FUSION), lines)
+    points = rr.Points3D.from_fields(
+        radii=rr.Radius.ui_points(0.0), colors=[State.DOUBTFUL.value], show_labels=True
+    )
+    to.static(entities.names(entities.FUSION), points)
+    for camera in cameras:
+        for opinion in OPINIONS:
+            path = entities.image_opinion(camera, opinion)
+            _log_looks_in_view(to, path, opinion)
+            if to.root:
+                for shown in (path, entities.names(path)):
+                    to.static(shown, over_image(camera))
+    for opinion in OPINIONS:
+        _log_looks_in_view(to, entities.overlay_opinion(opinion), opinion)
+    for what, color in zip(COUNTED, SERIES[len(COUNTS) :], strict=False):
+        to.static(entities.count(what), rr.SeriesLines(colors=[color], widths=[1.5]))
+
+
+def log_fusion(to: Writer, result: FrameResult) -> None:
+    """The objects of our fusion: dim where the method has them, too, else in full colour and named."""
+    opinions = result.opinions
+    if opinions is None or not len(opinions.fused):
+        return
+    fused, missed = opinions.fused, opinions.missed
+    reasons = {e.row: e.text for e in result.explanations if e.subject == "fused"}
+    labels = scored(fused.names, fused.score)
+    colors = [
+        class_color(name) if is_missed else _dim(class_color(name))
+        for name, is_missed in zip(fused.names, missed.tolist(), strict=True)
+    ]
+    to.put(
+        entities.FUSION,
+        transform(result.frame.pose),
+        boxes3d(fused.boxes, np.arange(len(fused)), labels, colors=colors),
+        rr.AnyValues(
+            class_name=list(fused.names),
+            score=fused.score,
+            cluster=fused.cluster,
+            camera=list(fused.camera),
+            missed=missed,
+            reason=[reasons.get(j, "") for j in range(len(fused))],
+        ),
+    )
+    named = named_in_space(fused.boxes.center, missed) & missed
+    log_spoken(
+        to,
+        entities.FUSION,
+        fused.boxes,
+        [f"{label}, missed" if is_named else "" for label, is_named in zip(labels, named, strict=True)],
+        [reasons.get(j, label) for j, label in enumerate(labels)],
+        colors,
+    )
+
+
+# --- in the images and from above --------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class Told:
+    """Objects that are in a view, of which the same is said.
+
+    Attributes:
+        opinion: of ``OPINIONS``.
+        rows: in the method's objects; where they are missed, in those of our fusion.
+        strokes: (M, 2) pixels of each.
+    """
+
+    opinion: str
+    rows: list[int]
+    strokes: list[F32]
+
+
+def told_in_image(result: FrameResult, camera: Camera) -> Mapping[str, Told]:
+    """By entity, what is told of objects in the image of a camera."""
+    return {
+        entities.image_opinion(camera.name, opinion): told
+        for opinion, boxes, rows in _by_opinion(result)
+        if (told := _told(opinion, rows, image_outlines(boxes.chosen(rows), camera))).rows
+    }
+
+
+def told_from_above(result: FrameResult) -> Mapping[str, Told]:
+    """By entity, what is told of objects whose centre is in the bird's-eye view."""
+    config = result.config.bev
+    reach = np.array([config.range_x, config.range_y], np.float32)
+    found = {}
+    for opinion, boxes, all_rows in _by_opinion(result):
+        rows = all_rows[(np.abs(boxes.center[all_rows, :2]) < reach).all(axis=1)]
+        if len(rows):
+            outlines = footprints(geometry.corners(boxes.chosen(rows)))
+            strokes = [*seen_from_above(config, np.eye(4), outlines)]
+            found[entities.overlay_opinion(opinion)] = Told(opinion, rows.tolist(), strokes)
+    return found
+
+
+def log_opinions_in_images(to: Writer, result: FrameResult) -> None:
+    """Where the boxes are in each image, in the colour of what cameras say of them."""
+    for found in result.cameras if result.opinions is not None else ():
+        camera = found.camera
+        if (told := told_in_image(result, camera)) and camera.intrinsics is not None:
+            width = camera.intrinsics.width
+            beside = _Beside(np.array(IN_IMAGE) * width, LETTER * width, CORNER, over=True)
+            _log_told(to, result, told, beside)
+
+
+def log_opinions_from_above(to: Writer, result: FrameResult) -> None:
+    """The same over the bird's-eye image, which has the names of the method's objects itself."""
+    if result.opinions is not None:
+        room = np.array(FROM_ABOVE) / result.config.bev.resolution
+        _log_told(to, result, told_from_above(result), _Beside(room, 0.0, 0.0, over=False))
+
+
+def _by_opinion(result: FrameResult) -> Iterator[tuple[str, Boxes3D, I64]]:
+    """Each opinion, the boxes that it is on and their rows among these."""
+    opinions, objects = result.opinions, result.objects
+    if opinions is None or objects is None:
+        return
+    said = np.array([Opinion(value).word for value in opinions.opinion.tolist()], np.str_)
+    for opinion in OPINIONS:
+        if opinion == MISSED:
+            yield opinion, opinions.fused.boxes, np.flatnonzero(opinions.missed)
+        else:
+            yield opinion, objects.boxes, np.flatnonzero(said == opinion)
+
+
+def _told(opinion: str, rows: I64, strokes: Sequence[F32]) -> Told:
+    """Without what is not in the view."""
+    shown = [(row, stroke) for row, stroke in zip(rows.tolist(), strokes, strict=True) if len(stroke)]
+    return Told(opinion, [row for row, _ in shown], [stroke for _, stroke in shown])
+
+
+@dataclass(frozen=True, slots=True)
+class _Beside:
+    """How names are written in a view.
+
+    Attributes:
+        room: (2,) of a name, across and up in pixels.
+        letter: of each letter of a name that is longer, in pixels.
+        corner: what Rerun adds to a pixel.
+        over: over the outlines, as the names of detections are under them; else under them.
+    """
+
+    room: F64
+    letter: float
+    corner: float
+    over: bool
+
+    def place(self, stroke: F32) -> tuple[float, float]:
+        """Where the upper edge of the name is."""
+        (left, top), (right, bottom) = stroke.min(axis=0).tolist(), stroke.max(axis=0).tolist()
+        return (left + right) / 2, max(top - float(self.room[1]), 0.0) if self.over else bottom
+
+
+def _log_told(to: Writer, result: FrameResult, told: Mapping[str, Told], beside: _Beside) -> None:
+    """Outlines, and names of those that are in doubt, as far as these do not meet.
+
+    What is missed comes last, as it has a detection with a name; else the nearest comes first.
+    """
+    doubted = [found for found in told.values() if found.opinion in DOUBTS]
+    places = np.array([beside.place(stroke) for found in doubted for stroke in found.strokes], np.float32)
+    centers = [_of(result, found.opinion).boxes.center[found.rows, :2] for found in doubted]
+    away = np.hypot(*np.concatenate([np.zeros((0, 2), np.float32), *centers]).T)
+    denied = np.array([found.opinion != MISSED for found in doubted for _ in found.rows], bool)
+    letters = [len(name) for found in doubted for name in _names(result, found)]
+    across = np.maximum(beside.room[0], beside.letter * np.array(letters, np.float64))
+    named = iter(apart(places.reshape(-1, 2), away, (across, float(beside.room[1])), denied).tolist())
+    for path, found in told.items():
+        subject = "fused" if found.opinion == MISSED else "object"
+        said = {e.row: e.text for e in result.explanations if e.subject == subject}
+        names = _names(result, found)
+        shown = [next(named) for _ in names] if found.opinion in DOUBTS else [False] * len(names)
+        log_stroked(
+            to,
+            path,
+            [stroke + np.float32(beside.corner) for stroke in found.strokes],
+            [name if is_named else "" for name, is_named in zip(names, shown, strict=True)],
+            [said.get(row, name) for row, name in zip(found.rows, names, strict=True)],
+            np.array([beside.place(stroke) for stroke in found.strokes], np.float32),
+        )
+
+
+def _names(result: FrameResult, found: Told) -> list[str]:
+    theirs = _of(result, found.opinion)
+    return [f"{theirs.names[row]} {found.opinion}" for row in found.rows]
+
+
+def _of(result: FrameResult, opinion: str) -> Objects:
+    """Whose rows they are of which this is told."""
+    assert result.opinions is not None and result.objects is not None
+    return result.opinions.fused if opinion == MISSED else result.objects
+
+
+def _log_looks_in_view(to: Writer, path: str, opinion: str) -> None:
+    doubted = opinion in DOUBTS
+    radius, order = (2.0, 34.0) if doubted else (0.75, 33.0)
+    looks = rr.LineStrips2D.from_fields(
+        colors=[OPINIONS[opinion]], radii=rr.Radius.ui_points(radius), draw_order=order
+    )
+    to.static(path, looks)
+    if doubted:
+        log_names_looks(to, path, order + 1)
+
+
+# --- in space ----------------------------------------------------------------------------------
+
+
+def marked(result: FrameResult, colors: Sequence[Color]) -> list[Color]:
+    """Colours of the objects' outlines: what a camera denies stands out."""
+    if result.opinions is None:
+        return [*colors]
+    said = map(Opinion, result.opinions.opinion.tolist())
+    return [_MARKED.get(opinion, color) for opinion, color in zip(said, colors, strict=True)]
+
+
+def _dim(color: Color) -> Color:
+    red, green, blue = (round(DIM * value) for value in color)
+    return red, green, blue

@@ -1,0 +1,131 @@
+"""What several things that are logged are made of."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+import cv2
+import numpy as np
+import pyarrow as pa
+import rerun as rr
+from numpy.typing import NDArray
+
+from bevviz.model import geometry
+from bevviz.model.frame import F32, F64, U8, Boxes3D, Camera, Image
+from bevviz.stages.visibility import image_points
+from bevviz.support.kernel import kernel
+
+CORNER = 0.5  # pixels: Rerun counts from the corner of the first pixel, bevviz from its centre
+OUTLINE = rr.components.FillMode.MajorWireframe
+
+_EDGES = [0, 1, 2, 3, 0, 4, 5, 1, 5, 6, 2, 6, 7, 3, 7, 4]
+
+
+def transform(world_from_entity: F64) -> rr.Transform3D:
+    return rr.Transform3D(
+        translation=world_from_entity[:3, 3],
+        quaternion=rr.Quaternion(xyzw=geometry.quaternion(world_from_entity)),
+    )
+
+
+def boxes3d(boxes: Boxes3D, rows: np.ndarray[Any, Any], labels: list[str], **looks: Any) -> rr.Boxes3D:
+    half = boxes.yaw[rows] / 2
+    turns = np.zeros((len(rows), 4), np.float32)
+    turns[:, 2], turns[:, 3] = np.sin(half), np.cos(half)
+    return rr.Boxes3D(
+        centers=boxes.center[rows], sizes=boxes.size[rows], quaternions=turns, labels=labels, **looks
+    )
+
+
+def boxes2d(xyxy: F32, labels: list[str], **looks: Any) -> rr.Boxes2D:
+    """(N, 4) boxes in pixels as bevviz counts them."""
+    return rr.Boxes2D(array=xyxy + CORNER, array_format=rr.Box2DFormat.XYXY, labels=labels, **looks)
+
+
+def edges(corners: F32) -> F32:
+    """(..., 16, D) every edge of a box or frustum, given its (..., 8, D) corners, in one stroke."""
+    return corners[..., _EDGES, :]
+
+
+def image_outlines(boxes: Boxes3D, camera: Camera) -> list[F32]:
+    """What can be drawn in an image of each of (K,) boxes around the robot: one stroke of (M, 2) pixels.
+
+    Every edge, where all of them are in the image; else the outline of what is, cut at the image's edge. Of
+    one that is not in it there are no points.
+    """
+    nothing = np.zeros((0, 2), np.float32)
+    if camera.intrinsics is None or (found := image_points(boxes, camera)) is None:
+        return [nothing] * len(boxes)
+    width, height = camera.intrinsics.width - 0.5, camera.intrinsics.height - 0.5
+    image = np.array([(-0.5, -0.5), (width, -0.5), (width, height), (-0.5, height)], np.float32)
+    with np.errstate(invalid="ignore"):
+        inside = (found >= image[0]) & (found < image[2])
+    is_whole: list[bool] = inside[:, :8].all(axis=(1, 2)).tolist()
+    outlines = []
+    for points, whole in zip(found, is_whole, strict=True):
+        if whole:
+            outlines.append(edges(points[:8]))
+            continue
+        area, cut, known = 0.0, nothing, points[np.isfinite(points[:, 0]) & np.isfinite(points[:, 1])]
+        if len(known):
+            area, cut = cv2.intersectConvexConvex(cv2.convexHull(known), image)
+        outlines.append(np.concatenate([cut[:, 0], cut[:1, 0]]) if area > 0 else nothing)
+    return outlines
+
+
+def strips(points: F32, lengths: NDArray[np.integer]) -> pa.Array:
+    """Lines as Rerun keeps them, in one piece rather than line by line.
+
+    Args:
+        points: (N, 2) or (N, 3), of one line after the other.
+        lengths: how many of them each line has.
+    """
+    point = pa.list_(pa.field("item", pa.float32(), nullable=False), points.shape[1])
+    line = pa.list_(pa.field("item", point, nullable=False))
+    offsets = pa.array(np.append(0, np.cumsum(lengths)).astype(np.int32))
+    values = pa.FixedSizeListArray.from_arrays(pa.array(points.ravel()), type=point)
+    return pa.ListArray.from_arrays(offsets, values, type=line)
+
+
+def scored(names: Iterable[str], scores: Iterable[Any]) -> list[str]:
+    """``person 0.90`` for each."""
+    return [f"{name} {score:.2f}" for name, score in zip(names, scores, strict=True)]
+
+
+def document(text: str) -> rr.TextDocument:
+    """A page of Markdown."""
+    return rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN)
+
+
+def encode_image(image: Image, quality: int) -> rr.EncodedImage:
+    """As it came where it came encoded, else as JPEG of that quality."""
+    if image.encoded is not None:
+        return rr.EncodedImage(contents=image.encoded, media_type=image.media_type or None)
+    return jpeg(image.bgr, quality)
+
+
+def jpeg(bgr: U8, quality: int) -> rr.EncodedImage:
+    _, data = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, quality])
+    return rr.EncodedImage(contents=blob(data), media_type="image/jpeg")
+
+
+def png(bgr: U8) -> rr.EncodedImage:
+    _, data = cv2.imencode(".png", bgr, [cv2.IMWRITE_PNG_COMPRESSION, 1])
+    return rr.EncodedImage(contents=blob(data), media_type="image/png")
+
+
+def blob(data: U8) -> pa.Array:
+    """(N,) bytes as Rerun keeps them, without the copies that it would make of them."""
+    one = pa.list_(pa.field("item", pa.uint8(), nullable=False))
+    return pa.ListArray.from_arrays(pa.array([0, len(data)], pa.int32()), pa.array(data), type=one)
+
+
+@kernel
+def rounded(points: F32, scale: float) -> F32:
+    """To the nearest 1 / scale, in one pass, as it is done to every frame."""
+    found, factor = np.empty_like(points), np.float32(scale)
+    for i in range(len(points)):
+        for axis in range(3):
+            found[i, axis] = np.rint(points[i, axis] * factor) / factor
+    return found

@@ -1,0 +1,52 @@
+"""How a recording was made: for people on a page, for programs as the recording's property."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import rerun as rr
+
+from bevviz.config import Config, dump, stated_lines
+from bevviz.model.frame import Scene
+from bevviz.recording import entities
+from bevviz.recording.primitives import document
+from bevviz.recording.provenance import versions
+from bevviz.recording.retention import left_out
+from bevviz.recording.writer import Writer
+from bevviz.support.text import fenced, markdown
+
+
+def log_origin(to: Writer, config: Config, scene: Scene, network: str = "") -> None:
+    """Source, configuration, versions, and what the detector's network runs on."""
+    settings = dump(config)
+    stated = stated_lines(config, folders=False)
+    packages = [f"{name} {version}" for name, version in versions().items()]
+    lines = [*map(markdown, stated), *packages, *([f"network on {markdown(network)}"] if network else [])]
+    lacking = list(left_out(config.logging))
+    lacks = "".join(f"- {line}\n" for line in lacking)
+    lacks = f"## Not in this recording (keep: {config.logging.keep})\n\n{lacks}\n" if lacks else ""
+    to.static(
+        entities.CONFIG,
+        document(
+            "# How this recording was made\n\n"
+            f"Source: **{markdown(scene.name)}**, preset: **{config.preset}**\n\n"
+            f"{lacks}{fenced(settings, 'yaml')}\n\n" + "\n".join(f"- {line}" for line in lines)
+        ),
+    )
+    if not to.root:
+        to.recording.send_recording_name(scene.name)
+    made: dict[str, Any] = {
+        "source": scene.name,
+        "preset": config.preset,
+        "config": settings,
+        "stated": stated,
+        "versions": packages,
+        "lidars": [name for name in scene.lidars or (scene.lidar,) if name],
+        "cameras": list(scene.cameras),
+        "keep": config.logging.keep,
+        "left_out": lacking,
+        "network": network,
+    }
+    # Rerun leaves out what is None or has it empty, as its process has met the name before or not.
+    there = rr.AnyValues(**{name: value for name, value in made.items() if value})
+    to.recording.send_property(entities.PROPERTY + to.root.replace("/", "_"), there)

@@ -1,0 +1,182 @@
+"""What results depend on besides data and configuration: versions, files by their content, the machine.
+
+A recording tells the versions, a report all of it, so that its check can say what is not as it was; a batch
+runs a bag again where anything but the machine is another.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import platform
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
+from dataclasses import dataclass, field
+from functools import lru_cache
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+
+from bevviz.config import STAGES, Config, object_files, plugin_of
+from bevviz.config.methods import CLASS_LISTS
+from bevviz.config.plugins import TOPIC
+from bevviz.support.version import __version__
+
+PACKAGES = (  # those that are not installed do not count: some libraries come as one of several
+    *("rerun-sdk", "rosbags", "numpy"),
+    "protobuf",  # decodes Foxglove's messages
+    *("velodyne-decoder", "dracopy", "pypcd4"),  # make points of packets, compressed clouds and PCD files
+    *("numba", "llvmlite"),  # compile every LiDAR stage
+    *(
+        "opencv-python-headless",
+        "opencv-python",
+        "pillow",
+        "av",
+    ),  # decode images, and prepare them for the network
+    *("onnxruntime", "onnxruntime-gpu"),
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Dependency:
+    """A thing that results depend on: a package, or a file. The same content is the same under any name."""
+
+    version: str = ""
+    sha256: str = ""  # of the file's content, in hexadecimal
+    file: str = field(default="", compare=False)  # its name, without the folder; of a function, module:name
+
+    def __str__(self) -> str:
+        content = f"SHA-256 {self.sha256}" if self.sha256 else ""
+        named = f"{self.file} ({content})" if self.file and content else self.file or content
+        return ", ".join(filter(None, (self.version, named)))
+
+
+@dataclass(frozen=True, slots=True)
+class Provenance:
+    """What results were made with, and on.
+
+    ``dependencies`` decide what comes out: packages by their name, files by the key that names them in the
+    configuration (``detector.model``). The ``machine`` may round differently.
+    """
+
+    dependencies: Mapping[str, Dependency]
+    machine: Mapping[str, str] = field(default_factory=dict)
+
+
+def provenance(config: Config, network: str = "") -> Provenance:
+    """That of a run here and now.
+
+    Args:
+        config: of the run; the files that it names are read.
+        network: what the detector's network runs on; empty: there is none.
+    """
+    return Provenance(dependencies_of(config), machine(network))
+
+
+def dependencies_of(config: Config) -> dict[str, Dependency]:
+    """Every package, and every file that the configuration names and whose content decides results.
+
+    Of somebody's stage the file that its module is, and the version of the package that it came with.
+    """
+    found = {name: Dependency(version=number) for name, number in versions().items()}
+    for key, path in (("detector.model", model_path(config)), ("detector.names", names_path(config))):
+        if path is not None:
+            found[key] = Dependency(sha256=file_hash(path), file=path.name)
+    for key, file in object_files(config).items():
+        found[key] = Dependency(sha256=file_hash(Path(file)), file=Path(file).name)
+    for section, key in STAGES.items():
+        plugin = plugin_of(config, section)
+        if plugin is not None:
+            content = file_hash(plugin.file) if plugin.file else ""
+            found[f"{section}.{key}"] = Dependency(plugin.version, content, plugin.name)
+    return found
+
+
+def differences(then: Provenance, now: Provenance) -> Iterator[str]:
+    """One sentence for whatever is not as it was."""
+    for before, after in ((then.dependencies, now.dependencies), (then.machine, now.machine)):
+        for name in dict.fromkeys([*before, *after]):
+            if before.get(name) != after.get(name):
+                yield f"{name} was {before.get(name, 'absent')}, is {after.get(name, 'absent')}"
+
+
+@lru_cache(maxsize=1)
+def versions() -> Mapping[str, str]:
+    """Version of each package that results depend on, by its name."""
+    found = {"bevviz": __version__, "python": platform.python_version()}
+    for name in PACKAGES:
+        with suppress(PackageNotFoundError):
+            found[name] = version(name)
+    return found
+
+
+# --- files -------------------------------------------------------------------------------------
+
+
+def model_path(config: Config) -> Path | None:
+    """The detector's file; None: there is no detector, or it is a topic or somebody's function."""
+    from bevviz.stages.detector import DEMO_MODEL
+
+    name = config.detector.model
+    if not name or name.startswith(TOPIC) or plugin_of(config, "detector") is not None:
+        return None
+    return DEMO_MODEL if name == "demo" else Path(name)
+
+
+def names_path(config: Config) -> Path | None:
+    """The file with the detector's class names; None: there is none, or they are known by a name."""
+    name = config.detector.names
+    return Path(name) if name and name not in CLASS_LISTS and config.detector.model else None
+
+
+def file_hash(path: Path) -> str:
+    """SHA-256 of a file's content, in hexadecimal. Read once, as long as the file stays as it is."""
+    stat = path.stat()
+    return _hash(path, stat.st_size, stat.st_mtime_ns)
+
+
+@lru_cache
+def _hash(path: Path, size: int, mtime: int) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+# --- the machine -------------------------------------------------------------------------------
+
+
+def machine(network: str = "") -> dict[str, str]:
+    """What results and times may depend on, by name. No name of a host or a user.
+
+    Args:
+        network: what the detector's network runs on; empty: there is none.
+    """
+    found = {
+        "processor": _processor(),
+        "cores": f"{os.cpu_count() or 0}",
+        "memory": _memory(),
+        "system": _system(),
+        "network": network,
+    }
+    return {name: value for name, value in found.items() if value}
+
+
+def _processor() -> str:
+    with suppress(OSError):
+        for line in Path("/proc/cpuinfo").read_text().splitlines():
+            if line.startswith("model name"):
+                return f"{line.partition(':')[2].strip()}, {platform.machine()}"
+    return platform.processor() or platform.machine()
+
+
+def _memory() -> str:
+    try:
+        size = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    except (ValueError, OSError):
+        return "unknown"
+    return f"{size / 2**30:.0f} GiB"
+
+
+def _system() -> str:
+    with suppress(OSError):
+        name = platform.freedesktop_os_release().get("PRETTY_NAME", "")
+        return f"{name}, {platform.system()} {platform.release()}"
+    return f"{platform.system()} {platform.release()}"

@@ -1,0 +1,123 @@
+"""Boxes that somebody else states: ground truth, and what the robot itself published."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import rerun as rr
+
+from bevviz.config import BevConfig
+from bevviz.model import geometry
+from bevviz.model.frame import F64, Frame, LabelledBoxes2D, LabelledBoxes3D, LateResult
+from bevviz.recording import entities
+from bevviz.recording.bev import footprints, seen_from_above
+from bevviz.recording.camera import over_image
+from bevviz.recording.primitives import OUTLINE, boxes2d, boxes3d, scored, transform
+from bevviz.recording.writer import Writer
+
+Color = tuple[int, int, int]
+Put = Callable[..., None]  # of a Writer: ``put`` or ``write``
+
+_TRUTH_COLOR = (215, 215, 215)
+_ROBOT_COLOR = (255, 210, 0)
+
+
+def log_truth_looks(to: Writer) -> None:
+    to.static(
+        entities.TRUTH,
+        rr.Boxes3D.from_fields(
+            colors=[_TRUTH_COLOR],
+            radii=rr.Radius.ui_points(0.5),
+            show_labels=False,
+            fill_mode=OUTLINE,
+        ),
+    )
+
+
+def log_truth(to: Writer, frame: Frame, config: BevConfig) -> None:
+    if frame.truth is not None and len(frame.truth.boxes):
+        _log_boxes(to.put, entities.TRUTH, frame.truth, None)
+        path = entities.overlay("ground_truth")
+        _log_outlines(to.put, path, frame.pose, frame.truth, config, _TRUTH_COLOR)
+
+
+def log_robot(to: Writer, frame: Frame, config: BevConfig) -> None:
+    """Under the names of its topics."""
+    for labelled in frame.robot_boxes:
+        if len(labelled.boxes):
+            _log_boxes(to.put, entities.robot(labelled.topic), labelled, _ROBOT_COLOR)
+            path = entities.robot_overlay(labelled.topic)
+            _log_outlines(to.put, path, frame.pose, labelled, config, _ROBOT_COLOR)
+    for found in frame.robot_detections:
+        if len(found.xyxy):
+            _log_image_boxes(to.put, found)
+
+
+def log_late(to: Writer, late: LateResult, config: BevConfig) -> None:
+    """What came too late for its frame, at its own stamp, until there is more or ``forget_late``."""
+    boxes = late.boxes
+    to.set_time(late.index, boxes.stamp, boxes.received)
+    if isinstance(boxes, LabelledBoxes2D):
+        _log_image_boxes(to.write, boxes)
+        return
+    _log_boxes(to.write, entities.robot(boxes.topic), boxes, _ROBOT_COLOR)
+    path = entities.robot_overlay(boxes.topic)
+    if not _log_outlines(to.write, path, late.pose, boxes, config, _ROBOT_COLOR):
+        to.write(path, rr.Clear(recursive=False))
+
+
+def forget_late(to: Writer, topic: str) -> None:
+    """Nothing of this topic came for a long time."""
+    for path in (entities.robot(topic), entities.robot_overlay(topic)):
+        to.write(path, rr.Clear(recursive=False))
+
+
+def _log_boxes(put: Put, path: str, labelled: LabelledBoxes3D, color: Color | None) -> None:
+    put(
+        path,
+        transform(_pose(labelled)),
+        boxes3d(
+            labelled.boxes,
+            np.arange(len(labelled.boxes)),
+            scored(labelled.labels, labelled.scores),
+            colors=None if color is None else [color],
+        ),
+    )
+
+
+def _log_image_boxes(put: Put, found: LabelledBoxes2D) -> None:
+    """Under /robot, but in the space of the camera's image, so that it can be shown over it."""
+    put(
+        entities.robot(found.topic),
+        *([over_image(found.camera)] if found.camera else []),
+        boxes2d(found.xyxy, scored(found.labels, found.scores), colors=[_ROBOT_COLOR], draw_order=25.0),
+    )
+
+
+def _log_outlines(
+    put: Put, path: str, pose: F64, labelled: LabelledBoxes3D, config: BevConfig, color: Color
+) -> bool:
+    """Boxes seen from above, over the bird's-eye image; only those whose centre is in it. False: none is."""
+    points_from_boxes = geometry.inverse(pose) @ _pose(labelled)
+    reach = np.array([config.range_x, config.range_y], np.float32)
+    inside = (np.abs(geometry.apply(points_from_boxes, labelled.boxes.center)[:, :2]) < reach).all(axis=1)
+    if not inside.any():
+        return False
+    outlines = footprints(geometry.corners(labelled.boxes)[inside])
+    put(
+        path,
+        rr.LineStrips2D(
+            seen_from_above(config, points_from_boxes, outlines),
+            colors=[color],
+            radii=rr.Radius.ui_points(0.75),
+            labels=[labelled.labels[k] for k in np.flatnonzero(inside)],
+            show_labels=False,
+            draw_order=10.0,
+        ),
+    )
+    return True
+
+
+def _pose(labelled: LabelledBoxes3D) -> F64:
+    return np.eye(4) if labelled.world_from_boxes is None else labelled.world_from_boxes

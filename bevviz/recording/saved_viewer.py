@@ -1,0 +1,65 @@
+"""A recording that is there, shown as it is: in a viewer on this machine, or in a browser."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from bevviz.recording import rerun_cli
+from bevviz.recording.ports import (
+    FIRST_DATA_PORT,
+    LOOPBACK,
+    check_port,
+    free_port,
+    viewer_address,
+)
+from bevviz.recording.sinks import MEMORY
+
+WEB = 2.3e9  # bytes that the web viewer can hold, of the 4 GiB that WebAssembly has
+
+
+def too_large_for_web(recording: Path, size: int) -> str:
+    """What to say of one that a browser cannot show whole; empty: it can. ``size`` in bytes."""
+    if size <= WEB:
+        return ""
+    return (
+        f"{recording.name} has {size / 1e9:.1f} GB, and a browser's viewer can hold {WEB / 1e9:.1f} GB: its "
+        f"beginning is missing; Rerun's own viewer reads what it shows from the file (rerun {recording}); "
+        "--keep inspect saves a fifth"
+    )
+
+
+def in_viewer(recording: Path) -> None:
+    """The viewer stays open when we have ended.
+
+    Raises:
+        UserError: it does not start.
+    """
+    port = free_port(FIRST_DATA_PORT)
+    arguments = [str(recording), "--bind", LOOPBACK, "--port", str(port), "--hide-welcome-screen"]
+    rerun_cli.start(arguments, LOOPBACK, port, lasting=True)
+
+
+@contextmanager
+def in_browser(recording: Path, port: int | None = None) -> Iterator[str]:
+    """The address of a page of this machine alone, which shows it as long as this is open.
+
+    Args:
+        recording: .rrd file.
+        port: of the page; None: 9090, or the next that is free.
+
+    Raises:
+        UserError: the port is in use, or it does not start.
+    """
+    if port is not None:
+        check_port(port, "--port")
+    page = port or free_port(9090)
+    data = free_port(FIRST_DATA_PORT, but=page)
+    arguments = [str(recording), "--serve-web", "--bind", LOOPBACK, "--web-viewer-port", str(page)]
+    arguments += ["--port", str(data), "--server-memory-limit", MEMORY]
+    process = rerun_cli.start(arguments, LOOPBACK, page)
+    try:
+        yield viewer_address("localhost", page, data)
+    finally:
+        rerun_cli.end(process)

@@ -1,0 +1,246 @@
+"""Where a recording goes: a file, a viewer on this machine, one elsewhere, a browser; several at once."""
+
+from __future__ import annotations
+
+import socket
+import sys
+from collections.abc import Iterator
+from contextlib import AbstractContextManager, ExitStack, contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from urllib.parse import urlsplit
+
+import rerun as rr
+import rerun.blueprint as rrb
+
+from bevviz.config import Config
+from bevviz.errors import UserError
+from bevviz.model.frame import Scene
+from bevviz.recording import blueprints, rerun_cli
+from bevviz.recording.file_writer import FileWriter
+from bevviz.recording.ports import (
+    FIRST_DATA_PORT,
+    LOOPBACK,
+    check_port,
+    free_port,
+    host_for,
+    origins,
+    own_address,
+    viewer_address,
+)
+from bevviz.recording.retention import is_whole
+from bevviz.recording.source_lookup import Origin
+from bevviz.support.files import Unfinished, written
+
+APPLICATION = "bevviz"
+TICK = 2.0  # seconds that a frame may wait for others to go into a file with
+CHUNK = 1 << 24  # bytes that may wait
+MEMORY = "25%"  # of the machine's, for what a server keeps for those who join late, and for the viewer
+
+
+@dataclass(frozen=True, slots=True)
+class Sinks:
+    """An open recording.
+
+    Attributes:
+        urls: what to open in a browser or viewer, one for each server.
+        warnings: one sentence each.
+        file: where the recording is until it is whole; None: in no file.
+    """
+
+    recording: rr.RecordingStream
+    urls: list[str] = field(default_factory=list)
+    warnings: list[str] = field(default_factory=list)
+    file: Path | None = None
+    writer: FileWriter | None = None
+
+    @property
+    def recording_id(self) -> str:
+        found = rr.get_recording_id(self.recording)
+        assert found is not None
+        return str(found)
+
+    def check(self) -> None:
+        """Raises UserError where the file cannot be written any more."""
+        if self.writer is not None:
+            self.writer.check()
+
+
+@contextmanager
+def open_recording(
+    scene: Scene,
+    config: Config,
+    *,
+    save: Path | None = None,
+    serve: int | None = None,
+    bind: str = LOOPBACK,
+    connect: str | None = None,
+    spawn: bool = False,
+    blueprint: str | rrb.Blueprint = "debug",
+    recording_id: str | None = None,
+    place: Path | None = None,
+    origin: Origin | None = None,
+) -> Iterator[Sinks]:
+    """Open a recording that goes to everything that is asked for, with the blueprint.
+
+    A file is written while the recording goes on, beside its place (see ``bevviz.support.files``): what was
+    logged before an interruption is in it.
+
+    Args:
+        scene: names of the sensors, for the blueprint.
+        config: the configuration.
+        save: .rrd file; overwritten in the end.
+        serve: port of the web viewer on this machine.
+        bind: its address at which ``serve`` listens, for the page and for the data.
+        connect: URL of a viewer that listens, rerun+http://host:9876/proxy.
+        spawn: open the viewer on this machine.
+        blueprint: name of a layout, a .py or .rbl file, or a layout.
+        recording_id: viewers and catalogs take two recordings with the same one for the same; None: a
+            random one, the same for all recordings of a process.
+        place: where ``save`` is going to lie, if elsewhere.
+        origin: what it says of what it was made from; None: everything.
+
+    Raises:
+        UserError: unknown blueprint, file that cannot be written or that another
+            process writes, port in use, no viewer found or reached;
+            on leaving, when not everything could be written.
+    """
+    layout = blueprints.load(blueprint, scene, config) if isinstance(blueprint, str) else blueprint
+    sinks: list[rr.FileSink | rr.GrpcSink | rr.GrpcServerSink] = []
+    urls: list[str] = []
+    warnings: list[str] = []
+    file: Path | None = None
+    writer: FileWriter | None = None
+    with ExitStack() as stack:
+        if save is not None:
+            given = stack.enter_context(_file(save))
+            file = given.path
+            writer = stack.enter_context(FileWriter(file))
+            sinks.append(writer.sink)
+            warnings += given.warnings
+        if connect is not None:
+            sinks.append(_connection(connect))
+        if spawn:
+            sinks.append(_viewer())
+        if serve is not None:
+            server, address = stack.enter_context(_served(serve, bind))
+            sinks.append(server)
+            urls.append(address)
+        watched = connect is not None or spawn or serve is not None
+        recording = _stream(recording_id, batcher=None if watched else batches(config))
+        # The writer waits until Rerun closes the sink: an interrupt at any moment from here on must close it.
+        stack.callback(recording.disconnect)
+        try:
+            recording.set_sinks(*sinks, default_blueprint=layout)
+        except (RuntimeError, ValueError) as error:
+            raise UserError(f"cannot open the outputs: {error}") from None
+        if writer is not None:
+            writer.begin()
+        if origin is None:
+            origin = Origin.of(scene, config, place or save)
+        if origin is not None:
+            origin.log(recording)
+        try:
+            yield Sinks(recording, urls, warnings, file, writer)
+        finally:
+            _close(recording)
+            if writer is not None:
+                writer.close()
+        if writer is not None:
+            writer.check()
+
+
+def _stream(
+    recording_id: str | None, *, properties: bool = True, batcher: rr.ChunkBatcherConfig | None = None
+) -> rr.RecordingStream:
+    recording = rr.RecordingStream(
+        APPLICATION, recording_id=recording_id, send_properties=properties, batcher_config=batcher
+    )
+    recording.set_log_time_enabled(False)  # frames have their own clocks
+    return recording
+
+
+def batches(config: Config) -> rr.ChunkBatcherConfig | None:
+    """How many rows a file's chunks have: of small frames more, which packs better. None: as Rerun does."""
+    if is_whole(config):
+        return None
+    found = rr.ChunkBatcherConfig()
+    found.flush_tick, found.flush_num_bytes = TICK, CHUNK
+    return found
+
+
+def _close(recording: rr.RecordingStream) -> None:
+    """Hand over what is still on its way. An error that is already on its way out goes first."""
+    pending = sys.exc_info()[0] is not None
+    try:
+        recording.flush()
+    except (RuntimeError, ValueError) as error:
+        if not pending:
+            raise UserError(f"the end of the recording was lost: {error}") from None
+    finally:
+        recording.disconnect()
+
+
+def _file(path: Path) -> AbstractContextManager[Unfinished]:
+    for name in (path, path.resolve()):  # a slip must not overwrite the bag itself, also not through a link
+        if name.suffix != ".rrd":
+            link = f" (it is a link to {name})" if name != path else ""
+            raise UserError(f"--save {path}: expected a file name that ends in .rrd{link}")
+    return written(path, "recording")
+
+
+def _connection(url: str) -> rr.GrpcSink:
+    """A viewer elsewhere. Rerun would only complain when the recording ends: try the port first."""
+    check_viewer(url)
+    return rr.GrpcSink(url)
+
+
+def check_viewer(url: str) -> tuple[str, int]:
+    """Host and port of a viewer that answers.
+
+    Raises:
+        UserError: the URL is none of a viewer, or nobody answers.
+    """
+    parts = urlsplit(url)
+    scheme = parts.scheme in ("rerun", "rerun+http", "rerun+https")
+    try:
+        host, port = parts.hostname, parts.port
+    except ValueError:
+        host, port = None, None
+    if not scheme or not host or parts.path != "/proxy":
+        raise UserError(f"--connect {url}: expected a URL such as rerun+http://192.168.0.2:9876/proxy")
+    port = port or (80 if parts.scheme == "rerun+http" else 443)
+    try:
+        socket.create_connection((host, port), timeout=5).close()
+    except OSError as error:
+        why = error.strerror or str(error)
+        raise UserError(f"--connect {url}: no viewer answers there ({why}); start one with 'rerun'") from None
+    return host, port
+
+
+def _viewer() -> rr.GrpcSink:
+    """The viewer on this machine, for this machine. (The SDK's own way opens it to everybody.)"""
+    port = free_port(FIRST_DATA_PORT)
+    arguments = ["--bind", LOOPBACK, "--port", str(port), "--memory-limit", "50%"]
+    arguments += ["--server-memory-limit", MEMORY, "--expect-data-soon", "--hide-welcome-screen"]
+    try:
+        rerun_cli.start(arguments, LOOPBACK, port, lasting=True)
+    except UserError as error:
+        raise UserError(f"cannot start the viewer: {error}; --save or --serve need none") from None
+    return rr.GrpcSink(f"rerun+http://{LOOPBACK}:{port}/proxy")
+
+
+@contextmanager
+def _served(port: int, bind: str) -> Iterator[tuple[rr.GrpcServerSink, str]]:
+    """The web viewer at ``port`` of an address and beside it the server that it takes the data from."""
+    address = own_address(bind)
+    check_port(port)
+    data_port, host = free_port(FIRST_DATA_PORT, but=port), host_for(address)
+    server = rr.GrpcServerSink(
+        address, data_port, server_memory_limit=MEMORY, cors_allow_origin=origins(address, port)
+    )
+    page = rerun_cli.page(address, port, f"rerun+http://{host}:{data_port}/proxy")
+    try:
+        yield server, viewer_address(host, port, data_port)
+    finally:
+        rerun_cli.end(page)

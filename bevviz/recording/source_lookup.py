@@ -1,0 +1,375 @@
+"""From a recording (.rrd) back to the bag that it was made from, and to how it was made."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from itertools import islice
+from pathlib import Path
+from typing import Any, Self
+
+import rerun as rr
+
+from bevviz.config import (
+    Config,
+    Layer,
+    Preset,
+    flat_yaml,
+    load,
+    object_files,
+    received,
+    values,
+)
+from bevviz.config.pillars import is_network
+from bevviz.errors import UserError, first_line
+from bevviz.model.frame import Scene
+from bevviz.recording import entities
+from bevviz.recording.decoding import check_decodes
+from bevviz.recording.provenance import model_path, names_path
+from bevviz.support.files import bag_files, open_regular, sampled_files
+from bevviz.support.text import path_text
+
+FRAMES = ("source.", "sync.")  # sections that say what a frame is made of
+OBJECTS = ("objects.method", "objects.params.encoder")  # files of a 3D detector
+BLOCK = 1 << 16  # bytes at the beginning, in the middle and at the end of a file that are looked at
+AFTER = 500  # chunks in which one property follows another
+MAGIC = b"RRF"  # and a digit, for the generation of the format
+HEAD = 1 << 24  # bytes: what of a recording is read to find what it was made with, and more
+
+
+class NoBagError(UserError):
+    """A recording without a bag behind it: another program's, of the synthetic drive, a comparison."""
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """A bag, or another file, as it was: found by where it was, known again by its content.
+
+    Attributes:
+        name: without the folder.
+        size: bytes; of a folder those of the bag's files in it.
+        fingerprint: of ``fingerprint``.
+        beside: path from the recording's folder; empty: the recording was no file.
+        path: absolute; empty: it is not told.
+    """
+
+    name: str
+    size: int
+    fingerprint: str
+    beside: str = ""
+    path: str = ""
+
+    @classmethod
+    def of(cls, path: Path, recording: Path | None, *, folders: bool) -> Self:
+        """That of a file or a bag's folder.
+
+        Args:
+            path: which.
+            recording: that names it; None: it is no file.
+            folders: whether folders of this machine may be told.
+        """
+        size, mark = fingerprint(path)
+        where = Path(os.path.normpath(path.absolute()))  # a link's own name
+        beside = ""
+        if recording is not None:
+            beside = os.path.relpath(where, recording.absolute().parent) if folders else where.name
+        return cls(path_text(where.name), size, mark, path_text(beside), path_text(where) if folders else "")
+
+    def candidates(self, recording: Path) -> list[Path]:
+        """Where it may be, the likeliest first."""
+        folder = recording.absolute().parent
+        found = [folder / (self.beside or self.name), folder / self.name]
+        found += [Path(self.path)] if self.path else []
+        return list(dict.fromkeys(Path(os.path.normpath(path)) for path in found))
+
+    def is_same(self, path: Path) -> bool:
+        """Whether that is what it was."""
+        try:
+            return fingerprint(path) == (self.size, self.fingerprint)
+        except OSError:
+            return False
+
+    def found(self, recording: Path) -> tuple[Path | None, str]:
+        """Where it is now, and in words where it was looked for."""
+        tried = self.candidates(recording)
+        for path in tried:
+            if self.is_same(path):
+                return path, ""
+        others = [path for path in tried if path.exists()]
+        absent = [str(path) for path in tried if path not in others]
+        said = [f"what is at {path} is another one (size or content)" for path in others]
+        said += [f"there is none at {' or '.join(absent)}"] if absent else []
+        return None, "; ".join(said)
+
+
+def fingerprint(path: Path) -> tuple[int, str]:
+    """Size and a quick SHA-256 (hexadecimal) of a file, or of the bag's files in a folder.
+
+    Of each file its size and the beginning, the middle and the end count: enough to tell two recordings
+    apart, and done at once for 100 GB. Of a data set some files of each folder do, and how many there are.
+
+    Raises:
+        OSError: it is not there, or cannot be read.
+    """
+    total, mark = 0, hashlib.sha256()
+    files = bag_files(path) if path.is_dir() else [path]
+    if not files:
+        count, files = sampled_files(path)
+        mark.update(count.to_bytes(8, "little"))
+    for file in files:
+        with open_regular(file) as content:
+            size = os.fstat(content.fileno()).st_size
+            mark.update(size.to_bytes(8, "little"))
+            for start in sorted({0, max(size // 2 - BLOCK // 2, 0), max(size - BLOCK, 0)}):
+                content.seek(start)
+                mark.update(content.read(BLOCK) or b"")  # None: a file of the system that would wait
+        total += size
+    return total, mark.hexdigest()
+
+
+@dataclass(frozen=True, slots=True)
+class Origin:
+    """What a recording holds of what it was made from.
+
+    Attributes:
+        bag: files and folders, several being one drive.
+        files: what the configuration names, by the key that names it.
+        topics: ``key=value`` each, which give the same topics the same roles.
+        redacted: the images of the bag are not those that the network saw.
+    """
+
+    bag: Sequence[Place]
+    files: Mapping[str, Place] = field(default_factory=dict)
+    topics: Sequence[str] = ()
+    redacted: bool = False
+
+    @classmethod
+    def of(
+        cls,
+        scene: Scene,
+        config: Config,
+        recording: Path | None,
+        *,
+        folders: bool = True,
+        redacted: bool = False,
+    ) -> Self | None:
+        """That of a recording that is to be made; None: it is not made from a bag, or this is gone.
+
+        Args:
+            scene: of the source.
+            config: of the run.
+            recording: the file that it will be; None: none.
+            folders: whether folders of this machine may be told.
+            redacted: see the attribute.
+        """
+        named = {"detector.model": model_path(config), "detector.names": names_path(config)}
+        if config.detector.model == "demo":
+            named = {}
+        named |= {key: Path(file) for key, file in object_files(config).items()}
+        try:
+            bag = [Place.of(path, recording, folders=folders) for path in scene.bag]
+            files = {
+                key: Place.of(path, recording, folders=folders)
+                for key, path in named.items()
+                if path is not None
+            }
+        except OSError:
+            return None
+        return cls(bag, files, scene.topics, redacted) if bag else None
+
+    def log(self, recording: rr.RecordingStream) -> None:
+        """As the recording's property."""
+        recording.send_property(entities.BAG, rr.AnyValues(about=json.dumps(asdict(self))))
+
+    @classmethod
+    def load(cls, text: str) -> Self:
+        """Raises ValueError, TypeError or KeyError where it is not what ``log`` has written."""
+        tree = json.loads(text)
+        return cls(
+            [Place(**place) for place in tree["bag"]],
+            {str(key): Place(**place) for key, place in tree["files"].items()},
+            [str(setting) for setting in tree["topics"]],
+            bool(tree["redacted"]),
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Recorded:
+    """A recording that stands for its bag.
+
+    Attributes:
+        recording: the file.
+        paths: of the bag.
+        settings: ``key=value`` each: topics as they were, and where the files lie that it was made with.
+        warnings: one sentence each.
+    """
+
+    recording: Path
+    paths: tuple[Path, ...]
+    settings: tuple[str, ...]
+    warnings: tuple[str, ...]
+    yaml: str  # the configuration, as ``dump`` wrote it
+
+    def load(
+        self,
+        file: Path | Sequence[Path] | None = None,
+        settings: Sequence[str] = (),
+        preset: Preset | None = None,
+    ) -> Config:
+        """The recording's configuration with other values.
+
+        A file or a preset takes its place; what frames are made of, and the detector, are then the
+        recording's where these have nothing but the preset's own; the objects' method is not, as nothing is
+        without its parameters.
+
+        Functions that it names run where ``settings``, or a trusted file, name them as well.
+
+        Raises:
+            UserError: as ``bevviz.config.load``.
+        """
+        if file or preset is not None:
+            stated = load(file, settings, preset)
+            return load(file, [self.missing(stated), *settings], preset)
+        base = Layer(str(self.recording), flat_yaml(self.yaml, str(self.recording)))
+        return load(settings=[*self._received(), *settings], base=base)
+
+    def missing(self, config: Config) -> Layer:
+        """Values that a configuration leaves open: what frames are made of, and the detector."""
+        stated, own = values(config), values(load(preset=config.preset))
+        there = flat_yaml(self.yaml, str(self.recording))
+        recorded = {key: value for key, value in there.items() if key.startswith(FRAMES)}
+        if there.get("detector.model"):
+            recorded["detector.model"] = there["detector.model"]
+        for layer in self._received():
+            recorded |= layer.values
+        stays = [key for key in recorded if key in own and key not in OBJECTS and stated[key] == own[key]]
+        return Layer(str(self.recording), {key: recorded[key] for key in stays})
+
+    def _received(self) -> list[Layer]:
+        return received(self.settings, str(self.recording))
+
+
+def follow(recording: Path, bag: Sequence[Path] = (), settings: Sequence[str] = ()) -> Recorded:
+    """The bag that a recording was made from, and how.
+
+    Args:
+        recording: .rrd file.
+        bag: where the bag is, where it is neither beside the recording nor where it was.
+        settings: that are going to be given, in which the detector's file may be named.
+
+    Raises:
+        NoBagError: it has none, or does not say which.
+        UserError: no recording; the bag, or the detector's file, is not found, or is another one.
+    """
+    how, origin = read(recording)
+    warnings: list[str] = []
+    if origin is None and not bag:
+        beside = recording.with_suffix(".mcap")  # as 'bevviz live' saves both
+        if not beside.is_file():
+            raise NoBagError(
+                f"{recording}: it does not say which bag it was made from, and {beside.name} is not beside "
+                "it: give --bag PATH"
+            )
+        bag = [beside]
+    given = flat_yaml(how, str(recording))
+    if bag:
+        paths = list(bag)
+        marks = {(p.size, p.fingerprint) for p in origin.bag} if origin is not None else set()
+        if origin is not None and {_mark(path) for path in bag} != marks:
+            names = ", ".join(place.name for place in origin.bag)
+            warnings.append(f"--bag is not what {recording.name} was made from, {names} (size or content)")
+    else:
+        assert origin is not None
+        paths = [_found(place, recording) for place in origin.bag]
+    if origin is not None and origin.redacted:
+        warnings.append(
+            f"the images in {paths[0].name} are redacted: what the detector finds in them is not what "
+            f"{recording.name} holds"
+        )
+    chosen, files = list(origin.topics) if origin is not None else [], list[str]()
+    own = {key: value for key, _, value in (setting.partition("=") for setting in settings)}
+    named_otherwise = not is_network(own.get("objects.method", ".onnx"))
+    for key, place in origin.files.items() if origin is not None else ():
+        if key in own or (key in OBJECTS and named_otherwise):
+            continue
+        path, where = place.found(recording)
+        if path is None:
+            option = "--model FILE" if key == "detector.model" else f"--set {key}=FILE"
+            raise UserError(f"{recording}: it was made with {key} {place.name}; {where}: give {option}")
+        files.append(f"{key}={json.dumps(str(path))}")
+    stated = [*(one for one in chosen if not given.get(one.partition("=")[0])), *files]
+    return Recorded(recording, tuple(paths), tuple(stated), tuple(warnings), how)
+
+
+def _found(place: Place, recording: Path) -> Path:
+    path, where = place.found(recording)
+    if path is None:
+        raise UserError(
+            f"{recording}: it was made from the bag {place.name}; {where}: move it beside the recording, or "
+            "give --bag PATH"
+        )
+    return path
+
+
+def _mark(path: Path) -> tuple[int, str]:
+    try:
+        return fingerprint(path)
+    except OSError as error:
+        raise UserError(f"--bag {path}: cannot be read: {error.strerror}") from None
+
+
+def read(recording: Path) -> tuple[str, Origin | None]:
+    """The configuration (YAML) in a recording, and what it was made from; None: it does not say.
+
+    Raises:
+        UserError: no recording, or none of bevviz.
+    """
+    if not recording.is_file():
+        raise UserError(f"{recording}: no such file")
+    with recording.open("rb") as file:
+        if file.read(len(MAGIC)) != MAGIC:
+            raise UserError(f"{recording}: no recording: it does not begin as one of Rerun's")
+    check_decodes(recording, first=HEAD)
+    how: str | None = None
+    origin: Origin | None = None
+    try:
+        for path, chunk in _properties(recording):
+            # A property may be in several chunks, with some of its fields each.
+            if path == entities.PROPERTY and (found := _column(chunk, "config")):
+                how = str(found[-1][0])
+            elif path == entities.BAG and (found := _column(chunk, "about")):
+                origin = Origin.load(found[-1][0])
+            if how is not None and origin is not None:
+                break
+    except (OSError, ValueError, KeyError, TypeError, RuntimeError) as error:
+        raise UserError(f"{recording}: cannot be read as a recording: {first_line(error)}") from None
+    if how is None:
+        raise NoBagError(f"{recording}: no recording of bevviz: it does not say how it was made")
+    return how, origin
+
+
+def _properties(recording: Path) -> Iterator[tuple[str, Any]]:
+    """Name and chunk of each, which are near the beginning: of a long recording little is read."""
+    from rerun.chunk import RrdReader
+
+    chunks = iter(RrdReader(recording).stream())
+    for chunk in chunks:
+        head, _, name = chunk.entity_path.rpartition("/")
+        if head != "/__properties":
+            continue
+        yield name, chunk
+        if name == entities.PROPERTY:
+            break
+    for chunk in islice(chunks, AFTER):
+        head, _, name = chunk.entity_path.rpartition("/")
+        if head == "/__properties":
+            yield name, chunk
+
+
+def _column(chunk: Any, name: str) -> list[Any]:
+    """Its values; none where the chunk has no such column."""
+    batch = chunk.to_record_batch()
+    return list(batch.column(name).to_pylist()) if name in batch.schema.names else []

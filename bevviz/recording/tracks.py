@@ -1,0 +1,147 @@
+"""What tracks look like in Rerun: boxes, trails, and a fixed number of lanes for their states and speeds."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+
+import numpy as np
+import rerun as rr
+
+from bevviz import anomalies
+from bevviz.config import BevConfig
+from bevviz.model import geometry
+from bevviz.model.frame import F32, I64, Frame
+from bevviz.model.results import Tracks
+from bevviz.recording import entities
+from bevviz.recording.annotations import class_annotations
+from bevviz.recording.bev import footprints, seen_from_above
+from bevviz.recording.entities import TRACK_COLORS, ClassId
+from bevviz.recording.labels import named_from_above
+from bevviz.recording.primitives import OUTLINE, boxes3d, strips
+from bevviz.recording.writer import Writer
+
+LANES = 12  # tracks with a state lane and a speed of their own: entities that come and go are never freed
+
+
+def log_tracks_looks(to: Writer) -> None:
+    looks = rr.Boxes3D.from_fields(radii=rr.Radius.ui_points(0.75), show_labels=False, fill_mode=OUTLINE)
+    for path in (entities.TRACKS, entities.UNSEEN):
+        to.static(path, looks)
+    to.static(entities.TRAILS, rr.LineStrips3D.from_fields(radii=rr.Radius.ui_points(1.5)))
+    to.static(entities.TRACK_SPEEDS, rr.SeriesLines(names=[f"{n:02}" for n in range(LANES)]))
+    for name, radius in (("tracks", 1.0), ("trails", 1.5)):
+        to.static(
+            entities.overlay(name),
+            class_annotations(),
+            rr.LineStrips2D.from_fields(radii=rr.Radius.ui_points(radius), draw_order=20.0),
+        )
+
+
+def log_tracks(to: Writer, frame: Frame, tracks: Tracks, config: BevConfig) -> None:
+    """In the fixed frame, and seen from above over the bird's-eye image."""
+    rows = shown(tracks)
+    named = tracks.object[rows] >= 0
+    for path, chosen, text in (
+        (entities.TRACKS, rows[named], label),
+        (entities.UNSEEN, rows[~named], unseen),
+    ):
+        if len(chosen):
+            labels = [text(tracks, row) for row in chosen.tolist()]
+            to.put(path, boxes3d(tracks.boxes, chosen, labels, class_ids=class_ids(tracks.id[chosen])))
+    if len(rows) == 0:
+        return
+    colors, points_from_world = class_ids(tracks.id[rows]), geometry.inverse(frame.pose)
+    trail, lengths = trails(tracks, rows)
+    to.put(entities.TRAILS, rr.LineStrips3D(strips(trail, lengths), class_ids=colors))
+    seen = seen_from_above(config, points_from_world, trail)
+    to.put(entities.overlay("trails"), rr.LineStrips2D(strips(seen, lengths), class_ids=colors))
+    outlines = footprints(geometry.corners(tracks.boxes)[rows])
+    is_named = named_from_above(geometry.apply(points_from_world, tracks.boxes.center[rows]))
+    to.put(
+        entities.overlay("tracks"),
+        rr.LineStrips2D(
+            seen_from_above(config, points_from_world, outlines),
+            class_ids=colors,
+            labels=[label(tracks, row) if shown else "" for row, shown in zip(rows, is_named, strict=True)],
+            show_labels=True,
+        ),
+    )
+
+
+def log_speeds(to: Writer, tracks: Tracks, rows: Mapping[int, int]) -> None:
+    """``rows``: lane -> row of its track."""
+    speeds = np.full(LANES, np.nan)
+    speeds[list(rows)] = tracks.speed[list(rows.values())]
+    to.write(entities.TRACK_SPEEDS, rr.Scalars(speeds))
+
+
+class Lanes:
+    """Gives each track that is shown one of ``LANES`` numbers, which it keeps until it ends."""
+
+    def __init__(self) -> None:
+        self._lane_of: dict[int, int] = {}  # id -> lane
+
+    def update(self, tracks: Tracks | None) -> Mapping[int, int]:
+        """Lane -> row of its track. Where there are more tracks than lanes, the latest have none."""
+        row_of = {} if tracks is None else {int(tracks.id[row]): row for row in shown(tracks).tolist()}
+        self._lane_of = {number: lane for number, lane in self._lane_of.items() if number in row_of}
+        free = self._free()
+        for number in row_of:
+            if number not in self._lane_of and (lane := next(free, None)) is not None:
+                self._lane_of[number] = lane
+        return {lane: row_of[number] for number, lane in self._lane_of.items()}
+
+    def _free(self) -> Iterator[int]:
+        taken = set(self._lane_of.values())
+        return (lane for lane in range(LANES) if lane not in taken)
+
+
+# --- words and colours -------------------------------------------------------------------------
+
+
+def shown(tracks: Tracks | None) -> I64:
+    """Rows of what is drawn."""
+    return np.zeros(0, np.int64) if tracks is None else np.flatnonzero(tracks.confirmed)
+
+
+def label(tracks: Tracks, row: int) -> str:
+    """``person #12 1.4 m/s``."""
+    return f"{anomalies.label(tracks, row)} {tracks.speed[row]:.1f} m/s"
+
+
+def unseen(tracks: Tracks, row: int) -> str:
+    """Why a track that is shown has no object in this frame."""
+    if tracks.cluster[row] >= 0:
+        return f"{anomalies.label(tracks, row)}, not named"
+    return f"{anomalies.label(tracks, row)}, unseen for {tracks.coasting[row]:.1f} s"
+
+
+def class_ids(ids: I64) -> np.ndarray[tuple[int], np.dtype[np.uint16]]:
+    """The colours of these tracks, as class ids."""
+    return (ClassId.TRACK + ids % TRACK_COLORS).astype(np.uint16)
+
+
+def of_clusters(tracks: Tracks | None, count: int) -> I64:
+    """(count,) id of each cluster's track; without tracks, or without its own, the cluster's row."""
+    ids = np.arange(count)
+    if tracks is not None:
+        seen = tracks.cluster >= 0
+        ids[tracks.cluster[seen]] = tracks.id[seen]
+    return ids
+
+
+def of_objects(tracks: Tracks | None, count: int) -> list[int | None]:
+    """Row of the track of each object, None where it has none that is shown."""
+    rows: list[int | None] = [None] * count
+    if tracks is not None:
+        for row in shown(tracks).tolist():
+            if (j := int(tracks.object[row])) >= 0:
+                rows[j] = row
+    return rows
+
+
+def trails(tracks: Tracks, rows: I64) -> tuple[F32, I64]:
+    """Where each was, oldest first: (N, 3) points of one after the other, and how many each has."""
+    found = tracks.trail[rows]
+    known = np.isfinite(found[:, :, 0])
+    return found[known], known.sum(axis=1)

@@ -1,0 +1,90 @@
+"""Images of a camera as a stream of H.264."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+
+import av
+import numpy as np
+from av.video.frame import PictureType
+from av.video.reformatter import ColorRange, Colorspace
+
+from bevviz.model.frame import U8
+
+GOP = 1_000_000_000  # nanoseconds from one key frame to the next, at most
+QUALITY = "20"  # x264's constant rate factor: hardly told from the image
+BT709 = 1  # of H.264's tables of matrices, primaries and transfer functions
+
+
+@dataclass(frozen=True, slots=True)
+class Sample:
+    """One encoded image, in Annex B; a key frame needs none before it."""
+
+    data: bytes
+    key: bool
+
+
+class VideoEncoder:
+    """Encodes images as they come: each is complete at once, without B-frames.
+
+    Rows and columns are even in H.264: of an odd one the last is there twice.
+    """
+
+    def __init__(self) -> None:
+        self._context: av.VideoCodecContext | None = None
+        self._size: tuple[int, int] = (0, 0)
+        self._key = 0  # stamp of the last key frame
+        self._count = 0
+        self._again = True
+
+    def restart(self) -> None:
+        """The next image needs none before it."""
+        self._again = True
+
+    def __call__(self, bgr: U8, stamp: int) -> Sample:
+        """The next image, (H, W, 3), and its stamp in nanoseconds."""
+        if self._context is None or bgr.shape[:2] != self._size:
+            self._size, self._count = (bgr.shape[0], bgr.shape[1]), 0
+            self._context, self._again = _opened(bgr), True
+        key = self._again or not 0 <= stamp - self._key < GOP
+        if key:
+            self._key, self._again = stamp, False
+        frame = av.VideoFrame.from_ndarray(_even(bgr), format="bgr24").reformat(
+            format="yuv420p", dst_colorspace=Colorspace.ITU709, dst_color_range=ColorRange.MPEG
+        )
+        frame.pts = self._count
+        frame.pict_type = PictureType.I if key else PictureType.NONE
+        self._count += 1
+        return Sample(b"".join(bytes(packet) for packet in self._context.encode(frame)), key)
+
+
+def decode(samples: Sequence[bytes]) -> list[U8]:
+    """(H, W, 3) BGR images of samples of which the first is a key frame."""
+    context = av.CodecContext.create("h264", "r")
+    assert isinstance(context, av.VideoCodecContext)
+    packets = [av.Packet(sample) for sample in samples]
+    frames = [frame for packet in [*packets, None] for frame in context.decode(packet)]
+    return [np.asarray(frame.to_ndarray(format="bgr24"), np.uint8) for frame in frames]
+
+
+def _opened(bgr: U8) -> av.VideoCodecContext:
+    height, width = (side + side % 2 for side in bgr.shape[:2])
+    context = av.CodecContext.create("libx264", "w")
+    assert isinstance(context, av.VideoCodecContext)
+    context.width, context.height, context.pix_fmt = width, height, "yuv420p"
+    context.time_base = Fraction(1, 10)
+    context.gop_size, context.max_b_frames = 1 << 16, 0  # key frames are asked for by time
+    context.thread_count = 1  # the cores have other work
+    context.colorspace = context.color_primaries = context.color_trc = BT709
+    context.color_range = ColorRange.MPEG
+    context.options = {"preset": "superfast", "tune": "zerolatency", "crf": QUALITY, "forced-idr": "1"}
+    return context
+
+
+def _even(bgr: U8) -> U8:
+    height, width = bgr.shape[:2]
+    if height % 2 or width % 2:
+        return np.pad(bgr, ((0, height % 2), (0, width % 2), (0, 0)), "edge")
+    return np.ascontiguousarray(bgr)

@@ -1,0 +1,274 @@
+"""The views that the layouts in ``blueprints/`` are put together from; for a layout of your own, too."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import rerun.blueprint as rrb
+
+from bevviz.config.sections import Quantity
+from bevviz.model.counts import OPINIONS
+from bevviz.model.frame import Scene
+from bevviz.recording import color_by, entities
+from bevviz.recording.health import COUNTS
+from bevviz.recording.labels import EYE, LOOK
+
+_DARK = (13, 14, 18)
+HIDDEN = rrb.EntityBehavior(visible=False)
+LINKED = rrb.archetypes.TimeAxis(link=rrb.components.LinkAxis.LinkToGlobal)
+
+
+def space(
+    scene: Scene,
+    *,
+    raw: bool = True,
+    frustums: bool = True,
+    why: bool = False,
+    names: bool = True,
+    name: str = "3D",
+    root: str = "",
+    beside: Sequence[str] = (f"{entities.ROBOT}/**",),
+    by: Quantity | None = None,
+) -> rrb.Spatial3DView:
+    """Points, boxes, frusta and poses around the robot, seen from behind and above it.
+
+    The origin is the LiDAR: the robot stays where it is and the world moves, whichever way it drives. The
+    occupancy on the ground and tracks without an object in the frame are there to be switched on.
+
+    Args:
+        scene: names of the sensors.
+        raw: with every raw point, coloured as ground or obstacle.
+        frustums: with what each detection sees.
+        why: with the chain of what ``bevviz why`` explains.
+        names: of what was found and is near.
+        name: of the view.
+        root: entity that the run is logged under.
+        beside: what else is shown.
+        by: what the raw points are coloured by, where they are; None: ground or obstacle.
+    """
+    hidden = [entities.set_aside(scene.lidar)]
+    # The coloured points of the clusters and the raw cloud already show what is obstacle.
+    hidden += [entities.ground(scene.lidar)] if scene.raw or why else []
+    hidden += [entities.obstacles(scene.lidar)] if raw and scene.raw else []
+    clouds = [entities.points(lidar) for lidar in scene.lidars or (scene.lidar,)]
+    hidden += [] if raw else clouds
+    hidden += [entities.GRID, entities.UNSEEN]
+    hidden += [] if frustums else [entities.FRUSTUMS]
+    # The points of what is explained stand out by their colours, which tell another story than the clusters'.
+    hidden += [entities.clusters(scene.lidar), entities.FRUSTUMS] if why else []
+    hidden += [entities.clusters(scene.lidar), entities.FRUSTUMS] if by is not None else []
+    own = entities.names(entities.FUSED), entities.names(entities.FUSION)
+    hidden += [*own] if why or not names else []
+    overrides: dict[Any, Any] = dict.fromkeys((root + path for path in hidden), HIDDEN)
+    if by is not None:
+        overrides |= {root + path: color_by.visualizer(by) for path in clouds}
+    position, target = EYE, LOOK
+    if why and scene.focus is not None:
+        position, target = _beside(scene.focus), scene.focus
+    return rrb.Spatial3DView(
+        name=name if scene.raw else f"{name}, voxels (raw clouds now and then, or none)",
+        origin=root + entities.sensor(scene.lidar),
+        contents=[f"{root}{entities.WORLD}/**", *beside, *([f"{entities.WHY}/**"] if why else [])],
+        background=_DARK,
+        line_grid=False,
+        # Said, as the viewer takes the fixed frame instead where contents lie outside of the origin's tree.
+        spatial_information=rrb.SpatialInformation(
+            target_frame=entities.space(root + entities.sensor(scene.lidar))
+        ),
+        eye_controls=rrb.EyeControls3D(
+            kind=rrb.Eye3DKind.Orbital,
+            position=position,
+            look_target=target,
+            eye_up=(0.0, 0.0, 1.0),
+        ),
+        overrides=overrides,
+    )
+
+
+def spaces(scene: Scene, **looks: Any) -> rrb.Container | rrb.View:
+    """``space``, with a further tab for each quantity that the raw points can be coloured by."""
+    first = space(scene, **looks)
+    if not scene.color_by:
+        return first
+    tabs = [space(scene, **looks | {"raw": True, "name": by.capitalize(), "by": by}) for by in scene.color_by]
+    return rrb.Tabs(first, *tabs, name="3D")
+
+
+def _beside(place: tuple[float, float, float]) -> tuple[float, float, float]:
+    """Where to look at it from: the robot's side, a few metres before it, to the left and above."""
+    x, y, z = place
+    away = max(math.hypot(x, y), 1e-6)
+    back = min(away, 6.0)
+    return x - back * x / away - 2.0 * y / away, y - back * y / away + 2.0 * x / away, z + 2.5
+
+
+def camera(scene: Scene, name: str, *, why: bool = False, weak: bool = False) -> rrb.Spatial2DView:
+    """The image with detections and the projected points; what the robot itself detected there, too.
+
+    ``why``: with the weak detections and what ``bevviz why`` explains instead of the points and names;
+    ``weak``: with the weak detections, too.
+    """
+    contents = ["$origin/**", *([f"{entities.ROBOT}/**"] if scene.robot else [])]
+    told = [entities.projected(name), entities.names(entities.detections(name))]
+    hidden = told if why else [] if weak else [entities.weak(name)]
+    return rrb.Spatial2DView(
+        name=name,
+        origin=entities.sensor(name),
+        contents=[*contents, *([f"{entities.why(name)}/**"] if why else [])],
+        overrides=dict.fromkeys(hidden, HIDDEN),
+    )
+
+
+def cameras(scene: Scene, *, why: bool = False) -> rrb.Container | rrb.View:
+    """Every camera; tabs where there are more than two."""
+    views = [camera(scene, name, why=why) for name in scene.cameras]
+    if len(views) == 1:
+        return views[0]
+    return rrb.Tabs(*views, name="Cameras") if len(views) > 2 else rrb.Vertical(*views, name="Cameras")
+
+
+def birds_eye(scene: Scene, root: str = "", name: str = "Bird's-eye view") -> rrb.Spatial2DView:
+    """The bird's-eye image with the outlines of ground truth and of the robot's own boxes."""
+    bev = root + entities.BEV
+    channels = [
+        f"- {root}{entities.channel(name)}/**" for name in ("density", "height", "intensity", "occupancy")
+    ]
+    bounds = None
+    if scene.above is not None:
+        left, top, right, bottom = scene.above
+        bounds = rrb.VisualBounds2D(x_range=(left, right), y_range=(top, bottom))
+    contents = ["$origin/**", *channels]
+    return rrb.Spatial2DView(name=name, origin=bev, contents=contents, background=_DARK, visual_bounds=bounds)
+
+
+def robots_birds_eye() -> rrb.Spatial2DView:
+    """The bird's-eye image that the robot itself publishes."""
+    origin = entities.robot("/visualization/bev_image")
+    return rrb.Spatial2DView(name="The robot's", origin=origin, background=_DARK)
+
+
+def explain(root: str = "", name: str = "Explain") -> rrb.TextDocumentView:
+    """Every decision of the frame in words."""
+    return rrb.TextDocumentView(name=name, origin=root + entities.EXPLAIN, contents=["$origin"])
+
+
+def why() -> rrb.TextDocumentView:
+    """What ``bevviz why`` answered."""
+    return rrb.TextDocumentView(name="Why", origin=entities.WHY, contents=["$origin"])
+
+
+def text_log(name: str, origin: str) -> rrb.TextLogView:
+    """Frame, time and text of each line."""
+    columns = rrb.TextLogColumns(timeline_columns=[entities.FRAME, entities.STAMP], text_log_columns=["body"])
+    return rrb.TextLogView(name=name, origin=origin, columns=columns)
+
+
+def log() -> rrb.TextLogView:
+    """Failures, problems and rejected detections of all frames."""
+    return text_log("Log", entities.EXPLAIN_LOG)
+
+
+def states() -> rrb.StateTimelineView:
+    """What became of the pipeline, of each camera and of the best detection of each class, over time."""
+    return rrb.StateTimelineView(name="States", origin=entities.STATES)
+
+
+def diagnostics() -> rrb.StateTimelineView:
+    """What the robot's own diagnostics say of its parts, over time."""
+    return rrb.StateTimelineView(name="Diagnostics", origin=entities.DIAGNOSTICS)
+
+
+def anomalies() -> rrb.StateTimelineView:
+    """What was worth a look, by kind, over time; below it how the pipeline is, which no drive lacks."""
+    contents = [entities.state("pipeline"), "$origin/**"]
+    return rrb.StateTimelineView(name="Anomalies", origin=entities.ANOMALY_STATES, contents=contents)
+
+
+def anomaly_log() -> rrb.TextLogView:
+    """Each anomaly when it began, with its numbers."""
+    return text_log("Anomaly log", entities.ANOMALY_LOG)
+
+
+def tracks() -> rrb.StateTimelineView:
+    """Who was tracked when."""
+    return rrb.StateTimelineView(name="Tracks", origin=entities.TRACK_STATES)
+
+
+def speeds() -> rrb.TimeSeriesView:
+    """Of the tracks, in the same lanes."""
+    return rrb.TimeSeriesView(
+        name="Speeds, m/s", origin=entities.TRACK_SPEEDS, plot_legend=rrb.PlotLegend(visible=False)
+    )
+
+
+def over_time() -> rrb.Tabs:
+    """Lanes of anomalies, decisions and tracks, and the speeds of these."""
+    return rrb.Tabs(anomalies(), states(), tracks(), speeds(), name="Over time")
+
+
+def plot(
+    name: str, origin: str, contents: Sequence[str] = ("$origin/**",), *, linked: bool = False
+) -> rrb.TimeSeriesView:
+    """Numbers over time, the legend inside. ``linked``: it shows the same time as the others that are."""
+    return rrb.TimeSeriesView(
+        name=name,
+        origin=origin,
+        contents=contents,
+        plot_legend=rrb.Corner2D.LeftTop,
+        axis_x=LINKED if linked else None,
+    )
+
+
+def stage_times() -> rrb.TimeSeriesView:
+    return plot("Stage times, ms", entities.stage_time(""))
+
+
+def clocks() -> rrb.TimeSeriesView:
+    """Image against cloud, and how old the transforms are."""
+    contents = [entities.sync_error("**"), entities.tf_age("**")]
+    return plot("Sync error and TF age, ms", entities.HEALTH, contents)
+
+
+def counts() -> rrb.TimeSeriesView:
+    """Clusters, detections and matches, opinions: the numbers of the same size."""
+    return plot("Counts", entities.HEALTH, [entities.count(what) for what in (*COUNTS, *OPINIONS)])
+
+
+def rates() -> rrb.TimeSeriesView:
+    return plot("Rates, Hz", entities.rate(""))
+
+
+def latencies() -> rrb.TimeSeriesView:
+    """From a cloud's arrival until it is logged, and from there to the viewers."""
+    contents = [entities.latency("**"), entities.viewer_lag("**")]
+    return plot("Latency and lag of viewers, ms", entities.HEALTH, contents)
+
+
+def motion(scene: Scene) -> list[rrb.View]:
+    """What Imus measure, where there are some."""
+    if not scene.imu:
+        return []
+    return [plot("Rotation, rad/s", entities.ROTATION), plot("Acceleration, m/s²", entities.ACCELERATION)]
+
+
+def health() -> rrb.Tabs:
+    """In tabs: side by side, their legends would hide the curves."""
+    return rrb.Tabs(stage_times(), clocks(), counts(), rates(), name="Health")
+
+
+def config() -> rrb.TextDocumentView:
+    """How the recording was made."""
+    return rrb.TextDocumentView(name="Configuration", origin=entities.CONFIG)
+
+
+def time_panel(
+    *, play: rrb.components.PlayState | None = None, timeline: str = entities.STAMP
+) -> rrb.TimePanel:
+    """Sensor time, collapsed."""
+    return rrb.TimePanel(state="collapsed", timeline=timeline, play_state=play)
+
+
+def panels() -> tuple[rrb.BlueprintPanel, rrb.SelectionPanel]:
+    return rrb.BlueprintPanel(state="collapsed"), rrb.SelectionPanel(state="collapsed")

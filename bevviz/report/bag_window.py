@@ -1,0 +1,179 @@
+"""The part of a bag that a report is about, cut out as a bag of its own that runs again."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import dataclass
+from fnmatch import fnmatchcase
+from pathlib import Path
+
+import numpy as np
+from backports import zstd
+from rosbags.interfaces import Connection
+
+from bevviz.bags.bag import ATTACHED, Recording
+from bevviz.bags.mcap_writer import McapWriter
+from bevviz.bags.message import RawMessage, is_ros1
+from bevviz.bags.source import MARGIN, SECOND, BagSource, iso
+from bevviz.config import Config
+from bevviz.drivers.ouster import metadata_of
+from bevviz.errors import UserError
+from bevviz.messages.roles import Roles
+from bevviz.sync.unusable_messages import Damage
+
+MILLISECOND = 1_000_000
+
+Edited = tuple[Connection, bytes | memoryview] | None
+Edit = Callable[[RawMessage, bytes | memoryview], Edited]
+
+
+def as_it_is(message: RawMessage, data: bytes | memoryview) -> Edited:
+    return message.connection, data
+
+
+@dataclass(frozen=True, slots=True)
+class Window:
+    """Log times in nanoseconds. ``low`` and ``high`` are whole milliseconds, so that they can be written."""
+
+    at: int  # of the scan that the report is about
+    low: int  # scans from here
+    high: int  # to before here
+    start: int  # of the whole recording
+
+
+@dataclass(frozen=True, slots=True)
+class Cut:
+    """What a bag was made of."""
+
+    counts: Counter[str]  # messages by topic
+    left_out: tuple[str, ...]  # one sentence each
+
+
+def find_window(source: BagSource, at: int, before: float, after: float) -> Window:
+    """The window from the first scan to the last one within ``before`` and ``after`` seconds of ``at``."""
+    times = source.recording.scan_times(source.roles.driver)
+    first, last = np.searchsorted(times, [at - round(before * SECOND), at + round(after * SECOND) + 1])
+    low = int(times[first]) // MILLISECOND * MILLISECOND
+    high = (int(times[last - 1]) // MILLISECOND + 1) * MILLISECOND
+    return Window(at, low, high, source.recording.start)
+
+
+def open_window(paths: Sequence[Path], config: Config, low: int, high: int) -> BagSource:
+    """The scans of a window, in the whole bag as in the one cut out."""
+    return BagSource(paths, config, start=iso(low), end=iso(high))
+
+
+def choose_topics(recording: Recording, roles: Roles, patterns: Sequence[str] | None) -> list[str]:
+    """Those that the pipeline reads, and those of the others that a pattern names; None: all of them.
+
+    Raises:
+        UserError: a pattern that no topic fits.
+    """
+    there = [topic.name for topic in recording.topics]
+    if patterns is None:
+        return there
+    fits(recording, patterns, "--topics")
+    needed = {*_read(roles), *(metadata_of(topic.name) for topic in recording.topics if topic.scans)}
+    return [n for n in there if n in needed or any(fnmatchcase(n, pattern) for pattern in patterns)]
+
+
+def fits(recording: Recording, patterns: Sequence[str], option: str) -> None:
+    """Raises UserError for a pattern that no topic fits."""
+    there = [topic.name for topic in recording.topics]
+    for pattern in patterns:
+        if not any(fnmatchcase(name, pattern) for name in there):
+            raise UserError(f"{option} {pattern}: no topic fits among {', '.join(there)}")
+
+
+def _read(roles: Roles) -> list[str]:
+    """Every topic that the pipeline reads."""
+    cameras = [name for camera in roles.cameras for name in (camera.topic, camera.info_topic)]
+    single = [roles.odometry, roles.truth]
+    return [
+        *roles.lidars,
+        *roles.tf,
+        *roles.tf_static,
+        *roles.robot_detections_2d,
+        *roles.robot_detections_3d,
+        *(name for name in (*cameras, *single) if name),
+    ]
+
+
+def cut(
+    recording: Recording,
+    window: Window,
+    topics: Collection[str],
+    static: Collection[str],
+    path: Path,
+    edit: Edit = as_it_is,
+) -> Cut:
+    """Write the messages of a window to an MCAP file, byte for byte, with all that it needs to run again.
+
+    That is: files with calibrations of LiDARs, ``MARGIN`` on either side, as ``BagSource`` reads it,
+    everything that was said on the ``static`` topics, of video what was before and is needed to decode it,
+    and of each topic that is silent in the window the last message before it, else the first one after it
+    (a calibration, a map or a robot's description that was published once).
+
+    Args:
+        recording: the whole bag.
+        window: the scans.
+        topics: those to be written.
+        static: topics of static transforms.
+        path: of the MCAP file.
+        edit: gives what is to be written for a message, and of which type; None: leave it out.
+
+    Raises:
+        UserError: the file cannot be written.
+    """
+    low, high = window.low - MARGIN, window.high + MARGIN
+    chosen = [name for name in topics if name not in static]
+    counts: Counter[str] = Counter()
+    damage = Damage()
+    ros1 = is_ros1(next(c for f in recording.files for c in f.connections))
+    with McapWriter(path, recording.types.definition, ros1=ros1) as bag:
+        for topic in sorted(recording.calibrations.keys() & set(topics)):
+            file = Path(recording.calibrations[topic])
+            bag.attach(f"{ATTACHED}{topic}/{file.name}", file.read_bytes())
+
+        def put(message: RawMessage) -> None:
+            try:
+                content = message.content()
+            except zstd.ZstdError:
+                damage.add(message.topic, f"{message.topic}: it is damaged, and left out")
+                return
+            if (edited := edit(message, content)) is not None:
+                connection, data = edited
+                bag.write(connection, message.received, data)
+                counts[message.topic] += 1
+
+        videos = {topic.name for topic in recording.topics if topic.kind == "CompressedVideo"}
+        silent = [_last(recording, name, low, high) for name in chosen if name not in videos]
+        early = [m for m in silent if m is not None and m.received < low]
+        late = [m for m in silent if m is not None and m.received >= high]
+        early += recording.messages(static, None, low)
+        early += [m for name in chosen if name in videos for m in _needed(recording, name, low)]
+        for message in sorted(early, key=lambda m: m.received):
+            put(message)
+        for message in recording.messages(topics, low, high):
+            put(message)
+        late += recording.messages(static, high)
+        for message in sorted(late, key=lambda m: m.received):
+            put(message)
+    return Cut(counts, tuple(damage.sentences))
+
+
+def _needed(recording: Recording, topic: str, low: int) -> list[RawMessage]:
+    """The messages of a video before the window that its first pictures are decoded from."""
+    times = sorted({packet.received for packet in recording.packets(topic, low - 1)})
+    return [m for time in times for m in recording.messages([topic], time, time + 1)]
+
+
+def _last(recording: Recording, topic: str, low: int, high: int) -> RawMessage | None:
+    """What holds in the window, of a topic without a message in it; None where it has one."""
+    times = recording.times(topic)
+    first, last = np.searchsorted(times, [low, high])
+    if first < last or not len(times):
+        return None
+    nearest = int(times[first - 1]) if first else int(times[0])
+    return next(recording.messages([topic], nearest, nearest + 1), None)

@@ -1,0 +1,235 @@
+"""The results of a frame as fingerprints, so that a second run can be proven to give the same ones."""
+
+from __future__ import annotations
+
+import io
+from collections import defaultdict
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, fields, is_dataclass
+from hashlib import sha256
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bevviz.model.frame import U8
+from bevviz.model.results import Detections, FrameResult, Masks
+
+Arrays = Mapping[str, NDArray[Any]]
+
+WHOLE = 1 << 14  # elements up to which an array is kept beside its fingerprint, so that a change has a size
+ROUNDING = 1e-5  # of a number, or of 1: networks and geometry round differently on another processor
+
+
+class LargeArray(NamedTuple):
+    """An array that is too large to be kept."""
+
+    fingerprint: str
+    rows: str
+    total: str  # sum of its elements
+
+
+@dataclass(frozen=True, slots=True)
+class StageDigest:
+    """What one stage made of a frame."""
+
+    name: str  # with the camera behind it where there is one: "detector zed"
+    fingerprint: str  # SHA-256 over names, types, shapes and bytes of its arrays
+    whole: Arrays  # those of at most ``WHOLE`` elements
+    large: Mapping[str, LargeArray]  # what is kept of the others
+
+
+@dataclass(frozen=True, slots=True)
+class DigestDifference:
+    """Where two runs part. ``amount``: see ``ROUNDING``; infinite where it is no question of numbers."""
+
+    stage: str
+    text: str
+    amount: float
+
+
+def digest(result: FrameResult) -> tuple[StageDigest, ...]:
+    """Each stage's results, in the order in which they depend on each other.
+
+    Times, words and the picture's encoding are no part of it: the first differ from run to run, the others
+    are made from the rest.
+    """
+    return tuple(_stage(name, arrays) for name, arrays in _stages(result))
+
+
+def compare(then: tuple[StageDigest, ...], now: tuple[StageDigest, ...]) -> DigestDifference | None:
+    """The first stage that differs by more than rounding, else the one that rounds worst, else None.
+
+    Numbers within ``ROUNDING`` of each other, with everything else being equal, are rounding.
+    """
+    worst: DigestDifference | None = None
+    before, after = {s.name: s for s in then}, {s.name: s for s in now}
+    for name in dict.fromkeys([*before, *after]):
+        if name not in after or name not in before:
+            there = "the report has" if name in before else "this run has"
+            return DigestDifference(name, f"only {there} results of it", float("inf"))
+        if before[name].fingerprint == after[name].fingerprint:
+            continue
+        found = _difference(before[name], after[name])
+        if found.amount > ROUNDING:
+            return found
+        if worst is None or found.amount > worst.amount:
+            worst = found
+    return worst
+
+
+def pack(stages: tuple[StageDigest, ...]) -> tuple[list[str], U8]:
+    """Lines of text and a compressed block of arrays, as a recording can hold them."""
+    block: dict[str, NDArray[Any]] = {}
+    for stage in stages:
+        block |= {f"whole/{stage.name}/{name}": array for name, array in stage.whole.items()}
+        block |= {f"large/{stage.name}/{name}": np.array(large) for name, large in stage.large.items()}
+    buffer = io.BytesIO()
+    np.savez_compressed(buffer, **block)  # type: ignore[arg-type]  # no key is the name of an option
+    return [f"{stage.fingerprint} {stage.name}" for stage in stages], np.frombuffer(
+        buffer.getvalue(), np.uint8
+    )
+
+
+def unpack(lines: list[str], block: U8) -> tuple[StageDigest, ...]:
+    """What ``pack`` packed."""
+    whole: dict[str, dict[str, NDArray[Any]]] = defaultdict(dict)
+    large: dict[str, dict[str, LargeArray]] = defaultdict(dict)
+    with np.load(io.BytesIO(block.tobytes()), allow_pickle=False) as archive:
+        for key in archive.files:
+            kind, stage, name = key.split("/", 2)
+            if kind == "large":
+                large[stage][name] = LargeArray(*archive[key].tolist())
+            else:
+                whole[stage][name] = archive[key]
+    split = [line.partition(" ")[::2] for line in lines]
+    return tuple(StageDigest(name, fingerprint, whole[name], large[name]) for fingerprint, name in split)
+
+
+def detections_of(stages: tuple[StageDigest, ...]) -> dict[tuple[str, int], Detections]:
+    """What the network found, exactly, by camera and stamp of the image."""
+    arrays = {stage.name: stage.whole for stage in stages}
+    found = {}
+    for name, values in arrays.items():
+        kind, _, camera = name.partition(" ")
+        if kind == "detector" and values:
+            boxes: dict[str, Any] = {**values, "names": tuple(values["names"].tolist())}
+            masks = {key.removeprefix("masks."): boxes.pop(key) for key in values if key.startswith("masks.")}
+            if masks:
+                boxes["masks"] = Masks(**masks)
+            found[camera, int(arrays[f"image {camera}"]["stamp"][0])] = Detections(**boxes)
+    return found
+
+
+# --- stages ------------------------------------------------------------------------------------
+
+
+def _stages(result: FrameResult) -> Iterator[tuple[str, Arrays]]:
+    frame = result.frame
+    yield "cloud", {"xyz": frame.points, "stamp": np.array([frame.stamp])}
+    yield "fields", dict(sorted(frame.fields.items()))
+    poses = {} if frame.world_from_points is None else {"world_from_points": frame.world_from_points}
+    yield "transforms", poses
+    for found in result.cameras:
+        camera = found.camera
+        if camera.image is not None:
+            yield (
+                f"image {camera.name}",
+                {
+                    "pixels": camera.image.bgr,
+                    "stamp": np.array([camera.image.stamp]),
+                },
+            )
+        placed = {"camera_from_points": camera.camera_from_points}
+        if camera.intrinsics is not None:
+            placed |= {"K": camera.intrinsics.K, "D": camera.intrinsics.D}
+        yield f"transforms {camera.name}", {k: v for k, v in placed.items() if v is not None}
+    for name in ("voxels", "ground", "clusters"):
+        yield name, dict(_arrays(getattr(result, name)))
+    for found in result.cameras:
+        for name, part in (("detector", found.detections), ("fusion", found.fusion)):
+            yield f"{name} {found.camera.name}", dict(_arrays(part))
+    yield "objects", dict(_arrays(result.objects))
+    if result.bev is not None:
+        yield "bev", {"picture": result.bev.image, **result.bev.channels}
+    yield "failures", {"stage": np.array([f.stage for f in result.failures], np.str_)}
+
+
+def _arrays(part: Any, prefix: str = "") -> Iterator[tuple[str, NDArray[Any]]]:
+    """The arrays of a dataclass, and of those inside it."""
+    if part is None:
+        return
+    for entry in fields(part):
+        value = getattr(part, entry.name)
+        if isinstance(value, np.ndarray):
+            yield prefix + entry.name, value
+        elif isinstance(value, tuple):
+            yield prefix + entry.name, np.array(value, np.str_)
+        elif is_dataclass(value):
+            yield from _arrays(value, f"{prefix}{entry.name}.")
+
+
+def _stage(name: str, arrays: Arrays) -> StageDigest:
+    content = sha256()
+    whole, large = {}, {}
+    for key, given in arrays.items():
+        array = np.ascontiguousarray(given)
+        data = "\n".join(array.tolist()).encode() if array.dtype.kind == "U" else array.tobytes()
+        own = sha256(data).hexdigest()
+        kind = "text" if array.dtype.kind == "U" else array.dtype.str
+        content.update(f"{key} {kind} {array.shape} {own}\n".encode())
+        if array.size <= WHOLE or key == "masks.packed":  # the network need not run again to check the rest
+            whole[key] = array
+        else:
+            large[key] = LargeArray(own, str(len(array)), f"{np.sum(array, dtype=np.float64):.17g}")
+    return StageDigest(name, content.hexdigest(), whole, large)
+
+
+# --- differences -------------------------------------------------------------------------------
+
+
+def _difference(then: StageDigest, now: StageDigest) -> DigestDifference:
+    """How two stages with different fingerprints differ: the array that does so by most."""
+    worst = DigestDifference(now.name, "equal in value, but not in every bit", 0.0)  # 0.0 and -0.0
+    for name in dict.fromkeys([*then.whole, *then.large, *now.whole, *now.large]):
+        amount, text = _array_difference(then, now, name)
+        if amount > worst.amount:
+            worst = DigestDifference(now.name, f"{name}: {text}", amount)
+    return worst
+
+
+def _array_difference(then: StageDigest, now: StageDigest, name: str) -> tuple[float, str]:
+    """By how much, infinite where that is no question of numbers, and in words."""
+    rows, new_rows = _rows(then, name), _rows(now, name)
+    if rows != new_rows:
+        return float("inf"), f"{rows} rows became {new_rows}"
+    if name in then.large and name in now.large:
+        if then.large[name] == now.large[name]:
+            return 0.0, ""
+        change = float(now.large[name].total) - float(then.large[name].total)
+        return float("inf"), f"{rows} rows as before with other values, their sum {change:+g}"
+    if name not in then.whole or name not in now.whole or then.whole[name].shape != now.whole[name].shape:
+        return float("inf"), "another shape"
+    old, new = then.whole[name].reshape(-1), now.whole[name].reshape(-1)
+    if old.dtype.kind == "f" and new.dtype.kind == "f":
+        return _step(old, new)
+    changed = np.flatnonzero(old != new)
+    if not len(changed):
+        return 0.0, ""
+    became = f"{old[changed[0]]} became {new[changed[0]]}"
+    return float("inf"), f"{len(changed)} of {old.size} values differ, the first: {became}"
+
+
+def _step(old: NDArray[Any], new: NDArray[Any]) -> tuple[float, str]:
+    same = (old == new) | (np.isnan(old) & np.isnan(new))
+    with np.errstate(invalid="ignore"):
+        step = np.nan_to_num(np.abs(new.astype(np.float64) - old), nan=np.inf)[~same]
+        relative = step / np.maximum(1.0, np.abs(old[~same], dtype=np.float64))
+    text = f"{len(step)} of {old.size} values differ, by up to {step.max(initial=0.0):.3g}"
+    return float(relative.max(initial=0.0)), text
+
+
+def _rows(stage: StageDigest, name: str) -> int:
+    if name in stage.large:
+        return int(stage.large[name].rows)
+    return len(stage.whole[name]) if name in stage.whole else 0

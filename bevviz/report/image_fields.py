@@ -1,0 +1,140 @@
+"""What of a message may be a picture, found by walking its definition."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from functools import cache
+from typing import Any, TypeAlias
+
+import numpy as np
+from rosbags.interfaces import Nodetype
+from rosbags.typesys import Stores, get_typestore
+
+from bevviz.messages.decoding import MessageError
+
+Definitions: TypeAlias = Mapping[str, Any]  # as rosbags has them: type -> constants, fields
+
+IMAGE, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
+CLOUD, OLD_CLOUD = "sensor_msgs/msg/PointCloud2", "sensor_msgs/msg/PointCloud"
+PLAIN = {"nav_msgs/msg/OccupancyGrid"}  # its bytes are what it says
+# Pictures in other clothes, which nothing here can decode.
+PICTURES = re.compile(r"image|video|ffmpeg|theora|h26[45]|jpeg|png|disparity", re.IGNORECASE)
+COLOUR_FIELDS = {"rgb", "rgba", "r", "red", "color"}  # of a cloud that is a picture, too
+PIXELS = {"uint8", "int8", "byte", "octet", "char", "uint16", "int16"}
+SMALL = 256  # values that are no picture: a key, a name
+
+
+@cache
+def known_types() -> frozenset[str]:
+    """Those whose every field means what ROS says."""
+    stores = (get_typestore(Stores.ROS2_JAZZY), get_typestore(Stores.ROS1_NOETIC))
+    return frozenset(name for store in stores for name in store.fielddefs)
+
+
+def is_known(msgtype: str) -> bool:
+    """Whether what its fields mean is known; of vision_msgs every version."""
+    return msgtype in known_types() or msgtype.startswith(("vision_msgs/", "tf2_msgs/"))
+
+
+def is_coloured(cloud: Any) -> bool:
+    """Whether a PointCloud2 or PointCloud has the colours of a picture."""
+    columns = cloud.fields if hasattr(cloud, "fields") else cloud.channels
+    return not COLOUR_FIELDS.isdisjoint(column.name.lower() for column in columns)
+
+
+class Contents:
+    """Looks into the messages of one type.
+
+    Args:
+        msgtype: the type, normalised.
+        definitions: of it and of all that it is made of.
+
+    Raises:
+        MessageError: a type in it is not defined.
+    """
+
+    def __init__(self, msgtype: str, definitions: Definitions) -> None:
+        self._msgtype, self._definitions = msgtype, definitions
+        self._inside: dict[str, bool] = {}
+        self.may_show = self._look(msgtype)
+
+    def without_pictures(self, message: Any, lenient: bool = False) -> tuple[Any, Counter[str]]:
+        """The message with every image and every coloured cloud in it emptied, and which these were.
+
+        Args:
+            message: as it was decoded.
+            lenient: leave bytes that nobody can look into as they are.
+
+        Raises:
+            MessageError: there are such bytes.
+        """
+        found: Counter[str] = Counter()
+        return self._strip(message, self._msgtype, "", found, lenient), found
+
+    def _look(self, msgtype: str, within: tuple[str, ...] = ()) -> bool:
+        """Whether anything in a type has to be looked at; where this is told, all of it is known."""
+        if msgtype in self._inside:
+            return self._inside[msgtype]
+        if msgtype not in self._definitions or msgtype in within:
+            raise MessageError(f"nobody knows what a {msgtype} is made of")
+        inside = msgtype in _EMPTIED
+        for _, kind in self._definitions[msgtype][1]:
+            inside |= self._is_opaque(msgtype, kind)
+            if part := _part(kind):
+                inside |= self._look(part, (*within, msgtype))
+        self._inside[msgtype] = inside
+        return inside
+
+    def _is_opaque(self, msgtype: str, kind: Any) -> bool:
+        """Whether a field is bytes or numbers that may be pixels."""
+        node, about = kind
+        if node not in (Nodetype.ARRAY, Nodetype.SEQUENCE) or msgtype in PLAIN:
+            return False
+        (element, basic), length = about
+        if element != Nodetype.BASE or 0 < length <= SMALL:
+            return False
+        return basic[0] in PIXELS or msgtype.endswith("MultiArray")
+
+    def _strip(self, message: Any, msgtype: str, path: str, found: Counter[str], lenient: bool) -> Any:
+        if not self._inside[msgtype]:
+            return message
+        if msgtype in _EMPTIED:
+            if _EMPTIED[msgtype][0](message):
+                found[path] += 1
+                return replace(message, **_EMPTIED[msgtype][1])
+            return message
+        changed = {}
+        for name, kind in self._definitions[msgtype][1]:
+            value, inner = getattr(message, name), f"{path}.{name}".lstrip(".")
+            if self._is_opaque(msgtype, kind):
+                if len(value) > SMALL and not lenient:
+                    raise MessageError(f"nobody can tell what the {len(value)} values of '{inner}' show")
+            elif (part := _part(kind)) and self._inside[part]:
+                if kind[0] == Nodetype.NAME:
+                    changed[name] = self._strip(value, part, inner, found, lenient)
+                else:
+                    changed[name] = [self._strip(v, part, inner, found, lenient) for v in value]
+        return replace(message, **changed)
+
+
+def _part(kind: Any) -> str:
+    """The type that a field is made of; empty where it is none but a number or a text."""
+    node, about = kind
+    if node in (Nodetype.ARRAY, Nodetype.SEQUENCE):
+        node, about = about[0]
+    return str(about) if node == Nodetype.NAME else ""
+
+
+_NOTHING = np.zeros(0, np.uint8)
+_EMPTIED: Mapping[str, tuple[Callable[[Any], bool], Mapping[str, Any]]] = {
+    IMAGE: (lambda image: len(image.data) > 0, {"height": 0, "width": 0, "step": 0, "data": _NOTHING}),
+    COMPRESSED: (lambda image: len(image.data) > 0, {"data": _NOTHING}),
+    CLOUD: (
+        lambda cloud: len(cloud.data) > 0 and is_coloured(cloud),
+        {"height": 0, "width": 0, "row_step": 0, "data": _NOTHING},
+    ),
+    OLD_CLOUD: (is_coloured, {"points": [], "channels": []}),
+}

@@ -1,1 +1,0 @@
-"""ROS: messages and the roles of their topics; and, in what imports rclpy, a running graph."""

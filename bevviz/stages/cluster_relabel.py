@@ -1,0 +1,86 @@
+"""Clusters, after detections took points of them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from bevviz.config import ClusteringConfig
+from bevviz.model.frame import F32, I32, I64
+from bevviz.model.results import Clusters, Splits
+from bevviz.stages.clustering import redescribe
+
+
+@dataclass(slots=True)
+class Part:
+    """What one detection took.
+
+    Attributes:
+        camera: its row.
+        detection: its row among the detections of the camera.
+        rows: of the points.
+    """
+
+    camera: int
+    detection: int
+    rows: I64
+
+
+def relabelled(
+    points: F32, clusters: Clusters, parts: list[Part], cameras: list[str], config: ClusteringConfig
+) -> tuple[Clusters, I32, Splits]:
+    """The clusters with the parts as clusters of their own, the row of each part (-1 at the end), and why."""
+    before, fresh = len(clusters), 0
+    origins = []
+    for part in parts:
+        counts = np.bincount(clusters.labels[part.rows] + 1)
+        sources = np.flatnonzero(counts)
+        origins.append((sources - 1, counts[sources]))
+    left = clusters.count.astype(np.int64)
+    for sources, counts in origins:
+        known = sources >= 0
+        left[sources[known]] -= counts[known]
+    unchanged, alive = left == clusters.count, left > 0
+    number = np.empty(len(parts), np.int64)
+    made: list[tuple[int, int, int]] = []  # part, cluster that it took from, points
+    for j, (sources, counts) in enumerate(origins):
+        pairs = list(zip(sources.tolist(), counts.tolist(), strict=True))
+        whole = [(n, k) for k, n in pairs if k >= 0 and n == clusters.count[k]]
+        if whole:  # a part that holds all of a cluster has its number
+            number[j] = max(whole)[1]
+            alive[number[j]] = True
+            unchanged[number[j]] = len(pairs) == 1
+        else:
+            number[j] = before + fresh
+            fresh += 1
+        if not whole or len(pairs) > 1:
+            made += [(j, k, n) for k, n in pairs]
+    if not made:
+        return clusters, np.append(number, -1).astype(np.int32), Splits.none()
+
+    labels = clusters.labels.copy()
+    for part, k in zip(parts, number.tolist(), strict=True):
+        labels[part.rows] = k
+    alive = np.concatenate([alive, np.ones(fresh, np.bool_)])
+    row = np.append(np.where(alive, np.cumsum(alive) - 1, -1), -1).astype(np.int32)
+    if not alive.all():
+        labels = row[labels]
+    kept = np.concatenate([np.where(unchanged, np.arange(before), -1), np.full(fresh, -1)])[alive]
+    rows = np.append(row[number], -1).astype(np.int32)
+    now = redescribe(points, labels, clusters, kept, rows[:-1], config)
+    part_of, source, taken = np.array(made, np.int32).T
+    was_noise = source < 0
+    return (
+        now,
+        rows,
+        Splits(
+            camera=tuple(cameras[parts[j].camera] for j in part_of),
+            detection=np.array([parts[j].detection for j in part_of], np.int32),
+            cluster=rows[part_of],
+            rest=np.where(~was_noise & (np.append(left, 0)[source] > 0), row[source], -1).astype(np.int32),
+            is_noise=was_noise,
+            points=taken,
+            of=np.where(was_noise, taken, np.append(clusters.count, 0)[source]).astype(np.int32),
+        ),
+    )

@@ -1,0 +1,253 @@
+"""The points in an image box's frustum: the best candidate among them, and those in the box fitted to it."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from bevviz.model.frame import F32, F64, I32, I64
+from bevviz.stages.box_fit import fit
+from bevviz.support.kernel import kernel
+
+MARGIN = 0.05  # of a box's width that is looked at on either side of it
+TIGHT = 0.15  # of a box's sides that it may be too tight by
+AROUND = 0.5  # of its width, in which points tell that an object goes on
+TAIL = 4.0  # degrees of freedom of Student's distribution, of how far a height is from its class's
+WINDOWS = 8  # that overlap at each depth
+SKIN = 0.1  # metres around a box in which a point is still its own
+SLACK = 0.5  # metres around a box in which what is left of a cluster, too small to be one, is its own
+
+
+@kernel
+def choose(
+    points: F32,
+    place: F64,
+    uv: F32,
+    seen: I64,
+    taker: I32,
+    box: F64,
+    gap: float,
+    reach: float,
+    ratio: float,
+    tall: float,
+    height: float,
+    sigma: float,
+    lowest: float,
+    fewest: int,
+    least: float,
+) -> tuple[I64, float, float]:
+    """Points of the best candidate, how well it fits and how far away it begins.
+
+    Args:
+        points: (P, 3).
+        place: (2,) where the camera is.
+        uv: (P, 2) pixels.
+        seen: points in the image.
+        taker: (P,) -1 where nobody has it.
+        box: (4,) the image box.
+        gap: points that are this near hold together.
+        reach: how deep an object can be; NaN: as deep as it is large.
+        ratio: how large it is for each metre of distance.
+        tall: how high it is for each metre of distance.
+        height: of its class, NaN where unknown.
+        sigma: of that.
+        lowest: in sigmas, how much lower it may be for nothing more.
+        fewest: points.
+        least: part of the image box that is covered.
+    """
+    margin, around = MARGIN * (box[2] - box[0]), AROUND * (box[2] - box[0])
+    there = np.empty(len(seen), np.int64)
+    n = 0
+    for i in seen:
+        there[n] = i
+        beside = box[0] - around <= uv[i, 0] <= box[2] + around
+        n += beside and box[1] <= uv[i, 1] <= box[3] and taker[i] == -1
+    there = there[:n]
+    inside, far = np.empty(n, np.bool_), np.empty(n)
+    xy = np.empty((n, 2))
+    low_x, low_y, high_x, high_y = np.inf, np.inf, -np.inf, -np.inf
+    for i in range(n):
+        xy[i, 0], xy[i, 1] = points[there[i], 0] - place[0], points[there[i], 1] - place[1]
+        far[i] = math.hypot(xy[i, 0], xy[i, 1])
+        inside[i] = box[0] - margin <= uv[there[i], 0] <= box[2] + margin
+        if inside[i]:
+            low_x, high_x = min(low_x, xy[i, 0]), max(high_x, xy[i, 0])
+            low_y, high_y = min(low_y, xy[i, 1]), max(high_y, xy[i, 1])
+    if high_x < low_x:
+        return there[:0], 0.0, 0.0
+
+    # What holds together: cells half as wide as the gap, flooded two cells far. -1: to be flooded, -2: empty.
+    cell = gap / 2
+    columns, rows = int((high_x - low_x) / cell) + 1, int((high_y - low_y) / cell) + 1
+    grid = np.full((columns, rows), -2, np.int32)
+    at = np.empty((n, 2), np.int64)
+    for i in range(n):
+        at[i, 0], at[i, 1] = (
+            math.floor((xy[i, 0] - low_x) / cell),
+            math.floor((xy[i, 1] - low_y) / cell),
+        )
+        if inside[i]:
+            grid[at[i, 0], at[i, 1]] = -1
+    stack = np.empty((n, 2), np.int64)
+    bodies = 0
+    for i in range(n):
+        if not inside[i] or grid[at[i, 0], at[i, 1]] != -1:
+            continue
+        grid[at[i, 0], at[i, 1]] = bodies
+        stack[0, 0], stack[0, 1] = at[i, 0], at[i, 1]
+        top = 1
+        while top:
+            top -= 1
+            column, row = stack[top, 0], stack[top, 1]
+            for p in range(max(column - 2, 0), min(column + 3, columns)):
+                for q in range(max(row - 2, 0), min(row + 3, rows)):
+                    if grid[p, q] == -1:
+                        grid[p, q] = bodies
+                        stack[top, 0], stack[top, 1] = p, q
+                        top += 1
+        bodies += 1
+    start = np.zeros(bodies + 1, np.int64)
+    body = np.full(n, -1, np.int64)
+    for i in range(n):
+        for p in range(max(at[i, 0] - 2, 0), min(at[i, 0] + 3, columns)):
+            for q in range(max(at[i, 1] - 2, 0), min(at[i, 1] + 3, rows)):
+                if grid[p, q] >= 0 and (body[i] < 0 or (p == at[i, 0] and q == at[i, 1])):
+                    body[i] = grid[p, q]
+        if body[i] >= 0:
+            start[body[i] + 1] += 1
+    for k in range(bodies):
+        start[k + 1] += start[k]
+    end, by_body = start[:-1].copy(), np.empty(start[-1], np.int64)
+    for i in np.argsort(far):
+        if body[i] >= 0:
+            by_body[end[body[i]]] = i
+            end[body[i]] += 1
+
+    area = (box[2] - box[0]) * (box[3] - box[1])
+    best, best_first, best_last, best_far = 0.0, 0, 0, 0.0
+    for k in range(bodies):
+        first = start[k]
+        while first < start[k + 1]:
+            begin = far[by_body[first]]
+            deep = ratio * begin if np.isnan(reach) else reach
+            u0, v0, u1, v1 = np.inf, np.inf, -np.inf, -np.inf
+            held = 0
+            last = first
+            while last < start[k + 1] and far[by_body[last]] <= begin + deep:
+                i = by_body[last]
+                if inside[i]:
+                    held += 1
+                    u, v = uv[there[i], 0], uv[there[i], 1]
+                    u0, u1, v0, v1 = min(u0, u), max(u1, u), min(v0, v), max(v1, v)
+                last += 1
+            if held >= fewest:
+                covered = max(min(u1, box[2]) - max(u0, box[0]), 0.0) * max(
+                    min(v1, box[3]) - max(v0, box[1]), 0.0
+                )
+                overlap = covered / area if area > 0 else 0.0
+                front = far[by_body[first + (last - 1 - first) // WINDOWS]]
+                rating = overlap * held / (last - first)
+                if not np.isnan(height):
+                    z = max((tall * front - height) / sigma, -lowest)
+                    rating /= 1 + z * z / TAIL
+                if overlap >= least and rating > best:
+                    best, best_first, best_last, best_far = rating, first, last, front
+            if last == start[k + 1]:
+                break
+            while first < start[k + 1] and far[by_body[first]] < begin + deep / WINDOWS:
+                first += 1
+    chosen = by_body[best_first:best_last]
+    return there[chosen[inside[chosen]]], best, best_far
+
+
+@kernel
+def fit_from(
+    points: F32, rows: I64, place: F64, normals: F64, edge: F64, prior: F64, longest: float, about: float
+) -> tuple[F64, I64]:
+    """``boxfit.fit`` of some points seen from a place."""
+    xy = np.empty((len(rows), 2))
+    for k, i in enumerate(rows):
+        xy[k, 0], xy[k, 1] = points[i, 0] - place[0], points[i, 1] - place[1]
+    flat, facing = fit(xy, normals, edge, prior, longest, about)
+    flat[0] += place[0]
+    flat[1] += place[1]
+    return flat, facing
+
+
+@kernel
+def _within(points: F32, i: int, flat: F64, skin: float) -> bool:
+    """Whether a point is in a box seen from above (place, length, width, heading), or as near as ``skin``."""
+    c, s = math.cos(flat[4]), math.sin(flat[4])
+    x, y = points[i, 0] - flat[0], points[i, 1] - flat[1]
+    along, across = abs(c * x + s * y), abs(c * y - s * x)
+    return bool(along <= flat[2] / 2 + skin and across <= flat[3] / 2 + skin)
+
+
+@kernel
+def points_inside(
+    points: F32,
+    uv: F32,
+    seen: I64,
+    kin: I64,
+    taker: I32,
+    owner: I64,
+    box: F64,
+    flat: F64,
+    unseen: bool,
+) -> I64:
+    """Points in an object's box that nobody has: of those in the image box, and of its clusters beside that.
+
+    Args:
+        points: (P, 3).
+        uv: (P, 2) their pixels.
+        seen: those in the image.
+        kin: those of the object's clusters.
+        taker: (P,) -1 where no detection of this camera has it.
+        owner: (P,) -1 where none of any camera has.
+        box: (4,) image box.
+        flat: (5,) place, length, width and heading of the object's box.
+        unseen: those of its clusters that are outside the image count, too.
+    """
+    margin, across, along = MARGIN * (box[2] - box[0]), TIGHT * (box[2] - box[0]), TIGHT * (box[3] - box[1])
+    found = np.empty(len(seen) + len(kin), np.int64)
+    known = np.zeros(len(points), np.bool_)
+    n = 0
+    for i in seen:
+        if (
+            box[0] - margin <= uv[i, 0] <= box[2] + margin
+            and box[1] <= uv[i, 1] <= box[3]
+            and taker[i] == -1
+            and owner[i] == -1
+            and _within(points, i, flat, SKIN)
+        ):
+            found[n] = i
+            known[i] = True
+            n += 1
+    for i in kin:
+        if known[i] or taker[i] != -1 or owner[i] != -1:
+            continue
+        beside = (
+            box[0] - across <= uv[i, 0] <= box[2] + across and box[1] - along <= uv[i, 1] <= box[3] + along
+        )
+        if (beside or (unseen and np.isnan(uv[i, 0]))) and _within(points, i, flat, SKIN):
+            found[n] = i
+            n += 1
+    return found[:n]
+
+
+@kernel
+def leftover(points: F32, own: I64, rows: I64, flat: F64, smallest: int) -> I64:
+    """What is left of a cluster, where that is beside the object and too small to be one; else nothing."""
+    taken = np.zeros(len(points), np.bool_)
+    for i in rows:
+        taken[i] = True
+    rest = np.empty(len(own), np.int64)
+    n = 0
+    for i in own:
+        if not taken[i]:
+            if n + 1 >= smallest or not _within(points, i, flat, SLACK):
+                return rest[:0]
+            rest[n] = i
+            n += 1
+    return rest[:n]

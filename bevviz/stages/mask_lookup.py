@@ -1,0 +1,45 @@
+"""Which points an instance mask covers."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from bevviz.model.frame import F32, I32, U8, Bool
+from bevviz.model.results import Masks
+from bevviz.support.kernel import kernel
+
+
+def cover(masks: Masks, d: int, uv: F32, margin: float = 0.0) -> Bool:
+    """(N,) which of these pixels of the image a detection's object covers; NaN is none.
+
+    ``margin``: pixels to the left, right, above and below it that count, too.
+    """
+    return _cover(masks.packed, masks.start(d), masks.place[d], masks.grid, uv, margin)
+
+
+@kernel
+def _cover(packed: U8, start: int, place: I32, grid: F32, uv: F32, margin: float) -> Bool:
+    covered = np.zeros(len(uv), np.bool_)
+    for n in range(len(uv)):
+        if np.isnan(uv[n, 0]) or np.isnan(uv[n, 1]):
+            continue
+        for beside in range(5 if margin > 0 else 1):
+            u, v = uv[n, 0] + 0.5, uv[n, 1] + 0.5
+            if beside == 1:
+                u += margin
+            elif beside == 2:
+                u -= margin
+            elif beside == 3:
+                v += margin
+            elif beside == 4:
+                v -= margin
+            column = math.floor(u * grid[0] + grid[2]) - place[0]
+            row = math.floor(v * grid[1] + grid[3]) - place[1]
+            if 0 <= column < place[2] and 0 <= row < place[3]:
+                bit = start + row * place[2] + column
+                if (packed[bit >> 3] >> (7 - (bit & 7))) & 1:
+                    covered[n] = True
+                    break
+    return covered

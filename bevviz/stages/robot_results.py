@@ -1,0 +1,146 @@
+"""What the robot itself published as the result of a stage, in place of our own: ``topic:NAME``."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+
+from bevviz.errors import StageError
+from bevviz.model import geometry
+from bevviz.model.frame import (
+    F32,
+    Bool,
+    Boxes3D,
+    Camera,
+    Frame,
+    LabelledBoxes2D,
+    LabelledBoxes3D,
+)
+from bevviz.model.results import (
+    Clusters,
+    ClusterState,
+    Detections,
+    DetectionState,
+    Ground,
+    Objects,
+)
+from bevviz.stages.cells import cell_keys
+from bevviz.stages.user_stages import heights, placed
+
+NEAR = 0.05  # metres from a point of ours to one of the robot's that make them the same
+
+
+def segment(points: F32, frame: Frame, topic: str, voxel: float) -> Ground:
+    """Ground is what the robot's cloud of obstacles has not.
+
+    A point of ours is an obstacle where one of the robot's is within a voxel's diagonal, or 5 cm: both may
+    have thinned the same scan in their own way.
+
+    Raises:
+        StageError: there is none at this time.
+    """
+    cloud = next((c for c in frame.robot_clouds if c.topic == topic), None)
+    if cloud is None:
+        raise _missing(topic, "cloud of obstacles")
+    reach = max(NEAR, voxel * 3**0.5)
+    obstacle = _within(points, cloud.xyz, reach)
+    return Ground(~obstacle, heights(points, ~obstacle))
+
+
+def cluster(points: F32, frame: Frame, topic: str) -> Clusters:
+    """The robot's boxes as clusters: each holds the points in it, those in several are the nearest one's.
+
+    Raises:
+        StageError: there are none at this time.
+    """
+    boxes = in_points_frame(frame, _boxes(frame, topic))
+    labels = np.full(len(points), -1, np.int32)
+    nearest = np.full(len(points), np.inf, np.float32)
+    centroid = boxes.center.astype(np.float32)
+    for k in range(len(boxes)):
+        inside = np.flatnonzero(geometry.inside(points, boxes, k))
+        away = np.linalg.norm(points[inside] - boxes.center[k], axis=1)
+        mine = inside[away < nearest[inside]]
+        labels[mine], nearest[mine] = k, away[away < nearest[inside]]
+    count = np.bincount(labels[labels >= 0], minlength=len(boxes)).astype(np.int32)
+    for axis in range(3):
+        total = np.bincount(labels[labels >= 0], points[labels >= 0, axis], minlength=len(boxes))
+        np.divide(total, count, out=centroid[:, axis], where=count > 0, casting="unsafe")
+    corners = geometry.corners(boxes)
+    low, high = corners.min(axis=1), corners.max(axis=1)
+    aligned = Boxes3D((low + high) / 2, high - low, np.zeros(len(boxes), np.float32))
+    state = np.full(len(boxes), ClusterState.KEPT, np.int32)
+    return Clusters(labels, state, count, centroid, aligned, boxes)
+
+
+def detect(frame: Frame, camera: Camera, topic: str) -> Detections:
+    """The robot's boxes in the camera's image, all of them kept.
+
+    Raises:
+        StageError: there are none at this time, or nobody says which of several cameras they are of.
+    """
+    for found in frame.robot_detections:
+        if found.topic == topic and not found.camera and len(frame.cameras) > 1:
+            raise StageError(
+                f"{topic} does not say which camera its boxes are of: no image is in the frame "
+                f"'{found.frame_id}' of its header; name the one camera: source.camera_topics"
+            )
+        if found.topic == topic and found.camera in ("", camera.name):
+            return detections_of(found)
+    raise _missing(topic, "detections")
+
+
+def find_objects(frame: Frame, topic: str, obstacles: F32 | None, clusters: Clusters | None) -> Objects:
+    """The robot's named boxes.
+
+    Raises:
+        StageError: there are none at this time.
+    """
+    labelled = _boxes(frame, topic)
+    return placed(in_points_frame(frame, labelled), labelled.labels, labelled.scores, obstacles, clusters)
+
+
+def detections_of(found: LabelledBoxes2D) -> Detections:
+    """Image boxes that somebody else states, best first as all detections are, none of them refused."""
+    order = np.argsort(-found.scores, kind="stable")
+    zero = np.zeros(len(order), np.int32)
+    kept = np.full(len(order), DetectionState.KEPT, np.int32)
+    names = tuple(found.labels[d] for d in order)
+    nothing = np.zeros(len(order), np.float32)
+    return Detections(found.xyxy[order], found.scores[order], zero, names, kept, zero - 1, nothing)
+
+
+def in_points_frame(frame: Frame, labelled: LabelledBoxes3D) -> Boxes3D:
+    """Boxes that somebody else states, in the frame of the points."""
+    points_from_boxes = np.eye(4)
+    if labelled.world_from_boxes is not None:
+        points_from_boxes = geometry.inverse(frame.pose) @ labelled.world_from_boxes
+    return geometry.moved(labelled.boxes, points_from_boxes)
+
+
+def _boxes(frame: Frame, topic: str) -> LabelledBoxes3D:
+    """Also those that a person has labelled."""
+    for labelled in (*frame.robot_boxes, frame.truth):
+        if labelled is not None and labelled.topic == topic:
+            return labelled
+    raise _missing(topic, "boxes")
+
+
+def _within(points: F32, others: F32, reach: float) -> Bool:
+    """(N,) which points have one of the others in their cell, ``reach`` wide, or in a cell beside it."""
+    found = np.zeros(len(points), np.bool_)
+    if not len(points) or not len(others):
+        return found
+    keys, strides = cell_keys(np.concatenate([points, others]), reach, reach=1)
+    there = np.unique(keys[len(points) :])
+    for offset in sorted(itertools.product((0, -1, 1), repeat=3), key=np.count_nonzero):
+        rest = np.flatnonzero(~found)
+        wanted = keys[rest] + np.array(offset) @ strides
+        place = np.minimum(np.searchsorted(there, wanted), len(there) - 1)
+        found[rest] = there[place] == wanted
+    return found
+
+
+def _missing(topic: str, what: str) -> StageError:
+    return StageError(f"the robot published no {what} on {topic} at the time of this scan")

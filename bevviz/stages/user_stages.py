@@ -1,0 +1,228 @@
+"""Somebody else's functions as stages: what they return is checked, and the rest is derived from it."""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from bevviz.config import ClusteringConfig, Config, plugin_of
+from bevviz.config.plugins import Plugin
+from bevviz.errors import StageError, UserError
+from bevviz.model import geometry
+from bevviz.model.frame import F32, I32, Bool, Boxes3D
+from bevviz.model.results import Clusters, Detections, DetectionState, Ground, Objects
+from bevviz.stages.clustering import describe
+
+CELL = 1.0  # metres: edge of a cell of the ground's level, where only its points are known
+REACH = 200.0  # metres around the origin in which that level is kept
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Foreign:
+    """A function of somebody else's, with its parameters."""
+
+    plugin: Plugin
+    call: Callable[..., Any]
+
+    def __call__(self, array: NDArray[Any]) -> Any:
+        """What it makes of a copy of the array: nobody may change that of a frame."""
+        return self.call(array.copy())
+
+    @property
+    def name(self) -> str:
+        return self.plugin.name
+
+
+def foreign(config: Config, section: str) -> Foreign | None:
+    """The function that a stage's section names; None: it names none of somebody else's.
+
+    Raises:
+        UserError: it cannot be had, or, being a class, cannot be made.
+    """
+    plugin = plugin_of(config, section)
+    if plugin is None:
+        return None
+    params = []
+    if plugin.takes_params and plugin.params is not None:
+        params.append(plugin.params.model_validate(getattr(config, section).params))
+    if not isinstance(plugin.target, type):
+        return Foreign(plugin, lambda array: plugin.target(array, *params))
+    try:
+        made = plugin.target(*params)
+    except Exception as error:  # whatever a user's class may do
+        raise UserError(
+            f"{section}: {plugin.name} cannot be made: {type(error).__name__}: {error}"
+        ) from error
+    if not callable(made):
+        raise UserError(f"{section}: {plugin.name} makes a {type(made).__name__} that cannot be called")
+    return Foreign(plugin, made)
+
+
+# --- the stages --------------------------------------------------------------------------------
+
+
+def ground_of(points: F32, returned: Any, name: str) -> Ground:
+    """Ground of ``(N, 3) -> (N,) bool``; the heights above it are derived.
+
+    Raises:
+        StageError: it returned something else.
+    """
+    mask = _array(name, returned, "a mask", (len(points),), "b")
+    return Ground(mask.astype(np.bool_), heights(points, mask))
+
+
+def clusters_of(points: F32, config: ClusteringConfig, returned: Any, name: str) -> Clusters:
+    """Clusters of ``(P, 3) -> (P,) int labels``, -1 noise; counts, boxes and size verdicts are derived.
+
+    Raises:
+        StageError: it returned something else.
+    """
+    labels = _array(name, returned, "labels", (len(points),), "iu").astype(np.int64)
+    if len(labels) and labels.min() < -1:
+        raise StageError(f"{name} returned label {labels.min()}: -1 is noise, 0 the first")
+    return describe(points, _numbered(labels), config)
+
+
+def detections_of(threshold: float, returned: Any, name: str) -> Detections:
+    """Detections of ``(H, W, 3) BGR -> xyxy (D, 4), score (D,), names``, best first.
+
+    Raises:
+        StageError: it returned something else.
+    """
+    xyxy, score, names = _several(name, returned, "xyxy, score and class names")
+    xyxy = _array(name, xyxy, "boxes xyxy", (-1, 4), "fiu").astype(np.float32)
+    score, names = _scored(name, len(xyxy), score, names)
+    order = np.argsort(-score, kind="stable")
+    kept = score[order] >= threshold
+    return Detections(
+        xyxy=xyxy[order],
+        score=score[order],
+        class_id=np.array([zlib.crc32(names[d].encode()) >> 1 for d in order], np.int32),
+        names=tuple(names[d] for d in order),
+        state=np.where(kept, DetectionState.KEPT, DetectionState.BELOW_THRESHOLD).astype(np.int32),
+        suppressed_by=np.full(len(order), -1, np.int32),
+        overlap=np.zeros(len(order), np.float32),
+    )
+
+
+def objects_of(returned: Any, name: str, obstacles: F32 | None, clusters: Clusters | None) -> Objects:
+    """Objects of ``(N, 4) x y z intensity -> boxes (K, 7), score (K,), names``.
+
+    A box is x, y, z of its centre, length, width, height and yaw, in metres and radians. The cluster of
+    each object is derived.
+
+    Raises:
+        StageError: it returned something else.
+    """
+    rows, score, names = _several(name, returned, "boxes, score and class names")
+    rows = _array(name, rows, "boxes", (-1, 7), "fiu").astype(np.float32)
+    if (rows[:, 3:6] <= 0).any():
+        raise StageError(f"{name} returned a box without a volume: its columns are x y z l w h yaw")
+    score, names = _scored(name, len(rows), score, names)
+    return placed(Boxes3D(rows[:, :3], rows[:, 3:6], rows[:, 6]), names, score, obstacles, clusters)
+
+
+def with_intensity(points: F32, intensity: NDArray[Any] | None) -> F32:
+    """(N, 4) x, y, z and intensity, 0 where the sensor tells none."""
+    cloud = np.zeros((len(points), 4), np.float32)
+    cloud[:, :3] = points
+    if intensity is not None:
+        cloud[:, 3] = intensity
+    return cloud
+
+
+def placed(
+    boxes: Boxes3D, names: Sequence[str], score: F32, obstacles: F32 | None, clusters: Clusters | None
+) -> Objects:
+    """Boxes that no detection named, each with the kept cluster that has most points in it, -1: none."""
+    own = np.full(len(boxes), -1, np.int32)
+    if obstacles is not None and clusters is not None:
+        kept = np.append(clusters.kept, False)
+        candidates = np.flatnonzero(kept[clusters.labels])  # noise, -1, is the last
+        points, labels = obstacles[candidates], clusters.labels[candidates]
+        for k, rows in geometry.inside_each(points, boxes):
+            if len(rows):
+                own[k] = np.bincount(labels[rows]).argmax()
+    nobody = np.full(len(boxes), -1, np.int32)
+    return Objects(boxes, tuple(names), score, own, ("",) * len(boxes), nobody)
+
+
+def heights(points: F32, ground: Bool) -> F32:
+    """(N,) metres above the ground around each point, where only the ground's points are known.
+
+    The level of a square metre is the mean of the ground's points in it; where there are none, that of the
+    nearest square metre with some. NaN: there is no ground at all.
+    """
+    if not ground.any():
+        return np.full(len(points), np.nan, np.float32)
+    size = int(2 * REACH / CELL)
+    cells = np.clip((points[:, :2] + REACH) / CELL, 0, size - 1).astype(np.int32)
+    cell = cells[:, 1] * size + cells[:, 0]
+    count = np.bincount(cell[ground], minlength=size * size)
+    total = np.bincount(cell[ground], points[ground, 2], minlength=size * size)
+    known = np.flatnonzero(count)
+    empty = (count == 0).astype(np.uint8).reshape(size, size)
+    _, nearest = cv2.distanceTransformWithLabels(
+        empty, cv2.DIST_L2, cv2.DIST_MASK_5, labelType=cv2.DIST_LABEL_PIXEL
+    )
+    # Labels count the known cells from 1, in whatever order: look them up at these cells themselves.
+    level = np.zeros(len(known) + 1)
+    level[nearest.ravel()[known]] = total[known] / count[known]
+    return np.asarray(points[:, 2] - level[nearest.ravel()[cell]], np.float32)
+
+
+# --- what was returned -------------------------------------------------------------------------
+
+
+def _array(name: str, value: Any, what: str, shape: tuple[int, ...], kinds: str) -> NDArray[Any]:
+    """The value as an array of that shape (-1: any length) and kind of dtype, finite."""
+    try:
+        array = np.asarray(value)
+    except (TypeError, ValueError, RuntimeError) as error:  # a tensor on another device, a ragged list
+        raise StageError(f"{name} returned no array for {what}: {error}") from None
+    if array.size == 0 and shape[0] in (-1, 0):
+        return np.zeros((0, *shape[1:]), array.dtype if array.dtype.kind in kinds else kinds[0])
+    wanted = ", ".join("any" if n < 0 else str(n) for n in shape)
+    if array.ndim != len(shape) or any(n not in (-1, m) for n, m in zip(shape, array.shape, strict=True)):
+        raise StageError(f"{name} returned {what} of shape {array.shape}, not ({wanted})")
+    if array.dtype.kind not in kinds:
+        kind = {"b": "bool", "iu": "integers", "fiu": "numbers"}[kinds]
+        raise StageError(f"{name} returned {what} of type {array.dtype}, not {kind}")
+    if array.dtype.kind == "f" and not np.isfinite(array).all():
+        raise StageError(
+            f"{name} returned {what} with {np.isnan(array).sum()} NaN and {np.isinf(array).sum()} inf"
+        )
+    return array
+
+
+def _several(name: str, value: Any, what: str) -> tuple[Any, Any, Any]:
+    if not isinstance(value, tuple | list) or len(value) != 3:
+        count = f"{len(value)} values" if isinstance(value, tuple | list) else f"a {type(value).__name__}"
+        raise StageError(f"{name} returned {count}, not {what}")
+    return value[0], value[1], value[2]
+
+
+def _scored(name: str, count: int, score: Any, names: Any) -> tuple[F32, list[str]]:
+    scores = _array(name, score, "scores", (count,), "fiu").astype(np.float32)
+    try:
+        listed = [str(text) for text in names]
+    except TypeError:
+        raise StageError(f"{name} returned a {type(names).__name__} for class names") from None
+    if len(listed) != count:
+        raise StageError(f"{name} returned {len(listed)} class names for {count} boxes")
+    return scores, listed
+
+
+def _numbered(labels: NDArray[np.int64]) -> I32:
+    """The same clusters, numbered in the order of each one's first point."""
+    found, first, number = np.unique(labels, return_index=True, return_inverse=True)
+    rank = np.empty(len(found), np.int32)
+    rank[np.argsort(np.where(found < 0, -1, first), kind="stable")] = np.arange(len(found))
+    noise = int(len(found) > 0 and found[0] < 0)
+    return np.asarray(rank[number.ravel()] - noise, np.int32)

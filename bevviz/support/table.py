@@ -1,0 +1,40 @@
+"""Tables of text, for a terminal and for a page of Markdown. The first row is the heading."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+from bevviz.support import text
+
+Rows = Sequence[Sequence[str]]
+
+
+def lines(rows: Rows, align: str = "") -> Iterator[str]:
+    """Lines for a terminal.
+
+    Args:
+        rows: of the same length.
+        align: ``l`` or ``r`` for each column; default: the first to the left, the others to the right.
+    """
+    cells = [[text.printable(cell) for cell in row] for row in rows]
+    widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
+    sides = align or _default(rows)
+    for row in cells:
+        padded = [
+            cell.ljust(width) if side == "l" else cell.rjust(width)
+            for cell, width, side in zip(row, widths, sides, strict=True)
+        ]
+        yield "  ".join(padded).rstrip()
+
+
+def markdown(rows: Rows, align: str = "") -> str:
+    """A table in Markdown; arguments as of ``lines``."""
+    rules = ["---" if side == "l" else "---:" for side in align or _default(rows)]
+    head, *body = [[text.markdown(cell) for cell in row] for row in rows]
+    return "\n".join(
+        "|" + "".join(f" {cell} |" if cell else " |" for cell in row) for row in [head, rules, *body]
+    )
+
+
+def _default(rows: Rows) -> str:
+    return "l" + "r" * (len(rows[0]) - 1)

@@ -1,0 +1,202 @@
+"""One frame, run anew whenever the configuration's file is saved."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import Executor
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import rerun as rr
+
+from bevviz.compare.differences import DIFFERENT, Change, FrameDifferences, differences, seen
+from bevviz.compare.log import DifferenceLogger
+from bevviz.config import Config, ParameterChange, changes
+from bevviz.config.reloading import Settings
+from bevviz.errors import UserError
+from bevviz.model.frame import Frame, Scene
+from bevviz.model.protocols import Items, Observer
+from bevviz.model.results import FrameResult
+from bevviz.pipeline.perceive import describe
+from bevviz.pipeline.variants import Variants, check_same_frames
+from bevviz.recording import entities
+from bevviz.recording.frame_logger import Logger
+from bevviz.recording.primitives import document
+from bevviz.support.files import save
+from bevviz.support.text import markdown, printable
+
+ABOUT = "A is the version before, B the one that is shown."
+LOOK = 0.01  # seconds between two looks at the file
+
+
+@dataclass(frozen=True, slots=True)
+class Save:
+    """One state of the file."""
+
+    config: Config
+    changes: Mapping[str, ParameterChange]  # since the state before
+    time: float  # of the save; of the first state that of the start
+
+
+@dataclass(frozen=True, slots=True)
+class Version:
+    """What one state of the file has made of the frame."""
+
+    number: int
+    save: Save
+    result: FrameResult
+    found: FrameDifferences  # from the version before
+
+    @property
+    def text(self) -> str:
+        """In one line."""
+        counts = self.found.counts
+        words = {Change.ONLY_A: "gone", Change.ONLY_B: "new"}
+        different = [
+            f"{counts[change]} {words.get(change, change)}" for change in DIFFERENT if counts[change]
+        ]
+        changed = "; ".join(f"{key} {change}" for key, change in self.save.changes.items())
+        failed = [f"{failure.stage} failed: {failure.reason}" for failure in self.result.failures]
+        objects = f"{len(self.found.b.names)} objects" + (f" ({', '.join(different)})" if different else "")
+        return printable("; ".join([f"version {self.number}: {changed or 'as it is'}: {objects}", *failed]))
+
+
+class Saves:
+    """The states of a configuration's file: as it is, then each one that is saved, until ``stop``.
+
+    Args:
+        settings: the configuration and its file.
+        scene: of the frame that is looked at.
+        check: raises UserError where a configuration cannot be run.
+        tell: called with what is wrong with a state that is left out.
+    """
+
+    total = None
+    warnings = ()
+
+    def __init__(
+        self,
+        settings: Settings,
+        scene: Scene,
+        check: Callable[[Config], None],
+        tell: Callable[[UserError], None],
+    ) -> None:
+        self.scene = scene
+        self._settings, self._check, self._tell = settings, check, tell
+        self._first = self._last = settings.config
+        self._pending = False
+        self._stopped = threading.Event()
+
+    def stop(self) -> None:
+        """End the iteration, from any thread."""
+        self._stopped.set()
+
+    def __iter__(self) -> Iterator[Save]:
+        yield Save(self._first, {}, time.time())
+        while not self._stopped.wait(LOOK):
+            try:
+                save = self._look()
+            except UserError as error:
+                self._tell(error)
+                continue
+            if save is not None:
+                yield save
+
+    def _look(self) -> Save | None:
+        """The new state, once the file was saved and rests."""
+        if self._settings.changed():  # editors may write in several steps
+            self._pending = True
+            return None
+        file = self._settings.file
+        if not self._pending or file is None:
+            return None
+        try:
+            stat = file.stat()
+        except OSError:
+            return None  # between two steps of an editor
+        if stat.st_size == 0:
+            return None  # being written
+        self._pending = False
+        config = self._settings.read()
+        check_same_frames({"the first version": self._first, str(file): config})
+        changed = changes(self._last, config)
+        if not changed:
+            return None
+        self._check(config)
+        self._last = config
+        return Save(config, changed, stat.st_mtime)
+
+
+class OneFrame:
+    """Makes a version of each state of the file, on a frame that was decoded once."""
+
+    def __init__(self, frame: Frame) -> None:
+        self._frame = frame
+        self._variants = Variants()
+        self._last: Version | None = None
+
+    def check(self, config: Config) -> None:
+        """Raises UserError where the configuration cannot be run."""
+        self._variants.check(config)
+
+    def perceive(self, save: Save, network: Executor | None = None) -> Version:
+        result = self._variants.perceive(self._frame, save.config, network)
+        now, last = seen(result), self._last
+        before = last.found.b if last is not None else now
+        found = differences(self._frame.index, self._frame.stamp, before, now)
+        self._last = Version(0 if last is None else last.number + 1, save, result, found)
+        return self._last
+
+    def finish(self, version: Version) -> Version:
+        return replace(version, result=describe(version.result))
+
+
+class VersionRecorder(Observer[Version]):
+    """Logs each version on the timeline ``version``.
+
+    Args:
+        recording: where to.
+        config: of the first version.
+        tell: called with each version when it is logged, and the seconds since it was saved.
+    """
+
+    def __init__(
+        self, recording: rr.RecordingStream, config: Config, tell: Callable[[Version, float], None]
+    ) -> None:
+        self._recording, self._config, self._tell = recording, config, tell
+
+    def begin(self, items: Items[object]) -> None:
+        self._scene = items.scene
+        self._logger = Logger(self._recording, self._config, items.scene)
+        self._differences = DifferenceLogger(self._recording, ("version before", "this version"), ABOUT)
+        self._logger.log_static()
+
+    def see(self, version: Version) -> None:
+        result, frame, save = version.result, version.result.frame, version.save
+        if save.changes:
+            self._logger.reconfigure(save.config, self._scene)
+        for writer in (self._logger, self._differences):
+            writer.sequences = {entities.VERSION: version.number}
+        self._logger.log(result)
+        self._differences.log(version.found, frame.received, frame.pose)
+        lines = [f"- {key}: {markdown(str(change))}" for key, change in save.changes.items()] or [
+            "- the first one"
+        ]
+        page = "\n".join([f"# Version {version.number}", "", *lines])
+        self._recording.log(entities.TUNE, document(page))
+        self._recording.flush()
+        self._tell(version, time.time() - save.time)
+
+
+def create(file: Path, text: str) -> bool:
+    """Write the configuration's file where there is none. Returns whether there was none.
+
+    Raises:
+        UserError: it cannot be written.
+    """
+    if file.exists():
+        return False
+    save(file, text, "--config")
+    return True

@@ -1,0 +1,240 @@
+"""Which way is up at a LiDAR, so that ground, heights and boxes are not computed in a tilted frame.
+
+REP 103 makes z the axis that points up in every body frame. The frame of a LiDAR that hangs upside down,
+is pitched towards the road or is a depth camera is none, and is turned upright. Who tells it, best first:
+
+1. the transforms to ``source.base_frame``, which is upright by definition (REP 105),
+2. the transforms to the fixed frame,
+3. gravity, as an accelerometer with transforms to the LiDAR feels it,
+4. the ground that the LiDAR sees,
+5. nobody: z of its frame is assumed to point up.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import dataclass, field
+
+import cv2
+import numpy as np
+
+from bevviz.messages.transforms import Acceleration
+from bevviz.model.frame import F32, F64, Cloud
+from bevviz.sync.transform_tree import TransformBuffer, TransformError
+
+TILT = math.radians(2.0)  # of a LiDAR on its robot, from which on it is turned
+SLOPE = math.radians(8.0)  # the same where nothing but the world tells it: a road may be as steep
+DISAGREEMENT = math.radians(12.0)  # between transforms and ground, from which on one of them is wrong
+GRAVITY_TIME = 2.0  # seconds that an acceleration is smoothed over: braking is no slope
+NEAR, POINTS, PLANES = 25.0, 4000, 400  # metres; points and planes that the ground is searched with
+LOW = 0.2  # of the points, by z, that as many planes more are drawn from
+THICKNESS = 0.12  # metres that the ground's points are from its plane
+SUPPORT, BELOW = 0.15, 0.02  # of the near points: in the ground at least, below it at most
+FLOOR, UNDER, LOWEST = (
+    0.05,
+    0.01,
+    0.5,
+)  # the same of the floor of a hall, and metres that it is below at least
+ASTRAY, SURE = math.radians(45.0), 0.25  # z of a frame, from which on a wall may be meant; its SUPPORT
+HEIGHTS = 0.15, 6.0  # metres from the ground to a LiDAR
+TRIES = 5  # scans that the ground is looked for in
+
+_OPTICAL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])  # FLU from RDF (REP 103)
+_Z = np.array([0.0, 0.0, 1.0])
+
+
+@dataclass(slots=True)
+class Upright:
+    """Keeps what is known of the vertical during a drive.
+
+    Args:
+        tf: the transforms.
+        base_frame: of the robot.
+        tolerance: seconds, see ``TransformBuffer.lookup``.
+    """
+
+    tf: TransformBuffer
+    base_frame: str
+    tolerance: float
+    warnings: dict[str, str] = field(default_factory=dict)  # by LiDAR frame
+    needs_gravity: bool = True  # whether an Imu could tell more than the transforms do
+    _gravity: dict[str, tuple[int, F64]] = field(default_factory=dict)  # by frame: stamp, mean acceleration
+    _ground: dict[str, F64] = field(default_factory=dict)  # up in a LiDAR's frame, where the ground is seen
+    _tries: dict[str, int] = field(default_factory=dict)
+    _tilted: set[str] = field(default_factory=set)  # LiDAR frames once turned: they stay what they are
+
+    def add_acceleration(self, felt: Acceleration) -> None:
+        """Of an Imu: at rest it points up."""
+        norm = float(np.linalg.norm(felt.acceleration))
+        if not math.isfinite(norm) or norm == 0:
+            return
+        frame, now = felt.frame_id.lstrip("/"), felt.acceleration / norm
+        stamp, mean = self._gravity.get(frame, (felt.stamp, now))
+        share = min(1.0, max(0.0, (felt.stamp - stamp) * 1e-9 / GRAVITY_TIME))
+        self._gravity[frame] = felt.stamp, mean + share * (now - mean)
+
+    def turn(self, cloud: Cloud, fixed_frame: str) -> F64 | None:
+        """(4, 4) that turns the points of a LiDAR upright about its origin; None: they are.
+
+        Args:
+            cloud: in its own frame.
+            fixed_frame: above it in TF; empty: none is.
+        """
+        frame = cloud.frame_id.lstrip("/")
+        base = self._rotation(self.base_frame, frame, cloud.stamp)
+        up, who = (
+            (base[2], f"'{self.base_frame}'") if base is not None else self._up(cloud, frame, fixed_frame)
+        )
+        self.needs_gravity = up is None or who.startswith("gravity")
+        ground = self._seen_ground(cloud, frame)
+        if up is None:
+            return self._by_ground(frame, ground)
+        if ground is not None and _angle(up, ground) > DISAGREEMENT:
+            self.warnings[frame] = (
+                f"the ground that LiDAR frame '{frame}' sees is tilted by {_degrees(up, ground):.0f} degrees "
+                f"against the vertical of {who}: one of them is wrong (source.extrinsics states transforms)"
+            )
+        if _angle(up, _Z) > (TILT if base is not None else SLOPE):
+            self._tilted.add(frame)
+        if frame not in self._tilted:
+            return None
+        return _homogeneous(base if base is not None else _least_turn(frame, up))
+
+    def _up(self, cloud: Cloud, frame: str, fixed_frame: str) -> tuple[F64 | None, str]:
+        """Up in a LiDAR's frame, by the fixed frame or by gravity, and who says so."""
+        world = self._rotation(fixed_frame, frame, cloud.stamp) if fixed_frame else None
+        if world is not None:
+            down = "ned" in re.split(r"[/_]", fixed_frame.lower())
+            return (-world[2] if down else world[2]), f"'{fixed_frame}'"
+        for there, (_, felt) in self._gravity.items():
+            turned = np.eye(3) if there == frame else self._rotation(frame, there, cloud.stamp)
+            if turned is not None:
+                up = turned @ felt
+                return up / np.linalg.norm(up), f"gravity, as '{there}' feels it"
+        return None, ""
+
+    def _by_ground(self, frame: str, ground: F64 | None) -> F64 | None:
+        if ground is None:
+            if self._tries[frame] == TRIES:
+                self.warnings[frame] = (
+                    f"no transform, no Imu and no ground tells which way is up at LiDAR frame '{frame}': "
+                    f"z is taken; source.extrinsics '{self.base_frame} {frame}' states it"
+                )
+            return None
+        self.warnings.pop(frame, None)
+        if _angle(ground, _Z) <= SLOPE:
+            return None
+        self.warnings[frame] = (
+            f"z of LiDAR frame '{frame}' does not point up: it is turned by {_degrees(ground, _Z):.0f} "
+            f"degrees, by the ground in its scans, as no transform tells it; source.extrinsics "
+            f"'{self.base_frame} {frame}' does"
+        )
+        return _homogeneous(_least_turn(frame, ground))
+
+    def _rotation(self, target: str, source: str, stamp: int) -> F64 | None:
+        if not self.tf.knows(target, source):
+            return None
+        try:
+            return self.tf.lookup(target, source, stamp, self.tolerance).matrix[:3, :3]
+        except TransformError:
+            return None
+
+    def _seen_ground(self, cloud: Cloud, frame: str) -> F64 | None:
+        """Up by the ground, looked for in the first scans of a LiDAR only."""
+        if frame not in self._ground and self._tries.setdefault(frame, 0) < TRIES:
+            self._tries[frame] += 1
+            found = ground_normal(cloud.xyz)
+            if found is not None:
+                self._ground[frame] = found
+        return self._ground.get(frame)
+
+
+def ground_normal(points: F32) -> F64 | None:
+    """Up, as the ground under a LiDAR tells it, whatever way the LiDAR is turned.
+
+    The ground is the plane through many of the near points that has almost nothing below it. Walls and
+    ceilings may have nothing behind them either, and in a hall most of the points. Of several planes it is
+    therefore one that z of the frame agrees with, where there is one, else the one with most points. One that
+    is turned as a wall is to z needs more of them, none like it opposite, and that not even few points are a
+    floor that z agrees with.
+    Planes are drawn at random (RANSAC: Fischler and Bolles 1981), always the same ones.
+
+    Args:
+        points: (N, 3) metres, the LiDAR at the origin.
+
+    Returns:
+        (3,) unit vector; z, where a floor of few points agrees with it; None: no such plane.
+    """
+    near = points[np.einsum("ij,ij->i", points, points) < NEAR**2]
+    if len(near) < 200:
+        return None
+    random = np.random.default_rng(0)
+    sample = near[random.integers(0, len(near), POINTS)].astype(np.float64)
+    # Every third of a metre counts once: else the rings about the LiDAR are all that there is.
+    _, first = np.unique(np.floor(sample / 0.3).astype(np.int64), axis=0, return_index=True)
+    sample = sample[first]
+    low = sample[sample[:, 2] <= np.quantile(sample[:, 2], LOW)]  # a floor of few points is not drawn else
+    normals, heights = (
+        np.concatenate(pair) for pair in zip(*(_planes(some, random) for some in (sample, low)), strict=True)
+    )
+    distance = sample @ normals.T + heights  # (points, planes), above the plane
+    support = (np.abs(distance) < THICKNESS).mean(axis=0)
+    below = (distance < -2 * THICKNESS).mean(axis=0)
+    floor = (support > FLOOR) & (below < UNDER) & (heights > LOWEST) & (heights < HEIGHTS[1])
+    opposite = (normals @ normals[floor].T < -math.cos(DISAGREEMENT)).any(axis=1)
+    astray = normals[:, 2] < math.cos(ASTRAY)
+    fit = (support > np.where(astray, SURE, SUPPORT)) & (below < BELOW)
+    fit &= (heights > HEIGHTS[0]) & (heights < HEIGHTS[1]) & ~(astray & opposite)
+    upwards = normals[:, 2] > math.cos(DISAGREEMENT)
+    usual = fit & upwards
+    best = int(np.argmax(np.where(usual if usual.any() else fit, support, -1.0)))
+    if (astray[best] or not fit[best]) and (floor & upwards).any():
+        return _Z
+    if not fit[best]:
+        return None
+    inliers = sample[np.abs(distance[:, best]) < THICKNESS]
+    _, _, axes = np.linalg.svd(inliers - inliers.mean(axis=0), full_matrices=False)
+    normal: F64 = axes[2] * np.sign(axes[2] @ normals[best])
+    return normal
+
+
+def _planes(points: F64, random: np.random.Generator) -> tuple[F64, F64]:
+    """(P, 3) normals and (P,) distances of planes through three of the points; they face the origin."""
+    a, b, c = (points[random.integers(0, len(points), PLANES)] for _ in range(3))
+    normals = np.cross(b - a, c - a)
+    lengths = np.linalg.norm(normals, axis=1)
+    normals, origins = normals[lengths > 0.5] / lengths[lengths > 0.5, None], a[lengths > 0.5]
+    height = np.einsum("ij,ij->i", normals, origins)
+    normals[height > 0] *= -1  # the LiDAR is above its ground
+    return normals, np.abs(height)
+
+
+def _least_turn(frame: str, up: F64) -> F64:
+    """(3, 3) that turns ``up`` to z and else as little as it can, so that ahead stays ahead.
+
+    The optical frame of a depth camera looks along z; it is made to look along x first.
+    """
+    start = _OPTICAL if "optical" in frame.lower() else np.eye(3)
+    x, y, z = start @ up
+    if z < 0 and math.hypot(x, y) < 1e-6:
+        # Upside down every axis is as good: about x, ahead stays ahead. What is left is turned as ever.
+        start = np.diag([1.0, -1.0, -1.0]) @ start
+    axis = np.cross(start @ up, _Z)
+    sine, cosine = float(np.linalg.norm(axis)), float((start @ up)[2])
+    turn, _ = cv2.Rodrigues(axis * (math.atan2(sine, cosine) / sine if sine else 1.0))
+    return np.asarray(turn @ start)
+
+
+def _homogeneous(rotation: F64) -> F64:
+    matrix = np.eye(4)
+    matrix[:3, :3] = rotation
+    return matrix
+
+
+def _angle(a: F64, b: F64) -> float:
+    return math.atan2(float(np.linalg.norm(np.cross(a, b))), float(a @ b))
+
+
+def _degrees(a: F64, b: F64) -> float:
+    return math.degrees(_angle(a, b))

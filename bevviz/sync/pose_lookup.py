@@ -1,0 +1,227 @@
+"""Where the points and sensors of one time are, to one another and in the world."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from bevviz.config import Config
+from bevviz.errors import UserError
+from bevviz.messages.transforms import StampedTransform
+from bevviz.model import geometry
+from bevviz.model.frame import F64, Cloud, Frame, LabelledBoxes3D
+from bevviz.sync.gravity import Upright
+from bevviz.sync.report import SyncReport
+from bevviz.sync.transform_tree import Lookup, Origin, TransformError
+
+FIXED_FRAMES = {"map", "odom", "world", "earth", "global", "utm", "enu", "ned", "mocap", "vicon", "init"}
+GLOBE_FRAMES = {"earth", "ecef", "utm"}  # coordinates too large for the float32 of a viewer
+LEVEL = math.cos(math.radians(20))  # a frame that leans by less, as on a road, has upright boxes
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """Where the points of a frame are, and how they hang together with the world."""
+
+    stamp: int
+    points_frame: str
+    world_frame: str  # "" where there is none
+    inertial_frame: str  # the smoothest fixed frame, to compensate motion with; "" where there is none
+    upright: F64 | None = None  # (4, 4) points from points_frame; None: it is upright
+    world_from_points: F64 | None = None
+    tf_age: float = float("nan")
+
+    def points_from(self, frame: Lookup) -> Lookup:
+        """Of what was looked up in ``points_frame``."""
+        return frame if self.upright is None else replace(frame, matrix=self.upright @ frame.matrix)
+
+    def from_points(self, matrix: F64) -> F64:
+        """The same the other way round."""
+        return matrix if self.upright is None else matrix @ geometry.inverse(self.upright)
+
+
+class Placing:
+    """Finds the frames of reference of each cloud, and what the transforms say of it.
+
+    Args:
+        config: source.base_frame, source.fixed_frame, source.extrinsics and the tolerances of ``sync``.
+        report: is told what is missing; its transforms are those that are asked.
+        upright: finds which way is up.
+        turned: whether clouds may have to be turned upright: there is a LiDAR.
+        merged: whether there are several, whose points are taken to source.base_frame.
+
+    Attributes:
+        odometry_frames: that Odometry is in.
+    """
+
+    def __init__(
+        self, config: Config, report: SyncReport, upright: Upright, *, turned: bool, merged: bool
+    ) -> None:
+        self._config, self._report, self._upright = config, report, upright
+        self._tf = report.tf
+        self._turned, self._merged = turned, merged
+        self.odometry_frames: set[str] = set()
+        for names, pose in config.source.extrinsics.items():
+            self._tf.add(_extrinsic(names, pose), static=True, origin=Origin.CONFIG)
+
+    def take_over(self, former: Placing) -> None:
+        """Go on with the transforms of ``former``."""
+        self._report, self._upright, self._tf = former._report, former._upright, former._tf
+        self.odometry_frames = former.odometry_frames
+
+    def of(self, cloud: Cloud, problems: list[str] | None = None) -> Place:
+        """Find the frames of reference; with ``problems``, also where the points are in the world."""
+        points_frame = cloud.frame_id.lstrip("/")
+        base = self._config.source.base_frame
+        if self._merged and self._tf.knows(base, points_frame):
+            points_frame = base
+        world, inertial = self.fixed(points_frame)
+        place = Place(cloud.stamp, points_frame, world, inertial)
+        if problems is None:
+            return place
+        turn = self._upright.turn(cloud, world) if self._turned else None
+        if points_frame == cloud.frame_id.lstrip("/"):
+            place = replace(place, upright=turn)
+        if self._merged and points_frame != base:
+            self._report.complain(
+                problems,
+                f"no transform from '{points_frame}' to source.base_frame '{base}': "
+                f"the LiDARs are merged in '{points_frame}'",
+            )
+        if not world and not self._turned:
+            return place
+        if not world:
+            self._report.problems[
+                f"no fixed frame (map, odom or the like) above '{points_frame}' in TF: motion is not "
+                f"compensated; odometry is taken from source.odometry_topic"
+            ] += 1
+            return place
+        try:
+            found = self._tf.lookup(world, points_frame, cloud.stamp, self._config.sync.tf_tolerance)
+        except TransformError as error:
+            self._report.complain(problems, f"{error}: the cloud has no place in the world")
+            return place
+        return replace(place, world_from_points=place.from_points(found.matrix), tf_age=found.age)
+
+    def fixed(self, points_frame: str) -> tuple[str, str]:
+        """The world's frame and the smoothest fixed frame above ``points_frame``; "" where there is none."""
+        path = self._tf.ancestors(points_frame)
+        fixed = [f for f in path if f in self.odometry_frames or _words(f) & FIXED_FRAMES]
+        near = [f for f in fixed if not _words(f) & GLOBE_FRAMES] or fixed
+        given = self._config.source.fixed_frame.lstrip("/")
+        return given or (near[-1] if near else ""), near[0] if near else given
+
+    def pose(self, frame: Frame, stamp: int) -> F64 | None:
+        """(4, 4) smoothest fixed frame from points, as far as the transforms reach so far."""
+        inertial = self.fixed(frame.points_frame)[1]
+        if not inertial:
+            return None
+        try:
+            found = self._tf.lookup(inertial, frame.points_frame, stamp, self._config.sync.tf_tolerance)
+        except TransformError:
+            return None
+        return found.matrix if frame.upright is None else found.matrix @ geometry.inverse(frame.upright)
+
+    def moved(self, place: Place, stamp: int, frame: str) -> tuple[Lookup, bool]:
+        """points at the cloud's stamp from ``frame`` at ``stamp``, and whether motion is compensated."""
+        tolerance = self._config.sync.tf_tolerance
+        if self.compensates(place):
+            try:
+                found = self._tf.lookup_moving(
+                    place.points_frame, place.stamp, frame, stamp, place.inertial_frame, tolerance
+                )
+                return place.points_from(found), True
+            except TransformError:
+                pass  # without motion is the next best
+        return place.points_from(self._tf.lookup(place.points_frame, frame, place.stamp, tolerance)), False
+
+    def compensates(self, place: Place) -> bool:
+        return self._config.sync.motion_compensation and bool(place.inertial_frame)
+
+    def mounting(self, place: Place, frame: str) -> F64 | None:
+        """frame from points at the cloud's stamp, None where TF does not say."""
+        try:
+            found = self._tf.lookup(place.points_frame, frame, place.stamp, self._config.sync.tf_tolerance)
+        except TransformError:
+            return None
+        return geometry.inverse(place.points_from(found).matrix)
+
+    def world_from(self, place: Place, frame: str) -> F64 | None:
+        """world from a frame at the cloud's stamp; None where TF does not say."""
+        if not frame:
+            return None
+        from_points = self.mounting(place, frame)
+        if from_points is None:
+            return None
+        world = np.eye(4) if place.world_from_points is None else place.world_from_points
+        return world @ geometry.inverse(from_points)
+
+    def placed(self, boxes: LabelledBoxes3D, place: Place, problems: list[str]) -> LabelledBoxes3D:
+        """The boxes with their place in the world.
+
+        Where they lean in the frame of the points, or are in several frames, they become upright ones in it.
+        """
+        if not len(boxes.boxes):
+            return boxes  # without any there may be no frame, either
+        world = place.world_from_points
+        stamp = place.stamp if world is None else boxes.stamp
+        target = place.points_frame if world is None else place.world_frame
+        poses = dict[str, F64]()  # of what each frame is in, in the world
+        for frame in dict.fromkeys(boxes.frames or (boxes.frame_id,)):
+            try:
+                found = self._tf.lookup(target, frame, stamp, self._config.sync.tf_tolerance)
+                poses[frame] = (place.points_from(found) if world is None else found).matrix
+            except TransformError as error:
+                lost = "are left out" if boxes.frames else "have no place in the world"
+                self._report.complain(problems, f"{error}: the boxes of {boxes.topic} {lost}")
+        if not boxes.frames and not poses:
+            return boxes
+        points_from_world = np.eye(4) if world is None else geometry.inverse(world)
+        if not boxes.frames and boxes.turns is None:
+            pose = poses[boxes.frame_id]
+            if (points_from_world @ pose)[2, 2] > LEVEL:
+                return replace(boxes, world_from_boxes=pose)
+        return _upright(boxes, {name: points_from_world @ pose for name, pose in poses.items()}, place)
+
+
+def _upright(boxes: LabelledBoxes3D, poses: Mapping[str, F64], place: Place) -> LabelledBoxes3D:
+    """The boxes in the frame of the points; those in frames that ``poses`` lacks are left out."""
+    frames = boxes.frames or (boxes.frame_id,) * len(boxes.boxes)
+    rows = [row for row, frame in enumerate(frames) if frame in poses]
+    kept = boxes.boxes.chosen(rows)
+    turned = np.empty((len(rows), 4, 4))
+    for k, row in enumerate(rows):
+        half = float(kept.yaw[k]) / 2
+        turn = [0, 0, math.sin(half), math.cos(half)] if boxes.turns is None else boxes.turns[row]
+        turned[k] = poses[frames[row]] @ geometry.transform(kept.center[k], turn)
+    world = place.world_from_points
+    return replace(
+        boxes,
+        frame_id=place.points_frame,
+        boxes=geometry.upright(turned[:, :3, 3], kept.size, turned[:, :3, :3]),
+        labels=tuple(boxes.labels[row] for row in rows),
+        scores=boxes.scores[rows],
+        ids=tuple(boxes.ids[row] for row in rows) if boxes.ids else (),
+        world_from_boxes=np.eye(4) if world is None else world,
+        turns=None,
+        frames=(),
+    )
+
+
+def _words(frame: str) -> set[str]:
+    return set(re.split(r"[/_]", frame.lower()))
+
+
+def _extrinsic(names: str, pose: tuple[float, ...]) -> StampedTransform:
+    parent, _, child = names.strip().partition(" ")
+    if not parent or not child.strip():
+        raise UserError(f"source.extrinsics: '{names}' should be 'parent child', two frame names")
+    try:
+        matrix = geometry.transform(np.array(pose[:3]), np.array(pose[3:]))
+    except ValueError as error:
+        raise UserError(f"source.extrinsics '{names}': {error}; expected x y z qx qy qz qw") from None
+    return StampedTransform(0, parent, child.strip(), matrix)

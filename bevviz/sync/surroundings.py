@@ -1,0 +1,76 @@
+"""What the robot says around its perception, until the next frame takes it along."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
+from typing import TypeAlias
+
+import numpy as np
+
+from bevviz.model.frame import F64, Around, Motion, Shape, Status
+
+_Sample: TypeAlias = tuple[int, int, Sequence[float], Sequence[float]]
+
+MANY = 200  # statuses and shapes that are kept; the oldest goes
+SAMPLES = 5000  # of an Imu that wait for a frame; the oldest goes
+MARKS = 100  # that wait for a frame
+
+
+class Surroundings:
+    """Marks and samples of an Imu belong to the one frame that comes next.
+
+    Statuses and shapes hold until there are others.
+    """
+
+    def __init__(self) -> None:
+        self._marks: list[str] = []
+        self._statuses: dict[str, Status] = {}  # by name
+        self._shapes: dict[str, list[Shape]] = {}  # by topic
+        self._samples: dict[str, deque[_Sample]] = {}  # by topic
+
+    def add_mark(self, text: str) -> None:
+        self._marks.append(text)
+        del self._marks[:-MARKS]
+
+    def add_motion(
+        self, topic: str, stamp: int, received: int, rotation: Sequence[float], acceleration: Sequence[float]
+    ) -> None:
+        samples = self._samples.setdefault(topic, deque(maxlen=SAMPLES))
+        samples.append((stamp, received, rotation, acceleration))
+
+    def add_statuses(self, statuses: Sequence[Status]) -> None:
+        for status in statuses:
+            self._statuses.pop(status.name, None)
+            self._statuses[status.name] = status
+        while len(self._statuses) > MANY:
+            del self._statuses[next(iter(self._statuses))]
+
+    def add_shapes(self, topic: str, shapes: list[Shape]) -> None:
+        self._shapes[topic] = shapes[-MANY:]
+
+    def take(self, place: Callable[[str], F64 | None]) -> Around | None:
+        """All of it, for a frame; None: there is nothing.
+
+        Args:
+            place: (4, 4) world from a frame at the time of the cloud; None: not connected.
+        """
+        if not (self._marks or self._statuses or self._shapes or self._samples):
+            return None
+        shapes = [shape for found in self._shapes.values() for shape in found]
+        places = {frame: place(frame) for frame in dict.fromkeys(shape.frame_id for shape in shapes)}
+        around = Around(
+            marks=tuple(self._marks),
+            statuses=tuple(self._statuses.values()),
+            shapes=tuple(replace(shape, world_from_shape=places[shape.frame_id]) for shape in shapes),
+            motions=tuple(_motion(topic, samples) for topic, samples in self._samples.items()),
+        )
+        self._marks, self._samples = [], {}
+        return around
+
+
+def _motion(topic: str, samples: Iterable[_Sample]) -> Motion:
+    stamp, received, rotation, acceleration = zip(*samples, strict=True)
+    times = np.array(stamp, np.int64), np.array(received, np.int64)
+    return Motion(topic, *times, np.array(rotation, np.float64), np.array(acceleration, np.float64))

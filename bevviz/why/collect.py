@@ -1,0 +1,190 @@
+"""Follows one subject through the stages of a frame."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+
+from bevviz.model import geometry
+from bevviz.model.frame import F32, I32, I64
+from bevviz.model.results import ClusterState, FrameResult
+from bevviz.stages.visibility import in_view
+from bevviz.support.kernel import kernel
+from bevviz.why.detection_candidates import find_candidates, sort_candidates
+from bevviz.why.evidence import Candidate, Evidence, Part
+from bevviz.why.frame_index import FEW, PART, Fate, Traces
+from bevviz.why.merged import LOOKED_AT, closest, find_mates, part_from
+from bevviz.why.outcome import find_named
+from bevviz.why.subject import IN_VIEW, Subject
+
+NEARER = 0.5  # metres by which something must be nearer to hide what is behind it
+CORE = 0.8  # of the directions in which a box is seen: its object does not fill its corners
+
+
+def gather(subject: Subject, traces: Traces) -> Evidence:
+    """Follow the subject through the stages."""
+    result = traces.result
+    voxels, ground = result.voxels, result.ground
+    points = traces.place(subject)
+    front_rows, aimed = _before(subject, traces)
+    fate = np.zeros(len(result.frame.points), np.uint8)
+    fate[front_rows] = Fate.IN_FRONT
+    fate[points] = traces.fate[points]
+    rows, heights = np.zeros(0, np.int64), np.zeros(0, np.float32)
+    obstacle, labels = np.zeros(0, np.int64), np.zeros(0, np.int32)
+    if voxels is not None and ground is not None:
+        rows = np.unique(voxels.inverse[points]).astype(np.int64)
+        heights = ground.height[rows[traces.obstacle[rows] < 0]]
+        obstacle = traces.obstacle[rows][traces.obstacle[rows] >= 0]
+        if result.clusters is not None:
+            labels = result.clusters.labels[obstacle]
+    parts = _parts(labels, result)
+    candidates = find_candidates(subject, traces, parts)
+    main = _main(subject, parts, candidates, len(labels))
+    named = find_named(subject, traces, parts, candidates)
+    if named is not None and named.cluster >= 0:
+        main = named.cluster
+    candidates = sort_candidates(candidates, subject, main, result.config.detector.conf_threshold)
+    noise = obstacle[labels < 0]
+    mates = find_mates(subject, traces, main, obstacle)
+    shared = part_from(subject, traces, main, obstacle, mates)
+    hiding = traces.cluster[front_rows]
+    hiding = hiding[hiding >= 0]
+    config = result.config.clustering
+    return Evidence(
+        points=points,
+        fate=fate,
+        distance=_distance(subject, traces, points, main),
+        voxels=len(rows),
+        ground=heights,
+        noise=len(noise) if result.clusters is not None else 0,
+        neighbours=_most_neighbours(result.obstacles, noise, config.eps)
+        if traces.origin("clustering").ours
+        else 0,
+        parts=parts,
+        main=main,
+        aimed=aimed,
+        in_front=len(front_rows),
+        front=int(np.bincount(hiding).argmax()) if len(hiding) else -1,
+        candidates=candidates,
+        named=named,
+        mates=tuple(row for row, _, _ in mates),
+        others=tuple((name, count) for _, name, count in mates),
+        gap=shared[0],
+        finer=shared[1],
+        apart=_apart(result, parts),
+        in_view=bool(candidates) or _in_view(subject, traces),
+    )
+
+
+# --- LiDAR -------------------------------------------------------------------------------------
+
+
+def _parts(labels: I32, result: FrameResult) -> tuple[Part, ...]:
+    found, points = np.unique(labels[labels >= 0], return_counts=True)
+    clusters = result.clusters
+    if clusters is None:
+        return ()
+    order = np.argsort(-points, kind="stable")
+    return tuple(
+        Part(int(k), int(n), int(clusters.count[k]), ClusterState(int(clusters.state[k])))
+        for k, n in zip(found[order], points[order], strict=True)
+    )
+
+
+def _main(subject: Subject, parts: Sequence[Part], candidates: Sequence[Candidate], obstacles: int) -> int:
+    """The kept cluster that the subject is in, if it is more than a few points of it."""
+    if subject.kind == "detection":  # what is behind it is in its frustum, too: the fusion knows better
+        return next((c.cluster for c in candidates if c.kept and c.cluster >= 0), -1)
+    least = 1 if subject.is_place else max(FEW, PART * obstacles)
+    return next((p.cluster for p in parts if p.kept and p.points >= least), -1)
+
+
+def _before(subject: Subject, traces: Traces) -> tuple[I64, int]:
+    """Rows of the returns in the subject's direction that end before it, and how many there are in all.
+
+    Directions are seen from the origin of the points, which for one LiDAR is the LiDAR itself.
+    """
+    nothing = np.zeros(0, np.int64)
+    if subject.box is None:
+        return nothing, 0
+    corners, center = geometry.corners(subject.box)[0], subject.box.center[0]
+    away = np.hypot(corners[:, 0], corners[:, 1])
+    if np.hypot(*center[:2]) < np.hypot(*subject.box.size[0, :2]) / 2:
+        return nothing, 0  # the sensor is in it
+    seen = traces.directions
+    middle = np.arctan2(center[1], center[0])
+    turned = CORE * _turn(np.arctan2(corners[:, 1], corners[:, 0]) - middle)
+    elevation = np.arctan2(corners[:, 2], away)
+    half = CORE * (elevation.max() - elevation.min()) / 2
+    rows = np.concatenate(list(_between(seen.azimuth, middle + turned.min(), middle + turned.max())))
+    aimed = rows[np.abs(seen.elevation[rows] - (elevation.max() + elevation.min()) / 2) < half]
+    before = aimed[seen.away[aimed] < away.min() - NEARER]
+    return np.sort(seen.row[before]), len(aimed)
+
+
+def _between(azimuth: F32, low: float, high: float) -> Iterator[I64]:
+    """Rows of the sorted azimuths within an interval, which may go beyond half a turn."""
+    for turn in (-2 * np.pi, 0.0, 2 * np.pi):
+        first, last = np.searchsorted(azimuth, [low + turn, high + turn])
+        yield np.arange(first, last)
+
+
+def _turn(angle: F32) -> F32:
+    """The same angles within half a turn of zero."""
+    return np.asarray((angle + np.pi) % (2 * np.pi) - np.pi, np.float32)
+
+
+def _most_neighbours(obstacles: F32 | None, noise: I64, eps: float) -> int:
+    if obstacles is None or len(noise) == 0:
+        return 0
+    own = obstacles[noise[:: 1 + len(noise) // LOOKED_AT]]
+    near = ((obstacles > own.min(0) - eps) & (obstacles < own.max(0) + eps)).all(axis=1)
+    return int(_most_around(own, obstacles[near], eps * eps))
+
+
+@kernel
+def _most_around(own: F32, points: F32, eps2: float) -> int:
+    """Most points within a distance of one of ``own``."""
+    most = 0
+    for i in range(len(own)):
+        count = 0
+        for j in range(len(points)):
+            square = 0.0
+            for axis in range(3):
+                square += (np.float64(own[i, axis]) - points[j, axis]) ** 2
+            count += square < eps2
+        most = max(most, count)
+    return most
+
+
+def _distance(subject: Subject, traces: Traces, points: I64, main: int) -> float:
+    result = traces.result
+    if subject.box is not None:
+        return float(np.hypot(*subject.box.center[0, :2]))
+    if main >= 0 and result.clusters is not None:
+        return float(np.hypot(*result.clusters.centroid[main, :2]))
+    if subject.kind in ("pixel", "detection") and len(points):
+        return float(np.median(np.hypot(*result.frame.points[points, :2].T)))
+    return float("nan")
+
+
+def _apart(result: FrameResult, parts: Sequence[Part]) -> float:
+    kept = [part for part in parts if part.kept]
+    if len(kept) < 2 or result.clusters is None or result.obstacles is None:
+        return float("nan")
+    a, b = (result.obstacles[result.clusters.labels == part.cluster] for part in kept[:2])
+    return closest(a, b)
+
+
+def _in_view(subject: Subject, traces: Traces) -> bool:
+    """Whether some camera has the subject in its image; where no camera has a place, it is not known."""
+    placed = [c.camera for c in traces.result.cameras if c.camera.intrinsics is not None]
+    if all(camera.camera_from_points is None for camera in placed):
+        return True
+    if subject.kind == "truth":
+        return bool((traces.shown[subject.row] >= IN_VIEW).any())
+    if subject.box is not None:
+        return any(in_view(subject.box, camera)[0] >= IN_VIEW for camera in placed)
+    return True

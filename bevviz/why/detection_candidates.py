@@ -1,0 +1,116 @@
+"""The detections that are a subject's own."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from bevviz.model import geometry
+from bevviz.model.frame import F32, I64
+from bevviz.model.results import CameraResult, Decision, DetectionState, Fusion
+from bevviz.why.evidence import Candidate, Part
+from bevviz.why.frame_index import Traces
+from bevviz.why.subject import LINK, Subject, projected
+
+COVERED = 0.8  # share of a cluster in the image that is under a detection which may be of it
+
+
+def find_candidates(subject: Subject, traces: Traces, parts: Sequence[Part]) -> tuple[Candidate, ...]:
+    """The detections that are the subject's own."""
+    found = []
+    for camera in traces.result.cameras:
+        detections = camera.detections
+        if detections is None or (subject.camera and camera.camera.name != subject.camera):
+            continue
+        rows, overlap = _own_rows(subject, traces, camera, parts)
+        found += [_candidate(camera, int(row), float(overlap[row])) for row in rows]
+    return tuple(found)
+
+
+def _own_rows(
+    subject: Subject, traces: Traces, camera: CameraResult, parts: Sequence[Part]
+) -> tuple[I64, F32]:
+    """Rows of the camera's detections, and (D,) how far each overlaps the subject."""
+    detections = camera.detections
+    assert detections is not None
+    if subject.kind == "detection":
+        # The configuration may be another one than that which the subject was found in: find it by place.
+        assert subject.xyxy is not None
+        overlap = geometry.iou(subject.xyxy[None], detections.xyxy)[0]
+        return np.flatnonzero((np.array(detections.names) == subject.label) & (overlap > 0.99)), overlap
+    if subject.kind == "truth":
+        box = projected(subject.box, camera.camera) if subject.box is not None else None
+        around = np.full((1, 4), np.nan, np.float32) if box is None else box[None]
+        overlap = geometry.iou(around, detections.xyxy)[0]
+        return np.flatnonzero(traces.owners(camera) == subject.row), overlap
+    kept = [part.cluster for part in parts if part.kept]
+    if not kept:
+        nothing = np.zeros(len(detections), np.float32)
+        if subject.xyxy is None:
+            return np.zeros(0, np.int64), nothing
+        overlap = geometry.iou(subject.xyxy[None], detections.xyxy)[0]
+        return np.flatnonzero(overlap > 0), overlap
+    return _over_cluster(camera, kept[0])
+
+
+def _over_cluster(camera: CameraResult, cluster: int) -> tuple[I64, F32]:
+    """Detections over a cluster: that which the fusion found best for it, and all that look like it."""
+    detections, fusion = camera.detections, camera.fusion
+    assert detections is not None
+    if fusion is None:
+        return np.zeros(0, np.int64), np.zeros(len(detections), np.float32)
+    overlap = geometry.iou(fusion.cluster_uv[[cluster]], detections.xyxy)[0]
+    rows = np.flatnonzero(overlap >= LINK)
+    best = int(fusion.cluster_detection[cluster])
+    own = best >= 0 and _may_be_of(fusion, best, cluster, detections.xyxy[best])
+    return (np.union1d(rows, [best]) if own else rows).astype(np.int64), overlap
+
+
+def _may_be_of(fusion: Fusion, detection: int, cluster: int, xyxy: F32) -> bool:
+    """Whether the best detection for a cluster is of it: not if it named another, unless it covers it."""
+    if (
+        fusion.detection_decision[detection] != Decision.MATCHED
+        or fusion.detection_cluster[detection] == cluster
+    ):
+        return True
+    around = fusion.cluster_uv[cluster]
+    low, high = np.maximum(around[:2], xyxy[:2]), np.minimum(around[2:], xyxy[2:])
+    area = np.prod(around[2:] - around[:2])
+    return bool(np.prod(np.maximum(high - low, 0)) >= COVERED * area)
+
+
+def sort_candidates(
+    candidates: Sequence[Candidate], subject: Subject, main: int, threshold: float
+) -> tuple[Candidate, ...]:
+    """Of a right class, kept, matched with the subject's cluster, sure ones first."""
+
+    known = subject.kind in ("truth", "detection")
+
+    def rank(c: Candidate) -> tuple[bool, bool, bool, bool, bool, bool, float]:
+        matched = c.decision == Decision.MATCHED and c.cluster == main
+        suppressed = c.state == DetectionState.SUPPRESSED
+        weak = c.score < threshold
+        elsewhere = not known and c.decision == Decision.MATCHED and not matched
+        sure = c.overlap * c.score
+        return not subject.accepts(c.name), elsewhere, not c.kept, weak, suppressed, not matched, -sure
+
+    return tuple(sorted(candidates, key=rank))
+
+
+def _candidate(result: CameraResult, row: int, overlap: float) -> Candidate:
+    detections, fusion = result.detections, result.fusion
+    assert detections is not None
+    decision, cluster = Decision.NO_CLUSTER, -1
+    if fusion is not None:
+        decision, cluster = Decision(int(fusion.detection_decision[row])), int(fusion.detection_cluster[row])
+    return Candidate(
+        result.camera.name,
+        row,
+        detections.names[row],
+        float(detections.score[row]),
+        DetectionState(int(detections.state[row])),
+        overlap,
+        decision,
+        cluster,
+    )

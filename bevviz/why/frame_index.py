@@ -1,0 +1,371 @@
+"""A frame's results, turned so that any question about it is answered fast."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from enum import IntEnum
+from functools import cached_property
+
+import numpy as np
+
+from bevviz.model import geometry
+from bevviz.model.class_names import accepted_names
+from bevviz.model.frame import F32, I32, I64, U8, Bool, Boxes3D, Frame
+from bevviz.model.results import CameraResult, Decision, Detections, FrameResult
+from bevviz.stages.robot_results import in_points_frame
+from bevviz.stages.visibility import in_view
+from bevviz.why.stage_owner import StageOrigin, origin
+from bevviz.why.subject import FOOT, LINK, MARGIN, Subject, in_box, one_of, projected
+
+SAME_CLASS = 1.3  # times as good is the overlap of a detection with an object of its class
+FEW = 3  # points that are as good as none
+CORE = 0.5  # of the width and height of a detection: its middle
+DEPTH = 1.5  # metres of depth that what is seen of an object takes
+PART = 0.2  # of an object's obstacle voxels: what makes a cluster one of its clusters
+
+
+class Fate(IntEnum):
+    """What became of a raw point."""
+
+    ELSEWHERE = 0  # not one of the subject's
+    GROUND = 1
+    NOISE = 2
+    SET_ASIDE = 3  # in a cluster outside the size limits
+    CLUSTERED = 4  # in a cluster that no detection named
+    REPORTED = 5  # in a cluster that became an object
+    IN_FRONT = 6  # of the subject, and nearer: it hides it
+
+
+@dataclass(frozen=True, slots=True)
+class Directions:
+    """Where raw points are as seen from the origin, sorted by azimuth."""
+
+    row: I64  # (N,) of the point
+    azimuth: F32  # (N,) radians, ascending
+    elevation: F32  # (N,)
+    away: F32  # (N,) horizontal metres
+
+
+class Traces:
+    """What every question about a frame needs; each part is made when it is first asked for.
+
+    Args:
+        result: what was made of a frame.
+        classes: names that the detector knows; those that it gave in this frame are known without.
+    """
+
+    def __init__(self, result: FrameResult, classes: Sequence[str] = ()) -> None:
+        self.result = result
+        seen = [name for c in result.cameras if c.detections is not None for name in c.detections.names]
+        self.classes = tuple(dict.fromkeys([*classes, *seen]))
+        self._places: dict[tuple[object, ...], I64] = {}
+        self._uv: dict[str, F32] = {}
+        self._owners: dict[str, tuple[Detections, I64]] = {}  # with what they are the owners of
+        self._labels: dict[int, I32] = {}
+
+    def again(self, result: FrameResult) -> Traces:
+        """For another result of the same frame: what hangs on the frame alone is shared."""
+        other = Traces(result, self.classes)
+        other._places, other._uv, other._owners = self._places, self._uv, dict(self._owners)
+        other.truth, other.shown = self.truth, self.shown
+        other.directions, other._by_x = self.directions, self._by_x
+        return other
+
+    def origin(self, section: str) -> StageOrigin:
+        """Whose the stage of a section is."""
+        return self._origins[section]
+
+    @cached_property
+    def _origins(self) -> dict[str, StageOrigin]:
+        sections = "ground", "clustering", "detector", "objects"
+        return {section: origin(self.result.config, section) for section in sections}
+
+    # --- points --------------------------------------------------------------------------------
+
+    @cached_property
+    def directions(self) -> Directions:
+        x, y, z = self.result.frame.points.T
+        azimuth = np.arctan2(y, x)
+        row = np.argsort(azimuth)
+        away = np.hypot(x, y)
+        return Directions(row, azimuth[row], np.arctan2(z, away)[row], away[row])
+
+    @cached_property
+    def obstacle(self) -> I64:
+        """(M,) row of each voxel among the obstacles, -1: ground."""
+        ground = self.result.ground
+        if ground is None:
+            return np.zeros(0, np.int64)
+        return np.where(ground.mask, -1, np.cumsum(~ground.mask) - 1)
+
+    @cached_property
+    def cluster(self) -> I32:
+        """(N,) cluster of each raw point, -1: none."""
+        voxels, ground, clusters = self.result.voxels, self.result.ground, self.result.clusters
+        if voxels is None or ground is None or clusters is None:
+            return np.full(len(self.result.frame.points), -1, np.int32)
+        of_voxel = np.full(len(ground.mask), -1, np.int32)
+        of_voxel[~ground.mask] = clusters.labels
+        return of_voxel[voxels.inverse]
+
+    @cached_property
+    def fate(self) -> U8:
+        """(N,) Fate of each raw point, whosever it is."""
+        result = self.result
+        fate = np.full(len(result.frame.points), Fate.CLUSTERED, np.uint8)
+        if result.voxels is None or result.ground is None:
+            return fate
+        if result.clusters is not None:
+            of_cluster = np.full(len(result.clusters) + 1, Fate.CLUSTERED, np.uint8)
+            of_cluster[:-1][~result.clusters.kept] = Fate.SET_ASIDE
+            if result.objects is not None:
+                of_cluster[result.objects.cluster] = Fate.REPORTED
+            of_cluster[-1] = Fate.NOISE
+            fate = of_cluster[self.cluster]
+        fate[result.ground.mask[result.voxels.inverse]] = Fate.GROUND
+        return fate
+
+    @cached_property
+    def _by_x(self) -> tuple[I64, F32]:
+        x = self.result.frame.points[:, 0]
+        order = np.argsort(x)
+        return order, x[order]
+
+    def uv(self, camera: CameraResult) -> F32:
+        """(N, 2) raw points in pixels, NaN where not before the camera or its place is not known."""
+        name, view = camera.camera.name, camera.camera
+        if name not in self._uv:
+            points = self.result.frame.points
+            if view.intrinsics is None or view.camera_from_points is None:
+                self._uv[name] = np.full((len(points), 2), np.nan, np.float32)
+            else:
+                self._uv[name], _ = geometry.project(
+                    geometry.apply(view.camera_from_points, points), view.intrinsics
+                )
+        return self._uv[name]
+
+    def place(self, subject: Subject) -> I64:
+        """Rows of the raw points at the subject's place: its own, in its box or sphere, or in its frustum."""
+        if subject.is_place or subject.points is not None:  # of places there is no end
+            return self._place(subject)
+        key = subject.key if subject.xyxy is None else (*subject.key, *subject.xyxy.tolist())
+        if key not in self._places:
+            self._places[key] = self._place(subject)
+        return self._places[key]
+
+    def _place(self, subject: Subject) -> I64:
+        if subject.points is not None:
+            return subject.points
+        points, box = self.result.frame.points, subject.box
+        if box is not None:
+            order, x = self._by_x
+            reach = float(np.hypot(*box.size[0, :2])) / 2 + MARGIN
+            first, last = np.searchsorted(x, [box.center[0, 0] - reach, box.center[0, 0] + reach])
+            rows = order[first:last]
+            if subject.kind == "point":
+                away = np.linalg.norm(points[rows] - box.center[0], axis=1)
+                return np.sort(rows[away < box.size[0, 0] / 2])
+            foot = -MARGIN if subject.kind == "cell" else FOOT
+            return np.sort(rows[in_box(box, points[rows], MARGIN, foot)])
+        camera = self.camera(subject.camera)
+        if camera is None or subject.xyxy is None:
+            return np.zeros(0, np.int64)
+        rows = self._in_frustum(camera, subject.xyxy)
+        return self._foreground(camera, subject.xyxy, rows) if subject.kind == "detection" else rows
+
+    def _in_frustum(self, camera: CameraResult, xyxy: F32) -> I64:
+        u, v = self.uv(camera).T
+        x0, y0, x1, y1 = xyxy
+        with np.errstate(invalid="ignore"):
+            return np.flatnonzero((u >= x0) & (u <= x1) & (v >= y0) & (v <= y1))
+
+    def _foreground(self, camera: CameraResult, xyxy: F32, rows: I64) -> I64:
+        """Of the points in a detection's frustum those at the depth at which the middle of it has most.
+
+        What is behind an object shows around it, seldom in the middle of its box.
+        """
+        view = camera.camera
+        if view.camera_from_points is None:
+            return rows
+        depth = geometry.apply(view.camera_from_points, self.result.frame.points[rows])[:, 2]
+        half = (xyxy[2:] - xyxy[:2]) / 2
+        off = np.abs(self.uv(camera)[rows] - xyxy[:2] - half) / half
+        middle = np.sort(depth[(off < CORE).all(axis=1)])
+        if len(middle) < FEW:
+            return rows
+        first = int((np.searchsorted(middle, middle + DEPTH) - np.arange(len(middle))).argmax())
+        near = middle[first]
+        foreground: I64 = rows[(depth >= near - DEPTH) & (depth <= near + 2 * DEPTH)]
+        return foreground
+
+    def camera(self, name: str) -> CameraResult | None:
+        return next((c for c in self.result.cameras if c.camera.name == name), None)
+
+    # --- the ground truth ----------------------------------------------------------------------
+
+    @cached_property
+    def truth(self) -> tuple[Subject, ...]:
+        """Its objects, in order of their rows."""
+        return truth_subjects(self.result.frame, self.classes)
+
+    @cached_property
+    def of_truth(self) -> Bool:
+        """(K,) clusters most of whose points are on objects of the truth."""
+        known = np.zeros(len(self.result.frame.points), np.bool_)
+        for subject in self.truth:
+            known[self.place(subject)] = True
+        number = 0 if self.result.clusters is None else len(self.result.clusters)
+        clustered = self.cluster >= 0
+        whole = np.bincount(self.cluster[clustered], minlength=number)
+        return np.bincount(self.cluster[clustered & known], minlength=number) * 2 >= np.maximum(whole, 1)
+
+    @cached_property
+    def shown(self) -> F32:
+        """(K, cameras) share of each object of the truth that is inside each camera's image."""
+        share = np.zeros((len(self.truth), len(self.result.cameras)), np.float32)
+        boxes = joined([s.box for s in self.truth if s.box is not None])
+        for column, camera in enumerate(self.result.cameras):
+            share[:, column] = in_view(boxes, camera.camera)
+        return share
+
+    def labels(self, row: int) -> I32:
+        """Clusters of the obstacle voxels of one object of the truth, -1 noise."""
+        if row not in self._labels:
+            self._labels[row] = self.labels_of(self.place(self.truth[row]))
+        return self._labels[row]
+
+    def labels_of(self, points: I64) -> I32:
+        """Clusters of the obstacle voxels that raw points are in, -1 noise."""
+        voxels, clusters = self.result.voxels, self.result.clusters
+        if voxels is None or clusters is None or self.result.ground is None:
+            return np.zeros(0, np.int32)
+        obstacle = self.obstacle[np.unique(voxels.inverse[points])]
+        return clusters.labels[obstacle[obstacle >= 0]]
+
+    def holds(self, cluster: int, row: int) -> int:
+        """Voxels of an object of the truth in a cluster, 0 where these are a small part of it."""
+        labels = self.labels(row)
+        count = int((labels == cluster).sum())
+        return count if count >= max(FEW, PART * len(labels)) else 0
+
+    def mates(self, cluster: int, row: int) -> Iterator[int]:
+        """Rows of other objects of the truth that the cluster is one of."""
+        clusters = self.result.clusters
+        if clusters is None:
+            return
+        center, half = clusters.aabb.center[cluster], clusters.aabb.size[cluster] / 2
+        for other in self.truth:
+            if other.row == row or other.box is None:
+                continue
+            reach = half[:2] + np.hypot(*other.box.size[0, :2]) / 2 + MARGIN
+            near = np.abs(other.box.center[0, :2] - center[:2]) <= reach
+            if near.all() and self.holds(cluster, other.row):
+                yield other.row
+
+    def owners(self, camera: CameraResult) -> I64:
+        """(D,) row of the truth that each detection is of, -1: none.
+
+        It is of the object that it overlaps most. Detectors box what is seen of an object, or guess the whole
+        of it, so that two IoU count: with the projected box of the object, and with the image box around its
+        own points, which are not where another is before it; the greater one three times.
+        """
+        name, detections = camera.camera.name, camera.detections
+        assert detections is not None
+        known, owners = self._owners.get(name, (None, None))
+        if owners is None or known is None or not _same_boxes(known, detections):
+            owners = self._find_owners(camera, detections)
+            self._owners[name] = detections, owners
+        return owners
+
+    def _find_owners(self, camera: CameraResult, detections: Detections) -> I64:
+        owner = np.full(len(detections), -1, np.int64)
+        column = [c.camera.name for c in self.result.cameras].index(camera.camera.name)
+        rows = [row for row in range(len(self.truth)) if self.shown[row, column] > 0]
+        whole = np.full((len(rows), 4), np.nan, np.float32)
+        seen = whole.copy()
+        for i, row in enumerate(rows):
+            box = self.truth[row].box
+            around = projected(box, camera.camera) if box is not None else None
+            if around is not None:
+                whole[i] = around
+                inside = self._in_image(self.uv(camera)[self.place(self.truth[row])], around)
+                if len(inside) >= FEW:
+                    seen[i] = *inside.min(0), *inside.max(0)
+        if not rows or not len(detections):
+            return owner
+        both = geometry.iou(detections.xyxy, whole), geometry.iou(detections.xyxy, seen)
+        overlap = 0.75 * np.maximum(*both) + 0.25 * np.minimum(*both)
+        overlap[:, np.isnan(seen[:, 0])] = both[0][:, np.isnan(seen[:, 0])] / 2
+        same = np.array([[self.truth[row].accepts(name) for row in rows] for name in detections.names])
+        best = (overlap * np.where(same, SAME_CLASS, 1.0)).argmax(axis=1)
+        sure = overlap[np.arange(len(best)), best] >= LINK
+        owner[sure] = np.array(rows)[best[sure]]
+        return owner
+
+    @staticmethod
+    def _in_image(uv: F32, box: F32) -> F32:
+        with np.errstate(invalid="ignore"):
+            return uv[((uv >= box[:2]) & (uv <= box[2:])).all(axis=1)]
+
+    @cached_property
+    def competing(self) -> tuple[Subject, ...]:
+        """Kept detections that are of no object of the truth: each may be one that it does not know."""
+        found = []
+        for camera in self.result.cameras:
+            if camera.detections is not None:
+                kept = camera.detections.kept & (self.owners(camera) < 0)
+                found += [detection_subject(camera, d) for d in np.flatnonzero(kept).tolist()]
+        return tuple(found)
+
+
+def truth_subjects(frame: Frame, classes: Sequence[str] = ()) -> tuple[Subject, ...]:
+    """The objects of a frame's ground truth, in order of their rows.
+
+    Args:
+        frame: the frame.
+        classes: names that the detector knows.
+    """
+    stated = frame.truth
+    if stated is None:
+        return ()
+    boxes = in_points_frame(frame, stated)
+    away = np.hypot(*boxes.center[:, :2].T)
+    return tuple(
+        Subject(
+            "truth",
+            f"the {label.lower()} at {away[row]:.1f} m",
+            label,
+            accepted_names(label, classes),
+            row,
+            box=one_of(boxes, row),
+        )
+        for row, label in enumerate(stated.labels)
+    )
+
+
+def _same_boxes(a: Detections, b: Detections) -> bool:
+    """Whether they differ in their states only."""
+    return a is b or (a.names == b.names and np.array_equal(a.xyxy, b.xyxy))
+
+
+def joined(boxes: Sequence[Boxes3D]) -> Boxes3D:
+    """Several boxes as one list."""
+    if not boxes:
+        return Boxes3D.empty()
+    columns = ([getattr(box, name) for box in boxes] for name in ("center", "size", "yaw"))
+    return Boxes3D(*map(np.concatenate, columns))
+
+
+def detection_subject(camera: CameraResult, row: int) -> Subject:
+    """A detection of its own."""
+    detections = camera.detections
+    assert detections is not None
+    label, fusion = detections.names[row], camera.fusion
+    name = f"the {label} {detections.score[row]:.2f} in {camera.camera.name}"
+    if fusion is not None and fusion.detection_decision[row] == Decision.MATCHED:
+        pair = fusion.pair(row, int(fusion.detection_cluster[row]))
+        name += f" at {pair.depth:.1f} m" if pair is not None else ""
+    return Subject(
+        "detection", name, label, frozenset({label.lower()}), row, camera.camera.name, detections.xyxy[row]
+    )

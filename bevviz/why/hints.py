@@ -1,0 +1,384 @@
+"""What would change a verdict: said only where running the stages again proves it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from itertools import islice
+from typing import Any
+
+import numpy as np
+from pydantic import ValidationError
+
+from bevviz.config import Config, plugin_of
+from bevviz.errors import UserError
+from bevviz.model.frame import Camera
+from bevviz.model.results import Detections, DetectionState, FrameResult
+from bevviz.pipeline.perceive import perceive
+from bevviz.pipeline.stage_loader import Detect, StageLoader
+from bevviz.pipeline.stage_log import Memo
+from bevviz.why.collect import gather
+from bevviz.why.evidence import Candidate, Evidence
+from bevviz.why.frame_index import Traces
+from bevviz.why.side_effects import Effects, effects
+from bevviz.why.subject import Subject
+from bevviz.why.verdict import FLAWED, Reason, find_reason
+
+TRIES = 10  # configurations that are run for one subject
+SURE = 0.5  # IoU of a detection with its object that leaves no doubt
+FURTHER = 10  # more of them, that go on from where the first have brought it
+RESULTS = 20  # of other configurations that are kept, for further subjects of the frame
+
+Change = Mapping[str, Any]  # dotted key -> value
+
+# Applied by bevviz to what somebody's function gave.
+_WHOEVER = {"min_cluster_points", "max_cluster_points", "conf_threshold"}
+_SECTION = {  # whose parameters may help, by the reason
+    Reason.GROUND: "ground",
+    Reason.NOISE: "clustering",
+    Reason.NO_CLUSTER: "clustering",
+    Reason.MERGED: "clustering",
+    Reason.SPLIT: "clustering",
+    Reason.NOT_DETECTED: "detector",
+    Reason.BELOW_THRESHOLD: "detector",
+    Reason.NOT_AMONG: "objects",
+    Reason.MISNAMED: "objects",
+}
+
+
+_ORDER = {reason: place for place, reason in enumerate(Reason)}  # along the stages
+
+
+@dataclass(frozen=True, slots=True)
+class _Stage:
+    """How far a subject came."""
+
+    reported: bool
+    reason: Reason
+
+    def __gt__(self, other: _Stage) -> bool:
+        return (self.reported, _ORDER[self.reason]) > (other.reported, _ORDER[other.reason])
+
+
+@dataclass(frozen=True, slots=True)
+class Hint:
+    """Settings that change the verdict when the stages are run again, and what happens then.
+
+    Attributes:
+        settings: as ``--set`` takes them.
+        text: what becomes of the subject.
+        effects: what else they change in the frame.
+    """
+
+    settings: tuple[str, ...]
+    text: str
+    effects: Effects
+
+
+@dataclass(frozen=True, slots=True)
+class Search:
+    """What was tried for a subject.
+
+    Attributes:
+        hints: the best that changes the verdict; empty: none of those that were tried does.
+        tried: configurations that were run.
+        furthest: settings that bring it to a later stage, where none helps; empty: none does.
+        then: why it is not reported with these, or what is wrong with how it is.
+        reported: whether it is.
+    """
+
+    hints: tuple[Hint, ...]
+    tried: int
+    furthest: tuple[str, ...] = ()
+    then: Reason | None = None
+    reported: bool = False
+
+
+class WhatIf:
+    """Runs a frame with other configurations, each once.
+
+    Args:
+        traces: what was made of the frame.
+        loader: that has the networks already.
+    """
+
+    def __init__(self, traces: Traces, loader: StageLoader | None = None) -> None:
+        self._traces, self._result = traces, traces.result
+        self._loader, self._memo = loader or StageLoader(), Memo()
+        self._runs: dict[tuple[tuple[str, Any], ...], Traces | None] = {}
+
+    def search(self, subject: Subject, evidence: Evidence, reason: Reason, reported: bool) -> Search:
+        """The best change of those that the reason suggests: the mildest that makes nothing worse.
+
+        Where each that helps makes something worse, the one that does the least harm. Where none helps, those
+        that bring it to a later stage are joined with what the reason there suggests.
+        """
+        found: list[Hint] = []
+        reached: dict[_Stage, tuple[Change, Evidence, Traces]] = {}  # by the mildest change
+        tried = 0
+
+        def ways() -> Iterator[Change]:
+            yield from islice(_changes(evidence, reason, self._traces), TRIES)
+            if not found:
+                yield from islice(_further(reached), FURTHER)
+
+        for change in ways():
+            after = self._run(change)
+            if after is None:
+                continue
+            tried += 1
+            then = gather(subject, after)
+            new, now_reported = find_reason(subject, then, after)
+            text, own = _outcome(subject, (reason, reported), (new, now_reported), then, after)
+            if text and _is_sure(subject, change, then):
+                row = subject.row if subject.kind == "truth" else -1
+                objects, then_objects = self._result.objects, after.result.objects
+                harm = effects(objects, then_objects, self._traces.truth, row, own)
+                found.append(Hint(_settings(change), text, harm))
+                if not found[-1].effects.harm:
+                    break
+            elif not text and (stage := _Stage(now_reported, new)) > _Stage(reported, reason):
+                reached.setdefault(stage, (change, then, after))
+        if found or not reached:
+            return Search(tuple(sorted(found, key=lambda hint: hint.effects.harm)[:1]), tried)
+        last = max(reached)
+        return Search((), tried, _settings(reached[last][0]), last.reason, last.reported)
+
+    def _run(self, change: Change) -> Traces | None:
+        key = tuple(change.items())
+        if key not in self._runs:
+            try:
+                config = changed(self._result.config, change)
+                stages = self._loader.load(config, self._known_detections(config, change))
+            except (UserError, ValidationError):  # the model file has gone, or nobody may set that value
+                self._runs[key] = None
+            else:
+                result = perceive(self._result.frame, config, stages, self._memo)
+                self._runs[key] = self._traces.again(result)
+            while len(self._runs) > RESULTS:
+                del self._runs[next(iter(self._runs))]
+        return self._runs[key]
+
+    def _known_detections(self, config: Config, change: Change) -> Detect | None:
+        """Detections for other thresholds: the network need not be run. None: it has to be.
+
+        What NMS leaves cannot be told from the candidates that were kept to be explained, nor what somebody's
+        detector makes of other parameters; the robot's are what they are.
+        """
+        touched = {key for key in change if key.startswith("detector.")} - {"detector.conf_threshold"}
+        if touched or self._traces.origin("detector").topic:
+            return None
+        known = {c.camera.name: c.detections for c in self._result.cameras}
+
+        def detect(camera: Camera) -> Detections | None:
+            found = known[camera.name]
+            if found is None:
+                return None
+            kept = found.score >= config.detector.conf_threshold
+            state = np.where(kept, DetectionState.KEPT, DetectionState.BELOW_THRESHOLD).astype(np.int32)
+            state[found.state == DetectionState.SUPPRESSED] = DetectionState.SUPPRESSED
+            return replace(found, state=state)
+
+        return detect
+
+
+def changed(config: Config, change: Change) -> Config:
+    """The configuration with other values."""
+    tree = config.model_dump()
+    for key, value in change.items():
+        *path, name = key.split(".")
+        section = tree
+        for part in path:
+            section = section[part]
+        section[name] = value
+    return config.restated(tree)
+
+
+def _outcome(
+    subject: Subject, was: tuple[Reason, bool], now: tuple[Reason, bool], e: Evidence, after: Traces
+) -> tuple[str, int]:
+    """What has become of the subject, empty where it is no better off, and its object's row."""
+    (reason, reported), (new, now_reported), named = was, now, e.named
+    if reason is Reason.BORROWED and subject.kind != "truth":
+        return ("" if named is not None else "it is not named any more"), -1
+    better = now_reported and (not reported or reason in FLAWED | {Reason.BORROWED})
+    if not better or named is None or new is not Reason.REPORTED:
+        return "", -1
+    if named.cluster < 0 or not after.origin("objects").ours:
+        return f"{after.origin('objects').name} has {named.name} there then", named.row
+    return f"it is cluster {named.cluster} then, named {named.name}", named.row
+
+
+def _is_sure(subject: Subject, change: Change, e: Evidence) -> bool:
+    """Whether a detection that other limits let pass is the subject's own without a doubt."""
+    if subject.kind != "truth" or e.named is None or e.named.detection < 0:
+        return True
+    if not any(key.startswith(("detector.", "fusion.min", "fusion.split")) for key in change):
+        return True
+    camera, row = e.named.camera, e.named.detection
+    return any((c.camera, c.row) == (camera, row) and c.overlap >= SURE for c in e.candidates)
+
+
+def _settings(change: Change) -> tuple[str, ...]:
+    return tuple(f"{key}={_written(value)}" for key, value in change.items())
+
+
+def _further(reached: Mapping[_Stage, tuple[Change, Evidence, Traces]]) -> Iterator[Change]:
+    """What might help in addition; ``reached`` may grow meanwhile. What came the farthest goes first."""
+    done: set[_Stage] = set()
+    while left := reached.keys() - done:
+        stage = max(left)
+        done.add(stage)
+        change, evidence, after = reached[stage]
+        for more in _changes(evidence, stage.reason, after):
+            yield {**change, **more}
+
+
+# --- what to try -------------------------------------------------------------------------------
+
+
+def _changes(e: Evidence, reason: Reason, traces: Traces) -> Iterator[Change]:
+    """What might help, by the reason: parameters of ours, or of the function that was at fault."""
+    result = traces.result
+    section = _SECTION.get(reason, "")
+    if section and not traces.origin(section).ours:
+        yield from _of_function(result, section)
+    if not traces.origin("objects").ours:
+        return
+    config = result.config
+    for change in _of_ours(e, reason, config):
+        if all(_is_ours(key, traces) for key in change):
+            yield change
+
+
+def _is_ours(key: str, traces: Traces) -> bool:
+    """Whether a parameter has a say: those of a stage that is somebody else's have none."""
+    section, _, name = key.partition(".")
+    if section not in ("ground", "clustering", "detector"):
+        return True
+    there = traces.origin(section)
+    shared = {
+        "min_cluster_points",
+        "max_cluster_points",
+        "conf_threshold",
+    }  # bevviz's own, whoever's stage it is
+    return there.ours or (bool(there.function) and name in shared)
+
+
+def _of_function(result: FrameResult, section: str) -> Iterator[Change]:
+    """Halves and doubles of the numbers among the parameters of somebody's function, within their bounds."""
+    try:
+        plugin = plugin_of(result.config, section)
+    except UserError:
+        return
+    if plugin is None or plugin.params is None:
+        return
+    given = dict(getattr(result.config, section).params)
+    for factor in (0.5, 2.0):
+        for name, value in given.items():
+            if isinstance(value, bool) or not isinstance(value, int | float) or not value:
+                continue
+            other = type(value)(round(value * factor)) if isinstance(value, int) else round(value * factor, 6)
+            try:
+                plugin.params.model_validate({**given, name: other})
+            except ValidationError:
+                continue
+            if other != value:
+                yield {f"{section}.params.{name}": other}
+
+
+def _of_ours(e: Evidence, reason: Reason, config: Config) -> Iterator[Change]:
+    c, best = config.clustering, e.best
+    if reason is Reason.GROUND:
+        yield from _lower_ground(config)
+    elif reason is Reason.NOISE:
+        for points in _below(e.neighbours, c.min_points):
+            yield {"clustering.min_points": points}
+            if points < c.min_cluster_points:
+                yield {"clustering.min_points": points, "clustering.min_cluster_points": points}
+        for factor in (1.5, 2.0):
+            yield {"clustering.eps": round(c.eps * factor, 3)}
+        yield from _lower_ground(config)
+    elif reason is Reason.TOO_SMALL:
+        yield {"clustering.min_cluster_points": max(_aside(e), 1)}
+        yield {"clustering.eps": round(c.eps * 1.5, 3)}
+    elif reason is Reason.TOO_LARGE:
+        yield {"clustering.max_cluster_points": _aside(e)}
+    elif reason is Reason.MERGED:
+        if config.fusion.method == "frustum" and not config.fusion.split:
+            yield {"fusion.split": True}
+        if e.finer:
+            yield from ({"clustering.eps": round(e.finer * f, 3)} for f in (1.0, 0.85, 0.7))
+        elif not e.others:
+            yield from ({"clustering.eps": round(c.eps * f, 3)} for f in (0.8, 0.6, 0.4))
+    elif reason is Reason.SPLIT:
+        # How far apart is unknown where one of the parts is not a cluster.
+        yield {"clustering.eps": round(max(np.nan_to_num(e.apart), c.eps) * 1.1, 3)}
+        yield {"clustering.min_points": max(1, c.min_points // 2)}
+        yield {"clustering.eps": round(c.eps * 1.5, 3)}
+    elif best is not None:
+        yield from _for_detection(reason, best, config)
+
+
+def _aside(e: Evidence) -> int:
+    """Points of the cluster that was set aside."""
+    return next(part.count for part in e.parts if not part.kept)
+
+
+def _for_detection(reason: Reason, best: Candidate, config: Config) -> Iterator[Change]:
+    if reason is Reason.BELOW_THRESHOLD:
+        # A threshold that lets any noise pass is no advice.
+        if best.score >= 0.05:
+            passes = {"detector.conf_threshold": math.floor(100 * best.score) / 100}
+            yield passes
+            if config.fusion.method == "frustum" and config.fusion.split:
+                # What it rates a match by is in proportion to the score.
+                weak = config.fusion.min_rating * best.score / config.detector.conf_threshold
+                yield from ({**passes, "fusion.min_rating": round(weak * f, 4)} for f in (1.0, 0.5))
+    elif reason is Reason.SUPPRESSED:
+        yield from ({"detector.iou_threshold": value} for value in (0.6, 0.7, 0.8, 0.9))
+    elif reason is Reason.LOW_OVERLAP:
+        yield from ({"fusion.min_iou": round(config.fusion.min_iou * f, 3)} for f in (0.5, 0.2, 0.0))
+        yield {"clustering.eps": round(config.clustering.eps * 0.6, 3)}
+    elif reason is Reason.MISFIT:
+        yield from ({"fusion.min_rating": round(config.fusion.min_rating * f, 4)} for f in (0.5, 0.2))
+        yield {"fusion.split": False}
+    elif reason is Reason.TOO_FEW_POINTS:
+        yield from ({"fusion.min_points": value} for value in range(config.fusion.min_points - 1, 0, -1))
+    elif reason in (Reason.SHARED_BOX, Reason.BORROWED, Reason.TAKEN, Reason.OTHER_CLUSTER, Reason.MISNAMED):
+        if config.fusion.method == "centroid":
+            yield {"fusion.method": "frustum"}
+    elif reason is Reason.TOO_FAR and config.fusion.method == "centroid":
+        # Its own cluster is missing: something else was merely the nearest.
+        yield from _lower_ground(config)
+        yield {"fusion.method": "frustum"}
+    elif reason is Reason.TOO_FAR:
+        yield {"fusion.max_depth": 200.0}
+
+
+def _lower_ground(config: Config) -> Iterator[Change]:
+    """A thinner ground; where one plane is all there is, one that follows the road, too."""
+    g, points = config.ground, max(1, config.clustering.min_points // 3)
+    for threshold in (0.3, 0.2, 0.1):
+        if threshold < g.distance_threshold:
+            yield {"ground.distance_threshold": threshold}
+    if g.method == "plane":
+        yield {"ground.method": "polar", "ground.distance_threshold": 0.2}
+        yield {
+            "ground.method": "polar",
+            "ground.distance_threshold": 0.2,
+            "clustering.min_points": points,
+        }
+
+
+def _below(neighbours: int, limit: int) -> list[int]:
+    """Values of min_points to try: what the best point just reaches, and less."""
+    tries = [neighbours, round(neighbours * 0.75), neighbours // 2]
+    return [n for n in dict.fromkeys(tries) if 2 <= n < limit]
+
+
+def _written(value: Any) -> str:
+    if isinstance(value, bool):
+        return str(value).lower()
+    return f"{value:g}" if isinstance(value, float) else str(value)

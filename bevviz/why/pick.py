@@ -1,0 +1,177 @@
+"""From what was clicked in a view to the thing that is asked about."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal, Self, get_args
+
+import numpy as np
+
+from bevviz.errors import UserError
+from bevviz.model import geometry
+from bevviz.model.results import CameraResult, FrameResult, Tracks
+from bevviz.recording import entities
+from bevviz.recording.labels import row_of
+from bevviz.recording.opinions import MISSED, told_from_above, told_in_image
+from bevviz.recording.primitives import CORNER
+from bevviz.recording.tracks import shown
+
+Kind = Literal["truth", "object", "detection", "cluster", "pixel", "point", "cell"]
+
+
+@dataclass(frozen=True, slots=True)
+class Pick:
+    """One thing of a frame, or a place in it.
+
+    Attributes:
+        kind: what it is.
+        row: of the ground truth, the objects, the clusters or the camera's detections.
+        camera: of a detection or pixel.
+        place: u, v in pixels, x, y, z in metres of ``Frame.points_frame``, or row, column of the BEV.
+    """
+
+    kind: Kind
+    row: int = -1
+    camera: str = ""
+    place: tuple[float, ...] = ()
+
+    @property
+    def is_place(self) -> bool:
+        """Whether it is a place, where any number of things may be."""
+        return self.kind in ("pixel", "point", "cell")
+
+    def __str__(self) -> str:
+        """As it stands in the page's address: ``detection/front/3``, ``point//1.5,2,0``."""
+        what = ",".join(f"{v:.4g}" for v in self.place) if self.place else str(self.row)
+        return f"{self.kind}/{self.camera}/{what}"
+
+    @classmethod
+    def parse(cls, text: str) -> Self:
+        """Raises UserError where it is none."""
+        kind, _, rest = text.partition("/")
+        camera, _, what = rest.rpartition("/")
+        size = {"pixel": 2, "point": 3, "cell": 2}.get(kind, 1)
+        try:
+            numbers = tuple(float(part) for part in what.split(","))
+        except ValueError:
+            numbers = ()
+        if kind not in get_args(Kind) or len(numbers) != size or not np.isfinite(numbers).all():
+            raise UserError(f"'{text}' is nothing that can be asked about")
+        if size == 1:
+            return cls(kind, int(numbers[0]), camera)  # type: ignore[arg-type]
+        return cls(kind, camera=camera, place=numbers)  # type: ignore[arg-type]
+
+
+def pick(
+    result: FrameResult, tracks: Tracks | None, path: str, instance: int | None, position: Sequence[float]
+) -> Pick | None:
+    """What a click in a view is on; None: nothing that could be asked about.
+
+    Args:
+        result: of the frame that is shown.
+        tracks: of the run over the drive in that frame.
+        path: entity that was clicked.
+        instance: row of its boxes or points; None: the entity as a whole.
+        position: where: 2 pixels in a view of an image, 3 metres of the fixed frame in one of space.
+    """
+    row, path = -1 if instance is None else instance, entities.boxes_of(path)
+    if found := _told(result, path, row):
+        return found
+    for camera in result.cameras:
+        if found := _in_image(camera, path, row, position):
+            return found
+    if path == entities.BEV or path.startswith(f"{entities.BEV}/"):
+        return _cell(result, position) if len(position) >= 2 else None
+    return _in_space(result, tracks, path, row) or _at(result, position)
+
+
+def _told(result: FrameResult, path: str, row: int) -> Pick | None:
+    """An object over an image or the bird's-eye view of which cameras say something."""
+    views = [told_from_above(result)] if path.startswith(f"{entities.BEV}/") else []
+    views += [
+        told_in_image(result, found.camera)
+        for found in result.cameras
+        if path.startswith(f"{entities.image(found.camera.name)}/")
+    ]
+    for told in views:
+        if path in told and 0 <= (row := row_of(row, len(told[path].rows))) < len(told[path].rows):
+            found = told[path].rows[row]
+            return _missed(result, found) if told[path].opinion == MISSED else Pick("object", found)
+    return None
+
+
+def _missed(result: FrameResult, row: int) -> Pick | None:
+    """What our fusion would have made of a detection, where the objects are somebody else's."""
+    if result.opinions is None:
+        return None
+    fused = result.opinions.fused
+    if (row := row_of(row, len(fused))) >= len(fused):
+        return None
+    return Pick("detection", int(fused.detection[row]), fused.camera[row])
+
+
+def _in_image(found: CameraResult, path: str, row: int, position: Sequence[float]) -> Pick | None:
+    name = found.camera.name
+    if found.detections is not None and row >= 0:
+        kept = found.detections.kept
+        for where, rows in ((entities.detections(name), kept), (entities.weak(name), ~kept)):
+            listed = np.flatnonzero(rows)
+            if path == where and (row := row_of(row, len(listed))) < len(listed):
+                return Pick("detection", int(listed[row]), name)
+    inside = path in (entities.sensor(name), entities.image(name)) or path.startswith(
+        (f"{entities.image(name)}/", entities.why(f"{name}/"))
+    )
+    if not inside or len(position) < 2:
+        return None
+    return Pick("pixel", camera=name, place=(position[0] - CORNER, position[1] - CORNER))
+
+
+def _cell(result: FrameResult, position: Sequence[float]) -> Pick | None:
+    if result.bev is None:
+        return None
+    column, row = (int(np.floor(v)) for v in position[:2])
+    height, width = result.bev.image.shape[:2]
+    return Pick("cell", place=(row, column)) if 0 <= row < height and 0 <= column < width else None
+
+
+def _in_space(result: FrameResult, tracks: Tracks | None, path: str, row: int) -> Pick | None:
+    frame = result.frame
+    if row < 0:
+        return None
+    if path == entities.points(frame.lidar) and len(frame.clouds) <= 1 and row < len(frame.points):
+        return _point(frame.points[row])
+    if path == entities.FUSED and (objects := result.objects) is not None:
+        return Pick("object", row_of(row, len(objects))) if row_of(row, len(objects)) < len(objects) else None
+    if path == entities.FUSION:
+        return _missed(result, row)
+    if path == entities.TRUTH and frame.truth is not None and row < len(frame.truth.boxes):
+        return Pick("truth", row)
+    if path in (entities.TRACKS, entities.UNSEEN) and tracks is not None:
+        rows = shown(tracks)
+        named = tracks.object[rows] >= 0
+        listed = rows[named] if path == entities.TRACKS else rows[~named]
+        return _track(result, tracks, int(listed[row])) if row < len(listed) else None
+    if path == entities.set_aside(frame.lidar) and result.clusters is not None:
+        aside = np.flatnonzero(~result.clusters.kept)
+        return Pick("cluster", int(aside[row])) if row < len(aside) else None
+    return None
+
+
+def _track(result: FrameResult, tracks: Tracks, row: int) -> Pick | None:
+    if tracks.cluster[row] >= 0:
+        return Pick("cluster", int(tracks.cluster[row]))
+    center = tracks.boxes.center[row]
+    return _at(result, center.tolist()) if tracks.absolute else _point(center)
+
+
+def _at(result: FrameResult, position: Sequence[float]) -> Pick | None:
+    """A place in the fixed frame."""
+    if len(position) != 3:
+        return None
+    return _point(geometry.apply(geometry.inverse(result.frame.pose), np.array([position]))[0])
+
+
+def _point(xyz: np.ndarray[tuple[int], np.dtype[np.floating]]) -> Pick:
+    x, y, z = map(float, xyz)
+    return Pick("point", place=(x, y, z))

@@ -1,0 +1,412 @@
+"""From what was selected to the subjects that it is of."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+
+from bevviz.config import BevConfig
+from bevviz.errors import UserError
+from bevviz.model import geometry
+from bevviz.model.class_names import accepted_names
+from bevviz.model.frame import F32, I64, Boxes3D, Intrinsics
+from bevviz.model.results import CameraResult, Decision, DetectionState, Opinion
+from bevviz.why.frame_index import FEW, Traces, detection_subject, joined
+from bevviz.why.outcome import OVERLAP
+from bevviz.why.subject import IN_VIEW, LINK, Selection, Subject, one_of, projected
+
+PIXELS = 6.0  # half edge of what is looked at around a pixel
+SPACING = 1.0  # pixels by which the points of what a pixel shows may be farther from it than those of another
+SURFACE = 1.0  # metres behind the nearest return at a pixel that still count as what the pixel shows
+AS_GOOD = 0.8  # of the best fit to a box: what is as good an answer
+
+
+def select(traces: Traces, selection: Selection) -> list[Subject]:
+    """The subjects of a selection; of a pixel, a box or a point, what lies there and the place itself.
+
+    Raises:
+        UserError: unknown class, camera or row, pixel outside the image, several cameras and none named.
+    """
+    result = traces.result
+    if selection.truth is not None:
+        return [_row(traces.truth, selection.truth, "object in the ground truth of this frame")]
+    if selection.object is not None:
+        return [object_subject(traces, selection.object)]
+    if selection.cluster is not None:
+        return [cluster_subject(traces, selection.cluster)]
+    if selection.track is not None:
+        return [track_subject(traces, selection.track)]
+    if selection.detection is not None:
+        found = camera_of(traces, selection.camera)
+        number = 0 if found.detections is None else len(found.detections)
+        if not 0 <= selection.detection < number:
+            raise UserError(
+                f"there is no detection {selection.detection} in {found.camera.name}: it has {number}"
+            )
+        return [detection_subject(found, selection.detection)]
+    if selection.point or selection.cell:
+        return [_around(traces, selection)]
+    if selection.box:
+        return [_pixel(traces, selection)]
+    if selection.camera:
+        camera_of(traces, selection.camera)
+    subjects = [*_seen(traces, selection.camera), *_strange_detections(traces, selection.camera)]
+    subjects += _denied(traces, selection.camera)
+    if not selection.label:
+        return subjects
+    truth = result.frame.truth
+    theirs = result.objects.names if result.opinions is not None and result.objects is not None else ()
+    known = dict.fromkeys([*traces.classes, *(truth.labels if truth is not None else ()), *theirs])
+    wanted = selection.label.lower()
+    if not any(wanted == name.lower() or wanted in accepted_names(name, ()) for name in known):
+        near = difflib.get_close_matches(selection.label, known, 1, 0.5)
+        hint = f"did you mean '{near[0]}'?" if near else f"there are {', '.join(sorted(known)) or 'none'}"
+        raise UserError(f"--class {selection.label}: no such class; {hint}")
+    return [s for s in subjects if s.label.lower() == wanted or _is_called(s, wanted)]
+
+
+def _is_called(subject: Subject, name: str) -> bool:
+    """Whether a name of the detector's stands for the subject, too."""
+    if subject.kind == "object":
+        return name in accepted_names(subject.label, ())
+    return subject.kind == "truth" and subject.accepts(name)
+
+
+def _row(subjects: tuple[Subject, ...], row: int, what: str) -> Subject:
+    if not 0 <= row < len(subjects):
+        raise UserError(f"there is no {what} of number {row}: it has {len(subjects)}")
+    return subjects[row]
+
+
+def object_subject(traces: Traces, row: int) -> Subject:
+    """An object that the frame's result has.
+
+    Raises:
+        UserError: it has no such object.
+    """
+    objects = traces.result.objects
+    number = 0 if objects is None else len(objects)
+    if objects is None or not 0 <= row < number:
+        raise UserError(f"there is no object {row} in this frame: it has {number}")
+    box, name = one_of(objects.boxes, row), objects.names[row]
+    away = float(np.hypot(*box.center[0, :2]))
+    k = int(objects.cluster[row])
+    points = np.flatnonzero(traces.cluster == k) if k >= 0 else None
+    title = f"the {name} {objects.score[row]:.2f} at {away:.1f} m"
+    return Subject("object", title, name, frozenset({name.lower()}), row, box=box, points=points)
+
+
+def cluster_subject(traces: Traces, row: int) -> Subject:
+    """A cluster of the frame.
+
+    Raises:
+        UserError: it has no such cluster.
+    """
+    clusters = traces.result.clusters
+    number = 0 if clusters is None else len(clusters)
+    if clusters is None or not 0 <= row < number:
+        raise UserError(f"there is no cluster {row} in this frame: it has {number}")
+    away = float(np.hypot(*clusters.centroid[row, :2]))
+    points = np.flatnonzero(traces.cluster == row)
+    name = f"cluster {row} at {away:.1f} m"
+    box = one_of(clusters.boxes(traces.result.config.clustering), row)
+    return Subject("cluster", name, row=row, box=box, points=points)
+
+
+def track_subject(traces: Traces, number: int) -> Subject:
+    """A track that lives: the cluster that it has in this frame, or where it is expected.
+
+    Raises:
+        UserError: no track has that id, or the frame was run by itself.
+    """
+    tracks, frame = traces.result.tracks, traces.result.frame
+    if tracks is None:
+        raise UserError(f"there is no track {number}: tracks are known in a run over the drive only")
+    rows = np.flatnonzero(tracks.id == number)
+    if not len(rows):
+        known = ", ".join(map(str, tracks.id[:10].tolist())) or "none"
+        raise UserError(f"there is no track {number} in this frame; there are {known}")
+    row = int(rows[0])
+    box, name, k = one_of(tracks.boxes, row), tracks.names[row], int(tracks.cluster[row])
+    if tracks.absolute:
+        box = geometry.moved(box, geometry.inverse(frame.pose))
+    title = f"track {number}{f' ({name})' if name else ''} at {float(np.hypot(*box.center[0, :2])):.1f} m"
+    points = np.flatnonzero(traces.cluster == k) if k >= 0 else None
+    accepted = frozenset({name.lower()} if name else ())
+    return Subject("track", title, name, accepted, number, box=box, points=points)
+
+
+def _around(traces: Traces, selection: Selection) -> Subject:
+    """All around a point, or over a cell of the bird's-eye view and what is around that."""
+    edge = 2 * selection.radius
+    if selection.point:
+        center, size = selection.point, (edge, edge, edge)
+        kind, name = "point", "what is at {:g}, {:g}, {:g} m".format(*center)
+    else:
+        points = traces.result.frame.points
+        x, y = _of_cell(traces.result.config.bev, *selection.cell[:2])
+        low, high = (float(points[:, 2].min()), float(points[:, 2].max())) if len(points) else (0.0, 0.0)
+        center, size = (x, y, (low + high) / 2), (edge, edge, high - low)
+        kind, name = "cell", f"what is at {x:.2f}, {y:.2f} m of the bird's-eye view"
+    box = Boxes3D(np.array([center], np.float32), np.array([size], np.float32), np.zeros(1, np.float32))
+    return Subject("point" if kind == "point" else "cell", name, box=box)
+
+
+def _of_cell(config: BevConfig, row: int, column: int) -> tuple[float, float]:
+    """Middle of a cell, in metres of the points' frame."""
+    rows, columns = (round(2 * reach / config.resolution) for reach in (config.range_x, config.range_y))
+    if not (0 <= row < rows and 0 <= column < columns):
+        raise UserError(
+            f"cell {row}, {column}: outside the bird's-eye view, which has {rows} rows and {columns} columns"
+        )
+    return config.range_x - (row + 0.5) * config.resolution, config.range_y - (
+        column + 0.5
+    ) * config.resolution
+
+
+def _pixel(traces: Traces, selection: Selection) -> Subject:
+    found = camera_of(traces, selection.camera)
+    wanted = _wanted(found, selection)
+    u, v = (wanted[:2] + wanted[2:]) / 2
+    return Subject("pixel", f"what is at pixel {u:g}, {v:g}", camera=found.camera.name, xyxy=wanted)
+
+
+def _wanted(found: CameraResult, selection: Selection) -> F32:
+    """(4,) what of the image is asked about: the box, or what is around the pixel."""
+    size = found.camera.intrinsics or _image_size(found)
+    if size is None:
+        raise UserError(f"--box: {found.camera.name} has no image in this frame")
+    low, high = np.array(selection.box[:2]), np.array(selection.box[-2:])
+    if (low < -0.5).any() or (high > [size.width - 0.5, size.height - 0.5]).any() or (high < low).any():
+        raise UserError(
+            f"--box {','.join(f'{v:g}' for v in selection.box)}: outside the image of {found.camera.name}, "
+            f"which has {size.width} x {size.height} pixels"
+        )
+    around = PIXELS if len(selection.box) == 2 else 0.0
+    return np.concatenate([low - around, high + around]).astype(np.float32)
+
+
+def _image_size(found: CameraResult) -> Intrinsics | None:
+    if found.camera.image is None:
+        return None
+    height, width = found.camera.image.bgr.shape[:2]
+    return Intrinsics(width, height, np.eye(3))
+
+
+def camera_of(traces: Traces, name: str) -> CameraResult:
+    """The camera of that name; empty: the only one.
+
+    Raises:
+        UserError: there is none, or there are several and none is named.
+    """
+    cameras = traces.result.cameras
+    names = [c.camera.name for c in cameras]
+    if not names:
+        raise UserError("this recording has no camera: ask with --point x,y,z")
+    if not name and len(names) > 1:
+        raise UserError(f"several cameras: say which with --camera, one of {', '.join(names)}")
+    if name and name not in names:
+        raise UserError(f"--camera {name}: there is none of that name; there are {', '.join(names)}")
+    return cameras[names.index(name) if name else 0]
+
+
+def _seen(traces: Traces, camera: str) -> Iterator[Subject]:
+    """Objects of the truth that a camera has in view; where no camera has a place, all of them."""
+    usable = [
+        column
+        for column, c in enumerate(traces.result.cameras)
+        if camera in ("", c.camera.name)
+        and c.camera.intrinsics is not None
+        and c.camera.camera_from_points is not None
+    ]
+    for subject in traces.truth:
+        if not usable or (traces.shown[subject.row, usable] >= IN_VIEW).any():
+            yield subject
+
+
+def _strange_detections(traces: Traces, camera: str) -> Iterator[Subject]:
+    """Detections that are of no object of the ground truth. Duplicates speak through what suppressed them."""
+    for found in traces.result.cameras:
+        detections = found.detections
+        if detections is None or camera not in ("", found.camera.name):
+            continue
+        strange = (detections.state != DetectionState.SUPPRESSED) & (traces.owners(found) < 0)
+        for row in np.flatnonzero(strange).tolist():
+            yield detection_subject(found, row)
+
+
+def _denied(traces: Traces, camera: str) -> Iterator[Subject]:
+    """Objects of somebody else's that a camera contradicts; what is of the ground truth speaks for itself."""
+    opinions, objects = traces.result.opinions, traces.result.objects
+    if opinions is None or objects is None:
+        return
+    real = joined([subject.box for subject in traces.truth if subject.box is not None])
+    there = geometry.bev_iou(objects.boxes, real).max(axis=1, initial=0) >= OVERLAP
+    for row in np.flatnonzero(opinions.opinion == Opinion.CONTRADICTED).tolist():
+        if not there[row] and camera in ("", opinions.camera[row]):
+            yield object_subject(traces, row)
+
+
+# --- what lies at a place ----------------------------------------------------------------------
+
+
+def at_place(traces: Traces, selection: Selection) -> list[tuple[Subject, bool]]:
+    """Things at a pixel, in an image box or around a point, each once, and whether each is what shows there.
+
+    An object of the truth stands for its detections and clusters, a detection for the cluster that it named.
+
+    Raises:
+        UserError: as ``select``.
+    """
+    around = bool(selection.point or selection.cell)
+    return list(_in_space(traces, selection) if around else _in_image(traces, selection))
+
+
+def _in_space(traces: Traces, selection: Selection) -> Iterator[tuple[Subject, bool]]:
+    place = _around(traces, selection)
+    points = traces.place(place)
+    assert place.box is not None
+    axes = slice(2 if place.kind == "cell" else 3)
+    covered: set[int] = set()
+    for subject in traces.truth:
+        assert subject.box is not None
+        away = float(np.linalg.norm((subject.box.center - place.box.center)[0, axes]))
+        if away > np.linalg.norm(subject.box.size[0]) / 2 + selection.radius:
+            continue
+        own = traces.place(subject)
+        if away <= selection.radius or len(np.intersect1d(own, points, assume_unique=True)):
+            covered.update(_clusters_of(traces, own))
+            yield subject, True
+    for k in np.unique(traces.cluster[points]).tolist():
+        if k >= 0 and k not in covered:
+            yield cluster_subject(traces, k), True
+
+
+def _in_image(traces: Traces, selection: Selection) -> Iterator[tuple[Subject, bool]]:
+    found = camera_of(traces, selection.camera)
+    wanted = _wanted(found, selection)
+    pixel = len(selection.box) == 2
+    things: list[tuple[Subject, float]] = []  # with how well each fits
+    covered: set[int] = set()
+    for subject, fit in _truth_there(traces, found, wanted, pixel):
+        covered.update(_clusters_of(traces, traces.place(subject)))
+        things.append((subject, fit))
+    rows = {subject.row for subject, _ in things}
+    for row, fit in _detections_there(found, wanted, pixel):
+        if found.detections is not None and traces.owners(found)[row] not in rows:
+            subject = detection_subject(found, row)
+            if found.fusion is not None and found.fusion.detection_decision[row] == Decision.MATCHED:
+                covered.add(int(found.fusion.detection_cluster[row]))
+            things.append((subject, fit))
+    for k, fit in _clusters_there(traces, found, wanted, pixel):
+        if k not in covered:
+            things.append((cluster_subject(traces, k), fit))
+    if pixel:
+        yield from _before_the_rest(traces, found, [subject for subject, _ in things], wanted)
+        return
+    best = max((fit for _, fit in things), default=0.0)
+    yield from ((subject, fit >= AS_GOOD * best) for subject, fit in things)
+
+
+def _before_the_rest(
+    traces: Traces, found: CameraResult, things: Sequence[Subject], wanted: F32
+) -> Iterator[tuple[Subject, bool]]:
+    """Which of the things at a pixel it shows: of those whose points are nearest to it, the nearest.
+
+    A scan is sparse in an image, and of several things each has points around a pixel.
+    """
+    if not things:
+        return
+    near = [_nearest(traces, found, _own(traces, found, subject), wanted) for subject in things]
+    pixels, depth = np.array(near).T
+    if pixels.min() > PIXELS:
+        yield from ((subject, True) for subject in things)
+        return
+    close = pixels <= pixels.min() + SPACING
+    shown = close & (depth <= depth[close].min() + SURFACE)
+    yield from zip(things, shown.tolist(), strict=True)
+
+
+def _nearest(traces: Traces, found: CameraResult, rows: I64, wanted: F32) -> tuple[float, float]:
+    """Pixels from the middle of what is asked about to the nearest of these points, and its depth."""
+    view = found.camera
+    away = np.linalg.norm(traces.uv(found)[rows] - (wanted[:2] + wanted[2:]) / 2, axis=1)
+    away = np.where(np.isfinite(away), away, np.inf)
+    if view.camera_from_points is None or not np.isfinite(away).any():
+        return np.inf, np.inf
+    row = int(away.argmin())
+    point = traces.result.frame.points[rows[row]]
+    return float(away[row]), float(geometry.apply(view.camera_from_points, point[None])[0, 2])
+
+
+def _own(traces: Traces, found: CameraResult, subject: Subject) -> I64:
+    """Rows of the raw points that are the subject's; of a detection, those of the cluster that it named."""
+    fusion, row = found.fusion, subject.row
+    if subject.kind != "detection" or fusion is None or fusion.detection_decision[row] != Decision.MATCHED:
+        return traces.place(subject)
+    return np.flatnonzero(traces.cluster == fusion.detection_cluster[row])
+
+
+def _clusters_of(traces: Traces, points: I64) -> list[int]:
+    """Clusters of some of an object's points that are mostly of it, or of it and other objects."""
+    return [k for k in np.unique(traces.cluster[points]).tolist() if k >= 0 and traces.of_truth[k]]
+
+
+def _truth_there(
+    traces: Traces, found: CameraResult, wanted: F32, pixel: bool
+) -> Iterator[tuple[Subject, float]]:
+    column = [c.camera.name for c in traces.result.cameras].index(found.camera.name)
+    for subject in traces.truth:
+        if traces.shown[subject.row, column] <= 0 or subject.box is None:
+            continue
+        box = projected(subject.box, found.camera)
+        if box is None:
+            continue
+        fit = _fit(wanted, box, pixel)
+        if not pixel:
+            uv = traces.uv(found)[traces.place(subject)]
+            uv = uv[np.isfinite(uv).all(axis=1)]
+            if len(uv) >= FEW:
+                fit = max(fit, _fit(wanted, np.concatenate([uv.min(0), uv.max(0)]), pixel))
+        if fit:
+            yield subject, fit
+
+
+def _detections_there(found: CameraResult, wanted: F32, pixel: bool) -> Iterator[tuple[int, float]]:
+    detections = found.detections
+    if detections is None:
+        return
+    for row in np.flatnonzero(detections.state != DetectionState.SUPPRESSED).tolist():
+        fit = _fit(wanted, detections.xyxy[row], pixel)
+        if fit:
+            yield row, fit
+
+
+def _clusters_there(
+    traces: Traces, found: CameraResult, wanted: F32, pixel: bool
+) -> Iterator[tuple[int, float]]:
+    clusters = traces.result.clusters
+    if clusters is None:
+        return
+    if pixel:
+        there = Subject("pixel", "", camera=found.camera.name, xyxy=wanted)
+        yield from ((k, 1.0) for k in np.unique(traces.cluster[traces.place(there)]).tolist() if k >= 0)
+        return
+    if found.fusion is None:
+        return
+    for k in np.flatnonzero(clusters.kept).tolist():
+        around = found.fusion.cluster_uv[k]
+        fit = _fit(wanted, around, pixel) if np.isfinite(around).all() else 0.0
+        if fit:
+            yield k, fit
+
+
+def _fit(wanted: F32, box: F32, pixel: bool) -> float:
+    """IoU, 0 where it is too little to be meant; of a pixel, 1 in the box."""
+    if pixel:
+        u, v = (wanted[:2] + wanted[2:]) / 2
+        return float(box[0] <= u <= box[2] and box[1] <= v <= box[3])
+    overlap = float(geometry.iou(wanted[None], box[None])[0, 0])
+    return overlap if overlap >= LINK else 0.0

@@ -1,0 +1,306 @@
+"""A running robot on the bench: its newest frames are held, and can be asked about."""
+
+from __future__ import annotations
+
+import threading
+from collections import OrderedDict, deque
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, nullcontext
+from typing import Any
+
+import rerun as rr
+
+from bevviz.config import Config, revised
+from bevviz.errors import UserError
+from bevviz.evaluate import Truth, truth_of
+from bevviz.live.runtime import Live
+from bevviz.live.thinning import chosen
+from bevviz.model.frame import Scene
+from bevviz.model.results import FrameResult
+from bevviz.pipeline.perceive import describe
+from bevviz.pipeline.session import Session
+from bevviz.pipeline.variants import Variants
+from bevviz.recording import entities
+from bevviz.recording.frame_logger import Logger
+from bevviz.recording.sinks import APPLICATION
+from bevviz.support.contexts import Closing
+from bevviz.why import Answer, Questioner
+from bevviz.why.log import mark_answers
+from bevviz.why.pick import Pick, pick
+from bevviz.why.pick_answers import selection, surroundings
+from bevviz.workbench.finding_list import Entries
+from bevviz.workbench.findings import finds, with_reasons
+from bevviz.workbench.live_buffer import LiveFilm
+from bevviz.workbench.trials import attempt
+
+KEPT = 4  # frames that pages may hold at once
+TRIED = 2  # results of held frames with other values
+LISTED = ("missed", "false", "contradicted", "lost", "unmatched", "unnamed")
+
+Settings = tuple[str, ...]
+
+
+class Robot:
+    """What a page asks of a drive: names, configuration, networks."""
+
+    def __init__(self, live: Live) -> None:
+        self._live = live
+
+    def __len__(self) -> int:
+        return 0
+
+    @property
+    def scene(self) -> Scene:
+        return self._live.scene
+
+    @property
+    def config(self) -> Config:
+        return self._live.config
+
+    @property
+    def session(self) -> Session:
+        return self._live.session
+
+
+class LiveBench(Closing):
+    """A robot on the bench: its newest frames can be asked about, its parameters changed for all to come.
+
+    Questions are to be asked from one thread.
+
+    Args:
+        live: before its run.
+
+    Attributes:
+        entries: what is worth a look in the frame that was held last.
+    """
+
+    def __init__(self, live: Live) -> None:
+        self.live, self.drive = live, Robot(live)
+        self.film = LiveFilm(live, live.config.live.output_queue)
+        self.truth_of: Callable[..., Truth | None] | None = None
+        self.opening: int | None = None  # the page is at the newest frame
+        self.entries, self.notes_changed = Entries(), -1
+        self._newest: deque[FrameResult] = deque(maxlen=live.config.live.held)
+        self._kept: OrderedDict[int, FrameResult] = OrderedDict()
+        self._lock = threading.Lock()  # of the two
+        self._tried: OrderedDict[tuple[int, Settings], FrameResult] = OrderedDict()
+        self._set: Settings = ()
+        self._variants = Variants(live.session.loader)
+        self._asked: Questioner | None = None
+        self._listeners: list[Callable[[], None]] = []
+        recording = rr.RecordingStream(APPLICATION, recording_id=live.encoder.recording_id)
+        recording.set_log_time_enabled(False)
+        self._marks = rr.binary_stream(recording)
+        self._marker = Logger(recording, live.config, live.scene)
+        live.attach(self.film, self._see)
+
+    def close(self) -> None:
+        self.film.close()
+
+    def listen(self, listener: Callable[[], None]) -> Callable[[], None]:
+        """Call it, from any thread, whenever there is a new frame. Returns what ends that."""
+        self._listeners.append(listener)
+        return lambda: self._listeners.remove(listener)
+
+    def quiet(self) -> AbstractContextManager[None]:
+        """A robot does not wait."""
+        return nullcontext()
+
+    def progress(self) -> dict[str, Any]:
+        """How it goes."""
+        status = self.live.status
+        drops = ", ".join(f"{count} {where}" for where, count in status.drops.items() if count)
+        return {
+            "type": "progress",
+            "done": status.frames,
+            "total": None,
+            "over": True,
+            "error": "",
+            "reports": [],
+            "trial": None,
+            "warnings": [f"{1e3 * status.p50:.0f} ms", f"dropped: {drops or 'none'}"],
+        }
+
+    def _see(self, result: FrameResult) -> None:
+        with self._lock:
+            self._newest.append(result)
+        if result.frame.truth is not None and self.truth_of is None:
+            self.truth_of = _own_truth
+        for listener in tuple(self._listeners):
+            listener()
+
+    # --- frames --------------------------------------------------------------------------------
+
+    def number_at(self, stamp: int) -> int:
+        """Number of the frame that a viewer shows at that time.
+
+        Raises:
+            UserError: it is not held any more.
+        """
+        frames = sorted((r.frame.stamp, r.frame.index) for r in self._held())
+        if not frames:
+            raise UserError("no frame has come yet")
+        there = [index for at, index in frames if at <= stamp + entities.SLACK]
+        if not there:
+            raise UserError(
+                f"that frame is gone: the newest {self._newest.maxlen} can be asked about "
+                "(live.held); hold one with H, and ask then"
+            )
+        return there[-1]
+
+    def _held(self) -> list[FrameResult]:
+        with self._lock:
+            return [*self._kept.values(), *self._newest]
+
+    def hold(self, stamp: int) -> FrameResult:
+        """Keep the frame that a viewer shows, to ask about it for as long as one likes; a few at most.
+
+        Of a viewer that lags behind it is the oldest one that is there still.
+
+        Raises:
+            UserError: there is none yet.
+        """
+        frames = sorted((r.frame.stamp, r.frame.index) for r in self._held())
+        shown = [index for at, index in frames if at <= stamp + entities.SLACK]
+        if not frames:
+            raise UserError("no frame has come yet")
+        result = self.look(shown[-1] if shown else frames[0][1])
+        index = result.frame.index
+        with self._lock:
+            self._kept[index] = result
+            self._kept.move_to_end(index)
+            while len(self._kept) > KEPT:
+                self._kept.popitem(last=False)
+        found = finds(result, None if self.truth_of is None else self.truth_of(result.frame))
+        self.entries.replace(LISTED)
+        self.entries.add(with_reasons(found, result, self._new_questioner(result)))
+        for listener in tuple(self._listeners):
+            listener()
+        return result
+
+    def look(self, number: int, settings: Settings = ()) -> FrameResult:
+        """A held frame as it was made, or with other values.
+
+        Raises:
+            UserError: it is gone; an unknown parameter, or a wrong value.
+        """
+        result = next((r for r in self._held() if r.frame.index == number), None)
+        if result is None:
+            raise UserError(f"frame {number} is gone: hold one with H, and ask then")
+        if not settings:
+            return result
+        config = revised(self.live.config, settings)
+        if config == result.config:
+            return result
+        key = number, settings
+        if key not in self._tried:
+            self._tried[key] = describe(self._variants.perceive(result.frame, config))
+            while len(self._tried) > TRIED:
+                self._tried.popitem(last=False)
+        return self._tried[key]
+
+    # --- questions -----------------------------------------------------------------------------
+
+    def picked(
+        self, number: int, settings: Settings, path: str, instance: int | None, position: Sequence[float]
+    ) -> Pick | None:
+        """What a click in the frame is on, see ``pick``."""
+        result = self.look(number)
+        points = result.config.live.viewer_points
+        if instance is not None and points is not None and path == entities.points(result.frame.lidar):
+            rows = chosen(len(result.frame.points), points, result.frame.index)
+            instance = int(rows[instance]) if instance < len(rows) else None
+        return pick(result, result.tracks, path, instance, position)
+
+    def ask(self, number: int, settings: Settings, what: Pick) -> tuple[Answer, list[Answer]]:
+        """Why it was reported, or was not, and what else is there; it is shown in every view.
+
+        Raises:
+            UserError: there is no such thing in the frame.
+        """
+        result = self.look(number, settings)
+        questioner, there = self._candidates(result, what)
+        found = there or questioner.ask(selection(what))
+        if not found:
+            raise UserError(f"there is nothing to say about {what}")
+        answer = found[0]
+        if not there and (around := surroundings(what, answer)) is not None:
+            there = questioner.candidates(around)
+        mark_answers(self._marker, result.frame, [answer], result.config.bev)
+        self.film.add(self._marks.read())
+        return answer, [other for other in there if other.subject.key != answer.subject.key]
+
+    def hints(self, number: int, settings: Settings, what: Pick) -> Answer:
+        """The same with what would change it, which takes longer.
+
+        Raises:
+            UserError: as ``ask``.
+        """
+        questioner, there = self._candidates(self.look(number, settings), what)
+        return questioner.with_hints((there or questioner.ask(selection(what)))[0])
+
+    def _candidates(self, result: FrameResult, what: Pick) -> tuple[Questioner, list[Answer]]:
+        if self._asked is None or self._asked.traces.result is not result:
+            self._asked = self._new_questioner(result)
+        return self._asked, list(self._asked.candidates(selection(what))) if what.is_place else []
+
+    def _new_questioner(self, result: FrameResult) -> Questioner:
+        session = self.live.session
+        return Questioner(result, session.loader, session.stages.class_names)
+
+    def go_on(self) -> None:
+        """A robot has not waited."""
+
+    # --- orders --------------------------------------------------------------------------------
+
+    @property
+    def settings(self) -> Settings:
+        """That pages have changed."""
+        return self._set
+
+    def configured(self, settings: Settings) -> Config:
+        """How frames are made, once these have been taken on."""
+        return self.live.config
+
+    def attempt(self, number: int, settings: Settings, what: Pick | None = None) -> dict[str, Any]:
+        """Change parameters of the running session for good, and tell what they do to a frame.
+
+        Raises:
+            UserError: an unknown parameter, or a wrong value; nothing is changed.
+        """
+        before = self.look(number)
+        self.change(settings)
+        after = describe(self._variants.perceive(before.frame, self.live.config))
+        asked = what.row if what is not None and what.kind == "truth" else -1
+        truth = None if self.truth_of is None else self.truth_of(before.frame)
+        return attempt(before, after, truth, asked)
+
+    def change(self, settings: Settings) -> None:
+        """Change parameters of the running session; those that pages changed before and that are none of
+        these are as they are stated elsewhere.
+
+        Raises:
+            UserError: an unknown parameter, or a wrong value; nothing is changed.
+        """
+        if settings != self._set:
+            self.live.update(settings, without=self._set)
+        self._set = settings
+
+    def snap(self) -> str:
+        """Save the flight recorder. Returns what to say.
+
+        Raises:
+            UserError: it holds nothing, or cannot be written.
+        """
+        return f"saved in {self.live.save()}"
+
+    def mark(self, stamp: int, text: str) -> str:
+        """A note at a frame, in every recording and on the terminal. Returns what to say."""
+        number = self.number_at(stamp)
+        said = f"mark at frame {number}: {text.strip() or 'look here'}"
+        self.live.notes.info(said)
+        return said
+
+
+def _own_truth(frame: Any) -> Truth | None:
+    return None if frame.truth is None else truth_of(frame, frame.truth)

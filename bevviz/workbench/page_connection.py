@@ -1,0 +1,273 @@
+"""One page that is open: what it asks, what it is answered, and what is new."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict
+from typing import TYPE_CHECKING, Any
+
+from starlette.websockets import WebSocket, WebSocketDisconnect
+
+from bevviz.errors import UserError, first_line
+from bevviz.support.loggers import logger
+
+if TYPE_CHECKING:
+    from bevviz.why import Answer
+    from bevviz.why.pick import Pick
+    from bevviz.workbench.session import Bench, Settings
+
+BESIDE = 6  # further things that are listed
+TOGETHER = 0.05  # seconds that what is new waits for more of it
+
+_log = logger(__name__)
+
+
+class Visit:
+    """Talks with one page.
+
+    Args:
+        bench: what it asks about.
+        socket: accepted.
+        desk: answers one question after the other, whoever asks.
+        run: name of this run of the server.
+    """
+
+    def __init__(self, bench: Bench, socket: WebSocket, desk: ThreadPoolExecutor, run: str) -> None:
+        self._bench, self._socket, self._desk, self._run = bench, socket, desk, run
+        self._sending = asyncio.Lock()
+        self._tasks: set[asyncio.Task[None]] = set()
+        self._newest = 0
+        self._handlers = {
+            "ask": self._ask,
+            "try": self._try,
+            "settle": self._settle,
+            "shown": self._shown,
+            "drive": self._drive,
+            "cancel": self._cancel,
+            "report": self._report,
+            "note": self._note,
+            "unnote": self._unnote,
+        }
+
+    async def stay(self) -> None:
+        """Until the page goes."""
+        with listening(self._bench.listen) as more:
+            await self._send(self._welcome())
+            news = asyncio.ensure_future(self._tell(more))
+            try:
+                while True:
+                    self._take(await self._socket.receive_text())
+            finally:
+                news.cancel()
+                for task in self._tasks:
+                    task.cancel()
+
+    # --- what it is told -----------------------------------------------------------------------
+
+    def _welcome(self) -> dict[str, Any]:
+        from bevviz.workbench.controls import controls
+
+        bench = self._bench
+        self._opened = bench.drive.config
+        self._controls = controls(self._opened)
+        return {
+            "type": "welcome",
+            "run": self._run,
+            "bag": bench.drive.scene.name,
+            "scans": len(bench.drive),
+            "truth": bench.truth_of is not None,
+            "detector": bool(bench.drive.config.detector.model),
+            "controls": self._controls,
+        }
+
+    async def _tell(self, more: asyncio.Event) -> None:
+        """What is new of the run, whenever there is something."""
+        told: dict[int, int] = {}
+        opened, noted, bench = False, -1, self._bench
+        while True:
+            more.clear()
+            if not opened and bench.opening is not None:
+                opened = True
+                await self._send({"type": "opening", "stamp": str(bench.opening)})
+            for news in bench.entries.news(told):
+                await self._send(news)
+            if noted != bench.notes_changed:
+                noted = bench.notes_changed
+                await self._send(await asyncio.to_thread(_notes, bench))
+            await self._send(bench.progress())
+            await more.wait()
+            await asyncio.sleep(TOGETHER)
+
+    async def _send(self, message: dict[str, Any]) -> None:
+        async with self._sending:
+            await self._socket.send_text(json.dumps(message))
+
+    # --- what it asks --------------------------------------------------------------------------
+
+    def _take(self, text: str) -> None:
+        """Answer a message of the page, beside those that come next."""
+        task = asyncio.ensure_future(self._handle(text))
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)
+
+    async def _handle(self, text: str) -> None:
+        number: Any = None
+        try:
+            message = json.loads(text)
+            number = message.get("id")
+            self._newest = max(self._newest, int(number))
+            await self._handlers[message["type"]](int(number), message)
+        except (WebSocketDisconnect, RuntimeError):
+            return
+        except UserError as error:
+            await self._send({"type": "error", "id": number, "text": str(error)})
+        except (KeyError, TypeError, ValueError, AttributeError) as error:
+            _log.debug("a message that cannot be used", exc_info=error)
+            await self._send({"type": "error", "id": number, "text": "that message cannot be understood"})
+        except Exception as error:
+            _log.error("a question that failed", exc_info=error)
+            what = f"error of bevviz itself: {type(error).__name__}: {first_line(error)}"
+            await self._send({"type": "error", "id": number, "text": what})
+
+    async def _at_desk(self, number: int, work: Callable[[], Any], *, idle: bool = False) -> Any:
+        """Done in its turn; what is idle only if nothing newer was asked meanwhile."""
+
+        def job() -> Any:
+            if idle and number != self._newest:
+                return None
+            with self._bench.quiet():
+                return work()
+
+        return await asyncio.get_running_loop().run_in_executor(self._desk, job)
+
+    async def _ask(self, number: int, message: dict[str, Any]) -> None:
+        from bevviz.why.pick import Pick
+
+        bench, settings = self._bench, _settings(message)
+        frame = await self._frame(message)
+
+        def what() -> Pick | None:
+            if "pick" in message:
+                return Pick.parse(str(message["pick"]))
+            position = tuple(float(v) for v in message.get("position") or () if v is not None)
+            instance = message.get("instance")
+            path = str(message["entity"])
+            return bench.picked(frame, settings, path, None if instance is None else int(instance), position)
+
+        def work() -> dict[str, Any] | None:
+            picked = what()
+            if picked is None:
+                return None
+            answer, beside = bench.ask(frame, settings, picked)
+            return {"pick": str(picked), **answer.as_dict(), "beside": list(_briefly(beside))}
+
+        answer = await self._at_desk(number, work)
+        head = {"id": number, "frame": frame}
+        if answer is None:
+            await self._send({"type": "nothing", **head, "entity": str(message.get("entity", ""))})
+            return
+        await self._send({"type": "answer", **head, **answer})
+        pick = Pick.parse(answer["pick"])
+        hints = await self._at_desk(number, lambda: bench.hints(frame, settings, pick), idle=True)
+        if hints is not None:
+            await self._send({"type": "hints", **head, "hints": hints.as_dict()["hints"]})
+
+    async def _try(self, number: int, message: dict[str, Any]) -> None:
+        from bevviz.why.pick import Pick
+        from bevviz.workbench.controls import controls
+
+        settings, frame = _settings(message), await self._frame(message)
+        pick = Pick.parse(str(message["pick"])) if message.get("pick") else None
+        told = await self._at_desk(number, lambda: self._bench.attempt(frame, settings, pick))
+        await self._send({"type": "tried", "id": number, "frame": frame, **told})
+        there = controls(self._bench.configured(settings), self._opened)
+        if there != self._controls:  # a stage is somebody else's now, or is no longer
+            self._controls = there
+            await self._send({"type": "controls", "controls": there})
+
+    async def _settle(self, number: int, message: dict[str, Any]) -> None:
+        """The page shows this frame for a while: questions about it are to come."""
+        frame = await self._frame(message)
+        await self._at_desk(number, lambda: self._bench.look(frame, _settings(message)), idle=True)
+
+    async def _drive(self, number: int, message: dict[str, Any]) -> None:
+        """Run all of it with other values."""
+        settings = _settings(message)
+        await asyncio.to_thread(self._bench.trials.begin, settings)
+
+    async def _cancel(self, number: int, message: dict[str, Any]) -> None:
+        what = self._bench.reports if message["what"] == "report" else self._bench.trials
+        await asyncio.to_thread(what.end)
+
+    async def _report(self, number: int, message: dict[str, Any]) -> None:
+        frame, settings, text = await self._frame(message), _settings(message), str(message["text"])
+        before, after = float(message["before"]), float(message["after"])
+        await self._at_desk(number, lambda: self._bench.reports.begin(frame, settings, before, after, text))
+
+    async def _note(self, number: int, message: dict[str, Any]) -> None:
+        from bevviz.why.pick import Pick
+
+        frame, text = await self._frame(message), str(message["text"])
+        pick = Pick.parse(str(message["pick"])) if message.get("pick") else None
+        await self._at_desk(number, lambda: self._bench.note(frame, text, pick))
+        await self._send({"type": "noted", "id": number, "file": self._bench.notes.path.name})
+
+    async def _unnote(self, number: int, message: dict[str, Any]) -> None:
+        stamp, text = int(message["stamp"]), str(message["text"])
+        await self._at_desk(number, lambda: self._bench.remove_note(stamp, text))
+
+    async def _shown(self, number: int, message: dict[str, Any]) -> None:
+        """The page has drawn its first frame: the run may take the machine."""
+        self._bench.go_on()
+
+    async def _frame(self, message: dict[str, Any]) -> int:
+        """Number of the frame that the page shows; one that has not been run yet is looked for."""
+        return await asyncio.to_thread(self._bench.number_at, round(float(message["time"])))
+
+
+def _briefly(answers: Sequence[Answer]) -> Iterator[dict[str, Any]]:
+    """What else is there: the nearest missed first, as the questioner has it."""
+    from bevviz.why.pick_answers import pick_of
+
+    for answer in answers[:BESIDE]:
+        if (pick := pick_of(answer)) is not None:
+            verdict = answer.verdict
+            yield {
+                "pick": str(pick),
+                "name": answer.subject.name,
+                "reported": verdict.reported,
+                "reason": verdict.reason.value,
+            }
+
+
+def _notes(bench: Bench) -> dict[str, Any]:
+    try:
+        notes = list(bench.notes)
+    except UserError as error:
+        return {"type": "notes", "notes": [], "error": str(error)}
+    told = [{**asdict(note), "stamp": str(note.stamp), "received": str(note.received)} for note in notes]
+    return {"type": "notes", "notes": told, "error": ""}
+
+
+def _settings(message: dict[str, Any]) -> Settings:
+    return tuple(str(setting) for setting in message.get("set") or ())
+
+
+@contextlib.contextmanager
+def listening(listen: Callable[[Callable[[], None]], Callable[[], None]]) -> Iterator[asyncio.Event]:
+    """An event that is set whenever there is more, from whatever thread that is told."""
+    more, loop = asyncio.Event(), asyncio.get_running_loop()
+
+    def tell() -> None:
+        with contextlib.suppress(RuntimeError):  # the server has ended
+            loop.call_soon_threadsafe(more.set)
+
+    end = listen(tell)
+    try:
+        yield more
+    finally:
+        end()

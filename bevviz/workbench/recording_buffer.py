@@ -1,0 +1,70 @@
+"""What the viewers of a page are shown: pieces of a recording, from the first for whoever joins late."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+import threading
+from collections.abc import Callable
+
+from bevviz.support.contexts import Closing
+from bevviz.support.files import on_disk
+
+
+class Film(Closing):
+    """Pieces in the order in which they were made, each a whole ``.rrd``, on disk rather than in memory.
+
+    ``add`` may be called from any thread; every reader goes on at its own pace.
+
+    Raises:
+        UserError: the disk of the temporary folder is full.
+    """
+
+    def __init__(self) -> None:
+        with on_disk():
+            self._file = tempfile.TemporaryFile(prefix="bevviz-")  # noqa: SIM115, it lives as long as the film
+        self._ends = [0]
+        self._lock = threading.Lock()
+        self._listeners: list[Callable[[], None]] = []
+
+    def close(self) -> None:
+        self._file.close()
+
+    def __len__(self) -> int:
+        return len(self._ends) - 1
+
+    def add(self, piece: bytes | None) -> None:
+        """Append a piece; None is nothing.
+
+        Raises:
+            UserError: the disk of the temporary folder is full. The pieces before it stay.
+        """
+        if not piece:
+            return
+        with self._lock:
+            view, end = memoryview(piece), self._ends[-1]
+            with on_disk():
+                while view:
+                    written = os.pwrite(self._file.fileno(), view, end)
+                    view, end = view[written:], end + written
+            self._ends.append(end)
+            listeners = tuple(self._listeners)
+        for listener in listeners:
+            listener()
+
+    def __getitem__(self, row: int) -> bytes:
+        if not 0 <= row < len(self):
+            raise IndexError(row)
+        start, end = self._ends[row], self._ends[row + 1]
+        return os.pread(self._file.fileno(), end - start, start)
+
+    def listen(self, listener: Callable[[], None]) -> Callable[[], None]:
+        """Call it, from some thread, whenever there is more. Returns what ends that."""
+        with self._lock:
+            self._listeners.append(listener)
+
+        def end() -> None:
+            with self._lock:
+                self._listeners.remove(listener)
+
+        return end
