@@ -240,3 +240,10 @@ def test_a_network_that_is_no_file_is_not_read(name: str, capsys: Capture) -> No
     assert main(["info", "drive", "--model", name]) == 0
     assert "it is no file" in capsys.readouterr().out
     assert "no such file" in error_of(capsys, "bag", "drive", "--model", name, "--save", "out.rrd")
+
+
+@pytest.mark.parametrize("last", ["-1", "nan"])
+def test_times_that_do_not_grow_are_refused(last: str, capsys: Capture) -> None:
+    sequence = datasets.kitti_odometry(Path("set"))
+    (sequence / "times.txt").write_text(f"0.0\n0.1\n{last}\n")
+    assert "times.txt: its times do not grow line by line" in error_of(capsys, "info", "set")

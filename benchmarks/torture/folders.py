@@ -399,7 +399,7 @@ class Tally:
     """What came of the folders of one kind."""
 
     cases: int = 0
-    read: int = 0  # commands that ended with status 0
+    read: int = 0  # commands that ended with status 0, or with 1 and the line that there are no frames
     refused: int = 0  # commands that ended with one clear line
     failed: int = 0  # commands that ended otherwise: a traceback, status 3, several lines
     warned: int = 0  # commands in which NumPy warns of a number beyond all measure
@@ -453,6 +453,8 @@ def _wrong(status: object, errors: str) -> str:
     """Say what is wrong with how a command ended; "": nothing."""
     lines = [line for line in errors.splitlines() if line.strip()]
     told = [line for line in lines if line.startswith("bevviz: error")]
+    if status == 1 and any("0 frames" in line for line in lines):
+        return ""  # as documented: nothing was made, and that is said
     if status not in (0, 2):
         return f"status {status}: {' '.join(lines)[-400:]}"
     if status == 2 and len(told) != 1:
@@ -524,7 +526,7 @@ def judged(what: str, worker: Worker, folder: Path, commands: Sequence[Sequence[
         elif wrong:
             tally.failed += 1
         else:
-            tally.read += int(status == "0")
+            tally.read += int(status in ("0", "1"))
             tally.refused += int(status == "2")
         if wrong:
             last = outcome.traceback.strip().splitlines()[-1:]

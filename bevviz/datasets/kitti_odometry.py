@@ -147,6 +147,8 @@ class KittiOdometry(Dataset):
         table = read_table(folder / "times.txt", 1)[:, 0]
         if len(table) <= max(numbers):
             raise UserError(f"{folder / 'times.txt'}: {len(table)} times, and a scan {max(numbers):06d}.bin")
+        if not np.isfinite(table).all() or (np.diff(table) < 0).any():
+            raise UserError(f"{folder / 'times.txt'}: its times do not grow line by line")
         return SECOND + np.round(table[numbers] * 1e9).astype(np.int64)
 
     def _poses(self, folder: Path, calibration: Calibration) -> F64 | None:
