@@ -179,6 +179,8 @@ def _warn(text: str) -> None:
 def _execute(
     todo: list[Job], options: argparse.Namespace, on_frame: Callable[[], None], tick: Callable[[], None]
 ) -> JobResults:
+    from bevviz.fleet.work import BagTask
+
     if not todo:
         return
     with ExitStack() as stack:
@@ -192,7 +194,8 @@ def _execute(
 
             workers = options.jobs or max(1, (os.cpu_count() or 1) // 2)
             engine = stack.enter_context(Processes(min(workers, len(todo))))
-        yield from stack.enter_context(closing(engine.run(todo, options.retries, on_frame, tick)))
+        tasks = map(BagTask, todo)
+        yield from stack.enter_context(closing(engine.run(tasks, options.retries, on_frame, tick)))
 
 
 def _sum_up(

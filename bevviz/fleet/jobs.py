@@ -7,7 +7,7 @@ import json
 import os
 import re
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
@@ -18,7 +18,6 @@ from bevviz.bags.source import FrameSelection
 from bevviz.config import Config, with_object_files
 from bevviz.datasets import find_loader
 from bevviz.errors import UserError
-from bevviz.fleet.engine.task import JobResult
 from bevviz.fleet.table import RunInfo, read_info
 from bevviz.recording.provenance import dependencies_of, file_hash, model_path
 from bevviz.support.files import bag_files, sampled_files
@@ -75,16 +74,6 @@ class Job:
     def recording_id(self) -> str:
         """Another one for another result: a viewer takes recordings with the same one for the same."""
         return f"{self.name}-{self.key[:8]}"
-
-    @property
-    def identity(self) -> str:
-        return f"{self.folder}-{self.name}-{self.key}"
-
-    def run(self, threads: int, on_frame: Callable[[], None] = lambda: None) -> JobResult:
-        """See ``bevviz.fleet.work.run``."""
-        from bevviz.fleet.work import run
-
-        return run(self, threads, on_frame)
 
     def complete(self) -> RunInfo | None:
         """What is known of the result, None where it is missing or out of date."""

@@ -7,7 +7,7 @@ import os
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeAlias
 from uuid import uuid4
@@ -38,6 +38,25 @@ class WithdrawnError(Exception):
 
     def __init__(self) -> None:
         super().__init__("its unfinished recording was removed")
+
+
+@dataclass(frozen=True, slots=True)
+class BagTask:
+    """One bag of a batch, as a task of an engine."""
+
+    job: Job
+
+    @property
+    def name(self) -> str:
+        return self.job.name
+
+    @property
+    def identity(self) -> str:
+        return f"{self.job.folder}-{self.job.name}-{self.job.key}"
+
+    def run(self, threads: int, on_frame: Callable[[], None]) -> JobResult:
+        """Run the pipeline over the bag, see ``run``."""
+        return run(self.job, threads, on_frame)
 
 
 def run(job: Job, threads: int, on_frame: Callable[[], None] = lambda: None) -> JobResult:
