@@ -30,10 +30,10 @@ bench: $(VENV)/.installed
 	$(BIN)/python -m benchmarks.performance --write docs/performance.md
 
 accuracy: $(VENV)/.tested
-	$(BIN)/python -m benchmarks.accuracy --write docs/accuracy.md
-	$(BIN)/python -m benchmarks.why --write docs/accuracy.md
-	$(BIN)/python -m benchmarks.ground --write docs/accuracy.md
-	$(BIN)/python -m benchmarks.anomalies --write docs/accuracy.md
+	$(BIN)/python -m benchmarks.accuracy --write docs/performance.md
+	$(BIN)/python -m benchmarks.why --write docs/performance.md
+	$(BIN)/python -m benchmarks.ground --write docs/performance.md
+	$(BIN)/python -m benchmarks.anomalies --write docs/performance.md
 
 $(VENV)/.installed: pyproject.toml
 	$(PYTHON) -m venv $(VENV)
