@@ -232,15 +232,18 @@ def section_of(tallies: Mapping[str, Tally], what: str) -> str:
         "same reason. A hint holds if the object is reported with it. `mistuned` is the default with",
         f"{mistuned}.",
         f"{what}\n",
-        "| asked | configuration | objects | right |",
-        "| --- | --- | ---: | ---: |",
+        f"| right answers, of objects | {' | '.join(tallies)} |",
+        "| --- |" + " ---: |" * len(tallies),
     ]
-    for name, tally in tallies.items():
-        lines += [
-            f"| in view, with points | {_row(name, tally.of(visible))}",
-            f"| of these within {RANGE:.0f} m, {MIN_HITS} points or more | {_row(name, tally.near)}",
-            f"| out of view, hidden or without points | {_row(name, tally.of([*HOPELESS]))}",
-        ]
+    asked = {
+        "in view, with points": [tally.of(visible) for tally in tallies.values()],
+        f"of these within {RANGE:.0f} m, {MIN_HITS} points or more": [
+            tally.near for tally in tallies.values()
+        ],
+        "out of view, hidden or without points": [tally.of([*HOPELESS]) for tally in tallies.values()],
+    }
+    for what_asked, counts in asked.items():
+        lines.append(f"| {what_asked} | " + " | ".join(map(_share, counts)) + " |")
     lines += ["\n| hints | given | hold | none was found |", "| --- | ---: | ---: | ---: |"]
     for name, tally in tallies.items():
         given = tally.hints["given"]
@@ -275,6 +278,11 @@ def details_of(tallies: Mapping[str, Tally]) -> str:
             cells = " | ".join(f"{counts['asked']} | {counts['right']}" for counts in known)
             lines.append(f"| {reason.value} | {cells} |")
     return "\n".join(lines) + "\n"
+
+
+def _share(counts: Counter[str]) -> str:
+    """Format the share of right answers and the number of objects."""
+    return f"{counts['right'] / counts['asked']:.3f} of {counts['asked']}" if counts["asked"] else "-"
 
 
 def _row(name: str, counts: Counter[str], right: str = "right") -> str:

@@ -15,7 +15,8 @@ def documented(form: str) -> dict[str, bool]:
     text = PAGE.read_text()
     section = text.partition(f"## `{form}`")[2].partition("\n## ")[0]
     assert section, f"{PAGE.name}: says nothing of {form}"
-    rows = re.findall(r"^\| `([^`]+)`( \?)? \|", section, re.MULTILINE)
+    block = section.partition("```text\n")[2].partition("```")[0]
+    rows = re.findall(r"^(\S+?)(\??)(?:  .*)?$", block, re.MULTILINE)
     elements = {path + "[]": False for path, _ in rows}  # a list may be empty
     return elements | {path: not optional for path, optional in rows}
 
