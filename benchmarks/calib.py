@@ -261,6 +261,7 @@ def main() -> None:
     }
     page = "\n".join(summary(groups))
     if options.write:
+        page = "\n".join(line for line in page.splitlines() if "of those six |" not in line)
         before, _, rest = options.write.read_text().partition(BEGIN)
         _, _, after = rest.partition(END)
         options.write.write_text(f"{before}{BEGIN}\n\n{page}\n\n{END}{after}")

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import inspect
+import re
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from benchmarks import accuracy, anomalies, calib, ground, kitti, large, performance, size, why
 from benchmarks.bags import repeat
 from benchmarks.measure import interleaved, run
 from benchmarks.pages import write_section
@@ -136,3 +139,22 @@ def test_a_section_takes_the_place_of_its_older_self_alone(tmp_path: Path) -> No
     assert page.read_text() == "# Title\n\n## One\n\nnew\n\n## Two\n\nkept\n"
     write_section(page, "## Three\n\nlast\n")
     assert page.read_text().endswith("kept\n\n## Three\n\nlast\n")
+
+
+def test_the_page_has_the_place_of_each_benchmark_that_writes_it() -> None:
+    page = (Path(__file__).parents[1] / "docs/performance.md").read_text()
+    for module in (calib, performance):
+        assert page.count(module.BEGIN) == page.count(module.END) == 1
+    headings = [text.strip().splitlines()[0] for text in (why.HEADING, accuracy.SYNTHETIC, anomalies.INTRO)]
+    sources = (inspect.getsource(module) for module in (kitti, size, large, ground))
+    headings += [heading for source in sources for heading in re.findall(r'"(## [^"\n]+)', source)]
+    assert len(headings) == 7
+    for heading in headings:
+        assert page.count(f"\n{heading}\n") == 1, heading
+
+
+def test_targets_are_not_on_the_page() -> None:
+    assert (
+        performance.without_target("| a | b | 1 s | 2 s | 2 x | 3 x | same |")
+        == "| a | b | 1 s | 2 s | 2 x | same |"
+    )
