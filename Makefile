@@ -35,10 +35,10 @@ bench: $(VENV)/.installed
 	$(BIN)/python -m benchmarks.performance --write docs/performance.md
 
 accuracy: $(VENV)/.tested
-	$(BIN)/python -m benchmarks.accuracy --write docs/accuracy.md
-	$(BIN)/python -m benchmarks.why --write docs/accuracy.md
-	$(BIN)/python -m benchmarks.ground --write docs/accuracy.md
-	$(BIN)/python -m benchmarks.anomalies --write docs/accuracy.md
+	$(BIN)/python -m benchmarks.accuracy --write docs/performance.md
+	$(BIN)/python -m benchmarks.why --write docs/performance.md
+	$(BIN)/python -m benchmarks.ground --write docs/performance.md
+	$(BIN)/python -m benchmarks.anomalies --write docs/performance.md
 
 # Renew the versions. Commit the result when make test and make check pass with it.
 constraints: .venv-release/.installed

@@ -15,6 +15,7 @@ import numpy as np
 from tqdm import tqdm
 
 from benchmarks import kitti
+from benchmarks.pages import write_section
 from benchmarks.tracking import Tallies, TrackTally, add_tracks, truth_of
 from bevviz.config import Preset, load
 from bevviz.evaluate import MAX_DISTANCE, MIN_HITS, RANGE, pair_in_order
@@ -27,23 +28,11 @@ PRESETS: tuple[Preset, ...] = ("reference", "default")
 CLASSES = ("person", "cyclist", "car")
 MIN_HEIGHT = 20  # visible pixels in height of an object that must be found
 
-INTRO = """# Accuracy
+SYNTHETIC = f"""## Objects on synthetic drives
 
-*How well does it see?* Measured by `make accuracy` on labelled real frames and on the synthetic drive. Read
-the figures as a comparison of methods and as a guard against regressions, not as a promise about your robot.
-"""
-
-SYNTHETIC = f"""
-## Synthetic drives
-
-Measured against exact ground truth, with the shipped demo network. Both presets process the same frames, from
-drives whose seeds the network was not trained on. A simulator is kinder than a street.
-
-An object must be found if it lies within {RANGE:.0f} m, has at least {MIN_HITS} LiDAR points and at least
-{MIN_HEIGHT} px of visible height in the image. Others are neither required nor counted as false when found.
-A fused box is right if an object of its class has its centre within {MAX_DISTANCE:.0f} m on the ground plane,
-one box for one object; the centre error is that of the right ones. The boxes of `reference` enclose what the
-sensor saw, so that the centre of a half-seen car lies towards the sensor.
+`python -m benchmarks.accuracy`, with the demo network, on drives that it was not trained on. An object must
+be found within {RANGE:.0f} m, with {MIN_HITS} LiDAR points and {MIN_HEIGHT} px of visible height or more.
+A fused box is right if an object of its class has its centre within {MAX_DISTANCE:.0f} m on the ground plane.
 """
 
 
@@ -76,7 +65,7 @@ def main() -> None:
         help="drives that tracking is measured on",
     )
     parser.add_argument("--data", type=Path, default=kitti.DATA, help="folder of real frames and models")
-    parser.add_argument("--write", type=Path, help="Markdown page to write, instead of printing it")
+    parser.add_argument("--write", type=Path, help="page whose sections are replaced, instead of printing")
     options = parser.parse_args()
 
     tallies = {preset: Tally() for preset in PRESETS}
@@ -96,19 +85,20 @@ def main() -> None:
     tracked = Tallies(TrackTally)
     for seed in options.tracked_seeds:
         track(tracked, SyntheticSource(options.frames, seed), options.tracked)
-    real = kitti.page(options.data) if (options.data / "kitti").is_dir() else ""
-    page = (
-        INTRO
-        + real
-        + SYNTHETIC
+    sections = [kitti.section(options.data)] if (options.data / "kitti").is_dir() else []
+    sections.append(
+        SYNTHETIC
         + f"\n{len(shots)} frames, seeds {options.seeds}, Python {platform.python_version()}.\n"
         + tables(tallies)
         + track_table(tracked, options.tracked, options.tracked_seeds)
     )
-    if options.write:
-        options.write.write_text(page)
-    else:
-        print(page)
+    for section in sections:
+        if options.write:
+            write_section(options.write, section)
+        else:
+            print(section)
+    if options.write is None:
+        print(details(tallies))
 
 
 def track(tallies: Tallies, source: SyntheticSource, frames: int) -> None:
@@ -217,22 +207,13 @@ def count(counts: Counter[str], distance: np.ndarray, must: np.ndarray, limit: f
     return [float(distance[row, partners[row]]) for row in np.flatnonzero(right)]
 
 
-def tables(tallies: dict[Preset, Tally]) -> str:
-    def share(part: float, whole: float) -> str:
-        return f"{part / whole:.3f}" if whole else "-"
+def share(part: float, whole: float) -> str:
+    return f"{part / whole:.3f}" if whole else "-"
 
+
+def details(tallies: dict[Preset, Tally]) -> str:
+    """Format the tables of clusters and detections, which are printed but not on the page."""
     lines = [
-        "\n### Ground\n",
-        "| preset | precision | recall | IoU | object points kept |",
-        "| --- | ---: | ---: | ---: | ---: |",
-    ]
-    for preset, tally in tallies.items():
-        g = tally.ground
-        lines.append(
-            f"| {preset} | {share(g['tp'], g['tp'] + g['fp'])} | {share(g['tp'], g['tp'] + g['fn'])} "
-            f"| {share(g['tp'], g['tp'] + g['fp'] + g['fn'])} | {share(g['object kept'], g['object'])} |"
-        )
-    lines += [
         "\n### Clusters: objects that have one of their own\n",
         "| class | objects | " + " | ".join(tallies) + " |",
     ]
@@ -247,6 +228,21 @@ def tables(tallies: dict[Preset, Tally]) -> str:
         c = tallies["default"].detections[name]
         found, all_found, all_there = c["tp"], c["tp"] + c["fp"], c["tp"] + c["fn"]
         lines.append(f"| {name} | {all_there} | {share(found, all_found)} | {share(found, all_there)} |")
+    return "\n".join(lines) + "\n"
+
+
+def tables(tallies: dict[Preset, Tally]) -> str:
+    lines = [
+        "\n### Ground\n",
+        "| preset | precision | recall | IoU | object points kept |",
+        "| --- | ---: | ---: | ---: | ---: |",
+    ]
+    for preset, tally in tallies.items():
+        g = tally.ground
+        lines.append(
+            f"| {preset} | {share(g['tp'], g['tp'] + g['fp'])} | {share(g['tp'], g['tp'] + g['fn'])} "
+            f"| {share(g['tp'], g['tp'] + g['fp'] + g['fn'])} | {share(g['object kept'], g['object'])} |"
+        )
     lines.append("\n### Fused objects: class and place\n")
     lines.append("| class | preset | precision | recall | centre error, median m | 90 % m |")
     lines.append("| --- | --- | ---: | ---: | ---: | ---: |")
@@ -264,11 +260,8 @@ def tables(tallies: dict[Preset, Tally]) -> str:
 def track_table(tallies: Tallies, frames: int, seeds: list[int]) -> str:
     lines = [
         "\n### Tracks: ids and speeds, `default` preset\n",
-        f"{frames} scans in a row of each of the drives {seeds}, on which nothing was chosen. All tracks",
-        "count that are shown and have a cluster, be they named in that scan or not, in view of the camera",
-        "or not: outside of it one can be false, but not right. A car of which only the rear is seen has its",
-        "centre too far from the true one. Speed errors are those of the velocity vector, of tracks older",
-        "than a second.\n",
+        f"{frames} scans in a row of each of the drives {seeds}. All tracks count that are shown and have a",
+        "cluster. Speed errors are of the velocity vector of tracks older than a second.\n",
         "| class | MOTA | IDF1 | precision | recall | id switches | speed error, median m/s | 90 % m/s |",
         "| --- | ---: | ---: | ---: | ---: | ---: | ---: | ---: |",
     ]

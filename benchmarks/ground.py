@@ -28,11 +28,9 @@ from bevviz.synthetic import SyntheticSource
 
 INTRO = """## Ground against Patchwork++
 
-Voxels of 12 synthetic scans, each counted once, of the 12 labelled KITTI frames and of 9 scans of a KITTI
-drive past an embankment, by `python -m benchmarks.ground`. Patchwork++ (`pypatchworkpp`, Lee et al. 2022) is
-told the height of the sensor, ours is not. Times are of the processor. Real scans have no labels of the
-ground: what is in a labelled box, from 30 cm above its bottom on, is none, and of a cluster ten metres long
-or more, the points of metre cells that are less than 40 cm high are likely to be some.
+Voxels of 12 synthetic scans, of the 12 labelled KITTI frames and of 9 scans of a KITTI drive, by
+`python -m benchmarks.ground`. Patchwork++ (`pypatchworkpp`, Lee et al. 2022) is told the sensor's height.
+Flat points of long clusters are probably ground.
 """
 
 SEEDS, FRAMES, STEP = (1000, 1001, 1002), 60, 15

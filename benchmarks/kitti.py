@@ -290,11 +290,12 @@ def cases(data: Path, settings: Sequence[str] = ()) -> dict[str, Case]:
     }
 
 
-def table(tallies: Mapping[str, Tally]) -> str:
+def table(tallies: Mapping[str, Tally], columns: Sequence[str] = ()) -> str:
+    """Format the figures of each case as a Markdown table. Without ``columns`` it has all of them."""
     figures = {case: tally.figures() for case, tally in tallies.items()}
-    heads = list(next(iter(figures.values())))
+    heads = columns or list(next(iter(figures.values())))
     lines = ["| case | " + " | ".join(heads) + " |", "| --- |" + " ---: |" * len(heads)]
-    lines += [f"| {case} | " + " | ".join(f.values()) + " |" for case, f in figures.items()]
+    lines += [f"| {case} | " + " | ".join(f[head] for head in heads) + " |" for case, f in figures.items()]
     return "\n".join(lines)
 
 
@@ -338,28 +339,21 @@ def by_distance(tallies: Mapping[str, Tally]) -> str:
     return "\n".join(lines)
 
 
-def page(data: Path) -> str:
-    """For docs/accuracy.md."""
+COLUMNS = ("found within 2 m", "error, median m", "IoU 0.5", "cars 0.7", "wrong")  # on the page
+
+
+def section(data: Path) -> str:
+    """Measure every case and format its section of docs/performance.md."""
     tallies = measure(data / "kitti", cases(data))
-    return f"""
-## Real frames: objects, with the labels' own 2D boxes and with a detector
+    shown = {case: tally for case, tally in tallies.items() if "clusters as they are" not in case}
+    return f"""## Objects on real frames
 
-Twelve labelled frames of the KITTI object benchmark (Geiger et al. 2012), 000000 to 000011: few, and of one
-city. An object must be found if it lies within {RANGE:.0f} m and has at least {MIN_HITS} LiDAR points;
-it is, if a box of a right class has its centre within {FOUND:.0f} m. IoU is seen from above. A box is
-wrong if no labelled object of any class is within {FOUND:.0f} m of it. With the labels' own boxes only what
-comes after the detector is judged.
+Twelve labelled frames of the KITTI object benchmark (Geiger et al. 2012), 000000 to 000011, by
+`python -m benchmarks.kitti`, which also has the tables by distance and visibility. An object must be found
+within {RANGE:.0f} m with {MIN_HITS} LiDAR points or more. It is found if a box of its class has its centre
+within {FOUND:.0f} m. IoU is seen from above. A box is wrong if no labelled object is within {FOUND:.0f} m.
 
-{table(tallies)}
-
-{by_distance(tallies)}
-
-{by_visibility(tallies)}
-
-The weights of the fit and the rating were set by what they stand for, and looked at on these frames. Eleven
-of them halved and doubled, one at a time, on each half of the frames alone: the figures of the third case
-stay at 30 found, 26 to 28 with an IoU of 0.5 and 18 to 19 cars with 0.7, and no choice on one half is better
-on the other.
+{table(shown, COLUMNS)}
 """
 
 
@@ -371,7 +365,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--set", action="append", default=[], help="key=value for the default preset")
     options = parser.parse_args(arguments)
     tallies = measure(options.data / "kitti", cases(options.data, options.set), options.frame)
-    print(table(tallies))
+    print(table(tallies), by_distance(tallies), by_visibility(tallies), sep="\n\n")
     if options.objects:
         for case, tally in tallies.items():
             print(f"\n{case}")

@@ -1,7 +1,7 @@
 """What is true of each object of a synthetic frame, and where it was lost: told from the simulator alone.
 
 Nothing of ``bevviz.why`` is asked but the names of its reasons. The simulator knows which object each point
-and each pixel is of; docs/accuracy.md says the rule in words.
+and each pixel is of; `cause` has the rule.
 """
 
 from __future__ import annotations

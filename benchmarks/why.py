@@ -17,6 +17,7 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
+from benchmarks.pages import write_section
 from benchmarks.truth import Cause, Rule, Scene, scene_of
 from bevviz.config import Config, load, revised
 from bevviz.evaluate import MIN_HITS, RANGE
@@ -34,7 +35,7 @@ MISTUNED = (
     "detector.conf_threshold=0.5",
     "fusion.min_iou=0.35",
 )
-HEADING = "\n## Answers of `bevviz why`\n"
+HEADING = "## Answers of `bevviz why`\n"
 
 
 def configurations() -> dict[str, Config]:
@@ -215,59 +216,60 @@ def main() -> None:
         tallies, f"{number} frames, seeds {options.seeds}, Python {platform.python_version()}."
     )
     if options.write:
-        options.write.write_text(options.write.read_text().partition(HEADING)[0] + section)
+        write_section(options.write, section)
     else:
-        print(section)
+        print(section, details_of(tallies), sep="\n")
 
 
 def section_of(tallies: Mapping[str, Tally], what: str) -> str:
-    """Of the page of accuracy."""
-
-    def row(name: str, counts: Counter[str], right: str = "right") -> str:
-        asked = counts["asked"]
-        return f"{name} | {asked} | {counts[right] / asked:.3f} |" if asked else f"{name} | 0 | - |"
-
+    """Format the section of docs/performance.md."""
     visible = [reason for reason in Reason if reason not in HOPELESS]
     mistuned = ", ".join(f"`{setting}`" for setting in MISTUNED)
     lines = [
         HEADING,
-        "Every object of the ground truth is asked about, and its verdict is right if the reason, and",
-        "whether it was reported, are those of an independent rule (`benchmarks/truth.py`): the simulator",
-        "tells which object each point and pixel is of, so that the rule looks up where the object's own",
-        "points and pixels were lost; `why` knows only the boxes. A hint holds if, with its settings and",
-        "everything run anew, the rule finds the object reported in a cluster of its own under a name of",
-        "its own. `mistuned` is the default with",
+        "`python -m benchmarks.why` asks about every object of synthetic drives. An answer is right if an",
+        "independent rule (`benchmarks/truth.py`), which knows the object of each point and pixel, gives the",
+        "same reason. A hint holds if the object is reported with it. `mistuned` is the default with",
         f"{mistuned}.",
         f"{what}\n",
-        "| asked | configuration | objects | right |",
-        "| --- | --- | ---: | ---: |",
+        f"| right answers, of objects | {' | '.join(tallies)} |",
+        "| --- |" + " ---: |" * len(tallies),
     ]
-    for name, tally in tallies.items():
-        lines += [
-            f"| all that a camera has in view and the LiDAR has points on | {row(name, tally.of(visible))}",
-            f"| those within {RANGE:.0f} m with {MIN_HITS} points or more | {row(name, tally.near)}",
-            f"| out of view, hidden or without points | {row(name, tally.of([*HOPELESS]))}",
-        ]
-    lines.append("\n| hints | configuration | given | hold | none was found |")
-    lines.append("| --- | --- | ---: | ---: | ---: |")
+    asked = {
+        "in view, with points": [tally.of(visible) for tally in tallies.values()],
+        f"of these within {RANGE:.0f} m, {MIN_HITS} points or more": [
+            tally.near for tally in tallies.values()
+        ],
+        "out of view, hidden or without points": [tally.of([*HOPELESS]) for tally in tallies.values()],
+    }
+    for what_asked, counts in asked.items():
+        lines.append(f"| {what_asked} | " + " | ".join(map(_share, counts)) + " |")
+    lines += ["\n| hints | given | hold | none was found |", "| --- | ---: | ---: | ---: |"]
     for name, tally in tallies.items():
         given = tally.hints["given"]
         holding = f"{tally.hints['hold'] / given:.3f}" if given else "-"
-        lines.append(f"| the change that is named | {name} | {given} | {holding} | {tally.hints['none']} |")
-    lines += [
-        f"\nBy a place in the image, of objects with {MIN_HEIGHT} px of visible height: a pixel of it,",
-        "and the box around its pixels.",
-        "Right is an answer for that object. Without the ground truth, as in most recordings, the box is",
-        "all that is known; then it counts whether `why` rightly says that what ought to be seen was",
-        "reported, and in the row below also whether it gives the rule's reason.\n",
+        lines.append(f"| {name} | {given} | {holding} | {tally.hints['none']} |")
+    seconds = [s for tally in tallies.values() for s in tally.seconds]
+    hinted = [s for tally in tallies.values() for s in tally.hint_seconds]
+    lines.append(
+        f"\nA question takes {_times(seconds)} of processor time, looking for a hint {_times(hinted)} more."
+    )
+    return "\n".join(lines) + "\n"
+
+
+def details_of(tallies: Mapping[str, Tally]) -> str:
+    """Format the answers by a place in the image and by reason."""
+    lines = [
+        f"Objects with {MIN_HEIGHT} px of visible height, asked about by a pixel or by the box around them.",
+        "Without ground truth: is the verdict reported or not right, and is the reason?\n",
     ]
     lines += ["| asked by | configuration | objects | right |", "| --- | --- | ---: | ---: |"]
     for name, tally in tallies.items():
         for kind in ("pixel", "box"):
             counts = Counter(asked=tally.places[f"{kind} asked"], right=tally.places[f"{kind} right"])
-            lines.append(f"| {kind} | {row(name, counts)}")
-        lines.append(f"| box, no truth: reported or not | {row(name, tally.blind, 'reported')}")
-        lines.append(f"| box, no truth: the reason, too | {row(name, tally.blind)}")
+            lines.append(f"| {kind} | {_row(name, counts)}")
+        lines.append(f"| box, no truth: reported or not | {_row(name, tally.blind, 'reported')}")
+        lines.append(f"| box, no truth: the reason, too | {_row(name, tally.blind)}")
     lines += ["\n| reason, by the rule | " + " | ".join(f"{name} | right" for name in tallies) + " |"]
     lines.append("| --- |" + " ---: | ---: |" * len(tallies))
     for reason in Reason:
@@ -275,12 +277,18 @@ def section_of(tallies: Mapping[str, Tally], what: str) -> str:
         if any(counts["asked"] for counts in known):
             cells = " | ".join(f"{counts['asked']} | {counts['right']}" for counts in known)
             lines.append(f"| {reason.value} | {cells} |")
-    seconds = [s for tally in tallies.values() for s in tally.seconds]
-    hinted = [s for tally in tallies.values() for s in tally.hint_seconds]
-    lines.append(
-        f"\nA question takes {_times(seconds)} of processor time, looking for a hint {_times(hinted)} more."
-    )
     return "\n".join(lines) + "\n"
+
+
+def _share(counts: Counter[str]) -> str:
+    """Format the share of right answers and the number of objects."""
+    return f"{counts['right'] / counts['asked']:.3f} of {counts['asked']}" if counts["asked"] else "-"
+
+
+def _row(name: str, counts: Counter[str], right: str = "right") -> str:
+    """Format the last cells of a row: configuration, number asked, share of right answers."""
+    asked = counts["asked"]
+    return f"{name} | {asked} | {counts[right] / asked:.3f} |" if asked else f"{name} | 0 | - |"
 
 
 def _times(seconds: Sequence[float]) -> str:

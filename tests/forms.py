@@ -1,4 +1,4 @@
-"""Holds what ``--json`` gives to what docs/json.md says of it."""
+"""Holds what ``--json`` gives to what docs/api.md says of it."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-PAGE = Path(__file__).resolve().parents[1] / "docs" / "json.md"
+PAGE = Path(__file__).resolve().parents[1] / "docs" / "api.md"
 
 
 def documented(form: str) -> dict[str, bool]:
@@ -15,9 +15,10 @@ def documented(form: str) -> dict[str, bool]:
     text = PAGE.read_text()
     section = text.partition(f"## `{form}`")[2].partition("\n## ")[0]
     assert section, f"{PAGE.name}: says nothing of {form}"
-    return {
-        path: not optional for path, optional in re.findall(r"^\| `([^`]+)`( \?)? \|", section, re.MULTILINE)
-    }
+    block = section.partition("```text\n")[2].partition("```")[0]
+    rows = re.findall(r"^(\S+?)(\??)(?:  .*)?$", block, re.MULTILINE)
+    elements = {path + "[]": False for path, _ in rows}  # a list may be empty
+    return elements | {path: not optional for path, optional in rows}
 
 
 def check(tree: dict[str, Any], form: str) -> None:

@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+import inspect
+import re
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from benchmarks import accuracy, anomalies, calib, ground, kitti, large, performance, size, why
 from benchmarks.bags import repeat
 from benchmarks.measure import interleaved, run
 from benchmarks.pages import write_section
 from benchmarks.runs import counted, logged_points
 from benchmarks.stages import same_clusters, side_by_side
 from benchmarks.truth import Rule, scene_of
-from benchmarks.why import Bench, ask_all, configurations, section_of
+from benchmarks.why import Bench, ask_all, configurations, details_of, section_of
 from bevviz.bags.bag import Recording
 from bevviz.cli import main
 from bevviz.pipeline.stage_loader import StageLoader
@@ -98,15 +101,14 @@ def test_memory_is_that_of_the_program_alone() -> None:
 
 
 def test_why_is_right_about_objects_and_its_hints_hold() -> None:
-    """Two frames of a fixed drive, three configurations; the whole of it is in docs/accuracy.md."""
+    """Two frames of a fixed drive, three configurations; the whole of it is in docs/performance.md."""
     tallies = ask_all([1040], frames=31, every=30)
     every = [tally.of([reason for reason in Reason if reason not in HOPELESS]) for tally in tallies.values()]
     asked, right = (sum(counts[key] for counts in every) for key in ("asked", "right"))
     assert asked >= 100 and right / asked >= 0.95
     given, hold = (sum(tally.hints[key] for tally in tallies.values()) for key in ("given", "hold"))
     assert given >= 10 and hold / given >= 0.9
-    section = section_of(tallies, "2 frames.")
-    assert "| merged |" in section and "A question takes " in section
+    assert "| merged |" in details_of(tallies) and "A question takes " in section_of(tallies, "2 frames.")
 
 
 def test_the_rule_knows_the_planted_faults_and_a_wrong_answer_counts_as_wrong(
@@ -137,3 +139,22 @@ def test_a_section_takes_the_place_of_its_older_self_alone(tmp_path: Path) -> No
     assert page.read_text() == "# Title\n\n## One\n\nnew\n\n## Two\n\nkept\n"
     write_section(page, "## Three\n\nlast\n")
     assert page.read_text().endswith("kept\n\n## Three\n\nlast\n")
+
+
+def test_the_page_has_the_place_of_each_benchmark_that_writes_it() -> None:
+    page = (Path(__file__).parents[1] / "docs/performance.md").read_text()
+    for module in (calib, performance):
+        assert page.count(module.BEGIN) == page.count(module.END) == 1
+    headings = [text.strip().splitlines()[0] for text in (why.HEADING, accuracy.SYNTHETIC, anomalies.INTRO)]
+    sources = (inspect.getsource(module) for module in (kitti, size, large, ground))
+    headings += [heading for source in sources for heading in re.findall(r'"(## [^"\n]+)', source)]
+    assert len(headings) == 7
+    for heading in headings:
+        assert page.count(f"\n{heading}\n") == 1, heading
+
+
+def test_targets_are_not_on_the_page() -> None:
+    assert (
+        performance.without_target("| a | b | 1 s | 2 s | 2 x | 3 x | same |")
+        == "| a | b | 1 s | 2 s | 2 x | same |"
+    )

@@ -54,7 +54,7 @@ def test_the_tutorial_and_the_page_of_why_show_what_comes_out(
         monkeypatch.delenv(name, raising=False)
     done: list[str] = []
     why = [e for e in examples("docs/why.md") if e[1]]
-    for command, shown in [*examples("docs/tutorial.md"), *why]:
+    for command, shown in [*examples("docs/index.md"), *why]:
         program, *arguments = shlex.split(command)
         if program == "printf":
             Path("bevviz.toml").write_text(arguments[0].replace("\\n", "\n"))
@@ -69,7 +69,7 @@ def test_the_tutorial_and_the_page_of_why_show_what_comes_out(
         done.append(command)
     assert len(done) >= 6
     assert {path.name for path in folder.iterdir()} >= {"bug.rrd", "bug.html", "bug.mcap", "compare.rrd"}
-    Path("bevviz.toml").write_text(project_on("docs/tutorial.md"))
+    Path("bevviz.toml").write_text(project_on("docs/index.md"))
     assert main(["why", "drive.mcap", "--at-frame", "30", "--box", "479,229"]) == 0
     assert "The car at 10.1 m was reported" in capsys.readouterr().out
 

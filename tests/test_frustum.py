@@ -322,7 +322,7 @@ def tally(shared: Path) -> kitti.Tally:
 
 
 def test_objects_of_labelled_frames(tally: kitti.Tally) -> None:
-    """Floors well below what was measured: docs/accuracy.md has the figures."""
+    """Floors well below what was measured: docs/performance.md has the figures."""
     assert len(tally.objects) == 30
     assert sum(v.distance <= 2 for v in tally.objects) >= 28
     assert sum(v.iou >= 0.5 for v in tally.objects) >= 23

@@ -1,4 +1,4 @@
-"""``--json``: the result for other programs, one form for each command (docs/json.md)."""
+"""``--json``: the result for other programs, one form for each command (docs/api.md)."""
 
 from __future__ import annotations
 

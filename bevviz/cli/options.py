@@ -195,7 +195,7 @@ def add_keep(group: argparse._ActionsContainer) -> None:
     group.add_argument(
         "--keep",
         choices=("everything", "inspect", "report"),
-        help="inspect: a fifth of everything, with raw clouds now and then; report: less (docs/size.md)",
+        help="inspect: a fifth of everything, with some raw clouds; report: less (docs/recordings.md)",
     )
 
 

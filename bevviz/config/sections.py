@@ -282,7 +282,7 @@ class BevConfig(Section):
 class LoggingConfig(Section):
     keep: Keep = Field(
         "everything",
-        description="inspect: a fifth, with raw clouds now and then; report: less, without (docs/size.md)",
+        description="inspect: a fifth, with some raw clouds; report: less, without (docs/recordings.md)",
     )
     raw_every: int = Field(50, ge=1, description="keep=inspect: raw cloud of each N-th frame")
     raw_around: Seconds = Field(

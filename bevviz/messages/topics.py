@@ -20,7 +20,7 @@ IMAGES = ("Image", "CompressedImage", "CompressedVideo")
 VIDEO = "video of a kind that is not decoded here: republish it as images (image_transport) and record these"
 _VIDEO = re.compile(r"ffmpeg_image_transport_msgs/(msg/)?FFMPEGPacket$|theora_image_transport/(msg/)?Packet$")
 
-# Entities that a recording has beside those of its sensors (docs/entities.md). No sensor may be called so.
+# Entities that a recording has beside those of its sensors (docs/recordings.md). No sensor may be called so.
 RESERVED = frozenset(
     {"fused", "fusion", "frustums", "bev", "ground_truth", "tracks"}  # of /world
     | {"missed", "false", "unnamed"}  # of /world, too

@@ -1,4 +1,4 @@
-"""Where everything is in a recording: entity paths and class ids, in one place (see docs/entities.md)."""
+"""Where everything is in a recording: entity paths and class ids, in one place (see docs/recordings.md)."""
 
 from __future__ import annotations
 
