@@ -39,7 +39,7 @@ def cells(points):
 def rows() -> dict[str, str]:
     """First and second cell of the table."""
     text = PAGE.read_text()
-    section = text[text.index("## What runs code") : text.index("## What is sent")]
+    section = text[text.index("## What runs code") : text.index("## Limits")]
     return dict(re.findall(r"^\| (.+?) \| ((?:yes|no|only after).*?) \|$", section, re.MULTILINE))
 
 
@@ -169,7 +169,7 @@ INPUTS: dict[str, Input] = {
     "`--blueprint FILE.py`": _blueprint,
 }
 # Rows about other programs: onnxruntime has no option for custom operators here, dask says so itself.
-ELSEWHERE = {"`--model FILE.onnx`", "`batch --dask ADDRESS`, `bag --dask`"}
+ELSEWHERE = {"`--model FILE.onnx`", "`batch --dask ADDRESS`"}
 
 
 def test_each_row_of_the_page_is_checked() -> None:
