@@ -1,4 +1,4 @@
-"""Check of calibration and clocks. Imports `pipeline` and below."""
+"""Check of extrinsic calibration and clocks. Imports `pipeline` and below."""
 
 from bevviz.calib.offsets import AXES, Axis
 from bevviz.calib.result import AxisResult, Calibration, Finding

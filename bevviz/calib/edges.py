@@ -1,14 +1,16 @@
-"""Edges of a cloud and of an image that show the same border of the same thing.
+"""Edges of a point cloud and of an image.
 
-After Levinson and Thrun 2013, "Automatic Online Calibration of Cameras and Lasers": where the range jumps
-between neighbouring beams, the image should have an edge. Three things are done beyond that: the jump is
-looked for along the rings and across them; an edge of the cloud lies half-way between the two beams that it
-separates, not on the nearer point, which would shift all left borders to the right and all right ones to the
-left; and borders of reflectance (road markings, kerbs) count too, which lie near and on the ground where
-silhouettes are few. What reflects more is mostly brighter in the image as well, so that such a border is
-looked for with its sign, as mutual information would (Pandey et al. 2012, "Automatic Targetless Extrinsic
-Calibration of a 3D Lidar and Camera by Maximizing Mutual Information"), but without calibrated reflectance.
-They count within a ring only: beams are seldom calibrated to each other.
+The method follows Levinson and Thrun 2013, "Automatic Online Calibration of Cameras and Lasers": where the
+range jumps between neighbouring beams, the image should have an edge. This module adds three things:
+
+- Jumps are searched along the rings and across them.
+- An edge of the cloud lies half-way between the two beams that it separates. On the nearer point, it would
+  shift all left borders to the right and all right borders to the left.
+- Steps of reflectance (road markings, kerbs) count as edges too. They lie on the ground, where silhouettes
+  are few. A surface that reflects more is mostly brighter in the image, so these edges have a sign, as in
+  mutual information (Pandey et al. 2012, "Automatic Targetless Extrinsic Calibration of a 3D Lidar and Camera
+  by Maximizing Mutual Information"). The reflectance need not be calibrated. Beams are seldom calibrated to
+  each other, so steps of reflectance are searched within a ring only.
 """
 
 from __future__ import annotations
@@ -20,34 +22,34 @@ import numpy as np
 
 from bevviz.model.frame import F32, F64, I64, RING_FIELDS, U8, Bool, Cloud
 
-ROW = np.radians(0.4)  # height of a row of beams where the cloud does not tell its rings
-JUMP = 0.12  # least share by which the inverse range falls at a border
+ROW = np.radians(0.4)  # radians, height of a row of beams in a cloud without rings
+JUMP = 0.12  # least share by which the inverse range falls at an edge
 STEP = 0.4  # metres, least jump of the range
-FLAT = 0.03  # largest share by which the inverse range changes at a border of reflectance
-CONTRAST = 0.15  # least step of reflectance, as share of the cloud's brightest
-USUAL = 8.0  # pixels around, over which the usual change of an image is taken
+FLAT = 0.03  # largest share by which the inverse range changes at a step of reflectance
+CONTRAST = 0.15  # least step of reflectance, as a share of the brightest point of the cloud
+USUAL = 8.0  # pixels, blur that gives the usual change of the image around a pixel
 NOISE = 4.0  # grey values by which an image changes without an edge
-LEVELS = 60  # steps of a change in an image that are told apart, for each multiple of what is usual
-TURN = 10.0  # more than the azimuths of a ring span, so that ring and azimuth are one number
+LEVELS = 60  # steps of image_edges for one multiple of the usual change
+TURN = 10.0  # radians, more than the azimuths of a ring span, so that ring and azimuth make one sort key
 
 
 @dataclass(frozen=True, slots=True)
 class Edges:
-    """Points on borders, in the frame of the cloud."""
+    """Edge points of a cloud, in the frame of the cloud."""
 
     xyz: F32  # (E, 3)
-    towards: F32  # (E, 3) across the border, to where it is farther or reflects more
-    bright: Bool  # (E,) of reflectance, not of range
+    towards: F32  # (E, 3) across the edge, to the farther side or the side that reflects more
+    bright: Bool  # (E,) whether it is a step of reflectance. The others are jumps of range.
 
 
 @dataclass(frozen=True, slots=True)
 class _Rings:
-    """The cloud in order of ring and azimuth, and the neighbours of each point (-1: none)."""
+    """Points sorted by ring and azimuth, with the rows of their four neighbours (-1: no neighbour)."""
 
     xyz: F64
     range: F64
-    unit: F64  # (N, 3) directions
-    reflectance: F64 | None  # 1: the cloud's brightest
+    unit: F64  # (N, 3) directions from the sensor
+    reflectance: F64 | None  # (N,) 1: the brightest point of the cloud
     left: I64
     right: I64
     below: I64
@@ -55,7 +57,7 @@ class _Rings:
 
 
 def cloud_edges(cloud: Cloud) -> Edges:
-    """The borders in one scan: jumps of range and steps of reflectance between neighbouring beams."""
+    """Return the edges of one scan: jumps of range and steps of reflectance between neighbouring beams."""
     rings = _arrange(cloud)
     if rings is None:
         return Edges(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.float32), np.zeros(0, np.bool_))
@@ -74,12 +76,13 @@ def cloud_edges(cloud: Cloud) -> Edges:
 
 
 def _arrange(cloud: Cloud) -> _Rings | None:
+    """Sort the points by ring and azimuth and find their neighbours. Return None if they are too few."""
     xyz = cloud.xyz.astype(np.float64)
     distance = np.linalg.norm(xyz, axis=1)
     azimuth = np.arctan2(xyz[:, 1], xyz[:, 0])
     ring = _ring(cloud, azimuth, distance)
     order = np.lexsort((azimuth, ring))
-    order = order[distance[order] > 0.5]  # nearer: the robot itself, or no echo at all
+    order = order[distance[order] > 0.5]  # Nearer points are the robot itself, or beams without an echo.
     if len(order) < 100:
         return None
     xyz, distance, azimuth, ring = xyz[order], distance[order], azimuth[order], ring[order]
@@ -101,13 +104,13 @@ def _arrange(cloud: Cloud) -> _Rings | None:
 
 
 def _ring(cloud: Cloud, azimuth: F64, distance: F64) -> I64:
-    """Which ring each point belongs to: as told, as stored ring by ring, or by its elevation."""
+    """Return the (N,) ring of each point: from its field, from the storage order, or from its elevation."""
     for name in RING_FIELDS:
         if name in cloud.fields:
             told: I64 = cloud.fields[name].astype(np.int64)
             return told
     turns = np.abs(np.diff(azimuth)) > np.pi
-    if 4 <= turns.sum() <= 300:  # as many as there are beams, where each ring is stored in turn
+    if 4 <= turns.sum() <= 300:  # a plausible number of beams: the cloud is stored ring by ring
         return np.cumsum(np.insert(turns, 0, False), dtype=np.int64)
     with np.errstate(invalid="ignore", divide="ignore"):
         elevation = np.nan_to_num(np.arcsin(cloud.xyz[:, 2] / distance))
@@ -116,17 +119,18 @@ def _ring(cloud: Cloud, azimuth: F64, distance: F64) -> I64:
 
 
 def _nearest(keys: F64, wanted: F64, tolerance: float) -> I64:
-    """Row of the sorted key that is nearest to each wanted one, -1 where none is within the tolerance."""
+    """Return the row of the sorted key nearest to each wanted key, -1 where none is within the tolerance."""
     after = np.clip(np.searchsorted(keys, wanted), 1, len(keys) - 1)
     nearest = np.where(wanted - keys[after - 1] < keys[after] - wanted, after - 1, after)
     return np.where(np.abs(keys[nearest] - wanted) < tolerance, nearest, -1)
 
 
 def _jumps(rings: _Rings, beyond: I64, before: I64) -> tuple[F64, F64]:
-    """(J, 3) borders of what is nearer than its neighbour ``beyond``, and where that lies.
+    """Return the (J, 3) jumps of range from each point to its neighbour ``beyond``, and their directions.
 
-    On a plane the inverse range is all but linear from beam to beam, however flat the beam meets it: the road
-    far ahead is no row of borders. So the neighbour must lie behind what the one ``before`` leads to.
+    On a plane, the inverse range is almost linear from beam to beam, even where beams meet the plane at a
+    small angle. So a jump is measured against the range extrapolated from the neighbour ``before``. Otherwise
+    the road far ahead would give a row of edges.
     """
     near = np.flatnonzero(beyond >= 0)
     far, behind = beyond[near], before[near]
@@ -141,7 +145,10 @@ def _jumps(rings: _Rings, beyond: I64, before: I64) -> tuple[F64, F64]:
 
 
 def _steps_along(rings: _Rings, reflectance: F64) -> tuple[F64, F64]:
-    """Steps of reflectance within a ring, two beams on either side being alike, and where it is more."""
+    """Return the steps of reflectance within a ring, and their directions towards the higher reflectance.
+
+    The two beams on either side of a step must be alike.
+    """
     a = np.flatnonzero((rings.left >= 0) & (rings.right >= 0))
     a = a[rings.right[rings.right[a]] >= 0]
     b = a + 1
@@ -154,7 +161,12 @@ def _steps_along(rings: _Rings, reflectance: F64) -> tuple[F64, F64]:
 
 
 def _clear_step(near: tuple[F64, F64], far: tuple[F64, F64]) -> Bool:
-    """Where two samples on one side, the second next to the border, differ from two on the other."""
+    """Return where the two samples on one side of a step differ from the two on the other side.
+
+    Args:
+        near: two samples of reflectance before the step. The second is next to the step.
+        far: two samples behind the step. The first is next to the step.
+    """
     step = np.abs(near[0] + near[1] - far[0] - far[1]) / 2
     noise = np.maximum(np.abs(near[0] - near[1]), np.abs(far[0] - far[1]))
     clear: Bool = (step > CONTRAST) & (np.abs(near[1] - far[0]) > 0.5 * step) & (noise < step)
@@ -162,10 +174,10 @@ def _clear_step(near: tuple[F64, F64], far: tuple[F64, F64]) -> Bool:
 
 
 def image_edges(bgr: U8) -> U8:
-    """(4, H, W) how much it brightens to the right, to the left, downwards and upwards.
+    """Return (4, H, W) how much the image brightens to the right, to the left, downwards and upwards.
 
-    In 1 / LEVELS of what is usual around there, so that a bright wall does not outshout a grey one, and a
-    hedge is no better a place than a road.
+    The unit is 1 / LEVELS of the usual change around the pixel. So a bright wall does not outweigh a grey
+    one, and a hedge scores no better than a road.
     """
     gray = cv2.cvtColor(bgr, cv2.COLOR_BGR2GRAY).astype(np.float32)
     gray = cv2.GaussianBlur(gray, (0, 0), 0.8)

@@ -1,11 +1,11 @@
-"""How far the data is to be believed: how wide the peak is, and whether another is as good.
+"""Uncertainty of a calibration: how wide the peak of the score is, and whether another peak is as good.
 
-The edges of one border err together, and so do those of a thing that stands in many frames: thirty pictures
-of one place are one. So nothing here counts edges. The data is divided twice, into frames and into parts of
-the image, and both are weighted at random, independently (Owen and Eckles 2012, "Bootstrapping data arrays of
-arbitrary order"). A frame's weight varies the more, the more frames are like it: those of a frame that comes
-eight times add up to what that of a frame of its own would be. Where all frames are the same, what is left is
-how the parts of one image scatter.
+The edges of one border have the same error, and so have the edges of one object in many frames: thirty images
+of one place are worth one image. So nothing here counts edges. The data is divided into frames and into parts
+of the image, and both are weighted at random, independently (Owen and Eckles 2012, "Bootstrapping data arrays
+of arbitrary order"). The weight of a frame varies more if other frames are like it: the weights of eight
+copies of a frame add up to the weight of one unique frame. If all frames are the same, the result is the
+scatter between the parts of one image.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ from bevviz.calib.search import Peak, climb
 from bevviz.model.frame import F64, Bool
 
 REPLICATES = 24
-SETTLED = 0.05  # pixels, of the climb of a replicate
-VIEW = 6.0  # variance of a single view beyond what its parts let on, as multiple of that (docs/calib.md)
+SETTLED = 0.05  # pixels, last step of the climb of a replicate
+VIEW = 6.0  # hidden variance of a view, as a multiple of the variance of its parts (docs/calib.md)
 LEAD = 2.0  # standard errors by which the best peak must be higher than another
 
 
 def scatter(scorer: Scorer, peak: Peak, free: Bool) -> F64:
-    """(7,) standard deviation of the offsets of a peak, from climbs with the data weighted at random."""
+    """Return the (7,) standard deviation of a peak, from climbs with random weights of the data."""
     rng = np.random.default_rng(0)
     frames, parts = peak.sums.score.shape
     own = views(peak) / frames
@@ -35,14 +35,15 @@ def scatter(scorer: Scorer, peak: Peak, free: Bool) -> F64:
 
 
 def caution(peak: Peak) -> float:
-    """By how much a standard deviation is to be widened: a few views err in ways that they do not show."""
+    """Return the factor that widens a standard deviation. Few views have errors that they do not show."""
     return float(np.sqrt(1 + VIEW / views(peak)))
 
 
 def views(peak: Peak) -> float:
-    """How many frames there are that do not err alike: 1 for the same frame thirty times.
+    """Return how many frames have independent errors: 1 for the same frame thirty times.
 
-    The participation ratio of how the frames' parts pull at the peak, correlated frame with frame.
+    This is the participation ratio of the gradients of the frames' parts at the peak, correlated frame with
+    frame.
     """
     values, vectors = np.linalg.eigh(peak.metric)
     pull = peak.sums.gradient @ (vectors * np.sqrt(np.maximum(values, 0.0)))
@@ -55,10 +56,10 @@ def views(peak: Peak) -> float:
 
 
 def lead(best: Peak, rival: Peak) -> tuple[float, float]:
-    """By how much the best peak is higher than another, and by how much it must be to be believed.
+    """Return by how much the best peak is higher than another, and by how much it must be.
 
-    Part by part and frame by frame, as Vuong 1989, "Likelihood Ratio Tests for Model Selection and Non-Nested
-    Hypotheses", does sample by sample.
+    The comparison goes part by part and frame by frame, as that of Vuong 1989, "Likelihood Ratio Tests for
+    Model Selection and Non-Nested Hypotheses", goes sample by sample.
     """
     ahead = best.sums.score - rival.sums.score
     by_frame, by_part = ahead.sum(1), ahead.sum(0)

@@ -1,4 +1,4 @@
-"""Logs what ``bevviz calib`` found: points over the image, stated and corrected, and the score curves."""
+"""Log the result of ``bevviz calib``: points over the image, stated and corrected, and the score curves."""
 
 from __future__ import annotations
 
@@ -32,12 +32,12 @@ _COLORS = {
 def log_calibration(
     recording: rr.RecordingStream, result: Calibration, shots: Sequence[Shot], config: LoggingConfig
 ) -> None:
-    """Log one camera.
+    """Log the result for one camera.
 
     Args:
-        recording: where to.
-        result: what was found.
-        shots: what it was found from.
+        recording: recording to log to.
+        result: calibration of the camera.
+        shots: images and clouds that gave the result.
         config: quality of the images.
     """
     camera = result.camera
@@ -68,7 +68,7 @@ def _log_pair(
     config: LoggingConfig,
     color: tuple[int, int, int],
 ) -> None:
-    """The image, every point over it by depth, and the edges of the cloud."""
+    """Log the image, all points over it by depth, and the edges of the cloud."""
     assert shot.camera.image is not None and shot.camera.intrinsics is not None
     recording.log(f"{path}/image", encode_image(shot.camera.image, config.jpeg_quality))
     intrinsics = shot.camera.intrinsics
@@ -98,11 +98,13 @@ def _log_pair(
 
 
 def _inside(uv: F32, intrinsics: Intrinsics) -> Bool:
+    """Return (N,) which pixels are inside the image."""
     with np.errstate(invalid="ignore"):
         return np.asarray(((uv > -CORNER) & (uv < [intrinsics.width, intrinsics.height])).all(axis=1))
 
 
 def _page(result: Calibration) -> str:
+    """Return the page of the result in Markdown."""
     rows = [(axis.axis.name, axis.measured, axis.told) for axis in result.axes]
     return "\n".join(
         [

@@ -1,4 +1,4 @@
-"""The seven numbers that are looked for, in the axes of the camera: three turns, three shifts, a time."""
+"""The seven offsets of a calibration, in the axes of the camera: three turns, three shifts, one time."""
 
 from __future__ import annotations
 
@@ -13,24 +13,25 @@ from bevviz.model.frame import F64
 
 @dataclass(frozen=True, slots=True)
 class Axis:
-    """One of them. What is computed is in radians, metres and seconds, what is told in ``unit``.
+    """One of the seven offsets. The computation uses radians, metres and seconds. The output uses ``unit``.
 
-    ``prior`` is more than such a number is usually wrong, and holds what the scene does not: an error of
-    that size costs as much as one standard deviation of the edges. ``floor`` is what remains between
-    the edges of perfectly calibrated sensors (docs/calib.md), and part of every uncertainty that is told.
+    ``prior`` is larger than a usual error. It holds the offsets that the scene does not determine: an error
+    of that size costs as much as one standard deviation of the edges. ``floor`` is the error that remains
+    between the edges of perfectly calibrated sensors (docs/calib.md). It is part of every reported
+    uncertainty.
     """
 
     name: str
-    what: str  # how it is called
-    short: str  # the same where room is short
-    positive: str  # what the stated calibration does wrong where the offset is positive
+    what: str  # its name in sentences
+    short: str  # its name in narrow places
+    positive: str  # error of the stated calibration if the offset is positive
     negative: str
     unit: str
     scale: float  # unit / internal unit
-    prior: float  # in ``unit``, as all below
+    prior: float  # in ``unit``, as all numbers below
     floor: float
-    least: float  # a smaller error is not worth a word
-    sure: float  # what is fine may be no more off than that
+    least: float  # smaller errors are not reported
+    sure: float  # an axis is fine if its error is surely smaller than this
     reach: float  # the score is plotted this far to both sides
     decimals: int
 
@@ -82,16 +83,17 @@ AXES: tuple[Axis, ...] = (
     Axis("tz", "shift along the camera's z axis", "shift z", "is too far ahead", "is too far back", **_CM),
     Axis("dt", "time of the image", "image time", "the stamps are late", "the stamps are early", **_MS),
 )
-TIME = 6  # row of the last one
+TIME = 6  # row of the time in AXES
 SCALES = np.array([axis.scale for axis in AXES])
 PRIOR = np.array([axis.prior for axis in AXES]) / SCALES
 FLOOR = np.array([axis.floor for axis in AXES]) / SCALES
 
 
 def error_pose(offsets: F64) -> F64:
-    """(4, 4) true_camera_from_stated_camera of the (7,) offsets (radians, metres; the time plays no part).
+    """Return the (4, 4) true_camera_from_stated_camera of (7,) offsets in radians, metres and seconds.
 
-    The stated camera, seen from the true one, is turned by the rotation vector and then shifted.
+    The stated camera, seen from the true one, is turned by the rotation vector and then shifted. The time has
+    no effect.
     """
     turn = np.asarray(offsets[:3], np.float64)
     angle = float(np.linalg.norm(turn))

@@ -1,4 +1,4 @@
-"""What came out, and how it is told: a sentence, a table, JSON and the corrected configuration."""
+"""Result of a calibration as a sentence, a table, JSON and the corrected configuration."""
 
 from __future__ import annotations
 
@@ -13,28 +13,32 @@ from bevviz.model.frame import F64
 
 
 class Finding(StrEnum):
-    """What is found of one axis."""
+    """Judgement about one axis."""
 
     FINE = "fine"
     OFF = "off"
     UNKNOWN = "cannot tell"  # too little data
-    CONFLICT = "no agreement"  # enough of it, but the parts contradict each other
+    CONFLICT = "no agreement"  # enough data, but its parts contradict each other
 
 
 @dataclass(frozen=True, slots=True)
 class AxisResult:
-    """One axis, in its own unit. ``interval`` is two standard deviations to either side of ``offset``."""
+    """Result for one axis, in its own unit.
+
+    ``interval`` is two standard deviations to either side of ``offset``.
+    """
 
     axis: Axis
-    offset: float  # of what is stated from what fits best
+    offset: float  # of the stated value from the best fit
     interval: float
     finding: Finding
-    reason: str  # of a finding UNKNOWN or CONFLICT
-    abscissa: F64  # (S,) offsets along this axis, the other axes being as they fit best
-    score: F64  # (S,)
+    reason: str  # reason of a finding UNKNOWN or CONFLICT, else empty
+    abscissa: F64  # (S,) offsets along this axis; the other axes stay at their best fit
+    score: F64  # (S,) mean score at each of these offsets
 
     @property
     def measured(self) -> str:
+        """Offset, interval and unit in words."""
         if self.interval >= 2 * self.axis.prior:
             return "not known"
         n = self.axis.decimals
@@ -53,25 +57,25 @@ class AxisResult:
 
 @dataclass(frozen=True, slots=True)
 class Calibration:
-    """Of one camera against the cloud."""
+    """Result for one camera against the point cloud."""
 
     camera: str
     parent: str  # frame of the points
-    child: str  # optical frame
-    topic: str  # of the images
-    offset: float  # seconds that are added to their stamps already
+    child: str  # optical frame of the camera
+    topic: str  # topic of the images
+    offset: float  # seconds already added to the stamps of the images
     axes: tuple[AxisResult, ...]
     frames: int
     edges: int
     stated: F64  # (4, 4) parent_from_child
-    corrected: F64  # (4, 4) the same with the axes that are off put right, the others as stated
-    correction: F64  # (7,) what was put right: radians, metres, seconds
+    corrected: F64  # (4, 4) parent_from_child with the axes that are off corrected, the others as stated
+    correction: F64  # (7,) the correction in radians, metres, seconds
     score_stated: float
     score_corrected: float
     notes: tuple[str, ...] = ()
 
     def by(self, finding: Finding) -> list[AxisResult]:
-        """The axes of which that was found."""
+        """Return the axes with this finding."""
         return [axis for axis in self.axes if axis.finding is finding]
 
     @property
@@ -93,23 +97,23 @@ class Calibration:
 
     @property
     def measured_from(self) -> str:
-        """``30 frames, 43192 edges``."""
+        """Amount of data, e.g. ``30 frames, 43192 edges``."""
         return f"{self.frames} frame{'s' * (self.frames != 1)}, {self.edges} edges"
 
     @property
     def moved(self) -> bool:
-        """Whether mounting or clock are put right, and not left as stated."""
+        """Whether the result corrects the mounting or the clock."""
         return bool(self.correction.any())
 
     @property
     def config(self) -> str:
-        """What puts it right as a configuration, in YAML."""
+        """Configuration that applies the correction, in YAML."""
         return configuration([self])
 
     def table(self) -> str:
-        """The axes in lines of fixed width."""
+        """Return one line of fixed width for each axis."""
         rows = [("axis", "offset of what is stated", "finding")]
-        same = len({axis.reason for axis in self.axes}) == 1  # it is in the answer
+        same = len({axis.reason for axis in self.axes}) == 1  # The answer has the reason already.
         for axis in self.axes:
             told = str(axis.finding) if same and axis.reason else axis.told
             rows.append((f"{axis.axis.name}  {axis.axis.what}", axis.measured, told))
@@ -117,7 +121,7 @@ class Calibration:
         return "\n".join(f"{a:<{widths[0]}}  {b:>{widths[1]}}  {c}" for a, b, c in rows)
 
     def to_dict(self) -> dict[str, Any]:
-        """For JSON."""
+        """Return the result for JSON."""
         return {
             "camera": self.camera,
             "answer": self.answer,
@@ -143,7 +147,7 @@ class Calibration:
 
 
 def configuration(results: Sequence[Calibration]) -> str:
-    """What puts several cameras right as one configuration, in YAML: extrinsics, and offsets of stamps."""
+    """Return one configuration that corrects several cameras, in YAML: extrinsics and offsets of stamps."""
     lines = ["source:", "  extrinsics:"]
     for result in results:
         pose = [*result.corrected[:3, 3], *geometry.quaternion(result.corrected)]
@@ -156,7 +160,7 @@ def configuration(results: Sequence[Calibration]) -> str:
 
 
 def _error(result: AxisResult) -> str:
-    """``it looks too high, by 1.02 +- 0.05 deg (turn about the camera's x axis)``."""
+    """Return e.g. ``it looks too high, by 1.02 +- 0.05 deg (turn about the camera's x axis)``."""
     axis, n = result.axis, result.axis.decimals
     size = f"{abs(result.offset):.{n}f} +- {result.interval:.{n}f} {axis.unit}"
     how = axis.positive if result.offset > 0 else axis.negative
@@ -166,7 +170,7 @@ def _error(result: AxisResult) -> str:
 
 
 def _names(results: Sequence[AxisResult]) -> str:
-    """``turns about x and z, shift along z and time of the image``, of the camera's axes."""
+    """Return e.g. ``turns about x and z, shift along z and time of the image``."""
     kinds: dict[str, list[str]] = {}
     for result in results:
         kind, _, axis = result.axis.what.partition(" the camera's ")
@@ -179,4 +183,5 @@ def _names(results: Sequence[AxisResult]) -> str:
 
 
 def _listed(words: Sequence[str]) -> str:
+    """Join words with commas and a final 'and'."""
     return " and ".join(filter(None, [", ".join(words[:-1]), words[-1]]))

@@ -1,4 +1,4 @@
-"""What a calibration is made from: for each frame and camera the edges of both, and how the robot moved."""
+"""Data of a calibration: the edges of image and cloud in each frame, and the motion of the robot."""
 
 from __future__ import annotations
 
@@ -13,42 +13,43 @@ from bevviz.calib.edges import Edges, cloud_edges, image_edges
 from bevviz.model import geometry
 from bevviz.model.frame import F32, F64, I32, U8, Bool, Camera, Frame, Intrinsics
 
-CELLS = (8, 4)  # along u and v: parts of the image, whose edges err together
+CELLS = (8, 4)  # parts of the image along u and v; the edges of one part have the same errors
 PIXELS = 500_000  # larger images are scaled down to this size
-REACH = np.radians(3.5)  # edges that project this far outside the image may still come in
-NEAREST, FARTHEST = 2.0, 60.0  # metres: the robot itself; an edge of more than a pixel
-STEPS = np.arange(-15, 16) * 10_000_000  # nanoseconds around the image at which the pose is looked up
+REACH = np.radians(3.5)  # radians outside the image; edges up to there may still move into it
+NEAREST, FARTHEST = 2.0, 60.0  # metres: the robot itself is nearer; farther edges are wider than a pixel
+STEPS = np.arange(-15, 16) * 10_000_000  # nanoseconds from the image's stamp at which the pose is looked up
 
-Pose = Callable[[Frame, int], F64 | None]  # fixed_from_points at a stamp; None: not known
+Pose = Callable[[Frame, int], F64 | None]  # fixed_from_points at a stamp; None: unknown
 
 
 @dataclass(frozen=True, slots=True)
 class Shot:
-    """One image and the cloud that goes with it."""
+    """One image with the edges of the cloud of its frame."""
 
     frame: Frame
     camera: Camera
-    K: F64  # (3, 3) of the image that the edges are from, free of distortion
+    K: F64  # (3, 3) of the undistorted and scaled image that ``maps`` is made from
     maps: U8  # (4, H, W) see ``image_edges``
     xyz: F32  # (E, 3) edges of the cloud, in Frame.points_frame
-    change: U8  # (E,) what each edge should be in the image: a row of ``score.CHANGES``
-    cell: I32  # (E,) where it is in the image, as stated
-    mounting: F64  # (4, 4) camera_from_points as stated, the robot standing still
-    motion: F64 | None  # (T, 4, 4) points at the image's stamp + STEPS from points at the cloud's
+    change: U8  # (E,) expected change of the image at each edge: a row of ``score.CHANGES``
+    cell: I32  # (E,) part of the image that each edge projects to, as stated
+    mounting: F64  # (4, 4) camera_from_points as stated, for a robot that stands still
+    motion: F64 | None  # (T, 4, 4) points at the image's stamp + STEPS from points at the cloud's stamp
 
     def camera_from_points(self, late: float) -> F64:
-        """As stated, for an image that was taken ``late`` seconds before its stamp."""
+        """Return the stated (4, 4) pose for an image that was taken ``late`` seconds before its stamp."""
         if self.motion is None:
             return self.mounting
         at = min(max((-late * 1e9 - STEPS[0]) / (STEPS[1] - STEPS[0]), 0.0), len(STEPS) - 1.0)
         i = min(int(at), len(STEPS) - 2)
-        moved = (i + 1 - at) * self.motion[i] + (at - i) * self.motion[i + 1]  # all but rigid: 10 ms apart
+        # The poses are 10 ms apart, so that their mean is almost rigid.
+        moved = (i + 1 - at) * self.motion[i] + (at - i) * self.motion[i + 1]
         return np.asarray(self.mounting @ moved, np.float64)
 
 
 @dataclass(slots=True)
 class Shots:
-    """All shots of one camera, and why other frames gave none."""
+    """All shots of one camera, and the reasons why other frames gave none."""
 
     camera: str
     shots: list[Shot] = field(default_factory=list)
@@ -56,6 +57,7 @@ class Shots:
 
     @property
     def edges(self) -> int:
+        """Number of edges of the cloud in all shots."""
         return sum(len(shot.xyz) for shot in self.shots)
 
 
@@ -63,10 +65,10 @@ def gather(frames: Iterable[Frame], cameras: Iterable[str], pose: Pose) -> dict[
     """Find the edges in all frames.
 
     Args:
-        frames: in order of stamp.
-        cameras: names of those that are looked at.
-        pose: where the points' frame was at a stamp up to 0.15 s from an image's; asked for a frame only when
-            the next one has come, so that a source that reads a bag has the transforms after it.
+        frames: frames in order of stamp.
+        cameras: names of the cameras to calibrate.
+        pose: returns fixed_from_points at a stamp up to 0.15 s from that of an image. It is called for a
+            frame after the next frame has come, so that a source that reads a bag has the later transforms.
 
     Returns:
         the shots of each camera, by name.
@@ -83,6 +85,7 @@ def gather(frames: Iterable[Frame], cameras: Iterable[str], pose: Pose) -> dict[
 
 
 def _take(frame: Frame, found: dict[str, Shots], pose: Pose) -> None:
+    """Add a shot of the frame to each camera, or the reason why there is none."""
     parts = []
     for cloud, points_from_cloud in zip(frame.clouds, frame.points_from_clouds, strict=True):
         edges = cloud_edges(cloud)
@@ -106,10 +109,12 @@ def _take(frame: Frame, found: dict[str, Shots], pose: Pose) -> None:
 
 
 def _columns(edges: Edges) -> tuple[F32, F32, Bool]:
+    """Return the arrays of the edges in the order of the class."""
     return edges.xyz, edges.towards, edges.bright
 
 
 def _shot(frame: Frame, camera: Camera, edges: Edges, pose: Pose) -> Shot:
+    """Return the shot of one camera, with the edges that project into the image or near it."""
     assert camera.image is not None and camera.intrinsics is not None
     assert camera.camera_from_points is not None
     motion = _motion(frame, camera.image.stamp, pose)
@@ -134,14 +139,14 @@ def _shot(frame: Frame, camera: Camera, edges: Edges, pose: Pose) -> Shot:
 
 
 def _change(away: F32, bright: Bool) -> U8:
-    """Row of ``score.CHANGES`` of edges with (E, 2) directions in the image."""
+    """Return the row of ``score.CHANGES`` for edges with (E, 2) directions in the image."""
     along_v = np.abs(away[:, 1]) > np.abs(away[:, 0])
     negative = np.where(along_v, away[:, 1], away[:, 0]) < 0
     return np.where(bright, 2 + 2 * along_v + negative, along_v).astype(np.uint8)
 
 
 def _motion(frame: Frame, stamp: int, pose: Pose) -> F64 | None:
-    """None where the way of the robot is not known all around the image's stamp."""
+    """Return the (T, 4, 4) motion around the stamp of an image, None where a pose is unknown."""
     here = pose(frame, frame.stamp)
     there = [pose(frame, stamp + int(step)) for step in STEPS] if here is not None else []
     known = [geometry.inverse(p) @ here for p in there if p is not None and here is not None]
@@ -149,7 +154,7 @@ def _motion(frame: Frame, stamp: int, pose: Pose) -> F64 | None:
 
 
 def _flatten(bgr: U8, intrinsics: Intrinsics) -> tuple[U8, F64]:
-    """The image without distortion and not larger than need be, and its camera matrix."""
+    """Return the image without distortion, scaled down to PIXELS, and its camera matrix."""
     picture, K = bgr, intrinsics.K
     if geometry.is_bent(intrinsics):
         if intrinsics.distortion_model in geometry.FISHEYE:

@@ -1,11 +1,11 @@
-"""How well the edges of clouds lie on the edges of images, and which way they would rather go.
+"""Score of how well the edges of clouds lie on the edges of images, and its gradient.
 
-The edges of an image, blurred by ``sigma`` pixels, are taken for the density that a ``SHARE`` of the cloud's
-edges are drawn from once projected, the others falling anywhere: the score of an edge is the logarithm of
-1 - SHARE + SHARE * density, the density's mean over the image being 1. An edge outside the image has 0. So
-the scores of any two poses compare, and of any two images. It has the same peak as the inverse distance
-transform of Levinson and Thrun, is smooth, and needs no threshold; its gradient with the information of the
-edges that fit gives the step of an expectation-maximisation, which a climb can start with.
+The edges of an image, blurred by ``sigma`` pixels, are a density of mean 1. A ``SHARE`` of the projected
+edges of the cloud is drawn from this density, and the others fall anywhere. So the score of an edge is the
+logarithm of 1 - SHARE + SHARE * density. An edge outside the image scores 0. This makes the scores of
+different poses and of different images comparable. The score has the same peak as the inverse distance
+transform of Levinson and Thrun, is smooth, and needs no threshold. Its gradient, with the information of the
+edges that fit, gives one step of expectation-maximisation, with which a climb can start.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ from bevviz.calib.samples import CELLS, Shot
 from bevviz.model.frame import F32, F64, I32, I64, Bool
 from bevviz.support.kernel import kernel
 
-SHARE = 0.2  # of the edges of a cloud that an image shows
-AGAINST = 0.25  # what is darker though it reflects more (leaves) counts so much beside what is brighter
+SHARE = 0.2  # of the edges of a cloud are visible in an image
+AGAINST = 0.25  # weight of a change of the opposite sign: some surfaces (leaves) reflect more and look darker
 PIXEL = 1.5  # pixels^2, variance of the edges themselves
 MOMENT = 0.01  # seconds over which the motion of the robot is differenced
 PARTS = CELLS[0] * CELLS[1]
 
-# What an edge of a cloud may be in the image, as weights of the four rows of ``image_edges``: a change along
-# u, along v; brighter to the right, to the left, downwards, upwards.
+# Changes of the image that an edge of the cloud may show, as weights of the four rows of ``image_edges``:
+# a change along u, a change along v; brighter to the right, to the left, downwards, upwards.
 CHANGES = np.array(
     [
         [1, 1, 0, 0],
@@ -45,15 +45,19 @@ ALONG_V = np.array([0, 1, 0, 0, 1, 1], np.bool_)
 
 @dataclass(frozen=True, slots=True)
 class Sums:
-    """Over the edges in each part of each shot, so that shots and parts can be compared and left out."""
+    """Score and slopes summed over the edges in each part of each shot.
+
+    Shots and parts can be compared and left out.
+    """
 
     score: F64  # (S, PARTS)
     count: F64  # (S, PARTS)
     gradient: F64  # (S, PARTS, 7)
-    information: F64  # (7, 7) of the edges that fit, were they known
+    information: F64  # (7, 7) of the edges that fit
 
     @property
     def mean(self) -> float:
+        """Mean score of an edge."""
         return float(self.score.sum() / max(float(self.count.sum()), 1.0))
 
 
@@ -61,7 +65,7 @@ class Scorer:
     """The score of all shots of one camera, at one blur.
 
     Args:
-        shots: what is compared.
+        shots: shots of the camera.
         sigma: blur in pixels.
     """
 
@@ -73,7 +77,7 @@ class Scorer:
         self._densities = [densities(shot, sigma) for shot in shots]
 
     def __call__(self, offsets: F64, slopes: bool = True, information: bool = False) -> Sums:
-        """At (7,) offsets: radians, metres, seconds. What is not asked for stays zero."""
+        """Return the sums at (7,) offsets in radians, metres and seconds. Sums not asked for are zero."""
         size = len(AXES)
         score, count = np.zeros((2, len(self.shots), PARTS))
         gradient, fitting = np.zeros((len(self.shots), PARTS, size)), np.zeros((size, size))
@@ -104,12 +108,12 @@ class Scorer:
 
 
 def densities(shot: Shot, sigma: float) -> tuple[F32, I64, Bool]:
-    """What the shot's edges are drawn from.
+    """Return the densities that the edges of a shot are drawn from.
 
     Returns:
-        density: (D, H, W) of mean 1, for each of ``CHANGES`` that there are.
-        row: (E,) which of them each edge is compared with.
-        along_v: (D,) whether it changes along v.
+        density: (D, H, W) of mean 1, one for each of ``CHANGES`` that the shot has.
+        row: (E,) the density of each edge.
+        along_v: (D,) whether the density changes along v.
     """
     changes, row = np.unique(shot.change, return_inverse=True)
     blurred = [cv2.GaussianBlur(rows.astype(np.float32), (0, 0), sigma) for rows in shot.maps]
@@ -140,7 +144,7 @@ def _add(
     gradient: F64,
     fitting: F64,
 ) -> None:
-    """Add the edges of one shot. ``change`` is how ``pose`` changes in a second of time offset."""
+    """Add the edges of one shot. ``change`` is the change of ``pose`` per second of time offset."""
     height, width = density.shape[1:]
     fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
     ju, jv, p, speed = np.zeros(7), np.zeros(7), np.zeros(3), np.zeros(3)

@@ -1,7 +1,8 @@
-"""Where the score has its peaks: a grid over turns and sideways shifts, and a climb from its best places.
+"""Search for the peaks of the score: a grid over turns and sideways shifts, and climbs from its best points.
 
-An error of a degree is many times as wide as a peak, so that a climb from what is stated ends on any peak
-that lies between. The grid sees all of them; what is told of the highest depends on how the others compare.
+An error of one degree is many times wider than a peak. So a climb from the stated calibration ends on any
+peak in between. The grid finds all peaks. The result depends on how the other peaks compare to the highest
+one.
 """
 
 from __future__ import annotations
@@ -20,42 +21,45 @@ from bevviz.model import geometry
 from bevviz.model.frame import F32, F64, I64, Bool
 from bevviz.support.kernel import kernel
 
-STEP = np.radians(0.32)  # of the grid about x and y
-ROLL = np.radians(0.7)  # about z, where an error moves the middle of the image little
-ROLLS = 4  # steps to both sides
+STEP = np.radians(0.32)  # radians, step of the grid about x and y
+ROLL = np.radians(0.7)  # radians about z, where an error moves the middle of the image little
+ROLLS = 4  # steps of ROLL to both sides
 SHIFTS = (-0.15, 0.0, 0.15)  # metres along x and y
-SAMPLE = 5000  # edges, about, that the grid is made with; of the others on a border there is little news
-MOST = 6 * SAMPLE  # that anything is made with
+SAMPLE = 5000  # edges, about, for the grid; more edges of the same borders add little
+MOST = 6 * SAMPLE  # edges, most that any step uses
 STARTS = 16  # peaks of the grid that are climbed
 FINALISTS = 6  # peaks that are climbed to the end
 LADDER = 2.5  # pixels of blur between that of the grid and the finest
 FINEST = 1.5
-APART = np.radians(0.3)  # turns by which two peaks differ
-WORTH = 1000.0  # independent edges, at most, that the edges count for beside the prior
+APART = np.radians(0.3)  # radians; peaks with larger differences of their turns are distinct
+WORTH = 1000.0  # the edges weigh at most as much as this number of independent edges, relative to the prior
 ROUNDS = 30  # steps at one blur, at most
-SETTLED = 0.01  # pixels
+SETTLED = 0.01  # pixels; a climb ends with a smaller step
 FARTHEST = 2.0  # blurs that a step may move the edges
 HALVINGS = 4
 
 
 @dataclass(frozen=True, slots=True)
 class Peak:
+    """A local maximum of the score."""
+
     offsets: F64  # (7,)
     sums: Sums
-    metric: F64  # (7, 7) inverse of the curvature, about
-    pixels: F64  # (7, 7) mean square of how far offsets move the edges
+    metric: F64  # (7, 7) about the inverse of the curvature
+    pixels: F64  # (7, 7) mean square of the pixels by which offsets move the edges
 
     @property
     def height(self) -> float:
+        """Score at the peak, summed over all edges."""
         return float(self.sums.score.sum())
 
 
 def search(
     shots: Sequence[Shot], free: Bool, progress: Callable[[float, str], None]
 ) -> tuple[Scorer, list[Peak]]:
-    """The peaks, highest first, over the (7,) ``free`` axes, and the scorer that they were found with.
+    """Search the offsets over the (7,) ``free`` axes. Return the last scorer and the peaks, highest first.
 
-    Without data there may be none.
+    Without data, there may be no peak.
     """
     progress(0.0, "grid")
     blur, starts = _grid(thin(shots, SAMPLE))
@@ -71,7 +75,7 @@ def search(
 
 
 def _climbs(scorer: Scorer, starts: list[F64], free: Bool) -> list[Peak]:
-    """The distinct peaks that the starts lead to, highest first. One that is nowhere near is none."""
+    """Climb from each start. Return the distinct peaks within two priors of zero, highest first."""
     found = [climb(scorer, start, free) for start in starts]
     near = [peak for peak in found if (np.abs(peak.offsets) < 2 * PRIOR).all()]
     kept: list[Peak] = []
@@ -89,15 +93,15 @@ def climb(
     weight: F64 | float = 1.0,
     settled: float = SETTLED,
 ) -> Peak:
-    """Up the score and the prior, by BFGS (Nocedal and Wright 2006, chapter 6) over the ``free`` axes.
+    """Climb the score plus the prior by BFGS (Nocedal and Wright 2006, chapter 6) over the ``free`` axes.
 
     Args:
-        scorer: of the score to be climbed.
+        scorer: gives the score.
         start: (7,) offsets.
         free: (7,) whether an axis moves.
-        near: a peak of about the same shape; without one, the first step is one of expectation-maximisation.
-        weight: (S, PARTS) or one number, how much each part of each shot counts.
-        settled: pixels: a step that moves the edges less is the last.
+        near: peak of about the same shape. Without it, the first step is one of expectation-maximisation.
+        weight: (S, PARTS) or one number: weight of each part of each shot.
+        settled: pixels. A step that moves the edges by less is the last.
     """
     worth = min(1.0, WORTH / max(scorer.edges, 1))
     hold = np.where(free, 1 / PRIOR**2, 0.0)
@@ -134,11 +138,12 @@ def climb(
 
 
 def _total(gradient: F64, weight: F64 | float) -> F64:
+    """Sum a gradient over all parts of all shots, with weights."""
     return np.asarray((gradient * np.asarray(weight)[..., None]).sum((0, 1)), np.float64)
 
 
 def thin(shots: Sequence[Shot], edges: int) -> list[Shot]:
-    """The same with about so many edges, or fewer."""
+    """Return the same shots with about this number of edges, or fewer."""
     every = -(-sum(len(shot.xyz) for shot in shots) // edges)
     return [
         replace(s, xyz=s.xyz[::every], change=s.change[::every], cell=s.cell[::every]) if every > 1 else s
@@ -150,7 +155,7 @@ def thin(shots: Sequence[Shot], edges: int) -> list[Shot]:
 
 
 def _grid(shots: Sequence[Shot]) -> tuple[float, list[F64]]:
-    """The blur of the grid in pixels, and the (7,) offsets of its highest peaks."""
+    """Return the blur of the grid in pixels, and the (7,) offsets of its highest peaks."""
     focal = float(np.mean([shot.K[0, 0] for shot in shots]))
     blur = max(focal * STEP, FINEST)
     shrink = max(1, round(blur))
@@ -175,7 +180,7 @@ def _grid(shots: Sequence[Shot]) -> tuple[float, list[F64]]:
 
 
 def _shrunk(shot: Shot, blur: float, shrink: int) -> tuple[F32, I64, F32, F64]:
-    """Its edges as the stated camera sees them, the row of each, the score of every pixel, and K of those."""
+    """Return the edges in the stated camera, the density of each, the log densities, and their K."""
     density, row, _ = densities(shot, blur)
     height, width = (-(-size // shrink) for size in density.shape[1:])
     small = [cv2.resize(d, (width, height), interpolation=cv2.INTER_AREA) for d in density]
@@ -203,7 +208,7 @@ def _sample(xyz: F32, which: I64, logs: F32, turns: F32, shift: F32, score: F64)
 
 
 def _highest(score: F64) -> Bool:
-    """Which places of a grid no neighbour overtops."""
+    """Return which cells of a grid have no higher neighbour."""
     around = np.pad(score, 1, constant_values=-np.inf)
     highest = np.ones(score.shape, np.bool_)
     for steps in itertools.product(range(3), repeat=score.ndim):

@@ -1,4 +1,4 @@
-"""Finds the offsets at which the edges meet best, and says how far that is to be believed."""
+"""Find the offsets at which the edges meet best, and judge each axis with its uncertainty."""
 
 from __future__ import annotations
 
@@ -18,33 +18,33 @@ from bevviz.errors import UserError
 from bevviz.model import geometry
 from bevviz.model.frame import F64, Bool
 
-SAMPLES = 41  # points of a curve
-EDGES = 500  # fewer say nothing
-RIVALS = 2  # peaks about as high as the best one, at most, that are likely to be all
-FIT = 0.035  # mean score that the worst of real scenes has where the calibration is right (docs/calib.md)
-HALF = 3  # frames, least, that are held against as many others
-CERTAIN = 1.25  # intervals, that is 2.5 standard deviations: an offset that is no chance
-ALONG = 0.005  # metres by which edges that move with others than the robot pull along its way
-UNTIMED = 0.05  # metres along z: what 5 ms are worth at 10 m/s, where the motion is not known
-TURNS, AHEAD = 3, 5  # how many of the axes are turns; the shift along z
+SAMPLES = 41  # points of a score curve
+EDGES = 500  # fewer edges give no result
+RIVALS = 2  # with more peaks about as high as the best one, there are probably more still
+FIT = 0.035  # mean score of the worst real scene with a right calibration (docs/calib.md)
+HALF = 3  # frames, least size of the halves that are compared
+CERTAIN = 1.25  # intervals, that is 2.5 standard deviations: a larger offset is significant
+ALONG = 0.005  # metres by which edges of other moving things shift the result along the robot's way
+UNTIMED = 0.05  # metres along z where the motion is unknown: 5 ms at 10 m/s
+TURNS, AHEAD = 3, 5  # number of turns in AXES; row of the shift along z
 MOTIONLESS = "the motion of the robot is not known"
-STILL = 1.0  # metres per second: an image of a robot that hardly moves has no time
+STILL = 1.0  # metres per second; at lower speeds the time of an image has no effect
 
 Progress = Callable[[float, str], None]
 
 
 @dataclass(frozen=True, slots=True)
 class _Found:
-    """The best offsets and how far from them the truth may be. ``rival``: another alignment as good."""
+    """The best offsets and their uncertainty. ``rival`` describes another alignment that is as good."""
 
     offsets: F64  # (7,)
-    interval: F64  # (7,) two standard deviations and the way to the rivals
+    interval: F64  # (7,) two standard deviations plus the distance to the rivals
     rival: str = ""
 
 
 @dataclass(frozen=True, slots=True)
 class _Said:
-    """A finding and why."""
+    """A finding and its reason."""
 
     finding: Finding
     reason: str = ""
@@ -55,15 +55,16 @@ def calibrate(
     progress: Progress = lambda done, what: None,
     stamps: Mapping[str, float] = MappingProxyType({}),
 ) -> Calibration:
-    """How wrong the stated calibration and clock of one camera are.
+    """Measure the error of the stated calibration and clock of one camera.
 
-    Maximises the score of ``bevviz.calib.score`` over three turns, three shifts and the time together, from a
-    grid and coarse to fine, with a weak prior (``Axis.prior``) that holds what the scene does not. How sure
-    that is: ``bevviz.calib.evidence``; ``Axis.floor`` is part of every uncertainty.
+    The function maximises the score of ``bevviz.calib.score`` over three turns, three shifts and the time
+    together. It starts from a grid and goes from coarse to fine. A weak prior (``Axis.prior``) holds the
+    offsets that the scene does not determine. The uncertainty comes from ``bevviz.calib.evidence`` and
+    includes ``Axis.floor``.
 
     Args:
-        shots: of one camera, from ``gather``.
-        progress: told which share is done, and what is done next.
+        shots: shots of one camera, from ``gather``.
+        progress: called with the share that is done and the name of the next step.
         stamps: ``sync.offsets`` that the frames were made with.
 
     Raises:
@@ -109,16 +110,18 @@ def calibrate(
 
 
 def _notes(shots: Shots, off: Bool) -> Iterator[str]:
+    """Yield the frames left out and a caution about the focal length."""
     for reason, n in shots.refused.items():
         yield f"{n} frames left out: {reason}"
     if off[AHEAD]:
         yield "a focal length that is wrong by a hundredth looks much like 10 cm along the camera's z axis"
 
 
-# --- what forbids to say anything ---------------------------------------------------------------
+# --- reasons for no result ----------------------------------------------------------------------
 
 
 def _too_little(shots: Shots) -> _Said | None:
+    """Return a finding UNKNOWN if cloud or images have too few edges, else None."""
     if shots.edges < EDGES:
         reason = f"too little data: only {shots.edges} edges in the clouds, {EDGES} are needed"
         return _Said(Finding.UNKNOWN, reason)
@@ -130,7 +133,7 @@ def _too_little(shots: Shots) -> _Said | None:
 def _weigh(
     shots: Shots, scorer: Scorer, peaks: list[Peak], free: Bool, progress: Progress
 ) -> tuple[_Found, _Said | None]:
-    """How far the truth may be from the best peak, and what forbids to say anything."""
+    """Return the offsets with their uncertainty, and a finding that holds for all axes or None."""
     if not peaks:
         reason = "too little data: there is no place where it would hold the camera"
         return _Found(np.zeros(len(AXES)), 2 * PRIOR), _Said(Finding.UNKNOWN, reason)
@@ -154,8 +157,8 @@ def _weigh(
 
 
 def _no_peak(scorer: Scorer, best: Peak, error: float) -> _Said:
-    """What it means that no peak is higher than all others."""
-    if max(best.height, LEAD * error) < FIT * scorer.edges:  # what fits would have shown
+    """Return the finding for a best peak that is not clearly higher than the others."""
+    if max(best.height, LEAD * error) < FIT * scorer.edges:  # A right calibration would have a higher score.
         within = f"{np.degrees(REACH):.1f} deg"
         reason = f"the edges of image and cloud do not agree anywhere within {within} of what is stated"
         return _Said(Finding.CONFLICT, f"{reason} (another camera, wrong intrinsics, or further off?)")
@@ -167,7 +170,7 @@ def _no_peak(scorer: Scorer, best: Peak, error: float) -> _Said:
 
 
 def _halves(taken: Sequence[Shot], peaks: list[Peak], free: Bool) -> _Said | None:
-    """Whether the first half of the frames says what the second half says."""
+    """Return a finding CONFLICT if the two halves of the frames disagree, else None."""
     middle = len(taken) // 2
     if middle < HALF:
         return None
@@ -192,6 +195,7 @@ def _halves(taken: Sequence[Shot], peaks: list[Peak], free: Bool) -> _Said | Non
 
 
 def _judge(shots: Shots, found: _Found, trouble: _Said | None) -> tuple[AxisResult, ...]:
+    """Return the result of each axis with its score curve."""
     results: list[AxisResult] = []
     scorer = Scorer(thin(shots.shots, 2 * SAMPLE), FINEST)
     for row, axis in enumerate(AXES):
@@ -210,6 +214,7 @@ def _judge(shots: Shots, found: _Found, trouble: _Said | None) -> tuple[AxisResu
 
 
 def _finding(shots: Shots, axis: Axis, offset: float, interval: float, rival: str) -> _Said:
+    """Return the finding for one axis."""
     if axis is AXES[TIME]:
         speeds = _speeds(shots)
         if len(speeds) < len(shots.shots):
@@ -224,6 +229,7 @@ def _finding(shots: Shots, axis: Axis, offset: float, interval: float, rival: st
 
 
 def _why_unsure(shots: Shots, axis: Axis) -> str:
+    """Return why the data does not determine an axis."""
     speeds = _speeds(shots)
     steady = len(speeds) and speeds.mean() > STILL and speeds.std() < 0.2 * speeds.mean()
     if axis.name in ("tz", "dt") and steady:
@@ -237,18 +243,19 @@ def _why_unsure(shots: Shots, axis: Axis) -> str:
     return "too little data to hold it: it takes frames of more places, and things nearby"
 
 
-# --- what the data cannot hold -----------------------------------------------------------------
+# --- uncertainty of the data -------------------------------------------------------------------
 
 
 def _told(scorer: Scorer, peak: Peak, free: Bool) -> F64:
-    """(7,) standard deviation of what the data says, and of what remains on calibrated sensors."""
+    """Return the (7,) standard deviation from the data, including the floor of calibrated sensors."""
     return np.asarray(caution(peak) * np.hypot(scatter(scorer, peak, free), FLOOR), np.float64)
 
 
 def _confusion(shots: Shots) -> F64:
-    """(7,) standard deviation that comes of a steady drive: there, late and too far back are the same.
+    """Return the (7,) standard deviation due to a steady drive.
 
-    Only a change of speed tells them apart, and what edges err along the way is divided by it.
+    At a steady speed, late stamps and a camera too far back look the same. A change of speed separates them,
+    so the error of the edges along the way is divided by that change.
     """
     speeds, confusion = _speeds(shots), np.zeros(len(AXES))
     if len(speeds):
@@ -260,8 +267,8 @@ def _confusion(shots: Shots) -> F64:
 
 
 def _speeds(shots: Shots) -> F64:
-    """(N,) metres per second at each shot whose motion is known."""
-    seconds = 0.3  # that the poses of a shot span
+    """Return the (N,) metres per second at each shot with known motion."""
+    seconds = 0.3  # the poses of a shot span this time
     poses = [shot.motion for shot in shots.shots if shot.motion is not None]
     ways = [(p[-1] @ geometry.inverse(p[0]))[:3, 3] for p in poses]
     return np.asarray(np.linalg.norm(ways, axis=1) / seconds if ways else np.zeros(0), np.float64)

@@ -1,4 +1,4 @@
-"""The views of a calibration, for layouts; see ``bevviz.recording.views``."""
+"""Views of a calibration for layouts; see ``bevviz.recording.views``."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from bevviz.recording import entities
 
 
 def alignment(camera: str) -> rrb.Tabs:
-    """Points by depth and the edges of the cloud over the image, before and after at the same place."""
+    """Return tabs with the image, the points by depth and the edges of the cloud, as stated and corrected."""
     return rrb.Tabs(
         rrb.Spatial2DView(name=f"{camera}, as stated", origin=entities.calib_stated(camera)),
         rrb.Spatial2DView(name=f"{camera}, corrected", origin=entities.calib_corrected(camera)),
@@ -17,12 +17,12 @@ def alignment(camera: str) -> rrb.Tabs:
 
 
 def calibration(camera: str) -> rrb.TextDocumentView:
-    """What 'bevviz calib' found."""
+    """Return the view of the result page of 'bevviz calib'."""
     return rrb.TextDocumentView(name="Calibration", origin=entities.calib_result(camera))
 
 
 def score_curves(camera: str) -> rrb.Grid:
-    """How well the edges meet over the offset along each axis."""
+    """Return bar charts of the score over the offset along each axis."""
     return rrb.Grid(
         *(
             rrb.BarChartView(
