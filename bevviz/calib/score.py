@@ -21,7 +21,7 @@ from bevviz.calib.samples import CELLS, Shot
 from bevviz.model.frame import F32, F64, I32, I64, Bool
 from bevviz.support.kernel import kernel
 
-SHARE = 0.2  # of the edges of a cloud are visible in an image
+SHARE = 0.2  # share of the edges of a cloud that are visible in an image
 AGAINST = 0.25  # weight of a change of the opposite sign: some surfaces (leaves) reflect more and look darker
 PIXEL = 1.5  # pixels^2, variance of the edges themselves
 MOMENT = 0.01  # seconds over which the motion of the robot is differenced

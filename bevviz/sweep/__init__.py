@@ -1,4 +1,4 @@
-"""Sweeps over parameters, and tuning on one frame. Imports `evaluate` and below."""
+"""Parameter sweeps, and tuning on one frame. Imports `evaluate` and below."""
 
 from bevviz.sweep.parameters import Parameter, combine, parse
 from bevviz.sweep.run import Outcome, Sweep

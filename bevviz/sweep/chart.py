@@ -1,6 +1,6 @@
-"""Curves over the values of a parameter, and maps over those of two, drawn in the plane.
+"""Charts of metrics over one parameter, and maps over two, drawn as 2D entities.
 
-The viewer's own plots are over time alone, and its bars and tensors do not say which values they are of.
+The viewer's own plots only plot over time. Its bar charts and tensors do not show the values on their axes.
 """
 
 from __future__ import annotations
@@ -16,17 +16,17 @@ from bevviz.model.colors import SERIES, Color, State
 from bevviz.model.frame import F64, U8
 from bevviz.recording.primitives import png
 
-Log = Callable[..., None]  # name below the chart, archetypes
+Log = Callable[..., None]  # name of the entity below the chart, archetypes
 
-WIDTH, HEIGHT = 640.0, 420.0  # of what is inside the axes
-_LEFT, _RIGHT, _TOP, _BOTTOM = 70.0, 190.0, 120.0, 60.0  # beside them
+WIDTH, HEIGHT = 640.0, 420.0  # size of the area inside the axes, in units of the view
+_LEFT, _RIGHT, _TOP, _BOTTOM = 70.0, 190.0, 120.0, 60.0  # room beside the axes
 _MARKS = (State.GOOD.value, State.DOUBTFUL.value)
 _AXIS, _GRID, _TEXT = (150, 155, 165), (48, 50, 58), (200, 204, 212)
-_LINE = 46.0  # between names that would cover one another
-_TICKS = 5  # about so many on the upright axis
-_LABELS = 9  # so many values at most are written below
-_CELL = 8  # pixels of a cell of a map, each way
-_NUMBERED = 42  # cells at most that have their numbers written on them; of others the pointer says it
+_LINE = 46.0  # least distance of names, so that they do not overlap
+_TICKS = 5  # ticks on the upright axis, about
+_LABELS = 9  # values written below the axis, at most
+_CELL = 8  # pixels of one cell of a map, each way
+_NUMBERED = 42  # cells, at most, whose numbers are always written; larger maps show a number on hovering
 
 
 def log_chart(
@@ -37,27 +37,30 @@ def log_chart(
     curves: Mapping[str, F64],
     marks: Mapping[str, int | float],
 ) -> None:
-    """Axes, a curve for each metric with its name where it ends, and marks.
+    """Log axes, one curve for each metric with its name at the end, and marks.
 
     Args:
-        recording: where to; static.
+        recording: recording to log to, as static data.
         path: entity of the chart.
-        places: (N,) of the values on the axis, rising.
-        values: (N,) as they are written.
-        curves: metric -> (N,) numbers; NaN where there is none.
-        marks: word -> place of an upright line, such as that of the best value; two at most.
+        places: (N,) positions of the values on the axis, ascending.
+        values: (N,) the values as text.
+        curves: metric -> (N,) numbers; NaN: unknown.
+        marks: word -> position of an upright line, such as that of the best value; at most two.
     """
     known = np.concatenate([c[np.isfinite(c)] for c in curves.values()])
     low, high, step = scale(float(known.min(initial=0.0)), float(known.max(initial=0.0)))
     span = float(places[-1] - places[0]) or 1.0
 
     def x(at: F64 | float) -> F64:
+        """Return the x coordinate of a position on the axis."""
         return np.asarray((at - places[0]) / span * WIDTH if len(places) > 1 else WIDTH / 2 + 0 * at)
 
     def y(at: F64 | float) -> F64:
+        """Return the y coordinate of a number."""
         return np.asarray(HEIGHT - (at - low) / (high - low) * HEIGHT)
 
     def log(name: str, *what: rr.AsComponents) -> None:
+        """Log static archetypes below the chart."""
         recording.log(f"{path}/{name}", *what, static=True)
 
     ticks = np.arange(low, high + step / 2, step)
@@ -99,22 +102,24 @@ def log_map(
     numbers: F64,
     marks: Mapping[str, tuple[float, float]],
 ) -> None:
-    """Cells from dark, the least, to light, each with its number, and frames around those that are marked.
+    """Log grey cells (dark: the smallest number), each with its number, and frames around the marked cells.
 
     Args:
-        recording: where to; static.
+        recording: recording to log to, as static data.
         path: entity of the map.
-        values: of the parameters across, from left to right, and up, from below, as they are written.
-        numbers: (across, up); NaN where there is none.
-        marks: word -> place of a cell, counted from 0 across and up; two at most.
+        values: values of the two parameters as text: across from the left, and up from the bottom.
+        numbers: (across, up); NaN: unknown.
+        marks: word -> position of a cell, counted from 0 across and up; at most two.
     """
     across, up = numbers.shape
     width, height = WIDTH / across, HEIGHT / up
 
     def log(name: str, *what: rr.AsComponents) -> None:
+        """Log static archetypes below the map."""
         recording.log(f"{path}/{name}", *what, static=True)
 
     def middle(i: float, j: float) -> tuple[float, float]:
+        """Return the x, y of the middle of a cell."""
         return (i + 0.5) * width, HEIGHT - (j + 0.5) * height
 
     log("cells", rr.Transform3D(scale=[width / _CELL, height / _CELL, 1.0]), png(_cells(numbers)))
@@ -138,7 +143,7 @@ def log_map(
         _log_words(log, name, [places[i] for i in shown], [words[i] for i in shown])
     for number, (word, at) in enumerate(marks.items()):
         color, (x, y) = _MARKS[number], middle(*at)
-        # One cell may have both.
+        # One cell may have both marks, so the second frame is smaller.
         half = np.array([width, height]) / 2 - 6.0 * number
         corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1], [-1, -1]]) * half + (x, y)
         frame = rr.LineStrips2D([corners], colors=[color], radii=rr.Radius.ui_points(2.0), draw_order=10.0)
@@ -147,7 +152,7 @@ def log_map(
 
 
 def _cells(numbers: F64) -> U8:
-    """(up, across, 3) a cell a block of pixels; where there is no number the colour of the ground."""
+    """Return the (up, across, 3) image of the cells; a cell is a block of pixels, dark grey if unknown."""
     known = numbers[np.isfinite(numbers)]
     low, high = float(known.min(initial=math.inf)), float(known.max(initial=-math.inf))
     grey = 35.0 + 105.0 * (numbers - low) / ((high - low) or 1.0)
@@ -157,7 +162,7 @@ def _cells(numbers: F64) -> U8:
 
 
 def chart_view(name: str, path: str, right: float = _RIGHT) -> rrb.Spatial2DView:
-    """``right``: the room for names beside it."""
+    """Return the view of a chart. ``right`` is the room for names beside it."""
     bounds = rrb.VisualBounds2D(x_range=(-_LEFT, WIDTH + right), y_range=(-_TOP, HEIGHT + _BOTTOM))
     return rrb.Spatial2DView(name=name, origin=path, visual_bounds=bounds)
 
@@ -169,14 +174,14 @@ def _log_words(
     words: Sequence[str],
     color: Color = _TEXT,
 ) -> None:
-    """Below these places, in the middle."""
+    """Log words centred below these positions."""
     points = np.array([[float(x), float(y)] for x, y in places])
     radii = rr.Radius.ui_points(0.0)
     log(name, rr.Points2D(points, labels=words, colors=[color], radii=radii, show_labels=True))
 
 
 def _log_names(log: Log, ends: Sequence[tuple[str, Color, float]]) -> None:
-    """Behind the ends of the curves, and not over one another."""
+    """Log the name of each curve beside its end, without overlaps."""
     below = -math.inf
     for metric, color, height in sorted(ends, key=lambda end: end[2]):
         below = max(height - 20, below + _LINE)
@@ -184,9 +189,9 @@ def _log_names(log: Log, ends: Sequence[tuple[str, Color, float]]) -> None:
 
 
 def scale(low: float, high: float) -> tuple[float, float, float]:
-    """From, to and by what an axis goes: from 0 where that wastes no more than about half of it."""
+    """Return start, end and step of an axis. It starts at 0 if that wastes at most about half of it."""
     low = 0.0 if low >= 0 and low < 0.6 * high else low
-    if high - low < 1e-300:  # whose logarithm is none
+    if high - low < 1e-300:  # The logarithm of zero is undefined.
         low, high = low - 0.5, high + 0.5
     raw = (high - low) / _TICKS
     power = 10.0 ** math.floor(math.log10(raw))

@@ -1,4 +1,4 @@
-"""Logs a sweep: its table, and every number over the parameters, with the layout that shows them."""
+"""Log a sweep: its table, every metric over the parameters, and the layout that shows them."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ from bevviz.sweep.run import COUNTS, OPINIONS, SCORES, STAGES, Sweep
 
 
 def log_sweep(recording: rr.RecordingStream, sweep: Sweep, name: str, present: Mapping[str, str]) -> None:
-    """The table, and every number over the parameter: curves, or over two parameters a heat map.
+    """Log the table, and every metric over the parameter: curves, or a heat map over two parameters.
 
     Args:
-        recording: where to; static.
-        sweep: with its outcomes.
-        name: of the drive.
+        recording: recording to log to, as static data.
+        sweep: the sweep with its outcomes.
+        name: name of the swept recording.
         present: parameter -> its value without the sweep.
     """
     recording.send_recording_name(name)
@@ -44,6 +44,7 @@ def log_sweep(recording: rr.RecordingStream, sweep: Sweep, name: str, present: M
 def _log_map(
     recording: rr.RecordingStream, path: str, sweep: Sweep, values: F64, present: Mapping[str, str]
 ) -> None:
+    """Log one metric over two parameters as a map."""
     across, up = sweep.parameters
     orders = [np.argsort(parameter.numbers, kind="stable") for parameter in (across, up)]
     written = [[parameter.values[i] for i in o] for parameter, o in zip((across, up), orders, strict=True)]
@@ -55,14 +56,14 @@ def _log_map(
 
 
 def _cell(parameter: Parameter, value: str) -> float:
-    """Which cell has the value, counted from the least; between two where no cell has."""
+    """Return the position of a value on the axis of cells, counted from the smallest value."""
     place = parameter.place(value)
     numbers = np.sort(parameter.numbers)
     return float(np.interp(math.nan if place is None else place, numbers, np.arange(len(numbers))))
 
 
 def _marked(sweep: Sweep, present: Mapping[str, str]) -> Mapping[str, Values]:
-    """Word -> the values that it marks, one for each parameter: the best, and those without the sweep."""
+    """Return word -> the values to mark, one for each parameter: the best values and the present ones."""
     marks = {}
     if sweep.best is not None:
         marks[f"best: {', '.join(sweep.best)}"] = sweep.best
@@ -79,6 +80,7 @@ def _log_curves(
     curves: Mapping[str, F64],
     present: Mapping[str, str],
 ) -> None:
+    """Log curves over one parameter."""
     [parameter] = sweep.parameters
     at = parameter.numbers
     order = np.argsort(at, kind="stable")
@@ -91,7 +93,7 @@ def _log_curves(
 
 
 def layout(sweep: Sweep) -> rrb.Blueprint:
-    """The plots beside the table."""
+    """Return the blueprint: the plots beside the table."""
     plots: list[rrb.View] = []
     for name, series in _plots(sweep).items():
         if len(sweep.parameters) == 2:
@@ -112,7 +114,7 @@ def layout(sweep: Sweep) -> rrb.Blueprint:
 
 
 def _plots(sweep: Sweep) -> Mapping[str, Sequence[str]]:
-    """What is shown in one plot."""
+    """Return the metrics of each plot, by its title."""
     one = len(sweep.parameters) == 1
     plots: dict[str, Sequence[str]] = {}
     if sweep.truth:

@@ -1,4 +1,4 @@
-"""Which values a parameter takes, as the user writes them, and the configurations that they make."""
+"""Swept parameters as the user writes them, and the configurations of all their combinations."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from bevviz.errors import UserError
 from bevviz.model.frame import F64
 from bevviz.pipeline.variants import check_same_frames
 
-MOST = 500  # combinations of values
+MOST = 500  # combinations of values, at most
 
 _NUMBER = r"[-+]?[\d.]+(?:[eE][-+]?\d+)?"
 _RANGE = re.compile(rf"\s*({_NUMBER})\s*:\s*({_NUMBER})\s*:\s*({_NUMBER})\s*")
@@ -25,35 +25,37 @@ Values = tuple[str, ...]
 
 @dataclass(frozen=True, slots=True)
 class Parameter:
-    """A dotted key and the values that it takes in turn, as they are written."""
+    """A dotted key and the values that it takes in turn, as text."""
 
     key: str
     values: Values
 
     @property
     def numbers(self) -> F64:
-        """Where the values are on an axis: the numbers that they are, else 0, 1, 2 ..."""
+        """(N,) positions of the values on an axis: the values as numbers, or 0, 1, 2 ... for words."""
         try:
             return np.array([float(value) for value in self.values])
         except ValueError:
             return np.arange(len(self.values), dtype=np.float64)
 
     def place(self, value: str) -> float | None:
-        """Where this value is on the axis; None: off it."""
+        """Return the position of a value on the axis; None: off the axis."""
         if value in self.values:
             return float(self.numbers[self.values.index(value)])
         try:
             number, *others = (float(one) for one in (value, *self.values))
-        except ValueError:  # of names, a further one has no place
+        except ValueError:  # A word that is not in the list has no position.
             return None
         return number if min(others) <= number <= max(others) else None
 
 
 def parse(settings: Sequence[str]) -> tuple[list[Parameter], list[str]]:
-    """Split ``key=value`` settings: with a range ``a:b:step`` or a list ``x,y,z``, and constant ones.
+    """Split ``key=value`` settings into swept ones and constant ones.
+
+    A swept setting has a range ``a:b:step`` or a list ``x,y,z``.
 
     Raises:
-        UserError: a range that leads nowhere, none at all, more than two, or too many values.
+        UserError: an empty range, no swept parameter, more than two, or too many values.
     """
     swept, constant = [], []
     for text in settings:
@@ -76,6 +78,7 @@ def parse(settings: Sequence[str]) -> tuple[list[Parameter], list[str]]:
 
 
 def _range(text: str, first: float, last: float, step: float) -> Values:
+    """Return the values of a range, both ends included."""
     if step <= 0 or last < first:
         raise UserError(f"--set {text}: expected first:last:step with last >= first and step > 0")
     number = int((last - first) / step + 1e-6) + 1
@@ -85,14 +88,14 @@ def _range(text: str, first: float, last: float, step: float) -> Values:
 
 
 def combine(parameters: Sequence[Parameter], load: Callable[[list[str]], Config]) -> dict[Values, Config]:
-    """Every combination of values.
+    """Return the configuration of every combination of values.
 
     Args:
-        parameters: one or two.
-        load: makes the configuration of further settings.
+        parameters: one or two parameters.
+        load: returns the configuration with further settings.
 
     Raises:
-        UserError: an unknown key, a value out of range, or a key that changes what frames are made of.
+        UserError: an unknown key, a value out of range, or a key that changes how frames are made.
     """
     configs = {}
     for values in itertools.product(*(parameter.values for parameter in parameters)):

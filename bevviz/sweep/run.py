@@ -1,4 +1,4 @@
-"""Every combination of values on the same frames: counted, timed and held against truth."""
+"""Run every combination of values on the same frames: count, time and compare with the ground truth."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from bevviz.support.files import save
 from bevviz.support.text import printable
 from bevviz.sweep.parameters import Parameter, Values
 
-STAGES = ("voxel", "ground", "clustering", "fusion")  # each has its own time
+STAGES = ("voxel", "ground", "clustering", "fusion")  # stages that are timed one by one
 COUNTS = ("clusters", "detections", "matches", "objects")
 OPINIONS = {what: what.replace("_", " ") for what in counts.OPINIONS}
 SCORES = ("precision", "recall", "F1", "error m")
@@ -34,16 +34,17 @@ SCORES = ("precision", "recall", "F1", "error m")
 
 @dataclass
 class Outcome:
-    """What one combination of values has made of the frames."""
+    """Counts, times and scores of one combination of values, over all frames."""
 
     frames: int = 0
     counts: Counter[str] = field(default_factory=Counter)
-    seconds: dict[str, list[float]] = field(default_factory=lambda: defaultdict(list))  # by stage
+    seconds: dict[str, list[float]] = field(default_factory=lambda: defaultdict(list))  # by stage and frame
     failures: int = 0
-    judged: int = 0  # frames with truth
+    judged: int = 0  # frames with ground truth
     score: Score = field(default_factory=Score)
 
     def add(self, result: FrameResult, truth: Truth | None) -> None:
+        """Add the result of one frame."""
         self.frames += 1
         self.failures += len(result.failures)
         self.counts.update(counts_of(result))
@@ -56,11 +57,14 @@ class Outcome:
 
     @property
     def metrics(self) -> dict[str, float]:
-        """Means of a frame; medians of the LiDAR stages' milliseconds, shared by values or not; scores."""
+        """Means of a frame, median milliseconds of each LiDAR stage, and scores.
+
+        A stage that several combinations share counts its full time in each of them.
+        """
         frames = max(self.frames, 1)
         found = {what: self.counts[what] / frames for what in COUNTS}
         found |= {OPINIONS[what]: self.counts[what] / frames for what in OPINIONS if what in self.counts}
-        # The first frame pays for what is loaded with it: no means.
+        # The first frame also loads the stages, so times are medians.
         times = {f"{stage} ms": float(np.median(self.seconds[stage] or [0.0])) * 1e3 for stage in STAGES}
         found |= {"time ms": sum(times.values()), **times}
         if self.judged:
@@ -72,15 +76,15 @@ class Outcome:
 
 
 class Sweep:
-    """Runs every combination of values on each frame.
+    """A run of every combination of values on each frame.
 
     Args:
-        parameters: one or two.
-        configs: of ``combine``.
-        truth: what is really there in a frame, where that is known.
+        parameters: one or two parameters.
+        configs: configurations from ``combine``.
+        truth: returns the ground truth of a frame, None where it is unknown.
 
     Raises:
-        UserError: a detector that cannot be used.
+        UserError: a detector cannot be used.
     """
 
     def __init__(
@@ -97,18 +101,19 @@ class Sweep:
             self._variants.check(config)
 
     def perceive(self, frame: Frame, network: Executor | None = None) -> int:
-        """Run everything on the frame. Returns its index."""
+        """Run every combination on the frame. Return the index of the frame."""
         truth = self.truth(frame) if self.truth else None
         for values, config in self.configs.items():
             self.outcomes[values].add(self._variants.perceive(frame, config, network), truth)
         return frame.index
 
     def finish(self, index: int) -> int:
+        """Return the index unchanged; ``perceive`` did all the work."""
         return index
 
     @property
     def best(self) -> Values | None:
-        """With the greatest F1, of equal ones with the least error; None where nothing could be judged."""
+        """Values with the highest F1, of equal ones with the smallest error. None without ground truth."""
         rated = {v: o.score for v, o in self.outcomes.items() if o.judged and not math.isnan(o.score.f1)}
         errors = {
             v: float(np.median(score.errors)) if score.errors else math.inf for v, score in rated.items()
@@ -117,10 +122,11 @@ class Sweep:
 
     @property
     def title(self) -> str:
+        """Title of the sweep, with its parameters."""
         return "Sweep over " + " and ".join(parameter.key for parameter in self.parameters)
 
     def table(self) -> str:
-        """For the terminal."""
+        """Return the table for the terminal."""
         frames = max(outcome.frames for outcome in self.outcomes.values())
         lines = [f"{frames} frames; means of a frame, median milliseconds", ""]
         lines += table.lines([*self.rows("time ms")])
@@ -134,7 +140,7 @@ class Sweep:
         return "\n".join([*lines, *([f"{failures} stages failed"] if failures else [])])
 
     def rows(self, last: str) -> Iterator[tuple[str, ...]]:
-        """The header and a row for each combination; of the times only ``last``."""
+        """Yield the header and a row for each combination. Of the times, it has ``last`` only."""
         names = [n for n in self._metrics() if not n.endswith(" ms") or n == last]
         yield (*(parameter.key for parameter in self.parameters), *names)
         for values, outcome in self.outcomes.items():
@@ -142,10 +148,11 @@ class Sweep:
             yield (*values, *(_number(name, metrics.get(name, math.nan)) for name in names))
 
     def _metrics(self) -> list[str]:
+        """Return the names of all metrics."""
         return max((list(outcome.metrics) for outcome in self.outcomes.values()), key=len)
 
     def as_tree(self) -> dict[str, Any]:
-        """For JSON: every number of the table, each stage's time, counts by class."""
+        """Return the sweep for JSON: every metric of the table, the time of each stage, counts by class."""
         return {
             "parameters": [parameter.key for parameter in self.parameters],
             "runs": [
@@ -165,7 +172,7 @@ class Sweep:
         }
 
     def write_csv(self, path: Path) -> None:
-        """A row for each combination: every number of the table, each stage's time, counts by class.
+        """Write a row for each combination: all metrics of the table, stage times, counts by class.
 
         Raises:
             UserError: the file cannot be written.
@@ -188,6 +195,7 @@ class Sweep:
 
 
 def _number(name: str, value: float) -> str:
+    """Return a metric as text, with the decimals of its kind."""
     if math.isnan(value):
         return "-"
     return f"{value:.3f}" if name in SCORES[:3] else f"{value:.2f}" if name == "error m" else f"{value:.1f}"

@@ -1,4 +1,4 @@
-"""One frame, run anew whenever the configuration's file is saved."""
+"""Tuning on one frame: run it again whenever the configuration file is saved."""
 
 from __future__ import annotations
 
@@ -33,16 +33,16 @@ LOOK = 0.01  # seconds between two looks at the file
 
 @dataclass(frozen=True, slots=True)
 class Save:
-    """One state of the file."""
+    """One saved state of the configuration file."""
 
     config: Config
     changes: Mapping[str, ParameterChange]  # since the state before
-    time: float  # of the save; of the first state that of the start
+    time: float  # of the save; for the first state, of the start
 
 
 @dataclass(frozen=True, slots=True)
 class Version:
-    """What one state of the file has made of the frame."""
+    """The result of one saved state for the frame."""
 
     number: int
     save: Save
@@ -51,7 +51,7 @@ class Version:
 
     @property
     def text(self) -> str:
-        """In one line."""
+        """Changes, objects and failures in one line."""
         counts = self.found.counts
         words = {Change.ONLY_A: "gone", Change.ONLY_B: "new"}
         different = [
@@ -64,13 +64,13 @@ class Version:
 
 
 class Saves:
-    """The states of a configuration's file: as it is, then each one that is saved, until ``stop``.
+    """Iterable over the states of a configuration file: the present one, then each saved one, until ``stop``.
 
     Args:
         settings: the configuration and its file.
-        scene: of the frame that is looked at.
+        scene: scene of the frame.
         check: raises UserError where a configuration cannot be run.
-        tell: called with what is wrong with a state that is left out.
+        tell: called with the error of a state that is skipped.
     """
 
     total = None
@@ -105,8 +105,8 @@ class Saves:
                 yield save
 
     def _look(self) -> Save | None:
-        """The new state, once the file was saved and rests."""
-        if self._settings.changed():  # editors may write in several steps
+        """Return the new state once the file was saved and no longer changes, else None."""
+        if self._settings.changed():  # Editors may write in several steps.
             self._pending = True
             return None
         file = self._settings.file
@@ -115,9 +115,9 @@ class Saves:
         try:
             stat = file.stat()
         except OSError:
-            return None  # between two steps of an editor
+            return None  # The editor is between two steps.
         if stat.st_size == 0:
-            return None  # being written
+            return None  # The editor is still writing.
         self._pending = False
         config = self._settings.read()
         check_same_frames({"the first version": self._first, str(file): config})
@@ -130,7 +130,7 @@ class Saves:
 
 
 class OneFrame:
-    """Makes a version of each state of the file, on a frame that was decoded once."""
+    """A frame that was decoded once, and its version for each state of the file."""
 
     def __init__(self, frame: Frame) -> None:
         self._frame = frame
@@ -138,10 +138,11 @@ class OneFrame:
         self._last: Version | None = None
 
     def check(self, config: Config) -> None:
-        """Raises UserError where the configuration cannot be run."""
+        """Raise a UserError if the configuration cannot be run."""
         self._variants.check(config)
 
     def perceive(self, save: Save, network: Executor | None = None) -> Version:
+        """Run the frame with a saved state. Compare it with the version before."""
         result = self._variants.perceive(self._frame, save.config, network)
         now, last = seen(result), self._last
         before = last.found.b if last is not None else now
@@ -150,16 +151,17 @@ class OneFrame:
         return self._last
 
     def finish(self, version: Version) -> Version:
+        """Add the explanations to the result of a version."""
         return replace(version, result=describe(version.result))
 
 
 class VersionRecorder(Observer[Version]):
-    """Logs each version on the timeline ``version``.
+    """Observer that logs each version on the timeline ``version``.
 
     Args:
-        recording: where to.
-        config: of the first version.
-        tell: called with each version when it is logged, and the seconds since it was saved.
+        recording: recording to log to.
+        config: configuration of the first version.
+        tell: called after logging with each version and the seconds since it was saved.
     """
 
     def __init__(
@@ -168,12 +170,14 @@ class VersionRecorder(Observer[Version]):
         self._recording, self._config, self._tell = recording, config, tell
 
     def begin(self, items: Items[object]) -> None:
+        """Log the static entities."""
         self._scene = items.scene
         self._logger = Logger(self._recording, self._config, items.scene)
         self._differences = DifferenceLogger(self._recording, ("version before", "this version"), ABOUT)
         self._logger.log_static()
 
     def see(self, version: Version) -> None:
+        """Log one version and its differences from the version before."""
         result, frame, save = version.result, version.result.frame, version.save
         if save.changes:
             self._logger.reconfigure(save.config, self._scene)
@@ -191,10 +195,10 @@ class VersionRecorder(Observer[Version]):
 
 
 def create(file: Path, text: str) -> bool:
-    """Write the configuration's file where there is none. Returns whether there was none.
+    """Write the configuration file if it does not exist. Return whether it was written.
 
     Raises:
-        UserError: it cannot be written.
+        UserError: the file cannot be written.
     """
     if file.exists():
         return False
