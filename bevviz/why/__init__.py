@@ -1,4 +1,4 @@
-"""Answers to why an object was reported or missed. Imports `compare` and below."""
+"""Explanations of why an object was reported or missed. Imports `compare` and below."""
 
 from bevviz.why.answer import Answer, Questioner, why
 from bevviz.why.chain import Step

@@ -1,4 +1,4 @@
-"""Answers: the verdict, the chain through the stages, and what would change it."""
+"""Answers about one frame: the verdict, the steps through the stages, and changes that help."""
 
 from __future__ import annotations
 
@@ -28,13 +28,14 @@ class Answer:
     """Everything about one subject.
 
     Attributes:
-        subject: what was asked about.
+        subject: the object or place in question.
         verdict: the reason and its sentence.
-        steps: stage by stage.
-        hints: changes of the configuration that were run and do change the verdict.
-        fate: (N,) what became of each raw point, see ``Fate``.
+        steps: the result of each stage.
+        hints: changes of the configuration that change the verdict. Each was run.
+        fate: (N,) ``Fate`` of each raw point.
         distance: horizontal metres, NaN where unknown.
-        points: raw points at the place.
+        points: number of raw points on the subject.
+        evidence: the points, clusters and detections of the subject.
     """
 
     subject: Subject
@@ -48,12 +49,12 @@ class Answer:
 
     @property
     def near(self) -> bool:
-        """Whether it ought to be seen: within 40 m, with 10 points or more."""
+        """Whether the pipeline should report it: it is within 40 m and has 10 points or more."""
         return self.distance <= RANGE and self.points >= MIN_HITS
 
     @property
     def weak(self) -> bool:
-        """Whether it is a weak detection of no known object, which is what thresholds are for."""
+        """Whether it is a detection below a threshold that belongs to no object of the ground truth."""
         reason, best = self.verdict.reason, self.evidence.best
         low = reason in (Reason.BELOW_THRESHOLD, Reason.SUPPRESSED)
         low |= reason is Reason.NOT_AMONG and best is not None and not best.kept
@@ -61,11 +62,11 @@ class Answer:
 
     @property
     def folded(self) -> bool:
-        """Whether nothing could be done: hidden, out of view, without points, or a weak detection."""
+        """Whether no setting could help: it is hidden, out of view, without points, or a weak detection."""
         return self.verdict.reason in HOPELESS or self.weak
 
     def as_dict(self) -> dict[str, Any]:
-        """For machines: without the points."""
+        """Return the answer for JSON, without the points."""
         s, v = self.subject, self.verdict
         return {
             "kind": s.kind,
@@ -87,6 +88,7 @@ class Answer:
 
 
 def _hint_dict(hint: Hint) -> Mapping[str, Any]:
+    """Return a hint for JSON."""
     e = hint.effects
     return {
         "settings": list(hint.settings),
@@ -101,12 +103,12 @@ def _hint_dict(hint: Hint) -> Mapping[str, Any]:
 
 
 class Questioner:
-    """Answers questions about one frame; what they have in common is worked out once.
+    """Explainer of one frame. All answers share the index of its results.
 
     Args:
-        result: what was made of the frame, described.
-        loader: that has the networks already, for ``hints``.
-        classes: names that the detector knows.
+        result: result of the frame, with its explanations.
+        loader: stage loader with the networks already loaded, for ``hints``.
+        classes: names of the classes that the detector knows.
     """
 
     def __init__(
@@ -117,13 +119,13 @@ class Questioner:
         self._answers: dict[tuple[object, ...], Answer] = {}
 
     def ask(self, selection: Selection) -> list[Answer]:
-        """Explain what is selected, the worst first, without hints.
+        """Explain the subjects of a selection without hints, the worst first.
 
-        Of a pixel or an image box that is what shows there, the first of ``candidates``; of a point or a cell
-        all that is around it. With nothing selected it is the whole frame, what went well included.
+        A pixel or an image box selects the object that shows there, the first of ``candidates``. A point or a
+        cell selects all points around it. An empty selection is the whole frame, reported objects included.
 
         Raises:
-            UserError: unknown class, camera, row or track, a pixel or cell outside the image.
+            UserError: unknown class, camera, row or track, or a pixel or cell outside the image.
         """
         if selection.box:
             candidates = self.candidates(selection)
@@ -140,13 +142,13 @@ class Questioner:
         *,
         everything: bool = False,
     ) -> list[Answer]:
-        """What ``ask`` has to say that is worth a word, with hints.
+        """Explain the subjects of a selection that matter, with hints.
 
         Args:
-            selection: what is asked about.
-            hints: for how many it is tried what would change them, which runs the stages again.
-            progress: wraps those answers while they are being tried.
-            everything: also what is folded, and, where nothing is selected, what went well.
+            selection: the subjects in question.
+            hints: number of answers that get hints. Each hint runs the stages again.
+            progress: wraps these answers while their hints are searched.
+            everything: include folded answers and, for an empty selection, reported objects.
 
         Raises:
             UserError: as ``ask``.
@@ -160,11 +162,10 @@ class Questioner:
         return [*map(self.with_hints, progress(answers[:hints])), *answers[hints:]]
 
     def candidates(self, selection: Selection) -> list[Answer]:
-        """Each thing that lies at a pixel, in an image box, around a point or a cell.
+        """Explain each subject at a pixel, in an image box, around a point or in a cell.
 
-        What shows there comes first, then what is behind it; among these what is known before clusters that
-        nobody named, what was missed before what was reported, and near before far. What cannot be seen at
-        all comes last.
+        The visible ones come first, then those behind them. Within these, known objects come before unnamed
+        clusters, missed before reported, near before far. Subjects that no sensor can see come last.
 
         Raises:
             UserError: as ``ask``.
@@ -174,17 +175,17 @@ class Questioner:
         return [answer for answer, _ in order]
 
     def missed(self) -> list[Answer]:
-        """What ought to have been reported and was not, the nearest first."""
+        """Explain the objects that should have been reported and were not, the nearest first."""
         answers = [a for a in self.ask(Selection()) if a.near and not a.verdict.reported and not a.folded]
         return sorted(answers, key=_far)
 
     def search(self, answer: Answer) -> Search:
-        """What would change an answer: other configurations are run, which takes a while."""
+        """Search changes that would change the verdict. This runs other configurations and takes a while."""
         verdict = answer.verdict
         return self._what_if.search(answer.subject, answer.evidence, verdict.reason, verdict.reported)
 
     def with_hints(self, answer: Answer) -> Answer:
-        """The answer with its hints, and the sentence that names the first, or says that there is none."""
+        """Add hints to an answer. Its sentence then names the first hint, or says that no change helps."""
         search, verdict = self.search(answer), answer.verdict
         hints = search.hints
         if not hints:
@@ -199,6 +200,7 @@ class Questioner:
         return replace(answer, verdict=replace(verdict, text=text), hints=hints)
 
     def _answer(self, subject: Subject) -> Answer:
+        """Return the answer about one subject, from the cache if it is known."""
         if subject.key in self._answers:
             return self._answers[subject.key]
         e = gather(subject, self.traces)
@@ -206,7 +208,7 @@ class Questioner:
         verdict = verdict_of(subject, reason, reported, e, self.traces)
         steps = tuple(chain(subject, e, self.traces))
         answer = Answer(subject, verdict, steps, (), e.fate, e.distance, e.raw, e)
-        if not subject.is_place:  # of places there is no end
+        if not subject.is_place:  # The number of possible places has no limit.
             self._answers[subject.key] = answer
         return answer
 
@@ -220,11 +222,12 @@ def why(
     *,
     everything: bool = False,
 ) -> list[Answer]:
-    """One question about a result: see ``Questioner.explain``."""
+    """Answer one question about a result; see ``Questioner.explain``."""
     return Questioner(result, loader, classes).explain(selection, hints, everything=everything)
 
 
 def _in_vain(search: Search) -> str:
+    """Say that no change helps, and how far the best one brings the subject."""
     count = "the change" if search.tried == 1 else f"none of the {search.tried} changes"
     helps = "that was tried does not help" if search.tried == 1 else "that were tried helps"
     if search.then is None:
@@ -234,17 +237,20 @@ def _in_vain(search: Search) -> str:
 
 
 def _rank(answer: Answer) -> tuple[bool, bool, bool, bool, bool, float]:
+    """Return the sort key of answers in a list, the worst first."""
     v, best = answer.verdict, answer.evidence.best
-    if answer.weak and best is not None:  # the surest first
+    if answer.weak and best is not None:  # the highest score first
         return True, True, False, False, False, -best.score
     return answer.folded, False, v.reported, v.reason is Reason.REPORTED, not answer.near, _far(answer)
 
 
 def _place_rank(answer: Answer, shows: bool) -> tuple[bool, bool, int, bool, float]:
+    """Return the sort key of the answers at one place."""
     kind = 2 if answer.weak else 1 if answer.subject.kind == "cluster" else 0
     hopeless = answer.verdict.reason in HOPELESS
     return hopeless, not shows, kind, answer.verdict.reported, _far(answer)
 
 
 def _far(answer: Answer) -> float:
+    """Return the distance; unknown distances sort last."""
     return float("inf") if np.isnan(answer.distance) else answer.distance

@@ -10,15 +10,16 @@ from bevviz.why.answer import Answer
 from bevviz.why.subject import count
 from bevviz.why.verdict import HOPELESS, Reason
 
-LISTED = 5  # things beside what was asked about
+LISTED = 5  # other subjects at the place, at most
 
 
 def plain(answers: Sequence[Answer], chains: int, beside: Sequence[Answer] = ()) -> str:
-    """The verdicts, worst first; under the first ``chains`` of them the stages; what else is there."""
+    """Return the verdicts with steps for the first ``chains``, then the other subjects there."""
     return "\n".join(map(printable, [*_plain(answers, chains), *_listed(beside)])).rstrip("\n")
 
 
 def _plain(answers: Sequence[Answer], chains: int) -> Iterator[str]:
+    """Yield the lines of the verdicts and steps."""
     for answer in answers[:chains]:
         yield answer.verdict.text
         yield ""
@@ -31,6 +32,7 @@ def _plain(answers: Sequence[Answer], chains: int) -> Iterator[str]:
 
 
 def _listed(beside: Sequence[Answer]) -> Iterator[str]:
+    """Yield the lines of the other subjects at the place."""
     if beside:
         yield "also there:"
         yield from (f"- {answer.verdict.text}" for answer in beside[:LISTED])
@@ -39,7 +41,7 @@ def _listed(beside: Sequence[Answer]) -> Iterator[str]:
 
 
 def summary(answers: Sequence[Answer]) -> str:
-    """How a frame went, in one line: of everything that was asked about, what went well included."""
+    """Return one line about a frame. It needs the answers about all objects, reported ones included."""
     things = [a for a in answers if not a.weak]
     reported = [a for a in things if a.verdict.reported]
     flawed = [a for a in reported if a.verdict.reason is not Reason.REPORTED]
@@ -62,10 +64,12 @@ def summary(answers: Sequence[Answer]) -> str:
 
 
 def page(answers: Sequence[Answer], chains: int) -> str:
+    """Return the answers as Markdown, with steps for the first ``chains`` of them."""
     return "\n".join(_page(answers, chains))
 
 
 def _page(answers: Sequence[Answer], chains: int) -> Iterator[str]:
+    """Yield the lines of the page."""
     for answer in answers[:chains]:
         yield f"### {answer.verdict.reason.value}"
         yield ""

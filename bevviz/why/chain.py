@@ -1,4 +1,4 @@
-"""What each stage made of a subject, in words and in numbers."""
+"""Steps of a subject through the stages, in words and in numbers."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from bevviz.why.sentences import label, not_run, state_text
 from bevviz.why.subject import Subject, projected
 from bevviz.why.verdict import detector_ran, name_of
 
-_SHOWN = 5  # candidates that the chain names
+_SHOWN = 5  # clusters or candidates listed in a step, at most
 
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    """What one stage made of the subject, in words and in numbers."""
+    """The result of one stage for the subject, in words and in numbers."""
 
     stage: str
     text: str
@@ -29,7 +29,7 @@ class Step:
 
 
 def chain(subject: Subject, e: Evidence, traces: Traces) -> Iterator[Step]:
-    """Stage by stage, as far as they were run."""
+    """Yield the step of each stage that was run."""
     result, config = traces.result, traces.result.config
     for failure in result.failures:
         yield Step("failure", f"{failure.stage}: {failure.reason}")
@@ -62,6 +62,7 @@ def chain(subject: Subject, e: Evidence, traces: Traces) -> Iterator[Step]:
 
 
 def _clock(subject: Subject, traces: Traces) -> Iterator[Step]:
+    """Yield the time and position of each camera relative to the cloud."""
     for camera in (c.camera for c in traces.result.cameras):
         if subject.camera and camera.name != subject.camera:
             continue
@@ -87,6 +88,7 @@ def _clock(subject: Subject, traces: Traces) -> Iterator[Step]:
 
 
 def _ground(e: Evidence, traces: Traces) -> Step:
+    """Return the step of the ground removal."""
     known = e.ground[np.isfinite(e.ground)]
     text = f"{len(e.ground)} of {e.voxels} voxels removed as ground"
     numbers: dict[str, Any] = {"removed": len(e.ground)}
@@ -105,6 +107,7 @@ def _ground(e: Evidence, traces: Traces) -> Step:
 
 
 def _clustering(e: Evidence, traces: Traces) -> Step:
+    """Return the step of the clustering, with the largest clusters of the subject."""
     said, rows = [], []
     clusters, there = traces.result.clusters, traces.origin("clustering")
     assert clusters is not None
@@ -144,6 +147,7 @@ def _clustering(e: Evidence, traces: Traces) -> Step:
 
 
 def _merged(e: Evidence, traces: Traces) -> Iterator[Step]:
+    """Yield the step about other objects in the cluster of the subject, if there are any."""
     if not np.isfinite(e.gap):
         return
     names = ", ".join(f"{name} ({points} points)" for name, points in e.others)
@@ -159,11 +163,13 @@ def _merged(e: Evidence, traces: Traces) -> Iterator[Step]:
 
 
 def _named(traces: Traces, cluster: int) -> str:
+    """Return the class of a cluster's object in brackets, empty for none."""
     name = name_of(traces.result, cluster)
     return f" ({name})" if name else ""
 
 
 def _detected(subject: Subject, e: Evidence, traces: Traces) -> Iterator[Step]:
+    """Yield the steps of the detector and of the fusion for the best candidates."""
     result, config = traces.result, traces.result.config
     if not detector_ran(result, subject.camera):
         yield Step("detector", "never ran: " + "; ".join(not_run(result, subject.camera)), {"candidates": 0})
@@ -197,7 +203,7 @@ def _detected(subject: Subject, e: Evidence, traces: Traces) -> Iterator[Step]:
 
 
 def _pairs(c: Candidate, e: Evidence, traces: Traces) -> Iterator[Step]:
-    """The evidence of the pairs of a detection: with the clusters there, and with the one it got."""
+    """Yield the fusion's decision about a detection, and its pairs with the subject's clusters."""
     _, fusion = fusion_of(traces.result, c.camera)
     assert fusion is not None
     ours = traces.origin("objects").ours
@@ -228,7 +234,7 @@ def _pairs(c: Candidate, e: Evidence, traces: Traces) -> Iterator[Step]:
 
 
 def _objects(subject: Subject, e: Evidence, traces: Traces) -> Iterator[Step]:
-    """Where they are not made of clusters and detections."""
+    """Yield the steps of objects that do not come from our fusion."""
     there, objects = traces.origin("objects"), traces.result.objects
     if there.ours:
         return
@@ -253,7 +259,7 @@ def _objects(subject: Subject, e: Evidence, traces: Traces) -> Iterator[Step]:
 
 
 def _seen(e: Evidence, traces: Traces) -> Mapping[str, Any]:
-    """What an opinion on an object hung on, and the limits."""
+    """Return the numbers behind the cameras' opinion on an object, with their limits."""
     opinions, least = traces.result.opinions, traces.result.config.opinions
     assert opinions is not None and e.named is not None
     k = e.named.row

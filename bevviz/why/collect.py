@@ -1,4 +1,4 @@
-"""Follows one subject through the stages of a frame."""
+"""Collect the evidence about one subject from the stages of a frame."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from bevviz.why.merged import LOOKED_AT, closest, find_mates, part_from
 from bevviz.why.outcome import find_named
 from bevviz.why.subject import IN_VIEW, Subject
 
-NEARER = 0.5  # metres by which something must be nearer to hide what is behind it
-CORE = 0.8  # of the directions in which a box is seen: its object does not fill its corners
+NEARER = 0.5  # metres by which a return must be nearer to hide the subject
+CORE = 0.8  # share of the directions of a box; an object does not fill the corners of its box
 
 
 def gather(subject: Subject, traces: Traces) -> Evidence:
-    """Follow the subject through the stages."""
+    """Collect the points, clusters and detections of the subject, stage by stage."""
     result = traces.result
     voxels, ground = result.voxels, result.ground
     points = traces.place(subject)
@@ -82,6 +82,7 @@ def gather(subject: Subject, traces: Traces) -> Evidence:
 
 
 def _parts(labels: I32, result: FrameResult) -> tuple[Part, ...]:
+    """Return the clusters of (M,) labels, the one with most points first."""
     found, points = np.unique(labels[labels >= 0], return_counts=True)
     clusters = result.clusters
     if clusters is None:
@@ -94,17 +95,18 @@ def _parts(labels: I32, result: FrameResult) -> tuple[Part, ...]:
 
 
 def _main(subject: Subject, parts: Sequence[Part], candidates: Sequence[Candidate], obstacles: int) -> int:
-    """The kept cluster that the subject is in, if it is more than a few points of it."""
-    if subject.kind == "detection":  # what is behind it is in its frustum, too: the fusion knows better
+    """Return the kept cluster of the subject, -1 if it holds only few of its points."""
+    # The frustum of a detection also holds clusters behind the object. The fusion has chosen one of them.
+    if subject.kind == "detection":
         return next((c.cluster for c in candidates if c.kept and c.cluster >= 0), -1)
     least = 1 if subject.is_place else max(FEW, PART * obstacles)
     return next((p.cluster for p in parts if p.kept and p.points >= least), -1)
 
 
 def _before(subject: Subject, traces: Traces) -> tuple[I64, int]:
-    """Rows of the returns in the subject's direction that end before it, and how many there are in all.
+    """Return the rows of the returns that end before the subject, and the number of returns in its direction.
 
-    Directions are seen from the origin of the points, which for one LiDAR is the LiDAR itself.
+    Directions start at the origin of the points. With one LiDAR, this is the LiDAR itself.
     """
     nothing = np.zeros(0, np.int64)
     if subject.box is None:
@@ -112,7 +114,7 @@ def _before(subject: Subject, traces: Traces) -> tuple[I64, int]:
     corners, center = geometry.corners(subject.box)[0], subject.box.center[0]
     away = np.hypot(corners[:, 0], corners[:, 1])
     if np.hypot(*center[:2]) < np.hypot(*subject.box.size[0, :2]) / 2:
-        return nothing, 0  # the sensor is in it
+        return nothing, 0  # the sensor is inside the box
     seen = traces.directions
     middle = np.arctan2(center[1], center[0])
     turned = CORE * _turn(np.arctan2(corners[:, 1], corners[:, 0]) - middle)
@@ -125,18 +127,19 @@ def _before(subject: Subject, traces: Traces) -> tuple[I64, int]:
 
 
 def _between(azimuth: F32, low: float, high: float) -> Iterator[I64]:
-    """Rows of the sorted azimuths within an interval, which may go beyond half a turn."""
+    """Yield the rows of sorted azimuths within an interval, which may wrap around."""
     for turn in (-2 * np.pi, 0.0, 2 * np.pi):
         first, last = np.searchsorted(azimuth, [low + turn, high + turn])
         yield np.arange(first, last)
 
 
 def _turn(angle: F32) -> F32:
-    """The same angles within half a turn of zero."""
+    """Wrap angles to [-pi, pi)."""
     return np.asarray((angle + np.pi) % (2 * np.pi) - np.pi, np.float32)
 
 
 def _most_neighbours(obstacles: F32 | None, noise: I64, eps: float) -> int:
+    """Return the most neighbours within ``eps`` that a noise point has, itself included."""
     if obstacles is None or len(noise) == 0:
         return 0
     own = obstacles[noise[:: 1 + len(noise) // LOOKED_AT]]
@@ -146,7 +149,7 @@ def _most_neighbours(obstacles: F32 | None, noise: I64, eps: float) -> int:
 
 @kernel
 def _most_around(own: F32, points: F32, eps2: float) -> int:
-    """Most points within a distance of one of ``own``."""
+    """Return the largest number of points within a distance of a point of ``own``."""
     most = 0
     for i in range(len(own)):
         count = 0
@@ -160,6 +163,7 @@ def _most_around(own: F32, points: F32, eps2: float) -> int:
 
 
 def _distance(subject: Subject, traces: Traces, points: I64, main: int) -> float:
+    """Return the horizontal distance of the subject in metres, NaN where unknown."""
     result = traces.result
     if subject.box is not None:
         return float(np.hypot(*subject.box.center[0, :2]))
@@ -171,6 +175,7 @@ def _distance(subject: Subject, traces: Traces, points: I64, main: int) -> float
 
 
 def _apart(result: FrameResult, parts: Sequence[Part]) -> float:
+    """Return the metres between the two largest kept clusters, NaN without two."""
     kept = [part for part in parts if part.kept]
     if len(kept) < 2 or result.clusters is None or result.obstacles is None:
         return float("nan")
@@ -179,7 +184,7 @@ def _apart(result: FrameResult, parts: Sequence[Part]) -> float:
 
 
 def _in_view(subject: Subject, traces: Traces) -> bool:
-    """Whether some camera has the subject in its image; where no camera has a place, it is not known."""
+    """Return whether a camera has the subject in its image. True if no camera has a pose."""
     placed = [c.camera for c in traces.result.cameras if c.camera.intrinsics is not None]
     if all(camera.camera_from_points is None for camera in placed):
         return True

@@ -1,4 +1,4 @@
-"""The detections that are a subject's own."""
+"""Detections of a subject."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from bevviz.why.evidence import Candidate, Part
 from bevviz.why.frame_index import Traces
 from bevviz.why.subject import LINK, Subject, projected
 
-COVERED = 0.8  # share of a cluster in the image that is under a detection which may be of it
+COVERED = 0.8  # share of a cluster's image box that a detection of it covers
 
 
 def find_candidates(subject: Subject, traces: Traces, parts: Sequence[Part]) -> tuple[Candidate, ...]:
-    """The detections that are the subject's own."""
+    """Find the detections of the subject in all cameras."""
     found = []
     for camera in traces.result.cameras:
         detections = camera.detections
@@ -31,11 +31,11 @@ def find_candidates(subject: Subject, traces: Traces, parts: Sequence[Part]) -> 
 def _own_rows(
     subject: Subject, traces: Traces, camera: CameraResult, parts: Sequence[Part]
 ) -> tuple[I64, F32]:
-    """Rows of the camera's detections, and (D,) how far each overlaps the subject."""
+    """Return the rows of the subject's detections in a camera, and the (D,) overlap with all."""
     detections = camera.detections
     assert detections is not None
     if subject.kind == "detection":
-        # The configuration may be another one than that which the subject was found in: find it by place.
+        # The subject may come from a run with another configuration, so rows differ. Find it by its box.
         assert subject.xyxy is not None
         overlap = geometry.iou(subject.xyxy[None], detections.xyxy)[0]
         return np.flatnonzero((np.array(detections.names) == subject.label) & (overlap > 0.99)), overlap
@@ -55,7 +55,7 @@ def _own_rows(
 
 
 def _over_cluster(camera: CameraResult, cluster: int) -> tuple[I64, F32]:
-    """Detections over a cluster: that which the fusion found best for it, and all that look like it."""
+    """Return the detections of a cluster: those that overlap it, and the best one of the fusion."""
     detections, fusion = camera.detections, camera.fusion
     assert detections is not None
     if fusion is None:
@@ -68,7 +68,10 @@ def _over_cluster(camera: CameraResult, cluster: int) -> tuple[I64, F32]:
 
 
 def _may_be_of(fusion: Fusion, detection: int, cluster: int, xyxy: F32) -> bool:
-    """Whether the best detection for a cluster is of it: not if it named another, unless it covers it."""
+    """Return whether the best detection of a cluster may belong to it.
+
+    A detection that was matched with another cluster does not, unless it covers this one.
+    """
     if (
         fusion.detection_decision[detection] != Decision.MATCHED
         or fusion.detection_cluster[detection] == cluster
@@ -83,11 +86,11 @@ def _may_be_of(fusion: Fusion, detection: int, cluster: int, xyxy: F32) -> bool:
 def sort_candidates(
     candidates: Sequence[Candidate], subject: Subject, main: int, threshold: float
 ) -> tuple[Candidate, ...]:
-    """Of a right class, kept, matched with the subject's cluster, sure ones first."""
-
+    """Sort detections: right class, kept, matched with the subject's cluster, high score times overlap."""
     known = subject.kind in ("truth", "detection")
 
     def rank(c: Candidate) -> tuple[bool, bool, bool, bool, bool, bool, float]:
+        """Return the sort key of a detection."""
         matched = c.decision == Decision.MATCHED and c.cluster == main
         suppressed = c.state == DetectionState.SUPPRESSED
         weak = c.score < threshold
@@ -99,6 +102,7 @@ def sort_candidates(
 
 
 def _candidate(result: CameraResult, row: int, overlap: float) -> Candidate:
+    """Return a detection with the decisions about it."""
     detections, fusion = result.detections, result.fusion
     assert detections is not None
     decision, cluster = Decision.NO_CLUSTER, -1

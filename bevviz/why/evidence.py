@@ -1,4 +1,4 @@
-"""What is known of one subject: its points, clusters and detections, and what became of them."""
+"""Evidence about one subject: its points, clusters and detections, and their results."""
 
 from __future__ import annotations
 
@@ -14,26 +14,27 @@ from bevviz.model.results import (
     Fusion,
 )
 
-MOST = 0.5  # share from which something is called the cause, or a cluster is mostly of an object
+MOST = 0.5  # least share of the main cause, and of a cluster that belongs mostly to one object
 
 
 @dataclass(frozen=True, slots=True)
 class Part:
-    """A cluster that has points at the place."""
+    """A cluster that holds points of the subject."""
 
     cluster: int
-    points: int  # there
-    count: int  # in all
+    points: int  # of the subject
+    count: int  # of the whole cluster
     state: ClusterState
 
     @property
     def kept(self) -> bool:
+        """Whether the cluster is within the size limits."""
         return self.state == ClusterState.KEPT
 
 
 @dataclass(frozen=True, slots=True)
 class Candidate:
-    """A detection at the place, and what became of it."""
+    """A detection of the subject, and the decisions about it."""
 
     camera: str
     row: int
@@ -42,22 +43,25 @@ class Candidate:
     state: DetectionState
     overlap: float  # IoU with the projected subject; 1 for the subject itself
     decision: Decision
-    cluster: int  # matched, or the best one that was refused, else -1
+    cluster: int  # the matched cluster, or the best one that was refused, else -1
 
     @property
     def kept(self) -> bool:
+        """Whether the detector stage kept it."""
         return self.state == DetectionState.KEPT
 
 
 @dataclass(frozen=True, slots=True)
 class Named:
-    """The object that stands at the place.
+    """The reported object of the subject.
 
     Attributes:
-        row: of the frame's objects.
-        cluster: that it is made of, -1: none.
-        camera, detection: that named it; empty and -1 where no detection did.
-        own: whether that detection is the subject's own.
+        row: row in the frame's objects.
+        name: class of the object.
+        cluster: cluster of the object, -1: none.
+        camera: camera of the detection that named it; empty: none.
+        detection: row of that detection, -1: none.
+        own: whether that detection belongs to the subject.
         also: other clusters that the same detection named.
     """
 
@@ -72,27 +76,29 @@ class Named:
 
 @dataclass(frozen=True, slots=True)
 class Evidence:
-    """What is known of a subject.
+    """Everything that the stages know about a subject.
 
     Attributes:
-        points: rows of the raw points at the place.
+        points: rows of the raw points of the subject.
         fate: (N,) Fate of every raw point.
         distance: horizontal metres from the origin of the points; NaN where unknown.
-        voxels: after the voxel grid.
-        ground: heights above the local ground of those that are ground.
-        noise: voxels there that are in no cluster.
-        neighbours: of the noise point that has most, within clustering.eps, itself included; 0: no noise.
-        parts: clusters there, the one with most points first.
-        main: the kept one that has most of it, -1: none has more than a few.
-        aimed: returns in the subject's direction; ``in_front``: those that end before it.
-        front: cluster that most of those in front belong to, else -1.
-        candidates: its own detections, the most telling first.
-        named: the object that stands there; None: none does.
-        mates: rows of other objects of the truth, or of detections, in its main cluster ...
-        others: ... with their names and points.
-        gap: metres between its points and the nearest of these, or the rest of its cluster; else NaN.
-        finer: largest eps that tells them apart, by clustering the points again; 0: none does.
-        apart: metres between its two largest clusters, NaN without.
+        voxels: number of voxels of the subject.
+        ground: heights in metres above the local ground of its voxels that are ground.
+        noise: number of its voxels that are in no cluster.
+        neighbours: most neighbours within clustering.eps that one of its noise voxels has, itself included;
+            0: no noise.
+        parts: its clusters, the one with most points first.
+        main: kept cluster that holds most of it, -1: none holds more than a few points.
+        aimed: number of returns in the direction of the subject.
+        in_front: number of these returns that end before the subject.
+        front: cluster of most of the returns in front, -1: none.
+        candidates: its detections, the most significant first.
+        named: its reported object; None: none.
+        mates: rows of other objects of the ground truth, or of other detections, in its main cluster.
+        others: names of these mates, with their points.
+        gap: metres between its points and the nearest mate, or the rest of its cluster; NaN: no mate.
+        finer: largest eps that separates them when the points are clustered again; 0: none does.
+        apart: metres between its two largest clusters, NaN without two.
         in_view: whether a camera has it in its image.
     """
 
@@ -119,28 +125,31 @@ class Evidence:
 
     @property
     def raw(self) -> int:
+        """Number of its raw points."""
         return len(self.points)
 
     @property
     def obstacles(self) -> int:
-        """Voxels there that are not ground."""
+        """Number of its voxels that are not ground."""
         return self.voxels - len(self.ground)
 
     @property
     def best(self) -> Candidate | None:
-        """The most telling of its detections."""
+        """Its most significant detection."""
         return self.candidates[0] if self.candidates else None
 
     def part(self, cluster: int) -> Part | None:
+        """Return its part in a cluster, None if it has no points there."""
         return next((part for part in self.parts if part.cluster == cluster), None)
 
     @property
     def purity(self) -> float:
-        """Share of its main cluster that is its own; 1 without a cluster."""
+        """Share of its main cluster that belongs to it; 1 without a cluster."""
         part = self.part(self.main)
         return 1.0 if part is None else part.points / max(part.count, 1)
 
 
 def fusion_of(result: FrameResult, camera: str) -> tuple[CameraResult, Fusion | None]:
+    """Return the result of a camera and its fusion."""
     found = next(c for c in result.cameras if c.camera.name == camera)
     return found, found.fusion

@@ -1,4 +1,4 @@
-"""A frame's results, turned so that any question about it is answered fast."""
+"""Index of a frame's results that answers questions about any subject fast."""
 
 from __future__ import annotations
 
@@ -18,41 +18,41 @@ from bevviz.stages.visibility import in_view
 from bevviz.why.stage_owner import StageOrigin, origin
 from bevviz.why.subject import FOOT, LINK, MARGIN, Subject, in_box, one_of, projected
 
-SAME_CLASS = 1.3  # times as good is the overlap of a detection with an object of its class
-FEW = 3  # points that are as good as none
-CORE = 0.5  # of the width and height of a detection: its middle
-DEPTH = 1.5  # metres of depth that what is seen of an object takes
-PART = 0.2  # of an object's obstacle voxels: what makes a cluster one of its clusters
+SAME_CLASS = 1.3  # factor on the overlap of a detection with an object of its class
+FEW = 3  # fewer points than this count as none
+CORE = 0.5  # share of a detection's width and height that is its middle
+DEPTH = 1.5  # metres of depth that the visible part of an object takes
+PART = 0.2  # least share of an object's obstacle voxels in a cluster that belongs to it
 
 
 class Fate(IntEnum):
-    """What became of a raw point."""
+    """Result of the stages for one raw point."""
 
-    ELSEWHERE = 0  # not one of the subject's
+    ELSEWHERE = 0  # not a point of the subject
     GROUND = 1
     NOISE = 2
     SET_ASIDE = 3  # in a cluster outside the size limits
     CLUSTERED = 4  # in a cluster that no detection named
     REPORTED = 5  # in a cluster that became an object
-    IN_FRONT = 6  # of the subject, and nearer: it hides it
+    IN_FRONT = 6  # nearer than the subject, in its direction: hides it
 
 
 @dataclass(frozen=True, slots=True)
 class Directions:
-    """Where raw points are as seen from the origin, sorted by azimuth."""
+    """Directions of raw points from the origin, sorted by azimuth."""
 
-    row: I64  # (N,) of the point
+    row: I64  # (N,) row of the point
     azimuth: F32  # (N,) radians, ascending
-    elevation: F32  # (N,)
+    elevation: F32  # (N,) radians
     away: F32  # (N,) horizontal metres
 
 
 class Traces:
-    """What every question about a frame needs; each part is made when it is first asked for.
+    """Index of one frame. Each array is computed at its first use.
 
     Args:
-        result: what was made of a frame.
-        classes: names that the detector knows; those that it gave in this frame are known without.
+        result: result of the frame.
+        classes: names of the classes that the detector knows. Classes detected in this frame are added.
     """
 
     def __init__(self, result: FrameResult, classes: Sequence[str] = ()) -> None:
@@ -61,11 +61,11 @@ class Traces:
         self.classes = tuple(dict.fromkeys([*classes, *seen]))
         self._places: dict[tuple[object, ...], I64] = {}
         self._uv: dict[str, F32] = {}
-        self._owners: dict[str, tuple[Detections, I64]] = {}  # with what they are the owners of
+        self._owners: dict[str, tuple[Detections, I64]] = {}  # camera -> detections, their owners
         self._labels: dict[int, I32] = {}
 
     def again(self, result: FrameResult) -> Traces:
-        """For another result of the same frame: what hangs on the frame alone is shared."""
+        """Return the index of another result of the same frame. Arrays of the frame alone are shared."""
         other = Traces(result, self.classes)
         other._places, other._uv, other._owners = self._places, self._uv, dict(self._owners)
         other.truth, other.shown = self.truth, self.shown
@@ -73,7 +73,7 @@ class Traces:
         return other
 
     def origin(self, section: str) -> StageOrigin:
-        """Whose the stage of a section is."""
+        """Return the owner of the stage of a section."""
         return self._origins[section]
 
     @cached_property
@@ -85,6 +85,7 @@ class Traces:
 
     @cached_property
     def directions(self) -> Directions:
+        """Directions of the raw points."""
         x, y, z = self.result.frame.points.T
         azimuth = np.arctan2(y, x)
         row = np.argsort(azimuth)
@@ -111,7 +112,7 @@ class Traces:
 
     @cached_property
     def fate(self) -> U8:
-        """(N,) Fate of each raw point, whosever it is."""
+        """(N,) Fate of each raw point, regardless of the subject."""
         result = self.result
         fate = np.full(len(result.frame.points), Fate.CLUSTERED, np.uint8)
         if result.voxels is None or result.ground is None:
@@ -128,12 +129,13 @@ class Traces:
 
     @cached_property
     def _by_x(self) -> tuple[I64, F32]:
+        """Rows of the raw points sorted by x, and the sorted x."""
         x = self.result.frame.points[:, 0]
         order = np.argsort(x)
         return order, x[order]
 
     def uv(self, camera: CameraResult) -> F32:
-        """(N, 2) raw points in pixels, NaN where not before the camera or its place is not known."""
+        """Return (N, 2) pixels of the raw points, NaN behind the camera or without its pose."""
         name, view = camera.camera.name, camera.camera
         if name not in self._uv:
             points = self.result.frame.points
@@ -146,8 +148,8 @@ class Traces:
         return self._uv[name]
 
     def place(self, subject: Subject) -> I64:
-        """Rows of the raw points at the subject's place: its own, in its box or sphere, or in its frustum."""
-        if subject.is_place or subject.points is not None:  # of places there is no end
+        """Return the rows of the subject's raw points: listed, or inside its box, sphere or frustum."""
+        if subject.is_place or subject.points is not None:  # The number of possible places has no limit.
             return self._place(subject)
         key = subject.key if subject.xyxy is None else (*subject.key, *subject.xyxy.tolist())
         if key not in self._places:
@@ -155,6 +157,7 @@ class Traces:
         return self._places[key]
 
     def _place(self, subject: Subject) -> I64:
+        """Find the rows of the subject's raw points."""
         if subject.points is not None:
             return subject.points
         points, box = self.result.frame.points, subject.box
@@ -175,15 +178,16 @@ class Traces:
         return self._foreground(camera, subject.xyxy, rows) if subject.kind == "detection" else rows
 
     def _in_frustum(self, camera: CameraResult, xyxy: F32) -> I64:
+        """Return the rows of the raw points that project into an image box."""
         u, v = self.uv(camera).T
         x0, y0, x1, y1 = xyxy
         with np.errstate(invalid="ignore"):
             return np.flatnonzero((u >= x0) & (u <= x1) & (v >= y0) & (v <= y1))
 
     def _foreground(self, camera: CameraResult, xyxy: F32, rows: I64) -> I64:
-        """Of the points in a detection's frustum those at the depth at which the middle of it has most.
+        """Keep the points of a detection's frustum at the depth that is most frequent in its middle.
 
-        What is behind an object shows around it, seldom in the middle of its box.
+        The background shows around an object, but seldom in the middle of its box.
         """
         view = camera.camera
         if view.camera_from_points is None:
@@ -200,18 +204,19 @@ class Traces:
         return foreground
 
     def camera(self, name: str) -> CameraResult | None:
+        """Return the result of a camera, None for an unknown name."""
         return next((c for c in self.result.cameras if c.camera.name == name), None)
 
     # --- the ground truth ----------------------------------------------------------------------
 
     @cached_property
     def truth(self) -> tuple[Subject, ...]:
-        """Its objects, in order of their rows."""
+        """Objects of the ground truth, in order of their rows."""
         return truth_subjects(self.result.frame, self.classes)
 
     @cached_property
     def of_truth(self) -> Bool:
-        """(K,) clusters most of whose points are on objects of the truth."""
+        """(K,) whether at least half of a cluster's points are on objects of the ground truth."""
         known = np.zeros(len(self.result.frame.points), np.bool_)
         for subject in self.truth:
             known[self.place(subject)] = True
@@ -222,7 +227,7 @@ class Traces:
 
     @cached_property
     def shown(self) -> F32:
-        """(K, cameras) share of each object of the truth that is inside each camera's image."""
+        """(K, cameras) share of each object of the ground truth that is inside each camera's image."""
         share = np.zeros((len(self.truth), len(self.result.cameras)), np.float32)
         boxes = joined([s.box for s in self.truth if s.box is not None])
         for column, camera in enumerate(self.result.cameras):
@@ -230,13 +235,13 @@ class Traces:
         return share
 
     def labels(self, row: int) -> I32:
-        """Clusters of the obstacle voxels of one object of the truth, -1 noise."""
+        """Return the cluster of each obstacle voxel of an object of the ground truth, -1: noise."""
         if row not in self._labels:
             self._labels[row] = self.labels_of(self.place(self.truth[row]))
         return self._labels[row]
 
     def labels_of(self, points: I64) -> I32:
-        """Clusters of the obstacle voxels that raw points are in, -1 noise."""
+        """Return the cluster of each obstacle voxel that holds these raw points, -1: noise."""
         voxels, clusters = self.result.voxels, self.result.clusters
         if voxels is None or clusters is None or self.result.ground is None:
             return np.zeros(0, np.int32)
@@ -244,13 +249,13 @@ class Traces:
         return clusters.labels[obstacle[obstacle >= 0]]
 
     def holds(self, cluster: int, row: int) -> int:
-        """Voxels of an object of the truth in a cluster, 0 where these are a small part of it."""
+        """Return the voxels of a ground truth object in a cluster, 0 if they are a small part of it."""
         labels = self.labels(row)
         count = int((labels == cluster).sum())
         return count if count >= max(FEW, PART * len(labels)) else 0
 
     def mates(self, cluster: int, row: int) -> Iterator[int]:
-        """Rows of other objects of the truth that the cluster is one of."""
+        """Yield the rows of other objects of the ground truth with points in the cluster."""
         clusters = self.result.clusters
         if clusters is None:
             return
@@ -264,11 +269,12 @@ class Traces:
                 yield other.row
 
     def owners(self, camera: CameraResult) -> I64:
-        """(D,) row of the truth that each detection is of, -1: none.
+        """Return the (D,) row of the ground truth object of each detection, -1: none.
 
-        It is of the object that it overlaps most. Detectors box what is seen of an object, or guess the whole
-        of it, so that two IoU count: with the projected box of the object, and with the image box around its
-        own points, which are not where another is before it; the greater one three times.
+        A detection belongs to the object with the largest overlap. Some detectors box the visible part of an
+        object, others guess all of it. So the overlap combines two IoU: with the projected box of the object,
+        and with the image box around its own points, which other objects do not cover. The larger IoU weighs
+        three times as much.
         """
         name, detections = camera.camera.name, camera.detections
         assert detections is not None
@@ -279,6 +285,7 @@ class Traces:
         return owners
 
     def _find_owners(self, camera: CameraResult, detections: Detections) -> I64:
+        """Find the ground truth object of each detection."""
         owner = np.full(len(detections), -1, np.int64)
         column = [c.camera.name for c in self.result.cameras].index(camera.camera.name)
         rows = [row for row in range(len(self.truth)) if self.shown[row, column] > 0]
@@ -305,12 +312,13 @@ class Traces:
 
     @staticmethod
     def _in_image(uv: F32, box: F32) -> F32:
+        """Return the pixels inside an image box."""
         with np.errstate(invalid="ignore"):
             return uv[((uv >= box[:2]) & (uv <= box[2:])).all(axis=1)]
 
     @cached_property
     def competing(self) -> tuple[Subject, ...]:
-        """Kept detections that are of no object of the truth: each may be one that it does not know."""
+        """Kept detections of no ground truth object. The ground truth may lack some objects."""
         found = []
         for camera in self.result.cameras:
             if camera.detections is not None:
@@ -320,11 +328,11 @@ class Traces:
 
 
 def truth_subjects(frame: Frame, classes: Sequence[str] = ()) -> tuple[Subject, ...]:
-    """The objects of a frame's ground truth, in order of their rows.
+    """Return the objects of a frame's ground truth, in order of their rows.
 
     Args:
         frame: the frame.
-        classes: names that the detector knows.
+        classes: names of the classes that the detector knows.
     """
     stated = frame.truth
     if stated is None:
@@ -345,12 +353,12 @@ def truth_subjects(frame: Frame, classes: Sequence[str] = ()) -> tuple[Subject, 
 
 
 def _same_boxes(a: Detections, b: Detections) -> bool:
-    """Whether they differ in their states only."""
+    """Return whether two lists of detections differ in their states only."""
     return a is b or (a.names == b.names and np.array_equal(a.xyxy, b.xyxy))
 
 
 def joined(boxes: Sequence[Boxes3D]) -> Boxes3D:
-    """Several boxes as one list."""
+    """Return several lists of boxes as one list."""
     if not boxes:
         return Boxes3D.empty()
     columns = ([getattr(box, name) for box in boxes] for name in ("center", "size", "yaw"))
@@ -358,7 +366,7 @@ def joined(boxes: Sequence[Boxes3D]) -> Boxes3D:
 
 
 def detection_subject(camera: CameraResult, row: int) -> Subject:
-    """A detection of its own."""
+    """Return a detection as a subject of its own."""
     detections = camera.detections
     assert detections is not None
     label, fusion = detections.names[row], camera.fusion

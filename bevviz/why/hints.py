@@ -1,4 +1,4 @@
-"""What would change a verdict: said only where running the stages again proves it."""
+"""Find parameter changes that would change a verdict. Each is tested by running the stages again."""
 
 from __future__ import annotations
 
@@ -25,16 +25,16 @@ from bevviz.why.side_effects import Effects, effects
 from bevviz.why.subject import Subject
 from bevviz.why.verdict import FLAWED, Reason, find_reason
 
-TRIES = 10  # configurations that are run for one subject
-SURE = 0.5  # IoU of a detection with its object that leaves no doubt
-FURTHER = 10  # more of them, that go on from where the first have brought it
-RESULTS = 20  # of other configurations that are kept, for further subjects of the frame
+TRIES = 10  # configurations to run for one subject
+SURE = 0.5  # IoU from which a detection surely belongs to its object
+FURTHER = 10  # more configurations, combined with the best changes so far
+RESULTS = 20  # results of other configurations in the cache, for other subjects of the frame
 
 Change = Mapping[str, Any]  # dotted key -> value
 
-# Applied by bevviz to what somebody's function gave.
+# Parameters that bevviz applies to the output of user functions, too.
 _WHOEVER = {"min_cluster_points", "max_cluster_points", "conf_threshold"}
-_SECTION = {  # whose parameters may help, by the reason
+_SECTION = {  # reason -> section whose parameters may help
     Reason.GROUND: "ground",
     Reason.NOISE: "clustering",
     Reason.NO_CLUSTER: "clustering",
@@ -47,12 +47,12 @@ _SECTION = {  # whose parameters may help, by the reason
 }
 
 
-_ORDER = {reason: place for place, reason in enumerate(Reason)}  # along the stages
+_ORDER = {reason: place for place, reason in enumerate(Reason)}  # in the order of the stages
 
 
 @dataclass(frozen=True, slots=True)
 class _Stage:
-    """How far a subject came."""
+    """The stage that a subject reached. A later stage is greater."""
 
     reported: bool
     reason: Reason
@@ -63,12 +63,12 @@ class _Stage:
 
 @dataclass(frozen=True, slots=True)
 class Hint:
-    """Settings that change the verdict when the stages are run again, and what happens then.
+    """Settings that change the verdict, and their effects, found by running the stages again.
 
     Attributes:
-        settings: as ``--set`` takes them.
-        text: what becomes of the subject.
-        effects: what else they change in the frame.
+        settings: settings as ``--set`` takes them.
+        text: the result for the subject.
+        effects: other objects of the frame that change.
     """
 
     settings: tuple[str, ...]
@@ -78,14 +78,14 @@ class Hint:
 
 @dataclass(frozen=True, slots=True)
 class Search:
-    """What was tried for a subject.
+    """Result of the search for hints on one subject.
 
     Attributes:
-        hints: the best that changes the verdict; empty: none of those that were tried does.
-        tried: configurations that were run.
-        furthest: settings that bring it to a later stage, where none helps; empty: none does.
-        then: why it is not reported with these, or what is wrong with how it is.
-        reported: whether it is.
+        hints: the best change that changes the verdict; empty: no tried change does.
+        tried: number of configurations that were run.
+        furthest: settings that bring the subject to a later stage, if no hint helps; empty: none does.
+        then: reason of the subject with these settings.
+        reported: whether the subject is reported with these settings.
     """
 
     hints: tuple[Hint, ...]
@@ -96,11 +96,11 @@ class Search:
 
 
 class WhatIf:
-    """Runs a frame with other configurations, each once.
+    """Runs of one frame with other configurations, each run once.
 
     Args:
-        traces: what was made of the frame.
-        loader: that has the networks already.
+        traces: index of the frame's result.
+        loader: stage loader with the networks already loaded.
     """
 
     def __init__(self, traces: Traces, loader: StageLoader | None = None) -> None:
@@ -109,16 +109,18 @@ class WhatIf:
         self._runs: dict[tuple[tuple[str, Any], ...], Traces | None] = {}
 
     def search(self, subject: Subject, evidence: Evidence, reason: Reason, reported: bool) -> Search:
-        """The best change of those that the reason suggests: the mildest that makes nothing worse.
+        """Search the mildest change that changes the verdict and makes no other object worse.
 
-        Where each that helps makes something worse, the one that does the least harm. Where none helps, those
-        that bring it to a later stage are joined with what the reason there suggests.
+        If each helpful change makes another object worse, return the one that does the least harm. If none
+        helps, combine the changes that bring the subject to a later stage with the changes for the reason
+        there.
         """
         found: list[Hint] = []
         reached: dict[_Stage, tuple[Change, Evidence, Traces]] = {}  # by the mildest change
         tried = 0
 
         def ways() -> Iterator[Change]:
+            """Yield the changes to try."""
             yield from islice(_changes(evidence, reason, self._traces), TRIES)
             if not found:
                 yield from islice(_further(reached), FURTHER)
@@ -146,12 +148,13 @@ class WhatIf:
         return Search((), tried, _settings(reached[last][0]), last.reason, last.reported)
 
     def _run(self, change: Change) -> Traces | None:
+        """Run the frame with a change, once. None: the configuration cannot be run."""
         key = tuple(change.items())
         if key not in self._runs:
             try:
                 config = changed(self._result.config, change)
                 stages = self._loader.load(config, self._known_detections(config, change))
-            except (UserError, ValidationError):  # the model file has gone, or nobody may set that value
+            except (UserError, ValidationError):  # the model file has gone, or the value is out of bounds
                 self._runs[key] = None
             else:
                 result = perceive(self._result.frame, config, stages, self._memo)
@@ -161,10 +164,10 @@ class WhatIf:
         return self._runs[key]
 
     def _known_detections(self, config: Config, change: Change) -> Detect | None:
-        """Detections for other thresholds: the network need not be run. None: it has to be.
+        """Return a detector that applies another threshold to the known detections. None: run the network.
 
-        What NMS leaves cannot be told from the candidates that were kept to be explained, nor what somebody's
-        detector makes of other parameters; the robot's are what they are.
+        The candidates kept for explanations do not tell the result of another NMS, nor that of other
+        parameters of a user's detector. Detections of the robot never change.
         """
         touched = {key for key in change if key.startswith("detector.")} - {"detector.conf_threshold"}
         if touched or self._traces.origin("detector").topic:
@@ -172,6 +175,7 @@ class WhatIf:
         known = {c.camera.name: c.detections for c in self._result.cameras}
 
         def detect(camera: Camera) -> Detections | None:
+            """Return the detections of a camera with the states of the new threshold."""
             found = known[camera.name]
             if found is None:
                 return None
@@ -184,7 +188,7 @@ class WhatIf:
 
 
 def changed(config: Config, change: Change) -> Config:
-    """The configuration with other values."""
+    """Return the configuration with other values."""
     tree = config.model_dump()
     for key, value in change.items():
         *path, name = key.split(".")
@@ -198,7 +202,7 @@ def changed(config: Config, change: Change) -> Config:
 def _outcome(
     subject: Subject, was: tuple[Reason, bool], now: tuple[Reason, bool], e: Evidence, after: Traces
 ) -> tuple[str, int]:
-    """What has become of the subject, empty where it is no better off, and its object's row."""
+    """Return the new result of the subject, empty if it is no better, and the row of its object."""
     (reason, reported), (new, now_reported), named = was, now, e.named
     if reason is Reason.BORROWED and subject.kind != "truth":
         return ("" if named is not None else "it is not named any more"), -1
@@ -211,7 +215,7 @@ def _outcome(
 
 
 def _is_sure(subject: Subject, change: Change, e: Evidence) -> bool:
-    """Whether a detection that other limits let pass is the subject's own without a doubt."""
+    """Return whether a detection that passes only with other limits surely belongs to the subject."""
     if subject.kind != "truth" or e.named is None or e.named.detection < 0:
         return True
     if not any(key.startswith(("detector.", "fusion.min", "fusion.split")) for key in change):
@@ -221,11 +225,12 @@ def _is_sure(subject: Subject, change: Change, e: Evidence) -> bool:
 
 
 def _settings(change: Change) -> tuple[str, ...]:
+    """Return a change as settings ``key=value``."""
     return tuple(f"{key}={_written(value)}" for key, value in change.items())
 
 
 def _further(reached: Mapping[_Stage, tuple[Change, Evidence, Traces]]) -> Iterator[Change]:
-    """What might help in addition; ``reached`` may grow meanwhile. What came the farthest goes first."""
+    """Yield combined changes, from the latest stage back. ``reached`` may grow meanwhile."""
     done: set[_Stage] = set()
     while left := reached.keys() - done:
         stage = max(left)
@@ -235,11 +240,11 @@ def _further(reached: Mapping[_Stage, tuple[Change, Evidence, Traces]]) -> Itera
             yield {**change, **more}
 
 
-# --- what to try -------------------------------------------------------------------------------
+# --- changes to try ----------------------------------------------------------------------------
 
 
 def _changes(e: Evidence, reason: Reason, traces: Traces) -> Iterator[Change]:
-    """What might help, by the reason: parameters of ours, or of the function that was at fault."""
+    """Yield changes that may help: parameters of our stages, or of the user's function."""
     result = traces.result
     section = _SECTION.get(reason, "")
     if section and not traces.origin(section).ours:
@@ -253,7 +258,7 @@ def _changes(e: Evidence, reason: Reason, traces: Traces) -> Iterator[Change]:
 
 
 def _is_ours(key: str, traces: Traces) -> bool:
-    """Whether a parameter has a say: those of a stage that is somebody else's have none."""
+    """Return whether a parameter has an effect. Ours have none on a stage that is not ours."""
     section, _, name = key.partition(".")
     if section not in ("ground", "clustering", "detector"):
         return True
@@ -262,12 +267,12 @@ def _is_ours(key: str, traces: Traces) -> bool:
         "min_cluster_points",
         "max_cluster_points",
         "conf_threshold",
-    }  # bevviz's own, whoever's stage it is
+    }  # bevviz applies them to every stage
     return there.ours or (bool(there.function) and name in shared)
 
 
 def _of_function(result: FrameResult, section: str) -> Iterator[Change]:
-    """Halves and doubles of the numbers among the parameters of somebody's function, within their bounds."""
+    """Yield halves and doubles of the numeric parameters of a user's function, within their bounds."""
     try:
         plugin = plugin_of(result.config, section)
     except UserError:
@@ -289,6 +294,7 @@ def _of_function(result: FrameResult, section: str) -> Iterator[Change]:
 
 
 def _of_ours(e: Evidence, reason: Reason, config: Config) -> Iterator[Change]:
+    """Yield changes of our parameters that may help against the reason."""
     c, best = config.clustering, e.best
     if reason is Reason.GROUND:
         yield from _lower_ground(config)
@@ -313,7 +319,7 @@ def _of_ours(e: Evidence, reason: Reason, config: Config) -> Iterator[Change]:
         elif not e.others:
             yield from ({"clustering.eps": round(c.eps * f, 3)} for f in (0.8, 0.6, 0.4))
     elif reason is Reason.SPLIT:
-        # How far apart is unknown where one of the parts is not a cluster.
+        # The distance is unknown if one of the parts is not a cluster.
         yield {"clustering.eps": round(max(np.nan_to_num(e.apart), c.eps) * 1.1, 3)}
         yield {"clustering.min_points": max(1, c.min_points // 2)}
         yield {"clustering.eps": round(c.eps * 1.5, 3)}
@@ -322,18 +328,19 @@ def _of_ours(e: Evidence, reason: Reason, config: Config) -> Iterator[Change]:
 
 
 def _aside(e: Evidence) -> int:
-    """Points of the cluster that was set aside."""
+    """Return the number of points of the cluster outside the size limits."""
     return next(part.count for part in e.parts if not part.kept)
 
 
 def _for_detection(reason: Reason, best: Candidate, config: Config) -> Iterator[Change]:
+    """Yield changes that may help a subject that has a detection."""
     if reason is Reason.BELOW_THRESHOLD:
-        # A threshold that lets any noise pass is no advice.
+        # A threshold that lets noise pass is no advice.
         if best.score >= 0.05:
             passes = {"detector.conf_threshold": math.floor(100 * best.score) / 100}
             yield passes
             if config.fusion.method == "frustum" and config.fusion.split:
-                # What it rates a match by is in proportion to the score.
+                # The rating of a match is proportional to the score.
                 weak = config.fusion.min_rating * best.score / config.detector.conf_threshold
                 yield from ({**passes, "fusion.min_rating": round(weak * f, 4)} for f in (1.0, 0.5))
     elif reason is Reason.SUPPRESSED:
@@ -350,7 +357,7 @@ def _for_detection(reason: Reason, best: Candidate, config: Config) -> Iterator[
         if config.fusion.method == "centroid":
             yield {"fusion.method": "frustum"}
     elif reason is Reason.TOO_FAR and config.fusion.method == "centroid":
-        # Its own cluster is missing: something else was merely the nearest.
+        # The subject has no cluster of its own: the fusion compared the nearest other one.
         yield from _lower_ground(config)
         yield {"fusion.method": "frustum"}
     elif reason is Reason.TOO_FAR:
@@ -358,7 +365,7 @@ def _for_detection(reason: Reason, best: Candidate, config: Config) -> Iterator[
 
 
 def _lower_ground(config: Config) -> Iterator[Change]:
-    """A thinner ground; where one plane is all there is, one that follows the road, too."""
+    """Yield thinner ground layers, and for a plane also a ground that follows the road."""
     g, points = config.ground, max(1, config.clustering.min_points // 3)
     for threshold in (0.3, 0.2, 0.1):
         if threshold < g.distance_threshold:
@@ -373,12 +380,13 @@ def _lower_ground(config: Config) -> Iterator[Change]:
 
 
 def _below(neighbours: int, limit: int) -> list[int]:
-    """Values of min_points to try: what the best point just reaches, and less."""
+    """Return values of min_points to try: the number that the best point reaches, and less."""
     tries = [neighbours, round(neighbours * 0.75), neighbours // 2]
     return [n for n in dict.fromkeys(tries) if 2 <= n < limit]
 
 
 def _written(value: Any) -> str:
+    """Return a value as ``--set`` takes it."""
     if isinstance(value, bool):
         return str(value).lower()
     return f"{value:g}" if isinstance(value, float) else str(value)

@@ -1,4 +1,4 @@
-"""Logs what ``bevviz why`` answered: the words, and the chain over the frame."""
+"""Log the answers of ``bevviz why``: the sentences, and the subjects and points over the frame."""
 
 from __future__ import annotations
 
@@ -39,11 +39,11 @@ NAMES = {
 }
 _SUBJECT = (255, 60, 200)
 _LINE = 0.35  # metres between the lines of the legend
-_DEPTH = 20.0  # metres that a frustum is drawn to where the distance is unknown
+_DEPTH = 20.0  # metres, length of a frustum where the distance is unknown
 
 
 def clear_answers(recording: rr.RecordingStream) -> None:
-    """Nothing is explained from the recording's current time on."""
+    """Clear all answers from the recording's current time on."""
     for path in (entities.WHY, entities.overlay("why")):
         recording.log(path, rr.Clear(recursive=True))
 
@@ -55,14 +55,14 @@ def log_answers(
     shown: int,
     above: BevConfig | None = None,
 ) -> None:
-    """The first answers over the frame, at the recording's current time; the words of all.
+    """Log the sentences of all answers, and draw the first ones at the recording's current time.
 
     Args:
-        recording: where the frame itself was just logged to.
-        frame: what was explained.
-        answers: worst first.
-        shown: how many of them are drawn.
-        above: of the bird's-eye view, to draw them there, too.
+        recording: recording that the frame was just logged to.
+        frame: the explained frame.
+        answers: the answers, worst first.
+        shown: number of answers to draw.
+        above: configuration of the bird's-eye view, to draw there as well.
     """
     recording.log(entities.WHY, document(page(answers, shown)))
     pose = transform(frame.pose)
@@ -90,7 +90,7 @@ def log_answers(
 
 
 def focus(frame: Frame, answer: Answer) -> F32 | None:
-    """(3,) where it is, in Frame.points_frame; None where nothing says."""
+    """Return the (3,) position of an answer in Frame.points_frame; None: unknown."""
     if answer.subject.box is not None:
         return np.asarray(answer.subject.box.center[0], np.float32)
     points = frame.points[(answer.fate > 0) & (answer.fate != Fate.IN_FRONT)]
@@ -98,7 +98,7 @@ def focus(frame: Frame, answer: Answer) -> F32 | None:
 
 
 def _log_legend(recording: rr.RecordingStream, frame: Frame, answer: Answer) -> None:
-    """Over the worst one its name, and what the colours of its points mean."""
+    """Log the name of the worst subject and the meaning of its colours above it."""
     place = focus(frame, answer)
     if place is None:
         return
@@ -117,7 +117,7 @@ def _log_legend(recording: rr.RecordingStream, frame: Frame, answer: Answer) -> 
 def _log_above(
     recording: rr.RecordingStream, frame: Frame, answers: Sequence[Answer], config: BevConfig, fate: U8
 ) -> None:
-    """Outlines, or the points where there is no box, as far as they are in the bird's-eye view."""
+    """Log the outlines of the boxes in the bird's-eye view, or the points if there is no box."""
     reach = np.array([config.range_x, config.range_y], np.float32)
     boxes = [a.subject.box for a in answers if a.subject.box is not None]
     inside = [box for box in boxes if (np.abs(box.center[0, :2]) < reach).all()]
@@ -137,13 +137,13 @@ def _log_above(
 
 
 def mark_answers(to: Writer, frame: Frame, answers: Sequence[Answer], above: BevConfig | None = None) -> None:
-    """The answers over the frame, and nothing of those before; gone again at the next frame.
+    """Log the answers over one frame. Earlier answers are cleared, and these end at the next frame.
 
     Args:
-        to: a writer of its own.
-        frame: what was explained.
-        answers: all are drawn.
-        above: as of ``log_answers``.
+        to: a writer for the answers only.
+        frame: the explained frame.
+        answers: the answers; all are drawn.
+        above: as for ``log_answers``.
     """
     to.set_time(frame.index, frame.stamp, frame.received)
     clear_answers(to.recording)
@@ -153,7 +153,7 @@ def mark_answers(to: Writer, frame: Frame, answers: Sequence[Answer], above: Bev
 
 
 def _frustums(camera: Camera, answers: Sequence[Answer]) -> Iterator[F32]:
-    """In Frame.points_frame."""
+    """Yield the frustums of the camera's subjects as line strips in Frame.points_frame."""
     if camera.intrinsics is None or camera.camera_from_points is None:
         return
     points_from_camera = geometry.inverse(camera.camera_from_points)
@@ -166,6 +166,7 @@ def _frustums(camera: Camera, answers: Sequence[Answer]) -> Iterator[F32]:
 
 
 def _log_image(recording: rr.RecordingStream, camera: Camera, answers: Sequence[Answer]) -> None:
+    """Log the image boxes of the subjects over a camera's image."""
     boxes, names = [], []
     for number, s in enumerate(answer.subject for answer in answers):
         own = s.xyxy if s.camera == camera.name else None

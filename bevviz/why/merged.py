@@ -1,4 +1,4 @@
-"""What else is in a subject's cluster, how far from it, and what would part the two."""
+"""Other objects in a subject's cluster, their distance, and the eps that separates them."""
 
 from __future__ import annotations
 
@@ -14,12 +14,21 @@ from bevviz.why.evidence import MOST
 from bevviz.why.frame_index import FEW, PART, Traces
 from bevviz.why.subject import LINK, Subject
 
-FINER = (0.9, 0.8, 0.7, 0.6, 0.5, 0.4, 0.3, 0.2)  # of clustering.eps, tried to tell merged objects apart
-LOOKED_AT = 2000  # points of a large set of which distances are measured
+FINER = (
+    0.9,
+    0.8,
+    0.7,
+    0.6,
+    0.5,
+    0.4,
+    0.3,
+    0.2,
+)  # factors on clustering.eps, tried to separate merged objects
+LOOKED_AT = 2000  # points of a large set used for distances
 
 
 def find_mates(subject: Subject, traces: Traces, main: int, own: I64) -> list[tuple[int, str, int]]:
-    """Row, name and points of others in the subject's main cluster."""
+    """Return the row, name and number of points of other objects in the subject's main cluster."""
     clusters, obstacles = traces.result.clusters, traces.result.obstacles
     if main < 0 or clusters is None or obstacles is None:
         return []
@@ -45,7 +54,7 @@ def find_mates(subject: Subject, traces: Traces, main: int, own: I64) -> list[tu
 
 
 def _same_view(a: Subject, b: Subject) -> bool:
-    """Whether two detections can be two objects of one image: the one is not just the other again."""
+    """Return whether two detections can be two objects of one image, and not one object detected twice."""
     if a.xyxy is None or b.xyxy is None:
         return True
     return a.camera == b.camera and float(geometry.iou(a.xyxy[None], b.xyxy[None])[0, 0]) < LINK
@@ -54,7 +63,10 @@ def _same_view(a: Subject, b: Subject) -> bool:
 def part_from(
     subject: Subject, traces: Traces, main: int, own: I64, mates: Sequence[tuple[int, str, int]]
 ) -> tuple[float, float]:
-    """The gap between the subject and what else is in its cluster, and the eps that parts them."""
+    """Return the gap in metres between the subject and its mates, and the eps that separates them.
+
+    The gap is NaN if the cluster holds only the subject. The eps is 0 if none separates them.
+    """
     result = traces.result
     clusters, obstacles = result.clusters, result.obstacles
     if main < 0 or clusters is None or obstacles is None or subject.kind not in ("truth", "detection"):
@@ -86,11 +98,12 @@ def part_from(
 
 
 def _other(traces: Traces, camera: str, row: int) -> Subject:
+    """Return the detection of a row as a subject."""
     return next(s for s in traces.competing if (s.camera, s.row) == (camera, row))
 
 
 def _finer(points: F32, mine: Bool, theirs: Bool, traces: Traces) -> float:
-    """The largest eps of those tried at which most of each fall into clusters of their own."""
+    """Return the largest tried eps at which the two sets of points fall into different clusters."""
     config = traces.result.config.clustering
     for factor in FINER:
         eps = round(config.eps * factor, 3)
@@ -99,7 +112,7 @@ def _finer(points: F32, mine: Bool, theirs: Bool, traces: Traces) -> float:
         for part in (mine, theirs):
             known = labels[part][labels[part] >= 0]
             if len(known) < 0.5 * part.sum():
-                return 0.0  # finer still only makes more of them noise
+                return 0.0  # A smaller eps only turns more of them into noise.
             tops.append(int(np.bincount(known).argmax()))
         if tops[0] != tops[1]:
             return eps
@@ -107,13 +120,13 @@ def _finer(points: F32, mine: Bool, theirs: Bool, traces: Traces) -> float:
 
 
 def closest(a: F32, b: F32) -> float:
-    """Least distance between two sets of points, of large ones roughly."""
+    """Return the least distance between two sets of points; approximate for large sets."""
     return float(np.sqrt(_closest(a[:: 1 + len(a) // LOOKED_AT], b[:: 1 + len(b) // LOOKED_AT])))
 
 
 @kernel
 def _closest(a: F32, b: F32) -> float:
-    """Square of the least distance."""
+    """Return the square of the least distance."""
     least = np.inf
     for i in range(len(a)):
         for j in range(len(b)):

@@ -1,4 +1,4 @@
-"""The object that a subject became."""
+"""The reported object of a subject."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from bevviz.why.evidence import Candidate, Evidence, Named, Part, fusion_of
 from bevviz.why.frame_index import FEW, PART, Traces
 from bevviz.why.subject import LINK, Subject, in_box, one_of, projected
 
-HELD = 0.3  # share of a subject's points that are in a box which is taken for its object
-OVERLAP = 0.1  # or least IoU of the two, seen from above
+HELD = 0.3  # least share of a subject's points inside the box of its object
+OVERLAP = 0.1  # or least IoU of both boxes from above
 
 
 def find_named(
     subject: Subject, traces: Traces, parts: Sequence[Part], candidates: Sequence[Candidate]
 ) -> Named | None:
-    """The object that the subject became, of a right class if there is one."""
+    """Find the reported object of the subject. Objects of a right class come first."""
     result = traces.result
     objects = result.objects
     if objects is None:
@@ -38,9 +38,10 @@ def find_named(
 
 
 def find_fused(subject: Subject, e: Evidence, traces: Traces) -> int:
-    """Row of the object that our fusion would have made of the subject, -1: it would have made none.
+    """Return the row of the object that our fusion would make of the subject, -1: none.
 
-    Where the objects are somebody else's; a detection's own, or that of the subject's cluster.
+    It applies where the objects are not ours. A detection has its own object, other subjects that of their
+    cluster.
     """
     opinions = traces.result.opinions
     if opinions is None:
@@ -54,18 +55,19 @@ def find_fused(subject: Subject, e: Evidence, traces: Traces) -> int:
 
 
 def in_box_of(objects: Objects, row: int) -> str:
-    """Where an object of our fusion is among somebody else's."""
+    """Name the object that is not ours and contains our fused object."""
     return f"in the box of {objects.names[row]} {objects.score[row]:.2f}"
 
 
 def opinion_on(result: FrameResult, row: int) -> str:
-    """What cameras say of an object of somebody else's, without its name; empty: they are not asked."""
+    """Return the opinion of the cameras on an object that is not ours; empty: no opinion."""
     key = "object", row
     said = next((x.text for x in result.explanations if (x.subject, x.row) == key), "")
     return said.partition(": ")[2]
 
 
 def _described(subject: Subject, j: int, result: FrameResult, candidates: Sequence[Candidate]) -> Named:
+    """Return the object with the detection that named it."""
     objects = result.objects
     assert objects is not None
     camera, d, k = objects.camera[j], int(objects.detection[j]), int(objects.cluster[j])
@@ -78,7 +80,7 @@ def _described(subject: Subject, j: int, result: FrameResult, candidates: Sequen
     known = subject.kind in (
         "truth",
         "detection",
-    )  # of a place, detections are candidates that merely touch it
+    )  # The detections of a place merely touch it.
     own = any((c.camera, c.row) == (camera, d) and (known or c.overlap >= LINK) for c in candidates)
     return Named(j, objects.names[j], k, camera, d, own, tuple(also))
 
@@ -86,7 +88,7 @@ def _described(subject: Subject, j: int, result: FrameResult, candidates: Sequen
 def _made_of(
     subject: Subject, traces: Traces, parts: Sequence[Part], candidates: Sequence[Candidate]
 ) -> Iterator[int]:
-    """Rows of the objects that are made of the subject's clusters and stand for it."""
+    """Yield the rows of the objects that come from the subject's clusters and represent it."""
     objects = traces.result.objects
     assert objects is not None
     if subject.kind == "detection":
@@ -104,7 +106,7 @@ def _made_of(
 
 
 def _stands_for(subject: Subject, traces: Traces, j: int, part: Part) -> bool:
-    """Whether an object is this subject, and not another one that is in the same cluster."""
+    """Return whether an object is this subject, and not another one in the same cluster."""
     if subject.kind != "truth":
         return True
     objects = traces.result.objects
@@ -118,7 +120,7 @@ def _stands_for(subject: Subject, traces: Traces, j: int, part: Part) -> bool:
 
 
 def _boxes_there(subject: Subject, traces: Traces) -> Iterator[int]:
-    """Rows of the objects whose box is the subject's place, where they are not made of clusters."""
+    """Yield the rows of the objects whose box is at the subject, for objects without clusters."""
     objects, points = traces.result.objects, traces.result.frame.points
     assert objects is not None
     if subject.kind in ("detection", "pixel"):

@@ -1,4 +1,4 @@
-"""From what was clicked in a view to the thing that is asked about."""
+"""Resolve a click in a view to the object or place that the user asks about."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ Kind = Literal["truth", "object", "detection", "cluster", "pixel", "point", "cel
 
 @dataclass(frozen=True, slots=True)
 class Pick:
-    """One thing of a frame, or a place in it.
+    """One object of a frame, or a place in it.
 
     Attributes:
-        kind: what it is.
-        row: of the ground truth, the objects, the clusters or the camera's detections.
-        camera: of a detection or pixel.
+        kind: kind of the object or place.
+        row: row in the ground truth, the objects, the clusters or the camera's detections.
+        camera: camera of a detection or pixel.
         place: u, v in pixels, x, y, z in metres of ``Frame.points_frame``, or row, column of the BEV.
     """
 
@@ -38,7 +38,7 @@ class Pick:
 
     @property
     def is_place(self) -> bool:
-        """Whether it is a place, where any number of things may be."""
+        """Whether it is a place. A place may hold any number of objects."""
         return self.kind in ("pixel", "point", "cell")
 
     def __str__(self) -> str:
@@ -48,7 +48,11 @@ class Pick:
 
     @classmethod
     def parse(cls, text: str) -> Self:
-        """Raises UserError where it is none."""
+        """Return the pick of an address such as ``detection/front/3``.
+
+        Raises:
+            UserError: the address is not valid.
+        """
         kind, _, rest = text.partition("/")
         camera, _, what = rest.rpartition("/")
         size = {"pixel": 2, "point": 3, "cell": 2}.get(kind, 1)
@@ -66,14 +70,14 @@ class Pick:
 def pick(
     result: FrameResult, tracks: Tracks | None, path: str, instance: int | None, position: Sequence[float]
 ) -> Pick | None:
-    """What a click in a view is on; None: nothing that could be asked about.
+    """Return the object or place at a click in a view; None: nothing that can be explained.
 
     Args:
-        result: of the frame that is shown.
-        tracks: of the run over the drive in that frame.
+        result: result of the shown frame.
+        tracks: tracks of the whole run in that frame.
         path: entity that was clicked.
-        instance: row of its boxes or points; None: the entity as a whole.
-        position: where: 2 pixels in a view of an image, 3 metres of the fixed frame in one of space.
+        instance: row of the clicked box or point; None: the whole entity.
+        position: 2 pixels in a view of an image, or 3 metres of the fixed frame in a 3D view.
     """
     row, path = -1 if instance is None else instance, entities.boxes_of(path)
     if found := _told(result, path, row):
@@ -87,7 +91,7 @@ def pick(
 
 
 def _told(result: FrameResult, path: str, row: int) -> Pick | None:
-    """An object over an image or the bird's-eye view of which cameras say something."""
+    """Return an object with an opinion of the cameras, drawn over an image or the bird's-eye view."""
     views = [told_from_above(result)] if path.startswith(f"{entities.BEV}/") else []
     views += [
         told_in_image(result, found.camera)
@@ -102,7 +106,7 @@ def _told(result: FrameResult, path: str, row: int) -> Pick | None:
 
 
 def _missed(result: FrameResult, row: int) -> Pick | None:
-    """What our fusion would have made of a detection, where the objects are somebody else's."""
+    """Return the detection of an object of our fusion, where the objects are not ours."""
     if result.opinions is None:
         return None
     fused = result.opinions.fused
@@ -112,6 +116,7 @@ def _missed(result: FrameResult, row: int) -> Pick | None:
 
 
 def _in_image(found: CameraResult, path: str, row: int, position: Sequence[float]) -> Pick | None:
+    """Return a detection or pixel of a camera."""
     name = found.camera.name
     if found.detections is not None and row >= 0:
         kept = found.detections.kept
@@ -128,6 +133,7 @@ def _in_image(found: CameraResult, path: str, row: int, position: Sequence[float
 
 
 def _cell(result: FrameResult, position: Sequence[float]) -> Pick | None:
+    """Return a cell of the bird's-eye view."""
     if result.bev is None:
         return None
     column, row = (int(np.floor(v)) for v in position[:2])
@@ -136,6 +142,7 @@ def _cell(result: FrameResult, position: Sequence[float]) -> Pick | None:
 
 
 def _in_space(result: FrameResult, tracks: Tracks | None, path: str, row: int) -> Pick | None:
+    """Return the object, cluster, track or point that was clicked in a 3D view."""
     frame = result.frame
     if row < 0:
         return None
@@ -159,6 +166,7 @@ def _in_space(result: FrameResult, tracks: Tracks | None, path: str, row: int) -
 
 
 def _track(result: FrameResult, tracks: Tracks, row: int) -> Pick | None:
+    """Return the cluster of a track, or the place where the track is expected."""
     if tracks.cluster[row] >= 0:
         return Pick("cluster", int(tracks.cluster[row]))
     center = tracks.boxes.center[row]
@@ -166,12 +174,13 @@ def _track(result: FrameResult, tracks: Tracks, row: int) -> Pick | None:
 
 
 def _at(result: FrameResult, position: Sequence[float]) -> Pick | None:
-    """A place in the fixed frame."""
+    """Return the place at a position in the fixed frame."""
     if len(position) != 3:
         return None
     return _point(geometry.apply(geometry.inverse(result.frame.pose), np.array([position]))[0])
 
 
 def _point(xyz: np.ndarray[tuple[int], np.dtype[np.floating]]) -> Pick:
+    """Return a point in Frame.points_frame."""
     x, y, z = map(float, xyz)
     return Pick("point", place=(x, y, z))

@@ -1,4 +1,4 @@
-"""Picks as the questions of ``bevviz why``, and answers as picks."""
+"""Convert picks to selections, and answers to picks."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from bevviz.why.pick import Pick
 
 
 def selection(pick: Pick) -> Selection:
-    """What to ask a ``Questioner``."""
+    """Return the selection of a pick for a ``Questioner``."""
     if pick.kind == "truth":
         return Selection(truth=pick.row)
     if pick.kind == "object":
@@ -24,7 +24,10 @@ def selection(pick: Pick) -> Selection:
 
 
 def surroundings(pick: Pick, answer: Answer) -> Selection | None:
-    """What else may be meant by who clicked on a thing: all that is there. None: its place is not known."""
+    """Return a selection of everything around the answered subject; None: its position is unknown.
+
+    A user who clicked on one object may mean another one at the same place.
+    """
     subject = answer.subject
     if pick.kind == "detection" and subject.xyxy is not None:
         u0, v0, u1, v1 = (float(v) for v in subject.xyxy)
@@ -36,7 +39,7 @@ def surroundings(pick: Pick, answer: Answer) -> Selection | None:
 
 
 def pick_of(answer: Answer) -> Pick | None:
-    """That asks about it again; None: it is a place."""
+    """Return the pick that selects the subject of an answer again; None: it is a place."""
     subject = answer.subject
     if subject.kind in ("truth", "object", "cluster", "detection"):
         return Pick(subject.kind, subject.row, subject.camera)

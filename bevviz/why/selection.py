@@ -1,4 +1,4 @@
-"""From what was selected to the subjects that it is of."""
+"""Resolve a selection to the subjects it refers to."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ from bevviz.why.frame_index import FEW, Traces, detection_subject, joined
 from bevviz.why.outcome import OVERLAP
 from bevviz.why.subject import IN_VIEW, LINK, Selection, Subject, one_of, projected
 
-PIXELS = 6.0  # half edge of what is looked at around a pixel
-SPACING = 1.0  # pixels by which the points of what a pixel shows may be farther from it than those of another
-SURFACE = 1.0  # metres behind the nearest return at a pixel that still count as what the pixel shows
-AS_GOOD = 0.8  # of the best fit to a box: what is as good an answer
+PIXELS = 6.0  # pixels, half edge of the box around a selected pixel
+SPACING = 1.0  # pixels; subjects whose points are this much farther from the pixel may still show there
+SURFACE = 1.0  # metres behind the nearest return at a pixel; subjects within it show there, too
+AS_GOOD = 0.8  # share of the best fit to a box from which a subject is as good an answer
 
 
 def select(traces: Traces, selection: Selection) -> list[Subject]:
-    """The subjects of a selection; of a pixel, a box or a point, what lies there and the place itself.
+    """Return the subjects of a selection. A pixel, box, point or cell is a subject itself.
 
     Raises:
-        UserError: unknown class, camera or row, pixel outside the image, several cameras and none named.
+        UserError: unknown class, camera or row, pixel outside the image, or several cameras and none named.
     """
     result = traces.result
     if selection.truth is not None:
@@ -68,23 +68,24 @@ def select(traces: Traces, selection: Selection) -> list[Subject]:
 
 
 def _is_called(subject: Subject, name: str) -> bool:
-    """Whether a name of the detector's stands for the subject, too."""
+    """Return whether a class name of the detector also means the subject."""
     if subject.kind == "object":
         return name in accepted_names(subject.label, ())
     return subject.kind == "truth" and subject.accepts(name)
 
 
 def _row(subjects: tuple[Subject, ...], row: int, what: str) -> Subject:
+    """Return the subject of a row, or raise a UserError."""
     if not 0 <= row < len(subjects):
         raise UserError(f"there is no {what} of number {row}: it has {len(subjects)}")
     return subjects[row]
 
 
 def object_subject(traces: Traces, row: int) -> Subject:
-    """An object that the frame's result has.
+    """Return an object of the frame's result as a subject.
 
     Raises:
-        UserError: it has no such object.
+        UserError: the frame has no such object.
     """
     objects = traces.result.objects
     number = 0 if objects is None else len(objects)
@@ -99,10 +100,10 @@ def object_subject(traces: Traces, row: int) -> Subject:
 
 
 def cluster_subject(traces: Traces, row: int) -> Subject:
-    """A cluster of the frame.
+    """Return a cluster of the frame as a subject.
 
     Raises:
-        UserError: it has no such cluster.
+        UserError: the frame has no such cluster.
     """
     clusters = traces.result.clusters
     number = 0 if clusters is None else len(clusters)
@@ -116,7 +117,7 @@ def cluster_subject(traces: Traces, row: int) -> Subject:
 
 
 def track_subject(traces: Traces, number: int) -> Subject:
-    """A track that lives: the cluster that it has in this frame, or where it is expected.
+    """Return a live track as a subject: its cluster in this frame, or its expected position.
 
     Raises:
         UserError: no track has that id, or the frame was run by itself.
@@ -139,7 +140,7 @@ def track_subject(traces: Traces, number: int) -> Subject:
 
 
 def _around(traces: Traces, selection: Selection) -> Subject:
-    """All around a point, or over a cell of the bird's-eye view and what is around that."""
+    """Return the surroundings of a point or of a cell of the bird's-eye view as a subject."""
     edge = 2 * selection.radius
     if selection.point:
         center, size = selection.point, (edge, edge, edge)
@@ -155,7 +156,7 @@ def _around(traces: Traces, selection: Selection) -> Subject:
 
 
 def _of_cell(config: BevConfig, row: int, column: int) -> tuple[float, float]:
-    """Middle of a cell, in metres of the points' frame."""
+    """Return the x, y of the middle of a cell, in metres of the points' frame."""
     rows, columns = (round(2 * reach / config.resolution) for reach in (config.range_x, config.range_y))
     if not (0 <= row < rows and 0 <= column < columns):
         raise UserError(
@@ -167,6 +168,7 @@ def _of_cell(config: BevConfig, row: int, column: int) -> tuple[float, float]:
 
 
 def _pixel(traces: Traces, selection: Selection) -> Subject:
+    """Return a pixel or image box as a subject."""
     found = camera_of(traces, selection.camera)
     wanted = _wanted(found, selection)
     u, v = (wanted[:2] + wanted[2:]) / 2
@@ -174,7 +176,7 @@ def _pixel(traces: Traces, selection: Selection) -> Subject:
 
 
 def _wanted(found: CameraResult, selection: Selection) -> F32:
-    """(4,) what of the image is asked about: the box, or what is around the pixel."""
+    """Return the (4,) image box in question: the selected box, or the surroundings of the pixel."""
     size = found.camera.intrinsics or _image_size(found)
     if size is None:
         raise UserError(f"--box: {found.camera.name} has no image in this frame")
@@ -189,6 +191,7 @@ def _wanted(found: CameraResult, selection: Selection) -> F32:
 
 
 def _image_size(found: CameraResult) -> Intrinsics | None:
+    """Return the size of the camera's image as intrinsics; None without an image."""
     if found.camera.image is None:
         return None
     height, width = found.camera.image.bgr.shape[:2]
@@ -196,10 +199,10 @@ def _image_size(found: CameraResult) -> Intrinsics | None:
 
 
 def camera_of(traces: Traces, name: str) -> CameraResult:
-    """The camera of that name; empty: the only one.
+    """Return the camera of that name. An empty name means the only camera.
 
     Raises:
-        UserError: there is none, or there are several and none is named.
+        UserError: there is no such camera, or there are several and none is named.
     """
     cameras = traces.result.cameras
     names = [c.camera.name for c in cameras]
@@ -213,7 +216,7 @@ def camera_of(traces: Traces, name: str) -> CameraResult:
 
 
 def _seen(traces: Traces, camera: str) -> Iterator[Subject]:
-    """Objects of the truth that a camera has in view; where no camera has a place, all of them."""
+    """Yield the objects of the ground truth that a camera has in view. Without camera poses, yield all."""
     usable = [
         column
         for column, c in enumerate(traces.result.cameras)
@@ -227,7 +230,7 @@ def _seen(traces: Traces, camera: str) -> Iterator[Subject]:
 
 
 def _strange_detections(traces: Traces, camera: str) -> Iterator[Subject]:
-    """Detections that are of no object of the ground truth. Duplicates speak through what suppressed them."""
+    """Yield the detections of no object of the ground truth, without duplicates that NMS suppressed."""
     for found in traces.result.cameras:
         detections = found.detections
         if detections is None or camera not in ("", found.camera.name):
@@ -238,7 +241,7 @@ def _strange_detections(traces: Traces, camera: str) -> Iterator[Subject]:
 
 
 def _denied(traces: Traces, camera: str) -> Iterator[Subject]:
-    """Objects of somebody else's that a camera contradicts; what is of the ground truth speaks for itself."""
+    """Yield the objects that are not ours, not in the ground truth, and contradicted by a camera."""
     opinions, objects = traces.result.opinions, traces.result.objects
     if opinions is None or objects is None:
         return
@@ -249,13 +252,14 @@ def _denied(traces: Traces, camera: str) -> Iterator[Subject]:
             yield object_subject(traces, row)
 
 
-# --- what lies at a place ----------------------------------------------------------------------
+# --- subjects at a place -----------------------------------------------------------------------
 
 
 def at_place(traces: Traces, selection: Selection) -> list[tuple[Subject, bool]]:
-    """Things at a pixel, in an image box or around a point, each once, and whether each is what shows there.
+    """Return the subjects at a pixel, in an image box or around a point, and whether each is visible there.
 
-    An object of the truth stands for its detections and clusters, a detection for the cluster that it named.
+    An object of the ground truth includes its detections and clusters. A detection includes the cluster that
+    it named.
 
     Raises:
         UserError: as ``select``.
@@ -265,6 +269,7 @@ def at_place(traces: Traces, selection: Selection) -> list[tuple[Subject, bool]]
 
 
 def _in_space(traces: Traces, selection: Selection) -> Iterator[tuple[Subject, bool]]:
+    """Yield the subjects around a point or in a cell."""
     place = _around(traces, selection)
     points = traces.place(place)
     assert place.box is not None
@@ -285,10 +290,11 @@ def _in_space(traces: Traces, selection: Selection) -> Iterator[tuple[Subject, b
 
 
 def _in_image(traces: Traces, selection: Selection) -> Iterator[tuple[Subject, bool]]:
+    """Yield the subjects at a pixel or in an image box."""
     found = camera_of(traces, selection.camera)
     wanted = _wanted(found, selection)
     pixel = len(selection.box) == 2
-    things: list[tuple[Subject, float]] = []  # with how well each fits
+    things: list[tuple[Subject, float]] = []  # with their fit
     covered: set[int] = set()
     for subject, fit in _truth_there(traces, found, wanted, pixel):
         covered.update(_clusters_of(traces, traces.place(subject)))
@@ -313,9 +319,9 @@ def _in_image(traces: Traces, selection: Selection) -> Iterator[tuple[Subject, b
 def _before_the_rest(
     traces: Traces, found: CameraResult, things: Sequence[Subject], wanted: F32
 ) -> Iterator[tuple[Subject, bool]]:
-    """Which of the things at a pixel it shows: of those whose points are nearest to it, the nearest.
+    """Yield the subjects at a pixel, and whether each is the nearest with points there.
 
-    A scan is sparse in an image, and of several things each has points around a pixel.
+    A scan is sparse in an image, so several subjects may have points around a pixel.
     """
     if not things:
         return
@@ -330,7 +336,7 @@ def _before_the_rest(
 
 
 def _nearest(traces: Traces, found: CameraResult, rows: I64, wanted: F32) -> tuple[float, float]:
-    """Pixels from the middle of what is asked about to the nearest of these points, and its depth."""
+    """Return the pixels from the middle of the selected box to the nearest of these points, and its depth."""
     view = found.camera
     away = np.linalg.norm(traces.uv(found)[rows] - (wanted[:2] + wanted[2:]) / 2, axis=1)
     away = np.where(np.isfinite(away), away, np.inf)
@@ -342,7 +348,7 @@ def _nearest(traces: Traces, found: CameraResult, rows: I64, wanted: F32) -> tup
 
 
 def _own(traces: Traces, found: CameraResult, subject: Subject) -> I64:
-    """Rows of the raw points that are the subject's; of a detection, those of the cluster that it named."""
+    """Return the rows of the subject's raw points. A detection has those of the cluster that it named."""
     fusion, row = found.fusion, subject.row
     if subject.kind != "detection" or fusion is None or fusion.detection_decision[row] != Decision.MATCHED:
         return traces.place(subject)
@@ -350,13 +356,14 @@ def _own(traces: Traces, found: CameraResult, subject: Subject) -> I64:
 
 
 def _clusters_of(traces: Traces, points: I64) -> list[int]:
-    """Clusters of some of an object's points that are mostly of it, or of it and other objects."""
+    """Return the clusters of an object's points that lie mostly on objects of the ground truth."""
     return [k for k in np.unique(traces.cluster[points]).tolist() if k >= 0 and traces.of_truth[k]]
 
 
 def _truth_there(
     traces: Traces, found: CameraResult, wanted: F32, pixel: bool
 ) -> Iterator[tuple[Subject, float]]:
+    """Yield the objects of the ground truth at the selected box, with their fit."""
     column = [c.camera.name for c in traces.result.cameras].index(found.camera.name)
     for subject in traces.truth:
         if traces.shown[subject.row, column] <= 0 or subject.box is None:
@@ -375,6 +382,7 @@ def _truth_there(
 
 
 def _detections_there(found: CameraResult, wanted: F32, pixel: bool) -> Iterator[tuple[int, float]]:
+    """Yield the rows of the detections at the selected box, with their fit."""
     detections = found.detections
     if detections is None:
         return
@@ -387,6 +395,7 @@ def _detections_there(found: CameraResult, wanted: F32, pixel: bool) -> Iterator
 def _clusters_there(
     traces: Traces, found: CameraResult, wanted: F32, pixel: bool
 ) -> Iterator[tuple[int, float]]:
+    """Yield the clusters at the selected box, with their fit."""
     clusters = traces.result.clusters
     if clusters is None:
         return
@@ -404,7 +413,7 @@ def _clusters_there(
 
 
 def _fit(wanted: F32, box: F32, pixel: bool) -> float:
-    """IoU, 0 where it is too little to be meant; of a pixel, 1 in the box."""
+    """Return the IoU of two boxes, 0 if it is too low. For a pixel, return 1 inside the box."""
     if pixel:
         u, v = (wanted[:2] + wanted[2:]) / 2
         return float(box[0] <= u <= box[2] and box[1] <= v <= box[3])

@@ -1,4 +1,4 @@
-"""The sentence that says why, with the number it hung on and whose stage it was."""
+"""The sentence of a verdict, with the number that decided and the stage that it belongs to."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from bevviz.why.stage_owner import StageOrigin
 from bevviz.why.subject import Subject, count
 from bevviz.why.verdict import Reason, Verdict, cameras_of, name_of, pair_reason
 
-_ONLY = ("nothing", "only ground", "mostly ground")  # that there is at a place where no object is
+_ONLY = ("nothing", "only ground", "mostly ground")  # at a place without an object
 
 
 def verdict_of(subject: Subject, reason: Reason, reported: bool, e: Evidence, traces: Traces) -> Verdict:
-    """The reason in one sentence."""
+    """Return the verdict with its reason in one sentence."""
     because = Because(subject, e, traces).of(reason)
     head = subject.name[0].upper() + subject.name[1:]
     if reason is Reason.REPORTED:
@@ -33,16 +33,17 @@ def verdict_of(subject: Subject, reason: Reason, reported: bool, e: Evidence, tr
 
 
 def label(candidate: Candidate) -> str:
+    """Return the class and score of a detection."""
     return f"{candidate.name} {candidate.score:.2f}"
 
 
 class Because:
-    """What follows after the word.
+    """Words that follow "because" in a verdict.
 
     Args:
-        subject: what was asked about.
-        e: what is known of it.
-        traces: the frame's results.
+        subject: the object or place in question.
+        e: the evidence about it.
+        traces: the index of the frame.
     """
 
     def __init__(self, subject: Subject, e: Evidence, traces: Traces) -> None:
@@ -51,7 +52,7 @@ class Because:
         self.config: Config = traces.result.config
 
     def of(self, reason: Reason) -> str:
-        """For a reason."""
+        """Return the words for a reason."""
         said = {
             Reason.REPORTED: self._reported,
             Reason.SHARED_BOX: self._shared_box,
@@ -86,21 +87,24 @@ class Because:
         return said[reason]()
 
     def _origin(self, section: str) -> StageOrigin:
+        """Return the owner of the stage of a section."""
         return self.traces.origin(section)
 
     def _whose(self, section: str, ours: str) -> str:
-        """In brackets: our parameter, or whose stage it was."""
+        """Return our parameter in brackets, or the name of the stage that is not ours."""
         there = self._origin(section)
         return f"({ours})" if there.ours else f"(by {there.name})"
 
     @property
     def _best(self) -> Candidate:
+        """The best detection of the subject, which must exist."""
         assert self.e.best is not None
         return self.e.best
 
     # --- reported ------------------------------------------------------------------------------
 
     def _with(self) -> str:
+        """Name the object of the subject and its cluster."""
         named = self.e.named
         assert named is not None
         objects = self._origin("objects")
@@ -124,7 +128,7 @@ class Because:
         return f"{text} by {named.name} {score:.2f}{self._split_off(named.cluster)}"
 
     def _split_off(self, cluster: int) -> str:
-        """Where a cluster's points were taken from."""
+        """Name the cluster that the points of a cluster were split from."""
         splits, texts = self.result.splits, []
         if splits is None:
             return ""
@@ -134,10 +138,12 @@ class Because:
         return "".join(texts)
 
     def _also(self) -> str:
+        """Name the other clusters of the same detection."""
         assert self.e.named is not None
         return " and ".join(f"cluster {k}" for k in self.e.named.also)
 
     def _method(self) -> str:
+        """Name the fusion method."""
         return f"fusion.method is {self.config.fusion.method}: each cluster takes the nearest box"
 
     def _shared_box(self) -> str:
@@ -153,7 +159,7 @@ class Because:
         return f"{self._with()} by {named.name}{score}, {self._whose_box(named.camera, named.detection)}"
 
     def _whose_box(self, camera: str, detection: int) -> str:
-        """Which object of the truth a detection is of."""
+        """Name the object of the ground truth that a detection belongs to."""
         found = self.traces.camera(camera)
         owner = -1 if found is None else int(self.traces.owners(found)[detection])
         if owner < 0 or owner == self.subject.row:
@@ -315,11 +321,11 @@ class Because:
 
     @property
     def _cluster(self) -> int:
-        """The cluster that its detection was to name."""
+        """Cluster that the detection should have named."""
         return self._best.cluster if self.subject.kind == "detection" else self.e.main
 
     def _pair_text(self, row: int, camera: str, cluster: int) -> str:
-        """The numbers that the fusion's rule looked at."""
+        """Return the numbers that the rule of the fusion compared."""
         _, fusion = fusion_of(self.result, camera)
         if fusion is None:
             return "not compared"
@@ -332,6 +338,7 @@ class Because:
         return in_frustum + in_mask(fusion, row, self.config)
 
     def _pair(self) -> str:
+        """Return the numbers of the best detection and its cluster."""
         return self._pair_text(self._best.row, self._best.camera, self._cluster)
 
     def _misfit(self) -> str:
@@ -386,7 +393,7 @@ class Because:
         return text + (self._fused() or ", ".join(self._beside()))
 
     def _fused(self) -> str:
-        """What our fusion would have made of it; empty: nothing."""
+        """Name the object that our fusion would make of it; empty: none."""
         j, opinions, clusters = (
             find_fused(self.subject, self.e, self.traces),
             self.result.opinions,
@@ -402,7 +409,7 @@ class Because:
         return text if row < 0 or objects is None else f"{text}, {in_box_of(objects, row)}"
 
     def _beside(self) -> Iterator[str]:
-        """What the stages beside it have at the place."""
+        """Yield the results of the other stages at the place."""
         e, best = self.e, self.e.best
         if e.main >= 0:
             yield f"cluster {e.main} is there"
@@ -421,7 +428,7 @@ class Because:
         return f"the robot's fusion lost it: {there}, but no object of {objects}; ours {self._ours(cluster)}"
 
     def _ours(self, cluster: int) -> str:
-        """What our fusion would have said of a detection and a cluster."""
+        """Say how our fusion would decide about a detection and a cluster."""
         best = self._best
         _, fusion = fusion_of(self.result, best.camera)
         pair = self._pair_text(best.row, best.camera, cluster)
@@ -439,11 +446,12 @@ class Because:
 
 
 def detector_known(result: FrameResult) -> bool:
+    """Return whether a camera has detections."""
     return any(camera.detections is not None for camera in result.cameras)
 
 
 def not_run(result: FrameResult, only: str = "") -> Iterator[str]:
-    """Why the detector has not looked at each camera's image."""
+    """Yield the reason why the detector did not run on each camera's image."""
     failed = "; ".join(f.reason for f in result.failures if f.stage == "detector")
     cameras = [c for c in result.cameras if c.detections is None and only in ("", c.camera.name)]
     if not result.cameras:
@@ -460,7 +468,7 @@ def not_run(result: FrameResult, only: str = "") -> Iterator[str]:
 
 
 def in_front(e: Evidence, result: FrameResult) -> str:
-    """What ends before the subject."""
+    """Count the returns that end before the subject."""
     what = ""
     if e.front >= 0:
         name = name_of(result, e.front)
@@ -469,10 +477,11 @@ def in_front(e: Evidence, result: FrameResult) -> str:
 
 
 def height_of(e: Evidence) -> float:
-    """Of the highest of what was removed as ground."""
+    """Return the height in metres of the highest voxel that was removed as ground."""
     known = e.ground[np.isfinite(e.ground)]
     return float(known.max(initial=0))
 
 
 def state_text(state: ClusterState | Decision) -> str:
+    """Return a state in lower case words."""
     return state.name.lower().replace("_", " ")

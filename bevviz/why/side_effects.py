@@ -1,4 +1,4 @@
-"""What another configuration changes in a frame beside what it was tried for."""
+"""Effects of another configuration on the other objects of a frame."""
 
 from __future__ import annotations
 
@@ -17,13 +17,14 @@ from bevviz.why.subject import Subject, count
 
 @dataclass(frozen=True, slots=True)
 class Effect:
-    """One object that two results of a frame do not both have; -1 where a row is not known.
+    """One object that only one of two results of a frame has; -1: unknown row.
 
     Attributes:
         name: class and distance.
-        truth: row of the ground truth that it is; -1: none, or there is none.
-        before, after: row of the object in that result.
-        missed: it was right, and nothing else stands for it now.
+        truth: its row in the ground truth; -1: none, or there is no ground truth.
+        before: row of the object in the first result.
+        after: row of the object in the second result.
+        missed: whether it was right and the second result has no object for it.
     """
 
     name: str
@@ -38,10 +39,10 @@ class Effects:
     """Objects that differ between two results of one frame.
 
     Attributes:
-        made: that were missing and are there now: of the ground truth, or what it was tried for.
-        more: further ones that are there now; those that are no object of the truth have no row of it.
-        gone: that are not there any more.
-        changed: others that have moved or have another class.
+        made: objects of the ground truth, and the subject in question, that are new in the second result.
+        more: other new objects. Those not in the ground truth have row -1.
+        gone: objects that the second result lacks.
+        changed: number of other objects that have moved or have another class.
         known: whether there is a ground truth.
     """
 
@@ -53,41 +54,43 @@ class Effects:
 
     @property
     def fixed(self) -> tuple[str, ...]:
-        """In words, what was asked about first."""
+        """Names of the objects made, the subject in question first."""
         return tuple(effect.name for effect in self.made)
 
     @property
     def added(self) -> tuple[str, ...]:
+        """Names of the other new objects."""
         return tuple(effect.name for effect in self.more)
 
     @property
     def false(self) -> tuple[str, ...]:
-        """Those of the added that are none, as the truth says."""
+        """Names of the added objects that are not in the ground truth."""
         return tuple(effect.name for effect in self.more if self.known and effect.truth < 0)
 
     @property
     def lost(self) -> tuple[str, ...]:
+        """Names of the objects that are gone."""
         return tuple(effect.name for effect in self.gone)
 
     @property
     def right(self) -> tuple[str, ...]:
-        """Those of the lost that were right."""
+        """Names of the lost objects that were right."""
         return tuple(effect.name for effect in self.gone if effect.missed)
 
     @property
     def good(self) -> int:
-        """How many objects it makes better: found, or no longer invented."""
+        """Number of objects that get better: new right ones, and false ones that are gone."""
         invented = sum(effect.truth < 0 for effect in self.gone) if self.known else 0
         return len(self.made) + invented
 
     @property
     def harm(self) -> int:
-        """How many objects it makes worse; without a ground truth, how many come or go."""
+        """Number of objects that get worse, 0 without a ground truth."""
         return len(self.false) + len(self.right)
 
     @property
     def text(self) -> str:
-        """In brief."""
+        """All effects in brief."""
         said = [f"fixes {' and '.join(self.fixed)}"] if self.fixed else []
         said += [f"adds {name}" + (" (false)" if name in self.false else "") for name in self.added]
         said += [f"loses {name}" + (" (right)" if name in self.right else "") for name in self.lost]
@@ -102,13 +105,14 @@ def effects(
     asked: int = -1,
     own: int = -1,
 ) -> Effects:
-    """How the objects of two results of the same frame differ.
+    """Compare the objects of two results of the same frame.
 
     Args:
-        before, after: the objects.
-        truth: what is really there; empty: not known.
-        asked: row of the truth that it was tried for, -1: it is none of it.
-        own: row of the object after it that the subject is, -1: not known.
+        before: objects of the first result.
+        after: objects of the second result.
+        truth: objects of the ground truth; empty: unknown.
+        asked: row of the ground truth object in question, -1: none.
+        own: row in ``after`` of the object in question, -1: unknown.
     """
     a, b = _seen(before), _seen(after)
     was, now = _truth_of(before, truth), _truth_of(after, truth)
@@ -143,17 +147,22 @@ def effects(
 
 
 def _seen(objects: Objects | None) -> Seen:
+    """Return objects in the form that the comparison needs."""
     if objects is None:
         return Seen(Boxes3D.empty(), (), np.zeros(0, np.float32))
     return Seen(objects.boxes, objects.names, objects.score)
 
 
 def _name(name: str, boxes: Boxes3D, row: int) -> str:
+    """Return the class and distance of an object."""
     return f"{name} at {float(np.hypot(*boxes.center[row, :2])):.1f} m"
 
 
 def _truth_of(objects: Objects | None, subjects: Sequence[Subject]) -> list[int]:
-    """Row of the truth that each object is, -1: none. One for one, best score first, as in ``evaluate``."""
+    """Return the ground truth row of each object, -1: none.
+
+    The pairs are one to one, the best score first, as in ``evaluate``.
+    """
     if objects is None:
         return []
     found = [-1] * len(objects)

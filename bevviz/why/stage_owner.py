@@ -1,4 +1,4 @@
-"""Whose each stage is: bevviz's own, somebody's function, or the robot's topic."""
+"""Owner of each stage: bevviz, a user's function, or a topic of the robot."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from bevviz.errors import UserError
 
 @dataclass(frozen=True, slots=True)
 class StageOrigin:
-    """Of one stage.
+    """The owner of one stage.
 
     Attributes:
-        section: of the configuration.
-        function: ``module:name`` of somebody's function; empty: it is none.
-        topic: of the robot; empty: it is not the robot's.
+        section: section of the configuration.
+        function: ``module:name`` of the user's function; empty: none.
+        topic: topic of the robot; empty: none.
     """
 
     section: str
@@ -26,23 +26,24 @@ class StageOrigin:
 
     @property
     def ours(self) -> bool:
+        """Whether the stage is part of bevviz."""
         return not self.function and not self.topic
 
     @property
     def name(self) -> str:
-        """For a sentence about what it made; empty for ours, whose parameters are named instead."""
+        """Name of the function or topic for sentences, empty for our stages."""
         return self.function or self.topic
 
 
 def origin(config: Config, section: str) -> StageOrigin:
-    """Whose the stage of a section is."""
+    """Return the owner of the stage of a section."""
     method = str(getattr(getattr(config, section), STAGES[section]))
     if method.startswith(TOPIC):
         return StageOrigin(section, topic=method.removeprefix(TOPIC))
     try:
         plugin = plugin_of(config, section)
-    except UserError:  # it could be had when the frame was run
+    except UserError:  # The function could be loaded when the frame was run.
         return StageOrigin(section, function=method)
     if plugin is None and section == "objects" and method not in OURS:
-        return StageOrigin(section, function=Path(method).name)  # a network's file
+        return StageOrigin(section, function=Path(method).name)  # file of a network
     return StageOrigin(section, function=plugin.name if plugin is not None else "")

@@ -1,4 +1,4 @@
-"""What is asked about: an object, of the ground truth or not, a detection, a cluster, a pixel, a place."""
+"""Subjects of a question: an object, a ground truth object, a detection, a cluster, a pixel or a place."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ from bevviz.model.class_names import CATEGORIES, accepted_names
 from bevviz.model.frame import F32, I64, Bool, Boxes3D, Camera
 from bevviz.stages.visibility import image_boxes
 
-LINK = 0.3  # IoU from which a box is taken for one of a projected object
-IN_VIEW = 0.1  # share of a box that is inside the image, if it is in view
-MARGIN = 0.02  # metres around a box of the ground truth that are still its own: noise of the sensor
-FOOT = 0.03  # metres above its bottom that are the road's: noise of the sensor, too
+LINK = 0.3  # IoU from which an image box belongs to a projected object
+IN_VIEW = 0.1  # least share of a box inside the image for an object in view
+MARGIN = 0.02  # metres around a ground truth box that still belong to it, because of sensor noise
+FOOT = 0.03  # metres above the bottom of a box that belong to the road, because of sensor noise
 
 Kind = Literal["truth", "object", "detection", "cluster", "track", "pixel", "point", "cell"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Selection:
-    """What to explain. Nothing given: the whole frame.
+    """The user's question. An empty selection means the whole frame.
 
     The rows are those of ``Frame.truth``, of ``FrameResult.objects`` and ``clusters``, and of the detections
     of ``camera``.
@@ -31,35 +31,35 @@ class Selection:
     box: tuple[float, ...] = ()  # u, v or u0, v0, u1, v1 in pixels
     point: tuple[float, ...] = ()  # x, y, z in Frame.points_frame
     cell: tuple[int, ...] = ()  # row, column of the bird's-eye view
-    radius: float = 0.5  # metres around that point or cell
-    camera: str = ""  # name, where there are several
+    radius: float = 0.5  # metres around the point or cell
+    camera: str = ""  # name; required if there are several
     truth: int | None = None
     object: int | None = None
     detection: int | None = None
     cluster: int | None = None
-    track: int | None = None  # its id
+    track: int | None = None  # id
 
     @property
     def one(self) -> bool:
-        """Whether it is of one thing, rather than of all of a kind."""
+        """Whether it selects one subject or place. Else it selects a whole class or frame."""
         rows = self.truth, self.object, self.detection, self.cluster, self.track
         return bool(self.box or self.point or self.cell) or any(row is not None for row in rows)
 
 
 @dataclass(frozen=True, slots=True)
 class Subject:
-    """One thing, and where it is looked for.
+    """One object or place to explain.
 
     Attributes:
-        kind: what it is.
-        name: in words.
-        label: class name; empty where none is known.
-        accepted: names that are right for it, in lower case; empty: any.
-        row: of the ground truth, the objects, the clusters or the camera's detections, else -1.
-        camera: that it is a detection or pixel of.
+        kind: kind of the subject.
+        name: name in sentences.
+        label: class name; empty where unknown.
+        accepted: right class names for it in lower case; empty: any.
+        row: row in the ground truth, the objects, the clusters or the camera's detections, else -1.
+        camera: camera of a detection or pixel.
         xyxy: (4,) image box of a detection or pixel.
-        box: its 3D box in Frame.points_frame; of a point, the cube around the sphere.
-        points: rows of Frame.points that are its own, where no box says which: of a cluster.
+        box: 3D box in Frame.points_frame; for a point, the cube around the sphere.
+        points: rows of Frame.points of a subject such as a cluster; None: the box or frustum selects them.
     """
 
     kind: Kind
@@ -74,7 +74,7 @@ class Subject:
 
     @property
     def key(self) -> tuple[object, ...]:
-        """Which one it is: two lists of the same frame's subjects name it alike."""
+        """Identity of the subject within a frame, the same in any list of subjects."""
         if self.xyxy is not None and self.kind == "pixel":
             return self.kind, self.camera, *self.xyxy.tolist()
         if self.box is not None and self.kind in ("point", "cell"):
@@ -83,20 +83,20 @@ class Subject:
 
     @property
     def is_place(self) -> bool:
-        """Whether nothing is known of it but where it is."""
+        """Whether only its position is known."""
         return self.kind in ("pixel", "point", "cell")
 
     def accepts(self, name: str) -> bool:
-        """Whether a detection or an object of that class is a right one."""
+        """Return whether the class of a detection or object is right for the subject."""
         return not self.accepted or name.lower() in self.accepted
 
     def accepts_of_others(self, name: str) -> bool:
-        """Whether an object of somebody else's, who need not have the detector's names, is a right one."""
+        """Return whether the class of an object that is not ours is right. It may have other class names."""
         return self.accepts(name) or CATEGORIES.get(name, name).lower() in accepted_names(self.label, ())
 
 
 def count(number: int, what: str) -> str:
-    """In words: no points, 1 point, 2 points."""
+    """Return a number with its noun: no points, 1 point, 2 points."""
     return f"{number} {what}" if number == 1 else f"{number or 'no'} {what}s"
 
 
@@ -104,12 +104,12 @@ def count(number: int, what: str) -> str:
 
 
 def one_of(boxes: Boxes3D, row: int) -> Boxes3D:
-    """One box of several."""
+    """Return one box of several."""
     return Boxes3D(boxes.center[[row]], boxes.size[[row]], boxes.yaw[[row]])
 
 
 def in_box(box: Boxes3D, points: F32, margin: float = 0.0, foot: float = 0.0) -> Bool:
-    """(N,) which points are in the one upright box, but for what is below it or near its bottom."""
+    """Return (N,) which points are in one upright box, except near or below its bottom."""
     x, y, z = (points - box.center[0]).T
     c, s = np.cos(box.yaw[0]), np.sin(box.yaw[0])
     half = box.size[0] / 2 + np.float32(margin)
@@ -118,6 +118,6 @@ def in_box(box: Boxes3D, points: F32, margin: float = 0.0, foot: float = 0.0) ->
 
 
 def projected(box: Boxes3D, camera: Camera) -> F32 | None:
-    """(4,) image box around what of a 3D box is before the camera, cut at the image's edge; None: nothing."""
+    """Return the (4,) image box of a 3D box, cut at the image's edge; None: it is out of view."""
     found = image_boxes(box, camera)[0]
     return found if np.isfinite(found).all() else None

@@ -1,4 +1,4 @@
-"""Which of the stages decided."""
+"""Reason why a subject was reported or lost."""
 
 from __future__ import annotations
 
@@ -21,12 +21,14 @@ from bevviz.why.frame_index import FEW, PART, Traces
 from bevviz.why.outcome import find_fused
 from bevviz.why.subject import Subject
 
-WHOLE = 0.7  # share of an object's clustered points that its named cluster has at least, if it is whole
+WHOLE = 0.7  # least share of an object's clustered points in its named cluster; with less, it is split
 
 
 class Reason(StrEnum):
+    """The stage or rule that decided about a subject."""
+
     REPORTED = "reported"
-    SHARED_BOX = "shared box"  # reported, but its box names other clusters, too
+    SHARED_BOX = "shared box"  # reported, but its box also names other clusters
     BORROWED = "borrowed name"  # named by a detection that is not its own
     SPLIT = "split"
     MERGED = "merged"
@@ -37,7 +39,7 @@ class Reason(StrEnum):
     NO_POINTS = "no points"
     GROUND = "ground"
     NOISE = "noise"
-    NO_CLUSTER = "no cluster"  # of somebody's function or the robot's: why is not known
+    NO_CLUSTER = "no cluster"  # of a user's function or the robot; the cause is unknown
     TOO_SMALL = "too small"
     TOO_LARGE = "too large"
     NOT_RUN = "detector not run"
@@ -51,9 +53,9 @@ class Reason(StrEnum):
     TAKEN = "taken"
     MISFIT = "misfit"
     OTHER_CLUSTER = "other cluster"
-    CONTRADICTED = "contradicted"  # reported by somebody else's method, and a camera sees nothing there
-    NOT_AMONG = "not among the objects"  # of a 3D detector, or the robot's whose stages are not known
-    LOST_IN_FUSION = "lost in the fusion"  # the robot's, which had a cluster and a detection
+    CONTRADICTED = "contradicted"  # reported by a stage that is not ours, and a camera sees nothing there
+    NOT_AMONG = "not among the objects"  # of a 3D detector, or of a robot whose stages are unknown
+    LOST_IN_FUSION = "lost in the fusion"  # in the robot's fusion, although it had a cluster and a detection
 
 
 FLAWED = {Reason.SHARED_BOX, Reason.MERGED, Reason.SPLIT}
@@ -71,7 +73,10 @@ _REFUSED = {
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """``reported``: it ended as an object of a right class, whatever else is wrong with it."""
+    """Reason and sentence about a subject.
+
+    ``reported`` means that it became an object of a right class, even if the object has other faults.
+    """
 
     reason: Reason
     reported: bool
@@ -79,11 +84,11 @@ class Verdict:
 
 
 def find_reason(subject: Subject, e: Evidence, traces: Traces) -> tuple[Reason, bool]:
-    """The first stage at which the subject was lost, or what is wrong with how it was reported.
+    """Find the first stage that lost the subject, or the fault of its reported object.
 
     Returns:
-        reason: that stage.
-        reported: whether it is an object of a right class all the same.
+        reason: that stage or fault.
+        reported: whether it still is an object of a right class.
     """
     if not traces.result.frame.lidar:
         return _seen(subject, e, traces)
@@ -103,7 +108,7 @@ def find_reason(subject: Subject, e: Evidence, traces: Traces) -> tuple[Reason, 
 
 
 def _seen(subject: Subject, e: Evidence, traces: Traces) -> tuple[Reason, bool]:
-    """By cameras alone: what the detector keeps is reported."""
+    """Return the reason with cameras alone, where a kept detection is reported."""
     best = e.best
     if not detector_ran(traces.result, subject.camera):
         return Reason.NOT_RUN, False
@@ -113,6 +118,7 @@ def _seen(subject: Subject, e: Evidence, traces: Traces) -> tuple[Reason, bool]:
 
 
 def _flaw(subject: Subject, e: Evidence, named: Named, traces: Traces) -> Reason:
+    """Return the fault of a reported object, REPORTED without a fault."""
     opinions = traces.result.opinions
     if opinions is not None and subject.kind == "object":
         denied = opinions.opinion[named.row] == Opinion.CONTRADICTED
@@ -132,7 +138,7 @@ def _flaw(subject: Subject, e: Evidence, named: Named, traces: Traces) -> Reason
 
 
 def _loss(subject: Subject, e: Evidence, traces: Traces) -> Reason:
-    """Of what our own fusion was to name."""
+    """Return the reason why our fusion reported no object."""
     if subject.kind == "detection":
         return _loss_of_detection(e, traces)
     if not subject.is_place and not e.in_view:
@@ -156,11 +162,12 @@ def _loss(subject: Subject, e: Evidence, traces: Traces) -> Reason:
 
 
 def _without_points(e: Evidence) -> Reason:
+    """Return the reason for a subject without points."""
     return Reason.HIDDEN if e.in_front > MOST * e.aimed else Reason.NO_POINTS
 
 
 def _unclustered(e: Evidence, traces: Traces) -> Reason:
-    """Of what has points but no usable cluster: what took most of them."""
+    """Return the reason for a subject with points but no kept cluster: the stage that took most of them."""
     aside = next((part for part in e.parts if not part.kept), None)
     if aside is not None and aside.points >= max(e.noise, len(e.ground)):
         return Reason.TOO_SMALL if aside.state == ClusterState.TOO_SMALL else Reason.TOO_LARGE
@@ -170,24 +177,27 @@ def _unclustered(e: Evidence, traces: Traces) -> Reason:
 
 
 def cameras_of(result: FrameResult, camera: str) -> list[CameraResult]:
-    """The one of that name; empty: all."""
+    """Return the camera of that name. An empty name means all cameras."""
     return [c for c in result.cameras if camera in ("", c.camera.name)]
 
 
 def detector_ran(result: FrameResult, camera: str) -> bool:
-    """Whether the detector has looked at an image: of the camera, or of any."""
+    """Return whether the detector ran on an image of the camera, or of any camera."""
     return any(c.detections is not None for c in cameras_of(result, camera))
 
 
 def _weakness(best: Candidate, traces: Traces) -> Reason:
-    """What was suppressed but is below the threshold anyway has nothing to blame a rival for."""
+    """Return the reason for a detection that was not kept.
+
+    If a suppressed detection is below the threshold anyway, the threshold is the reason.
+    """
     least = traces.result.config.detector.conf_threshold
     strong = best.state == DetectionState.SUPPRESSED and best.score >= least
     return Reason.SUPPRESSED if strong else Reason.BELOW_THRESHOLD
 
 
 def _refusal(subject: Subject, e: Evidence, best: Candidate, traces: Traces) -> Reason:
-    """Of what has a cluster and a detection: what kept the two apart."""
+    """Return the reason why a cluster and a detection were not matched."""
     _, fusion = fusion_of(traces.result, best.camera)
     if fusion is None:
         return Reason.NOT_FUSED
@@ -203,7 +213,7 @@ def _refusal(subject: Subject, e: Evidence, best: Candidate, traces: Traces) -> 
 
 
 def _taken_by_mate(e: Evidence, fusion: Fusion, camera: str, traces: Traces) -> bool:
-    """Whether the subject's cluster has the name of another object that is in it as well."""
+    """Return whether another object in the subject's cluster named the cluster."""
     if fusion.cluster_decision[e.main] != Decision.MATCHED:
         return False
     found, _ = fusion_of(traces.result, camera)
@@ -211,7 +221,7 @@ def _taken_by_mate(e: Evidence, fusion: Fusion, camera: str, traces: Traces) -> 
 
 
 def _fragment(e: Evidence, inside: int, traces: Traces) -> Reason | None:
-    """What took the most of an object of which less than half is in its cluster."""
+    """Return the stage that took most of an object, None if its cluster holds at least half of it."""
     if inside >= MOST * e.voxels:
         return None
     rest = e.obstacles - inside - e.noise
@@ -220,7 +230,7 @@ def _fragment(e: Evidence, inside: int, traces: Traces) -> Reason | None:
 
 
 def pair_reason(fusion: Fusion, traces: Traces, detection: int, cluster: int) -> Reason:
-    """The rule of our fusion that keeps a detection and a cluster apart; REPORTED: none does."""
+    """Return the rule of our fusion that separates a detection and a cluster; REPORTED: they match."""
     config, pair = traces.result.config.fusion, fusion.pair(detection, cluster)
     if config.method == "centroid":
         if pair is None or not np.isfinite(pair.cost):
@@ -240,6 +250,7 @@ def pair_reason(fusion: Fusion, traces: Traces, detection: int, cluster: int) ->
 
 
 def _loss_of_detection(e: Evidence, traces: Traces) -> Reason:
+    """Return the reason why a detection gave no object."""
     best = e.best
     if best is None:
         return Reason.NOT_DETECTED
@@ -250,7 +261,7 @@ def _loss_of_detection(e: Evidence, traces: Traces) -> Reason:
         return Reason.NOT_FUSED
     if best.decision is Decision.NO_CLUSTER or best.cluster < 0:
         return Reason.NO_POINTS if e.raw < FEW else _unclustered(e, traces)
-    if best.decision is Decision.MATCHED:  # and yet no object: another camera's name has won
+    if best.decision is Decision.MATCHED:  # a detection of another camera named the object
         return Reason.TAKEN
     held = max((part.points for part in e.parts if part.kept), default=0)
     if e.voxels >= FEW and held < max(FEW, PART * e.obstacles):
@@ -262,7 +273,7 @@ def _loss_of_detection(e: Evidence, traces: Traces) -> Reason:
 
 
 def _loss_of_others(subject: Subject, e: Evidence, traces: Traces) -> Reason:
-    """Of a 3D detector, or of the robot, whose stages are blamed as far as they are known."""
+    """Return the reason why a 3D detector or the robot has no object, as far as its stages are known."""
     if subject.kind != "detection" and e.raw < FEW:
         return _without_points(e)
     robot = {s for s in ("ground", "clustering", "detector", "objects") if traces.origin(s).topic}
@@ -280,20 +291,20 @@ def _loss_of_others(subject: Subject, e: Evidence, traces: Traces) -> Reason:
 
 
 def _in_their_box(subject: Subject, e: Evidence, named: Named, traces: Traces) -> bool:
-    """Whether what our fusion would have made of the subject is in the box that stands there."""
+    """Return whether the object of our fusion is inside the reported box."""
     j, opinions = find_fused(subject, e, traces), traces.result.opinions
     return j >= 0 and opinions is not None and int(opinions.partner[j]) == named.row
 
 
 def has_cluster(subject: Subject, e: Evidence) -> bool:
-    """Whether there is a cluster at the place; of a detection, one that our fusion finds no fault with."""
+    """Return whether the subject has a cluster; for a detection, one that our fusion accepts."""
     if subject.kind != "detection":
         return e.main >= 0
     return e.best is not None and e.best.kept and e.best.decision in (Decision.MATCHED, Decision.TAKEN)
 
 
 def name_of(result: FrameResult, cluster: int) -> str:
-    """Class of the object that a cluster became, empty for none."""
+    """Return the class of the object of a cluster, empty for none."""
     if result.objects is None or cluster < 0:
         return ""
     rows = np.flatnonzero(result.objects.cluster == cluster)
