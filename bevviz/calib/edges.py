@@ -67,11 +67,11 @@ def cloud_edges(cloud: Cloud) -> Edges:
         (rings.above, rings.below),
         (rings.below, rings.above),
     )
-    found = [_jumps(rings, beyond, before) for beyond, before in sides]
-    jumps = sum(len(xyz) for xyz, _ in found)
+    edges = [_jumps(rings, beyond, before) for beyond, before in sides]
+    jumps = sum(len(xyz) for xyz, _ in edges)
     if rings.reflectance is not None:
-        found.append(_steps_along(rings, rings.reflectance))
-    xyz, towards = (np.concatenate(parts).astype(np.float32) for parts in zip(*found, strict=True))
+        edges.append(_steps_along(rings, rings.reflectance))
+    xyz, towards = (np.concatenate(parts).astype(np.float32) for parts in zip(*edges, strict=True))
     return Edges(xyz, towards, np.arange(len(xyz)) >= jumps)
 
 
@@ -107,8 +107,8 @@ def _ring(cloud: Cloud, azimuth: F64, distance: F64) -> I64:
     """Return the (N,) ring of each point: from its field, from the storage order, or from its elevation."""
     for name in RING_FIELDS:
         if name in cloud.fields:
-            told: I64 = cloud.fields[name].astype(np.int64)
-            return told
+            ring: I64 = cloud.fields[name].astype(np.int64)
+            return ring
     turns = np.abs(np.diff(azimuth)) > np.pi
     if 4 <= turns.sum() <= 300:  # a plausible number of beams: the cloud is stored ring by ring
         return np.cumsum(np.insert(turns, 0, False), dtype=np.int64)
@@ -118,11 +118,11 @@ def _ring(cloud: Cloud, azimuth: F64, distance: F64) -> I64:
     return row
 
 
-def _nearest(keys: F64, wanted: F64, tolerance: float) -> I64:
+def _nearest(keys: F64, targets: F64, tolerance: float) -> I64:
     """Return the row of the sorted key nearest to each wanted key, -1 where none is within the tolerance."""
-    after = np.clip(np.searchsorted(keys, wanted), 1, len(keys) - 1)
-    nearest = np.where(wanted - keys[after - 1] < keys[after] - wanted, after - 1, after)
-    return np.where(np.abs(keys[nearest] - wanted) < tolerance, nearest, -1)
+    after = np.clip(np.searchsorted(keys, targets), 1, len(keys) - 1)
+    nearest = np.where(targets - keys[after - 1] < keys[after] - targets, after - 1, after)
+    return np.where(np.abs(keys[nearest] - targets) < tolerance, nearest, -1)
 
 
 def _jumps(rings: _Rings, beyond: I64, before: I64) -> tuple[F64, F64]:
@@ -149,15 +149,16 @@ def _steps_along(rings: _Rings, reflectance: F64) -> tuple[F64, F64]:
 
     The two beams on either side of a step must be alike.
     """
-    a = np.flatnonzero((rings.left >= 0) & (rings.right >= 0))
-    a = a[rings.right[rings.right[a]] >= 0]
-    b = a + 1
+    before = np.flatnonzero((rings.left >= 0) & (rings.right >= 0))
+    before = before[rings.right[rings.right[before]] >= 0]
+    after = before + 1
     inverse = 1 / rings.range
-    near, far = (reflectance[a - 1], reflectance[a]), (reflectance[b], reflectance[b + 1])
-    found = _clear_step(near, far) & (np.abs(inverse[a] - inverse[b]) < FLAT * inverse[a])
-    a, b = a[found], b[found]
-    more = np.sign(reflectance[b] + reflectance[b + 1] - reflectance[a] - reflectance[a - 1])
-    return (rings.xyz[a] + rings.xyz[b]) / 2, (rings.unit[b] - rings.unit[a]) * more[:, None]
+    near, far = (reflectance[before - 1], reflectance[before]), (reflectance[after], reflectance[after + 1])
+    is_step = _clear_step(near, far) & (np.abs(inverse[before] - inverse[after]) < FLAT * inverse[before])
+    before, after = before[is_step], after[is_step]
+    sign = np.sign(far[0] + far[1] - near[0] - near[1])[is_step]
+    across = rings.unit[after] - rings.unit[before]
+    return (rings.xyz[before] + rings.xyz[after]) / 2, across * sign[:, None]
 
 
 def _clear_step(near: tuple[F64, F64], far: tuple[F64, F64]) -> Bool:
@@ -181,10 +182,10 @@ def image_edges(bgr: U8) -> U8:
     """
     gray = cv2.cvtColor(bgr, cv2.COLOR_BGR2GRAY).astype(np.float32)
     gray = cv2.GaussianBlur(gray, (0, 0), 0.8)
-    found = np.empty((4, *gray.shape), np.uint8)
+    edges = np.empty((4, *gray.shape), np.uint8)
     for k, (dx, dy) in enumerate(((1, 0), (0, 1))):
         change = cv2.Sobel(gray, cv2.CV_32F, dx, dy)
         usual = cv2.GaussianBlur(np.abs(change), (0, 0), USUAL) + NOISE
         for sign in (0, 1):
-            found[2 * k + sign] = np.clip((1 - 2 * sign) * LEVELS * change / usual, 0, 4 * LEVELS)
-    return found
+            edges[2 * k + sign] = np.clip((1 - 2 * sign) * LEVELS * change / usual, 0, 4 * LEVELS)
+    return edges

@@ -26,12 +26,12 @@ def scatter(scorer: Scorer, peak: Peak, free: Bool) -> F64:
     """Return the (7,) standard deviation of a peak, from climbs with random weights of the data."""
     rng = np.random.default_rng(0)
     frames, parts = peak.sums.score.shape
-    own = views(peak) / frames
-    found = []
+    shape = views(peak) / frames
+    replicates = []
     for _ in range(REPLICATES):
-        weight = np.outer(rng.gamma(own, 1 / own, frames), rng.exponential(size=parts))
-        found.append(climb(scorer, peak.offsets, free, peak, weight / weight.mean(), SETTLED).offsets)
-    return np.asarray(np.sqrt(((np.stack(found) - peak.offsets) ** 2).mean(0)), np.float64)
+        weight = np.outer(rng.gamma(shape, 1 / shape, frames), rng.exponential(size=parts))
+        replicates.append(climb(scorer, peak.offsets, free, peak, weight / weight.mean(), SETTLED).offsets)
+    return np.asarray(np.sqrt(((np.stack(replicates) - peak.offsets) ** 2).mean(0)), np.float64)
 
 
 def caution(peak: Peak) -> float:
@@ -51,8 +51,8 @@ def views(peak: Peak) -> float:
     pull = pull[np.linalg.norm(pull, axis=1) > 0]
     if not len(pull):
         return 1.0
-    alike = np.corrcoef(pull) if len(pull) > 1 else np.ones((1, 1))
-    return float(len(pull) ** 2 / (alike**2).sum())
+    correlation = np.corrcoef(pull) if len(pull) > 1 else np.ones((1, 1))
+    return float(len(pull) ** 2 / (correlation**2).sum())
 
 
 def lead(best: Peak, rival: Peak) -> tuple[float, float]:

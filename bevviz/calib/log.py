@@ -105,7 +105,7 @@ def _inside(uv: F32, intrinsics: Intrinsics) -> Bool:
 
 def _page(result: Calibration) -> str:
     """Return the page of the result in Markdown."""
-    rows = [(axis.axis.name, axis.measured, axis.told) for axis in result.axes]
+    rows = [(axis.axis.name, axis.measured, axis.text) for axis in result.axes]
     return "\n".join(
         [
             f"## {markdown(result.answer)}\n",

@@ -41,11 +41,11 @@ class AxisResult:
         """Offset, interval and unit in words."""
         if self.interval >= 2 * self.axis.prior:
             return "not known"
-        n = self.axis.decimals
-        return f"{self.offset:+.{n}f} +- {self.interval:.{n}f} {self.axis.unit}"
+        decimals = self.axis.decimals
+        return f"{self.offset:+.{decimals}f} +- {self.interval:.{decimals}f} {self.axis.unit}"
 
     @property
-    def told(self) -> str:
+    def text(self) -> str:
         """The finding in words."""
         if self.finding is Finding.OFF:
             return f"off: {self.axis.positive if self.offset > 0 else self.axis.negative}"
@@ -86,14 +86,14 @@ class Calibration:
             return f"Camera '{self.camera}': {self.axes[0].finding}: {reason}."
         off, fine, unknown = (self.by(kind) for kind in (Finding.OFF, Finding.FINE, Finding.UNKNOWN))
         if off:
-            said = f"Camera '{self.camera}' is off: {'; '.join(_error(axis) for axis in off)}."
+            text = f"Camera '{self.camera}' is off: {'; '.join(_error(axis) for axis in off)}."
         elif not fine:
-            said = f"Camera '{self.camera}': too little data to hold any axis."
+            text = f"Camera '{self.camera}': too little data to hold any axis."
         elif unknown:
-            said = f"Camera '{self.camera}': what can be told is fine: the {_names(fine)}."
+            text = f"Camera '{self.camera}': what can be told is fine: the {_names(fine)}."
         else:
-            said = f"Camera '{self.camera}': calibration and clock are fine."
-        return f"{said} It cannot tell the {_names(unknown)}." if unknown else said
+            text = f"Camera '{self.camera}': calibration and clock are fine."
+        return f"{text} It cannot tell the {_names(unknown)}." if unknown else text
 
     @property
     def measured_from(self) -> str:
@@ -115,10 +115,13 @@ class Calibration:
         rows = [("axis", "offset of what is stated", "finding")]
         same = len({axis.reason for axis in self.axes}) == 1  # The answer has the reason already.
         for axis in self.axes:
-            told = str(axis.finding) if same and axis.reason else axis.told
-            rows.append((f"{axis.axis.name}  {axis.axis.what}", axis.measured, told))
+            text = str(axis.finding) if same and axis.reason else axis.text
+            rows.append((f"{axis.axis.name}  {axis.axis.what}", axis.measured, text))
         widths = [max(len(row[i]) for row in rows) for i in range(2)]
-        return "\n".join(f"{a:<{widths[0]}}  {b:>{widths[1]}}  {c}" for a, b, c in rows)
+        return "\n".join(
+            f"{name:<{widths[0]}}  {offset:>{widths[1]}}  {finding_text}"
+            for name, offset, finding_text in rows
+        )
 
     def to_dict(self) -> dict[str, Any]:
         """Return the result for JSON."""
@@ -155,14 +158,16 @@ def configuration(results: Sequence[Calibration]) -> str:
         lines.append(f"    {result.parent} {result.child}: [{numbers}]")
     late = [result for result in results if result.correction[TIME] or result.offset]
     lines += ["sync:", "  offsets:"] if late else []
-    lines += [f"    {r.topic}: {r.offset - float(r.correction[TIME]):.4f}" for r in late]
+    lines += [
+        f"    {shifted.topic}: {shifted.offset - float(shifted.correction[TIME]):.4f}" for shifted in late
+    ]
     return "\n".join(lines) + "\n"
 
 
 def _error(result: AxisResult) -> str:
     """Return e.g. ``it looks too high, by 1.02 +- 0.05 deg (turn about the camera's x axis)``."""
-    axis, n = result.axis, result.axis.decimals
-    size = f"{abs(result.offset):.{n}f} +- {result.interval:.{n}f} {axis.unit}"
+    axis, decimals = result.axis, result.axis.decimals
+    size = f"{abs(result.offset):.{decimals}f} +- {result.interval:.{decimals}f} {axis.unit}"
     how = axis.positive if result.offset > 0 else axis.negative
     if axis is AXES[TIME]:
         return f"{how}, by {size}"

@@ -73,18 +73,18 @@ def gather(frames: Iterable[Frame], cameras: Iterable[str], pose: Pose) -> dict[
     Returns:
         the shots of each camera, by name.
     """
-    found = {name: Shots(name) for name in cameras}
+    shots_by_camera = {name: Shots(name) for name in cameras}
     last: Frame | None = None
     for frame in frames:
         if last is not None:
-            _take(last, found, pose)
+            _take(last, shots_by_camera, pose)
         last = frame
     if last is not None:
-        _take(last, found, pose)
-    return found
+        _take(last, shots_by_camera, pose)
+    return shots_by_camera
 
 
-def _take(frame: Frame, found: dict[str, Shots], pose: Pose) -> None:
+def _take(frame: Frame, shots_by_camera: dict[str, Shots], pose: Pose) -> None:
     """Add a shot of the frame to each camera, or the reason why there is none."""
     parts = []
     for cloud, points_from_cloud in zip(frame.clouds, frame.points_from_clouds, strict=True):
@@ -98,9 +98,9 @@ def _take(frame: Frame, found: dict[str, Shots], pose: Pose) -> None:
         )
     together = Edges(*(np.concatenate(columns) for columns in zip(*map(_columns, parts), strict=True)))
     for camera in frame.cameras:
-        if camera.name not in found:
+        if camera.name not in shots_by_camera:
             continue
-        shots = found[camera.name]
+        shots = shots_by_camera[camera.name]
         if camera.image is None or camera.intrinsics is None or camera.camera_from_points is None:
             reason = camera.problems[0] if camera.problems else "no image, calibration or transform"
             shots.refused[reason] += 1
@@ -131,8 +131,8 @@ def _shot(frame: Frame, camera: Camera, edges: Edges, pose: Pose) -> Shot:
         inside = ((uv > -margin) & (uv < size + margin)).all(axis=1)
     inside &= (depth > NEAREST) & (depth < FARTHEST)
     xyz, towards, bright, uv = edges.xyz[inside], edges.towards[inside], edges.bright[inside], uv[inside]
-    beside = xyz + towards * np.linalg.norm(xyz, axis=1, keepdims=True)
-    away = geometry.project(geometry.apply(camera.camera_from_points, beside), flat)[0] - uv
+    displaced = xyz + towards * np.linalg.norm(xyz, axis=1, keepdims=True)
+    away = geometry.project(geometry.apply(camera.camera_from_points, displaced), flat)[0] - uv
     column, row = np.clip(uv / size * CELLS, 0, np.array(CELLS) - 1).astype(np.int32).T
     cell = row * CELLS[0] + column
     return Shot(frame, camera, K, image_edges(picture), xyz, _change(away, bright), cell, mounting, motion)
@@ -148,8 +148,8 @@ def _change(away: F32, bright: Bool) -> U8:
 def _motion(frame: Frame, stamp: int, pose: Pose) -> F64 | None:
     """Return the (T, 4, 4) motion around the stamp of an image, None where a pose is unknown."""
     here = pose(frame, frame.stamp)
-    there = [pose(frame, stamp + int(step)) for step in STEPS] if here is not None else []
-    known = [geometry.inverse(p) @ here for p in there if p is not None and here is not None]
+    poses = [pose(frame, stamp + int(step)) for step in STEPS] if here is not None else []
+    known = [geometry.inverse(then) @ here for then in poses if then is not None and here is not None]
     return np.stack(known) if len(known) == len(STEPS) else None
 
 

@@ -129,7 +129,7 @@ def densities(shot: Shot, sigma: float) -> tuple[F32, I64, Bool]:
 @kernel
 def _add(
     xyz: F32,
-    which: I64,
+    density_row: I64,
     along_v: Bool,
     cell: I32,
     pose: F64,
@@ -159,7 +159,7 @@ def _add(
         u, v = fx * x + cx, fy * y + cy
         if not (0 <= u < width - 1 and 0 <= v < height - 1):
             continue
-        col, row, k = int(u), int(v), which[i]
+        col, row, k = int(u), int(v), density_row[i]
         s, t = u - col, v - row
         d00, d01 = density[k, row, col], density[k, row, col + 1]
         d10, d11 = density[k, row + 1, col], density[k, row + 1, col + 1]

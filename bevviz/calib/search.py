@@ -68,7 +68,9 @@ def search(
     peaks = _climbs(Scorer(thin(shots, 2 * SAMPLE), blur), starts, free)
     progress(0.2, "fine")
     shots = thin(shots, MOST)
-    peaks = _climbs(Scorer(thin(shots, MOST // 2), LADDER), [p.offsets for p in peaks[:FINALISTS]], free)
+    peaks = _climbs(
+        Scorer(thin(shots, MOST // 2), LADDER), [peak.offsets for peak in peaks[:FINALISTS]], free
+    )
     progress(0.4, "finest")
     scorer = Scorer(shots, FINEST)
     return scorer, _climbs(scorer, [peak.offsets for peak in peaks], free)
@@ -76,8 +78,8 @@ def search(
 
 def _climbs(scorer: Scorer, starts: list[F64], free: Bool) -> list[Peak]:
     """Climb from each start. Return the distinct peaks within two priors of zero, highest first."""
-    found = [climb(scorer, start, free) for start in starts]
-    near = [peak for peak in found if (np.abs(peak.offsets) < 2 * PRIOR).all()]
+    peaks = [climb(scorer, start, free) for start in starts]
+    near = [peak for peak in peaks if (np.abs(peak.offsets) < 2 * PRIOR).all()]
     kept: list[Peak] = []
     for peak in sorted(near, key=lambda peak: -peak.height):
         if all(np.abs(peak.offsets - other.offsets)[:3].max() > APART for other in kept):
@@ -146,8 +148,10 @@ def thin(shots: Sequence[Shot], edges: int) -> list[Shot]:
     """Return the same shots with about this number of edges, or fewer."""
     every = -(-sum(len(shot.xyz) for shot in shots) // edges)
     return [
-        replace(s, xyz=s.xyz[::every], change=s.change[::every], cell=s.cell[::every]) if every > 1 else s
-        for s in shots
+        replace(shot, xyz=shot.xyz[::every], change=shot.change[::every], cell=shot.cell[::every])
+        if every > 1
+        else shot
+        for shot in shots
     ]
 
 
@@ -165,7 +169,7 @@ def _grid(shots: Sequence[Shot]) -> tuple[float, list[F64]]:
     turns = np.stack(np.meshgrid(axis, axis, roll, indexing="ij"), -1)
     rotations = np.stack([error_pose(np.append(turn, np.zeros(4)))[:3, :3] for turn in turns.reshape(-1, 3)])
     parts = [_shrunk(shot, blur, shrink) for shot in shots]
-    found: list[tuple[float, F64]] = []
+    peaks: list[tuple[float, F64]] = []
     for along_x, along_y in itertools.product(SHIFTS, SHIFTS):
         shift = np.array([along_x, along_y, 0.0])
         sums = np.zeros(len(rotations))
@@ -174,9 +178,9 @@ def _grid(shots: Sequence[Shot]) -> tuple[float, list[F64]]:
         score = sums.reshape(turns.shape[:3])
         for place in np.argwhere(_highest(score) & (score > 0)):
             at = tuple(place)
-            found.append((float(score[at]), np.concatenate([turns[at], shift, [0.0]])))
-    found.sort(key=lambda peak: -peak[0])
-    return blur, [offsets for _, offsets in found[:STARTS]]
+            peaks.append((float(score[at]), np.concatenate([turns[at], shift, [0.0]])))
+    peaks.sort(key=lambda peak: -peak[0])
+    return blur, [offsets for _, offsets in peaks[:STARTS]]
 
 
 def _shrunk(shot: Shot, blur: float, shrink: int) -> tuple[F32, I64, F32, F64]:
@@ -191,7 +195,7 @@ def _shrunk(shot: Shot, blur: float, shrink: int) -> tuple[F32, I64, F32, F64]:
 
 
 @kernel
-def _sample(xyz: F32, which: I64, logs: F32, turns: F32, shift: F32, score: F64) -> None:
+def _sample(xyz: F32, density_row: I64, logs: F32, turns: F32, shift: F32, score: F64) -> None:
     """Add the score of one shot at each of the (T, 3, 3) pixels_from_camera."""
     height, width = logs.shape[1:]
     half = np.float32(0.5)
@@ -203,7 +207,7 @@ def _sample(xyz: F32, which: I64, logs: F32, turns: F32, shift: F32, score: F64)
             u = (m[0, 0] * x + m[0, 1] * y + m[0, 2] * z + shift[0]) * depth + half
             v = (m[1, 0] * x + m[1, 1] * y + m[1, 2] * z + shift[1]) * depth + half
             if 0 <= u < width and 0 <= v < height:
-                total += logs[which[i], int(v), int(u)]
+                total += logs[density_row[i], int(v), int(u)]
         score[j] += total
 
 

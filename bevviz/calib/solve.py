@@ -34,7 +34,7 @@ Progress = Callable[[float, str], None]
 
 
 @dataclass(frozen=True, slots=True)
-class _Found:
+class _Estimate:
     """The best offsets and their uncertainty. ``rival`` describes another alignment that is as good."""
 
     offsets: F64  # (7,)
@@ -43,7 +43,7 @@ class _Found:
 
 
 @dataclass(frozen=True, slots=True)
-class _Said:
+class _Judgement:
     """A finding and its reason."""
 
     finding: Finding
@@ -71,21 +71,21 @@ def calibrate(
         UserError: there is no shot.
     """
     if not shots.shots:
-        reasons = "; ".join(f"{reason} ({n} frames)" for reason, n in shots.refused.items())
+        reasons = "; ".join(f"{reason} ({count} frames)" for reason, count in shots.refused.items())
         raise UserError(f"camera '{shots.camera}': no frame to calibrate with: {reasons or 'no image'}")
     moving = all(shot.motion is not None for shot in shots.shots)
     free = np.array([True] * TIME + [moving])
-    found = _Found(np.zeros(len(AXES)), 2 * PRIOR)
+    estimate = _Estimate(np.zeros(len(AXES)), 2 * PRIOR)
     trouble = _too_little(shots)
     if trouble is None:
         scorer, peaks = search(shots.shots, free, progress)
-        found, trouble = _weigh(shots, scorer, peaks, free, progress)
+        estimate, trouble = _weigh(shots, scorer, peaks, free, progress)
     else:
         scorer = Scorer(shots.shots, FINEST)
     progress(0.8, "curves")
-    axes = _judge(shots, found, trouble)
+    axes = _judge(shots, estimate, trouble)
     off = np.array([axis.finding is Finding.OFF for axis in axes])
-    fixed = climb(scorer, np.where(off, found.offsets, 0.0), off).offsets
+    fixed = climb(scorer, np.where(off, estimate.offsets, 0.0), off).offsets
     frame, stated = shots.shots[0].frame, shots.shots[0].mounting
     if frame.upright is not None:
         stated = stated @ frame.upright
@@ -120,81 +120,81 @@ def _notes(shots: Shots, off: Bool) -> Iterator[str]:
 # --- reasons for no result ----------------------------------------------------------------------
 
 
-def _too_little(shots: Shots) -> _Said | None:
+def _too_little(shots: Shots) -> _Judgement | None:
     """Return a finding UNKNOWN if cloud or images have too few edges, else None."""
     if shots.edges < EDGES:
         reason = f"too little data: only {shots.edges} edges in the clouds, {EDGES} are needed"
-        return _Said(Finding.UNKNOWN, reason)
+        return _Judgement(Finding.UNKNOWN, reason)
     if not any(shot.maps.any() for shot in shots.shots):
-        return _Said(Finding.UNKNOWN, "too little data: the images show no edges")
+        return _Judgement(Finding.UNKNOWN, "too little data: the images show no edges")
     return None
 
 
 def _weigh(
     shots: Shots, scorer: Scorer, peaks: list[Peak], free: Bool, progress: Progress
-) -> tuple[_Found, _Said | None]:
+) -> tuple[_Estimate, _Judgement | None]:
     """Return the offsets with their uncertainty, and a finding that holds for all axes or None."""
     if not peaks:
         reason = "too little data: there is no place where it would hold the camera"
-        return _Found(np.zeros(len(AXES)), 2 * PRIOR), _Said(Finding.UNKNOWN, reason)
+        return _Estimate(np.zeros(len(AXES)), 2 * PRIOR), _Judgement(Finding.UNKNOWN, reason)
     best = peaks[0]
-    nothing = _Found(best.offsets, 2 * PRIOR)
+    nothing = _Estimate(best.offsets, 2 * PRIOR)
     rivals = [rival for rival in peaks[1:] if np.less(*lead(best, rival))]
     error = float(np.sqrt((best.sums.score.sum(0) ** 2).sum()))
     if len(rivals) > RIVALS or best.height < LEAD * error:
         return nothing, _no_peak(scorer, best, error)
     progress(0.5, "uncertainty")
-    if (said := _halves(scorer.shots, peaks, free)) is not None:
-        return nothing, said
-    spread = np.minimum(np.hypot(_told(scorer, best, free), _confusion(shots)), PRIOR)
+    if (judgement := _halves(scorer.shots, peaks, free)) is not None:
+        return nothing, judgement
+    spread = np.minimum(np.hypot(_data_deviation(scorer, best, free), _confusion(shots)), PRIOR)
     spread = np.where(free, spread, PRIOR)
-    ways = (
+    rival_offsets = (
         np.stack([rival.offsets - best.offsets for rival in rivals]) if rivals else np.zeros((1, len(AXES)))
     )
-    turned = ", ".join(f"{angle:+.1f}" for angle in ways[0, :TURNS] * SCALES[:TURNS])
+    turned = ", ".join(f"{angle:+.1f}" for angle in rival_offsets[0, :TURNS] * SCALES[:TURNS])
     rival = f"turned by {turned} deg, it fits about as well" if rivals else ""
-    return _Found(best.offsets, np.abs(ways).max(0) + 2 * spread, rival), None
+    return _Estimate(best.offsets, np.abs(rival_offsets).max(0) + 2 * spread, rival), None
 
 
-def _no_peak(scorer: Scorer, best: Peak, error: float) -> _Said:
+def _no_peak(scorer: Scorer, best: Peak, error: float) -> _Judgement:
     """Return the finding for a best peak that is not clearly higher than the others."""
     if max(best.height, LEAD * error) < FIT * scorer.edges:  # A right calibration would have a higher score.
         within = f"{np.degrees(REACH):.1f} deg"
         reason = f"the edges of image and cloud do not agree anywhere within {within} of what is stated"
-        return _Said(Finding.CONFLICT, f"{reason} (another camera, wrong intrinsics, or further off?)")
+        return _Judgement(Finding.CONFLICT, f"{reason} (another camera, wrong intrinsics, or further off?)")
     shown, taken = max(round(views(best)), 1), len(scorer.shots)
     frames = f"{shown} frame{'s' if shown > 1 else ''}"
     if shown < taken:
         frames = f"{taken} frames, which show as much as {shown} different one{'s' if shown > 1 else ''},"
-    return _Said(Finding.UNKNOWN, f"too little data: in {frames} several alignments fit about as well")
+    return _Judgement(Finding.UNKNOWN, f"too little data: in {frames} several alignments fit about as well")
 
 
-def _halves(taken: Sequence[Shot], peaks: list[Peak], free: Bool) -> _Said | None:
+def _halves(taken: Sequence[Shot], peaks: list[Peak], free: Bool) -> _Judgement | None:
     """Return a finding CONFLICT if the two halves of the frames disagree, else None."""
     middle = len(taken) // 2
     if middle < HALF:
         return None
-    found = []
+    half_results = []
     for part in (slice(middle), slice(middle, None)):
         likely = max(peaks, key=lambda peak: float(peak.sums.score[part].sum()))
         scorer = Scorer(taken[part], FINEST)
         peak = climb(scorer, likely.offsets, free, likely)
-        found.append((peak.offsets, _told(scorer, peak, free)))
-    (first, doubt), (second, other) = found
-    apart = np.where(free, np.abs(second - first) / np.hypot(doubt, other), 0.0)
-    row = int(np.argmax(apart))
-    if apart[row] < 2 * CERTAIN:
+        half_results.append((peak.offsets, _data_deviation(scorer, peak, free)))
+    (first, doubt), (second, other) = half_results
+    deviation = np.where(free, np.abs(second - first) / np.hypot(doubt, other), 0.0)
+    row = int(np.argmax(deviation))
+    if deviation[row] < 2 * CERTAIN:
         return None
     axis = AXES[row]
-    said = ", ".join(f"{offsets[row] * axis.scale:+.{axis.decimals}f}" for offsets in (first, second))
-    reason = f"the two halves of the frames disagree on the {axis.what} ({said} {axis.unit})"
-    return _Said(Finding.CONFLICT, f"{reason}, as if the camera had been moved on the way")
+    values = ", ".join(f"{offsets[row] * axis.scale:+.{axis.decimals}f}" for offsets in (first, second))
+    reason = f"the two halves of the frames disagree on the {axis.what} ({values} {axis.unit})"
+    return _Judgement(Finding.CONFLICT, f"{reason}, as if the camera had been moved on the way")
 
 
 # --- each axis ---------------------------------------------------------------------------------
 
 
-def _judge(shots: Shots, found: _Found, trouble: _Said | None) -> tuple[AxisResult, ...]:
+def _judge(shots: Shots, estimate: _Estimate, trouble: _Judgement | None) -> tuple[AxisResult, ...]:
     """Return the result of each axis with its score curve."""
     results: list[AxisResult] = []
     scorer = Scorer(thin(shots.shots, 2 * SAMPLE), FINEST)
@@ -202,30 +202,32 @@ def _judge(shots: Shots, found: _Found, trouble: _Said | None) -> tuple[AxisResu
         abscissa = np.linspace(-axis.reach, axis.reach, SAMPLES)
         curve = []
         for value in abscissa:
-            at = found.offsets.copy()
+            at = estimate.offsets.copy()
             at[row] = value / axis.scale
             curve.append(scorer(at, slopes=False).mean)
-        offset, interval = (float(values[row]) * axis.scale for values in (found.offsets, found.interval))
-        said = trouble or _finding(shots, axis, offset, interval, found.rival)
+        offset, interval = (
+            float(values[row]) * axis.scale for values in (estimate.offsets, estimate.interval)
+        )
+        judgement = trouble or _finding(shots, axis, offset, interval, estimate.rival)
         results.append(
-            AxisResult(axis, offset, interval, said.finding, said.reason, abscissa, np.array(curve))
+            AxisResult(axis, offset, interval, judgement.finding, judgement.reason, abscissa, np.array(curve))
         )
     return tuple(results)
 
 
-def _finding(shots: Shots, axis: Axis, offset: float, interval: float, rival: str) -> _Said:
+def _finding(shots: Shots, axis: Axis, offset: float, interval: float, rival: str) -> _Judgement:
     """Return the finding for one axis."""
     if axis is AXES[TIME]:
         speeds = _speeds(shots)
         if len(speeds) < len(shots.shots):
-            return _Said(Finding.UNKNOWN, f"{MOTIONLESS} (no fixed frame in TF, no odometry)")
+            return _Judgement(Finding.UNKNOWN, f"{MOTIONLESS} (no fixed frame in TF, no odometry)")
         if speeds.max() < STILL:
-            return _Said(Finding.UNKNOWN, f"the robot hardly moved ({speeds.max():.1f} m/s at most)")
+            return _Judgement(Finding.UNKNOWN, f"the robot hardly moved ({speeds.max():.1f} m/s at most)")
     if abs(offset) > max(CERTAIN * interval, axis.least):
-        return _Said(Finding.OFF)
+        return _Judgement(Finding.OFF)
     if abs(offset) + interval <= axis.sure:
-        return _Said(Finding.FINE)
-    return _Said(Finding.UNKNOWN, rival or _why_unsure(shots, axis))
+        return _Judgement(Finding.FINE)
+    return _Judgement(Finding.UNKNOWN, rival or _why_unsure(shots, axis))
 
 
 def _why_unsure(shots: Shots, axis: Axis) -> str:
@@ -246,7 +248,7 @@ def _why_unsure(shots: Shots, axis: Axis) -> str:
 # --- uncertainty of the data -------------------------------------------------------------------
 
 
-def _told(scorer: Scorer, peak: Peak, free: Bool) -> F64:
+def _data_deviation(scorer: Scorer, peak: Peak, free: Bool) -> F64:
     """Return the (7,) standard deviation from the data, including the floor of calibrated sensors."""
     return np.asarray(caution(peak) * np.hypot(scatter(scorer, peak, free), FLOOR), np.float64)
 
@@ -270,5 +272,5 @@ def _speeds(shots: Shots) -> F64:
     """Return the (N,) metres per second at each shot with known motion."""
     seconds = 0.3  # the poses of a shot span this time
     poses = [shot.motion for shot in shots.shots if shot.motion is not None]
-    ways = [(p[-1] @ geometry.inverse(p[0]))[:3, 3] for p in poses]
-    return np.asarray(np.linalg.norm(ways, axis=1) / seconds if ways else np.zeros(0), np.float64)
+    shifts = [(motion[-1] @ geometry.inverse(motion[0]))[:3, 3] for motion in poses]
+    return np.asarray(np.linalg.norm(shifts, axis=1) / seconds if shifts else np.zeros(0), np.float64)

@@ -47,7 +47,7 @@ def log_chart(
         curves: metric -> (N,) numbers; NaN: unknown.
         marks: word -> position of an upright line, such as that of the best value; at most two.
     """
-    known = np.concatenate([c[np.isfinite(c)] for c in curves.values()])
+    known = np.concatenate([curve[np.isfinite(curve)] for curve in curves.values()])
     low, high, step = scale(float(known.min(initial=0.0)), float(known.max(initial=0.0)))
     span = float(places[-1] - places[0]) or 1.0
 
@@ -73,18 +73,19 @@ def log_chart(
     _log_words(log, "numbers", [(-26, y(tick) - 14) for tick in ticks], [f"{tick:.6g}" for tick in ticks])
     ends = []
     for (metric, curve), color in zip(curves.items(), SERIES, strict=False):
-        there = np.isfinite(curve)
-        if not there.any():
+        finite = np.isfinite(curve)
+        if not finite.any():
             continue
-        points = np.column_stack([x(places), y(curve)])[there]
+        points = np.column_stack([x(places), y(curve)])[finite]
         name = metric.replace(" ", "_")
         line = rr.LineStrips2D([points], colors=[color], radii=rr.Radius.ui_points(1.5), draw_order=10.0)
         log(f"{name}/curve", line)
-        told = [
-            f"{metric} {n:.4g} at {v}" for n, v in zip(curve[there], np.array(values)[there], strict=True)
+        hover_texts = [
+            f"{metric} {number:.4g} at {value}"
+            for number, value in zip(curve[finite], np.array(values)[finite], strict=True)
         ]
         dots = rr.Points2D(points, colors=[color], radii=rr.Radius.ui_points(4.0), draw_order=11.0)
-        log(f"{name}/points", dots, rr.AnyValues(says=told))
+        log(f"{name}/points", dots, rr.AnyValues(says=hover_texts))
         ends.append((metric, color, float(points[-1, 1])))
     _log_names(log, ends)
     for number, (word, at) in enumerate(marks.items()):
@@ -125,7 +126,9 @@ def log_map(
     log("cells", rr.Transform3D(scale=[width / _CELL, height / _CELL, 1.0]), png(_cells(numbers)))
     cells = [(i, j) for i in range(across) for j in range(up)]
     texts = ["-" if math.isnan(number) else f"{number:.3g}" for number in numbers.ravel().tolist()]
-    said = [f"{text} at {values[0][i]}, {values[1][j]}" for (i, j), text in zip(cells, texts, strict=True)]
+    hover_texts = [
+        f"{text} at {values[0][i]}, {values[1][j]}" for (i, j), text in zip(cells, texts, strict=True)
+    ]
     dots = rr.Points2D(
         [middle(i, j) for i, j in cells],
         labels=texts,
@@ -134,7 +137,7 @@ def log_map(
         show_labels=len(cells) <= _NUMBERED,
         draw_order=11.0,
     )
-    log("numbers", dots, rr.AnyValues(says=said if len(said) > 1 else said * 2))
+    log("numbers", dots, rr.AnyValues(says=hover_texts if len(hover_texts) > 1 else hover_texts * 2))
     for name, words, places in (
         ("values_across", values[0], [(middle(i, 0)[0], HEIGHT + 2) for i in range(across)]),
         ("values_up", values[1], [(-36, middle(0, j)[1] - 14) for j in range(up)]),

@@ -33,11 +33,14 @@ def log_sweep(recording: rr.RecordingStream, sweep: Sweep, name: str, present: M
     page = f"# {sweep.title}\n\n{markdown(name)}\n\n{columns}"
     recording.log(entities.SWEEP, document(page), static=True)
     for title, series in _plots(sweep).items():
-        found = {m: np.array([o.metrics.get(m, math.nan) for o in sweep.outcomes.values()]) for m in series}
+        numbers = {
+            metric: np.array([outcome.metrics.get(metric, math.nan) for outcome in sweep.outcomes.values()])
+            for metric in series
+        }
         if len(sweep.parameters) == 1:
-            _log_curves(recording, entities.sweep(title), sweep, found, present)
+            _log_curves(recording, entities.sweep(title), sweep, numbers, present)
             continue
-        for metric, values in found.items():
+        for metric, values in numbers.items():
             _log_map(recording, entities.sweep(metric), sweep, values, present)
 
 
@@ -47,7 +50,9 @@ def _log_map(
     """Log one metric over two parameters as a map."""
     across, up = sweep.parameters
     orders = [np.argsort(parameter.numbers, kind="stable") for parameter in (across, up)]
-    written = [[parameter.values[i] for i in o] for parameter, o in zip((across, up), orders, strict=True)]
+    written = [
+        [parameter.values[i] for i in order] for parameter, order in zip((across, up), orders, strict=True)
+    ]
     marks = {}
     for word, chosen in _marked(sweep, present).items():
         marks[word] = (_cell(across, chosen[0]), _cell(up, chosen[1]))
@@ -67,9 +72,12 @@ def _marked(sweep: Sweep, present: Mapping[str, str]) -> Mapping[str, Values]:
     marks = {}
     if sweep.best is not None:
         marks[f"best: {', '.join(sweep.best)}"] = sweep.best
-    now = tuple(present.get(parameter.key, "") for parameter in sweep.parameters)
-    if all(p.place(value) is not None for p, value in zip(sweep.parameters, now, strict=True)):
-        marks[f"now: {', '.join(now)}"] = now
+    present_values = tuple(present.get(parameter.key, "") for parameter in sweep.parameters)
+    if all(
+        parameter.place(value) is not None
+        for parameter, value in zip(sweep.parameters, present_values, strict=True)
+    ):
+        marks[f"now: {', '.join(present_values)}"] = present_values
     return marks
 
 
@@ -89,7 +97,9 @@ def _log_curves(
         if (place := parameter.place(value)) is not None:
             marks[word] = place
     values = [parameter.values[i] for i in order]
-    log_chart(recording, path, at[order], values, {m: c[order] for m, c in curves.items()}, marks)
+    log_chart(
+        recording, path, at[order], values, {metric: curve[order] for metric, curve in curves.items()}, marks
+    )
 
 
 def layout(sweep: Sweep) -> rrb.Blueprint:
@@ -115,13 +125,13 @@ def layout(sweep: Sweep) -> rrb.Blueprint:
 
 def _plots(sweep: Sweep) -> Mapping[str, Sequence[str]]:
     """Return the metrics of each plot, by its title."""
-    one = len(sweep.parameters) == 1
+    is_single = len(sweep.parameters) == 1
     plots: dict[str, Sequence[str]] = {}
     if sweep.truth:
         plots["Precision, recall, F1"] = SCORES[:3]
-    plots["Detections, matches, objects"] = COUNTS[1:] if one else COUNTS[3:]
+    plots["Detections, matches, objects"] = COUNTS[1:] if is_single else COUNTS[3:]
     plots["Clusters"] = COUNTS[:1]
     if any(config.objects.method != "frustum" for config in sweep.configs.values()):
-        plots["Objects, by cameras and our fusion"] = [*OPINIONS.values()] if one else ["contradicted"]
-    plots["Time, ms"] = [f"{stage} ms" for stage in STAGES] if one else ["time ms"]
+        plots["Objects, by cameras and our fusion"] = [*OPINIONS.values()] if is_single else ["contradicted"]
+    plots["Time, ms"] = [f"{stage} ms" for stage in STAGES] if is_single else ["time ms"]
     return plots

@@ -43,7 +43,7 @@ class Parameter:
         if value in self.values:
             return float(self.numbers[self.values.index(value)])
         try:
-            number, *others = (float(one) for one in (value, *self.values))
+            number, *others = (float(word) for word in (value, *self.values))
         except ValueError:  # A word that is not in the list has no position.
             return None
         return number if min(others) <= number <= max(others) else None
@@ -60,9 +60,9 @@ def parse(settings: Sequence[str]) -> tuple[list[Parameter], list[str]]:
     swept, constant = [], []
     for text in settings:
         key, _, value = text.partition("=")
-        found = _RANGE.fullmatch(value)
-        if found:
-            swept.append(Parameter(key.strip(), _range(text, *map(float, found.groups()))))
+        match = _RANGE.fullmatch(value)
+        if match:
+            swept.append(Parameter(key.strip(), _range(text, *map(float, match.groups()))))
         elif "," in value and value.strip()[0] not in "[{\"'":
             swept.append(Parameter(key.strip(), tuple(part.strip() for part in value.split(","))))
         else:
@@ -70,7 +70,8 @@ def parse(settings: Sequence[str]) -> tuple[list[Parameter], list[str]]:
     if not swept:
         raise UserError("sweep: over what? Give a range or a list, e.g. --set clustering.eps=0.3:0.9:0.1")
     if len(swept) > 2:
-        raise UserError(f"sweep: two parameters at most, not {len(swept)}: {', '.join(p.key for p in swept)}")
+        keys = ", ".join(parameter.key for parameter in swept)
+        raise UserError(f"sweep: two parameters at most, not {len(swept)}: {keys}")
     number = math.prod(len(parameter.values) for parameter in swept)
     if number > MOST:
         raise UserError(f"sweep: {number} combinations are more than {MOST}; take larger steps")

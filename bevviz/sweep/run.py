@@ -62,17 +62,19 @@ class Outcome:
         A stage that several combinations share counts its full time in each of them.
         """
         frames = max(self.frames, 1)
-        found = {what: self.counts[what] / frames for what in COUNTS}
-        found |= {OPINIONS[what]: self.counts[what] / frames for what in OPINIONS if what in self.counts}
+        metrics = {metric: self.counts[metric] / frames for metric in COUNTS}
+        metrics |= {
+            OPINIONS[metric]: self.counts[metric] / frames for metric in OPINIONS if metric in self.counts
+        }
         # The first frame also loads the stages, so times are medians.
         times = {f"{stage} ms": float(np.median(self.seconds[stage] or [0.0])) * 1e3 for stage in STAGES}
-        found |= {"time ms": sum(times.values()), **times}
+        metrics |= {"time ms": sum(times.values()), **times}
         if self.judged:
             errors = self.score.errors
             error = float(np.median(errors)) if errors else math.nan
             scores = (self.score.precision, self.score.recall, self.score.f1, error)
-            found |= dict(zip(SCORES, scores, strict=True))
-        return found
+            metrics |= dict(zip(SCORES, scores, strict=True))
+        return metrics
 
 
 class Sweep:
@@ -114,9 +116,14 @@ class Sweep:
     @property
     def best(self) -> Values | None:
         """Values with the highest F1, of equal ones with the smallest error. None without ground truth."""
-        rated = {v: o.score for v, o in self.outcomes.items() if o.judged and not math.isnan(o.score.f1)}
+        rated = {
+            values: outcome.score
+            for values, outcome in self.outcomes.items()
+            if outcome.judged and not math.isnan(outcome.score.f1)
+        }
         errors = {
-            v: float(np.median(score.errors)) if score.errors else math.inf for v, score in rated.items()
+            values: float(np.median(score.errors)) if score.errors else math.inf
+            for values, score in rated.items()
         }
         return min(rated, key=lambda values: (-rated[values].f1, errors[values]), default=None)
 
@@ -131,17 +138,20 @@ class Sweep:
         lines = [f"{frames} frames; means of a frame, median milliseconds", ""]
         lines += table.lines([*self.rows("time ms")])
         if self.best is not None:
-            where = ", ".join(f"{p.key} = {v}" for p, v in zip(self.parameters, self.best, strict=True))
+            where = ", ".join(
+                f"{parameter.key} = {value}"
+                for parameter, value in zip(self.parameters, self.best, strict=True)
+            )
             f1 = self.outcomes[self.best].score.f1
-            others = sum(o.judged and o.score.f1 == f1 for o in self.outcomes.values()) - 1
-            alike = f"; the same F1 at {others} more, with errors as large or larger" if others else ""
-            lines += ["", f"best F1: {f1:.3f} at {printable(where)}{alike}"]
+            others = sum(outcome.judged and outcome.score.f1 == f1 for outcome in self.outcomes.values()) - 1
+            ties = f"; the same F1 at {others} more, with errors as large or larger" if others else ""
+            lines += ["", f"best F1: {f1:.3f} at {printable(where)}{ties}"]
         failures = sum(outcome.failures for outcome in self.outcomes.values())
         return "\n".join([*lines, *([f"{failures} stages failed"] if failures else [])])
 
     def rows(self, last: str) -> Iterator[tuple[str, ...]]:
         """Yield the header and a row for each combination. Of the times, it has ``last`` only."""
-        names = [n for n in self._metrics() if not n.endswith(" ms") or n == last]
+        names = [name for name in self._metrics() if not name.endswith(" ms") or name == last]
         yield (*(parameter.key for parameter in self.parameters), *names)
         for values, outcome in self.outcomes.items():
             metrics = outcome.metrics
@@ -161,8 +171,8 @@ class Sweep:
                     "frames": outcome.frames,
                     "metrics": outcome.metrics,
                     "classes": {
-                        name: {kind: found[kind] for kind in ("tp", "fp", "fn")}
-                        for name, found in sorted(outcome.score.classes.items())
+                        name: {kind: class_counts[kind] for kind in ("tp", "fp", "fn")}
+                        for name, class_counts in sorted(outcome.score.classes.items())
                     },
                     "failures": outcome.failures,
                 }
@@ -178,17 +188,17 @@ class Sweep:
             UserError: the file cannot be written.
         """
         names = self._metrics()
-        classes = sorted({name for o in self.outcomes.values() for name in o.score.classes})
+        classes = sorted({name for outcome in self.outcomes.values() for name in outcome.score.classes})
         kinds = ("tp", "fp", "fn")
-        header = [p.key for p in self.parameters] + ["frames", *names]
+        header = [parameter.key for parameter in self.parameters] + ["frames", *names]
         header += [f"{name} {kind}" for name in classes for kind in kinds]
         file = StringIO()
         writer = csv.writer(file)
         writer.writerow(header)
         for values, outcome in self.outcomes.items():
             metrics = outcome.metrics
-            found = outcome.score.classes
-            by_class = [found.get(name, Counter())[kind] for name in classes for kind in kinds]
+            class_counts = outcome.score.classes
+            by_class = [class_counts.get(name, Counter())[kind] for name in classes for kind in kinds]
             rounded = (f"{metrics.get(name, math.nan):.6g}" for name in names)
             writer.writerow([*values, outcome.frames, *rounded, *by_class])
         save(path, file.getvalue(), "--csv")

@@ -144,10 +144,10 @@ class OneFrame:
     def perceive(self, save: Save, network: Executor | None = None) -> Version:
         """Run the frame with a saved state. Compare it with the version before."""
         result = self._variants.perceive(self._frame, save.config, network)
-        now, last = seen(result), self._last
-        before = last.found.b if last is not None else now
-        found = differences(self._frame.index, self._frame.stamp, before, now)
-        self._last = Version(0 if last is None else last.number + 1, save, result, found)
+        current, last = seen(result), self._last
+        before = last.found.b if last is not None else current
+        diff = differences(self._frame.index, self._frame.stamp, before, current)
+        self._last = Version(0 if last is None else last.number + 1, save, result, diff)
         return self._last
 
     def finish(self, version: Version) -> Version:
