@@ -67,38 +67,40 @@ class Answer:
 
     def as_dict(self) -> dict[str, Any]:
         """Return the answer for JSON, without the points."""
-        s, v = self.subject, self.verdict
+        subject, verdict = self.subject, self.verdict
         return {
-            "kind": s.kind,
-            "name": s.name,
-            "label": s.label,
-            "row": s.row,
-            "camera": s.camera,
-            "image_box": None if s.xyxy is None else [round(float(x), 2) for x in s.xyxy],
-            "position": None if s.box is None else [round(float(x), 3) for x in s.box.center[0]],
+            "kind": subject.kind,
+            "name": subject.name,
+            "label": subject.label,
+            "row": subject.row,
+            "camera": subject.camera,
+            "image_box": None if subject.xyxy is None else [round(float(value), 2) for value in subject.xyxy],
+            "position": None
+            if subject.box is None
+            else [round(float(value), 3) for value in subject.box.center[0]],
             "distance": None if np.isnan(self.distance) else round(self.distance, 2),
             "points": self.points,
-            "reported": v.reported,
-            "reason": v.reason.value,
-            "verdict": v.text,
+            "reported": verdict.reported,
+            "reason": verdict.reason.value,
+            "verdict": verdict.text,
             "folded": self.folded,
-            "chain": [{"stage": x.stage, "text": x.text, **x.numbers} for x in self.steps],
+            "chain": [{"stage": step.stage, "text": step.text, **step.numbers} for step in self.steps],
             "hints": [_hint_dict(hint) for hint in self.hints],
         }
 
 
 def _hint_dict(hint: Hint) -> Mapping[str, Any]:
     """Return a hint for JSON."""
-    e = hint.effects
+    effects = hint.effects
     return {
         "settings": list(hint.settings),
         "text": hint.text,
-        "fixed": list(e.fixed),
-        "added": list(e.added),
-        "false": list(e.false),
-        "lost": list(e.lost),
-        "right": list(e.right),
-        "changed": e.changed,
+        "fixed": list(effects.fixed),
+        "added": list(effects.added),
+        "false": list(effects.false),
+        "lost": list(effects.lost),
+        "right": list(effects.right),
+        "changed": effects.changed,
     }
 
 
@@ -170,14 +172,18 @@ class Questioner:
         Raises:
             UserError: as ``ask``.
         """
-        found = [(self._answer(subject), shows) for subject, shows in at_place(self.traces, selection)]
-        order = sorted(found, key=lambda pair: _place_rank(*pair))
+        answers = [(self._answer(subject), shows) for subject, shows in at_place(self.traces, selection)]
+        order = sorted(answers, key=lambda pair: _place_rank(*pair))
         return [answer for answer, _ in order]
 
     def missed(self) -> list[Answer]:
         """Explain the objects that should have been reported and were not, the nearest first."""
-        answers = [a for a in self.ask(Selection()) if a.near and not a.verdict.reported and not a.folded]
-        return sorted(answers, key=_far)
+        answers = [
+            answer
+            for answer in self.ask(Selection())
+            if answer.near and not answer.verdict.reported and not answer.folded
+        ]
+        return sorted(answers, key=_sort_distance)
 
     def search(self, answer: Answer) -> Search:
         """Search changes that would change the verdict. This runs other configurations and takes a while."""
@@ -191,7 +197,7 @@ class Questioner:
         if not hints:
             if verdict.reason is Reason.REPORTED or answer.folded or not search.tried:
                 return answer
-            text = f"{verdict.text.removesuffix('.')}; {_in_vain(search)}."
+            text = f"{verdict.text.removesuffix('.')}; {_no_help_text(search)}."
             return replace(answer, verdict=replace(verdict, text=text))
         hint = hints[0]
         also = f" (in this frame it {hint.effects.text})" if hint.effects.text else ""
@@ -203,11 +209,11 @@ class Questioner:
         """Return the answer about one subject, from the cache if it is known."""
         if subject.key in self._answers:
             return self._answers[subject.key]
-        e = gather(subject, self.traces)
-        reason, reported = find_reason(subject, e, self.traces)
-        verdict = verdict_of(subject, reason, reported, e, self.traces)
-        steps = tuple(chain(subject, e, self.traces))
-        answer = Answer(subject, verdict, steps, (), e.fate, e.distance, e.raw, e)
+        evidence = gather(subject, self.traces)
+        reason, reported = find_reason(subject, evidence, self.traces)
+        verdict = verdict_of(subject, reason, reported, evidence, self.traces)
+        steps = tuple(chain(subject, evidence, self.traces))
+        answer = Answer(subject, verdict, steps, (), evidence.fate, evidence.distance, evidence.raw, evidence)
         if not subject.is_place:  # The number of possible places has no limit.
             self._answers[subject.key] = answer
         return answer
@@ -226,31 +232,38 @@ def why(
     return Questioner(result, loader, classes).explain(selection, hints, everything=everything)
 
 
-def _in_vain(search: Search) -> str:
+def _no_help_text(search: Search) -> str:
     """Say that no change helps, and how far the best one brings the subject."""
     count = "the change" if search.tried == 1 else f"none of the {search.tried} changes"
     helps = "that was tried does not help" if search.tried == 1 else "that were tried helps"
     if search.then is None:
         return f"{count} {helps}"
-    what = "reported, but" if search.reported else "lost as"
-    return f"{count} {helps}: with {', '.join(search.furthest)} it is {what} '{search.then.value}'"
+    outcome = "reported, but" if search.reported else "lost as"
+    return f"{count} {helps}: with {', '.join(search.furthest)} it is {outcome} '{search.then.value}'"
 
 
 def _rank(answer: Answer) -> tuple[bool, bool, bool, bool, bool, float]:
     """Return the sort key of answers in a list, the worst first."""
-    v, best = answer.verdict, answer.evidence.best
+    verdict, best = answer.verdict, answer.evidence.best
     if answer.weak and best is not None:  # the highest score first
         return True, True, False, False, False, -best.score
-    return answer.folded, False, v.reported, v.reason is Reason.REPORTED, not answer.near, _far(answer)
+    return (
+        answer.folded,
+        False,
+        verdict.reported,
+        verdict.reason is Reason.REPORTED,
+        not answer.near,
+        _sort_distance(answer),
+    )
 
 
 def _place_rank(answer: Answer, shows: bool) -> tuple[bool, bool, int, bool, float]:
     """Return the sort key of the answers at one place."""
     kind = 2 if answer.weak else 1 if answer.subject.kind == "cluster" else 0
     hopeless = answer.verdict.reason in HOPELESS
-    return hopeless, not shows, kind, answer.verdict.reported, _far(answer)
+    return hopeless, not shows, kind, answer.verdict.reported, _sort_distance(answer)
 
 
-def _far(answer: Answer) -> float:
+def _sort_distance(answer: Answer) -> float:
     """Return the distance; unknown distances sort last."""
     return float("inf") if np.isnan(answer.distance) else answer.distance

@@ -31,36 +31,38 @@ def _plain(answers: Sequence[Answer], chains: int) -> Iterator[str]:
         yield from (f"- {answer.verdict.text}" for answer in answers[chains:])
 
 
-def _listed(beside: Sequence[Answer]) -> Iterator[str]:
+def _listed(others: Sequence[Answer]) -> Iterator[str]:
     """Yield the lines of the other subjects at the place."""
-    if beside:
+    if others:
         yield "also there:"
-        yield from (f"- {answer.verdict.text}" for answer in beside[:LISTED])
-    if len(beside) > LISTED:
-        yield f"- and {len(beside) - LISTED} more"
+        yield from (f"- {answer.verdict.text}" for answer in others[:LISTED])
+    if len(others) > LISTED:
+        yield f"- and {len(others) - LISTED} more"
 
 
 def summary(answers: Sequence[Answer]) -> str:
     """Return one line about a frame. It needs the answers about all objects, reported ones included."""
-    things = [a for a in answers if not a.weak]
-    reported = [a for a in things if a.verdict.reported]
-    flawed = [a for a in reported if a.verdict.reason is not Reason.REPORTED]
-    hopeless = [a for a in things if a.verdict.reason in HOPELESS]
-    missed = [a for a in things if not a.verdict.reported and a.verdict.reason not in HOPELESS]
-    near = [a for a in missed if a.near]
-    said = [f"{len(reported)} reported" + (f" ({len(flawed)} with a flaw)" if flawed else "")]
-    said.append(f"{len(near)} missed within {RANGE:g} m with {MIN_HITS} points or more")
+    things = [answer for answer in answers if not answer.weak]
+    reported = [answer for answer in things if answer.verdict.reported]
+    flawed = [answer for answer in reported if answer.verdict.reason is not Reason.REPORTED]
+    hopeless = [answer for answer in things if answer.verdict.reason in HOPELESS]
+    missed = [
+        answer for answer in things if not answer.verdict.reported and answer.verdict.reason not in HOPELESS
+    ]
+    near = [answer for answer in missed if answer.near]
+    parts = [f"{len(reported)} reported" + (f" ({len(flawed)} with a flaw)" if flawed else "")]
+    parts.append(f"{len(near)} missed within {RANGE:g} m with {MIN_HITS} points or more")
     if len(missed) > len(near):
-        said.append(f"{len(missed) - len(near)} missed farther off or with fewer points")
+        parts.append(f"{len(missed) - len(near)} missed farther off or with fewer points")
     if hopeless:
-        said.append(f"{len(hopeless)} hidden, out of view or without points")
+        parts.append(f"{len(hopeless)} hidden, out of view or without points")
     weak = len(answers) - len(things)
     if weak:
-        said.append(count(weak, "weak detection"))
-    if any(a.verdict.reason is Reason.NOT_RUN for a in missed):
-        said.append("the detector never ran")
-    folded = " (folded: --all)" if any(a.folded for a in answers) else ""
-    return f"{count(len(things), 'object')}: {', '.join(said)}{folded}"
+        parts.append(count(weak, "weak detection"))
+    if any(answer.verdict.reason is Reason.NOT_RUN for answer in missed):
+        parts.append("the detector never ran")
+    folded = " (folded: --all)" if any(answer.folded for answer in answers) else ""
+    return f"{count(len(things), 'object')}: {', '.join(parts)}{folded}"
 
 
 def page(answers: Sequence[Answer], chains: int) -> str:

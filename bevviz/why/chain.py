@@ -28,76 +28,84 @@ class Step:
     numbers: Mapping[str, Any] = field(default_factory=dict)
 
 
-def chain(subject: Subject, e: Evidence, traces: Traces) -> Iterator[Step]:
+def chain(subject: Subject, evidence: Evidence, traces: Traces) -> Iterator[Step]:
     """Yield the step of each stage that was run."""
     result, config = traces.result, traces.result.config
     for failure in result.failures:
         yield Step("failure", f"{failure.stage}: {failure.reason}")
-    yield from _clock(subject, traces)
+    yield from _camera_steps(subject, traces)
     if not result.frame.lidar:
-        yield from _detected(subject, e, traces)
+        yield from _detector_steps(subject, evidence, traces)
         return
     where = {"truth": "in its box", "point": "around it", "cell": "over it and around"}
     where |= dict.fromkeys(("object", "cluster", "track"), "in it")
-    yield Step("raw cloud", f"{e.raw} points {where.get(subject.kind, 'in its frustum')}", {"points": e.raw})
-    if subject.box is not None and e.aimed:
-        share = e.in_front / e.aimed
-        text = f"{e.in_front} of {e.aimed} returns in its direction end in front of it"
-        if e.front >= 0:
-            text += f", most on cluster {e.front}" + _named(traces, e.front)
-        yield Step("occlusion", text, {"in_front": e.in_front, "aimed": e.aimed, "share": round(share, 3)})
-    if e.raw and result.voxels is not None and result.ground is not None:
-        merged = max(e.raw - e.voxels, 0)
+    yield Step(
+        "raw cloud",
+        f"{evidence.raw} points {where.get(subject.kind, 'in its frustum')}",
+        {"points": evidence.raw},
+    )
+    if subject.box is not None and evidence.aimed:
+        share = evidence.in_front / evidence.aimed
+        text = f"{evidence.in_front} of {evidence.aimed} returns in its direction end in front of it"
+        if evidence.front >= 0:
+            text += f", most on cluster {evidence.front}" + _class_in_brackets(traces, evidence.front)
+        yield Step(
+            "occlusion",
+            text,
+            {"in_front": evidence.in_front, "aimed": evidence.aimed, "share": round(share, 3)},
+        )
+    if evidence.raw and result.voxels is not None and result.ground is not None:
+        merged = max(evidence.raw - evidence.voxels, 0)
         yield Step(
             "voxel grid",
-            f"{e.voxels} voxels of {config.voxel.size:g} m, {merged} points merged into them",
-            {"voxels": e.voxels, "merged": merged},
+            f"{evidence.voxels} voxels of {config.voxel.size:g} m, {merged} points merged into them",
+            {"voxels": evidence.voxels, "merged": merged},
         )
-        yield _ground(e, traces)
+        yield _ground_step(evidence, traces)
         if result.clusters is not None:
-            yield _clustering(e, traces)
-            yield from _merged(e, traces)
-    yield from _detected(subject, e, traces)
-    yield from _objects(subject, e, traces)
+            yield _clustering_step(evidence, traces)
+            yield from _merged_steps(evidence, traces)
+    yield from _detector_steps(subject, evidence, traces)
+    yield from _object_steps(subject, evidence, traces)
 
 
-def _clock(subject: Subject, traces: Traces) -> Iterator[Step]:
+def _camera_steps(subject: Subject, traces: Traces) -> Iterator[Step]:
     """Yield the time and position of each camera relative to the cloud."""
-    for camera in (c.camera for c in traces.result.cameras):
+    for camera in (result.camera for result in traces.result.cameras):
         if subject.camera and camera.name != subject.camera:
             continue
-        said, numbers = [], {}
+        texts, numbers = [], {}
         if not traces.result.frame.lidar:
             yield Step(f"camera {camera.name}", ", ".join(camera.problems) or "its image makes the frame")
             continue
         if np.isfinite(camera.sync_error):
-            said.append(f"image {1e3 * camera.sync_error:+.0f} ms from the cloud")
+            texts.append(f"image {1e3 * camera.sync_error:+.0f} ms from the cloud")
             numbers["sync_error_ms"] = round(1e3 * camera.sync_error, 1)
         if np.isfinite(camera.tf_age):
-            said.append(f"transform {1e3 * camera.tf_age:.0f} ms old")
+            texts.append(f"transform {1e3 * camera.tf_age:.0f} ms old")
             numbers["tf_age_ms"] = round(1e3 * camera.tf_age, 1)
-        said.append(
+        texts.append(
             "moved to the image's time" if camera.motion_compensated else "not moved to the image's time"
         )
-        said += camera.problems
+        texts += camera.problems
         box = projected(subject.box, camera) if subject.box is not None else None
         if box is not None:
             u, v = (box[:2] + box[2:]) / 2
-            said.append(f"expected at pixel {u:.0f}, {v:.0f}")
-        yield Step(f"camera {camera.name}", ", ".join(said), numbers)
+            texts.append(f"expected at pixel {u:.0f}, {v:.0f}")
+        yield Step(f"camera {camera.name}", ", ".join(texts), numbers)
 
 
-def _ground(e: Evidence, traces: Traces) -> Step:
+def _ground_step(evidence: Evidence, traces: Traces) -> Step:
     """Return the step of the ground removal."""
-    known = e.ground[np.isfinite(e.ground)]
-    text = f"{len(e.ground)} of {e.voxels} voxels removed as ground"
-    numbers: dict[str, Any] = {"removed": len(e.ground)}
+    known = evidence.ground[np.isfinite(evidence.ground)]
+    text = f"{len(evidence.ground)} of {evidence.voxels} voxels removed as ground"
+    numbers: dict[str, Any] = {"removed": len(evidence.ground)}
     if len(known):
         text += f", {float(known.min()):z.2f} to {float(known.max()):z.2f} m above the local ground"
         numbers |= {"lowest": round(float(known.min()), 3), "highest": round(float(known.max()), 3)}
-    config, there = traces.result.config.ground, traces.origin("ground")
-    if not there.ours:
-        return Step("ground", f"{text} ({there.name})", {**numbers, "by": there.name})
+    config, owner = traces.result.config.ground, traces.origin("ground")
+    if not owner.ours:
+        return Step("ground", f"{text} ({owner.name})", {**numbers, "by": owner.name})
     numbers["threshold"] = config.distance_threshold
     return Step(
         "ground",
@@ -106,17 +114,17 @@ def _ground(e: Evidence, traces: Traces) -> Step:
     )
 
 
-def _clustering(e: Evidence, traces: Traces) -> Step:
+def _clustering_step(evidence: Evidence, traces: Traces) -> Step:
     """Return the step of the clustering, with the largest clusters of the subject."""
-    said, rows = [], []
-    clusters, there = traces.result.clusters, traces.origin("clustering")
+    texts, rows = [], []
+    clusters, owner = traces.result.clusters, traces.origin("clustering")
     assert clusters is not None
     boxes = clusters.boxes(traces.result.config.clustering)
-    for part in e.parts[:_SHOWN]:
+    for part in evidence.parts[:_SHOWN]:
         size = " x ".join(f"{v:.1f}" for v in boxes.size[part.cluster])
         state = "" if part.kept else f", {state_text(part.state)}"
-        name = _named(traces, part.cluster)
-        said.append(f"{part.points} in cluster {part.cluster}{name} of {part.count}, {size} m{state}")
+        name = _class_in_brackets(traces, part.cluster)
+        texts.append(f"{part.points} in cluster {part.cluster}{name} of {part.count}, {size} m{state}")
         rows.append(
             {
                 "cluster": part.cluster,
@@ -125,107 +133,122 @@ def _clustering(e: Evidence, traces: Traces) -> Step:
                 "state": part.state.name.lower(),
             }
         )
-    if len(e.parts) > _SHOWN:
-        said.append(f"{len(e.parts) - _SHOWN} clusters more")
-    if e.noise and there.ours:
-        c = traces.result.config.clustering
-        said.append(
-            f"{e.noise} noise: at most {e.neighbours} neighbours within {c.eps:g} m, "
-            f"clustering.min_points is {c.min_points}"
+    if len(evidence.parts) > _SHOWN:
+        texts.append(f"{len(evidence.parts) - _SHOWN} clusters more")
+    if evidence.noise and owner.ours:
+        config = traces.result.config.clustering
+        texts.append(
+            f"{evidence.noise} noise: at most {evidence.neighbours} neighbours within {config.eps:g} m, "
+            f"clustering.min_points is {config.min_points}"
         )
-    elif e.noise:
-        said.append(f"{e.noise} in no cluster")
-    if np.isfinite(e.apart):
-        said.append(f"the two largest are {e.apart:.2f} m apart")
-    numbers: dict[str, Any] = {"clusters": rows, "noise": e.noise}
-    if there.ours:
-        numbers["best_neighbours"] = e.neighbours
+    elif evidence.noise:
+        texts.append(f"{evidence.noise} in no cluster")
+    if np.isfinite(evidence.apart):
+        texts.append(f"the two largest are {evidence.apart:.2f} m apart")
+    numbers: dict[str, Any] = {"clusters": rows, "noise": evidence.noise}
+    if owner.ours:
+        numbers["best_neighbours"] = evidence.neighbours
     else:
-        numbers["by"] = there.name
-        said.append(f"by {there.name}")
-    return Step("clustering", "; ".join(said) or "no obstacle point", numbers)
+        numbers["by"] = owner.name
+        texts.append(f"by {owner.name}")
+    return Step("clustering", "; ".join(texts) or "no obstacle point", numbers)
 
 
-def _merged(e: Evidence, traces: Traces) -> Iterator[Step]:
+def _merged_steps(evidence: Evidence, traces: Traces) -> Iterator[Step]:
     """Yield the step about other objects in the cluster of the subject, if there are any."""
-    if not np.isfinite(e.gap):
+    if not np.isfinite(evidence.gap):
         return
-    names = ", ".join(f"{name} ({points} points)" for name, points in e.others)
-    part, there = e.part(e.main), traces.origin("clustering")
+    names = ", ".join(f"{name} ({points} points)" for name, points in evidence.others)
+    part, owner = evidence.part(evidence.main), traces.origin("clustering")
     names = names or f"{part.count - part.points if part is not None else 0} points that are not its own"
-    text = f"the cluster also holds {names}; gap {e.gap:.2f} m"
-    numbers: dict[str, Any] = {"others": [name for name, _ in e.others], "gap": round(e.gap, 3)}
-    if there.ours:
-        finer = f"with eps {e.finer:g} m they fall apart" if e.finer else "no smaller eps parts them"
+    text = f"the cluster also holds {names}; gap {evidence.gap:.2f} m"
+    numbers: dict[str, Any] = {"others": [name for name, _ in evidence.others], "gap": round(evidence.gap, 3)}
+    if owner.ours:
+        finer = (
+            f"with eps {evidence.finer:g} m they fall apart"
+            if evidence.finer
+            else "no smaller eps parts them"
+        )
         text += f", clustering.eps {traces.result.config.clustering.eps:g} m; {finer}"
-        numbers["eps_that_parts"] = e.finer
+        numbers["eps_that_parts"] = evidence.finer
     yield Step("merged", text, numbers)
 
 
-def _named(traces: Traces, cluster: int) -> str:
+def _class_in_brackets(traces: Traces, cluster: int) -> str:
     """Return the class of a cluster's object in brackets, empty for none."""
     name = name_of(traces.result, cluster)
     return f" ({name})" if name else ""
 
 
-def _detected(subject: Subject, e: Evidence, traces: Traces) -> Iterator[Step]:
+def _detector_steps(subject: Subject, evidence: Evidence, traces: Traces) -> Iterator[Step]:
     """Yield the steps of the detector and of the fusion for the best candidates."""
     result, config = traces.result, traces.result.config
     if not detector_ran(result, subject.camera):
         yield Step("detector", "never ran: " + "; ".join(not_run(result, subject.camera)), {"candidates": 0})
         return
     by = "" if traces.origin("detector").ours else f" of {traces.origin('detector').name}"
-    if not e.candidates:
+    if not evidence.candidates:
         yield Step("detector", f"no candidate{by} there", {"candidates": 0})
-    for c in e.candidates[:_SHOWN]:
-        found, fusion = fusion_of(result, c.camera)
-        detections = found.detections
+    for candidate in evidence.candidates[:_SHOWN]:
+        camera, fusion = fusion_of(result, candidate.camera)
+        detections = camera.detections
         assert detections is not None
-        numbers = {"name": c.name, "score": round(c.score, 3), "state": c.state.name.lower(), "row": c.row}
-        text = f"{label(c)}{by}, overlap {c.overlap:.2f}: "
-        if c.state == DetectionState.BELOW_THRESHOLD:
+        numbers = {
+            "name": candidate.name,
+            "score": round(candidate.score, 3),
+            "state": candidate.state.name.lower(),
+            "row": candidate.row,
+        }
+        text = f"{label(candidate)}{by}, overlap {candidate.overlap:.2f}: "
+        if candidate.state == DetectionState.BELOW_THRESHOLD:
             text += f"below detector.conf_threshold {config.detector.conf_threshold:g}"
-        elif c.state == DetectionState.SUPPRESSED:
-            d = int(detections.suppressed_by[c.row])
+        elif candidate.state == DetectionState.SUPPRESSED:
+            rival = int(detections.suppressed_by[candidate.row])
             text += (
-                f"suppressed by {detections.names[d]} {detections.score[d]:.2f}, IoU "
-                f"{detections.overlap[c.row]:.2f} > detector.iou_threshold {config.detector.iou_threshold:g}"
+                f"suppressed by {detections.names[rival]} {detections.score[rival]:.2f}, IoU "
+                f"{detections.overlap[candidate.row]:.2f} > "
+                f"detector.iou_threshold {config.detector.iou_threshold:g}"
             )
-            numbers["suppressed_by"] = d
+            numbers["suppressed_by"] = rival
         else:
             text += "kept"
         yield Step("detector", text, numbers)
-        if c.kept and fusion is not None:
-            yield from _pairs(c, e, traces)
-    more = len(e.candidates) - _SHOWN
+        if candidate.kept and fusion is not None:
+            yield from _pair_steps(candidate, evidence, traces)
+    more = len(evidence.candidates) - _SHOWN
     if more > 0:
         yield Step("detector", f"{more} weaker candidates more", {"more": more})
 
 
-def _pairs(c: Candidate, e: Evidence, traces: Traces) -> Iterator[Step]:
+def _pair_steps(candidate: Candidate, evidence: Evidence, traces: Traces) -> Iterator[Step]:
     """Yield the fusion's decision about a detection, and its pairs with the subject's clusters."""
-    _, fusion = fusion_of(traces.result, c.camera)
+    _, fusion = fusion_of(traces.result, candidate.camera)
     assert fusion is not None
     ours = traces.origin("objects").ours
     stage = "fusion" if ours else "our fusion"
-    key = "detection", c.camera, c.row
-    said = next((x for x in traces.result.explanations if (x.subject, x.camera, x.row) == key), None)
-    if said is not None:
-        yield Step(stage, said.text, {"decision": c.decision.name.lower(), "cluster": c.cluster})
+    key = "detection", candidate.camera, candidate.row
+    explanation = next((x for x in traces.result.explanations if (x.subject, x.camera, x.row) == key), None)
+    if explanation is not None:
+        yield Step(
+            stage,
+            explanation.text,
+            {"decision": candidate.decision.name.lower(), "cluster": candidate.cluster},
+        )
     pairs = fusion.pairs
-    interesting = {part.cluster for part in e.parts[:3]} - {c.cluster}
-    for row in np.flatnonzero(pairs.detection == c.row).tolist():
-        k = int(pairs.cluster[row])
-        if k not in interesting:
+    interesting = {part.cluster for part in evidence.parts[:3]} - {candidate.cluster}
+    for row in np.flatnonzero(pairs.detection == candidate.row).tolist():
+        cluster = int(pairs.cluster[row])
+        if cluster not in interesting:
             continue
-        decision = state_text(Decision(int(fusion.cluster_decision[k])))
+        decision = state_text(Decision(int(fusion.cluster_decision[cluster])))
         cost = "refused" if np.isinf(pairs.cost[row]) else f"cost {pairs.cost[row]:.2f}"
         yield Step(
             stage,
-            f"{label(c)} with cluster {k}: {pairs.points[row]} points, IoU {pairs.iou[row]:.2f}, "
+            f"{label(candidate)} with cluster {cluster}: "
+            f"{pairs.points[row]} points, IoU {pairs.iou[row]:.2f}, "
             f"{pairs.distance[row]:.0f} px, {pairs.depth[row]:.1f} m, {cost}; that cluster ended {decision}",
             {
-                "cluster": k,
+                "cluster": cluster,
                 "points": int(pairs.points[row]),
                 "iou": round(float(pairs.iou[row]), 3),
                 "distance_px": round(float(pairs.distance[row]), 1),
@@ -233,44 +256,50 @@ def _pairs(c: Candidate, e: Evidence, traces: Traces) -> Iterator[Step]:
         )
 
 
-def _objects(subject: Subject, e: Evidence, traces: Traces) -> Iterator[Step]:
+def _object_steps(subject: Subject, evidence: Evidence, traces: Traces) -> Iterator[Step]:
     """Yield the steps of objects that do not come from our fusion."""
-    there, objects = traces.origin("objects"), traces.result.objects
-    if there.ours:
+    owner, objects = traces.origin("objects"), traces.result.objects
+    if owner.ours:
         return
-    j, opinions = find_fused(subject, e, traces), traces.result.opinions
-    if e.named is None or objects is None:
+    fused_row, opinions = find_fused(subject, evidence, traces), traces.result.opinions
+    if evidence.named is None or objects is None:
         number = "no" if objects is None else str(len(objects))
-        yield Step("objects", f"none of the {number} objects of {there.name} is there", {"by": there.name})
-        if j >= 0 and opinions is not None:
-            fused, k = opinions.fused, int(opinions.partner[j])
-            text = f"{fused.names[j]} {fused.score[j]:.2f} of cluster {fused.cluster[j]}, "
-            text += f"which {there.name} has missed" if k < 0 or objects is None else in_box_of(objects, k)
-            yield Step("our fusion", text, {"row": j, "missed": k < 0})
+        yield Step("objects", f"none of the {number} objects of {owner.name} is there", {"by": owner.name})
+        if fused_row >= 0 and opinions is not None:
+            fused, object_row = opinions.fused, int(opinions.partner[fused_row])
+            text = f"{fused.names[fused_row]} {fused.score[fused_row]:.2f} of cluster "
+            text += f"{fused.cluster[fused_row]}, "
+            if object_row < 0 or objects is None:
+                text += f"which {owner.name} has missed"
+            else:
+                text += in_box_of(objects, object_row)
+            yield Step("our fusion", text, {"row": fused_row, "missed": object_row < 0})
         return
-    score = float(objects.score[e.named.row])
-    text = f"{there.name} has {e.named.name} {score:.2f} there"
-    yield Step("objects", text, {"by": there.name, "row": e.named.row, "score": round(score, 3)})
-    if opinions is not None and (said := opinion_on(traces.result, e.named.row)):
-        opinion = Opinion(int(opinions.opinion[e.named.row]))
+    score = float(objects.score[evidence.named.row])
+    text = f"{owner.name} has {evidence.named.name} {score:.2f} there"
+    yield Step("objects", text, {"by": owner.name, "row": evidence.named.row, "score": round(score, 3)})
+    if opinions is not None and (opinion_text := opinion_on(traces.result, evidence.named.row)):
+        opinion = Opinion(int(opinions.opinion[evidence.named.row]))
         yield Step(
-            "cameras", said, {"opinion": opinion.word, "seen": not opinion.is_unseen, **_seen(e, traces)}
+            "cameras",
+            opinion_text,
+            {"opinion": opinion.word, "seen": not opinion.is_unseen, **_opinion_numbers(evidence, traces)},
         )
 
 
-def _seen(e: Evidence, traces: Traces) -> Mapping[str, Any]:
+def _opinion_numbers(evidence: Evidence, traces: Traces) -> Mapping[str, Any]:
     """Return the numbers behind the cameras' opinion on an object, with their limits."""
     opinions, least = traces.result.opinions, traces.result.config.opinions
-    assert opinions is not None and e.named is not None
-    k = e.named.row
-    found = {
-        "shown": round(float(opinions.shown[k]), 3),
-        "visible": round(float(opinions.visible[k]), 3),
-        "height_px": round(float(opinions.height[k]), 1),
+    assert opinions is not None and evidence.named is not None
+    row = evidence.named.row
+    numbers = {
+        "shown": round(float(opinions.shown[row]), 3),
+        "visible": round(float(opinions.visible[row]), 3),
+        "height_px": round(float(opinions.height[row]), 1),
     }
-    if opinions.detection[k] >= 0:
-        found["iou"] = round(float(opinions.iou[k]), 3)
-    if not np.isnan(opinions.held[k]):
-        found["cluster_share"] = round(float(opinions.held[k]), 3)
+    if opinions.detection[row] >= 0:
+        numbers["iou"] = round(float(opinions.iou[row]), 3)
+    if not np.isnan(opinions.held[row]):
+        numbers["cluster_share"] = round(float(opinions.held[row]), 3)
     limits = {"shown": least.min_shown, "visible": least.min_visible}
-    return {**found, "least": {**limits, "height_px": least.min_height, "iou": least.min_iou}}
+    return {**numbers, "least": {**limits, "height_px": least.min_height, "iou": least.min_iou}}

@@ -27,7 +27,7 @@ def gather(subject: Subject, traces: Traces) -> Evidence:
     result = traces.result
     voxels, ground = result.voxels, result.ground
     points = traces.place(subject)
-    front_rows, aimed = _before(subject, traces)
+    front_rows, aimed = _returns_in_front(subject, traces)
     fate = np.zeros(len(result.frame.points), np.uint8)
     fate[front_rows] = Fate.IN_FRONT
     fate[points] = traces.fate[points]
@@ -41,7 +41,7 @@ def gather(subject: Subject, traces: Traces) -> Evidence:
             labels = result.clusters.labels[obstacle]
     parts = _parts(labels, result)
     candidates = find_candidates(subject, traces, parts)
-    main = _main(subject, parts, candidates, len(labels))
+    main = _main_cluster(subject, parts, candidates, len(labels))
     named = find_named(subject, traces, parts, candidates)
     if named is not None and named.cluster >= 0:
         main = named.cluster
@@ -73,7 +73,7 @@ def gather(subject: Subject, traces: Traces) -> Evidence:
         others=tuple((name, count) for _, name, count in mates),
         gap=shared[0],
         finer=shared[1],
-        apart=_apart(result, parts),
+        apart=_largest_gap(result, parts),
         in_view=bool(candidates) or _in_view(subject, traces),
     )
 
@@ -83,27 +83,31 @@ def gather(subject: Subject, traces: Traces) -> Evidence:
 
 def _parts(labels: I32, result: FrameResult) -> tuple[Part, ...]:
     """Return the clusters of (M,) labels, the one with most points first."""
-    found, points = np.unique(labels[labels >= 0], return_counts=True)
+    cluster_rows, points = np.unique(labels[labels >= 0], return_counts=True)
     clusters = result.clusters
     if clusters is None:
         return ()
     order = np.argsort(-points, kind="stable")
     return tuple(
         Part(int(k), int(n), int(clusters.count[k]), ClusterState(int(clusters.state[k])))
-        for k, n in zip(found[order], points[order], strict=True)
+        for k, n in zip(cluster_rows[order], points[order], strict=True)
     )
 
 
-def _main(subject: Subject, parts: Sequence[Part], candidates: Sequence[Candidate], obstacles: int) -> int:
+def _main_cluster(
+    subject: Subject, parts: Sequence[Part], candidates: Sequence[Candidate], obstacles: int
+) -> int:
     """Return the kept cluster of the subject, -1 if it holds only few of its points."""
     # The frustum of a detection also holds clusters behind the object. The fusion has chosen one of them.
     if subject.kind == "detection":
-        return next((c.cluster for c in candidates if c.kept and c.cluster >= 0), -1)
+        return next(
+            (candidate.cluster for candidate in candidates if candidate.kept and candidate.cluster >= 0), -1
+        )
     least = 1 if subject.is_place else max(FEW, PART * obstacles)
-    return next((p.cluster for p in parts if p.kept and p.points >= least), -1)
+    return next((part.cluster for part in parts if part.kept and part.points >= least), -1)
 
 
-def _before(subject: Subject, traces: Traces) -> tuple[I64, int]:
+def _returns_in_front(subject: Subject, traces: Traces) -> tuple[I64, int]:
     """Return the rows of the returns that end before the subject, and the number of returns in its direction.
 
     Directions start at the origin of the points. With one LiDAR, this is the LiDAR itself.
@@ -117,23 +121,23 @@ def _before(subject: Subject, traces: Traces) -> tuple[I64, int]:
         return nothing, 0  # the sensor is inside the box
     seen = traces.directions
     middle = np.arctan2(center[1], center[0])
-    turned = CORE * _turn(np.arctan2(corners[:, 1], corners[:, 0]) - middle)
+    turned = CORE * _wrap_angles(np.arctan2(corners[:, 1], corners[:, 0]) - middle)
     elevation = np.arctan2(corners[:, 2], away)
     half = CORE * (elevation.max() - elevation.min()) / 2
-    rows = np.concatenate(list(_between(seen.azimuth, middle + turned.min(), middle + turned.max())))
+    rows = np.concatenate(list(_rows_between(seen.azimuth, middle + turned.min(), middle + turned.max())))
     aimed = rows[np.abs(seen.elevation[rows] - (elevation.max() + elevation.min()) / 2) < half]
     before = aimed[seen.away[aimed] < away.min() - NEARER]
     return np.sort(seen.row[before]), len(aimed)
 
 
-def _between(azimuth: F32, low: float, high: float) -> Iterator[I64]:
+def _rows_between(azimuth: F32, low: float, high: float) -> Iterator[I64]:
     """Yield the rows of sorted azimuths within an interval, which may wrap around."""
     for turn in (-2 * np.pi, 0.0, 2 * np.pi):
         first, last = np.searchsorted(azimuth, [low + turn, high + turn])
         yield np.arange(first, last)
 
 
-def _turn(angle: F32) -> F32:
+def _wrap_angles(angle: F32) -> F32:
     """Wrap angles to [-pi, pi)."""
     return np.asarray((angle + np.pi) % (2 * np.pi) - np.pi, np.float32)
 
@@ -142,24 +146,24 @@ def _most_neighbours(obstacles: F32 | None, noise: I64, eps: float) -> int:
     """Return the most neighbours within ``eps`` that a noise point has, itself included."""
     if obstacles is None or len(noise) == 0:
         return 0
-    own = obstacles[noise[:: 1 + len(noise) // LOOKED_AT]]
-    near = ((obstacles > own.min(0) - eps) & (obstacles < own.max(0) + eps)).all(axis=1)
-    return int(_most_around(own, obstacles[near], eps * eps))
+    noise_points = obstacles[noise[:: 1 + len(noise) // LOOKED_AT]]
+    near = ((obstacles > noise_points.min(0) - eps) & (obstacles < noise_points.max(0) + eps)).all(axis=1)
+    return int(_most_around(noise_points, obstacles[near], eps * eps))
 
 
 @kernel
-def _most_around(own: F32, points: F32, eps2: float) -> int:
+def _most_around(centers: F32, points: F32, eps2: float) -> int:
     """Return the largest number of points within a distance of a point of ``own``."""
-    most = 0
-    for i in range(len(own)):
+    largest = 0
+    for i in range(len(centers)):
         count = 0
         for j in range(len(points)):
             square = 0.0
             for axis in range(3):
-                square += (np.float64(own[i, axis]) - points[j, axis]) ** 2
+                square += (np.float64(centers[i, axis]) - points[j, axis]) ** 2
             count += square < eps2
-        most = max(most, count)
-    return most
+        largest = max(largest, count)
+    return largest
 
 
 def _distance(subject: Subject, traces: Traces, points: I64, main: int) -> float:
@@ -174,13 +178,13 @@ def _distance(subject: Subject, traces: Traces, points: I64, main: int) -> float
     return float("nan")
 
 
-def _apart(result: FrameResult, parts: Sequence[Part]) -> float:
+def _largest_gap(result: FrameResult, parts: Sequence[Part]) -> float:
     """Return the metres between the two largest kept clusters, NaN without two."""
     kept = [part for part in parts if part.kept]
     if len(kept) < 2 or result.clusters is None or result.obstacles is None:
         return float("nan")
-    a, b = (result.obstacles[result.clusters.labels == part.cluster] for part in kept[:2])
-    return closest(a, b)
+    first, second = (result.obstacles[result.clusters.labels == part.cluster] for part in kept[:2])
+    return closest(first, second)
 
 
 def _in_view(subject: Subject, traces: Traces) -> bool:

@@ -18,17 +18,17 @@ COVERED = 0.8  # share of a cluster's image box that a detection of it covers
 
 def find_candidates(subject: Subject, traces: Traces, parts: Sequence[Part]) -> tuple[Candidate, ...]:
     """Find the detections of the subject in all cameras."""
-    found = []
+    candidates = []
     for camera in traces.result.cameras:
         detections = camera.detections
         if detections is None or (subject.camera and camera.camera.name != subject.camera):
             continue
-        rows, overlap = _own_rows(subject, traces, camera, parts)
-        found += [_candidate(camera, int(row), float(overlap[row])) for row in rows]
-    return tuple(found)
+        rows, overlap = _rows_of_subject(subject, traces, camera, parts)
+        candidates += [_candidate(camera, int(row), float(overlap[row])) for row in rows]
+    return tuple(candidates)
 
 
-def _own_rows(
+def _rows_of_subject(
     subject: Subject, traces: Traces, camera: CameraResult, parts: Sequence[Part]
 ) -> tuple[I64, F32]:
     """Return the rows of the subject's detections in a camera, and the (D,) overlap with all."""
@@ -51,10 +51,10 @@ def _own_rows(
             return np.zeros(0, np.int64), nothing
         overlap = geometry.iou(subject.xyxy[None], detections.xyxy)[0]
         return np.flatnonzero(overlap > 0), overlap
-    return _over_cluster(camera, kept[0])
+    return _rows_of_cluster(camera, kept[0])
 
 
-def _over_cluster(camera: CameraResult, cluster: int) -> tuple[I64, F32]:
+def _rows_of_cluster(camera: CameraResult, cluster: int) -> tuple[I64, F32]:
     """Return the detections of a cluster: those that overlap it, and the best one of the fusion."""
     detections, fusion = camera.detections, camera.fusion
     assert detections is not None
@@ -63,11 +63,11 @@ def _over_cluster(camera: CameraResult, cluster: int) -> tuple[I64, F32]:
     overlap = geometry.iou(fusion.cluster_uv[[cluster]], detections.xyxy)[0]
     rows = np.flatnonzero(overlap >= LINK)
     best = int(fusion.cluster_detection[cluster])
-    own = best >= 0 and _may_be_of(fusion, best, cluster, detections.xyxy[best])
-    return (np.union1d(rows, [best]) if own else rows).astype(np.int64), overlap
+    belongs = best >= 0 and _may_belong(fusion, best, cluster, detections.xyxy[best])
+    return (np.union1d(rows, [best]) if belongs else rows).astype(np.int64), overlap
 
 
-def _may_be_of(fusion: Fusion, detection: int, cluster: int, xyxy: F32) -> bool:
+def _may_belong(fusion: Fusion, detection: int, cluster: int, xyxy: F32) -> bool:
     """Return whether the best detection of a cluster may belong to it.
 
     A detection that was matched with another cluster does not, unless it covers this one.
@@ -89,14 +89,22 @@ def sort_candidates(
     """Sort detections: right class, kept, matched with the subject's cluster, high score times overlap."""
     known = subject.kind in ("truth", "detection")
 
-    def rank(c: Candidate) -> tuple[bool, bool, bool, bool, bool, bool, float]:
+    def rank(candidate: Candidate) -> tuple[bool, bool, bool, bool, bool, bool, float]:
         """Return the sort key of a detection."""
-        matched = c.decision == Decision.MATCHED and c.cluster == main
-        suppressed = c.state == DetectionState.SUPPRESSED
-        weak = c.score < threshold
-        elsewhere = not known and c.decision == Decision.MATCHED and not matched
-        sure = c.overlap * c.score
-        return not subject.accepts(c.name), elsewhere, not c.kept, weak, suppressed, not matched, -sure
+        matched = candidate.decision == Decision.MATCHED and candidate.cluster == main
+        suppressed = candidate.state == DetectionState.SUPPRESSED
+        weak = candidate.score < threshold
+        elsewhere = not known and candidate.decision == Decision.MATCHED and not matched
+        sure = candidate.overlap * candidate.score
+        return (
+            not subject.accepts(candidate.name),
+            elsewhere,
+            not candidate.kept,
+            weak,
+            suppressed,
+            not matched,
+            -sure,
+        )
 
     return tuple(sorted(candidates, key=rank))
 

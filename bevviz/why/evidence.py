@@ -151,5 +151,5 @@ class Evidence:
 
 def fusion_of(result: FrameResult, camera: str) -> tuple[CameraResult, Fusion | None]:
     """Return the result of a camera and its fusion."""
-    found = next(c for c in result.cameras if c.camera.name == camera)
-    return found, found.fusion
+    result_of_camera = next(c for c in result.cameras if c.camera.name == camera)
+    return result_of_camera, result_of_camera.fusion

@@ -229,7 +229,7 @@ class Traces:
     def shown(self) -> F32:
         """(K, cameras) share of each object of the ground truth that is inside each camera's image."""
         share = np.zeros((len(self.truth), len(self.result.cameras)), np.float32)
-        boxes = joined([s.box for s in self.truth if s.box is not None])
+        boxes = joined([subject.box for subject in self.truth if subject.box is not None])
         for column, camera in enumerate(self.result.cameras):
             share[:, column] = in_view(boxes, camera.camera)
         return share
@@ -319,12 +319,12 @@ class Traces:
     @cached_property
     def competing(self) -> tuple[Subject, ...]:
         """Kept detections of no ground truth object. The ground truth may lack some objects."""
-        found = []
+        subjects = []
         for camera in self.result.cameras:
             if camera.detections is not None:
                 kept = camera.detections.kept & (self.owners(camera) < 0)
-                found += [detection_subject(camera, d) for d in np.flatnonzero(kept).tolist()]
-        return tuple(found)
+                subjects += [detection_subject(camera, row) for row in np.flatnonzero(kept).tolist()]
+        return tuple(subjects)
 
 
 def truth_subjects(frame: Frame, classes: Sequence[str] = ()) -> tuple[Subject, ...]:

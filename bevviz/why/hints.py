@@ -33,7 +33,7 @@ RESULTS = 20  # results of other configurations in the cache, for other subjects
 Change = Mapping[str, Any]  # dotted key -> value
 
 # Parameters that bevviz applies to the output of user functions, too.
-_WHOEVER = {"min_cluster_points", "max_cluster_points", "conf_threshold"}
+_SHARED_PARAMETERS = {"min_cluster_points", "max_cluster_points", "conf_threshold"}
 _SECTION = {  # reason -> section whose parameters may help
     Reason.GROUND: "ground",
     Reason.NOISE: "clustering",
@@ -51,13 +51,13 @@ _ORDER = {reason: place for place, reason in enumerate(Reason)}  # in the order 
 
 
 @dataclass(frozen=True, slots=True)
-class _Stage:
+class _ReachedStage:
     """The stage that a subject reached. A later stage is greater."""
 
     reported: bool
     reason: Reason
 
-    def __gt__(self, other: _Stage) -> bool:
+    def __gt__(self, other: _ReachedStage) -> bool:
         return (self.reported, _ORDER[self.reason]) > (other.reported, _ORDER[other.reason])
 
 
@@ -115,15 +115,15 @@ class WhatIf:
         helps, combine the changes that bring the subject to a later stage with the changes for the reason
         there.
         """
-        found: list[Hint] = []
-        reached: dict[_Stage, tuple[Change, Evidence, Traces]] = {}  # by the mildest change
+        hints: list[Hint] = []
+        reached: dict[_ReachedStage, tuple[Change, Evidence, Traces]] = {}  # by the mildest change
         tried = 0
 
         def ways() -> Iterator[Change]:
             """Yield the changes to try."""
-            yield from islice(_changes(evidence, reason, self._traces), TRIES)
-            if not found:
-                yield from islice(_further(reached), FURTHER)
+            yield from islice(_changes_for(evidence, reason, self._traces), TRIES)
+            if not hints:
+                yield from islice(_combined_changes(reached), FURTHER)
 
         for change in ways():
             after = self._run(change)
@@ -132,18 +132,18 @@ class WhatIf:
             tried += 1
             then = gather(subject, after)
             new, now_reported = find_reason(subject, then, after)
-            text, own = _outcome(subject, (reason, reported), (new, now_reported), then, after)
+            text, object_row = _new_outcome(subject, (reason, reported), (new, now_reported), then, after)
             if text and _is_sure(subject, change, then):
                 row = subject.row if subject.kind == "truth" else -1
                 objects, then_objects = self._result.objects, after.result.objects
-                harm = effects(objects, then_objects, self._traces.truth, row, own)
-                found.append(Hint(_settings(change), text, harm))
-                if not found[-1].effects.harm:
+                harm = effects(objects, then_objects, self._traces.truth, row, object_row)
+                hints.append(Hint(_settings(change), text, harm))
+                if not hints[-1].effects.harm:
                     break
-            elif not text and (stage := _Stage(now_reported, new)) > _Stage(reported, reason):
+            elif not text and (stage := _ReachedStage(now_reported, new)) > _ReachedStage(reported, reason):
                 reached.setdefault(stage, (change, then, after))
-        if found or not reached:
-            return Search(tuple(sorted(found, key=lambda hint: hint.effects.harm)[:1]), tried)
+        if hints or not reached:
+            return Search(tuple(sorted(hints, key=lambda hint: hint.effects.harm)[:1]), tried)
         last = max(reached)
         return Search((), tried, _settings(reached[last][0]), last.reason, last.reported)
 
@@ -176,13 +176,13 @@ class WhatIf:
 
         def detect(camera: Camera) -> Detections | None:
             """Return the detections of a camera with the states of the new threshold."""
-            found = known[camera.name]
-            if found is None:
+            detections = known[camera.name]
+            if detections is None:
                 return None
-            kept = found.score >= config.detector.conf_threshold
+            kept = detections.score >= config.detector.conf_threshold
             state = np.where(kept, DetectionState.KEPT, DetectionState.BELOW_THRESHOLD).astype(np.int32)
-            state[found.state == DetectionState.SUPPRESSED] = DetectionState.SUPPRESSED
-            return replace(found, state=state)
+            state[detections.state == DetectionState.SUPPRESSED] = DetectionState.SUPPRESSED
+            return replace(detections, state=state)
 
         return detect
 
@@ -199,11 +199,15 @@ def changed(config: Config, change: Change) -> Config:
     return config.restated(tree)
 
 
-def _outcome(
-    subject: Subject, was: tuple[Reason, bool], now: tuple[Reason, bool], e: Evidence, after: Traces
+def _new_outcome(
+    subject: Subject,
+    old_verdict: tuple[Reason, bool],
+    new_verdict: tuple[Reason, bool],
+    evidence: Evidence,
+    after: Traces,
 ) -> tuple[str, int]:
     """Return the new result of the subject, empty if it is no better, and the row of its object."""
-    (reason, reported), (new, now_reported), named = was, now, e.named
+    (reason, reported), (new, now_reported), named = old_verdict, new_verdict, evidence.named
     if reason is Reason.BORROWED and subject.kind != "truth":
         return ("" if named is not None else "it is not named any more"), -1
     better = now_reported and (not reported or reason in FLAWED | {Reason.BORROWED})
@@ -214,64 +218,62 @@ def _outcome(
     return f"it is cluster {named.cluster} then, named {named.name}", named.row
 
 
-def _is_sure(subject: Subject, change: Change, e: Evidence) -> bool:
+def _is_sure(subject: Subject, change: Change, evidence: Evidence) -> bool:
     """Return whether a detection that passes only with other limits surely belongs to the subject."""
-    if subject.kind != "truth" or e.named is None or e.named.detection < 0:
+    if subject.kind != "truth" or evidence.named is None or evidence.named.detection < 0:
         return True
     if not any(key.startswith(("detector.", "fusion.min", "fusion.split")) for key in change):
         return True
-    camera, row = e.named.camera, e.named.detection
-    return any((c.camera, c.row) == (camera, row) and c.overlap >= SURE for c in e.candidates)
+    camera, row = evidence.named.camera, evidence.named.detection
+    return any(
+        (candidate.camera, candidate.row) == (camera, row) and candidate.overlap >= SURE
+        for candidate in evidence.candidates
+    )
 
 
 def _settings(change: Change) -> tuple[str, ...]:
     """Return a change as settings ``key=value``."""
-    return tuple(f"{key}={_written(value)}" for key, value in change.items())
+    return tuple(f"{key}={_setting_text(value)}" for key, value in change.items())
 
 
-def _further(reached: Mapping[_Stage, tuple[Change, Evidence, Traces]]) -> Iterator[Change]:
+def _combined_changes(reached: Mapping[_ReachedStage, tuple[Change, Evidence, Traces]]) -> Iterator[Change]:
     """Yield combined changes, from the latest stage back. ``reached`` may grow meanwhile."""
-    done: set[_Stage] = set()
+    done: set[_ReachedStage] = set()
     while left := reached.keys() - done:
         stage = max(left)
         done.add(stage)
         change, evidence, after = reached[stage]
-        for more in _changes(evidence, stage.reason, after):
+        for more in _changes_for(evidence, stage.reason, after):
             yield {**change, **more}
 
 
 # --- changes to try ----------------------------------------------------------------------------
 
 
-def _changes(e: Evidence, reason: Reason, traces: Traces) -> Iterator[Change]:
+def _changes_for(evidence: Evidence, reason: Reason, traces: Traces) -> Iterator[Change]:
     """Yield changes that may help: parameters of our stages, or of the user's function."""
     result = traces.result
     section = _SECTION.get(reason, "")
     if section and not traces.origin(section).ours:
-        yield from _of_function(result, section)
+        yield from _function_changes(result, section)
     if not traces.origin("objects").ours:
         return
     config = result.config
-    for change in _of_ours(e, reason, config):
-        if all(_is_ours(key, traces) for key in change):
+    for change in _our_changes(evidence, reason, config):
+        if all(_has_effect(key, traces) for key in change):
             yield change
 
 
-def _is_ours(key: str, traces: Traces) -> bool:
+def _has_effect(key: str, traces: Traces) -> bool:
     """Return whether a parameter has an effect. Ours have none on a stage that is not ours."""
     section, _, name = key.partition(".")
     if section not in ("ground", "clustering", "detector"):
         return True
-    there = traces.origin(section)
-    shared = {
-        "min_cluster_points",
-        "max_cluster_points",
-        "conf_threshold",
-    }  # bevviz applies them to every stage
-    return there.ours or (bool(there.function) and name in shared)
+    owner = traces.origin(section)
+    return owner.ours or (bool(owner.function) and name in _SHARED_PARAMETERS)
 
 
-def _of_function(result: FrameResult, section: str) -> Iterator[Change]:
+def _function_changes(result: FrameResult, section: str) -> Iterator[Change]:
     """Yield halves and doubles of the numeric parameters of a user's function, within their bounds."""
     try:
         plugin = plugin_of(result.config, section)
@@ -279,60 +281,60 @@ def _of_function(result: FrameResult, section: str) -> Iterator[Change]:
         return
     if plugin is None or plugin.params is None:
         return
-    given = dict(getattr(result.config, section).params)
+    params = dict(getattr(result.config, section).params)
     for factor in (0.5, 2.0):
-        for name, value in given.items():
+        for name, value in params.items():
             if isinstance(value, bool) or not isinstance(value, int | float) or not value:
                 continue
             other = type(value)(round(value * factor)) if isinstance(value, int) else round(value * factor, 6)
             try:
-                plugin.params.model_validate({**given, name: other})
+                plugin.params.model_validate({**params, name: other})
             except ValidationError:
                 continue
             if other != value:
                 yield {f"{section}.params.{name}": other}
 
 
-def _of_ours(e: Evidence, reason: Reason, config: Config) -> Iterator[Change]:
+def _our_changes(evidence: Evidence, reason: Reason, config: Config) -> Iterator[Change]:
     """Yield changes of our parameters that may help against the reason."""
-    c, best = config.clustering, e.best
+    clustering, best = config.clustering, evidence.best
     if reason is Reason.GROUND:
-        yield from _lower_ground(config)
+        yield from _ground_changes(config)
     elif reason is Reason.NOISE:
-        for points in _below(e.neighbours, c.min_points):
+        for points in _smaller_min_points(evidence.neighbours, clustering.min_points):
             yield {"clustering.min_points": points}
-            if points < c.min_cluster_points:
+            if points < clustering.min_cluster_points:
                 yield {"clustering.min_points": points, "clustering.min_cluster_points": points}
         for factor in (1.5, 2.0):
-            yield {"clustering.eps": round(c.eps * factor, 3)}
-        yield from _lower_ground(config)
+            yield {"clustering.eps": round(clustering.eps * factor, 3)}
+        yield from _ground_changes(config)
     elif reason is Reason.TOO_SMALL:
-        yield {"clustering.min_cluster_points": max(_aside(e), 1)}
-        yield {"clustering.eps": round(c.eps * 1.5, 3)}
+        yield {"clustering.min_cluster_points": max(_set_aside_points(evidence), 1)}
+        yield {"clustering.eps": round(clustering.eps * 1.5, 3)}
     elif reason is Reason.TOO_LARGE:
-        yield {"clustering.max_cluster_points": _aside(e)}
+        yield {"clustering.max_cluster_points": _set_aside_points(evidence)}
     elif reason is Reason.MERGED:
         if config.fusion.method == "frustum" and not config.fusion.split:
             yield {"fusion.split": True}
-        if e.finer:
-            yield from ({"clustering.eps": round(e.finer * f, 3)} for f in (1.0, 0.85, 0.7))
-        elif not e.others:
-            yield from ({"clustering.eps": round(c.eps * f, 3)} for f in (0.8, 0.6, 0.4))
+        if evidence.finer:
+            yield from ({"clustering.eps": round(evidence.finer * factor, 3)} for factor in (1.0, 0.85, 0.7))
+        elif not evidence.others:
+            yield from ({"clustering.eps": round(clustering.eps * factor, 3)} for factor in (0.8, 0.6, 0.4))
     elif reason is Reason.SPLIT:
         # The distance is unknown if one of the parts is not a cluster.
-        yield {"clustering.eps": round(max(np.nan_to_num(e.apart), c.eps) * 1.1, 3)}
-        yield {"clustering.min_points": max(1, c.min_points // 2)}
-        yield {"clustering.eps": round(c.eps * 1.5, 3)}
+        yield {"clustering.eps": round(max(np.nan_to_num(evidence.apart), clustering.eps) * 1.1, 3)}
+        yield {"clustering.min_points": max(1, clustering.min_points // 2)}
+        yield {"clustering.eps": round(clustering.eps * 1.5, 3)}
     elif best is not None:
-        yield from _for_detection(reason, best, config)
+        yield from _detection_changes(reason, best, config)
 
 
-def _aside(e: Evidence) -> int:
+def _set_aside_points(evidence: Evidence) -> int:
     """Return the number of points of the cluster outside the size limits."""
-    return next(part.count for part in e.parts if not part.kept)
+    return next(part.count for part in evidence.parts if not part.kept)
 
 
-def _for_detection(reason: Reason, best: Candidate, config: Config) -> Iterator[Change]:
+def _detection_changes(reason: Reason, best: Candidate, config: Config) -> Iterator[Change]:
     """Yield changes that may help a subject that has a detection."""
     if reason is Reason.BELOW_THRESHOLD:
         # A threshold that lets noise pass is no advice.
@@ -342,14 +344,18 @@ def _for_detection(reason: Reason, best: Candidate, config: Config) -> Iterator[
             if config.fusion.method == "frustum" and config.fusion.split:
                 # The rating of a match is proportional to the score.
                 weak = config.fusion.min_rating * best.score / config.detector.conf_threshold
-                yield from ({**passes, "fusion.min_rating": round(weak * f, 4)} for f in (1.0, 0.5))
+                yield from ({**passes, "fusion.min_rating": round(weak * factor, 4)} for factor in (1.0, 0.5))
     elif reason is Reason.SUPPRESSED:
         yield from ({"detector.iou_threshold": value} for value in (0.6, 0.7, 0.8, 0.9))
     elif reason is Reason.LOW_OVERLAP:
-        yield from ({"fusion.min_iou": round(config.fusion.min_iou * f, 3)} for f in (0.5, 0.2, 0.0))
+        yield from (
+            {"fusion.min_iou": round(config.fusion.min_iou * factor, 3)} for factor in (0.5, 0.2, 0.0)
+        )
         yield {"clustering.eps": round(config.clustering.eps * 0.6, 3)}
     elif reason is Reason.MISFIT:
-        yield from ({"fusion.min_rating": round(config.fusion.min_rating * f, 4)} for f in (0.5, 0.2))
+        yield from (
+            {"fusion.min_rating": round(config.fusion.min_rating * factor, 4)} for factor in (0.5, 0.2)
+        )
         yield {"fusion.split": False}
     elif reason is Reason.TOO_FEW_POINTS:
         yield from ({"fusion.min_points": value} for value in range(config.fusion.min_points - 1, 0, -1))
@@ -358,19 +364,19 @@ def _for_detection(reason: Reason, best: Candidate, config: Config) -> Iterator[
             yield {"fusion.method": "frustum"}
     elif reason is Reason.TOO_FAR and config.fusion.method == "centroid":
         # The subject has no cluster of its own: the fusion compared the nearest other one.
-        yield from _lower_ground(config)
+        yield from _ground_changes(config)
         yield {"fusion.method": "frustum"}
     elif reason is Reason.TOO_FAR:
         yield {"fusion.max_depth": 200.0}
 
 
-def _lower_ground(config: Config) -> Iterator[Change]:
+def _ground_changes(config: Config) -> Iterator[Change]:
     """Yield thinner ground layers, and for a plane also a ground that follows the road."""
-    g, points = config.ground, max(1, config.clustering.min_points // 3)
+    ground, points = config.ground, max(1, config.clustering.min_points // 3)
     for threshold in (0.3, 0.2, 0.1):
-        if threshold < g.distance_threshold:
+        if threshold < ground.distance_threshold:
             yield {"ground.distance_threshold": threshold}
-    if g.method == "plane":
+    if ground.method == "plane":
         yield {"ground.method": "polar", "ground.distance_threshold": 0.2}
         yield {
             "ground.method": "polar",
@@ -379,13 +385,13 @@ def _lower_ground(config: Config) -> Iterator[Change]:
         }
 
 
-def _below(neighbours: int, limit: int) -> list[int]:
+def _smaller_min_points(neighbours: int, limit: int) -> list[int]:
     """Return values of min_points to try: the number that the best point reaches, and less."""
     tries = [neighbours, round(neighbours * 0.75), neighbours // 2]
     return [n for n in dict.fromkeys(tries) if 2 <= n < limit]
 
 
-def _written(value: Any) -> str:
+def _setting_text(value: Any) -> str:
     """Return a value as ``--set`` takes it."""
     if isinstance(value, bool):
         return str(value).lower()

@@ -78,7 +78,9 @@ def log_answers(
         colors[list(COLORS)] = list(COLORS.values())
         points = rr.Points3D(frame.points[known], colors=colors[fate[known]], radii=rr.Radius.ui_points(4.0))
         recording.log(entities.why("points"), pose, points)
-    strips = [edges(geometry.corners(a.subject.box)[0]) for a in drawn if a.subject.box is not None]
+    strips = [
+        edges(geometry.corners(answer.subject.box)[0]) for answer in drawn if answer.subject.box is not None
+    ]
     strips += [strip for camera in frame.cameras for strip in _frustums(camera, drawn)]
     if strips:
         place = rr.LineStrips3D(strips, colors=[_SUBJECT], radii=rr.Radius.ui_points(2.0))
@@ -119,7 +121,7 @@ def _log_above(
 ) -> None:
     """Log the outlines of the boxes in the bird's-eye view, or the points if there is no box."""
     reach = np.array([config.range_x, config.range_y], np.float32)
-    boxes = [a.subject.box for a in answers if a.subject.box is not None]
+    boxes = [answer.subject.box for answer in answers if answer.subject.box is not None]
     inside = [box for box in boxes if (np.abs(box.center[0, :2]) < reach).all()]
     points = frame.points[fate > 0]
     points = points[(np.abs(points[:, :2]) < reach).all(axis=1)]
@@ -158,22 +160,22 @@ def _frustums(camera: Camera, answers: Sequence[Answer]) -> Iterator[F32]:
         return
     points_from_camera = geometry.inverse(camera.camera_from_points)
     for answer in answers:
-        s = answer.subject
-        if s.xyxy is not None and s.camera == camera.name:
+        subject = answer.subject
+        if subject.xyxy is not None and subject.camera == camera.name:
             far = _DEPTH if np.isnan(answer.distance) else answer.distance
-            corners = geometry.frustum(s.xyxy[None], camera.intrinsics, 0.5, far)[0]
+            corners = geometry.frustum(subject.xyxy[None], camera.intrinsics, 0.5, far)[0]
             yield edges(geometry.apply(points_from_camera, corners))
 
 
 def _log_image(recording: rr.RecordingStream, camera: Camera, answers: Sequence[Answer]) -> None:
     """Log the image boxes of the subjects over a camera's image."""
     boxes, names = [], []
-    for number, s in enumerate(answer.subject for answer in answers):
-        own = s.xyxy if s.camera == camera.name else None
-        box = projected(s.box, camera) if s.box is not None else own
+    for number, subject in enumerate(answer.subject for answer in answers):
+        image_box = subject.xyxy if subject.camera == camera.name else None
+        box = projected(subject.box, camera) if subject.box is not None else image_box
         if box is not None:
             boxes.append(box)
-            names.append("" if number else s.name)
+            names.append("" if number else subject.name)
     if boxes:
         recording.log(
             entities.why(f"{camera.name}/place"),

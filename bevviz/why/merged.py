@@ -27,7 +27,7 @@ FINER = (
 LOOKED_AT = 2000  # points of a large set used for distances
 
 
-def find_mates(subject: Subject, traces: Traces, main: int, own: I64) -> list[tuple[int, str, int]]:
+def find_mates(subject: Subject, traces: Traces, main: int, obstacle_rows: I64) -> list[tuple[int, str, int]]:
     """Return the row, name and number of points of other objects in the subject's main cluster."""
     clusters, obstacles = traces.result.clusters, traces.result.obstacles
     if main < 0 or clusters is None or obstacles is None:
@@ -38,8 +38,8 @@ def find_mates(subject: Subject, traces: Traces, main: int, own: I64) -> list[tu
     if subject.kind != "detection":
         return []
     members = np.flatnonzero(clusters.labels == main)
-    mine = np.isin(members, own)
-    found = []
+    mine = np.isin(members, obstacle_rows)
+    mates = []
     for other in traces.competing:
         if other.key == subject.key or not _same_view(subject, other):
             continue
@@ -49,8 +49,8 @@ def find_mates(subject: Subject, traces: Traces, main: int, own: I64) -> list[tu
         theirs = np.isin(members, rows_of)
         alone, apart = mine & ~theirs, theirs & ~mine
         if alone.sum() >= FEW and apart.sum() >= max(FEW, PART * min(int(alone.sum()), 50)):
-            found.append((other.row, other.name, int(theirs.sum())))
-    return found
+            mates.append((other.row, other.name, int(theirs.sum())))
+    return mates
 
 
 def _same_view(a: Subject, b: Subject) -> bool:
@@ -61,7 +61,7 @@ def _same_view(a: Subject, b: Subject) -> bool:
 
 
 def part_from(
-    subject: Subject, traces: Traces, main: int, own: I64, mates: Sequence[tuple[int, str, int]]
+    subject: Subject, traces: Traces, main: int, obstacle_rows: I64, mates: Sequence[tuple[int, str, int]]
 ) -> tuple[float, float]:
     """Return the gap in metres between the subject and its mates, and the eps that separates them.
 
@@ -72,7 +72,7 @@ def part_from(
     if main < 0 or clusters is None or obstacles is None or subject.kind not in ("truth", "detection"):
         return float("nan"), 0.0
     members = np.flatnonzero(clusters.labels == main)
-    mine = np.isin(members, own)
+    mine = np.isin(members, obstacle_rows)
     if not mates and (subject.kind == "detection" or mine.mean() >= MOST):
         return float("nan"), 0.0
     points = obstacles[members]
@@ -80,7 +80,9 @@ def part_from(
     voxels = result.voxels
     assert voxels is not None
     for row, _, _ in mates:
-        other = traces.truth[row] if subject.kind == "truth" else _other(traces, subject.camera, row)
+        other = (
+            traces.truth[row] if subject.kind == "truth" else _detection_of_row(traces, subject.camera, row)
+        )
         theirs = np.isin(members, traces.obstacle[np.unique(voxels.inverse[traces.place(other)])])
         theirs &= ~mine if subject.box is not None else np.True_
         alone = mine if subject.box is not None else mine & ~theirs
@@ -93,16 +95,16 @@ def part_from(
         return float("nan"), 0.0
     if not mates:
         gap = closest(points[mine], points[nearest])
-    finer = _finer(points, mine, nearest, traces) if traces.origin("clustering").ours else 0.0
+    finer = _separating_eps(points, mine, nearest, traces) if traces.origin("clustering").ours else 0.0
     return gap, finer
 
 
-def _other(traces: Traces, camera: str, row: int) -> Subject:
+def _detection_of_row(traces: Traces, camera: str, row: int) -> Subject:
     """Return the detection of a row as a subject."""
-    return next(s for s in traces.competing if (s.camera, s.row) == (camera, row))
+    return next(subject for subject in traces.competing if (subject.camera, subject.row) == (camera, row))
 
 
-def _finer(points: F32, mine: Bool, theirs: Bool, traces: Traces) -> float:
+def _separating_eps(points: F32, mine: Bool, theirs: Bool, traces: Traces) -> float:
     """Return the largest tried eps at which the two sets of points fall into different clusters."""
     config = traces.result.config.clustering
     for factor in FINER:

@@ -27,17 +27,17 @@ def find_named(
     if subject.kind == "object":
         rows = [subject.row] if subject.row < len(objects) else []
     elif traces.origin("objects").ours:
-        rows = list(_made_of(subject, traces, parts, candidates))
+        rows = list(_objects_of_clusters(subject, traces, parts, candidates))
     else:
-        rows = list(_boxes_there(subject, traces))
+        rows = list(_objects_at_place(subject, traces))
     accepts = subject.accepts if traces.origin("objects").ours else subject.accepts_of_others
-    rows.sort(key=lambda j: not accepts(objects.names[j]))
-    for j in rows:
-        return _described(subject, j, result, candidates)
+    rows.sort(key=lambda row: not accepts(objects.names[row]))
+    for row in rows:
+        return _reported_object(subject, row, result, candidates)
     return None
 
 
-def find_fused(subject: Subject, e: Evidence, traces: Traces) -> int:
+def find_fused(subject: Subject, evidence: Evidence, traces: Traces) -> int:
     """Return the row of the object that our fusion would make of the subject, -1: none.
 
     It applies where the objects are not ours. A detection has its own object, other subjects that of their
@@ -48,10 +48,10 @@ def find_fused(subject: Subject, e: Evidence, traces: Traces) -> int:
         return -1
     fused = opinions.fused
     if subject.kind == "detection":
-        own = {(c.camera, c.row) for c in e.candidates}
+        candidate_keys = {(candidate.camera, candidate.row) for candidate in evidence.candidates}
         named = zip(fused.camera, fused.detection.tolist(), strict=True)
-        return next((j for j, key in enumerate(named) if key in own), -1)
-    return fused.cluster.tolist().index(e.main) if e.main in fused.cluster else -1
+        return next((row for row, key in enumerate(named) if key in candidate_keys), -1)
+    return fused.cluster.tolist().index(evidence.main) if evidence.main in fused.cluster else -1
 
 
 def in_box_of(objects: Objects, row: int) -> str:
@@ -62,83 +62,95 @@ def in_box_of(objects: Objects, row: int) -> str:
 def opinion_on(result: FrameResult, row: int) -> str:
     """Return the opinion of the cameras on an object that is not ours; empty: no opinion."""
     key = "object", row
-    said = next((x.text for x in result.explanations if (x.subject, x.row) == key), "")
-    return said.partition(": ")[2]
+    text = next(
+        (
+            explanation.text
+            for explanation in result.explanations
+            if (explanation.subject, explanation.row) == key
+        ),
+        "",
+    )
+    return text.partition(": ")[2]
 
 
-def _described(subject: Subject, j: int, result: FrameResult, candidates: Sequence[Candidate]) -> Named:
+def _reported_object(
+    subject: Subject, row: int, result: FrameResult, candidates: Sequence[Candidate]
+) -> Named:
     """Return the object with the detection that named it."""
     objects = result.objects
     assert objects is not None
-    camera, d, k = objects.camera[j], int(objects.detection[j]), int(objects.cluster[j])
+    camera, detection, cluster = objects.camera[row], int(objects.detection[row]), int(objects.cluster[row])
     also: list[int] = []
     if camera:
         _, fusion = fusion_of(result, camera)
         assert fusion is not None
-        same = (fusion.cluster_decision == Decision.MATCHED) & (fusion.cluster_detection == d)
-        also = [other for other in np.flatnonzero(same).tolist() if other != k]
+        same = (fusion.cluster_decision == Decision.MATCHED) & (fusion.cluster_detection == detection)
+        also = [other for other in np.flatnonzero(same).tolist() if other != cluster]
     known = subject.kind in (
         "truth",
         "detection",
     )  # The detections of a place merely touch it.
-    own = any((c.camera, c.row) == (camera, d) and (known or c.overlap >= LINK) for c in candidates)
-    return Named(j, objects.names[j], k, camera, d, own, tuple(also))
+    is_own = any(
+        (candidate.camera, candidate.row) == (camera, detection) and (known or candidate.overlap >= LINK)
+        for candidate in candidates
+    )
+    return Named(row, objects.names[row], cluster, camera, detection, is_own, tuple(also))
 
 
-def _made_of(
+def _objects_of_clusters(
     subject: Subject, traces: Traces, parts: Sequence[Part], candidates: Sequence[Candidate]
 ) -> Iterator[int]:
     """Yield the rows of the objects that come from the subject's clusters and represent it."""
     objects = traces.result.objects
     assert objects is not None
     if subject.kind == "detection":
-        own = {(c.camera, c.row) for c in candidates}
-        for j, key in enumerate(zip(objects.camera, objects.detection.tolist(), strict=True)):
-            if key in own:
-                yield j
+        candidate_keys = {(candidate.camera, candidate.row) for candidate in candidates}
+        for row, key in enumerate(zip(objects.camera, objects.detection.tolist(), strict=True)):
+            if key in candidate_keys:
+                yield row
         return
-    total = len(traces.labels(subject.row)) if subject.kind == "truth" else sum(p.points for p in parts)
+    total = len(traces.labels(subject.row)) if subject.kind == "truth" else sum(part.points for part in parts)
     least = 1 if subject.is_place else max(FEW, PART * total)
     for part in parts:
-        for j in np.flatnonzero(objects.cluster == part.cluster).tolist():
-            if part.points >= least and _stands_for(subject, traces, j, part):
-                yield j
+        for row in np.flatnonzero(objects.cluster == part.cluster).tolist():
+            if part.points >= least and _represents(subject, traces, row, part):
+                yield row
 
 
-def _stands_for(subject: Subject, traces: Traces, j: int, part: Part) -> bool:
+def _represents(subject: Subject, traces: Traces, row: int, part: Part) -> bool:
     """Return whether an object is this subject, and not another one in the same cluster."""
     if subject.kind != "truth":
         return True
     objects = traces.result.objects
     assert objects is not None
-    camera = traces.camera(objects.camera[j])
-    owner = -1 if camera is None else int(traces.owners(camera)[objects.detection[j]])
+    camera = traces.camera(objects.camera[row])
+    owner = -1 if camera is None else int(traces.owners(camera)[objects.detection[row]])
     mates = list(traces.mates(part.cluster, subject.row))
     if owner == subject.row or not mates:
         return True
     return owner not in mates and all(part.points > traces.holds(part.cluster, mate) for mate in mates)
 
 
-def _boxes_there(subject: Subject, traces: Traces) -> Iterator[int]:
+def _objects_at_place(subject: Subject, traces: Traces) -> Iterator[int]:
     """Yield the rows of the objects whose box is at the subject, for objects without clusters."""
     objects, points = traces.result.objects, traces.result.frame.points
     assert objects is not None
     if subject.kind in ("detection", "pixel"):
         camera = traces.camera(subject.camera)
-        for j in range(len(objects)):
-            box = projected(one_of(objects.boxes, j), camera.camera) if camera is not None else None
+        for row in range(len(objects)):
+            box = projected(one_of(objects.boxes, row), camera.camera) if camera is not None else None
             if box is None or subject.xyxy is None:
                 continue
             if subject.kind == "pixel" or geometry.iou(box[None], subject.xyxy[None])[0, 0] >= LINK:
-                yield j
+                yield row
         return
     mine = points[traces.place(subject)]
     share = np.array(
-        [in_box(one_of(objects.boxes, j), mine).mean() if len(mine) else 0 for j in range(len(objects))]
+        [in_box(one_of(objects.boxes, row), mine).mean() if len(mine) else 0 for row in range(len(objects))]
     )
     overlap = np.zeros(len(objects))
     if subject.box is not None and len(objects):
         overlap = geometry.bev_iou(subject.box, objects.boxes)[0]
-    for j in np.argsort(-(share + overlap), kind="stable").tolist():
-        if share[j] >= HELD or overlap[j] >= OVERLAP:
-            yield j
+    for row in np.argsort(-(share + overlap), kind="stable").tolist():
+        if share[row] >= HELD or overlap[row] >= OVERLAP:
+            yield row

@@ -80,32 +80,33 @@ def pick(
         position: 2 pixels in a view of an image, or 3 metres of the fixed frame in a 3D view.
     """
     row, path = -1 if instance is None else instance, entities.boxes_of(path)
-    if found := _told(result, path, row):
-        return found
+    if hit := _object_with_opinion(result, path, row):
+        return hit
     for camera in result.cameras:
-        if found := _in_image(camera, path, row, position):
-            return found
+        if hit := _in_image(camera, path, row, position):
+            return hit
     if path == entities.BEV or path.startswith(f"{entities.BEV}/"):
         return _cell(result, position) if len(position) >= 2 else None
-    return _in_space(result, tracks, path, row) or _at(result, position)
+    return _in_space(result, tracks, path, row) or _place_at(result, position)
 
 
-def _told(result: FrameResult, path: str, row: int) -> Pick | None:
+def _object_with_opinion(result: FrameResult, path: str, row: int) -> Pick | None:
     """Return an object with an opinion of the cameras, drawn over an image or the bird's-eye view."""
     views = [told_from_above(result)] if path.startswith(f"{entities.BEV}/") else []
     views += [
-        told_in_image(result, found.camera)
-        for found in result.cameras
-        if path.startswith(f"{entities.image(found.camera.name)}/")
+        told_in_image(result, camera.camera)
+        for camera in result.cameras
+        if path.startswith(f"{entities.image(camera.camera.name)}/")
     ]
-    for told in views:
-        if path in told and 0 <= (row := row_of(row, len(told[path].rows))) < len(told[path].rows):
-            found = told[path].rows[row]
-            return _missed(result, found) if told[path].opinion == MISSED else Pick("object", found)
+    for view in views:
+        if path in view and 0 <= (row := row_of(row, len(view[path].rows))) < len(view[path].rows):
+            object_row = view[path].rows[row]
+            is_missed = view[path].opinion == MISSED
+            return _fused_detection(result, object_row) if is_missed else Pick("object", object_row)
     return None
 
 
-def _missed(result: FrameResult, row: int) -> Pick | None:
+def _fused_detection(result: FrameResult, row: int) -> Pick | None:
     """Return the detection of an object of our fusion, where the objects are not ours."""
     if result.opinions is None:
         return None
@@ -115,11 +116,11 @@ def _missed(result: FrameResult, row: int) -> Pick | None:
     return Pick("detection", int(fused.detection[row]), fused.camera[row])
 
 
-def _in_image(found: CameraResult, path: str, row: int, position: Sequence[float]) -> Pick | None:
+def _in_image(camera: CameraResult, path: str, row: int, position: Sequence[float]) -> Pick | None:
     """Return a detection or pixel of a camera."""
-    name = found.camera.name
-    if found.detections is not None and row >= 0:
-        kept = found.detections.kept
+    name = camera.camera.name
+    if camera.detections is not None and row >= 0:
+        kept = camera.detections.kept
         for where, rows in ((entities.detections(name), kept), (entities.weak(name), ~kept)):
             listed = np.flatnonzero(rows)
             if path == where and (row := row_of(row, len(listed))) < len(listed):
@@ -151,7 +152,7 @@ def _in_space(result: FrameResult, tracks: Tracks | None, path: str, row: int) -
     if path == entities.FUSED and (objects := result.objects) is not None:
         return Pick("object", row_of(row, len(objects))) if row_of(row, len(objects)) < len(objects) else None
     if path == entities.FUSION:
-        return _missed(result, row)
+        return _fused_detection(result, row)
     if path == entities.TRUTH and frame.truth is not None and row < len(frame.truth.boxes):
         return Pick("truth", row)
     if path in (entities.TRACKS, entities.UNSEEN) and tracks is not None:
@@ -170,10 +171,10 @@ def _track(result: FrameResult, tracks: Tracks, row: int) -> Pick | None:
     if tracks.cluster[row] >= 0:
         return Pick("cluster", int(tracks.cluster[row]))
     center = tracks.boxes.center[row]
-    return _at(result, center.tolist()) if tracks.absolute else _point(center)
+    return _place_at(result, center.tolist()) if tracks.absolute else _point(center)
 
 
-def _at(result: FrameResult, position: Sequence[float]) -> Pick | None:
+def _place_at(result: FrameResult, position: Sequence[float]) -> Pick | None:
     """Return the place at a position in the fixed frame."""
     if len(position) != 3:
         return None

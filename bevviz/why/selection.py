@@ -31,7 +31,7 @@ def select(traces: Traces, selection: Selection) -> list[Subject]:
     """
     result = traces.result
     if selection.truth is not None:
-        return [_row(traces.truth, selection.truth, "object in the ground truth of this frame")]
+        return [_subject_of_row(traces.truth, selection.truth, "object in the ground truth of this frame")]
     if selection.object is not None:
         return [object_subject(traces, selection.object)]
     if selection.cluster is not None:
@@ -39,32 +39,32 @@ def select(traces: Traces, selection: Selection) -> list[Subject]:
     if selection.track is not None:
         return [track_subject(traces, selection.track)]
     if selection.detection is not None:
-        found = camera_of(traces, selection.camera)
-        number = 0 if found.detections is None else len(found.detections)
+        camera = camera_of(traces, selection.camera)
+        number = 0 if camera.detections is None else len(camera.detections)
         if not 0 <= selection.detection < number:
             raise UserError(
-                f"there is no detection {selection.detection} in {found.camera.name}: it has {number}"
+                f"there is no detection {selection.detection} in {camera.camera.name}: it has {number}"
             )
-        return [detection_subject(found, selection.detection)]
+        return [detection_subject(camera, selection.detection)]
     if selection.point or selection.cell:
-        return [_around(traces, selection)]
+        return [_surroundings(traces, selection)]
     if selection.box:
         return [_pixel(traces, selection)]
     if selection.camera:
         camera_of(traces, selection.camera)
-    subjects = [*_seen(traces, selection.camera), *_strange_detections(traces, selection.camera)]
-    subjects += _denied(traces, selection.camera)
+    subjects = [*_truth_in_view(traces, selection.camera), *_strange_detections(traces, selection.camera)]
+    subjects += _contradicted_objects(traces, selection.camera)
     if not selection.label:
         return subjects
     truth = result.frame.truth
-    theirs = result.objects.names if result.opinions is not None and result.objects is not None else ()
-    known = dict.fromkeys([*traces.classes, *(truth.labels if truth is not None else ()), *theirs])
+    object_names = result.objects.names if result.opinions is not None and result.objects is not None else ()
+    known = dict.fromkeys([*traces.classes, *(truth.labels if truth is not None else ()), *object_names])
     wanted = selection.label.lower()
     if not any(wanted == name.lower() or wanted in accepted_names(name, ()) for name in known):
         near = difflib.get_close_matches(selection.label, known, 1, 0.5)
         hint = f"did you mean '{near[0]}'?" if near else f"there are {', '.join(sorted(known)) or 'none'}"
         raise UserError(f"--class {selection.label}: no such class; {hint}")
-    return [s for s in subjects if s.label.lower() == wanted or _is_called(s, wanted)]
+    return [subject for subject in subjects if subject.label.lower() == wanted or _is_called(subject, wanted)]
 
 
 def _is_called(subject: Subject, name: str) -> bool:
@@ -74,7 +74,7 @@ def _is_called(subject: Subject, name: str) -> bool:
     return subject.kind == "truth" and subject.accepts(name)
 
 
-def _row(subjects: tuple[Subject, ...], row: int, what: str) -> Subject:
+def _subject_of_row(subjects: tuple[Subject, ...], row: int, what: str) -> Subject:
     """Return the subject of a row, or raise a UserError."""
     if not 0 <= row < len(subjects):
         raise UserError(f"there is no {what} of number {row}: it has {len(subjects)}")
@@ -93,8 +93,8 @@ def object_subject(traces: Traces, row: int) -> Subject:
         raise UserError(f"there is no object {row} in this frame: it has {number}")
     box, name = one_of(objects.boxes, row), objects.names[row]
     away = float(np.hypot(*box.center[0, :2]))
-    k = int(objects.cluster[row])
-    points = np.flatnonzero(traces.cluster == k) if k >= 0 else None
+    cluster = int(objects.cluster[row])
+    points = np.flatnonzero(traces.cluster == cluster) if cluster >= 0 else None
     title = f"the {name} {objects.score[row]:.2f} at {away:.1f} m"
     return Subject("object", title, name, frozenset({name.lower()}), row, box=box, points=points)
 
@@ -130,16 +130,16 @@ def track_subject(traces: Traces, number: int) -> Subject:
         known = ", ".join(map(str, tracks.id[:10].tolist())) or "none"
         raise UserError(f"there is no track {number} in this frame; there are {known}")
     row = int(rows[0])
-    box, name, k = one_of(tracks.boxes, row), tracks.names[row], int(tracks.cluster[row])
+    box, name, cluster = one_of(tracks.boxes, row), tracks.names[row], int(tracks.cluster[row])
     if tracks.absolute:
         box = geometry.moved(box, geometry.inverse(frame.pose))
     title = f"track {number}{f' ({name})' if name else ''} at {float(np.hypot(*box.center[0, :2])):.1f} m"
-    points = np.flatnonzero(traces.cluster == k) if k >= 0 else None
+    points = np.flatnonzero(traces.cluster == cluster) if cluster >= 0 else None
     accepted = frozenset({name.lower()} if name else ())
     return Subject("track", title, name, accepted, number, box=box, points=points)
 
 
-def _around(traces: Traces, selection: Selection) -> Subject:
+def _surroundings(traces: Traces, selection: Selection) -> Subject:
     """Return the surroundings of a point or of a cell of the bird's-eye view as a subject."""
     edge = 2 * selection.radius
     if selection.point:
@@ -147,7 +147,7 @@ def _around(traces: Traces, selection: Selection) -> Subject:
         kind, name = "point", "what is at {:g}, {:g}, {:g} m".format(*center)
     else:
         points = traces.result.frame.points
-        x, y = _of_cell(traces.result.config.bev, *selection.cell[:2])
+        x, y = _cell_center(traces.result.config.bev, *selection.cell[:2])
         low, high = (float(points[:, 2].min()), float(points[:, 2].max())) if len(points) else (0.0, 0.0)
         center, size = (x, y, (low + high) / 2), (edge, edge, high - low)
         kind, name = "cell", f"what is at {x:.2f}, {y:.2f} m of the bird's-eye view"
@@ -155,7 +155,7 @@ def _around(traces: Traces, selection: Selection) -> Subject:
     return Subject("point" if kind == "point" else "cell", name, box=box)
 
 
-def _of_cell(config: BevConfig, row: int, column: int) -> tuple[float, float]:
+def _cell_center(config: BevConfig, row: int, column: int) -> tuple[float, float]:
     """Return the x, y of the middle of a cell, in metres of the points' frame."""
     rows, columns = (round(2 * reach / config.resolution) for reach in (config.range_x, config.range_y))
     if not (0 <= row < rows and 0 <= column < columns):
@@ -169,32 +169,32 @@ def _of_cell(config: BevConfig, row: int, column: int) -> tuple[float, float]:
 
 def _pixel(traces: Traces, selection: Selection) -> Subject:
     """Return a pixel or image box as a subject."""
-    found = camera_of(traces, selection.camera)
-    wanted = _wanted(found, selection)
-    u, v = (wanted[:2] + wanted[2:]) / 2
-    return Subject("pixel", f"what is at pixel {u:g}, {v:g}", camera=found.camera.name, xyxy=wanted)
+    camera = camera_of(traces, selection.camera)
+    image_box = _selected_box(camera, selection)
+    u, v = (image_box[:2] + image_box[2:]) / 2
+    return Subject("pixel", f"what is at pixel {u:g}, {v:g}", camera=camera.camera.name, xyxy=image_box)
 
 
-def _wanted(found: CameraResult, selection: Selection) -> F32:
+def _selected_box(camera: CameraResult, selection: Selection) -> F32:
     """Return the (4,) image box in question: the selected box, or the surroundings of the pixel."""
-    size = found.camera.intrinsics or _image_size(found)
+    size = camera.camera.intrinsics or _image_size(camera)
     if size is None:
-        raise UserError(f"--box: {found.camera.name} has no image in this frame")
+        raise UserError(f"--box: {camera.camera.name} has no image in this frame")
     low, high = np.array(selection.box[:2]), np.array(selection.box[-2:])
     if (low < -0.5).any() or (high > [size.width - 0.5, size.height - 0.5]).any() or (high < low).any():
         raise UserError(
-            f"--box {','.join(f'{v:g}' for v in selection.box)}: outside the image of {found.camera.name}, "
+            f"--box {','.join(f'{v:g}' for v in selection.box)}: outside the image of {camera.camera.name}, "
             f"which has {size.width} x {size.height} pixels"
         )
     around = PIXELS if len(selection.box) == 2 else 0.0
     return np.concatenate([low - around, high + around]).astype(np.float32)
 
 
-def _image_size(found: CameraResult) -> Intrinsics | None:
+def _image_size(camera: CameraResult) -> Intrinsics | None:
     """Return the size of the camera's image as intrinsics; None without an image."""
-    if found.camera.image is None:
+    if camera.camera.image is None:
         return None
-    height, width = found.camera.image.bgr.shape[:2]
+    height, width = camera.camera.image.bgr.shape[:2]
     return Intrinsics(width, height, np.eye(3))
 
 
@@ -215,7 +215,7 @@ def camera_of(traces: Traces, name: str) -> CameraResult:
     return cameras[names.index(name) if name else 0]
 
 
-def _seen(traces: Traces, camera: str) -> Iterator[Subject]:
+def _truth_in_view(traces: Traces, camera: str) -> Iterator[Subject]:
     """Yield the objects of the ground truth that a camera has in view. Without camera poses, yield all."""
     usable = [
         column
@@ -231,24 +231,24 @@ def _seen(traces: Traces, camera: str) -> Iterator[Subject]:
 
 def _strange_detections(traces: Traces, camera: str) -> Iterator[Subject]:
     """Yield the detections of no object of the ground truth, without duplicates that NMS suppressed."""
-    for found in traces.result.cameras:
-        detections = found.detections
-        if detections is None or camera not in ("", found.camera.name):
+    for camera_result in traces.result.cameras:
+        detections = camera_result.detections
+        if detections is None or camera not in ("", camera_result.camera.name):
             continue
-        strange = (detections.state != DetectionState.SUPPRESSED) & (traces.owners(found) < 0)
+        strange = (detections.state != DetectionState.SUPPRESSED) & (traces.owners(camera_result) < 0)
         for row in np.flatnonzero(strange).tolist():
-            yield detection_subject(found, row)
+            yield detection_subject(camera_result, row)
 
 
-def _denied(traces: Traces, camera: str) -> Iterator[Subject]:
+def _contradicted_objects(traces: Traces, camera: str) -> Iterator[Subject]:
     """Yield the objects that are not ours, not in the ground truth, and contradicted by a camera."""
     opinions, objects = traces.result.opinions, traces.result.objects
     if opinions is None or objects is None:
         return
     real = joined([subject.box for subject in traces.truth if subject.box is not None])
-    there = geometry.bev_iou(objects.boxes, real).max(axis=1, initial=0) >= OVERLAP
+    in_truth = geometry.bev_iou(objects.boxes, real).max(axis=1, initial=0) >= OVERLAP
     for row in np.flatnonzero(opinions.opinion == Opinion.CONTRADICTED).tolist():
-        if not there[row] and camera in ("", opinions.camera[row]):
+        if not in_truth[row] and camera in ("", opinions.camera[row]):
             yield object_subject(traces, row)
 
 
@@ -270,7 +270,7 @@ def at_place(traces: Traces, selection: Selection) -> list[tuple[Subject, bool]]
 
 def _in_space(traces: Traces, selection: Selection) -> Iterator[tuple[Subject, bool]]:
     """Yield the subjects around a point or in a cell."""
-    place = _around(traces, selection)
+    place = _surroundings(traces, selection)
     points = traces.place(place)
     assert place.box is not None
     axes = slice(2 if place.kind == "cell" else 3)
@@ -280,44 +280,44 @@ def _in_space(traces: Traces, selection: Selection) -> Iterator[tuple[Subject, b
         away = float(np.linalg.norm((subject.box.center - place.box.center)[0, axes]))
         if away > np.linalg.norm(subject.box.size[0]) / 2 + selection.radius:
             continue
-        own = traces.place(subject)
-        if away <= selection.radius or len(np.intersect1d(own, points, assume_unique=True)):
-            covered.update(_clusters_of(traces, own))
+        own_points = traces.place(subject)
+        if away <= selection.radius or len(np.intersect1d(own_points, points, assume_unique=True)):
+            covered.update(_clusters_of(traces, own_points))
             yield subject, True
-    for k in np.unique(traces.cluster[points]).tolist():
-        if k >= 0 and k not in covered:
-            yield cluster_subject(traces, k), True
+    for cluster in np.unique(traces.cluster[points]).tolist():
+        if cluster >= 0 and cluster not in covered:
+            yield cluster_subject(traces, cluster), True
 
 
 def _in_image(traces: Traces, selection: Selection) -> Iterator[tuple[Subject, bool]]:
     """Yield the subjects at a pixel or in an image box."""
-    found = camera_of(traces, selection.camera)
-    wanted = _wanted(found, selection)
+    camera = camera_of(traces, selection.camera)
+    image_box = _selected_box(camera, selection)
     pixel = len(selection.box) == 2
     things: list[tuple[Subject, float]] = []  # with their fit
     covered: set[int] = set()
-    for subject, fit in _truth_there(traces, found, wanted, pixel):
+    for subject, fit in _truth_at_box(traces, camera, image_box, pixel):
         covered.update(_clusters_of(traces, traces.place(subject)))
         things.append((subject, fit))
     rows = {subject.row for subject, _ in things}
-    for row, fit in _detections_there(found, wanted, pixel):
-        if found.detections is not None and traces.owners(found)[row] not in rows:
-            subject = detection_subject(found, row)
-            if found.fusion is not None and found.fusion.detection_decision[row] == Decision.MATCHED:
-                covered.add(int(found.fusion.detection_cluster[row]))
+    for row, fit in _detections_at_box(camera, image_box, pixel):
+        if camera.detections is not None and traces.owners(camera)[row] not in rows:
+            subject = detection_subject(camera, row)
+            if camera.fusion is not None and camera.fusion.detection_decision[row] == Decision.MATCHED:
+                covered.add(int(camera.fusion.detection_cluster[row]))
             things.append((subject, fit))
-    for k, fit in _clusters_there(traces, found, wanted, pixel):
-        if k not in covered:
-            things.append((cluster_subject(traces, k), fit))
+    for cluster, fit in _clusters_at_box(traces, camera, image_box, pixel):
+        if cluster not in covered:
+            things.append((cluster_subject(traces, cluster), fit))
     if pixel:
-        yield from _before_the_rest(traces, found, [subject for subject, _ in things], wanted)
+        yield from _nearest_first(traces, camera, [subject for subject, _ in things], image_box)
         return
     best = max((fit for _, fit in things), default=0.0)
     yield from ((subject, fit >= AS_GOOD * best) for subject, fit in things)
 
 
-def _before_the_rest(
-    traces: Traces, found: CameraResult, things: Sequence[Subject], wanted: F32
+def _nearest_first(
+    traces: Traces, camera: CameraResult, things: Sequence[Subject], image_box: F32
 ) -> Iterator[tuple[Subject, bool]]:
     """Yield the subjects at a pixel, and whether each is the nearest with points there.
 
@@ -325,7 +325,7 @@ def _before_the_rest(
     """
     if not things:
         return
-    near = [_nearest(traces, found, _own(traces, found, subject), wanted) for subject in things]
+    near = [_nearest(traces, camera, _own_points(traces, camera, subject), image_box) for subject in things]
     pixels, depth = np.array(near).T
     if pixels.min() > PIXELS:
         yield from ((subject, True) for subject in things)
@@ -335,10 +335,10 @@ def _before_the_rest(
     yield from zip(things, shown.tolist(), strict=True)
 
 
-def _nearest(traces: Traces, found: CameraResult, rows: I64, wanted: F32) -> tuple[float, float]:
+def _nearest(traces: Traces, camera: CameraResult, rows: I64, image_box: F32) -> tuple[float, float]:
     """Return the pixels from the middle of the selected box to the nearest of these points, and its depth."""
-    view = found.camera
-    away = np.linalg.norm(traces.uv(found)[rows] - (wanted[:2] + wanted[2:]) / 2, axis=1)
+    view = camera.camera
+    away = np.linalg.norm(traces.uv(camera)[rows] - (image_box[:2] + image_box[2:]) / 2, axis=1)
     away = np.where(np.isfinite(away), away, np.inf)
     if view.camera_from_points is None or not np.isfinite(away).any():
         return np.inf, np.inf
@@ -347,9 +347,9 @@ def _nearest(traces: Traces, found: CameraResult, rows: I64, wanted: F32) -> tup
     return float(away[row]), float(geometry.apply(view.camera_from_points, point[None])[0, 2])
 
 
-def _own(traces: Traces, found: CameraResult, subject: Subject) -> I64:
+def _own_points(traces: Traces, camera: CameraResult, subject: Subject) -> I64:
     """Return the rows of the subject's raw points. A detection has those of the cluster that it named."""
-    fusion, row = found.fusion, subject.row
+    fusion, row = camera.fusion, subject.row
     if subject.kind != "detection" or fusion is None or fusion.detection_decision[row] != Decision.MATCHED:
         return traces.place(subject)
     return np.flatnonzero(traces.cluster == fusion.detection_cluster[row])
@@ -357,65 +357,73 @@ def _own(traces: Traces, found: CameraResult, subject: Subject) -> I64:
 
 def _clusters_of(traces: Traces, points: I64) -> list[int]:
     """Return the clusters of an object's points that lie mostly on objects of the ground truth."""
-    return [k for k in np.unique(traces.cluster[points]).tolist() if k >= 0 and traces.of_truth[k]]
+    return [
+        cluster
+        for cluster in np.unique(traces.cluster[points]).tolist()
+        if cluster >= 0 and traces.of_truth[cluster]
+    ]
 
 
-def _truth_there(
-    traces: Traces, found: CameraResult, wanted: F32, pixel: bool
+def _truth_at_box(
+    traces: Traces, camera: CameraResult, image_box: F32, pixel: bool
 ) -> Iterator[tuple[Subject, float]]:
     """Yield the objects of the ground truth at the selected box, with their fit."""
-    column = [c.camera.name for c in traces.result.cameras].index(found.camera.name)
+    column = [result.camera.name for result in traces.result.cameras].index(camera.camera.name)
     for subject in traces.truth:
         if traces.shown[subject.row, column] <= 0 or subject.box is None:
             continue
-        box = projected(subject.box, found.camera)
+        box = projected(subject.box, camera.camera)
         if box is None:
             continue
-        fit = _fit(wanted, box, pixel)
+        fit = _fit(image_box, box, pixel)
         if not pixel:
-            uv = traces.uv(found)[traces.place(subject)]
+            uv = traces.uv(camera)[traces.place(subject)]
             uv = uv[np.isfinite(uv).all(axis=1)]
             if len(uv) >= FEW:
-                fit = max(fit, _fit(wanted, np.concatenate([uv.min(0), uv.max(0)]), pixel))
+                fit = max(fit, _fit(image_box, np.concatenate([uv.min(0), uv.max(0)]), pixel))
         if fit:
             yield subject, fit
 
 
-def _detections_there(found: CameraResult, wanted: F32, pixel: bool) -> Iterator[tuple[int, float]]:
+def _detections_at_box(camera: CameraResult, image_box: F32, pixel: bool) -> Iterator[tuple[int, float]]:
     """Yield the rows of the detections at the selected box, with their fit."""
-    detections = found.detections
+    detections = camera.detections
     if detections is None:
         return
     for row in np.flatnonzero(detections.state != DetectionState.SUPPRESSED).tolist():
-        fit = _fit(wanted, detections.xyxy[row], pixel)
+        fit = _fit(image_box, detections.xyxy[row], pixel)
         if fit:
             yield row, fit
 
 
-def _clusters_there(
-    traces: Traces, found: CameraResult, wanted: F32, pixel: bool
+def _clusters_at_box(
+    traces: Traces, camera: CameraResult, image_box: F32, pixel: bool
 ) -> Iterator[tuple[int, float]]:
     """Yield the clusters at the selected box, with their fit."""
     clusters = traces.result.clusters
     if clusters is None:
         return
     if pixel:
-        there = Subject("pixel", "", camera=found.camera.name, xyxy=wanted)
-        yield from ((k, 1.0) for k in np.unique(traces.cluster[traces.place(there)]).tolist() if k >= 0)
+        pixel_subject = Subject("pixel", "", camera=camera.camera.name, xyxy=image_box)
+        yield from (
+            (cluster, 1.0)
+            for cluster in np.unique(traces.cluster[traces.place(pixel_subject)]).tolist()
+            if cluster >= 0
+        )
         return
-    if found.fusion is None:
+    if camera.fusion is None:
         return
-    for k in np.flatnonzero(clusters.kept).tolist():
-        around = found.fusion.cluster_uv[k]
-        fit = _fit(wanted, around, pixel) if np.isfinite(around).all() else 0.0
+    for cluster in np.flatnonzero(clusters.kept).tolist():
+        around = camera.fusion.cluster_uv[cluster]
+        fit = _fit(image_box, around, pixel) if np.isfinite(around).all() else 0.0
         if fit:
-            yield k, fit
+            yield cluster, fit
 
 
-def _fit(wanted: F32, box: F32, pixel: bool) -> float:
+def _fit(image_box: F32, box: F32, pixel: bool) -> float:
     """Return the IoU of two boxes, 0 if it is too low. For a pixel, return 1 inside the box."""
     if pixel:
-        u, v = (wanted[:2] + wanted[2:]) / 2
+        u, v = (image_box[:2] + image_box[2:]) / 2
         return float(box[0] <= u <= box[2] and box[1] <= v <= box[3])
-    overlap = float(geometry.iou(wanted[None], box[None])[0, 0])
+    overlap = float(geometry.iou(image_box[None], box[None])[0, 0])
     return overlap if overlap >= LINK else 0.0

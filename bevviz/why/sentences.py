@@ -19,15 +19,19 @@ from bevviz.why.verdict import Reason, Verdict, cameras_of, name_of, pair_reason
 _ONLY = ("nothing", "only ground", "mostly ground")  # at a place without an object
 
 
-def verdict_of(subject: Subject, reason: Reason, reported: bool, e: Evidence, traces: Traces) -> Verdict:
+def verdict_of(
+    subject: Subject, reason: Reason, reported: bool, evidence: Evidence, traces: Traces
+) -> Verdict:
     """Return the verdict with its reason in one sentence."""
-    because = Because(subject, e, traces).of(reason)
+    because = Because(subject, evidence, traces).of(reason)
     head = subject.name[0].upper() + subject.name[1:]
     if reason is Reason.REPORTED:
         return Verdict(reason, reported, f"{head} was reported: {because}.")
     if because.startswith(_ONLY):
-        what, _, rest = because.partition(": ")
-        return Verdict(reason, reported, f"There is {what} {subject.name.removeprefix('what is ')}: {rest}.")
+        content, _, rest = because.partition(": ")
+        return Verdict(
+            reason, reported, f"There is {content} {subject.name.removeprefix('what is ')}: {rest}."
+        )
     joint = "was reported, but" if reported else "was not reported because"
     return Verdict(reason, reported, f"{head} {joint} {because}.")
 
@@ -42,18 +46,18 @@ class Because:
 
     Args:
         subject: the object or place in question.
-        e: the evidence about it.
+        evidence: the evidence about it.
         traces: the index of the frame.
     """
 
-    def __init__(self, subject: Subject, e: Evidence, traces: Traces) -> None:
-        self.subject, self.e, self.traces = subject, e, traces
+    def __init__(self, subject: Subject, evidence: Evidence, traces: Traces) -> None:
+        self.subject, self.evidence, self.traces = subject, evidence, traces
         self.result: FrameResult = traces.result
         self.config: Config = traces.result.config
 
     def of(self, reason: Reason) -> str:
         """Return the words for a reason."""
-        said = {
+        sentences = {
             Reason.REPORTED: self._reported,
             Reason.SHARED_BOX: self._shared_box,
             Reason.BORROWED: self._borrowed,
@@ -84,28 +88,28 @@ class Because:
             Reason.NOT_AMONG: self._not_among,
             Reason.LOST_IN_FUSION: self._lost_in_fusion,
         }
-        return said[reason]()
+        return sentences[reason]()
 
     def _origin(self, section: str) -> StageOrigin:
         """Return the owner of the stage of a section."""
         return self.traces.origin(section)
 
-    def _whose(self, section: str, ours: str) -> str:
+    def _parameter_or_owner(self, section: str, ours: str) -> str:
         """Return our parameter in brackets, or the name of the stage that is not ours."""
-        there = self._origin(section)
-        return f"({ours})" if there.ours else f"(by {there.name})"
+        owner = self._origin(section)
+        return f"({ours})" if owner.ours else f"(by {owner.name})"
 
     @property
     def _best(self) -> Candidate:
         """The best detection of the subject, which must exist."""
-        assert self.e.best is not None
-        return self.e.best
+        assert self.evidence.best is not None
+        return self.evidence.best
 
     # --- reported ------------------------------------------------------------------------------
 
-    def _with(self) -> str:
+    def _object_text(self) -> str:
         """Name the object of the subject and its cluster."""
-        named = self.e.named
+        named = self.evidence.named
         assert named is not None
         objects = self._origin("objects")
         if not objects.ours:
@@ -116,9 +120,9 @@ class Because:
     def _reported(self) -> str:
         if not self.result.frame.lidar:
             least = f"detector.conf_threshold is {self.config.detector.conf_threshold:g}"
-            whose = self._whose("detector", least)
+            whose = self._parameter_or_owner("detector", least)
             return f"{label(self._best)} was kept {whose}; without a LiDAR nothing tells where it is"
-        named, text = self.e.named, self._with()
+        named, text = self.evidence.named, self._object_text()
         assert named is not None
         if opinion := opinion_on(self.result, named.row):
             return f"{text}, {opinion}"
@@ -137,123 +141,130 @@ class Because:
             texts.append(f", which split it off {off} ({splits.points[row]:,} of {splits.of[row]:,} points)")
         return "".join(texts)
 
-    def _also(self) -> str:
+    def _other_clusters_text(self) -> str:
         """Name the other clusters of the same detection."""
-        assert self.e.named is not None
-        return " and ".join(f"cluster {k}" for k in self.e.named.also)
+        assert self.evidence.named is not None
+        return " and ".join(f"cluster {cluster}" for cluster in self.evidence.named.also)
 
-    def _method(self) -> str:
+    def _method_text(self) -> str:
         """Name the fusion method."""
         return f"fusion.method is {self.config.fusion.method}: each cluster takes the nearest box"
 
     def _shared_box(self) -> str:
-        return f"its box also names {self._also()} ({self._method()})"
+        return f"its box also names {self._other_clusters_text()} ({self._method_text()})"
 
     def _borrowed(self) -> str:
-        named = self.e.named
+        named = self.evidence.named
         assert named is not None
         score = "" if self.result.objects is None else f" {self.result.objects.score[named.row]:.2f}"
         if self.config.fusion.method == "centroid":
-            also = f"that also names {self._also()}" if named.also else "that is not on it"
-            return f"{self._with()} by a box {also} ({self._method()})"
-        return f"{self._with()} by {named.name}{score}, {self._whose_box(named.camera, named.detection)}"
+            also = f"that also names {self._other_clusters_text()}" if named.also else "that is not on it"
+            return f"{self._object_text()} by a box {also} ({self._method_text()})"
+        box_owner = self._box_owner_text(named.camera, named.detection)
+        return f"{self._object_text()} by {named.name}{score}, {box_owner}"
 
-    def _whose_box(self, camera: str, detection: int) -> str:
+    def _box_owner_text(self, camera: str, detection: int) -> str:
         """Name the object of the ground truth that a detection belongs to."""
-        found = self.traces.camera(camera)
-        owner = -1 if found is None else int(self.traces.owners(found)[detection])
+        camera_result = self.traces.camera(camera)
+        owner = -1 if camera_result is None else int(self.traces.owners(camera_result)[detection])
         if owner < 0 or owner == self.subject.row:
             return "a box that fits it badly"
         return f"which is the box of {self.traces.truth[owner].name}"
 
     def _split(self) -> str:
-        kept = [part for part in self.e.parts if part.kept]
+        kept = [part for part in self.evidence.parts if part.kept]
         parts = " and ".join(str(part.cluster) for part in kept[:4]) + (" and more" if kept[4:] else "")
         by = "" if self._origin("clustering").ours else f" by {self._origin('clustering').name}"
-        apart = f", {self.e.apart:.2f} m apart" if np.isfinite(self.e.apart) else ""
+        apart = f", {self.evidence.apart:.2f} m apart" if np.isfinite(self.evidence.apart) else ""
         return f"it is split{by} into clusters {parts}{apart}"
 
     def _merged(self) -> str:
-        e, clustering = self.e, self._origin("clustering")
-        own = e.part(e.main)
-        rest = 0 if own is None else own.count - own.points
-        names = " and ".join(name for name, _ in e.others) or f"{count(rest, 'point')} that are not its own"
-        text = f"cluster {e.main} holds {names}, too"
-        if not np.isfinite(e.gap):
+        evidence, clustering = self.evidence, self._origin("clustering")
+        part = evidence.part(evidence.main)
+        rest = 0 if part is None else part.count - part.points
+        names = (
+            " and ".join(name for name, _ in evidence.others)
+            or f"{count(rest, 'point')} that are not its own"
+        )
+        text = f"cluster {evidence.main} holds {names}, too"
+        if not np.isfinite(evidence.gap):
             return text
         limit = f"clustering.eps is {self.config.clustering.eps:g} m"
-        return f"{text}: the gap between them is {e.gap:.2f} m and " + (
+        return f"{text}: the gap between them is {evidence.gap:.2f} m and " + (
             limit if clustering.ours else f"{clustering.name} made one of them"
         )
 
     def _misnamed(self) -> str:
-        named = self.e.named
+        named = self.evidence.named
         assert named is not None
-        text = self._with()
+        text = self._object_text()
         if opinion := opinion_on(self.result, named.row):
             text += f", {opinion}"
         if named.camera and not named.own:
-            text += f" by a detection that is not its own, {self._whose_box(named.camera, named.detection)}"
+            text += (
+                f" by a detection that is not its own, {self._box_owner_text(named.camera, named.detection)}"
+            )
         return text
 
     # --- LiDAR ---------------------------------------------------------------------------------
 
     def _failed(self) -> str:
-        said = "; ".join(f"{f.stage} failed: {f.reason}" for f in self.result.failures)
-        return said or "there are no clusters"
+        failures = "; ".join(f"{failure.stage} failed: {failure.reason}" for failure in self.result.failures)
+        return failures or "there are no clusters"
 
     def _hidden(self) -> str:
-        return f"it is hidden: {count(self.e.raw, 'point')} on it, and {in_front(self.e, self.result)}"
+        points = count(self.evidence.raw, "point")
+        return f"it is hidden: {points} on it, and {in_front(self.evidence, self.result)}"
 
     def _no_points(self) -> str:
-        e, subject = self.e, self.subject
+        evidence, subject = self.evidence, self.subject
         if subject.kind not in ("point", "cell") or subject.box is None:
-            return f"the LiDAR has {count(e.raw, 'point')} there"
+            return f"the LiDAR has {count(evidence.raw, 'point')} there"
         axes = slice(2 if subject.kind == "cell" else 3)
         center, radius = subject.box.center[0, axes], subject.box.size[0, 0] / 2
-        text = f"{_ONLY[0]}: the LiDAR has {count(e.raw, 'point')} within {radius:g} m"
+        text = f"{_ONLY[0]}: the LiDAR has {count(evidence.raw, 'point')} within {radius:g} m"
         points = self.result.frame.points
-        if e.raw or not len(points):
+        if evidence.raw or not len(points):
             return text
         away = float(np.linalg.norm(points[:, axes] - center, axis=1).min())
         return f"{text}, the nearest is {away:.1f} m away"
 
     def _ground(self) -> str:
-        e, ground = self.e, self._origin("ground")
+        evidence, ground = self.evidence, self._origin("ground")
         if self.subject.is_place:
-            number = int((self.traces.fate[e.points] == Fate.GROUND).sum())
-            whole = "all ground" if number == e.raw else f"{number} of them ground"
-            known = e.ground[np.isfinite(e.ground)]
+            number = int((self.traces.fate[evidence.points] == Fate.GROUND).sum())
+            whole = "all ground" if number == evidence.raw else f"{number} of them ground"
+            known = evidence.ground[np.isfinite(evidence.ground)]
             height = f", {known.min():z.2f} to {known.max():z.2f} m above its level" if len(known) else ""
-            only = _ONLY[1] if number == e.raw else _ONLY[2]
+            only = _ONLY[1] if number == evidence.raw else _ONLY[2]
             by = "" if ground.ours else f" (by {ground.name})"
-            return f"{only}: {count(e.raw, 'point')}, {whole}{height}{by}"
+            return f"{only}: {count(evidence.raw, 'point')}, {whole}{height}{by}"
         return (
-            f"it was taken for ground: {len(e.ground)} of its {e.voxels} voxels, "
-            f"up to {height_of(e):.2f} m high "
-            + self._whose(
+            f"it was taken for ground: {len(evidence.ground)} of its {evidence.voxels} voxels, "
+            f"up to {height_of(evidence):.2f} m high "
+            + self._parameter_or_owner(
                 "ground", f"ground.distance_threshold is {self.config.ground.distance_threshold:g} m"
             )
         )
 
     def _noise(self) -> str:
-        c, are = self.config.clustering, "is" if self.e.noise == 1 else "are"
-        points, neighbours = count(self.e.noise, "obstacle point"), self.e.neighbours
+        clustering, are = self.config.clustering, "is" if self.evidence.noise == 1 else "are"
+        points, neighbours = count(self.evidence.noise, "obstacle point"), self.evidence.neighbours
         return (
             f"its {points} {are} noise: none has more than {neighbours} "
-            f"neighbours within {c.eps:g} m (clustering.min_points is {c.min_points})"
+            f"neighbours within {clustering.eps:g} m (clustering.min_points is {clustering.min_points})"
         )
 
     def _no_cluster(self) -> str:
-        e, clustering = self.e, self._origin("clustering")
-        points = count(e.obstacles, "obstacle point")
+        evidence, clustering = self.evidence, self._origin("clustering")
+        points = count(evidence.obstacles, "obstacle point")
         few = (
-            f"{e.obstacles - e.noise} of its {points} are"
-            if e.obstacles > e.noise
+            f"{evidence.obstacles - evidence.noise} of its {points} are"
+            if evidence.obstacles > evidence.noise
             else f"none of its {points} is"
         )
         if clustering.topic:
-            best = e.best
+            best = evidence.best
             if best is not None and best.cluster >= 0:
                 pair = self._pair_text(best.row, best.camera, best.cluster)
                 return (
@@ -264,7 +275,7 @@ class Because:
         return f"{few} in a cluster of {clustering.name}"
 
     def _size(self, limit: str) -> str:
-        aside = next(part for part in self.e.parts if not part.kept)
+        aside = next(part for part in self.evidence.parts if not part.kept)
         value = getattr(self.config.clustering, limit)
         return (
             f"its cluster {aside.cluster} has {count(aside.count, 'point')} (clustering.{limit} is {value})"
@@ -276,8 +287,8 @@ class Because:
         return "the detector never ran: " + "; ".join(not_run(self.result, self.subject.camera))
 
     def _not_detected(self) -> str:
-        detector, e = self._origin("detector"), self.e
-        best = e.best
+        detector, evidence = self._origin("detector"), self.evidence
+        best = evidence.best
         wrong = f"; the camera has {label(best)} there" if best is not None else ""
         class_ = "of its class " if self.subject.label else ""
         if detector.topic:
@@ -313,8 +324,8 @@ class Because:
     # --- fusion --------------------------------------------------------------------------------
 
     def _not_fused(self) -> str:
-        only = self.subject.camera or (self.e.best.camera if self.e.best is not None else "")
-        cameras = [found.camera for found in cameras_of(self.result, only)]
+        only = self.subject.camera or (self.evidence.best.camera if self.evidence.best is not None else "")
+        cameras = [result.camera for result in cameras_of(self.result, only)]
         names = " and ".join(camera.name for camera in cameras)
         problems = "; ".join(problem for camera in cameras for problem in camera.problems)
         return f"{names} could not be compared with clusters" + (f": {problems}" if problems else "")
@@ -322,7 +333,7 @@ class Because:
     @property
     def _cluster(self) -> int:
         """Cluster that the detection should have named."""
-        return self._best.cluster if self.subject.kind == "detection" else self.e.main
+        return self._best.cluster if self.subject.kind == "detection" else self.evidence.main
 
     def _pair_text(self, row: int, camera: str, cluster: int) -> str:
         """Return the numbers that the rule of the fusion compared."""
@@ -337,7 +348,7 @@ class Because:
         in_frustum = f"{count(pair.points, 'point')} in its frustum, IoU {pair.iou:.2f}"
         return in_frustum + in_mask(fusion, row, self.config)
 
-    def _pair(self) -> str:
+    def _best_pair_text(self) -> str:
         """Return the numbers of the best detection and its cluster."""
         return self._pair_text(self._best.row, self._best.camera, self._cluster)
 
@@ -347,13 +358,15 @@ class Because:
 
     def _low_overlap(self) -> str:
         both = f"{label(self._best)} and cluster {self._cluster}"
-        return f"{both} overlap too little ({self._pair()}), fusion.min_iou is {self.config.fusion.min_iou:g}"
+        numbers, least = self._best_pair_text(), self.config.fusion.min_iou
+        return f"{both} overlap too little ({numbers}), fusion.min_iou is {least:g}"
 
     def _too_few_points(self) -> str:
         if self._cluster < 0:
             return f"{label(self._best)} found no cluster"
         limit = f"fusion.min_points is {self.config.fusion.min_points}"
-        return f"{label(self._best)} has too few points of cluster {self._cluster} ({self._pair()}), {limit}"
+        numbers = self._best_pair_text()
+        return f"{label(self._best)} has too few points of cluster {self._cluster} ({numbers}), {limit}"
 
     def _too_far(self) -> str:
         fusion = self.config.fusion
@@ -362,7 +375,9 @@ class Because:
             if fusion.method == "centroid"
             else f"fusion.max_depth is {fusion.max_depth:g} m"
         )
-        return f"cluster {self._cluster} is too far from {label(self._best)} ({self._pair()}), {limit}"
+        return (
+            f"cluster {self._cluster} is too far from {label(self._best)} ({self._best_pair_text()}), {limit}"
+        )
 
     def _taken(self) -> str:
         best, cluster = self._best, self._cluster
@@ -379,42 +394,42 @@ class Because:
 
     def _other_cluster(self) -> str:
         best = self._best
-        own = f"cluster {self.e.main} ({self._pair()})"
-        return f"{label(best)} went to cluster {best.cluster}, not to its own, {own}"
+        own_cluster = f"cluster {self.evidence.main} ({self._best_pair_text()})"
+        return f"{label(best)} went to cluster {best.cluster}, not to its own, {own_cluster}"
 
     # --- objects that are not ours -------------------------------------------------------------
 
     def _contradicted(self) -> str:
-        assert self.e.named is not None
-        return f"it is {opinion_on(self.result, self.e.named.row)}"
+        assert self.evidence.named is not None
+        return f"it is {opinion_on(self.result, self.evidence.named.row)}"
 
     def _not_among(self) -> str:
         text = f"it is not among the objects of {self._origin('objects').name}; "
-        return text + (self._fused() or ", ".join(self._beside()))
+        return text + (self._fused_text() or ", ".join(self._other_stages()))
 
-    def _fused(self) -> str:
+    def _fused_text(self) -> str:
         """Name the object that our fusion would make of it; empty: none."""
-        j, opinions, clusters = (
-            find_fused(self.subject, self.e, self.traces),
-            self.result.opinions,
-            self.result.clusters,
-        )
-        if j < 0 or opinions is None or clusters is None:
+        fused_row = find_fused(self.subject, self.evidence, self.traces)
+        opinions, clusters = self.result.opinions, self.result.clusters
+        if fused_row < 0 or opinions is None or clusters is None:
             return ""
         fused = opinions.fused
-        k, name = int(fused.cluster[j]), f"{fused.names[j]} {fused.score[j]:.2f}"
-        points = count(int(clusters.count[k]), "point")
-        text = f"our fusion has it: cluster {k} ({points}), named by {name} of {fused.camera[j]}"
-        row, objects = int(opinions.partner[j]), self.result.objects
+        cluster = int(fused.cluster[fused_row])
+        name = f"{fused.names[fused_row]} {fused.score[fused_row]:.2f}"
+        points = count(int(clusters.count[cluster]), "point")
+        text = (
+            f"our fusion has it: cluster {cluster} ({points}), named by {name} of {fused.camera[fused_row]}"
+        )
+        row, objects = int(opinions.partner[fused_row]), self.result.objects
         return text if row < 0 or objects is None else f"{text}, {in_box_of(objects, row)}"
 
-    def _beside(self) -> Iterator[str]:
+    def _other_stages(self) -> Iterator[str]:
         """Yield the results of the other stages at the place."""
-        e, best = self.e, self.e.best
-        if e.main >= 0:
-            yield f"cluster {e.main} is there"
+        evidence, best = self.evidence, self.evidence.best
+        if evidence.main >= 0:
+            yield f"cluster {evidence.main} is there"
         else:
-            yield f"{count(e.raw, 'point')} are there and no cluster"
+            yield f"{count(evidence.raw, 'point')} are there and no cluster"
         if not detector_known(self.result):
             return
         yield f"{label(best)} as well" if best is not None and best.kept else "and no detection of it"
@@ -424,21 +439,22 @@ class Because:
         clusters, detector, objects = (
             self._origin(section).name for section in ("clustering", "detector", "objects")
         )
-        there = f"cluster {cluster} of {clusters} and {label(best)} of {detector} are there"
-        return f"the robot's fusion lost it: {there}, but no object of {objects}; ours {self._ours(cluster)}"
+        inputs = f"cluster {cluster} of {clusters} and {label(best)} of {detector} are there"
+        ours = self._our_decision(cluster)
+        return f"the robot's fusion lost it: {inputs}, but no object of {objects}; ours {ours}"
 
-    def _ours(self, cluster: int) -> str:
+    def _our_decision(self, cluster: int) -> str:
         """Say how our fusion would decide about a detection and a cluster."""
         best = self._best
         _, fusion = fusion_of(self.result, best.camera)
         pair = self._pair_text(best.row, best.camera, cluster)
         if fusion is None:
             return "could not compare them"
-        said = pair_reason(fusion, self.traces, best.row, cluster)
+        reason = pair_reason(fusion, self.traces, best.row, cluster)
         return (
             f"matches them ({pair})"
-            if said is Reason.REPORTED
-            else f"refuses them, too: {said.value} ({pair})"
+            if reason is Reason.REPORTED
+            else f"refuses them, too: {reason.value} ({pair})"
         )
 
 
@@ -452,33 +468,34 @@ def detector_known(result: FrameResult) -> bool:
 
 def not_run(result: FrameResult, only: str = "") -> Iterator[str]:
     """Yield the reason why the detector did not run on each camera's image."""
-    failed = "; ".join(f.reason for f in result.failures if f.stage == "detector")
+    failed = "; ".join(failure.reason for failure in result.failures if failure.stage == "detector")
     cameras = [c for c in result.cameras if c.detections is None and only in ("", c.camera.name)]
     if not result.cameras:
         yield "there is no camera"
-    for found in cameras:
-        name = found.camera.name
+    for camera in cameras:
+        name = camera.camera.name
         if not result.config.detector.model:
             yield "detector.model is not set"
             return
-        if found.camera.image is None and not failed:
-            yield "; ".join(found.camera.problems) or f"{name} has no image for this scan"
+        if camera.camera.image is None and not failed:
+            yield "; ".join(camera.camera.problems) or f"{name} has no image for this scan"
         else:
             yield f"on {name} it failed: {failed or 'no reason was told'}"
 
 
-def in_front(e: Evidence, result: FrameResult) -> str:
+def in_front(evidence: Evidence, result: FrameResult) -> str:
     """Count the returns that end before the subject."""
-    what = ""
-    if e.front >= 0:
-        name = name_of(result, e.front)
-        what = f", most of them on cluster {e.front}" + (f" ({name})" if name else "")
-    return f"{e.in_front} of the {e.aimed} returns in its direction end in front of it{what}"
+    cluster_text = ""
+    if evidence.front >= 0:
+        name = name_of(result, evidence.front)
+        cluster_text = f", most of them on cluster {evidence.front}" + (f" ({name})" if name else "")
+    returns = f"{evidence.in_front} of the {evidence.aimed} returns in its direction"
+    return f"{returns} end in front of it{cluster_text}"
 
 
-def height_of(e: Evidence) -> float:
+def height_of(evidence: Evidence) -> float:
     """Return the height in metres of the highest voxel that was removed as ground."""
-    known = e.ground[np.isfinite(e.ground)]
+    known = evidence.ground[np.isfinite(evidence.ground)]
     return float(known.max(initial=0))
 
 

@@ -91,11 +91,11 @@ class Effects:
     @property
     def text(self) -> str:
         """All effects in brief."""
-        said = [f"fixes {' and '.join(self.fixed)}"] if self.fixed else []
-        said += [f"adds {name}" + (" (false)" if name in self.false else "") for name in self.added]
-        said += [f"loses {name}" + (" (right)" if name in self.right else "") for name in self.lost]
-        said += [f"changes {count(self.changed, 'other')}"] if self.changed else []
-        return ", ".join(said)
+        texts = [f"fixes {' and '.join(self.fixed)}"] if self.fixed else []
+        texts += [f"adds {name}" + (" (false)" if name in self.false else "") for name in self.added]
+        texts += [f"loses {name}" + (" (right)" if name in self.right else "") for name in self.lost]
+        texts += [f"changes {count(self.changed, 'other')}"] if self.changed else []
+        return ", ".join(texts)
 
 
 def effects(
@@ -115,7 +115,7 @@ def effects(
         own: row in ``after`` of the object in question, -1: unknown.
     """
     a, b = _seen(before), _seen(after)
-    was, now = _truth_of(before, truth), _truth_of(after, truth)
+    truth_before, truth_after = _truth_of(before, truth), _truth_of(after, truth)
     made: list[tuple[bool, str, Effect]] = []
     more, gone = [], []
     changed = 0
@@ -123,18 +123,18 @@ def effects(
         i, j = difference.row_a, difference.row_b
         if difference.change is Change.SAME:
             continue
-        if truth and j >= 0 and now[j] >= 0 and now[j] not in was:
-            name = truth[now[j]].name.removeprefix("the ")
-            made.append((now[j] != asked, name, Effect(name, now[j], i, j)))
+        if truth and j >= 0 and truth_after[j] >= 0 and truth_after[j] not in truth_before:
+            name = truth[truth_after[j]].name.removeprefix("the ")
+            made.append((truth_after[j] != asked, name, Effect(name, truth_after[j], i, j)))
         elif difference.change is Change.ONLY_B:
             name = _name(b.names[j], b.boxes, j)
             if j == own:
-                made.append((False, name, Effect(name, now[j], after=j)))
+                made.append((False, name, Effect(name, truth_after[j], after=j)))
             else:
-                more.append(Effect(name, now[j], after=j))
+                more.append(Effect(name, truth_after[j], after=j))
         elif difference.change is Change.ONLY_A:
-            missed = was[i] >= 0 and was[i] not in now
-            gone.append(Effect(_name(a.names[i], a.boxes, i), was[i], before=i, missed=missed))
+            missed = truth_before[i] >= 0 and truth_before[i] not in truth_after
+            gone.append(Effect(_name(a.names[i], a.boxes, i), truth_before[i], before=i, missed=missed))
         else:
             changed += 1
     return Effects(
@@ -165,12 +165,12 @@ def _truth_of(objects: Objects | None, subjects: Sequence[Subject]) -> list[int]
     """
     if objects is None:
         return []
-    found = [-1] * len(objects)
-    truth = joined([s.box for s in subjects if s.box is not None])
+    rows = [-1] * len(objects)
+    truth = joined([subject.box for subject in subjects if subject.box is not None])
     order = np.argsort(-objects.score, kind="stable")
     away = np.linalg.norm(objects.boxes.center[order][:, None, :2] - truth.center[None, :, :2], axis=2)
-    right = np.array([[s.accepts(objects.names[j]) for s in subjects] for j in order], bool)
+    right = np.array([[subject.accepts(objects.names[j]) for subject in subjects] for j in order], bool)
     partner, _ = pair_in_order(np.where(right.reshape(away.shape), away, np.inf), MAX_DISTANCE)
     for j, row in zip(order.tolist(), partner.tolist(), strict=True):
-        found[j] = row
-    return found
+        rows[j] = row
+    return rows

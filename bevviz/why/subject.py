@@ -95,9 +95,9 @@ class Subject:
         return self.accepts(name) or CATEGORIES.get(name, name).lower() in accepted_names(self.label, ())
 
 
-def count(number: int, what: str) -> str:
+def count(number: int, noun: str) -> str:
     """Return a number with its noun: no points, 1 point, 2 points."""
-    return f"{number} {what}" if number == 1 else f"{number or 'no'} {what}s"
+    return f"{number} {noun}" if number == 1 else f"{number or 'no'} {noun}s"
 
 
 # --- boxes -------------------------------------------------------------------------------------
@@ -119,5 +119,5 @@ def in_box(box: Boxes3D, points: F32, margin: float = 0.0, foot: float = 0.0) ->
 
 def projected(box: Boxes3D, camera: Camera) -> F32 | None:
     """Return the (4,) image box of a 3D box, cut at the image's edge; None: it is out of view."""
-    found = image_boxes(box, camera)[0]
-    return found if np.isfinite(found).all() else None
+    image_box = image_boxes(box, camera)[0]
+    return image_box if np.isfinite(image_box).all() else None

@@ -83,7 +83,7 @@ class Verdict:
     text: str
 
 
-def find_reason(subject: Subject, e: Evidence, traces: Traces) -> tuple[Reason, bool]:
+def find_reason(subject: Subject, evidence: Evidence, traces: Traces) -> tuple[Reason, bool]:
     """Find the first stage that lost the subject, or the fault of its reported object.
 
     Returns:
@@ -91,25 +91,25 @@ def find_reason(subject: Subject, e: Evidence, traces: Traces) -> tuple[Reason, 
         reported: whether it still is an object of a right class.
     """
     if not traces.result.frame.lidar:
-        return _seen(subject, e, traces)
+        return _reason_of_cameras(subject, evidence, traces)
     accepts = subject.accepts if traces.origin("objects").ours else subject.accepts_of_others
-    if e.named is not None and accepts(e.named.name):
-        return _flaw(subject, e, e.named, traces), True
-    if e.named is not None and (
-        not any(c.kept and subject.accepts(c.name) for c in e.candidates)
-        or _in_their_box(subject, e, e.named, traces)
+    if evidence.named is not None and accepts(evidence.named.name):
+        return _flaw(subject, evidence, evidence.named, traces), True
+    if evidence.named is not None and (
+        not any(candidate.kept and subject.accepts(candidate.name) for candidate in evidence.candidates)
+        or _is_in_reported_box(subject, evidence, evidence.named, traces)
     ):
         return Reason.MISNAMED, False
     if traces.result.objects is None:
         return Reason.FAILED, False
     if traces.origin("objects").ours:
-        return _loss(subject, e, traces), False
-    return _loss_of_others(subject, e, traces), False
+        return _loss(subject, evidence, traces), False
+    return _loss_of_other_stages(subject, evidence, traces), False
 
 
-def _seen(subject: Subject, e: Evidence, traces: Traces) -> tuple[Reason, bool]:
+def _reason_of_cameras(subject: Subject, evidence: Evidence, traces: Traces) -> tuple[Reason, bool]:
     """Return the reason with cameras alone, where a kept detection is reported."""
-    best = e.best
+    best = evidence.best
     if not detector_ran(traces.result, subject.camera):
         return Reason.NOT_RUN, False
     if best is None or not subject.accepts(best.name):
@@ -117,7 +117,7 @@ def _seen(subject: Subject, e: Evidence, traces: Traces) -> tuple[Reason, bool]:
     return (Reason.REPORTED, True) if best.kept else (_weakness(best, traces), False)
 
 
-def _flaw(subject: Subject, e: Evidence, named: Named, traces: Traces) -> Reason:
+def _flaw(subject: Subject, evidence: Evidence, named: Named, traces: Traces) -> Reason:
     """Return the fault of a reported object, REPORTED without a fault."""
     opinions = traces.result.opinions
     if opinions is not None and subject.kind == "object":
@@ -125,53 +125,53 @@ def _flaw(subject: Subject, e: Evidence, named: Named, traces: Traces) -> Reason
         return Reason.CONTRADICTED if denied else Reason.REPORTED
     if named.detection < 0 or subject.kind == "object":
         return Reason.SHARED_BOX if named.also else Reason.REPORTED
-    if e.mates or (subject.kind == "truth" and e.purity < MOST):
+    if evidence.mates or (subject.kind == "truth" and evidence.purity < MOST):
         return Reason.MERGED
     if not named.own and (subject.kind == "truth" or traces.result.config.fusion.method == "centroid"):
         return Reason.BORROWED
     if named.also:
         return Reason.SHARED_BOX
-    whole = sum(part.points for part in e.parts)
-    part = e.part(named.cluster)
-    several = subject.kind == "truth" and len([p for p in e.parts if p.kept]) > 1
+    whole = sum(part.points for part in evidence.parts)
+    part = evidence.part(named.cluster)
+    several = subject.kind == "truth" and len([part for part in evidence.parts if part.kept]) > 1
     return Reason.SPLIT if several and part is not None and part.points < WHOLE * whole else Reason.REPORTED
 
 
-def _loss(subject: Subject, e: Evidence, traces: Traces) -> Reason:
+def _loss(subject: Subject, evidence: Evidence, traces: Traces) -> Reason:
     """Return the reason why our fusion reported no object."""
     if subject.kind == "detection":
-        return _loss_of_detection(e, traces)
-    if not subject.is_place and not e.in_view:
+        return _loss_of_detection(evidence, traces)
+    if not subject.is_place and not evidence.in_view:
         return Reason.OUT_OF_VIEW
-    if e.raw < FEW:
-        return _without_points(e)
-    if e.main < 0:
-        return _unclustered(e, traces)
+    if evidence.raw < FEW:
+        return _without_points(evidence)
+    if evidence.main < 0:
+        return _unclustered(evidence, traces)
     if not detector_ran(traces.result, subject.camera):
         return Reason.NOT_RUN
     if all(camera.fusion is None for camera in cameras_of(traces.result, subject.camera)):
         return Reason.NOT_FUSED
-    if not e.in_view:
+    if not evidence.in_view:
         return Reason.OUT_OF_VIEW
-    best = e.best
+    best = evidence.best
     if best is None or not subject.accepts(best.name):
         return Reason.NOT_DETECTED
     if not best.kept:
         return _weakness(best, traces)
-    return _refusal(subject, e, best, traces)
+    return _refusal(subject, evidence, best, traces)
 
 
-def _without_points(e: Evidence) -> Reason:
+def _without_points(evidence: Evidence) -> Reason:
     """Return the reason for a subject without points."""
-    return Reason.HIDDEN if e.in_front > MOST * e.aimed else Reason.NO_POINTS
+    return Reason.HIDDEN if evidence.in_front > MOST * evidence.aimed else Reason.NO_POINTS
 
 
-def _unclustered(e: Evidence, traces: Traces) -> Reason:
+def _unclustered(evidence: Evidence, traces: Traces) -> Reason:
     """Return the reason for a subject with points but no kept cluster: the stage that took most of them."""
-    aside = next((part for part in e.parts if not part.kept), None)
-    if aside is not None and aside.points >= max(e.noise, len(e.ground)):
+    aside = next((part for part in evidence.parts if not part.kept), None)
+    if aside is not None and aside.points >= max(evidence.noise, len(evidence.ground)):
         return Reason.TOO_SMALL if aside.state == ClusterState.TOO_SMALL else Reason.TOO_LARGE
-    if len(e.ground) >= e.noise:
+    if len(evidence.ground) >= evidence.noise:
         return Reason.GROUND
     return Reason.NOISE if traces.origin("clustering").ours else Reason.NO_CLUSTER
 
@@ -196,37 +196,37 @@ def _weakness(best: Candidate, traces: Traces) -> Reason:
     return Reason.SUPPRESSED if strong else Reason.BELOW_THRESHOLD
 
 
-def _refusal(subject: Subject, e: Evidence, best: Candidate, traces: Traces) -> Reason:
+def _refusal(subject: Subject, evidence: Evidence, best: Candidate, traces: Traces) -> Reason:
     """Return the reason why a cluster and a detection were not matched."""
     _, fusion = fusion_of(traces.result, best.camera)
     if fusion is None:
         return Reason.NOT_FUSED
-    reason = pair_reason(fusion, traces, best.row, e.main)
-    main = e.part(e.main)
+    reason = pair_reason(fusion, traces, best.row, evidence.main)
+    main = evidence.part(evidence.main)
     if subject.kind != "truth" or main is None:
         return reason
-    if e.purity < MOST or _taken_by_mate(e, fusion, best.camera, traces):
+    if evidence.purity < MOST or _is_named_by_mate(evidence, fusion, best.camera, traces):
         return Reason.MERGED
     if reason in (Reason.LOW_OVERLAP, Reason.TOO_FEW_POINTS):
-        return _fragment(e, main.points, traces) or reason
+        return _fragment(evidence, main.points, traces) or reason
     return reason
 
 
-def _taken_by_mate(e: Evidence, fusion: Fusion, camera: str, traces: Traces) -> bool:
+def _is_named_by_mate(evidence: Evidence, fusion: Fusion, camera: str, traces: Traces) -> bool:
     """Return whether another object in the subject's cluster named the cluster."""
-    if fusion.cluster_decision[e.main] != Decision.MATCHED:
+    if fusion.cluster_decision[evidence.main] != Decision.MATCHED:
         return False
-    found, _ = fusion_of(traces.result, camera)
-    return int(traces.owners(found)[fusion.cluster_detection[e.main]]) in e.mates
+    camera_result, _ = fusion_of(traces.result, camera)
+    return int(traces.owners(camera_result)[fusion.cluster_detection[evidence.main]]) in evidence.mates
 
 
-def _fragment(e: Evidence, inside: int, traces: Traces) -> Reason | None:
+def _fragment(evidence: Evidence, inside: int, traces: Traces) -> Reason | None:
     """Return the stage that took most of an object, None if its cluster holds at least half of it."""
-    if inside >= MOST * e.voxels:
+    if inside >= MOST * evidence.voxels:
         return None
-    rest = e.obstacles - inside - e.noise
+    rest = evidence.obstacles - inside - evidence.noise
     noise = Reason.NOISE if traces.origin("clustering").ours else Reason.NO_CLUSTER
-    return max((len(e.ground), Reason.GROUND), (e.noise, noise), (rest, Reason.SPLIT))[1]
+    return max((len(evidence.ground), Reason.GROUND), (evidence.noise, noise), (rest, Reason.SPLIT))[1]
 
 
 def pair_reason(fusion: Fusion, traces: Traces, detection: int, cluster: int) -> Reason:
@@ -249,9 +249,9 @@ def pair_reason(fusion: Fusion, traces: Traces, detection: int, cluster: int) ->
     return Reason.OTHER_CLUSTER if decision == Decision.MATCHED else Reason.TAKEN
 
 
-def _loss_of_detection(e: Evidence, traces: Traces) -> Reason:
+def _loss_of_detection(evidence: Evidence, traces: Traces) -> Reason:
     """Return the reason why a detection gave no object."""
-    best = e.best
+    best = evidence.best
     if best is None:
         return Reason.NOT_DETECTED
     if not best.kept:
@@ -260,47 +260,57 @@ def _loss_of_detection(e: Evidence, traces: Traces) -> Reason:
     if fusion is None:
         return Reason.NOT_FUSED
     if best.decision is Decision.NO_CLUSTER or best.cluster < 0:
-        return Reason.NO_POINTS if e.raw < FEW else _unclustered(e, traces)
+        return Reason.NO_POINTS if evidence.raw < FEW else _unclustered(evidence, traces)
     if best.decision is Decision.MATCHED:  # a detection of another camera named the object
         return Reason.TAKEN
-    held = max((part.points for part in e.parts if part.kept), default=0)
-    if e.voxels >= FEW and held < max(FEW, PART * e.obstacles):
-        return _unclustered(e, traces)
-    return Reason.MERGED if best.decision is Decision.TAKEN and e.mates else _REFUSED[best.decision]
+    most_points = max((part.points for part in evidence.parts if part.kept), default=0)
+    if evidence.voxels >= FEW and most_points < max(FEW, PART * evidence.obstacles):
+        return _unclustered(evidence, traces)
+    return Reason.MERGED if best.decision is Decision.TAKEN and evidence.mates else _REFUSED[best.decision]
 
 
 # --- objects that our fusion did not make ------------------------------------------------------
 
 
-def _loss_of_others(subject: Subject, e: Evidence, traces: Traces) -> Reason:
+def _loss_of_other_stages(subject: Subject, evidence: Evidence, traces: Traces) -> Reason:
     """Return the reason why a 3D detector or the robot has no object, as far as its stages are known."""
-    if subject.kind != "detection" and e.raw < FEW:
-        return _without_points(e)
-    robot = {s for s in ("ground", "clustering", "detector", "objects") if traces.origin(s).topic}
+    if subject.kind != "detection" and evidence.raw < FEW:
+        return _without_points(evidence)
+    robot = {
+        section for section in ("ground", "clustering", "detector", "objects") if traces.origin(section).topic
+    }
     if "objects" not in robot:
         return Reason.NOT_AMONG
-    cluster = has_cluster(subject, e)
+    cluster = has_cluster(subject, evidence)
     if "clustering" in robot and traces.result.clusters is not None and not cluster:
-        return Reason.GROUND if "ground" in robot and len(e.ground) >= e.noise else Reason.NO_CLUSTER
-    detected = any(c.kept and subject.accepts(c.name) for c in e.candidates)
+        return (
+            Reason.GROUND
+            if "ground" in robot and len(evidence.ground) >= evidence.noise
+            else Reason.NO_CLUSTER
+        )
+    detected = any(candidate.kept and subject.accepts(candidate.name) for candidate in evidence.candidates)
     ran = detector_ran(traces.result, subject.camera)
     if "detector" in robot and ran and not detected:
-        return Reason.NOT_DETECTED if subject.is_place or e.in_view else Reason.OUT_OF_VIEW
+        return Reason.NOT_DETECTED if subject.is_place or evidence.in_view else Reason.OUT_OF_VIEW
     known = {"clustering", "detector"} <= robot and cluster and detected
     return Reason.LOST_IN_FUSION if known else Reason.NOT_AMONG
 
 
-def _in_their_box(subject: Subject, e: Evidence, named: Named, traces: Traces) -> bool:
+def _is_in_reported_box(subject: Subject, evidence: Evidence, named: Named, traces: Traces) -> bool:
     """Return whether the object of our fusion is inside the reported box."""
-    j, opinions = find_fused(subject, e, traces), traces.result.opinions
-    return j >= 0 and opinions is not None and int(opinions.partner[j]) == named.row
+    row, opinions = find_fused(subject, evidence, traces), traces.result.opinions
+    return row >= 0 and opinions is not None and int(opinions.partner[row]) == named.row
 
 
-def has_cluster(subject: Subject, e: Evidence) -> bool:
+def has_cluster(subject: Subject, evidence: Evidence) -> bool:
     """Return whether the subject has a cluster; for a detection, one that our fusion accepts."""
     if subject.kind != "detection":
-        return e.main >= 0
-    return e.best is not None and e.best.kept and e.best.decision in (Decision.MATCHED, Decision.TAKEN)
+        return evidence.main >= 0
+    return (
+        evidence.best is not None
+        and evidence.best.kept
+        and evidence.best.decision in (Decision.MATCHED, Decision.TAKEN)
+    )
 
 
 def name_of(result: FrameResult, cluster: int) -> str:
