@@ -26,7 +26,7 @@ def scatter(scorer: Scorer, peak: Peak, free: Bool) -> F64:
     """Return the (7,) standard deviation of a peak, from climbs with random weights of the data."""
     rng = np.random.default_rng(0)
     frames, parts = peak.sums.score.shape
-    shape = views(peak) / frames
+    shape = independent_views(peak) / frames
     replicates = []
     for _ in range(REPLICATES):
         weight = np.outer(rng.gamma(shape, 1 / shape, frames), rng.exponential(size=parts))
@@ -34,12 +34,12 @@ def scatter(scorer: Scorer, peak: Peak, free: Bool) -> F64:
     return np.asarray(np.sqrt(((np.stack(replicates) - peak.offsets) ** 2).mean(0)), np.float64)
 
 
-def caution(peak: Peak) -> float:
+def caution_factor(peak: Peak) -> float:
     """Return the factor that widens a standard deviation. Few views have errors that they do not show."""
-    return float(np.sqrt(1 + VIEW / views(peak)))
+    return float(np.sqrt(1 + VIEW / independent_views(peak)))
 
 
-def views(peak: Peak) -> float:
+def independent_views(peak: Peak) -> float:
     """Return how many frames have independent errors: 1 for the same frame thirty times.
 
     This is the participation ratio of the gradients of the frames' parts at the peak, correlated frame with

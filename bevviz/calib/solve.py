@@ -8,7 +8,7 @@ from types import MappingProxyType
 
 import numpy as np
 
-from bevviz.calib.evidence import LEAD, caution, lead, scatter, views
+from bevviz.calib.evidence import LEAD, caution_factor, independent_views, lead, scatter
 from bevviz.calib.offsets import AXES, FLOOR, PRIOR, SCALES, TIME, Axis, error_pose
 from bevviz.calib.result import AxisResult, Calibration, Finding
 from bevviz.calib.samples import REACH, Shot, Shots
@@ -162,7 +162,7 @@ def _no_peak(scorer: Scorer, best: Peak, error: float) -> _Judgement:
         within = f"{np.degrees(REACH):.1f} deg"
         reason = f"the edges of image and cloud do not agree anywhere within {within} of what is stated"
         return _Judgement(Finding.CONFLICT, f"{reason} (another camera, wrong intrinsics, or further off?)")
-    shown, taken = max(round(views(best)), 1), len(scorer.shots)
+    shown, taken = max(round(independent_views(best)), 1), len(scorer.shots)
     frames = f"{shown} frame{'s' if shown > 1 else ''}"
     if shown < taken:
         frames = f"{taken} frames, which show as much as {shown} different one{'s' if shown > 1 else ''},"
@@ -250,7 +250,7 @@ def _why_unsure(shots: Shots, axis: Axis) -> str:
 
 def _data_deviation(scorer: Scorer, peak: Peak, free: Bool) -> F64:
     """Return the (7,) standard deviation from the data, including the floor of calibrated sensors."""
-    return np.asarray(caution(peak) * np.hypot(scatter(scorer, peak, free), FLOOR), np.float64)
+    return np.asarray(caution_factor(peak) * np.hypot(scatter(scorer, peak, free), FLOOR), np.float64)
 
 
 def _confusion(shots: Shots) -> F64:

@@ -12,12 +12,12 @@ from bevviz.evaluate import MIN_HITS, RANGE
 from bevviz.model.frame import U8
 from bevviz.model.results import FrameResult
 from bevviz.pipeline.stage_loader import StageLoader
-from bevviz.why.chain import Step, chain
-from bevviz.why.collect import gather
+from bevviz.why.chain import Step, steps_of
+from bevviz.why.collect import collect_evidence
 from bevviz.why.evidence import Evidence
 from bevviz.why.frame_index import Traces
-from bevviz.why.hints import Hint, Search, WhatIf
-from bevviz.why.selection import at_place, select
+from bevviz.why.hints import Hint, HintFinder, Search
+from bevviz.why.selection import select_subjects, subjects_at_place
 from bevviz.why.sentences import verdict_of
 from bevviz.why.subject import Selection, Subject
 from bevviz.why.verdict import HOPELESS, Reason, Verdict, find_reason
@@ -117,7 +117,7 @@ class Questioner:
         self, result: FrameResult, loader: StageLoader | None = None, classes: Sequence[str] = ()
     ) -> None:
         self.traces = Traces(result, classes)
-        self._what_if = WhatIf(self.traces, loader)
+        self._hint_finder = HintFinder(self.traces, loader)
         self._answers: dict[tuple[object, ...], Answer] = {}
 
     def ask(self, selection: Selection) -> list[Answer]:
@@ -133,7 +133,7 @@ class Questioner:
             candidates = self.candidates(selection)
             if candidates:
                 return candidates[:1]
-        answers = [self._answer(subject) for subject in select(self.traces, selection)]
+        answers = [self._answer(subject) for subject in select_subjects(self.traces, selection)]
         return sorted(answers, key=_rank)
 
     def explain(
@@ -172,7 +172,9 @@ class Questioner:
         Raises:
             UserError: as ``ask``.
         """
-        answers = [(self._answer(subject), shows) for subject, shows in at_place(self.traces, selection)]
+        answers = [
+            (self._answer(subject), shows) for subject, shows in subjects_at_place(self.traces, selection)
+        ]
         order = sorted(answers, key=lambda pair: _place_rank(*pair))
         return [answer for answer, _ in order]
 
@@ -188,7 +190,7 @@ class Questioner:
     def search(self, answer: Answer) -> Search:
         """Search changes that would change the verdict. This runs other configurations and takes a while."""
         verdict = answer.verdict
-        return self._what_if.search(answer.subject, answer.evidence, verdict.reason, verdict.reported)
+        return self._hint_finder.search(answer.subject, answer.evidence, verdict.reason, verdict.reported)
 
     def with_hints(self, answer: Answer) -> Answer:
         """Add hints to an answer. Its sentence then names the first hint, or says that no change helps."""
@@ -209,10 +211,10 @@ class Questioner:
         """Return the answer about one subject, from the cache if it is known."""
         if subject.key in self._answers:
             return self._answers[subject.key]
-        evidence = gather(subject, self.traces)
+        evidence = collect_evidence(subject, self.traces)
         reason, reported = find_reason(subject, evidence, self.traces)
         verdict = verdict_of(subject, reason, reported, evidence, self.traces)
-        steps = tuple(chain(subject, evidence, self.traces))
+        steps = tuple(steps_of(subject, evidence, self.traces))
         answer = Answer(subject, verdict, steps, (), evidence.fate, evidence.distance, evidence.raw, evidence)
         if not subject.is_place:  # The number of possible places has no limit.
             self._answers[subject.key] = answer

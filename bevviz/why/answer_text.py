@@ -65,7 +65,7 @@ def summary(answers: Sequence[Answer]) -> str:
     return f"{count(len(things), 'object')}: {', '.join(parts)}{folded}"
 
 
-def page(answers: Sequence[Answer], chains: int) -> str:
+def markdown_page(answers: Sequence[Answer], chains: int) -> str:
     """Return the answers as Markdown, with steps for the first ``chains`` of them."""
     return "\n".join(_page(answers, chains))
 

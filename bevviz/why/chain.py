@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from bevviz.model.results import Decision, DetectionState, Opinion
-from bevviz.why.evidence import Candidate, Evidence, fusion_of
+from bevviz.why.evidence import Candidate, Evidence, camera_and_fusion
 from bevviz.why.frame_index import Traces
 from bevviz.why.outcome import find_fused, in_box_of, opinion_on
 from bevviz.why.sentences import label, not_run, state_text
@@ -28,7 +28,7 @@ class Step:
     numbers: Mapping[str, Any] = field(default_factory=dict)
 
 
-def chain(subject: Subject, evidence: Evidence, traces: Traces) -> Iterator[Step]:
+def steps_of(subject: Subject, evidence: Evidence, traces: Traces) -> Iterator[Step]:
     """Yield the step of each stage that was run."""
     result, config = traces.result, traces.result.config
     for failure in result.failures:
@@ -190,7 +190,7 @@ def _detector_steps(subject: Subject, evidence: Evidence, traces: Traces) -> Ite
     if not evidence.candidates:
         yield Step("detector", f"no candidate{by} there", {"candidates": 0})
     for candidate in evidence.candidates[:_SHOWN]:
-        camera, fusion = fusion_of(result, candidate.camera)
+        camera, fusion = camera_and_fusion(result, candidate.camera)
         detections = camera.detections
         assert detections is not None
         numbers = {
@@ -222,7 +222,7 @@ def _detector_steps(subject: Subject, evidence: Evidence, traces: Traces) -> Ite
 
 def _pair_steps(candidate: Candidate, evidence: Evidence, traces: Traces) -> Iterator[Step]:
     """Yield the fusion's decision about a detection, and its pairs with the subject's clusters."""
-    _, fusion = fusion_of(traces.result, candidate.camera)
+    _, fusion = camera_and_fusion(traces.result, candidate.camera)
     assert fusion is not None
     ours = traces.origin("objects").ours
     stage = "fusion" if ours else "our fusion"

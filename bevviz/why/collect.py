@@ -12,17 +12,17 @@ from bevviz.model.results import ClusterState, FrameResult
 from bevviz.stages.visibility import in_view
 from bevviz.support.kernel import kernel
 from bevviz.why.detection_candidates import find_candidates, sort_candidates
-from bevviz.why.evidence import Candidate, Evidence, Part
+from bevviz.why.evidence import Candidate, ClusterPart, Evidence
 from bevviz.why.frame_index import FEW, PART, Fate, Traces
-from bevviz.why.merged import LOOKED_AT, closest, find_mates, part_from
-from bevviz.why.outcome import find_named
+from bevviz.why.merged import LOOKED_AT, find_mates, least_distance, separation
+from bevviz.why.outcome import find_reported_object
 from bevviz.why.subject import IN_VIEW, Subject
 
 NEARER = 0.5  # metres by which a return must be nearer to hide the subject
 CORE = 0.8  # share of the directions of a box; an object does not fill the corners of its box
 
 
-def gather(subject: Subject, traces: Traces) -> Evidence:
+def collect_evidence(subject: Subject, traces: Traces) -> Evidence:
     """Collect the points, clusters and detections of the subject, stage by stage."""
     result = traces.result
     voxels, ground = result.voxels, result.ground
@@ -42,13 +42,13 @@ def gather(subject: Subject, traces: Traces) -> Evidence:
     parts = _parts(labels, result)
     candidates = find_candidates(subject, traces, parts)
     main = _main_cluster(subject, parts, candidates, len(labels))
-    named = find_named(subject, traces, parts, candidates)
+    named = find_reported_object(subject, traces, parts, candidates)
     if named is not None and named.cluster >= 0:
         main = named.cluster
     candidates = sort_candidates(candidates, subject, main, result.config.detector.conf_threshold)
     noise = obstacle[labels < 0]
     mates = find_mates(subject, traces, main, obstacle)
-    shared = part_from(subject, traces, main, obstacle, mates)
+    shared = separation(subject, traces, main, obstacle, mates)
     hiding = traces.cluster[front_rows]
     hiding = hiding[hiding >= 0]
     config = result.config.clustering
@@ -81,7 +81,7 @@ def gather(subject: Subject, traces: Traces) -> Evidence:
 # --- LiDAR -------------------------------------------------------------------------------------
 
 
-def _parts(labels: I32, result: FrameResult) -> tuple[Part, ...]:
+def _parts(labels: I32, result: FrameResult) -> tuple[ClusterPart, ...]:
     """Return the clusters of (M,) labels, the one with most points first."""
     cluster_rows, points = np.unique(labels[labels >= 0], return_counts=True)
     clusters = result.clusters
@@ -89,13 +89,13 @@ def _parts(labels: I32, result: FrameResult) -> tuple[Part, ...]:
         return ()
     order = np.argsort(-points, kind="stable")
     return tuple(
-        Part(int(k), int(n), int(clusters.count[k]), ClusterState(int(clusters.state[k])))
+        ClusterPart(int(k), int(n), int(clusters.count[k]), ClusterState(int(clusters.state[k])))
         for k, n in zip(cluster_rows[order], points[order], strict=True)
     )
 
 
 def _main_cluster(
-    subject: Subject, parts: Sequence[Part], candidates: Sequence[Candidate], obstacles: int
+    subject: Subject, parts: Sequence[ClusterPart], candidates: Sequence[Candidate], obstacles: int
 ) -> int:
     """Return the kept cluster of the subject, -1 if it holds only few of its points."""
     # The frustum of a detection also holds clusters behind the object. The fusion has chosen one of them.
@@ -178,13 +178,13 @@ def _distance(subject: Subject, traces: Traces, points: I64, main: int) -> float
     return float("nan")
 
 
-def _largest_gap(result: FrameResult, parts: Sequence[Part]) -> float:
+def _largest_gap(result: FrameResult, parts: Sequence[ClusterPart]) -> float:
     """Return the metres between the two largest kept clusters, NaN without two."""
     kept = [part for part in parts if part.kept]
     if len(kept) < 2 or result.clusters is None or result.obstacles is None:
         return float("nan")
     first, second = (result.obstacles[result.clusters.labels == part.cluster] for part in kept[:2])
-    return closest(first, second)
+    return least_distance(first, second)
 
 
 def _in_view(subject: Subject, traces: Traces) -> bool:

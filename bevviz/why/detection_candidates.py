@@ -9,14 +9,14 @@ import numpy as np
 from bevviz.model import geometry
 from bevviz.model.frame import F32, I64
 from bevviz.model.results import CameraResult, Decision, DetectionState, Fusion
-from bevviz.why.evidence import Candidate, Part
+from bevviz.why.evidence import Candidate, ClusterPart
 from bevviz.why.frame_index import Traces
 from bevviz.why.subject import LINK, Subject, projected
 
 COVERED = 0.8  # share of a cluster's image box that a detection of it covers
 
 
-def find_candidates(subject: Subject, traces: Traces, parts: Sequence[Part]) -> tuple[Candidate, ...]:
+def find_candidates(subject: Subject, traces: Traces, parts: Sequence[ClusterPart]) -> tuple[Candidate, ...]:
     """Find the detections of the subject in all cameras."""
     candidates = []
     for camera in traces.result.cameras:
@@ -29,7 +29,7 @@ def find_candidates(subject: Subject, traces: Traces, parts: Sequence[Part]) -> 
 
 
 def _rows_of_subject(
-    subject: Subject, traces: Traces, camera: CameraResult, parts: Sequence[Part]
+    subject: Subject, traces: Traces, camera: CameraResult, parts: Sequence[ClusterPart]
 ) -> tuple[I64, F32]:
     """Return the rows of the subject's detections in a camera, and the (D,) overlap with all."""
     detections = camera.detections

@@ -18,7 +18,7 @@ MOST = 0.5  # least share of the main cause, and of a cluster that belongs mostl
 
 
 @dataclass(frozen=True, slots=True)
-class Part:
+class ClusterPart:
     """A cluster that holds points of the subject."""
 
     cluster: int
@@ -52,7 +52,7 @@ class Candidate:
 
 
 @dataclass(frozen=True, slots=True)
-class Named:
+class ReportedObject:
     """The reported object of the subject.
 
     Attributes:
@@ -109,13 +109,13 @@ class Evidence:
     ground: F32
     noise: int
     neighbours: int
-    parts: tuple[Part, ...]
+    parts: tuple[ClusterPart, ...]
     main: int
     aimed: int
     in_front: int
     front: int
     candidates: tuple[Candidate, ...]
-    named: Named | None
+    named: ReportedObject | None
     mates: tuple[int, ...]
     others: tuple[tuple[str, int], ...]
     gap: float
@@ -138,7 +138,7 @@ class Evidence:
         """Its most significant detection."""
         return self.candidates[0] if self.candidates else None
 
-    def part(self, cluster: int) -> Part | None:
+    def part(self, cluster: int) -> ClusterPart | None:
         """Return its part in a cluster, None if it has no points there."""
         return next((part for part in self.parts if part.cluster == cluster), None)
 
@@ -149,7 +149,7 @@ class Evidence:
         return 1.0 if part is None else part.points / max(part.count, 1)
 
 
-def fusion_of(result: FrameResult, camera: str) -> tuple[CameraResult, Fusion | None]:
+def camera_and_fusion(result: FrameResult, camera: str) -> tuple[CameraResult, Fusion | None]:
     """Return the result of a camera and its fusion."""
     result_of_camera = next(c for c in result.cameras if c.camera.name == camera)
     return result_of_camera, result_of_camera.fusion

@@ -15,8 +15,8 @@ from bevviz.model.frame import F32, I32, I64, U8, Bool, Boxes3D, Frame
 from bevviz.model.results import CameraResult, Decision, Detections, FrameResult
 from bevviz.stages.robot_results import in_points_frame
 from bevviz.stages.visibility import in_view
-from bevviz.why.stage_owner import StageOrigin, origin
-from bevviz.why.subject import FOOT, LINK, MARGIN, Subject, in_box, one_of, projected
+from bevviz.why.stage_owner import StageOwner, origin
+from bevviz.why.subject import FOOT, LINK, MARGIN, Subject, one_of, points_in_box, projected
 
 SAME_CLASS = 1.3  # factor on the overlap of a detection with an object of its class
 FEW = 3  # fewer points than this count as none
@@ -64,7 +64,7 @@ class Traces:
         self._owners: dict[str, tuple[Detections, I64]] = {}  # camera -> detections, their owners
         self._labels: dict[int, I32] = {}
 
-    def again(self, result: FrameResult) -> Traces:
+    def for_result(self, result: FrameResult) -> Traces:
         """Return the index of another result of the same frame. Arrays of the frame alone are shared."""
         other = Traces(result, self.classes)
         other._places, other._uv, other._owners = self._places, self._uv, dict(self._owners)
@@ -72,12 +72,12 @@ class Traces:
         other.directions, other._by_x = self.directions, self._by_x
         return other
 
-    def origin(self, section: str) -> StageOrigin:
+    def origin(self, section: str) -> StageOwner:
         """Return the owner of the stage of a section."""
         return self._origins[section]
 
     @cached_property
-    def _origins(self) -> dict[str, StageOrigin]:
+    def _origins(self) -> dict[str, StageOwner]:
         sections = "ground", "clustering", "detector", "objects"
         return {section: origin(self.result.config, section) for section in sections}
 
@@ -170,7 +170,7 @@ class Traces:
                 away = np.linalg.norm(points[rows] - box.center[0], axis=1)
                 return np.sort(rows[away < box.size[0, 0] / 2])
             foot = -MARGIN if subject.kind == "cell" else FOOT
-            return np.sort(rows[in_box(box, points[rows], MARGIN, foot)])
+            return np.sort(rows[points_in_box(box, points[rows], MARGIN, foot)])
         camera = self.camera(subject.camera)
         if camera is None or subject.xyxy is None:
             return np.zeros(0, np.int64)
@@ -248,7 +248,7 @@ class Traces:
         obstacle = self.obstacle[np.unique(voxels.inverse[points])]
         return clusters.labels[obstacle[obstacle >= 0]]
 
-    def holds(self, cluster: int, row: int) -> int:
+    def voxels_in_cluster(self, cluster: int, row: int) -> int:
         """Return the voxels of a ground truth object in a cluster, 0 if they are a small part of it."""
         labels = self.labels(row)
         count = int((labels == cluster).sum())
@@ -265,7 +265,7 @@ class Traces:
                 continue
             reach = half[:2] + np.hypot(*other.box.size[0, :2]) / 2 + MARGIN
             near = np.abs(other.box.center[0, :2] - center[:2]) <= reach
-            if near.all() and self.holds(cluster, other.row):
+            if near.all() and self.voxels_in_cluster(cluster, other.row):
                 yield other.row
 
     def owners(self, camera: CameraResult) -> I64:

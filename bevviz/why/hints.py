@@ -18,7 +18,7 @@ from bevviz.model.results import Detections, DetectionState, FrameResult
 from bevviz.pipeline.perceive import perceive
 from bevviz.pipeline.stage_loader import Detect, StageLoader
 from bevviz.pipeline.stage_log import Memo
-from bevviz.why.collect import gather
+from bevviz.why.collect import collect_evidence
 from bevviz.why.evidence import Candidate, Evidence
 from bevviz.why.frame_index import Traces
 from bevviz.why.side_effects import Effects, effects
@@ -95,8 +95,8 @@ class Search:
     reported: bool = False
 
 
-class WhatIf:
-    """Runs of one frame with other configurations, each run once.
+class HintFinder:
+    """Finder of changes that help. It runs one frame with other configurations, each once.
 
     Args:
         traces: index of the frame's result.
@@ -130,7 +130,7 @@ class WhatIf:
             if after is None:
                 continue
             tried += 1
-            then = gather(subject, after)
+            then = collect_evidence(subject, after)
             new, now_reported = find_reason(subject, then, after)
             text, object_row = _new_outcome(subject, (reason, reported), (new, now_reported), then, after)
             if text and _is_sure(subject, change, then):
@@ -158,7 +158,7 @@ class WhatIf:
                 self._runs[key] = None
             else:
                 result = perceive(self._result.frame, config, stages, self._memo)
-                self._runs[key] = self._traces.again(result)
+                self._runs[key] = self._traces.for_result(result)
             while len(self._runs) > RESULTS:
                 del self._runs[next(iter(self._runs))]
         return self._runs[key]

@@ -17,7 +17,7 @@ from bevviz.recording.camera import over_image
 from bevviz.recording.primitives import boxes2d, document, edges, transform
 from bevviz.recording.writer import Writer
 from bevviz.why.answer import Answer
-from bevviz.why.answer_text import page
+from bevviz.why.answer_text import markdown_page
 from bevviz.why.frame_index import Fate
 from bevviz.why.subject import projected
 
@@ -64,7 +64,7 @@ def log_answers(
         shown: number of answers to draw.
         above: configuration of the bird's-eye view, to draw there as well.
     """
-    recording.log(entities.WHY, document(page(answers, shown)))
+    recording.log(entities.WHY, document(markdown_page(answers, shown)))
     pose = transform(frame.pose)
     drawn = answers[:shown]
     if drawn:

@@ -34,7 +34,7 @@ def find_mates(subject: Subject, traces: Traces, main: int, obstacle_rows: I64) 
         return []
     if subject.kind == "truth":
         rows = traces.mates(main, subject.row)
-        return [(row, traces.truth[row].name, traces.holds(main, row)) for row in rows]
+        return [(row, traces.truth[row].name, traces.voxels_in_cluster(main, row)) for row in rows]
     if subject.kind != "detection":
         return []
     members = np.flatnonzero(clusters.labels == main)
@@ -60,7 +60,7 @@ def _same_view(a: Subject, b: Subject) -> bool:
     return a.camera == b.camera and float(geometry.iou(a.xyxy[None], b.xyxy[None])[0, 0]) < LINK
 
 
-def part_from(
+def separation(
     subject: Subject, traces: Traces, main: int, obstacle_rows: I64, mates: Sequence[tuple[int, str, int]]
 ) -> tuple[float, float]:
     """Return the gap in metres between the subject and its mates, and the eps that separates them.
@@ -87,14 +87,14 @@ def part_from(
         theirs &= ~mine if subject.box is not None else np.True_
         alone = mine if subject.box is not None else mine & ~theirs
         if alone.any() and theirs.any():
-            between = closest(points[alone], points[theirs])
+            between = least_distance(points[alone], points[theirs])
             if between < gap:
                 gap, nearest = between, theirs
     mine &= ~nearest
     if not mine.any() or not nearest.any():
         return float("nan"), 0.0
     if not mates:
-        gap = closest(points[mine], points[nearest])
+        gap = least_distance(points[mine], points[nearest])
     finer = _separating_eps(points, mine, nearest, traces) if traces.origin("clustering").ours else 0.0
     return gap, finer
 
@@ -121,7 +121,7 @@ def _separating_eps(points: F32, mine: Bool, theirs: Bool, traces: Traces) -> fl
     return 0.0
 
 
-def closest(a: F32, b: F32) -> float:
+def least_distance(a: F32, b: F32) -> float:
     """Return the least distance between two sets of points; approximate for large sets."""
     return float(np.sqrt(_closest(a[:: 1 + len(a) // LOOKED_AT], b[:: 1 + len(b) // LOOKED_AT])))
 

@@ -8,17 +8,17 @@ import numpy as np
 
 from bevviz.model import geometry
 from bevviz.model.results import Decision, FrameResult, Objects
-from bevviz.why.evidence import Candidate, Evidence, Named, Part, fusion_of
+from bevviz.why.evidence import Candidate, ClusterPart, Evidence, ReportedObject, camera_and_fusion
 from bevviz.why.frame_index import FEW, PART, Traces
-from bevviz.why.subject import LINK, Subject, in_box, one_of, projected
+from bevviz.why.subject import LINK, Subject, one_of, points_in_box, projected
 
 HELD = 0.3  # least share of a subject's points inside the box of its object
 OVERLAP = 0.1  # or least IoU of both boxes from above
 
 
-def find_named(
-    subject: Subject, traces: Traces, parts: Sequence[Part], candidates: Sequence[Candidate]
-) -> Named | None:
+def find_reported_object(
+    subject: Subject, traces: Traces, parts: Sequence[ClusterPart], candidates: Sequence[Candidate]
+) -> ReportedObject | None:
     """Find the reported object of the subject. Objects of a right class come first."""
     result = traces.result
     objects = result.objects
@@ -75,14 +75,14 @@ def opinion_on(result: FrameResult, row: int) -> str:
 
 def _reported_object(
     subject: Subject, row: int, result: FrameResult, candidates: Sequence[Candidate]
-) -> Named:
+) -> ReportedObject:
     """Return the object with the detection that named it."""
     objects = result.objects
     assert objects is not None
     camera, detection, cluster = objects.camera[row], int(objects.detection[row]), int(objects.cluster[row])
     also: list[int] = []
     if camera:
-        _, fusion = fusion_of(result, camera)
+        _, fusion = camera_and_fusion(result, camera)
         assert fusion is not None
         same = (fusion.cluster_decision == Decision.MATCHED) & (fusion.cluster_detection == detection)
         also = [other for other in np.flatnonzero(same).tolist() if other != cluster]
@@ -94,11 +94,11 @@ def _reported_object(
         (candidate.camera, candidate.row) == (camera, detection) and (known or candidate.overlap >= LINK)
         for candidate in candidates
     )
-    return Named(row, objects.names[row], cluster, camera, detection, is_own, tuple(also))
+    return ReportedObject(row, objects.names[row], cluster, camera, detection, is_own, tuple(also))
 
 
 def _objects_of_clusters(
-    subject: Subject, traces: Traces, parts: Sequence[Part], candidates: Sequence[Candidate]
+    subject: Subject, traces: Traces, parts: Sequence[ClusterPart], candidates: Sequence[Candidate]
 ) -> Iterator[int]:
     """Yield the rows of the objects that come from the subject's clusters and represent it."""
     objects = traces.result.objects
@@ -117,7 +117,7 @@ def _objects_of_clusters(
                 yield row
 
 
-def _represents(subject: Subject, traces: Traces, row: int, part: Part) -> bool:
+def _represents(subject: Subject, traces: Traces, row: int, part: ClusterPart) -> bool:
     """Return whether an object is this subject, and not another one in the same cluster."""
     if subject.kind != "truth":
         return True
@@ -128,7 +128,9 @@ def _represents(subject: Subject, traces: Traces, row: int, part: Part) -> bool:
     mates = list(traces.mates(part.cluster, subject.row))
     if owner == subject.row or not mates:
         return True
-    return owner not in mates and all(part.points > traces.holds(part.cluster, mate) for mate in mates)
+    return owner not in mates and all(
+        part.points > traces.voxels_in_cluster(part.cluster, mate) for mate in mates
+    )
 
 
 def _objects_at_place(subject: Subject, traces: Traces) -> Iterator[int]:
@@ -146,7 +148,10 @@ def _objects_at_place(subject: Subject, traces: Traces) -> Iterator[int]:
         return
     mine = points[traces.place(subject)]
     share = np.array(
-        [in_box(one_of(objects.boxes, row), mine).mean() if len(mine) else 0 for row in range(len(objects))]
+        [
+            points_in_box(one_of(objects.boxes, row), mine).mean() if len(mine) else 0
+            for row in range(len(objects))
+        ]
     )
     overlap = np.zeros(len(objects))
     if subject.box is not None and len(objects):

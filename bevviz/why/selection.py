@@ -23,7 +23,7 @@ SURFACE = 1.0  # metres behind the nearest return at a pixel; subjects within it
 AS_GOOD = 0.8  # share of the best fit to a box from which a subject is as good an answer
 
 
-def select(traces: Traces, selection: Selection) -> list[Subject]:
+def select_subjects(traces: Traces, selection: Selection) -> list[Subject]:
     """Return the subjects of a selection. A pixel, box, point or cell is a subject itself.
 
     Raises:
@@ -255,14 +255,14 @@ def _contradicted_objects(traces: Traces, camera: str) -> Iterator[Subject]:
 # --- subjects at a place -----------------------------------------------------------------------
 
 
-def at_place(traces: Traces, selection: Selection) -> list[tuple[Subject, bool]]:
+def subjects_at_place(traces: Traces, selection: Selection) -> list[tuple[Subject, bool]]:
     """Return the subjects at a pixel, in an image box or around a point, and whether each is visible there.
 
     An object of the ground truth includes its detections and clusters. A detection includes the cluster that
     it named.
 
     Raises:
-        UserError: as ``select``.
+        UserError: as ``select_subjects``.
     """
     around = bool(selection.point or selection.cell)
     return list(_in_space(traces, selection) if around else _in_image(traces, selection))

@@ -9,10 +9,10 @@ import numpy as np
 from bevviz.config import Config
 from bevviz.model.decisions import in_mask
 from bevviz.model.results import ClusterState, Decision, FrameResult
-from bevviz.why.evidence import Candidate, Evidence, fusion_of
+from bevviz.why.evidence import Candidate, Evidence, camera_and_fusion
 from bevviz.why.frame_index import Fate, Traces
 from bevviz.why.outcome import find_fused, in_box_of, opinion_on
-from bevviz.why.stage_owner import StageOrigin
+from bevviz.why.stage_owner import StageOwner
 from bevviz.why.subject import Subject, count
 from bevviz.why.verdict import Reason, Verdict, cameras_of, name_of, pair_reason
 
@@ -23,7 +23,7 @@ def verdict_of(
     subject: Subject, reason: Reason, reported: bool, evidence: Evidence, traces: Traces
 ) -> Verdict:
     """Return the verdict with its reason in one sentence."""
-    because = Because(subject, evidence, traces).of(reason)
+    because = ReasonText(subject, evidence, traces).of(reason)
     head = subject.name[0].upper() + subject.name[1:]
     if reason is Reason.REPORTED:
         return Verdict(reason, reported, f"{head} was reported: {because}.")
@@ -41,7 +41,7 @@ def label(candidate: Candidate) -> str:
     return f"{candidate.name} {candidate.score:.2f}"
 
 
-class Because:
+class ReasonText:
     """Words that follow "because" in a verdict.
 
     Args:
@@ -90,7 +90,7 @@ class Because:
         }
         return sentences[reason]()
 
-    def _origin(self, section: str) -> StageOrigin:
+    def _origin(self, section: str) -> StageOwner:
         """Return the owner of the stage of a section."""
         return self.traces.origin(section)
 
@@ -337,7 +337,7 @@ class Because:
 
     def _pair_text(self, row: int, camera: str, cluster: int) -> str:
         """Return the numbers that the rule of the fusion compared."""
-        _, fusion = fusion_of(self.result, camera)
+        _, fusion = camera_and_fusion(self.result, camera)
         if fusion is None:
             return "not compared"
         pair = fusion.pair(row, cluster)
@@ -381,7 +381,7 @@ class Because:
 
     def _taken(self) -> str:
         best, cluster = self._best, self._cluster
-        _, fusion = fusion_of(self.result, best.camera)
+        _, fusion = camera_and_fusion(self.result, best.camera)
         text = f"cluster {cluster}, the best for {label(best)}, was taken by "
         if fusion is None or fusion.cluster_detection[cluster] in (-1, best.row):
             return text + "another camera's detection"
@@ -446,7 +446,7 @@ class Because:
     def _our_decision(self, cluster: int) -> str:
         """Say how our fusion would decide about a detection and a cluster."""
         best = self._best
-        _, fusion = fusion_of(self.result, best.camera)
+        _, fusion = camera_and_fusion(self.result, best.camera)
         pair = self._pair_text(best.row, best.camera, cluster)
         if fusion is None:
             return "could not compare them"

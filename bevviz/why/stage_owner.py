@@ -11,7 +11,7 @@ from bevviz.errors import UserError
 
 
 @dataclass(frozen=True, slots=True)
-class StageOrigin:
+class StageOwner:
     """The owner of one stage.
 
     Attributes:
@@ -35,15 +35,15 @@ class StageOrigin:
         return self.function or self.topic
 
 
-def origin(config: Config, section: str) -> StageOrigin:
+def origin(config: Config, section: str) -> StageOwner:
     """Return the owner of the stage of a section."""
     method = str(getattr(getattr(config, section), STAGES[section]))
     if method.startswith(TOPIC):
-        return StageOrigin(section, topic=method.removeprefix(TOPIC))
+        return StageOwner(section, topic=method.removeprefix(TOPIC))
     try:
         plugin = plugin_of(config, section)
     except UserError:  # The function could be loaded when the frame was run.
-        return StageOrigin(section, function=method)
+        return StageOwner(section, function=method)
     if plugin is None and section == "objects" and method not in OURS:
-        return StageOrigin(section, function=Path(method).name)  # file of a network
-    return StageOrigin(section, function=plugin.name if plugin is not None else "")
+        return StageOwner(section, function=Path(method).name)  # file of a network
+    return StageOwner(section, function=plugin.name if plugin is not None else "")

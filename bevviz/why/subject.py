@@ -108,7 +108,7 @@ def one_of(boxes: Boxes3D, row: int) -> Boxes3D:
     return Boxes3D(boxes.center[[row]], boxes.size[[row]], boxes.yaw[[row]])
 
 
-def in_box(box: Boxes3D, points: F32, margin: float = 0.0, foot: float = 0.0) -> Bool:
+def points_in_box(box: Boxes3D, points: F32, margin: float = 0.0, foot: float = 0.0) -> Bool:
     """Return (N,) which points are in one upright box, except near or below its bottom."""
     x, y, z = (points - box.center[0]).T
     c, s = np.cos(box.yaw[0]), np.sin(box.yaw[0])

@@ -16,7 +16,7 @@ from bevviz.model.results import (
     Fusion,
     Opinion,
 )
-from bevviz.why.evidence import MOST, Candidate, Evidence, Named, fusion_of
+from bevviz.why.evidence import MOST, Candidate, Evidence, ReportedObject, camera_and_fusion
 from bevviz.why.frame_index import FEW, PART, Traces
 from bevviz.why.outcome import find_fused
 from bevviz.why.subject import Subject
@@ -117,7 +117,7 @@ def _reason_of_cameras(subject: Subject, evidence: Evidence, traces: Traces) -> 
     return (Reason.REPORTED, True) if best.kept else (_weakness(best, traces), False)
 
 
-def _flaw(subject: Subject, evidence: Evidence, named: Named, traces: Traces) -> Reason:
+def _flaw(subject: Subject, evidence: Evidence, named: ReportedObject, traces: Traces) -> Reason:
     """Return the fault of a reported object, REPORTED without a fault."""
     opinions = traces.result.opinions
     if opinions is not None and subject.kind == "object":
@@ -198,7 +198,7 @@ def _weakness(best: Candidate, traces: Traces) -> Reason:
 
 def _refusal(subject: Subject, evidence: Evidence, best: Candidate, traces: Traces) -> Reason:
     """Return the reason why a cluster and a detection were not matched."""
-    _, fusion = fusion_of(traces.result, best.camera)
+    _, fusion = camera_and_fusion(traces.result, best.camera)
     if fusion is None:
         return Reason.NOT_FUSED
     reason = pair_reason(fusion, traces, best.row, evidence.main)
@@ -216,7 +216,7 @@ def _is_named_by_mate(evidence: Evidence, fusion: Fusion, camera: str, traces: T
     """Return whether another object in the subject's cluster named the cluster."""
     if fusion.cluster_decision[evidence.main] != Decision.MATCHED:
         return False
-    camera_result, _ = fusion_of(traces.result, camera)
+    camera_result, _ = camera_and_fusion(traces.result, camera)
     return int(traces.owners(camera_result)[fusion.cluster_detection[evidence.main]]) in evidence.mates
 
 
@@ -256,7 +256,7 @@ def _loss_of_detection(evidence: Evidence, traces: Traces) -> Reason:
         return Reason.NOT_DETECTED
     if not best.kept:
         return _weakness(best, traces)
-    _, fusion = fusion_of(traces.result, best.camera)
+    _, fusion = camera_and_fusion(traces.result, best.camera)
     if fusion is None:
         return Reason.NOT_FUSED
     if best.decision is Decision.NO_CLUSTER or best.cluster < 0:
@@ -296,7 +296,7 @@ def _loss_of_other_stages(subject: Subject, evidence: Evidence, traces: Traces) 
     return Reason.LOST_IN_FUSION if known else Reason.NOT_AMONG
 
 
-def _is_in_reported_box(subject: Subject, evidence: Evidence, named: Named, traces: Traces) -> bool:
+def _is_in_reported_box(subject: Subject, evidence: Evidence, named: ReportedObject, traces: Traces) -> bool:
     """Return whether the object of our fusion is inside the reported box."""
     row, opinions = find_fused(subject, evidence, traces), traces.result.opinions
     return row >= 0 and opinions is not None and int(opinions.partner[row]) == named.row
