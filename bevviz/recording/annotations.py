@@ -14,12 +14,12 @@ FAINT = (150, 150, 160, 110)
 
 
 def log_world(to: Writer) -> None:
-    """The axes of the fixed frame, and what class ids mean."""
+    """Log the axes of the fixed frame, and the names and colours of class ids. Both are static."""
     to.static(entities.WORLD, rr.ViewCoordinates.FLU, class_annotations())
 
 
 def class_annotations() -> rr.AnnotationContext:
-    """Of points and boxes."""
+    """Return the names and colours of the class ids of points and boxes."""
     classes: list[tuple[int, str, tuple[int, ...]]] = [
         (entities.DETECTION_CLASS[DetectionState.KEPT], "kept", (255, 255, 255)),
         (entities.DETECTION_CLASS[DetectionState.BELOW_THRESHOLD], "below threshold", FAINT),
@@ -38,7 +38,7 @@ def class_annotations() -> rr.AnnotationContext:
 
 
 def point_classes() -> list[rr.AnnotationInfo]:
-    """Of raw points and voxels."""
+    """Return the names and colours of the class ids of raw points and voxels."""
     return [
         rr.AnnotationInfo(id=ClassId.UNCLASSIFIED, color=(130, 130, 140)),
         rr.AnnotationInfo(id=ClassId.GROUND, label="ground", color=(92, 84, 76)),
@@ -47,7 +47,7 @@ def point_classes() -> list[rr.AnnotationInfo]:
 
 
 def depth_annotations() -> rr.AnnotationContext:
-    """Of points in an image, by bins of their depth: near is red, far is blue."""
+    """Return colours and labels of points in an image by depth: red is near, blue is far."""
     width = entities.DEPTH_RANGE / entities.DEPTH_BINS
     near_is_red = turbo(entities.DEPTH_BINS)[::-1].tolist()
     return rr.AnnotationContext(

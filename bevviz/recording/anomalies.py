@@ -1,4 +1,4 @@
-"""Anomalies: each when it begins, and how many there are."""
+"""Log anomalies: one line when an anomaly begins, and counts over time."""
 
 from __future__ import annotations
 
@@ -14,11 +14,18 @@ from bevviz.recording.writer import Writer
 
 
 def log_anomalies_looks(to: Writer) -> None:
+    """Log the static names of the anomaly count curves."""
     to.static(entities.ANOMALY_COUNTS, rr.SeriesLines(names=list(KINDS)))
 
 
 def log_anomalies(to: Writer, result: FrameResult, started: Sequence[Anomaly]) -> None:
-    """``started``: those of the frame that no frame before it had."""
+    """Log new anomalies as lines, and the number of anomalies of each kind.
+
+    Args:
+        to: writer of the recording.
+        result: results of the frame.
+        started: anomalies that begin in this frame.
+    """
     to.lines(entities.ANOMALY_LOG, [(a.severity, f"{a.kind}: {a.text}") for a in started])
     count = Counter(anomaly.kind for anomaly in result.anomalies)
     to.write(entities.ANOMALY_COUNTS, rr.Scalars([float(count[kind]) for kind in KINDS]))

@@ -1,4 +1,4 @@
-"""The bird's-eye view: its image and channels, and the occupancy laid on the ground."""
+"""Log the bird's-eye view: image, channels, and the occupancy grid on the ground."""
 
 from __future__ import annotations
 
@@ -15,11 +15,14 @@ from bevviz.recording import entities, retention
 from bevviz.recording.primitives import blob, jpeg, png
 from bevviz.recording.writer import Writer
 
-_TURNED = np.array([0.0, 0.0, -np.sqrt(0.5), np.sqrt(0.5)])  # by -90 degrees about z, as x, y, z, w
+_TURNED = np.array([0.0, 0.0, -np.sqrt(0.5), np.sqrt(0.5)])  # rotation by -90 degrees about z, as x, y, z, w
 
 
 def log_bev(to: Writer, bev: Bev, config: Config) -> None:
-    """The image, pixel for pixel where it is to be that of the tutorial, and its channels."""
+    """Log the bird's-eye image and its channels.
+
+    The reference style is logged as PNG, so that pixels equal those of the tutorial. The others are JPEG.
+    """
     quality = config.logging.jpeg_quality if retention.is_whole(config) else retention.BEV_QUALITY
     is_reference = config.bev.style == "reference"
     to.put(entities.BEV, png(bev.image) if is_reference else jpeg(bev.image, quality))
@@ -29,10 +32,10 @@ def log_bev(to: Writer, bev: Bev, config: Config) -> None:
 
 
 def log_grid(to: Writer, result: FrameResult, bev: Bev) -> None:
-    """The occupancy on the ground. The pose of a grid map is that of its lower left corner.
+    """Log the occupancy grid on the ground. The pose of a grid map is the pose of its lower left corner.
 
-    It has no transform beside it: the viewer holds all transforms of a drive, and with one each grid, as what
-    is in one chunk is held as a whole.
+    The pose is part of the grid map, not a separate transform. The viewer keeps the transforms of the whole
+    drive, and a chunk stays in memory as a whole. A transform in the chunk would keep every grid in memory.
     """
     grid = bev.channels.get("occupancy")
     if grid is None:
@@ -65,7 +68,7 @@ def _grid_looks(rows: int, columns: int, resolution: float) -> rr.GridMap:
 
 
 def seen_from_above(config: BevConfig, points_from_those: F64, those: F32) -> F32:
-    """(..., 3) positions as (..., 2) pixels of the bird's-eye image."""
+    """Project (..., 3) positions to (..., 2) pixels of the bird's-eye image."""
     reach = np.array([config.range_x, config.range_y], np.float32)
     xy = geometry.apply(points_from_those, those.reshape(-1, 3))[:, :2]
     pixels = ((reach - xy) / np.float32(config.resolution))[:, ::-1]
@@ -73,5 +76,5 @@ def seen_from_above(config: BevConfig, points_from_those: F64, those: F32) -> F3
 
 
 def footprints(corners: F32) -> F32:
-    """(K, 5, 3) closed outlines on the ground of (K, 8, 3) corners of boxes."""
+    """Return (K, 5, 3) closed outlines on the ground for (K, 8, 3) box corners."""
     return corners[:, [0, 1, 2, 3, 0]]

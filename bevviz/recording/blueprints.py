@@ -1,4 +1,4 @@
-"""Finds and loads viewer layouts: the ones that come along by name, a user's own from a file."""
+"""Find and load viewer layouts: bundled layouts by name, user layouts from a file."""
 
 from __future__ import annotations
 
@@ -18,30 +18,33 @@ from bevviz.recording.retention import is_whole
 
 
 def _folder() -> Path:
-    """Beside the package where it is installed, beside the package's folder in a checkout."""
+    """Return the folder of the bundled layouts.
+
+    It is inside the package in an installation, and next to the package folder in a checkout.
+    """
     package = Path(__file__).parents[1]
     installed = package / "blueprints"
     return installed if installed.is_dir() else package.parent / "blueprints"
 
 
 def names() -> list[str]:
-    """The layouts that come along."""
+    """Return the names of the bundled layouts."""
     return sorted(path.stem for path in _folder().glob("*.py") if not path.stem.startswith("_"))
 
 
 def load(name_or_path: str, scene: Scene, config: Config | None = None) -> rrb.Blueprint:
-    """A layout for the scene.
+    """Load a layout for a scene.
 
     Args:
         name_or_path: one of ``names()``, a .py file with a function ``blueprint(scene)`` that returns an
             ``rrb.Blueprint``, or a .rbl file that was saved in the viewer.
         scene: names of the sensors.
-        config: of the run: which raw clouds there are, what they can be coloured by, and where the look from
-            above begins, which is where objects can be expected; None: raw clouds, without colours, from
-            all over.
+        config: configuration of the run. It decides whether raw clouds are shown, the quantities that colour
+            them, and the visible part of the bird's-eye view. None: raw clouds without colours, and the whole
+            bird's-eye view.
 
     Raises:
-        UserError: unknown name, no such file, or a file that makes no layout.
+        UserError: the name is unknown, the file does not exist, or it does not make a layout.
     """
     if config is not None:
         whole, log = is_whole(config), config.logging
@@ -65,7 +68,7 @@ def load(name_or_path: str, scene: Scene, config: Config | None = None) -> rrb.B
 
 
 def _ahead(config: BevConfig) -> tuple[float, float, float, float]:
-    """Pixels of what is ahead and not far to the sides."""
+    """Return the pixel bounds of the area ahead of the robot and close to its sides."""
     rows, columns = config.range_x / config.resolution, config.range_y / config.resolution
     return 0.5 * columns, 0.1 * rows, 1.5 * columns, 1.25 * rows
 
@@ -78,7 +81,7 @@ def _from_python(path: Path, scene: Scene) -> rrb.Blueprint:
     try:
         spec.loader.exec_module(module)
         layout = module.blueprint(scene)
-    except Exception as error:  # whatever a user's file may do
+    except Exception as error:  # a user's file may raise anything
         reason = str(error).splitlines()[0] if str(error) else ""
         raise UserError(f"--blueprint {path}: {type(error).__name__}: {reason}") from error
     if not isinstance(layout, rrb.Blueprint):
@@ -88,7 +91,7 @@ def _from_python(path: Path, scene: Scene) -> rrb.Blueprint:
 
 
 class Saved(rrb.Blueprint):
-    """A layout that the viewer saved as .rbl: sent on as it is."""
+    """Layout that the viewer saved as .rbl. It is sent unchanged."""
 
     def __init__(self, path: Path) -> None:
         super().__init__(rrb.Grid())

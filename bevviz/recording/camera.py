@@ -1,4 +1,4 @@
-"""A camera: where it is, how it sees, its image, and over it detections and obstacle points."""
+"""Log a camera: pose, intrinsics, image, detections and projected obstacle points."""
 
 from __future__ import annotations
 
@@ -36,6 +36,7 @@ if TYPE_CHECKING:
 
 
 def log_camera_looks(to: Writer, cameras: Iterable[str]) -> None:
+    """Log the static style of detections, labels and projected points of each camera."""
     for camera in cameras:
         to.static(
             entities.projected(camera),
@@ -55,7 +56,7 @@ def log_camera_looks(to: Writer, cameras: Iterable[str]) -> None:
 
 
 def log_shared_image(to: Writer, camera: str) -> None:
-    """What is under a root is drawn over the one image that there is."""
+    """Draw the results of a run under a root over the main run's image. There is only one image."""
     boxes = entities.detections(camera)
     over = (entities.projected(camera), boxes, entities.outlines(boxes), entities.names(boxes))
     for path in (*over, entities.weak(camera)):
@@ -63,12 +64,12 @@ def log_shared_image(to: Writer, camera: str) -> None:
 
 
 def over_image(camera: str) -> rr.CoordinateFrame:
-    """In the space of the camera's image, wherever the entity is."""
+    """Return the coordinate frame of the camera's image. An entity with it is drawn over the image."""
     return rr.CoordinateFrame(entities.space(entities.image(camera)))
 
 
 def camera_pose(frame: Frame, result: CameraResult) -> F64 | None:
-    """(4, 4) ``world_from_camera``, None where nothing says."""
+    """Return (4, 4) ``world_from_camera``, or None if it is unknown."""
     camera = result.camera
     if camera.world_from_camera is not None:
         return camera.world_from_camera
@@ -80,9 +81,14 @@ def camera_pose(frame: Frame, result: CameraResult) -> F64 | None:
 def log_camera(
     to: Writer, frame: Frame, result: CameraResult, quality: int, videos: Videos | None = None
 ) -> None:
-    """Pose and image; the intrinsics are static, see ``log_intrinsics``.
+    """Log pose and image of a camera. The intrinsics are static, see ``log_intrinsics``.
 
-    ``videos``: take what came raw or without loss.
+    Args:
+        to: writer of the recording.
+        frame: frame of the image.
+        result: results of the camera.
+        quality: JPEG quality of images that came raw.
+        videos: encoders for images that came raw or lossless; None: these are logged as images.
     """
     camera, world_from_camera = result.camera, camera_pose(frame, result)
     if world_from_camera is not None:
@@ -96,7 +102,7 @@ def log_camera(
 
 
 def log_intrinsics(to: Writer, name: str, intrinsics: Intrinsics) -> None:
-    """Static, so that a viewer that joins late has it."""
+    """Log the intrinsics as static data, so that a viewer that connects late has them."""
     to.static(
         entities.sensor(name),
         rr.Pinhole(
@@ -109,7 +115,7 @@ def log_intrinsics(to: Writer, name: str, intrinsics: Intrinsics) -> None:
 
 
 def log_image(to: Writer, name: str, image: Image, quality: int) -> None:
-    """Once for each image: a camera may be slower than the LiDAR."""
+    """Log an image once. A camera may be slower than the LiDAR, so several frames may share an image."""
     path = entities.image(name)
     if to.keep(path, image.stamp):
         return
@@ -120,19 +126,19 @@ def log_image(to: Writer, name: str, image: Image, quality: int) -> None:
 
 
 class Videos:
-    """Images of cameras as H.264."""
+    """Encoders of camera images as H.264 streams, one for each camera."""
 
     def __init__(self) -> None:
         self._encoders: dict[str, VideoEncoder] = {}
         self._recording: object = None
 
     def restart(self) -> None:
-        """What comes next needs nothing before it."""
+        """Make the next image of each camera a key frame."""
         for encoder in self._encoders.values():
             encoder.restart()
 
     def log(self, to: Writer, name: str, image: Image) -> None:
-        """Once for each image, as ``log_image``."""
+        """Log an image once, as ``log_image`` does."""
         if self._recording is not to.recording:
             self._recording = to.recording
             self.restart()
@@ -140,7 +146,7 @@ class Videos:
         if to.keep(path, image.stamp):
             return
         if name not in self._encoders:
-            from bevviz.recording.video import VideoEncoder  # takes its time, and few need it
+            from bevviz.recording.video import VideoEncoder  # imports PyAV, which is slow and rarely needed
 
             self._encoders[name] = VideoEncoder()
         sample = self._encoders[name](image.bgr, image.stamp)
@@ -151,10 +157,10 @@ class Videos:
 
 
 def log_detections(to: Writer, result: CameraResult, explanations: Iterable[Explanation]) -> None:
-    """Those that went on to the fusion in the colour of their class, the others faint.
+    """Log kept detections in the colour of their class, and the other detections faint.
 
-    The names of those that have no match are written beside them, and of those that stand large in the image,
-    as far as names do not meet; what became of any is said by its outline, see ``spoken``.
+    Names are written at unmatched detections first, then at the tallest, as long as names do not overlap. The
+    tooltip of each outline explains the decision, see ``bevviz.recording.labels``.
     """
     name, detections = result.camera.name, result.detections
     if detections is None:
@@ -175,7 +181,7 @@ def log_detections(to: Writer, result: CameraResult, explanations: Iterable[Expl
             lost = result.fusion.detection_decision[kept] != Decision.MATCHED
         size = _size(result.camera)
         below = np.stack([xyxy[:, ::2].mean(axis=1), xyxy[:, 3]], axis=1) / size[0]
-        named = apart(below, xyxy[:, 1] - xyxy[:, 3], IN_IMAGE, lost)  # the tallest are what is near
+        named = apart(below, xyxy[:, 1] - xyxy[:, 3], IN_IMAGE, lost)  # the tallest are usually the nearest
         log_spoken_in_image(
             to,
             entities.detections(name),
@@ -187,7 +193,10 @@ def log_detections(to: Writer, result: CameraResult, explanations: Iterable[Expl
 
 
 def _size(camera: Camera) -> F32:
-    """(2,) width and height of the image, in pixels; endless where nothing says, so that names meet."""
+    """Return (2,) width and height of the image in pixels.
+
+    Return infinity if the size is unknown: then all names overlap, and only one is written.
+    """
     if camera.intrinsics is not None:
         return np.array([camera.intrinsics.width, camera.intrinsics.height], np.float32)
     if camera.image is not None:
@@ -196,7 +205,7 @@ def _size(camera: Camera) -> F32:
 
 
 def _log_masks(to: Writer, name: str, detections: Detections, masks: Masks, rows: I64) -> None:
-    """Their outlines."""
+    """Log the outlines of the masks."""
     lines, colors = [], []
     for d in rows.tolist():
         if not masks.has(d):
@@ -221,7 +230,13 @@ def _boxes(detections: Detections, rows: I64, **looks: Any) -> rr.Boxes2D:
 
 
 def log_projected_points(to: Writer, result: CameraResult, *, packed: bool = False) -> None:
-    """The obstacle points in the image, by depth. ``packed``: rounded and sorted as where less is kept."""
+    """Log the obstacle points in the image, coloured by depth.
+
+    Args:
+        to: writer of the recording.
+        result: results of the camera.
+        packed: round and sort the points, as in recordings that do not keep everything.
+    """
     if result.uv is None or result.depth is None:
         return
     seen = np.isfinite(result.uv[:, 0])

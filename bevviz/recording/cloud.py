@@ -1,4 +1,4 @@
-"""The points: as they came, and voxelised as ground and obstacles."""
+"""Log point clouds: raw points, and voxels of ground and obstacles."""
 
 from __future__ import annotations
 
@@ -18,10 +18,11 @@ from bevviz.recording.primitives import rounded, transform
 from bevviz.recording.writer import Writer
 from bevviz.stages.voxel import of_points
 
-RawCloud: TypeAlias = tuple[str, F32, NDArray[np.uint16]]  # entity, points, class id of each
+RawCloud: TypeAlias = tuple[str, F32, NDArray[np.uint16]]  # entity, points, class id of each point
 
 
 def log_cloud_looks(to: Writer, lidars: Iterable[str]) -> None:
+    """Log the static style of the points of each LiDAR."""
     for lidar in lidars:
         radii = rr.Points3D.from_fields(radii=rr.Radius.ui_points(1.0))
         to.static(entities.points(lidar), radii, color_by.annotation_context())
@@ -30,7 +31,10 @@ def log_cloud_looks(to: Writer, lidars: Iterable[str]) -> None:
 
 
 def log_cloud(to: Writer, result: FrameResult, wanted: Sequence[Quantity]) -> None:
-    """Every raw point, exact, of several LiDARs each in its own frame, with what it can be coloured by."""
+    """Log every raw point without loss, with the quantities that can colour it.
+
+    With several LiDARs, each cloud is logged in its own frame.
+    """
     frame = result.frame
     log_cloud_poses(to, frame)
     heights = color_by.height_ids(result) if "height" in wanted else np.zeros(len(frame.points), np.uint8)
@@ -45,14 +49,14 @@ def log_cloud(to: Writer, result: FrameResult, wanted: Sequence[Quantity]) -> No
 
 
 def log_cloud_poses(to: Writer, frame: Frame) -> None:
-    """Where the LiDARs are, where there are several."""
+    """Log the pose of each LiDAR if there are several."""
     if len(frame.clouds) > 1:
         for cloud, points_from_cloud in zip(frame.clouds, frame.points_from_clouds, strict=True):
             to.put(entities.sensor(cloud.name), transform(frame.pose @ points_from_cloud))
 
 
 def raw_clouds(result: FrameResult) -> list[RawCloud]:
-    """Those that have points."""
+    """Return the raw clouds that have points."""
     frame = result.frame
     class_ids = np.zeros(len(frame.points), np.uint16)
     if result.voxels is not None and result.ground is not None:
@@ -69,7 +73,14 @@ def raw_clouds(result: FrameResult) -> list[RawCloud]:
 
 
 def log_ground(to: Writer, result: FrameResult, voxel_size: float, *, packed: bool = False) -> None:
-    """``packed``: rounded and sorted as where less is kept."""
+    """Log the ground voxels.
+
+    Args:
+        to: writer of the recording.
+        result: results of the frame.
+        voxel_size: metres.
+        packed: round and sort the points, as in recordings that do not keep everything.
+    """
     if result.voxels is None or result.ground is None:
         return
     ground = result.voxels.points.compress(result.ground.mask, axis=0)
@@ -82,7 +93,7 @@ def log_ground(to: Writer, result: FrameResult, voxel_size: float, *, packed: bo
 
 
 def log_obstacles(to: Writer, frame: Frame, obstacles: F32) -> None:
-    """``obstacles`` as of ``quantised``."""
+    """Log the obstacle points. ``quantised`` has rounded them."""
     _log_class(to, entities.obstacles(frame.lidar), obstacles, ClassId.OBSTACLE)
 
 
@@ -92,10 +103,10 @@ def _log_class(to: Writer, path: str, points: F32, class_id: ClassId) -> None:
 
 
 def quantised(points: F32, voxel_size: float) -> F32:
-    """Voxelised points, rounded, which compresses to half; with size 0 as they are.
+    """Round voxel points, which halves their compressed size. With a voxel size of 0, return them unchanged.
 
-    The step is a power of two of a metre, from an eighth to a quarter of a voxel: no coordinate moves by more
-    than an eighth of one.
+    The step is a power of two of a metre, from an eighth to a quarter of a voxel. No coordinate moves by more
+    than an eighth of a voxel.
     """
     if voxel_size == 0:
         return points
@@ -103,5 +114,5 @@ def quantised(points: F32, voxel_size: float) -> F32:
 
 
 def coarse(points: F32, scale: float) -> F32:
-    """Rounded to the nearest 1 / scale; 0: as they are."""
+    """Round points to the nearest 1 / scale. With a scale of 0, return them unchanged."""
     return rounded(points, scale) if scale else points

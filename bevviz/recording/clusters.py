@@ -1,4 +1,4 @@
-"""Clusters: boxes and coloured points of those within the size limits, boxes of the others."""
+"""Log clusters: boxes and coloured points of kept clusters, boxes of clusters outside the size limits."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ from bevviz.recording.writer import Writer
 
 
 def log_clusters_looks(to: Writer, lidars: Iterable[str]) -> None:
+    """Log the static style of the clusters of each LiDAR."""
     for lidar in lidars:
         to.static(
             entities.clusters(lidar),
@@ -42,11 +43,11 @@ def log_clusters(
         to: writer of the recording.
         frame: frame of the clusters.
         clusters: all clusters of the frame.
-        tracked: tracks that give the colours; None: there are none.
+        tracked: tracks that give the colours; None: there are no tracks.
         obstacles: (P, 3) points, in the order of ``clusters.labels``.
         config: parameters of the clustering.
-        packed: steps per metre to which points are rounded (0: none), and points are sorted by cluster, as in
-            recordings that keep less; None: points stay as they are.
+        packed: steps per metre to which points are rounded (0: no rounding). Points are also sorted by
+            cluster. None: points are logged unchanged.
     """
     boxes = clusters.boxes(config)
     kept, others = np.flatnonzero(clusters.kept), np.flatnonzero(~clusters.kept)
@@ -76,13 +77,13 @@ def log_clusters(
 
 
 def in_kept(clusters: Clusters) -> Bool:
-    """(P,) obstacle points of the clusters that were kept."""
-    return np.append(clusters.kept, False).take(clusters.labels)  # -1 is noise
+    """Return the (P,) mask of obstacle points in kept clusters."""
+    return np.append(clusters.kept, False).take(clusters.labels)  # the label -1 is noise
 
 
 def _colors(
     clusters: Clusters, tracked: Tracks | None, labels: I32, kept: I64
 ) -> tuple[NDArray[np.uint16], NDArray[np.uint16]]:
-    """Class ids of points of these clusters, and of the boxes of the clusters that were kept."""
+    """Return class ids of the points with these labels, and of the boxes of the kept clusters."""
     colors = tracks.class_ids(tracks.of_clusters(tracked, len(clusters)))
     return colors.take(labels), colors[kept]

@@ -1,7 +1,7 @@
-"""What raw points can be coloured by: of each quantity a class id for each point; a view shows one of them.
+"""Class ids of raw points by quantity, such as height or intensity. A view shows one quantity.
 
-One byte a point (two for rings) is all that is logged of a quantity: colours and labels are those of the
-class ids, and a view maps one of these components to the points' own. The positions are there once.
+A quantity is logged as one byte per point (two for rings). Colours and labels belong to the class ids. A view
+maps one of these components to the points' class ids, so the positions are logged only once.
 """
 
 from __future__ import annotations
@@ -26,17 +26,17 @@ from bevviz.stages.voxel import of_points
 
 ClassIds: TypeAlias = NDArray[np.unsignedinteger]
 
-COMPONENTS = "ColorBy"  # archetype that the components are of
-FIELDS: dict[Quantity, tuple[str, ...]] = {  # of a cloud
+COMPONENTS = "ColorBy"  # archetype of the components
+FIELDS: dict[Quantity, tuple[str, ...]] = {  # names of a quantity in clouds
     "intensity": ("intensity", "reflectivity", "i"),
     "ring": RING_FIELDS,
     "time": ("time", "t", "offset_time", "timestamp", "time_stamp", "time_offset"),
 }
-TALLEST = 4.0  # metres above the ground that the scale ends at
+TALLEST = 4.0  # metres above the ground, end of the colour scale
 
-_ABSENT = 3  # class id: the clouds have no such field
-_HEIGHT, _DISTANCE, _INTENSITY, _TIME, _RING = 16, 80, 144, 176, 256  # first class id of each
-_STEPS, _DEPTHS, _SHARES, _RINGS = 64, entities.DEPTH_BINS, 32, 256  # class ids of each; of the third, two
+_ABSENT = 3  # class id of a missing field
+_HEIGHT, _DISTANCE, _INTENSITY, _TIME, _RING = 16, 80, 144, 176, 256  # first class id of each scale
+_STEPS, _DEPTHS, _SHARES, _RINGS = 64, entities.DEPTH_BINS, 32, 256  # ids of each scale
 
 
 class ColoredPoints(rr.AsComponents):
@@ -46,6 +46,7 @@ class ColoredPoints(rr.AsComponents):
         self._points, self._further = points, further
 
     def as_component_batches(self) -> list[rr.DescribedComponentBatch]:
+        """Return the components of the points and of the further class ids."""
         batches = self._points.as_component_batches()
         if self._further:
             columns: dict[str, Any] = {name: pa.array(ids) for name, ids in self._further.items()}
@@ -53,16 +54,16 @@ class ColoredPoints(rr.AsComponents):
         return batches
 
 
-@np.errstate(over="ignore", invalid="ignore")  # a field may hold anything
+@np.errstate(over="ignore", invalid="ignore")  # fields may hold any value
 def class_ids(
     wanted: Sequence[Quantity], points: F32, heights: NDArray[np.uint8], fields: Mapping[str, NDArray[Any]]
 ) -> dict[Quantity, ClassIds]:
-    """Class ids of each point, (N,) by quantity; (1,) where the cloud has no such field.
+    """Return class ids of each point by quantity: (N,), or (1,) if the cloud lacks the field.
 
     Args:
         wanted: quantities.
-        points: (N, 3) metres from the LiDAR.
-        heights: (N,) of ``height_ids``.
+        points: (N, 3) metres, in the LiDAR frame.
+        heights: (N,) class ids from ``height_ids``.
         fields: further (N,) fields of the cloud.
     """
     found: dict[Quantity, ClassIds] = {}
@@ -86,7 +87,10 @@ def class_ids(
 
 
 def height_ids(result: FrameResult) -> NDArray[np.uint8]:
-    """(N,) of each point, by the height of its voxel above the ground; without a ground, above the lowest."""
+    """Return (N,) class ids by the height of each point's voxel above the ground.
+
+    Without a ground, the height is measured from the lowest points.
+    """
     if result.voxels is not None and result.ground is not None:
         of_voxels = _scaled(result.ground.height, 0.0, TALLEST, _HEIGHT, _STEPS)
         return of_points(of_voxels, result.voxels.inverse)
@@ -96,7 +100,7 @@ def height_ids(result: FrameResult) -> NDArray[np.uint8]:
 
 
 def annotation_context() -> rr.AnnotationContext:
-    """Colours and labels of all class ids that raw points can have."""
+    """Return colours and labels of all class ids that raw points can have."""
     steps, shares = _ramp(_STEPS), _ramp(_SHARES)
     depth = entities.DEPTH_RANGE / _DEPTHS
     rings = palette().tolist()
@@ -112,7 +116,7 @@ def annotation_context() -> rr.AnnotationContext:
 
 
 def visualizer(by: Quantity) -> rrb.Visualizer:
-    """Of a view: the points by that quantity."""
+    """Return a visualizer that colours raw points by a quantity."""
     return rr.Points3D.from_fields().visualizer(
         mappings=[
             VisualizerComponentMapping(
@@ -130,20 +134,23 @@ def _info(number: int, label: str, color: Sequence[int]) -> rr.AnnotationInfo:
 
 
 def _ramp(count: int) -> list[list[int]]:
-    """Without what would be lost on black."""
+    """Return ``count`` colours of the turbo map, without the dark end that is invisible on black."""
     dark = count // 10
     ramp: list[list[int]] = turbo(count + dark)[dark:].tolist()
     return ramp
 
 
 def _scaled(values: NDArray[Any], low: float, high: float, base: int, count: int) -> NDArray[np.uint8]:
-    """One of ``count`` ids from ``base``: the last for ``high``, what is more, and what is no number."""
+    """Map values linearly to ``count`` class ids from ``base``. Large values and NaN get the last id."""
     rows = (values - low) * np.float32(count / max(high - low, 1e-9))
     return (np.fmax(np.fmin(rows, np.float32(count - 1)), np.float32(0)) + np.float32(base)).astype(np.uint8)
 
 
 def _brightest(values: NDArray[Any]) -> float:
-    """The 99th percentile, up to the next of 1, 1.4, 2, 2.8 ..., so that it seldom changes between scans."""
+    """Return the end of the intensity scale: the 99th percentile, rounded up to 1, 1.4, 2, 2.8 and so on.
+
+    The coarse steps keep the scale constant between most scans.
+    """
     some = values[:: len(values) // 5_000 + 1]
     some = some[np.isfinite(some)]
     share = float(np.percentile(some, 99)) if len(some) else 0.0

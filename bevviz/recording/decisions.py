@@ -1,4 +1,4 @@
-"""The decisions of one frame: a page of Markdown, and lines of the log of all frames."""
+"""Log the decisions of a frame: a page of Markdown, and lines for the log of all frames."""
 
 from __future__ import annotations
 
@@ -14,23 +14,27 @@ from bevviz.recording.writer import Writer
 from bevviz.support.text import markdown
 
 _WEAK = {"not_kept", "below_threshold", "suppressed"}
-_DOUBT = {"contradicted": 0, "missed": 1, "named otherwise": 2, "confirmed": 3}  # what is read first
-_LINES = 5  # of a frame's contradicted objects that have a line of the log: a network may have hundreds
-_MANY = {"out_of_view", "too_small", "too_large"}  # clusters that are only counted and numbered
+_DOUBT = {"contradicted": 0, "missed": 1, "named otherwise": 2, "confirmed": 3}  # order on the page
+_LINES = 5  # log lines for contradicted objects in a frame: a network may have hundreds
+_MANY = {"out_of_view", "too_small", "too_large"}  # clusters in these states are only counted and numbered
 
 
 def log_decisions(to: Writer, result: FrameResult) -> None:
+    """Log the page of the frame's decisions and its log lines."""
     to.put(entities.EXPLAIN, document(page(result)))
     to.lines(entities.EXPLAIN_LOG, remarks(result))
 
 
 def page(result: FrameResult) -> str:
-    """What went wrong, each camera's detections, those without a match first, then the clusters."""
+    """Return the frame's decisions as Markdown: problems, detections by camera, clusters.
+
+    Detections and clusters without a match come first.
+    """
     return "\n".join(_lines(result))
 
 
 def remarks(result: FrameResult) -> list[tuple[str, str]]:
-    """Level and text of what went wrong: failures, problems, detections without a match."""
+    """Return log lines (level and text) for failures, problems, unmatched detections and doubtful objects."""
     lines = [("ERROR", f"{f.stage}: {f.reason}") for f in result.failures]
     lines += [("WARN", problem) for problem in result.frame.problems]
     for camera in result.cameras:
@@ -75,7 +79,7 @@ def _lines(result: FrameResult) -> Iterator[str]:
 
 
 def _in_doubt(explanations: Iterable[Explanation]) -> Iterator[str]:
-    """Of somebody else's objects those that a camera contradicts, and what is missed among them."""
+    """Yield a line for each contradicted object, up to a limit, and for each missed object."""
     said = [(e.subject, e.state, e.text) for e in explanations]
     denied = [text for *what, text in said if what == ["object", "contradicted"]]
     yield from denied[:_LINES]
@@ -85,7 +89,7 @@ def _in_doubt(explanations: Iterable[Explanation]) -> Iterator[str]:
 
 
 def _not_kept(explanations: Sequence[Explanation], found: Detections) -> Iterator[str]:
-    """A line for each that suppresses others, and one for those below the threshold."""
+    """Yield a line for each detection that suppresses others, and one for all below the threshold."""
     for d in np.unique(found.suppressed_by[found.state == DetectionState.SUPPRESSED]).tolist():
         names = Counter(found.names[s] for s in np.flatnonzero(found.suppressed_by == d).tolist())
         [label] = scored([found.names[d]], [found.score[d]])
@@ -97,7 +101,7 @@ def _not_kept(explanations: Sequence[Explanation], found: Detections) -> Iterato
 
 
 def _counted(names: Counter[str]) -> str:
-    """``3``, or ``3 (2 car, 1 truck)``."""
+    """Format counts as ``3`` for one name, or as ``3 (2 car, 1 truck)`` for several."""
     if len(names) == 1:
         return str(names.total())
     return f"{names.total()} ({', '.join(f'{count} {name}' for name, count in names.most_common())})"
@@ -121,7 +125,7 @@ def _item(explanation: Explanation) -> str:
 
 
 def _section(title: str, items: Iterable[str]) -> Iterator[str]:
-    """``items`` are Markdown already."""
+    """Yield the Markdown lines of a section. ``items`` are Markdown already."""
     lines = [f"- {item}" for item in items]
     if lines:
         yield f"#### {markdown(title)}"

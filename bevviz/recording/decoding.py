@@ -1,4 +1,4 @@
-"""Recordings that come from somewhere, read with Rerun's own reader."""
+"""Guards around Rerun's reader for recordings that may be damaged."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from typing import Any
 from bevviz.errors import UserError, first_line
 from bevviz.recording import rerun_cli
 
-PANIC = 101  # and above: how a Rust program says that it broke
+PANIC = 101  # and above: exit status of a Rust program that panicked
 
 
 @contextmanager
 def readable(path: Path, otherwise: str = "cannot be read") -> Iterator[None]:
-    """Within, whatever reading a damaged recording leads to is one UserError, a panic of Rerun's too."""
+    """Raise a ``UserError`` for any error in this context, including a panic of Rerun's reader."""
     try:
         with warnings.catch_warnings():
-            warnings.filterwarnings("ignore", "RRD file has no footer")  # it was not finished
+            warnings.filterwarnings("ignore", "RRD file has no footer")  # the recording was not finished
             yield
     except UserError:
         raise
@@ -31,17 +31,18 @@ def readable(path: Path, otherwise: str = "cannot be read") -> Iterator[None]:
 
 
 def check_decodes(path: Path, otherwise: str = "cannot be read", *, first: int | None = None) -> None:
-    """Have a recording that may be damaged decoded by a process of its own.
+    """Decode a recording in a separate process, to find damage that breaks Rerun's reader.
 
-    Some damage makes Rerun's reader panic in a thread of its own, which ends the process that reads.
+    Some damage makes the reader panic in a thread of its own, which ends the whole process.
 
     Args:
-        path: of the recording.
-        otherwise: what to say where the reader breaks.
-        first: decode as many bytes from the beginning; None: all.
+        path: recording to decode.
+        otherwise: error text for a reader that breaks.
+        first: decode this many bytes from the beginning; None: all.
 
     Raises:
-        UserError: the reader breaks. What it merely refuses it will refuse again, with its reason.
+        UserError: the reader breaks. An ordinary error of the reader is ignored here. It occurs again, with
+            its reason, when the recording is read.
     """
     with path.open("rb") as file:
         given: dict[str, Any] = {"stdin": file} if first is None else {"input": file.read(first)}

@@ -1,4 +1,4 @@
-"""Where everything is in a recording: entity paths and class ids, in one place (see docs/recordings.md)."""
+"""Entity paths, timelines and class ids of a recording (see docs/recordings.md)."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from bevviz.model.results import ClusterState, DetectionState
 # --- timelines ---------------------------------------------------------------------------------
 
 STAMP = "stamp"  # sensor time, from the header of the cloud
-TRIED = "tried"  # the same, of a frame as other values make it, in bevviz open
-FRAME = "frame"  # sequence
-VERSION = "version"  # sequence: of the configuration, in bevviz tune
+TRIED = "tried"  # sensor time, for results with tried values in bevviz open
+FRAME = "frame"  # sequence number of the frame
+VERSION = "version"  # sequence number of the configuration, in bevviz tune
 RECEIVED = "received"  # when the cloud was received, or logged into the bag
 
-SLACK = 1000  # nanoseconds that a time which a viewer tells may be off: it counts them in doubles
+SLACK = 1000  # nanoseconds of tolerance for times from a viewer, which counts them in doubles
 
 # --- entities ----------------------------------------------------------------------------------
 
@@ -24,7 +24,7 @@ WORLD = "/world"
 DIAGNOSTICS = "/robot/diagnostics"
 FUSED = "/world/fused"
 MEASURED = "/world/fused/measured"
-FUSION = "/world/fusion"  # what our fusion would have made, where the objects are somebody else's
+FUSION = "/world/fusion"  # result of our fusion, if the objects come from another source
 MISSED = "/world/missed"
 FALSE = "/world/false"
 UNNAMED = "/world/unnamed"
@@ -51,9 +51,9 @@ HEALTH = "/health"
 CONFIG = "/config"
 REPORT = "/report"
 DIGEST = "/report/digest"  # fingerprints of each frame's results
-PROPERTY = "bevviz"  # the recording's property that says how it was made
-BAG = "bag"  # the one that says what it was made from
-B = "/b"  # root of the same tree again, for the other one of two runs that are compared
+PROPERTY = "bevviz"  # property of a recording that says how it was made
+BAG = "bag"  # property of a recording that says what it was made from
+B = "/b"  # root of the second run's tree in a comparison
 SWEEP = "/sweep"
 TUNE = "/tune"
 COMPARE = "/compare"
@@ -67,235 +67,263 @@ EVALUATE_LOG = "/evaluate/log"
 
 
 def sensor(name: str) -> str:
-    """A LiDAR or a camera: carries its pose."""
+    """Return the entity of a LiDAR or a camera. It carries the sensor's pose."""
     return f"{WORLD}/{name}"
 
 
 def space(path: str) -> str:
-    """The coordinate frame that Rerun gives an entity."""
+    """Return the coordinate frame that Rerun gives to an entity."""
     return f"tf#{path}"
 
 
 def points(lidar: str) -> str:
+    """Return the entity of a LiDAR's raw points."""
     return f"{WORLD}/{lidar}/points"
 
 
 def ground(lidar: str) -> str:
+    """Return the entity of a LiDAR's ground voxels."""
     return f"{WORLD}/{lidar}/points/ground"
 
 
 def obstacles(lidar: str) -> str:
+    """Return the entity of a LiDAR's obstacle voxels."""
     return f"{WORLD}/{lidar}/points/obstacles"
 
 
 def clusters(lidar: str) -> str:
+    """Return the entity of a LiDAR's kept clusters."""
     return f"{WORLD}/{lidar}/clusters"
 
 
 def set_aside(lidar: str) -> str:
-    """Clusters outside the size limits."""
+    """Return the entity of clusters outside the size limits."""
     return f"{WORLD}/{lidar}/clusters/set_aside"
 
 
 def image(camera: str) -> str:
+    """Return the entity of a camera's image."""
     return f"{WORLD}/{camera}/image"
 
 
 def masks(camera: str) -> str:
+    """Return the entity of the detections' mask outlines in a camera's image."""
     return f"{WORLD}/{camera}/image/detections/masks"
 
 
 def detections(camera: str) -> str:
+    """Return the entity of the kept detections in a camera's image."""
     return f"{WORLD}/{camera}/image/detections"
 
 
 def weak(camera: str) -> str:
-    """Detections below the threshold, or suppressed by a better one."""
+    """Return the entity of detections below the threshold or suppressed by a better one."""
     return f"{WORLD}/{camera}/image/detections/weak"
 
 
 def outlines(boxes: str) -> str:
-    """Over these boxes, a sentence for each; see ``bevviz.recording.labels``."""
+    """Return the entity of the outlines over boxes. Each has a sentence; see ``bevviz.recording.labels``."""
     return f"{boxes}/outlines"
 
 
 def names(boxes: str) -> str:
-    """Beside these boxes."""
+    """Return the entity of the names next to boxes."""
     return f"{boxes}/names"
 
 
 def boxes_of(path: str) -> str:
-    """The boxes that these outlines or names belong to; other entities are their own."""
+    """Return the entity of the boxes of these outlines or names. Other entities are returned unchanged."""
     return path.removesuffix("/outlines").removesuffix("/names")
 
 
 def projected(camera: str) -> str:
+    """Return the entity of the obstacle points in a camera's image."""
     return f"{WORLD}/{camera}/image/points"
 
 
 def image_opinion(camera: str, opinion: str) -> str:
-    """Objects of somebody else's of which cameras say so, or which they lack, over the image."""
+    """Return the entity of objects that share an opinion of the cameras, drawn over a camera's image.
+
+    The objects are external, from a 3D detector or a topic, or they are missed by it.
+    """
     return f"{image(camera)}/opinions/{_part(opinion)}"
 
 
 def overlay_opinion(opinion: str) -> str:
-    """The same over the bird's-eye image."""
+    """Return the entity of objects that share an opinion of the cameras, drawn over the bird's-eye image."""
     return overlay(f"opinions/{_part(opinion)}")
 
 
 def channel(name: str) -> str:
+    """Return the entity of a channel of the bird's-eye view."""
     return f"{BEV}/{name}"
 
 
 def overlay(what: str) -> str:
-    """Over the bird's-eye image: tracks, their trails, the ground truth."""
+    """Return the entity of an overlay on the bird's-eye image: tracks, trails, ground truth."""
     return f"{BEV}/overlay/{what}"
 
 
 def robot(topic: str) -> str:
+    """Return the entity of data that the robot published on a topic."""
     return f"{ROBOT}{_topic(topic)}"
 
 
 def rotation(topic: str) -> str:
-    """Of an Imu."""
+    """Return the entity of an IMU's rotation rates."""
     return f"{ROTATION}{_topic(topic)}"
 
 
 def acceleration(topic: str) -> str:
-    """Of an Imu."""
+    """Return the entity of an IMU's accelerations."""
     return f"{ACCELERATION}{_topic(topic)}"
 
 
 def robot_overlay(topic: str) -> str:
-    """What the robot published, over the bird's-eye image."""
+    """Return the entity of a topic's boxes, drawn over the bird's-eye image."""
     return overlay(f"robot{_topic(topic)}")
 
 
 def diagnostic(name: str) -> str:
-    """State lane of what the robot's diagnostics say of one part."""
+    """Return the state lane of a component in the robot's diagnostics."""
     return f"{DIAGNOSTICS}/{_part(name)}"
 
 
 def state(*lane: str) -> str:
+    """Return the entity of a state lane."""
     return "/".join((STATES, *lane))
 
 
 def topic_state(topic: str) -> str:
-    """Whether its messages come, and can be used."""
+    """Return the lane that shows whether a topic's messages arrive and can be used."""
     return f"{STATES}/topics{_topic(topic)}"
 
 
 def class_state(camera: str, class_name: str) -> str:
-    """What became of the best detection of the class."""
+    """Return the lane that shows the decision about the best detection of a class."""
     return state(camera, _part(class_name))
 
 
 def why(what: str) -> str:
-    """The chain of what ``bevviz why`` explains: points by their fate, boxes, frustums."""
+    """Return the entity of a part of a ``bevviz why`` explanation: points by fate, boxes, frustums."""
     return f"{WHY}/{what}"
 
 
 def difference(change: str) -> str:
-    """Objects that differ in this way between two runs."""
+    """Return the entity of objects that differ in this way between two runs."""
     return f"{COMPARE}/objects/{_change(change)}"
 
 
 def image_difference(camera: str, change: str) -> str:
+    """Return the entity of detections that differ in this way between two runs, in a camera's image."""
     return f"{COMPARE}/{camera}/{_change(change)}"
 
 
 def difference_count(change: str) -> str:
+    """Return the entity of the number of such differences."""
     return f"{COMPARE}/count/{_change(change)}"
 
 
 def difference_state(class_name: str) -> str:
+    """Return the lane of the differences of a class."""
     return f"{COMPARE_STATES}/{_part(class_name)}"
 
 
 def judged(what: str) -> str:
-    """Objects that are true, false or missed."""
+    """Return the entity of objects that are true, false or missed."""
     return f"{EVALUATE}/objects/{what}"
 
 
 def judged_count(what: str) -> str:
+    """Return the entity of the number of true, false or missed objects."""
     return f"{EVALUATE}/count/{what}"
 
 
 def sweep(metric: str) -> str:
-    """A number over the parameter that was swept."""
+    """Return the entity of a metric over the parameter of a sweep."""
     return f"{SWEEP}/{_part(metric)}"
 
 
 def track_state(lane: int) -> str:
+    """Return the entity of a track lane."""
     return f"{TRACK_STATES}/{lane:02}"
 
 
 def anomaly_state(kind: AnomalyKind) -> str:
+    """Return the lane of an anomaly kind."""
     return f"{ANOMALY_STATES}/{kind}"
 
 
 def stage_time(stage: str) -> str:
+    """Return the entity of a stage's time in milliseconds."""
     return f"{HEALTH}/time_ms/{stage}"
 
 
 def rate(what: str) -> str:
+    """Return the entity of a rate in Hz."""
     return f"{HEALTH}/rate_hz/{what}"
 
 
 def count(what: str) -> str:
+    """Return the entity of a count."""
     return f"{HEALTH}/count/{what}"
 
 
 def sync_error(camera: str) -> str:
+    """Return the entity of a camera's sync error in milliseconds."""
     return f"{HEALTH}/sync_error_ms/{camera}"
 
 
 def tf_age(sensor: str) -> str:
+    """Return the entity of the age of a sensor's transform in milliseconds."""
     return f"{HEALTH}/tf_age_ms/{sensor}"
 
 
 def latency(what: str) -> str:
-    """From the arrival of the cloud until its results are logged: percentiles of the last frames."""
+    """Return the entity of a latency percentile in milliseconds.
+
+    Latency is the time from a cloud's arrival until its results are logged, over the last frames.
+    """
     return f"{HEALTH}/latency_ms/{what}"
 
 
 def drops(where: str) -> str:
-    """Frames that were left out so far, by the place that they were left out at."""
+    """Return the entity of the number of frames dropped so far at one point of the pipeline."""
     return f"{HEALTH}/drops/{where}"
 
 
 def viewer_lag(name: str) -> str:
-    """From when a frame is logged until the process that shows it has taken it."""
+    """Return the entity of a viewer's lag in milliseconds, from logging a frame until the viewer has it."""
     return f"{HEALTH}/viewer_lag_ms/{name}"
 
 
 def process(what: str) -> str:
-    """What the process itself takes."""
+    """Return the entity of a resource that the process itself uses."""
     return f"{HEALTH}/process/{what}"
 
 
 def calib_result(camera: str) -> str:
-    """What ``bevviz calib`` found, in words."""
+    """Return the entity of the text result of ``bevviz calib``."""
     return f"{CALIB}/{camera}/result"
 
 
 def calib_curve(camera: str, axis: str) -> str:
-    """The score over the offset along one axis."""
+    """Return the entity of the score over the offset along one axis."""
     return f"{CALIB}/{camera}/score/{axis}"
 
 
 def calib_stated(camera: str) -> str:
-    """Image, points and edges with the calibration as stated."""
+    """Return the entity of image, points and edges with the stated calibration."""
     return f"{CALIB}/{camera}/stated"
 
 
 def calib_corrected(camera: str) -> str:
-    """The same with what is off put right."""
+    """Return the entity of image, points and edges with the corrected calibration."""
     return f"{CALIB}/{camera}/corrected"
 
 
 def _part(name: str) -> str:
-    """One part of a path, of a name that others chose: nothing in it ends the part or needs an escape."""
+    """Turn an external name into one path part. No character in it ends the part or needs an escape."""
     return re.sub(r"[\s/\\]", "_", name) or "_"
 
 
@@ -311,7 +339,7 @@ def _topic(topic: str) -> str:
 
 
 class ClassId(IntEnum):
-    """Class ids of points and boxes; the annotation context of /world names and colours them."""
+    """Class ids of points and boxes. The annotation context of /world names and colours them."""
 
     UNCLASSIFIED = 0
     GROUND = 1
@@ -322,8 +350,8 @@ class ClassId(IntEnum):
 
 
 TRACK_COLORS = 64
-DEPTH_BINS = 64  # class ids of the points projected into an image: bins of the depth
-DEPTH_RANGE = 50.0  # metres that these bins span
+DEPTH_BINS = 64  # depth bins, one class id each, of the points projected into an image
+DEPTH_RANGE = 50.0  # metres that the depth bins span
 
 DETECTION_CLASS = {state: ClassId.DETECTION + state for state in DetectionState}
 CLUSTER_CLASS = {state: ClassId.CLUSTER + state for state in ClusterState}

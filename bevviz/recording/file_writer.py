@@ -1,4 +1,4 @@
-"""A recording's way into its file, which tells when the disk takes no more."""
+"""A writer of recording files that detects a full disk."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ from bevviz.support.contexts import Closing
 from bevviz.support.files import write_all
 
 PIECE = 1 << 20  # bytes
-HEAD = 12  # bytes at the beginning of a recording: magic, version, options
-MESSAGE = struct.Struct("<QQ")  # kind and length of what follows
+HEAD = 12  # bytes of a recording's header: magic, version, options
+MESSAGE = struct.Struct("<QQ")  # kind and length of the message that follows
 
 
 class FileWriter(Closing):
-    """Writes what Rerun logs to a file.
+    """Writer of Rerun's log data to a file.
 
-    Rerun's own writer ends at the first error, without a word to us; whoever waits for it then waits for
-    ever. So it writes into a pipe, and a thread takes what comes to the file, or nowhere once that failed.
-    Messages go there whole: a file that ends early, for whatever reason, can be read up to its end.
+    Rerun's own writer ends silently at the first error, and the next flush then waits for ever. Here Rerun
+    writes into a pipe. A thread copies the pipe to the file. After a write error it discards the data.
+    The thread writes whole messages only, so a file that ends early can be read up to its end.
 
     Args:
-        file: it is there already.
+        file: existing file.
     """
 
     def __init__(self, file: Path) -> None:
@@ -45,17 +45,23 @@ class FileWriter(Closing):
         self._thread.start()
 
     def begin(self) -> None:
-        """Rerun has opened the sink: the pipe ends with it."""
+        """Close our end of the pipe, so that the pipe ends with the sink.
+
+        Call it when Rerun has opened the sink.
+        """
         os.close(self._in)
         self._in = -1
 
     def check(self) -> None:
-        """Raises UserError where the file cannot be written any more."""
+        """Raise UserError if the file can no longer be written."""
         if self._failure is not None:
             raise UserError(f"the recording ends early, its disk takes no more: {self._failure.strerror}")
 
     def close(self) -> None:
-        """When Rerun is done with the sink, until all is written. A second time it does nothing."""
+        """Wait until everything is written. A second call does nothing.
+
+        Call it when Rerun has closed the sink.
+        """
         if self._handle < 0:
             return
         if self._in >= 0:
@@ -67,7 +73,7 @@ class FileWriter(Closing):
 
     def _run(self) -> None:
         waiting = bytearray()
-        expected = HEAD  # bytes up to the end of the last message that has begun
+        expected = HEAD  # bytes up to the end of the last message seen so far
         while piece := os.read(self._out, PIECE):
             waiting += piece
             whole = 0
@@ -82,10 +88,10 @@ class FileWriter(Closing):
             del waiting[:whole]
             expected -= whole
         with memoryview(waiting) as view:
-            self._write(view)  # the end of the file is no message
+            self._write(view)  # the footer is no message
 
     def _write(self, data: memoryview) -> None:
-        """All of it or nothing."""
+        """Write all of the data. After an error, cut the file back to its last whole write."""
         if self._failure is not None:
             return
         try:

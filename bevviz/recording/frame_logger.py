@@ -1,4 +1,4 @@
-"""Logs a FrameResult: which ``log_*`` function is called when, and what they need of the frames before."""
+"""Log a FrameResult: call the ``log_*`` functions, and keep the state that they need between frames."""
 
 from __future__ import annotations
 
@@ -69,37 +69,35 @@ from bevviz.recording.surroundings import (
 from bevviz.recording.tracks import Lanes, log_speeds, log_tracks, log_tracks_looks
 from bevviz.recording.writer import Writer
 
-STALE = 3_000_000_000  # nanoseconds that the newest late result of the robot is shown
+STALE = 3_000_000_000  # nanoseconds that the newest late result of the robot stays visible
 
 
 @dataclass(frozen=True, slots=True)
 class Context:
-    """What a frame relies on that was logged before it: a recording that starts with it needs this."""
+    """State from earlier frames that a frame relies on. A recording that starts with the frame needs it."""
 
     config: Config
     scene: Scene
     clock: tuple[int, int, int] = (0, 0, 0)  # index, stamp and received of the frame
     intrinsics: Mapping[str, Intrinsics] = field(default_factory=dict)
     lanes: Mapping[str, str] = field(default_factory=dict)  # state lane -> its state
-    fixed: Mapping[str, Fixed] = field(
-        default_factory=dict
-    )  # entity -> what holds at all times since it came
+    fixed: Mapping[str, Fixed] = field(default_factory=dict)  # entity -> static data, from its first frame on
 
 
 class Logger(Writer):
-    """Writes frames to a recording, on the timelines ``stamp``, ``frame`` and ``received``.
+    """Logger of frames to a recording, on the timelines ``stamp``, ``frame`` and ``received``.
 
     Call ``log_static`` once, then ``log`` for each frame.
 
     Args:
-        recording: where to; it may have any number of sinks.
-        config: how the results were made; stored in the recording.
+        recording: recording stream, with any number of sinks.
+        config: configuration of the run; it is stored in the recording.
         scene: names of the sensors.
-        root: entity that everything goes under. With one, this is what else was made of frames that
-            another logger writes: what the sensors and the robot brought is not written twice.
-        wait, stamps: as of ``Writer``.
-        inputs: write what the sensors and the robot brought; default: without a root.
-        network: what the detector's runs on; stored in the recording.
+        root: entity above all others. A logger with a root adds the results of another run to frames that
+            another logger writes. It does not write the input of the sensors and the robot again.
+        wait, stamps: see ``Writer``.
+        inputs: write the input of the sensors and the robot; default: only without a root.
+        network: device of the detector's network; it is stored in the recording.
     """
 
     def __init__(
@@ -128,15 +126,15 @@ class Logger(Writer):
         self._last: Frame | None = None
         self._rates = Rates()
         self._videos, self._around_raw = Videos(), Around()
-        self._raw_shown: set[str] = set()  # entities with the raw clouds of the frame before
+        self._raw_shown: set[str] = set()  # entities with the raw clouds of the previous frame
         self._raw_known: set[str] = set()
         self._watched: dict[str, str] = {}  # state lane of the pipeline or a camera -> its state
-        self._changed = False  # the configuration, before this frame
-        self._late: dict[str, int] = {}  # topic of the robot's results that come late -> stamp of the newest
+        self._changed = False  # whether the configuration changed before this frame
+        self._late: dict[str, int] = {}  # topic of late robot results -> stamp of the newest
 
     @property
     def context(self) -> Context:
-        """What the frame that was logged last relies on."""
+        """State that the last logged frame relies on."""
         last = self._last
         clock = (0, 0, 0) if last is None else (last.index, last.stamp, last.received)
         return Context(
@@ -145,16 +143,19 @@ class Logger(Writer):
 
     @property
     def clouds_left_out(self) -> int:
-        """Times that something began and raw clouds around it were not kept, as there were many already."""
+        """Number of events without raw clouds around them, because the limit of raw clouds was reached."""
         return self._around_raw.left_out
 
     @property
     def results(self) -> frozenset[str]:
-        """Entities that any frame had, but for what the sensors and the robot brought."""
+        """Entities that any frame had, except the input of the sensors and the robot."""
         return self.known - self._brought
 
     def refresh(self, known: Set[str] = frozenset()) -> None:
-        """As a ``Writer``; inputs that are not written here are not cleared here either."""
+        """Make the next frame complete, as ``Writer.refresh`` does.
+
+        Inputs that this logger does not write are not cleared either.
+        """
         super().refresh(known)
         self._videos.restart()
         self._raw_shown = set(self._raw_known)
@@ -164,7 +165,7 @@ class Logger(Writer):
     # --- once ----------------------------------------------------------------------------------
 
     def log_static(self) -> None:
-        """How the recording was made, the axes, the classes and the looks: what no frame changes."""
+        """Log the static data: origin of the recording, axes, classes and styles."""
         lidars = list(dict.fromkeys(filter(None, (self._scene.lidar, *self._scene.lidars))))
         log_origin(self, self._config, self._scene, self._network)
         log_world(self)
@@ -180,7 +181,7 @@ class Logger(Writer):
         log_health_looks(self)
 
     def log_context(self, context: Context) -> None:
-        """Static data, calibration and states of a frame, for a recording that starts with it."""
+        """Log static data, calibration and states for a recording that starts with a frame."""
         self.log_static()
         for name, intrinsics in context.intrinsics.items():
             self._log_intrinsics(name, intrinsics)
@@ -191,7 +192,7 @@ class Logger(Writer):
             self._state_lanes.log(self, context.lanes)
 
     def reconfigure(self, config: Config, scene: Scene) -> None:
-        """From here on the results are made in another way, or of other sensors."""
+        """Change the configuration and the sensors for the frames that follow."""
         had_opinions = self._has_opinions
         same, self._config, self._scene = scene == self._scene, config, scene
         self._changed = True
@@ -205,7 +206,7 @@ class Logger(Writer):
 
     @property
     def _has_opinions(self) -> bool:
-        """Whether objects are somebody else's, so that cameras have opinions on them."""
+        """Whether a method other than our fusion makes the objects. Cameras then have opinions on them."""
         return self._config.objects.method != "frustum"
 
     # --- each frame ----------------------------------------------------------------------------
@@ -220,16 +221,16 @@ class Logger(Writer):
         beside: Callable[[], object] | None = None,
         cloud: bool = False,
     ) -> None:
-        """Everything of one frame. What the frame before had and this one has not is cleared.
+        """Log a frame. Entities that only the previous frame had are cleared.
 
         Args:
-            result: the frame and what was made of it.
+            result: the frame and its results.
             health: further scalars, by entity.
             notes: further lines of the log: level and text.
-            late: what the robot has published since and belongs to frames before.
-            states: of further lanes, by entity.
-            beside: puts something more into the frame.
-            cloud: write the raw cloud, which tells ground from obstacles, also where no inputs are written.
+            late: results that the robot has published since and that belong to earlier frames.
+            states: states of further lanes, by entity.
+            beside: function that logs additional data of the frame.
+            cloud: write the raw cloud, coloured as ground and obstacles, even without inputs.
         """
         frame = result.frame
         for found in late:
@@ -243,7 +244,7 @@ class Logger(Writer):
         self.end()
 
     def _log_stages(self, result: FrameResult, cloud: bool) -> None:
-        """Log what the stages computed from this frame alone."""
+        """Log the results of the stages for this frame alone."""
         frame = result.frame
         if frame.lidar:
             self.put(entities.sensor(frame.lidar), transform(frame.pose))
@@ -278,7 +279,7 @@ class Logger(Writer):
         notes: Sequence[tuple[str, str]],
         states: Mapping[str, str],
     ) -> None:
-        """Log what depends on the frames before: tracks, anomalies, states, rates."""
+        """Log data that depends on earlier frames: tracks, anomalies, states, rates."""
         frame = result.frame
         log_objects(self, result)
         log_fusion(self, result)
@@ -299,7 +300,7 @@ class Logger(Writer):
     def log_meanwhile(
         self, seconds: float, notes: Sequence[tuple[str, str]], states: Mapping[str, str]
     ) -> None:
-        """What is to be said while no frame comes, ``seconds`` after the last one was received."""
+        """Log notes and states while no frame arrives, ``seconds`` after the last frame was received."""
         if self._last is None:
             return
         later = round(seconds * 1e9)
@@ -309,7 +310,7 @@ class Logger(Writer):
         self._state_lanes.log(self, {**self._state_lanes.states, **states})
 
     def _log_input(self, result: FrameResult) -> None:
-        """What the sensors and the robot brought."""
+        """Log the input of the sensors and the robot."""
         frame, config = result.frame, self._config
         if config.logging.raw_cloud and is_whole(config):
             log_cloud(self, result, config.logging.color_by)
@@ -328,18 +329,18 @@ class Logger(Writer):
                 forget_late(self, topic)
 
     def _log_fixed(self, frame: Frame) -> None:
-        """Where it is new."""
+        """Log static data that the frame is the first to have."""
         for path, make in fixed_parts(frame).items():
             if path not in self._fixed and (fixed := make()) is not None:
-                self._fixed = {**self._fixed, path: fixed}  # a context may hold the one before
+                self._fixed = {**self._fixed, path: fixed}  # a Context may hold the previous mapping
                 self.static(path, *fixed)
 
     def _log_intrinsics(self, name: str, intrinsics: Intrinsics) -> None:
-        """Where they are new."""
+        """Log intrinsics if they changed."""
         last = self._intrinsics.get(name)
         if last is intrinsics:
             return
-        self._intrinsics = {**self._intrinsics, name: intrinsics}  # a context may hold the one before
+        self._intrinsics = {**self._intrinsics, name: intrinsics}  # a Context may hold the previous mapping
         size = (intrinsics.width, intrinsics.height)
         if last is None or (last.width, last.height) != size or not np.array_equal(last.K, intrinsics.K):
             log_intrinsics(self, name, intrinsics)
@@ -358,7 +359,7 @@ class Logger(Writer):
             log_clusters(self, frame, clusters, result.tracks, obstacles, config.clustering)
 
     def _log_packed_results(self, result: FrameResult) -> None:
-        """Each voxel once: those of clusters with these."""
+        """Log each voxel once. Voxels of clusters are logged with the clusters."""
         frame, config, clusters = result.frame, self._config, result.clusters
         size, ground_too = config.voxel.size, config.logging.keep != "report"
         if ground_too:
@@ -377,9 +378,9 @@ class Logger(Writer):
             log_clusters(self, frame, clusters, result.tracks, result.obstacles, config.clustering, scale)
 
     def _log_some_clouds(self, result: FrameResult, *, strange: bool) -> None:
-        """The raw clouds of this frame where they are wanted, and those before it that are wanted with it.
+        """Log the raw clouds of this frame and of buffered earlier frames, if they are wanted.
 
-        Needs what the frames before have a part in: anomalies, and states that change.
+        Call it after anomalies and states are logged, because changes in them select the clouds.
         """
         frame, clouds = result.frame, raw_clouds(result)
         lanes = [

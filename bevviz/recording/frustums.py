@@ -1,4 +1,4 @@
-"""What each detection sees: a frustum as far as its match."""
+"""Log the frustum of each detection, clipped to the depth of its match."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from bevviz.recording.writer import Writer
 
 _NEAR = 0.3  # metres from the camera
 _UNMATCHED_COLOR = (80, 80, 92)
-_UNMATCHED_DEPTH = 20.0  # metres that the frustum of a detection without a match is drawn to
+_UNMATCHED_DEPTH = 20.0  # metres to the far end of an unmatched detection's frustum
 
 
 def log_frustums(to: Writer, frame: Frame, cameras: Sequence[CameraResult]) -> None:
-    """Of all kept detections, in the fixed frame; grey without a match."""
+    """Log the frustum of every kept detection in the fixed frame. Unmatched ones are grey."""
     strips: list[F32] = []
     colors: list[tuple[int, ...]] = []
     labels: list[str] = []

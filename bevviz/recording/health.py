@@ -1,4 +1,4 @@
-"""How a frame went, as numbers to plot: times, rates, counts, clocks."""
+"""Log health numbers of a frame: times, rates, counts, clock errors."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from bevviz.model.results import FrameResult
 from bevviz.recording import entities
 from bevviz.recording.writer import Writer
 
-# Curves of one plot, in the order of their colours: the viewer's own may be the same twice.
+# Curves of one plot, in the order of their colours. The viewer's automatic colours may repeat.
 STAGES = (
     *("detector", "clustering", "bev", "ground", "fusion", "tracking", "projection", "voxel", "explain"),
     "total",
@@ -23,16 +23,20 @@ STAGES = (
 COUNTS = ("detections", "clusters", "matches", "problems", "failures")
 
 WINDOW = 1_000_000_000  # nanoseconds that a rate is counted over
-LEAST = 250_000_000  # nanoseconds that say something about a rate
+LEAST = 250_000_000  # nanoseconds, minimum time span for a rate
 
 
 class Rates:
-    """How often frames come, counted over the last second: two that come together are no frequency."""
+    """Rates at which frames arrive, over the last second.
+
+    A rate needs a minimum time span, because two frames that arrive together have no frequency.
+    """
 
     def __init__(self) -> None:
         self._times: dict[str, deque[int]] = {"sensor": deque(), "received": deque()}
 
     def add(self, frame: Frame) -> None:
+        """Count a frame."""
         for times, now in zip(self._times.values(), (frame.stamp, frame.received), strict=True):
             if times and now < times[-1]:
                 times.clear()
@@ -48,6 +52,7 @@ class Rates:
 
 
 def log_health_looks(to: Writer) -> None:
+    """Log the static colours of the stage time and count curves."""
     for paths in (map(entities.stage_time, STAGES), map(entities.count, COUNTS)):
         for path, color in zip(paths, SERIES, strict=False):
             to.static(path, rr.SeriesLines(colors=[color], widths=[1.5]))
@@ -56,14 +61,28 @@ def log_health_looks(to: Writer) -> None:
 def log_health(
     to: Writer, result: FrameResult, last: Frame | None, rates: Rates, more: Mapping[str, float]
 ) -> None:
-    """``last``: the frame before it; ``rates``: up to this frame; ``more``: further scalars, by entity."""
+    """Log every health scalar of a frame.
+
+    Args:
+        to: writer of the recording.
+        result: results of the frame.
+        last: previous frame.
+        rates: rates up to this frame.
+        more: further scalars, by entity.
+    """
     for path, value in (*health(result, last, rates), *more.items()):
         if np.isfinite(value):
             to.scalar(path, float(value))
 
 
 def health(result: FrameResult, last: Frame | None, rates: Rates) -> Iterator[tuple[str, float]]:
-    """Entity and value of every scalar of a frame; ``last`` is the frame before it. NaN: not known."""
+    """Yield entity and value of every scalar of a frame. NaN means unknown.
+
+    Args:
+        result: results of the frame.
+        last: previous frame.
+        rates: rates up to this frame.
+    """
     frame = result.frame
     for stage, seconds in result.timings.items():
         yield entities.stage_time(stage), seconds * 1e3

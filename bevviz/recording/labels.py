@@ -1,8 +1,8 @@
-"""Boxes that say what they are: outlines and names whose tooltip in the viewer is one sentence.
+"""Log outlines and names over boxes, so that the viewer's tooltip shows one sentence.
 
-The viewer's tooltip shows the values of what is hovered over where at most three differ from row to row, and
-only counts them otherwise. A box has five. So over the boxes, which have all that is known, lie outlines and
-names that have no more than a shape, a colour or a name, and a sentence; their rows are those of the boxes.
+The tooltip shows the values of a component only if at most three components differ from row to row. Otherwise
+it shows their number. A box has five such components. So bevviz logs outlines and names over the boxes. Each
+has a shape, a colour or a name, and a sentence. Their rows equal the rows of the boxes.
 """
 
 from __future__ import annotations
@@ -19,30 +19,31 @@ from bevviz.recording import entities
 from bevviz.recording.primitives import CORNER, edges, strips
 from bevviz.recording.writer import Writer
 
-NEAR = 6  # boxes that have their names beside them because they are near: with all, names cover the scene
-EYE, LOOK = (-16.0, 5.0, 11.0), (10.0, 0.0, -1.0)  # from where the layouts look into space, and whereto
-# The room of a name, across and up: in space as the eye sees it (tangents), from above in metres, in an image
-# in parts of its width, as views are narrow. What is named must be further apart than one of the two.
+NEAR = 6  # boxes with a name; names of all boxes would cover the scene
+EYE, LOOK = (-16.0, 5.0, 11.0), (10.0, 0.0, -1.0)  # default eye position and look target in 3D
+# Size of a name, across and up: as tangents of the view angle in 3D, in metres from above, and as fractions
+# of the image width in an image. Two names must be further apart than this in one direction.
 IN_SPACE, FROM_ABOVE, IN_IMAGE = (0.24, 0.035), (20.0, 3.5), (0.21, 0.05)
-LETTER = 0.014  # of a longer name in an image: part of its width
+LETTER = 0.014  # width of a letter in an image, as a fraction of the image width; for longer names
 
 _POINT, _COLOR = rr.Radius.ui_points(0.0), (235, 238, 245)
 
 
 def log_spoken_looks(to: Writer, path: str) -> None:
-    """Of boxes in space."""
+    """Log the static style of outlines and names of 3D boxes."""
     to.static(entities.outlines(path), rr.LineStrips3D.from_fields(radii=rr.Radius.ui_points(2.5)))
     to.static(entities.names(path), rr.Points3D.from_fields(radii=_POINT, colors=[_COLOR], show_labels=True))
 
 
 def log_spoken_looks_in_image(to: Writer, path: str, draw_order: float) -> None:
+    """Log the static style of outlines and names of boxes in an image."""
     lines = rr.LineStrips2D.from_fields(radii=rr.Radius.ui_points(1.5), draw_order=draw_order)
     to.static(entities.outlines(path), lines)
     log_names_looks(to, path, draw_order + 1)
 
 
 def log_names_looks(to: Writer, path: str, draw_order: float) -> None:
-    """Of what is written beside things in an image."""
+    """Log the static style of names in an image."""
     points = rr.Points2D.from_fields(radii=_POINT, colors=[_COLOR], show_labels=True, draw_order=draw_order)
     to.static(entities.names(path), points)
 
@@ -55,15 +56,15 @@ def log_spoken(
     sentences: Sequence[str],
     colors: Sequence[Color],
 ) -> None:
-    """Outlines and names over the (K,) boxes at ``path``, in whose frame they are.
+    """Log outlines and names over the (K,) boxes at ``path``, in the frame of the boxes.
 
     Args:
-        to: where to.
-        path: of the boxes.
-        boxes: that have rows there.
-        names: what is written beside them; empty: nothing.
-        sentences: of the tooltips.
-        colors: of the outlines.
+        to: writer of the recording.
+        path: entity of the boxes.
+        boxes: boxes, in the order of their rows.
+        names: text next to each box; empty: no text.
+        sentences: tooltip of each box.
+        colors: colour of each outline.
     """
     rows, words = _rows(len(boxes)), rr.AnyValues(says=_filled(sentences))
     lines = edges(geometry.corners(boxes))[rows]
@@ -76,7 +77,7 @@ def log_spoken(
 def log_spoken_in_image(
     to: Writer, path: str, xyxy: F32, names: Sequence[str], sentences: Sequence[str], colors: Sequence[Color]
 ) -> None:
-    """The same in an image. ``xyxy``: (K, 4) in pixels as bevviz counts them."""
+    """Log outlines and names over boxes in an image. ``xyxy``: (K, 4) pixels in bevviz's convention."""
     rows, words = _rows(len(xyxy)), rr.AnyValues(says=_filled(sentences))
     corners = (xyxy + CORNER)[rows][:, [0, 1, 2, 1, 2, 3, 0, 3, 0, 1]].reshape(-1, 5, 2)
     to.put(entities.outlines(path), rr.LineStrips2D(corners, colors=[colors[row] for row in rows]), words)
@@ -91,7 +92,7 @@ def log_spoken_in_image(
 def log_stroked(
     to: Writer, path: str, strokes: Sequence[F32], names: Sequence[str], sentences: Sequence[str], places: F32
 ) -> None:
-    """The same of (K,) things that are lines themselves, of (M, 2) pixels; names at (K, 2) ``places``."""
+    """Log (K,) outlines of (M, 2) pixels with a sentence each, and names at (K, 2) ``places``."""
     rows, words = _rows(len(strokes)), rr.AnyValues(says=_filled(sentences))
     chosen = [strokes[row] for row in rows]
     to.put(path, rr.LineStrips2D(strips(np.concatenate(chosen), np.array([*map(len, chosen)]))), words)
@@ -100,14 +101,20 @@ def log_stroked(
 
 
 def row_of(instance: int, count: int) -> int:
-    """What a row of outlines or names stands for; see ``_rows``."""
+    """Return the row of the box for an instance of outlines or names. A single box has two instances."""
     return 0 if count == 1 and instance in (0, 1) else instance
 
 
 def named_in_space(places: F32 | F64, first: Bool | None = None, height: float = 1.0) -> Bool:
-    """(K,) those of (K, 3) places around the robot that are named: the nearest, as far as names do not meet.
+    """Choose the 3D boxes that get a name: the nearest ones, as long as names do not overlap.
 
-    ``first``: (K,) come before what is near; ``height``: of the view, of what it has beside others usually.
+    Args:
+        places: (K, 3) positions around the robot.
+        first: (K,) mask of positions that come before nearer ones.
+        height: height of the view as a fraction of its usual height.
+
+    Returns:
+        (K,) mask.
     """
     ahead = np.subtract(LOOK, EYE)
     ahead /= np.linalg.norm(ahead)
@@ -119,20 +126,24 @@ def named_in_space(places: F32 | F64, first: Bool | None = None, height: float =
 
 
 def named_from_above(places: F32) -> Bool:
-    """The same, seen from above; (K, 2 or 3) places around the robot, x ahead."""
+    """Choose the boxes that get a name in the bird's-eye view. Return a (K,) mask.
+
+    Args:
+        places: (K, 2 or 3) positions around the robot, x ahead.
+    """
     return apart(places[:, 1::-1], _away(places), FROM_ABOVE)
 
 
 def apart(
     at: geometry.FloatArray, order: F32, room: tuple[float | F64, float], first: Bool | None = None
 ) -> Bool:
-    """(K,) the first ``NEAR`` whose names do not meet.
+    """Choose the first ``NEAR`` names that do not overlap. Return a (K,) mask.
 
     Args:
-        at: (K, 2) where the names are, across and up.
-        order: (K,) the least comes first.
-        room: of a name, across, one for all or (K,), and up.
-        first: (K,) come before all others.
+        at: (K, 2) positions of the names, across and up.
+        order: (K,) sort key; the smallest comes first.
+        room: size of a name: width, one for all or (K,), and height.
+        first: (K,) mask of names that come before all others.
     """
     chosen: list[tuple[float, float, float]] = []
     wide = np.broadcast_to(room[0], len(at)).tolist()
@@ -155,7 +166,10 @@ def _away(places: F32 | F64) -> F32:
 
 
 def _rows(count: int) -> list[int]:
-    """A single one twice: the viewer takes what has one row for a value of all rows, and only counts it."""
+    """Return the rows to log. A single row is repeated.
+
+    The viewer takes a component with one row for a value of all rows, and shows only its number.
+    """
     return list(range(count)) if count > 1 else [0, 0]
 
 

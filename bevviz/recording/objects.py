@@ -1,4 +1,4 @@
-"""Fused boxes, with the reason of their match."""
+"""Log fused boxes with the reason of their match."""
 
 from __future__ import annotations
 
@@ -18,13 +18,14 @@ from bevviz.recording.writer import Writer
 
 
 def log_objects_looks(to: Writer) -> None:
+    """Log the static style of fused boxes, their labels and their measured boxes."""
     to.static(entities.FUSED, rr.Boxes3D.from_fields(radii=rr.Radius.ui_points(0.5), show_labels=False))
     log_spoken_looks(to, entities.FUSED)
     to.static(entities.MEASURED, rr.Boxes3D.from_fields(radii=rr.Radius.ui_points(1.0), show_labels=False))
 
 
 def log_objects(to: Writer, result: FrameResult) -> None:
-    """Boxes by class, and everything that is known of each as values beside it; in thin what was seen."""
+    """Log objects as boxes coloured by class, with all their values. Measured boxes are drawn thin."""
     objects, tracked = result.objects, result.tracks
     if objects is None or not len(objects):
         return
@@ -85,7 +86,7 @@ def log_objects(to: Writer, result: FrameResult) -> None:
 
 
 def _with_doubts(labels: list[str], result: FrameResult) -> list[str]:
-    """As they are written beside the boxes: what a camera says against one comes with its name."""
+    """Return the labels, with the opinion of a camera that contradicts the object or its class."""
     if result.opinions is None:
         return labels
     said = map(Opinion, result.opinions.opinion.tolist())
@@ -97,7 +98,7 @@ def _with_doubts(labels: list[str], result: FrameResult) -> list[str]:
 
 
 def sides(objects: Objects) -> list[str]:
-    """The sides of each box that were seen, in words; empty where that is not known."""
+    """Return the visible sides of each box in words. The text is empty if they are unknown."""
     if objects.seen is None:
         return [""] * len(objects)
     return [

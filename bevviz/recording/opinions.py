@@ -1,4 +1,4 @@
-"""Two opinions: what cameras say of somebody else's objects, and beside them those of our own fusion."""
+"""Log the opinions of cameras on external objects, and the objects of our fusion for comparison."""
 
 from __future__ import annotations
 
@@ -30,15 +30,15 @@ from bevviz.recording.labels import (
 from bevviz.recording.primitives import CORNER, OUTLINE, boxes3d, image_outlines, scored, transform
 from bevviz.recording.writer import Writer
 
-DIM = 0.65  # of the colour of a class, where both have an object
+DIM = 0.65  # factor on the class colour of objects that both methods have
 MISSED = "missed"
-DOUBTS = ("contradicted", "named otherwise", MISSED)  # what has its name beside it
+DOUBTS = ("contradicted", "named otherwise", MISSED)  # opinions whose objects get a name
 
 _MARKED = {opinion: OPINIONS[opinion.word] for opinion in (Opinion.CONTRADICTED, Opinion.NAMED_OTHERWISE)}
 
 
 def log_opinions_looks(to: Writer, cameras: Iterable[str]) -> None:
-    """Thinner than the objects that they are beside."""
+    """Log the static style of opinions. Lines are thinner than those of the objects."""
     thin = rr.Radius.ui_points(0.5)
     to.static(entities.FUSION, rr.Boxes3D.from_fields(radii=thin, show_labels=False, fill_mode=OUTLINE))
     lines = rr.LineStrips3D.from_fields(radii=rr.Radius.ui_points(1.0))
@@ -61,7 +61,7 @@ def log_opinions_looks(to: Writer, cameras: Iterable[str]) -> None:
 
 
 def log_fusion(to: Writer, result: FrameResult) -> None:
-    """The objects of our fusion: dim where the method has them, too, else in full colour and named."""
+    """Log the objects of our fusion. Objects that the method has too are dim. Missed objects have a name."""
     opinions = result.opinions
     if opinions is None or not len(opinions.fused):
         return
@@ -101,12 +101,12 @@ def log_fusion(to: Writer, result: FrameResult) -> None:
 
 @dataclass(frozen=True, slots=True)
 class Told:
-    """Objects that are in a view, of which the same is said.
+    """Outlines of the objects in a view that share one opinion.
 
     Attributes:
-        opinion: of ``OPINIONS``.
-        rows: in the method's objects; where they are missed, in those of our fusion.
-        strokes: (M, 2) pixels of each.
+        opinion: one of ``OPINIONS``.
+        rows: rows in the method's objects; for missed objects, rows in the objects of our fusion.
+        strokes: (M, 2) pixels of each outline.
     """
 
     opinion: str
@@ -115,7 +115,7 @@ class Told:
 
 
 def told_in_image(result: FrameResult, camera: Camera) -> Mapping[str, Told]:
-    """By entity, what is told of objects in the image of a camera."""
+    """Return the outlines of objects in a camera's image, by the entity of their opinion."""
     return {
         entities.image_opinion(camera.name, opinion): told
         for opinion, boxes, rows in _by_opinion(result)
@@ -124,7 +124,10 @@ def told_in_image(result: FrameResult, camera: Camera) -> Mapping[str, Told]:
 
 
 def told_from_above(result: FrameResult) -> Mapping[str, Told]:
-    """By entity, what is told of objects whose centre is in the bird's-eye view."""
+    """Return the outlines of objects in the bird's-eye view, by the entity of their opinion.
+
+    Only objects with their centre in the view count.
+    """
     config = result.config.bev
     reach = np.array([config.range_x, config.range_y], np.float32)
     found = {}
@@ -138,7 +141,7 @@ def told_from_above(result: FrameResult) -> Mapping[str, Told]:
 
 
 def log_opinions_in_images(to: Writer, result: FrameResult) -> None:
-    """Where the boxes are in each image, in the colour of what cameras say of them."""
+    """Log object outlines over each image, in the colour of the cameras' opinion."""
     for found in result.cameras if result.opinions is not None else ():
         camera = found.camera
         if (told := told_in_image(result, camera)) and camera.intrinsics is not None:
@@ -148,14 +151,14 @@ def log_opinions_in_images(to: Writer, result: FrameResult) -> None:
 
 
 def log_opinions_from_above(to: Writer, result: FrameResult) -> None:
-    """The same over the bird's-eye image, which has the names of the method's objects itself."""
+    """Log object outlines over the bird's-eye image, which has the names of the method's objects already."""
     if result.opinions is not None:
         room = np.array(FROM_ABOVE) / result.config.bev.resolution
         _log_told(to, result, told_from_above(result), _Beside(room, 0.0, 0.0, over=False))
 
 
 def _by_opinion(result: FrameResult) -> Iterator[tuple[str, Boxes3D, I64]]:
-    """Each opinion, the boxes that it is on and their rows among these."""
+    """Yield each opinion with the boxes it may refer to, and the rows of the boxes that have it."""
     opinions, objects = result.opinions, result.objects
     if opinions is None or objects is None:
         return
@@ -168,20 +171,20 @@ def _by_opinion(result: FrameResult) -> Iterator[tuple[str, Boxes3D, I64]]:
 
 
 def _told(opinion: str, rows: I64, strokes: Sequence[F32]) -> Told:
-    """Without what is not in the view."""
+    """Return the outlines that are in the view."""
     shown = [(row, stroke) for row, stroke in zip(rows.tolist(), strokes, strict=True) if len(stroke)]
     return Told(opinion, [row for row, _ in shown], [stroke for _, stroke in shown])
 
 
 @dataclass(frozen=True, slots=True)
 class _Beside:
-    """How names are written in a view.
+    """Layout of names in a view.
 
     Attributes:
-        room: (2,) of a name, across and up in pixels.
-        letter: of each letter of a name that is longer, in pixels.
-        corner: what Rerun adds to a pixel.
-        over: over the outlines, as the names of detections are under them; else under them.
+        room: (2,) width and height of a name in pixels.
+        letter: width of a letter of a longer name, in pixels.
+        corner: Rerun's offset of a pixel.
+        over: write names above the outlines, as detections have theirs below; False: below the outlines.
     """
 
     room: F64
@@ -190,15 +193,16 @@ class _Beside:
     over: bool
 
     def place(self, stroke: F32) -> tuple[float, float]:
-        """Where the upper edge of the name is."""
+        """Return the centre of the name's upper edge in pixels."""
         (left, top), (right, bottom) = stroke.min(axis=0).tolist(), stroke.max(axis=0).tolist()
         return (left + right) / 2, max(top - float(self.room[1]), 0.0) if self.over else bottom
 
 
 def _log_told(to: Writer, result: FrameResult, told: Mapping[str, Told], beside: _Beside) -> None:
-    """Outlines, and names of those that are in doubt, as far as these do not meet.
+    """Log outlines, and names of doubtful objects as long as names do not overlap.
 
-    What is missed comes last, as it has a detection with a name; else the nearest comes first.
+    Missed objects come last, because their detection has a name already. Among the others the nearest comes
+    first.
     """
     doubted = [found for found in told.values() if found.opinion in DOUBTS]
     places = np.array([beside.place(stroke) for found in doubted for stroke in found.strokes], np.float32)
@@ -229,7 +233,7 @@ def _names(result: FrameResult, found: Told) -> list[str]:
 
 
 def _of(result: FrameResult, opinion: str) -> Objects:
-    """Whose rows they are of which this is told."""
+    """Return the ``Objects`` that the rows of this opinion index."""
     assert result.opinions is not None and result.objects is not None
     return result.opinions.fused if opinion == MISSED else result.objects
 
@@ -249,7 +253,7 @@ def _log_looks_in_view(to: Writer, path: str, opinion: str) -> None:
 
 
 def marked(result: FrameResult, colors: Sequence[Color]) -> list[Color]:
-    """Colours of the objects' outlines: what a camera denies stands out."""
+    """Return the colours of the objects' outlines. Doubtful objects have a colour of their own."""
     if result.opinions is None:
         return [*colors]
     said = map(Opinion, result.opinions.opinion.tolist())

@@ -1,4 +1,4 @@
-"""Addresses and ports: at which we listen, and whether somebody else does."""
+"""Addresses and ports: choose them, check them, and build URLs."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ FIRST_DATA_PORT = 9876  # Rerun's own default
 
 
 def own_address(bind: str) -> str:
-    """The numeric address of this machine that ``--bind`` means.
+    """Resolve ``--bind`` to a numeric address of this machine.
 
     Raises:
-        UserError: it is none.
+        UserError: it is no address of this machine.
     """
     try:
         found = socket.getaddrinfo(bind or LOOPBACK, 0, type=socket.SOCK_STREAM)
@@ -30,11 +30,12 @@ def own_address(bind: str) -> str:
 
 
 def is_loopback(address: str) -> bool:
+    """Return whether other machines cannot reach the address."""
     return ip_address(address).is_loopback
 
 
 def host_for(address: str) -> str:
-    """How a browser or a viewer calls who listens there."""
+    """Return the host name or address that a browser or viewer uses to reach the address."""
     if is_loopback(address):
         return "localhost" if address in (LOOPBACK, "::1") else address
     if ip_address(address).is_unspecified:
@@ -43,9 +44,10 @@ def host_for(address: str) -> str:
 
 
 def origins(address: str, port: int) -> list[str]:
-    """Which pages a browser may let at the data: those that are served beside it.
+    """Return the origins of web pages that may read the data: pages served from the same machine.
 
-    Rerun itself adds those of localhost. Of all addresses of a machine nobody knows every name.
+    Rerun adds localhost itself. An unspecified address allows any host name, because not every name of the
+    machine is known.
     """
     if is_loopback(address):
         return [] if address in (LOOPBACK, "::1") else [f"http://{address}:{port}"]
@@ -55,12 +57,12 @@ def origins(address: str, port: int) -> list[str]:
 
 
 def viewer_address(host: str, port: int, data_port: int) -> str:
-    """What to open in a browser."""
+    """Return the URL of the web viewer."""
     return f"http://{host}:{port}/?url={quote(f'rerun+http://{host}:{data_port}/proxy', safe='')}"
 
 
 def answers(host: str, port: int) -> bool:
-    """Whether somebody listens there."""
+    """Return whether a server listens at the port."""
     try:
         socket.create_connection((host, port), timeout=5).close()
     except OSError:
@@ -69,18 +71,18 @@ def answers(host: str, port: int) -> bool:
 
 
 def check_port(port: int, option: str = "--serve") -> None:
-    """Raises UserError with a free port where this one is in use."""
+    """Raise UserError with the next free port if this port is in use."""
     if not _is_free(port):
         raise UserError(f"{option} {port}: the port is in use; another one: {option} {free_port(port + 1)}")
 
 
 def free_port(port: int, but: int = 0) -> int:
-    """The port, or the next one that is free."""
+    """Return the port, or the next free port. ``but`` is excluded."""
     return next(p for p in range(port, 65536) if p != but and _is_free(p))
 
 
 def _is_free(port: int) -> bool:
-    """At every address: a name such as localhost may mean several."""
+    """Return whether the port is free at every address. A name such as localhost may mean several."""
     with socket.socket() as probe:
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:

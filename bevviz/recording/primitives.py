@@ -1,4 +1,4 @@
-"""What several things that are logged are made of."""
+"""Building blocks of logged data: boxes, outlines, images, documents."""
 
 from __future__ import annotations
 
@@ -23,6 +23,7 @@ _EDGES = [0, 1, 2, 3, 0, 4, 5, 1, 5, 6, 2, 6, 7, 3, 7, 4]
 
 
 def transform(world_from_entity: F64) -> rr.Transform3D:
+    """Convert a (4, 4) pose to a Rerun transform."""
     return rr.Transform3D(
         translation=world_from_entity[:3, 3],
         quaternion=rr.Quaternion(xyzw=geometry.quaternion(world_from_entity)),
@@ -30,6 +31,7 @@ def transform(world_from_entity: F64) -> rr.Transform3D:
 
 
 def boxes3d(boxes: Boxes3D, rows: np.ndarray[Any, Any], labels: list[str], **looks: Any) -> rr.Boxes3D:
+    """Convert the boxes in ``rows`` to Rerun boxes."""
     half = boxes.yaw[rows] / 2
     turns = np.zeros((len(rows), 4), np.float32)
     turns[:, 2], turns[:, 3] = np.sin(half), np.cos(half)
@@ -39,20 +41,20 @@ def boxes3d(boxes: Boxes3D, rows: np.ndarray[Any, Any], labels: list[str], **loo
 
 
 def boxes2d(xyxy: F32, labels: list[str], **looks: Any) -> rr.Boxes2D:
-    """(N, 4) boxes in pixels as bevviz counts them."""
+    """Convert (N, 4) boxes to Rerun boxes. Pixels are in bevviz's convention."""
     return rr.Boxes2D(array=xyxy + CORNER, array_format=rr.Box2DFormat.XYXY, labels=labels, **looks)
 
 
 def edges(corners: F32) -> F32:
-    """(..., 16, D) every edge of a box or frustum, given its (..., 8, D) corners, in one stroke."""
+    """Return one stroke along all edges of each box or frustum: (..., 16, D) for (..., 8, D) corners."""
     return corners[..., _EDGES, :]
 
 
 def image_outlines(boxes: Boxes3D, camera: Camera) -> list[F32]:
-    """What can be drawn in an image of each of (K,) boxes around the robot: one stroke of (M, 2) pixels.
+    """Return the outline of each of (K,) boxes around the robot in an image: one stroke of (M, 2) pixels.
 
-    Every edge, where all of them are in the image; else the outline of what is, cut at the image's edge. Of
-    one that is not in it there are no points.
+    The stroke follows all edges of a box that is completely in the image. Otherwise it is the contour of the
+    box, cut at the image border. It is empty for a box outside of the image.
     """
     nothing = np.zeros((0, 2), np.float32)
     if camera.intrinsics is None or (found := image_points(boxes, camera)) is None:
@@ -75,11 +77,11 @@ def image_outlines(boxes: Boxes3D, camera: Camera) -> list[F32]:
 
 
 def strips(points: F32, lengths: NDArray[np.integer]) -> pa.Array:
-    """Lines as Rerun keeps them, in one piece rather than line by line.
+    """Convert lines to Rerun's Arrow layout in one piece, which is faster than line by line.
 
     Args:
-        points: (N, 2) or (N, 3), of one line after the other.
-        lengths: how many of them each line has.
+        points: (N, 2) or (N, 3) points, one line after the other.
+        lengths: number of points in each line.
     """
     point = pa.list_(pa.field("item", pa.float32(), nullable=False), points.shape[1])
     line = pa.list_(pa.field("item", point, nullable=False))
@@ -89,41 +91,43 @@ def strips(points: F32, lengths: NDArray[np.integer]) -> pa.Array:
 
 
 def scored(names: Iterable[str], scores: Iterable[Any]) -> list[str]:
-    """``person 0.90`` for each."""
+    """Format each name with its score, as in ``person 0.90``."""
     return [f"{name} {score:.2f}" for name, score in zip(names, scores, strict=True)]
 
 
 def document(text: str) -> rr.TextDocument:
-    """A page of Markdown."""
+    """Return a Markdown page."""
     return rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN)
 
 
 def encode_image(image: Image, quality: int) -> rr.EncodedImage:
-    """As it came where it came encoded, else as JPEG of that quality."""
+    """Return the image as it came if it is encoded already, else as JPEG of that quality."""
     if image.encoded is not None:
         return rr.EncodedImage(contents=image.encoded, media_type=image.media_type or None)
     return jpeg(image.bgr, quality)
 
 
 def jpeg(bgr: U8, quality: int) -> rr.EncodedImage:
+    """Encode an image as JPEG."""
     _, data = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, quality])
     return rr.EncodedImage(contents=blob(data), media_type="image/jpeg")
 
 
 def png(bgr: U8) -> rr.EncodedImage:
+    """Encode an image as PNG with fast compression."""
     _, data = cv2.imencode(".png", bgr, [cv2.IMWRITE_PNG_COMPRESSION, 1])
     return rr.EncodedImage(contents=blob(data), media_type="image/png")
 
 
 def blob(data: U8) -> pa.Array:
-    """(N,) bytes as Rerun keeps them, without the copies that it would make of them."""
+    """Convert (N,) bytes to Rerun's Arrow layout without the copies that Rerun would make."""
     one = pa.list_(pa.field("item", pa.uint8(), nullable=False))
     return pa.ListArray.from_arrays(pa.array([0, len(data)], pa.int32()), pa.array(data), type=one)
 
 
 @kernel
 def rounded(points: F32, scale: float) -> F32:
-    """To the nearest 1 / scale, in one pass, as it is done to every frame."""
+    """Round points to the nearest 1 / scale in one pass. It runs on every frame."""
     found, factor = np.empty_like(points), np.float32(scale)
     for i in range(len(points)):
         for axis in range(3):

@@ -1,4 +1,4 @@
-"""How a recording was made: for people on a page, for programs as the recording's property."""
+"""Log how a recording was made: as a page for people, and as a recording property for programs."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from bevviz.support.text import fenced, markdown
 
 
 def log_origin(to: Writer, config: Config, scene: Scene, network: str = "") -> None:
-    """Source, configuration, versions, and what the detector's network runs on."""
+    """Log source, configuration, versions, and the device of the detector's network."""
     settings = dump(config)
     stated = stated_lines(config, folders=False)
     packages = [f"{name} {version}" for name, version in versions().items()]
@@ -47,6 +47,6 @@ def log_origin(to: Writer, config: Config, scene: Scene, network: str = "") -> N
         "left_out": lacking,
         "network": network,
     }
-    # Rerun leaves out what is None or has it empty, as its process has met the name before or not.
+    # Rerun omits None and may omit or keep empty values, depending on names that its process has seen.
     there = rr.AnyValues(**{name: value for name, value in made.items() if value})
     to.recording.send_property(entities.PROPERTY + to.root.replace("/", "_"), there)

@@ -1,7 +1,7 @@
-"""What results depend on besides data and configuration: versions, files by their content, the machine.
+"""Dependencies of results besides data and configuration: versions, file contents, the machine.
 
-A recording tells the versions, a report all of it, so that its check can say what is not as it was; a batch
-runs a bag again where anything but the machine is another.
+A recording stores the versions. A report stores everything, so that its check can name differences. A batch
+runs a bag again if a dependency other than the machine has changed.
 """
 
 from __future__ import annotations
@@ -21,28 +21,28 @@ from bevviz.config.methods import CLASS_LISTS
 from bevviz.config.plugins import TOPIC
 from bevviz.support.version import __version__
 
-PACKAGES = (  # those that are not installed do not count: some libraries come as one of several
+PACKAGES = (  # packages that are not installed are skipped: some libraries have several packages
     *("rerun-sdk", "rosbags", "numpy"),
-    "protobuf",  # decodes Foxglove's messages
-    *("velodyne-decoder", "dracopy", "pypcd4"),  # make points of packets, compressed clouds and PCD files
+    "protobuf",  # decodes Foxglove messages
+    *("velodyne-decoder", "dracopy", "pypcd4"),  # decode packets, compressed clouds and PCD files
     *("numba", "llvmlite"),  # compile every LiDAR stage
     *(
         "opencv-python-headless",
         "opencv-python",
         "pillow",
         "av",
-    ),  # decode images, and prepare them for the network
+    ),  # decode images and prepare them for the network
     *("onnxruntime", "onnxruntime-gpu"),
 )
 
 
 @dataclass(frozen=True, slots=True)
 class Dependency:
-    """A thing that results depend on: a package, or a file. The same content is the same under any name."""
+    """A package or a file that results depend on. A file is identified by its content, under any name."""
 
     version: str = ""
-    sha256: str = ""  # of the file's content, in hexadecimal
-    file: str = field(default="", compare=False)  # its name, without the folder; of a function, module:name
+    sha256: str = ""  # of the content, in hexadecimal
+    file: str = field(default="", compare=False)  # name without the folder; of a function, module:name
 
     def __str__(self) -> str:
         content = f"SHA-256 {self.sha256}" if self.sha256 else ""
@@ -52,9 +52,9 @@ class Dependency:
 
 @dataclass(frozen=True, slots=True)
 class Provenance:
-    """What results were made with, and on.
+    """Dependencies of a run, and the machine it ran on.
 
-    ``dependencies`` decide what comes out: packages by their name, files by the key that names them in the
+    ``dependencies`` decide the results: packages by name, files by the key that names them in the
     configuration (``detector.model``). The ``machine`` may round differently.
     """
 
@@ -63,19 +63,19 @@ class Provenance:
 
 
 def provenance(config: Config, network: str = "") -> Provenance:
-    """That of a run here and now.
+    """Return the provenance of a run on this machine with the installed packages.
 
     Args:
-        config: of the run; the files that it names are read.
-        network: what the detector's network runs on; empty: there is none.
+        config: configuration of the run. The files that it names are read.
+        network: device of the detector's network; empty: there is no network.
     """
     return Provenance(dependencies_of(config), machine(network))
 
 
 def dependencies_of(config: Config) -> dict[str, Dependency]:
-    """Every package, and every file that the configuration names and whose content decides results.
+    """Return every package, and every file in the configuration whose content decides results.
 
-    Of somebody's stage the file that its module is, and the version of the package that it came with.
+    A user-defined stage contributes the file of its module and the version of its package.
     """
     found = {name: Dependency(version=number) for name, number in versions().items()}
     for key, path in (("detector.model", model_path(config)), ("detector.names", names_path(config))):
@@ -92,7 +92,7 @@ def dependencies_of(config: Config) -> dict[str, Dependency]:
 
 
 def differences(then: Provenance, now: Provenance) -> Iterator[str]:
-    """One sentence for whatever is not as it was."""
+    """Yield one sentence for each difference."""
     for before, after in ((then.dependencies, now.dependencies), (then.machine, now.machine)):
         for name in dict.fromkeys([*before, *after]):
             if before.get(name) != after.get(name):
@@ -101,7 +101,7 @@ def differences(then: Provenance, now: Provenance) -> Iterator[str]:
 
 @lru_cache(maxsize=1)
 def versions() -> Mapping[str, str]:
-    """Version of each package that results depend on, by its name."""
+    """Return the version of each package that results depend on, by name."""
     found = {"bevviz": __version__, "python": platform.python_version()}
     for name in PACKAGES:
         with suppress(PackageNotFoundError):
@@ -113,7 +113,7 @@ def versions() -> Mapping[str, str]:
 
 
 def model_path(config: Config) -> Path | None:
-    """The detector's file; None: there is no detector, or it is a topic or somebody's function."""
+    """Return the file of the detector; None: there is no detector, or it is a topic or a user's function."""
     from bevviz.stages.detector import DEMO_MODEL
 
     name = config.detector.model
@@ -123,13 +123,13 @@ def model_path(config: Config) -> Path | None:
 
 
 def names_path(config: Config) -> Path | None:
-    """The file with the detector's class names; None: there is none, or they are known by a name."""
+    """Return the file with the detector's class names; None: there is no such file."""
     name = config.detector.names
     return Path(name) if name and name not in CLASS_LISTS and config.detector.model else None
 
 
 def file_hash(path: Path) -> str:
-    """SHA-256 of a file's content, in hexadecimal. Read once, as long as the file stays as it is."""
+    """Return the SHA-256 of a file's content in hexadecimal. The file is read again only if it changed."""
     stat = path.stat()
     return _hash(path, stat.st_size, stat.st_mtime_ns)
 
@@ -144,10 +144,10 @@ def _hash(path: Path, size: int, mtime: int) -> str:
 
 
 def machine(network: str = "") -> dict[str, str]:
-    """What results and times may depend on, by name. No name of a host or a user.
+    """Return the properties of the machine that results and times may depend on. No host or user names.
 
     Args:
-        network: what the detector's network runs on; empty: there is none.
+        network: device of the detector's network; empty: there is no network.
     """
     found = {
         "processor": _processor(),

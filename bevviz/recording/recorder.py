@@ -1,4 +1,4 @@
-"""Logs every result of a run, and sees to it that it is written."""
+"""Observers that record a run: the recorder, and a watch on the disk."""
 
 from __future__ import annotations
 
@@ -15,30 +15,33 @@ from bevviz.recording.writer import WAIT
 
 
 class Recorder(Observer[FrameResult]):
-    """Writes a run to a recording.
+    """Observer that writes a run to a recording.
 
     Args:
-        recording: where to.
-        config: that is stored as that of the run.
-        network: what the detector's runs on; stored, too.
+        recording: recording stream.
+        config: configuration of the run; it is stored in the recording.
+        network: device of the detector's network; it is stored in the recording.
     """
 
     def __init__(self, recording: rr.RecordingStream, config: Config, network: str = "") -> None:
         self.recording, self._config, self._network = recording, config, network
 
     def begin(self, items: Items[object]) -> None:
+        """Log the static data."""
         self.logger = Logger(self.recording, self._config, items.scene, wait=WAIT, network=self._network)
         self.logger.log_static()
 
     def see(self, result: FrameResult) -> None:
+        """Log a frame."""
         self.logger.log(result)
 
     def end(self) -> None:
+        """Send data that waits."""
         self.logger.flush()
 
     @property
     def warnings(self) -> list[str]:
-        """What the recording lacks that it was to have, one sentence each."""
+        """One sentence for each thing that the recording should have and lacks."""
         if not (times := self.logger.clouds_left_out):
             return []
         share = f"logging.raw_share={self._config.logging.raw_share:g}"
@@ -46,10 +49,11 @@ class Recorder(Observer[FrameResult]):
 
 
 class DiskWatch(Observer[Any]):
-    """Ends a run whose recording cannot be written any more: the rest would be for nothing."""
+    """Observer that ends a run if its recording can no longer be written."""
 
     def __init__(self, sinks: Sinks) -> None:
         self._sinks = sinks
 
     def see(self, result: object) -> None:
+        """Raise UserError if the recording can no longer be written."""
         self._sinks.check()

@@ -1,4 +1,4 @@
-"""Boxes that somebody else states: ground truth, and what the robot itself published."""
+"""Log reference boxes: ground truth, and boxes that the robot published."""
 
 from __future__ import annotations
 
@@ -17,13 +17,14 @@ from bevviz.recording.primitives import OUTLINE, boxes2d, boxes3d, scored, trans
 from bevviz.recording.writer import Writer
 
 Color = tuple[int, int, int]
-Put = Callable[..., None]  # of a Writer: ``put`` or ``write``
+Put = Callable[..., None]  # ``Writer.put`` or ``Writer.write``
 
 _TRUTH_COLOR = (215, 215, 215)
 _ROBOT_COLOR = (255, 210, 0)
 
 
 def log_truth_looks(to: Writer) -> None:
+    """Log the static style of the ground truth."""
     to.static(
         entities.TRUTH,
         rr.Boxes3D.from_fields(
@@ -36,6 +37,7 @@ def log_truth_looks(to: Writer) -> None:
 
 
 def log_truth(to: Writer, frame: Frame, config: BevConfig) -> None:
+    """Log the ground truth boxes in 3D and over the bird's-eye image."""
     if frame.truth is not None and len(frame.truth.boxes):
         _log_boxes(to.put, entities.TRUTH, frame.truth, None)
         path = entities.overlay("ground_truth")
@@ -43,7 +45,7 @@ def log_truth(to: Writer, frame: Frame, config: BevConfig) -> None:
 
 
 def log_robot(to: Writer, frame: Frame, config: BevConfig) -> None:
-    """Under the names of its topics."""
+    """Log the robot's boxes and detections under the names of their topics."""
     for labelled in frame.robot_boxes:
         if len(labelled.boxes):
             _log_boxes(to.put, entities.robot(labelled.topic), labelled, _ROBOT_COLOR)
@@ -55,7 +57,10 @@ def log_robot(to: Writer, frame: Frame, config: BevConfig) -> None:
 
 
 def log_late(to: Writer, late: LateResult, config: BevConfig) -> None:
-    """What came too late for its frame, at its own stamp, until there is more or ``forget_late``."""
+    """Log a result that came too late for its frame, at its own stamp.
+
+    It stays visible until the next result or ``forget_late``.
+    """
     boxes = late.boxes
     to.set_time(late.index, boxes.stamp, boxes.received)
     if isinstance(boxes, LabelledBoxes2D):
@@ -68,7 +73,7 @@ def log_late(to: Writer, late: LateResult, config: BevConfig) -> None:
 
 
 def forget_late(to: Writer, topic: str) -> None:
-    """Nothing of this topic came for a long time."""
+    """Clear the boxes of a topic."""
     for path in (entities.robot(topic), entities.robot_overlay(topic)):
         to.write(path, rr.Clear(recursive=False))
 
@@ -87,7 +92,7 @@ def _log_boxes(put: Put, path: str, labelled: LabelledBoxes3D, color: Color | No
 
 
 def _log_image_boxes(put: Put, found: LabelledBoxes2D) -> None:
-    """Under /robot, but in the space of the camera's image, so that it can be shown over it."""
+    """Log detections under /robot. They have the coordinate frame of the image, so that it can show them."""
     put(
         entities.robot(found.topic),
         *([over_image(found.camera)] if found.camera else []),
@@ -98,7 +103,7 @@ def _log_image_boxes(put: Put, found: LabelledBoxes2D) -> None:
 def _log_outlines(
     put: Put, path: str, pose: F64, labelled: LabelledBoxes3D, config: BevConfig, color: Color
 ) -> bool:
-    """Boxes seen from above, over the bird's-eye image; only those whose centre is in it. False: none is."""
+    """Log outlines of the boxes with their centre in the bird's-eye view. Return whether there are any."""
     points_from_boxes = geometry.inverse(pose) @ _pose(labelled)
     reach = np.array([config.range_x, config.range_y], np.float32)
     inside = (np.abs(geometry.apply(points_from_boxes, labelled.boxes.center)[:, :2]) < reach).all(axis=1)

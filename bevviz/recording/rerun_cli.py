@@ -1,4 +1,4 @@
-"""Rerun's own program beside us: viewer, web page, tools. It listens where we say, and reports on nobody."""
+"""Start Rerun's own program: viewer, web page, tools. It listens at one address and sends no usage data."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from bevviz.recording.ports import answers
 Process: TypeAlias = "subprocess.Popen[bytes]"
 
 PATIENCE = 30.0  # seconds until a program listens
-# Linux ends the program with its parent, however that ends. What is asked for lasts through exec.
+# Ask Linux to end the program with its parent, in every case. The request survives exec.
 _TIED = (
     "import ctypes,os,sys;ctypes.CDLL(None).prctl(1,15);"
     "os.getppid()==int(sys.argv[1]) and os.execvp(sys.argv[2],sys.argv[2:])"
@@ -27,23 +27,23 @@ _TIED = (
 
 
 def program() -> str:
-    """Of the very version that came with the SDK."""
+    """Return Rerun's program in the version of the SDK."""
     binary = Path(rr.__file__).parents[1] / "rerun_cli" / "rerun"
     return str(binary) if binary.exists() else "rerun"
 
 
 def tied(command: Sequence[str]) -> list[str]:
-    """The command, ended when the thread that starts it is gone: a server must not outlive what it serves."""
+    """Return a command that ends with the thread that starts it. A server must not outlive its client."""
     if sys.platform != "linux":
         return list(command)
     return [sys.executable, "-I", "-S", "-c", _TIED, str(os.getpid()), *command]
 
 
 def environment() -> dict[str, str]:
-    """For Rerun's program: it sends and stores nothing of its use, unless ``FORCE_RERUN_ANALYTICS`` is set.
+    """Return the environment of Rerun's program: no usage data, unless ``FORCE_RERUN_ANALYTICS`` is set.
 
-    The setting of its own (``rerun analytics``) is for all of a user's processes and belongs to the user. For
-    one process it only has that it leaves CI alone.
+    Rerun's own setting (``rerun analytics``) holds for all processes of a user, so bevviz does not change it.
+    For a single process, the only switch is that Rerun sends nothing in CI.
     """
     given = dict(os.environ)
     if not given.get("FORCE_RERUN_ANALYTICS"):
@@ -52,14 +52,14 @@ def environment() -> dict[str, str]:
 
 
 def spawn(command: Sequence[str], stdin: int = subprocess.PIPE) -> Process:
-    """Start a command beside us, silently.
+    """Start a command without output, in a session of its own.
 
     Args:
-        command: its words.
-        stdin: as ``subprocess`` takes it.
+        command: program and arguments.
+        stdin: as in ``subprocess``.
 
     Raises:
-        OSError: there is no such program.
+        OSError: the program does not exist.
     """
     return subprocess.Popen(
         command,
@@ -67,23 +67,23 @@ def spawn(command: Sequence[str], stdin: int = subprocess.PIPE) -> Process:
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
         env=environment(),
-        start_new_session=True,  # Ctrl-C is for us alone
+        start_new_session=True,  # Ctrl-C reaches only this process
     )
 
 
 def start(
     arguments: Sequence[str], host: str, port: int, *, lasting: bool = False
 ) -> subprocess.Popen[bytes]:
-    """Start the program and wait until it listens.
+    """Start Rerun's program and wait until it listens.
 
     Args:
-        arguments: of the program.
+        arguments: arguments of the program.
         host: address at which it will listen.
-        port: at which port.
-        lasting: it outlives us, for the user to close.
+        port: port at which it will listen.
+        lasting: the program outlives this process, and the user closes it.
 
     Raises:
-        UserError: it ends, or does not listen.
+        UserError: the program ends, or does not listen.
     """
     command = [program(), *arguments]
     try:
@@ -103,7 +103,7 @@ def start(
 
 
 def end(process: Process) -> None:
-    """Of one that is not to last."""
+    """Stop a program that was started without ``lasting``."""
     process.terminate()
     with suppress(subprocess.TimeoutExpired):
         process.wait(2.0)
@@ -112,10 +112,12 @@ def end(process: Process) -> None:
 
 
 def page(address: str, port: int, source: str) -> Process:
-    """The web viewer alone, at a port of an address, for data from ``source``. (The SDK's is open to all.)
+    """Serve the web viewer without data at an address. It loads the data from ``source``.
+
+    The SDK's own web server listens at all addresses, so it is not used.
 
     Raises:
-        UserError: it does not start.
+        UserError: the viewer does not start.
     """
     arguments = ["--serve-web", "--bind", address, "--web-viewer-port", str(port), source]
     return start(arguments, address, port)

@@ -1,4 +1,4 @@
-"""How much a recording keeps: everything, what an inspection needs, or what a report needs."""
+"""Amount of data that a recording keeps: everything, enough for an inspection, or enough for a report."""
 
 from __future__ import annotations
 
@@ -11,19 +11,20 @@ from numpy.typing import NDArray
 from bevviz.config import Config, LoggingConfig
 from bevviz.model.frame import F32, I64
 
-FINE = 4  # steps in a voxel, at most, that the points of clusters are rounded to where less is kept
-COARSE = 2  # the same of the ground and of what is in no cluster
-PIXEL = 2  # steps of a pixel that obstacle points in the image are rounded to
-BEV_QUALITY = 60  # JPEG, of the bird's-eye view: no detail of it is any but the points'
+FINE = 4  # rounding steps per voxel for points of clusters, if not everything is kept
+COARSE = 2  # the same for the ground and for points without a cluster
+PIXEL = 2  # rounding steps per pixel for obstacle points in an image
+BEV_QUALITY = 60  # JPEG quality of the bird's-eye view, which shows points only
 LOSSY = ("image/jpeg", "image/webp")
 
 
 def is_whole(config: Config) -> bool:
+    """Return whether the recording keeps everything."""
     return config.logging.keep == "everything"
 
 
 def left_out(config: LoggingConfig) -> tuple[str, ...]:
-    """What a recording lacks, one sentence each, for whoever looks at it."""
+    """Return one sentence for each kind of data that a recording omits."""
     if config.keep == "everything":
         return ()
     raw = (
@@ -49,19 +50,22 @@ def left_out(config: LoggingConfig) -> tuple[str, ...]:
 
 
 def step(voxel_size: float, parts: int) -> float:
-    """Steps in a metre, a power of two: so many in a voxel, or up to half as many. 0: not rounded."""
+    """Return rounding steps per metre, as a power of two. 0: no rounding.
+
+    A voxel has at most ``parts`` steps, and more than half as many.
+    """
     return 0.0 if voxel_size == 0 else float(2.0 ** np.floor(np.log2(parts / voxel_size)))
 
 
 def sorted_rows(points: F32, scale: float, first: I64 | None = None) -> I64:
-    """Rows of (N, 2) or (N, 3) points so that neighbours share their last, then their middle coordinate.
+    """Sort (N, 2) or (N, 3) points by their last coordinate, then by the one before it. Return their rows.
 
-    LZ4, which recordings are packed with, has no entropy coding: it gains from what is repeated.
+    LZ4, the compression of recordings, has no entropy coding. It profits from repeated values only.
 
     Args:
-        points: any.
-        scale: steps in a unit that they are rounded to.
-        first: (N,) numbers that go before the coordinates.
+        points: points to sort.
+        scale: steps per unit to which they are rounded.
+        first: (N,) integers that are compared before the coordinates.
     """
     cells = np.clip(np.rint(points * np.float32(scale or 32.0)), -(1 << 14), (1 << 14) - 1).astype(np.int64)
     key = np.zeros(len(points), np.int64) if first is None else first.astype(np.int64)
@@ -75,23 +79,23 @@ def sorted_rows(points: F32, scale: float, first: I64 | None = None) -> I64:
 
 @dataclass(frozen=True, slots=True)
 class Held:
-    """A frame whose raw clouds may be wanted yet."""
+    """Raw clouds of a frame that may still be wanted."""
 
     clock: tuple[int, int, int]  # index, stamp and received
-    clouds: Sequence[tuple[str, F32, NDArray[np.uint16]]]  # entity, points, class id of each
+    clouds: Sequence[tuple[str, F32, NDArray[np.uint16]]]  # entity, points, class id of each point
 
 
 class Around:
-    """Which frames' raw clouds are kept: so many are held as fit into ``raw_around`` seconds, and no more.
+    """Selector of frames whose raw clouds are kept. It buffers the frames of the last ``raw_around`` seconds.
 
-    What begins of itself, again and again where a sensor fails, has those around it only while all that were
-    kept for that reason are fewer than ``raw_share`` of the frames so far; the first time it has them.
+    Anomalies and state changes keep the clouds around them only while the clouds kept for this reason are
+    fewer than ``raw_share`` of all frames. The first event always keeps its clouds.
 
     Attributes:
-        left_out: times that something began and did not have them.
+        left_out: number of anomalies and state changes without raw clouds.
     """
 
-    LONGEST = 100  # frames that are held at most, however fast they come
+    LONGEST = 100  # frames; limit of the buffer at any frame rate
 
     def __init__(self) -> None:
         self.left_out = 0
@@ -101,19 +105,19 @@ class Around:
 
     @property
     def held(self) -> int:
-        """Frames that may be wanted yet."""
+        """Number of buffered frames."""
         return len(self._held)
 
     def see(
         self, frame: Held, config: LoggingConfig, *, strange: bool, wanted: bool = False
     ) -> Sequence[Held]:
-        """Those to be logged now, oldest first.
+        """Return the frames whose clouds are logged now, oldest first.
 
         Args:
-            frame: the next one.
-            config: how many.
-            strange: whether something begins here.
-            wanted: whether somebody has seen to it that it does.
+            frame: next frame.
+            config: limits.
+            strange: whether an anomaly begins or a state changes in this frame.
+            wanted: whether a user caused an event in this frame: a mark or a new configuration.
         """
         stamp, around = frame.clock[1], round(config.raw_around * 1e9)
         if self._held and stamp < self._held[-1].clock[1]:

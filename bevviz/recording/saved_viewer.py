@@ -1,4 +1,4 @@
-"""A recording that is there, shown as it is: in a viewer on this machine, or in a browser."""
+"""Show a saved recording in a viewer on this machine or in a browser."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from bevviz.recording.ports import (
 )
 from bevviz.recording.sinks import MEMORY
 
-WEB = 2.3e9  # bytes that the web viewer can hold, of the 4 GiB that WebAssembly has
+WEB = 2.3e9  # bytes that fit into the web viewer, as WebAssembly has 4 GiB of memory
 
 
 def too_large_for_web(recording: Path, size: int) -> str:
-    """What to say of one that a browser cannot show whole; empty: it can. ``size`` in bytes."""
+    """Return a warning if a browser cannot show the whole recording, else "". ``size`` is in bytes."""
     if size <= WEB:
         return ""
     return (
@@ -31,10 +31,10 @@ def too_large_for_web(recording: Path, size: int) -> str:
 
 
 def in_viewer(recording: Path) -> None:
-    """The viewer stays open when we have ended.
+    """Open the recording in a viewer, which stays open after this process.
 
     Raises:
-        UserError: it does not start.
+        UserError: the viewer does not start.
     """
     port = free_port(FIRST_DATA_PORT)
     arguments = [str(recording), "--bind", LOOPBACK, "--port", str(port), "--hide-welcome-screen"]
@@ -43,14 +43,14 @@ def in_viewer(recording: Path) -> None:
 
 @contextmanager
 def in_browser(recording: Path, port: int | None = None) -> Iterator[str]:
-    """The address of a page of this machine alone, which shows it as long as this is open.
+    """Serve the recording to browsers of this machine while the context is open. Yield the page's address.
 
     Args:
         recording: .rrd file.
-        port: of the page; None: 9090, or the next that is free.
+        port: port of the page; None: the first free one from 9090.
 
     Raises:
-        UserError: the port is in use, or it does not start.
+        UserError: the port is in use, or the viewer does not start.
     """
     if port is not None:
         check_port(port, "--port")

@@ -1,4 +1,4 @@
-"""Where a recording goes: a file, a viewer on this machine, one elsewhere, a browser; several at once."""
+"""Open a recording with its outputs: file, viewer on this machine, viewer elsewhere, browser."""
 
 from __future__ import annotations
 
@@ -33,9 +33,9 @@ from bevviz.recording.source_lookup import Origin
 from bevviz.support.files import Unfinished, written
 
 APPLICATION = "bevviz"
-TICK = 2.0  # seconds that a frame may wait for others to go into a file with
-CHUNK = 1 << 24  # bytes that may wait
-MEMORY = "25%"  # of the machine's, for what a server keeps for those who join late, and for the viewer
+TICK = 2.0  # seconds that a frame may wait until a chunk is written
+CHUNK = 1 << 24  # bytes that may wait until a chunk is written
+MEMORY = "25%"  # of the machine's memory, for a server's buffer for late viewers, and for the viewer
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,9 +43,11 @@ class Sinks:
     """An open recording.
 
     Attributes:
-        urls: what to open in a browser or viewer, one for each server.
+        recording: recording stream.
+        urls: addresses to open in a browser or viewer, one for each server.
         warnings: one sentence each.
-        file: where the recording is until it is whole; None: in no file.
+        file: temporary file until the recording is complete; None: the recording goes to no file.
+        writer: writer of the file.
     """
 
     recording: rr.RecordingStream
@@ -56,12 +58,13 @@ class Sinks:
 
     @property
     def recording_id(self) -> str:
+        """Identifier of the recording."""
         found = rr.get_recording_id(self.recording)
         assert found is not None
         return str(found)
 
     def check(self) -> None:
-        """Raises UserError where the file cannot be written any more."""
+        """Raise UserError if the file can no longer be written."""
         if self.writer is not None:
             self.writer.check()
 
@@ -81,29 +84,28 @@ def open_recording(
     place: Path | None = None,
     origin: Origin | None = None,
 ) -> Iterator[Sinks]:
-    """Open a recording that goes to everything that is asked for, with the blueprint.
+    """Open a recording with a blueprint and one or several outputs.
 
-    A file is written while the recording goes on, beside its place (see ``bevviz.support.files``): what was
-    logged before an interruption is in it.
+    The file is written under a temporary name next to its target (see ``bevviz.support.files``). After an
+    interruption it holds everything that was logged before.
 
     Args:
         scene: names of the sensors, for the blueprint.
-        config: the configuration.
-        save: .rrd file; overwritten in the end.
+        config: configuration of the run.
+        save: .rrd file; an existing one is replaced at the end.
         serve: port of the web viewer on this machine.
-        bind: its address at which ``serve`` listens, for the page and for the data.
+        bind: address of this machine at which ``serve`` listens, for the page and for the data.
         connect: URL of a viewer that listens, rerun+http://host:9876/proxy.
         spawn: open the viewer on this machine.
         blueprint: name of a layout, a .py or .rbl file, or a layout.
-        recording_id: viewers and catalogs take two recordings with the same one for the same; None: a
-            random one, the same for all recordings of a process.
-        place: where ``save`` is going to lie, if elsewhere.
-        origin: what it says of what it was made from; None: everything.
+        recording_id: viewers and catalogs merge recordings with the same identifier; None: a random one, the
+            same for all recordings of a process.
+        place: final path of the file, if it is not ``save``.
+        origin: source of the recording; None: it is made from ``scene`` and ``config``.
 
     Raises:
-        UserError: unknown blueprint, file that cannot be written or that another
-            process writes, port in use, no viewer found or reached;
-            on leaving, when not everything could be written.
+        UserError: the blueprint is unknown, the file cannot be written, another process writes it, the port
+            is in use, or no viewer answers. On leaving: not everything could be written.
     """
     layout = blueprints.load(blueprint, scene, config) if isinstance(blueprint, str) else blueprint
     sinks: list[rr.FileSink | rr.GrpcSink | rr.GrpcServerSink] = []
@@ -128,7 +130,7 @@ def open_recording(
             urls.append(address)
         watched = connect is not None or spawn or serve is not None
         recording = _stream(recording_id, batcher=None if watched else batches(config))
-        # The writer waits until Rerun closes the sink: an interrupt at any moment from here on must close it.
+        # The writer waits until Rerun closes the sink. From here on, every interrupt must close it.
         stack.callback(recording.disconnect)
         try:
             recording.set_sinks(*sinks, default_blueprint=layout)
@@ -161,7 +163,10 @@ def _stream(
 
 
 def batches(config: Config) -> rr.ChunkBatcherConfig | None:
-    """How many rows a file's chunks have: of small frames more, which packs better. None: as Rerun does."""
+    """Return the batching of log calls into chunks of a file. None: Rerun's default.
+
+    Small frames get larger chunks, which compress better.
+    """
     if is_whole(config):
         return None
     found = rr.ChunkBatcherConfig()
@@ -170,7 +175,7 @@ def batches(config: Config) -> rr.ChunkBatcherConfig | None:
 
 
 def _close(recording: rr.RecordingStream) -> None:
-    """Hand over what is still on its way. An error that is already on its way out goes first."""
+    """Flush and close the recording. An exception that is already being raised takes precedence."""
     pending = sys.exc_info()[0] is not None
     try:
         recording.flush()
@@ -182,7 +187,7 @@ def _close(recording: rr.RecordingStream) -> None:
 
 
 def _file(path: Path) -> AbstractContextManager[Unfinished]:
-    for name in (path, path.resolve()):  # a slip must not overwrite the bag itself, also not through a link
+    for name in (path, path.resolve()):  # a typing error must not overwrite a bag, not even through a link
         if name.suffix != ".rrd":
             link = f" (it is a link to {name})" if name != path else ""
             raise UserError(f"--save {path}: expected a file name that ends in .rrd{link}")
@@ -190,16 +195,16 @@ def _file(path: Path) -> AbstractContextManager[Unfinished]:
 
 
 def _connection(url: str) -> rr.GrpcSink:
-    """A viewer elsewhere. Rerun would only complain when the recording ends: try the port first."""
+    """Return a sink to a viewer elsewhere. Check the port first, as Rerun reports errors only at the end."""
     check_viewer(url)
     return rr.GrpcSink(url)
 
 
 def check_viewer(url: str) -> tuple[str, int]:
-    """Host and port of a viewer that answers.
+    """Return host and port of a viewer that answers.
 
     Raises:
-        UserError: the URL is none of a viewer, or nobody answers.
+        UserError: the URL is not a viewer's, or the viewer does not answer.
     """
     parts = urlsplit(url)
     scheme = parts.scheme in ("rerun", "rerun+http", "rerun+https")
@@ -219,7 +224,7 @@ def check_viewer(url: str) -> tuple[str, int]:
 
 
 def _viewer() -> rr.GrpcSink:
-    """The viewer on this machine, for this machine. (The SDK's own way opens it to everybody.)"""
+    """Start a viewer for this machine only. The SDK's own function opens it to the network."""
     port = free_port(FIRST_DATA_PORT)
     arguments = ["--bind", LOOPBACK, "--port", str(port), "--memory-limit", "50%"]
     arguments += ["--server-memory-limit", MEMORY, "--expect-data-soon", "--hide-welcome-screen"]
@@ -232,7 +237,7 @@ def _viewer() -> rr.GrpcSink:
 
 @contextmanager
 def _served(port: int, bind: str) -> Iterator[tuple[rr.GrpcServerSink, str]]:
-    """The web viewer at ``port`` of an address and beside it the server that it takes the data from."""
+    """Serve the web viewer at ``port``, and its data at another port. Yield the sink and the page's URL."""
     address = own_address(bind)
     check_port(port)
     data_port, host = free_port(FIRST_DATA_PORT, but=port), host_for(address)

@@ -1,4 +1,4 @@
-"""From a recording (.rrd) back to the bag that it was made from, and to how it was made."""
+"""Find the bag that a recording (.rrd) was made from, and the settings of the run."""
 
 from __future__ import annotations
 
@@ -32,28 +32,28 @@ from bevviz.recording.provenance import model_path, names_path
 from bevviz.support.files import bag_files, open_regular, sampled_files
 from bevviz.support.text import path_text
 
-FRAMES = ("source.", "sync.")  # sections that say what a frame is made of
+FRAMES = ("source.", "sync.")  # sections that decide what a frame is made of
 OBJECTS = ("objects.method", "objects.params.encoder")  # files of a 3D detector
-BLOCK = 1 << 16  # bytes at the beginning, in the middle and at the end of a file that are looked at
-AFTER = 500  # chunks in which one property follows another
-MAGIC = b"RRF"  # and a digit, for the generation of the format
-HEAD = 1 << 24  # bytes: what of a recording is read to find what it was made with, and more
+BLOCK = 1 << 16  # bytes that are hashed at the beginning, the middle and the end of a file
+AFTER = 500  # chunks within which one property follows another
+MAGIC = b"RRF"  # followed by a digit, the generation of the format
+HEAD = 1 << 24  # bytes that are checked before properties are read; they need fewer
 
 
 class NoBagError(UserError):
-    """A recording without a bag behind it: another program's, of the synthetic drive, a comparison."""
+    """Error for a recording without a bag: of another program, of the synthetic drive, or of a comparison."""
 
 
 @dataclass(frozen=True, slots=True)
 class Place:
-    """A bag, or another file, as it was: found by where it was, known again by its content.
+    """Reference to a bag or another file: paths where it may be, and a fingerprint of its content.
 
     Attributes:
-        name: without the folder.
-        size: bytes; of a folder those of the bag's files in it.
-        fingerprint: of ``fingerprint``.
-        beside: path from the recording's folder; empty: the recording was no file.
-        path: absolute; empty: it is not told.
+        name: file name without the folder.
+        size: bytes; of a folder, the sum over the bag's files in it.
+        fingerprint: SHA-256 from ``fingerprint``.
+        beside: path relative to the recording's folder; empty: the recording was no file.
+        path: absolute path; empty: it is private.
     """
 
     name: str
@@ -64,36 +64,36 @@ class Place:
 
     @classmethod
     def of(cls, path: Path, recording: Path | None, *, folders: bool) -> Self:
-        """That of a file or a bag's folder.
+        """Return the reference to a file or to a bag's folder.
 
         Args:
-            path: which.
-            recording: that names it; None: it is no file.
-            folders: whether folders of this machine may be told.
+            path: file or folder.
+            recording: recording that stores the reference; None: it is no file.
+            folders: whether the recording may name folders of this machine.
         """
         size, mark = fingerprint(path)
-        where = Path(os.path.normpath(path.absolute()))  # a link's own name
+        where = Path(os.path.normpath(path.absolute()))  # does not resolve a link
         beside = ""
         if recording is not None:
             beside = os.path.relpath(where, recording.absolute().parent) if folders else where.name
         return cls(path_text(where.name), size, mark, path_text(beside), path_text(where) if folders else "")
 
     def candidates(self, recording: Path) -> list[Path]:
-        """Where it may be, the likeliest first."""
+        """Return paths where the file may be, the likeliest first."""
         folder = recording.absolute().parent
         found = [folder / (self.beside or self.name), folder / self.name]
         found += [Path(self.path)] if self.path else []
         return list(dict.fromkeys(Path(os.path.normpath(path)) for path in found))
 
     def is_same(self, path: Path) -> bool:
-        """Whether that is what it was."""
+        """Return whether a file has the size and the fingerprint."""
         try:
             return fingerprint(path) == (self.size, self.fingerprint)
         except OSError:
             return False
 
     def found(self, recording: Path) -> tuple[Path | None, str]:
-        """Where it is now, and in words where it was looked for."""
+        """Return the file's present path and an empty text, or None and the reason why it is not found."""
         tried = self.candidates(recording)
         for path in tried:
             if self.is_same(path):
@@ -106,13 +106,14 @@ class Place:
 
 
 def fingerprint(path: Path) -> tuple[int, str]:
-    """Size and a quick SHA-256 (hexadecimal) of a file, or of the bag's files in a folder.
+    """Return the size and a quick SHA-256 (hexadecimal) of a file, or of the bag's files in a folder.
 
-    Of each file its size and the beginning, the middle and the end count: enough to tell two recordings
-    apart, and done at once for 100 GB. Of a data set some files of each folder do, and how many there are.
+    The hash covers the size, the beginning, the middle and the end of each file. This distinguishes
+    recordings, and is fast even for 100 GB. For a data set, it covers the number of files and a few files of
+    each folder.
 
     Raises:
-        OSError: it is not there, or cannot be read.
+        OSError: the file does not exist or cannot be read.
     """
     total, mark = 0, hashlib.sha256()
     files = bag_files(path) if path.is_dir() else [path]
@@ -125,20 +126,20 @@ def fingerprint(path: Path) -> tuple[int, str]:
             mark.update(size.to_bytes(8, "little"))
             for start in sorted({0, max(size // 2 - BLOCK // 2, 0), max(size - BLOCK, 0)}):
                 content.seek(start)
-                mark.update(content.read(BLOCK) or b"")  # None: a file of the system that would wait
+                mark.update(content.read(BLOCK) or b"")  # None: a special file that would block
         total += size
     return total, mark.hexdigest()
 
 
 @dataclass(frozen=True, slots=True)
 class Origin:
-    """What a recording holds of what it was made from.
+    """Source of a recording, as the recording stores it.
 
     Attributes:
-        bag: files and folders, several being one drive.
-        files: what the configuration names, by the key that names it.
-        topics: ``key=value`` each, which give the same topics the same roles.
-        redacted: the images of the bag are not those that the network saw.
+        bag: files and folders; several make up one drive.
+        files: files in the configuration, by the key that names them.
+        topics: ``key=value`` settings that give topics the same roles again.
+        redacted: the bag's images are not the images that the network saw.
     """
 
     bag: Sequence[Place]
@@ -156,13 +157,13 @@ class Origin:
         folders: bool = True,
         redacted: bool = False,
     ) -> Self | None:
-        """That of a recording that is to be made; None: it is not made from a bag, or this is gone.
+        """Return the source of a new recording. None: it is not made from a bag, or the bag is gone.
 
         Args:
-            scene: of the source.
-            config: of the run.
-            recording: the file that it will be; None: none.
-            folders: whether folders of this machine may be told.
+            scene: scene of the source.
+            config: configuration of the run.
+            recording: file of the new recording; None: it goes to no file.
+            folders: whether the recording may name folders of this machine.
             redacted: see the attribute.
         """
         named = {"detector.model": model_path(config), "detector.names": names_path(config)}
@@ -181,12 +182,16 @@ class Origin:
         return cls(bag, files, scene.topics, redacted) if bag else None
 
     def log(self, recording: rr.RecordingStream) -> None:
-        """As the recording's property."""
+        """Log the source as a property of the recording."""
         recording.send_property(entities.BAG, rr.AnyValues(about=json.dumps(asdict(self))))
 
     @classmethod
     def load(cls, text: str) -> Self:
-        """Raises ValueError, TypeError or KeyError where it is not what ``log`` has written."""
+        """Parse the text that ``log`` has written.
+
+        Raises:
+            ValueError, TypeError, KeyError: the text has another form.
+        """
         tree = json.loads(text)
         return cls(
             [Place(**place) for place in tree["bag"]],
@@ -198,20 +203,21 @@ class Origin:
 
 @dataclass(frozen=True, slots=True)
 class Recorded:
-    """A recording that stands for its bag.
+    """Bag and settings that a recording was made from.
 
     Attributes:
-        recording: the file.
-        paths: of the bag.
-        settings: ``key=value`` each: topics as they were, and where the files lie that it was made with.
+        recording: .rrd file.
+        paths: paths of the bag.
+        settings: ``key=value`` settings: the topics of the run, and the present paths of its files.
         warnings: one sentence each.
+        yaml: configuration of the run, as ``dump`` wrote it.
     """
 
     recording: Path
     paths: tuple[Path, ...]
     settings: tuple[str, ...]
     warnings: tuple[str, ...]
-    yaml: str  # the configuration, as ``dump`` wrote it
+    yaml: str
 
     def load(
         self,
@@ -219,16 +225,16 @@ class Recorded:
         settings: Sequence[str] = (),
         preset: Preset | None = None,
     ) -> Config:
-        """The recording's configuration with other values.
+        """Load the recording's configuration with changes.
 
-        A file or a preset takes its place; what frames are made of, and the detector, are then the
-        recording's where these have nothing but the preset's own; the objects' method is not, as nothing is
-        without its parameters.
+        A file or a preset replaces the recording's configuration. Values that it leaves at the preset's
+        default come from the recording if they decide how frames are made, or name the detector. The method
+        of the objects does not, because it needs its parameters.
 
-        Functions that it names run where ``settings``, or a trusted file, name them as well.
+        Functions in the recording's configuration run only if ``settings`` or a trusted file names them too.
 
         Raises:
-            UserError: as ``bevviz.config.load``.
+            UserError: see ``bevviz.config.load``.
         """
         if file or preset is not None:
             stated = load(file, settings, preset)
@@ -237,7 +243,7 @@ class Recorded:
         return load(settings=[*self._received(), *settings], base=base)
 
     def missing(self, config: Config) -> Layer:
-        """Values that a configuration leaves open: what frames are made of, and the detector."""
+        """Return the recording's frame and detector values that a configuration leaves at their default."""
         stated, own = values(config), values(load(preset=config.preset))
         there = flat_yaml(self.yaml, str(self.recording))
         recorded = {key: value for key, value in there.items() if key.startswith(FRAMES)}
@@ -253,21 +259,21 @@ class Recorded:
 
 
 def follow(recording: Path, bag: Sequence[Path] = (), settings: Sequence[str] = ()) -> Recorded:
-    """The bag that a recording was made from, and how.
+    """Find the bag and the settings that a recording was made from.
 
     Args:
         recording: .rrd file.
-        bag: where the bag is, where it is neither beside the recording nor where it was.
-        settings: that are going to be given, in which the detector's file may be named.
+        bag: paths of the bag, if it is neither next to the recording nor at its old path.
+        settings: settings that the caller will apply. They may name the detector's file.
 
     Raises:
-        NoBagError: it has none, or does not say which.
-        UserError: no recording; the bag, or the detector's file, is not found, or is another one.
+        NoBagError: the recording has no bag or does not name it.
+        UserError: it is no recording, or the bag or the detector's file is not found or has changed.
     """
     how, origin = read(recording)
     warnings: list[str] = []
     if origin is None and not bag:
-        beside = recording.with_suffix(".mcap")  # as 'bevviz live' saves both
+        beside = recording.with_suffix(".mcap")  # 'bevviz live' saves both
         if not beside.is_file():
             raise NoBagError(
                 f"{recording}: it does not say which bag it was made from, and {beside.name} is not beside "
@@ -322,10 +328,10 @@ def _mark(path: Path) -> tuple[int, str]:
 
 
 def read(recording: Path) -> tuple[str, Origin | None]:
-    """The configuration (YAML) in a recording, and what it was made from; None: it does not say.
+    """Return the configuration (YAML) in a recording, and its source. None: the recording does not name it.
 
     Raises:
-        UserError: no recording, or none of bevviz.
+        UserError: the file is no recording, or not one of bevviz.
     """
     if not recording.is_file():
         raise UserError(f"{recording}: no such file")
@@ -337,7 +343,7 @@ def read(recording: Path) -> tuple[str, Origin | None]:
     origin: Origin | None = None
     try:
         for path, chunk in _properties(recording):
-            # A property may be in several chunks, with some of its fields each.
+            # A property may be spread over several chunks.
             if path == entities.PROPERTY and (found := _column(chunk, "config")):
                 how = str(found[-1][0])
             elif path == entities.BAG and (found := _column(chunk, "about")):
@@ -352,7 +358,7 @@ def read(recording: Path) -> tuple[str, Origin | None]:
 
 
 def _properties(recording: Path) -> Iterator[tuple[str, Any]]:
-    """Name and chunk of each, which are near the beginning: of a long recording little is read."""
+    """Yield name and chunk of each property. They are near the beginning, so little of the file is read."""
     from rerun.chunk import RrdReader
 
     chunks = iter(RrdReader(recording).stream())
@@ -370,6 +376,6 @@ def _properties(recording: Path) -> Iterator[tuple[str, Any]]:
 
 
 def _column(chunk: Any, name: str) -> list[Any]:
-    """Its values; none where the chunk has no such column."""
+    """Return the values of a column; empty: the chunk has no such column."""
     batch = chunk.to_record_batch()
     return list(batch.column(name).to_pylist()) if name in batch.schema.names else []

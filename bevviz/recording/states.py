@@ -1,4 +1,4 @@
-"""States over time, in lanes: of the pipeline, the cameras and what they see, anomalies, tracks."""
+"""Log states over time in lanes: pipeline, cameras and their classes, anomalies, tracks."""
 
 from __future__ import annotations
 
@@ -30,18 +30,18 @@ COLORS: Mapping[str, Color] = {
     "silent": State.BAD.value,
     "unusable": State.BAD.value,
     "no publisher": State.BAD.value,
-    "warning": State.DOUBTFUL.value,  # of the robot's diagnostics
+    "warning": State.DOUBTFUL.value,  # level in the robot's diagnostics
     "error": State.BAD.value,
     "stale": State.UNKNOWN.value,
 }
 
 
 class StateLanes:
-    """Logs a lane's state where it changes. A lane without a state in a frame goes empty.
+    """Writer of state lanes. It logs a lane's state when it changes. A lane without a state becomes empty.
 
     Args:
-        colors: of the states, which are text; others get the viewer's own.
-        plain_lanes: entity of lanes that have one colour for all their states, whatever these are.
+        colors: colour of each state. Other states get the viewer's colour.
+        plain_lanes: entity above lanes that have one colour for all their states.
     """
 
     def __init__(self, colors: Mapping[Any, Color], plain_lanes: str = "") -> None:
@@ -50,12 +50,12 @@ class StateLanes:
         self.states: Mapping[str, str] = {}  # lane -> its latest state
 
     def log(self, to: Writer, states: Mapping[str, str]) -> None:
-        """The states of a frame, by the entity of their lane."""
+        """Log the states of a frame, by the entity of their lane."""
         now = {lane: state for lane, state in states.items() if state or lane in self.states}
         states = dict.fromkeys(self.states, "") | now
         for lane, state in states.items():
             self._log_colors(to, lane, state)
-            if self.states.get(lane, "") != state:  # a lane is there from its first state on
+            if self.states.get(lane, "") != state:  # a lane begins with its first state
                 to.write(lane, rr.StateChange(state=state))
         self.states = states
 
@@ -71,7 +71,7 @@ class StateLanes:
 
 
 def states_of(result: FrameResult) -> dict[str, str]:
-    """Lane -> state of the pipeline, of each camera and its classes, and of each kind of anomaly."""
+    """Return lane -> state of the pipeline, of each camera and its classes, and of each anomaly kind."""
     degraded = result.frame.problems or any(c.camera.problems for c in result.cameras)
     states = {entities.state("pipeline"): "failed" if result.failures else "degraded" if degraded else "ok"}
     if result.frame.around is not None and result.frame.around.marks:
@@ -85,7 +85,7 @@ def states_of(result: FrameResult) -> dict[str, str]:
         for class_name, decision in _best_decisions(camera):
             states[entities.class_state(name, class_name)] = decision
     for kind in KINDS:
-        # Without the numbers of tracks, which the log has: each state has to be given its colour.
+        # Each state of a lane needs a colour, so states have no track numbers. The log has them.
         subjects = [a.subject.partition(" #")[0] for a in result.anomalies if a.kind == kind]
         more = f" +{len(subjects) - 1}" if subjects[1:] else ""
         states[entities.anomaly_state(kind)] = f"{subjects[0]}{more}" if subjects else ""
@@ -93,12 +93,12 @@ def states_of(result: FrameResult) -> dict[str, str]:
 
 
 def track_states(tracks: Tracks, rows: Mapping[int, int]) -> dict[str, str]:
-    """``rows``: lane -> row of its track."""
+    """Return lane -> label of its track. ``rows`` is lane -> row of its track."""
     return {entities.track_state(lane): anomalies.label(tracks, row) for lane, row in rows.items()}
 
 
 def _best_decisions(camera: CameraResult) -> Iterator[tuple[str, str]]:
-    """For each class, what became of its best kept detection."""
+    """Yield each class of a camera with the decision about its best kept detection."""
     if camera.detections is None or camera.fusion is None:
         return
     found, seen = camera.detections, set()

@@ -1,4 +1,4 @@
-"""What the robot says around its perception: marks, its diagnostics, shapes in the world."""
+"""Log data of the robot other than its perception: marks, diagnostics, IMUs, shapes in the world."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from bevviz.recording import entities
 from bevviz.recording.primitives import transform
 from bevviz.recording.writer import Writer
 
-LANES = 40  # of the robot's diagnostics; the worst
+LANES = 40  # lanes for the robot's worst diagnostics
 _WORST = ("error", "stale", "warning", "ok")
 _PARTS = ("points", "strips", "solids", "axes", "grid", "surface", "fix", "picture")
-_TYPES = {".dae": "model/vnd.collada+xml"}  # that Rerun does not know by the name of the file
+_TYPES = {".dae": "model/vnd.collada+xml"}  # media types that Rerun does not guess from the file name
 _AXES = {"x": (225, 75, 60), "y": (110, 190, 90), "z": (86, 150, 233)}
 
 Fixed: TypeAlias = Sequence[rr.AsComponents]
@@ -28,17 +28,17 @@ _COLOR = (120, 200, 255)
 
 
 def log_shapes(to: Writer, frame: Frame) -> None:
-    """What has a place in the world."""
+    """Log shapes that have a pose in the fixed frame, geographic positions and pictures."""
     for shape in (frame.around or Around()).shapes:
         flat = shape.fix is not None or shape.picture is not None
         if flat or shape.world_from_shape is not None:
             _log_shape(to, shape)
-        elif shape.meshes:  # which are static, and cannot be cleared
+        elif shape.meshes:  # meshes are static and cannot be cleared: a scale of 0 hides them
             to.put(entities.robot(shape.topic), rr.Transform3D(scale=0.0))
 
 
 def fixed_parts(frame: Frame) -> dict[str, Callable[[], Fixed | None]]:
-    """What holds at all times, by entity, and how it is made: meshes of the robot's, the axes of its Imus."""
+    """Return functions that make the static data, by entity: the robot's meshes, and the axes of its IMUs."""
     around, found = frame.around or Around(), dict[str, Callable[[], Fixed | None]]()
     for shape in around.shapes:
         for number, mesh in enumerate(shape.meshes):
@@ -49,7 +49,7 @@ def fixed_parts(frame: Frame) -> dict[str, Callable[[], Fixed | None]]:
 
 
 def log_motions(to: Writer, frame: Frame) -> None:
-    """What Imus measured since the frame before, each sample at its own time."""
+    """Log IMU samples since the previous frame, each at its own time."""
     for motion in (frame.around or Around()).motions:
         for path, values in (
             (entities.rotation(motion.topic), motion.rotation),
@@ -61,17 +61,17 @@ def log_motions(to: Writer, frame: Frame) -> None:
 
 
 class AroundLog:
-    """Remembers what the diagnostics said."""
+    """Log lines of marks and diagnostics. It remembers the diagnostics, so that only changes make a line."""
 
     def __init__(self) -> None:
-        self._said: dict[str, str] = {}  # by name of the status
+        self._said: dict[str, str] = {}  # name of the status -> its text
 
     def lines(self, frame: Frame) -> list[tuple[str, str]]:
-        """Marks and news of the diagnostics as lines of the log: level and text."""
+        """Return log lines (level and text) of marks and of changed diagnostics."""
         return [*marks(frame), *self._news((frame.around or Around()).statuses)]
 
     def _news(self, statuses: Sequence[Status]) -> list[tuple[str, str]]:
-        """What the robot's diagnostics say that they did not say before; at first what is not well."""
+        """Return log lines of statuses that changed. A first status makes a line only if it is not ok."""
         lines = []
         for status in statuses:
             text = f"{status.name}: {status.level}{f', {status.text}' if status.text else ''}"
@@ -84,14 +84,14 @@ class AroundLog:
 
 
 def diagnostic_states(frame: Frame) -> dict[str, str]:
-    """State lane -> level of what the robot's diagnostics say, the worst of them."""
+    """Return state lane -> level of the robot's worst diagnostics."""
     statuses = frame.around.statuses if frame.around else ()
     shown = sorted(statuses, key=lambda status: _WORST.index(status.level))[:LANES]
     return {entities.diagnostic(status.name): status.level for status in shown}
 
 
 def marks(frame: Frame) -> list[tuple[str, str]]:
-    """Notes of people at this frame, as lines of the log."""
+    """Return users' notes at this frame as log lines."""
     return [("INFO", f"mark: {text}") for text in (frame.around.marks if frame.around else ())]
 
 
@@ -135,7 +135,7 @@ def _log_shape(to: Writer, shape: Shape) -> None:
 
 
 def _surface(surface: Surface) -> rr.AsComponents:
-    """In colours from its least to its greatest value; single cells as points."""
+    """Colour a surface from its lowest to its highest value. A surface without triangles becomes points."""
     low, high = np.percentile(surface.values, (1, 99)).tolist()
     rows = bins(surface.values, low, max(high, low + 1e-6), len(turbo()))
     colors = turbo()[rows]
@@ -175,5 +175,5 @@ def _grid(grid: Grid) -> rr.GridMap:
         translation=grid.pose[:3, 3],
         quaternion=rr.Quaternion(xyzw=geometry.quaternion(grid.pose)),
         colormap=rr.components.Colormap.RvizMap,
-        opacity=0.6,  # what is below stays seen
+        opacity=0.6,  # lower layers stay visible
     )

@@ -1,4 +1,4 @@
-"""What tracks look like in Rerun: boxes, trails, and a fixed number of lanes for their states and speeds."""
+"""Log tracks: boxes, trails, and a fixed number of lanes for their states and speeds."""
 
 from __future__ import annotations
 
@@ -20,10 +20,11 @@ from bevviz.recording.labels import named_from_above
 from bevviz.recording.primitives import OUTLINE, boxes3d, strips
 from bevviz.recording.writer import Writer
 
-LANES = 12  # tracks with a state lane and a speed of their own: entities that come and go are never freed
+LANES = 12  # tracks with a lane for state and speed; the viewer never frees an entity
 
 
 def log_tracks_looks(to: Writer) -> None:
+    """Log the static style of tracks and trails, in 3D and over the bird's-eye image."""
     looks = rr.Boxes3D.from_fields(radii=rr.Radius.ui_points(0.75), show_labels=False, fill_mode=OUTLINE)
     for path in (entities.TRACKS, entities.UNSEEN):
         to.static(path, looks)
@@ -38,7 +39,7 @@ def log_tracks_looks(to: Writer) -> None:
 
 
 def log_tracks(to: Writer, frame: Frame, tracks: Tracks, config: BevConfig) -> None:
-    """In the fixed frame, and seen from above over the bird's-eye image."""
+    """Log tracks in the fixed frame and over the bird's-eye image."""
     rows = shown(tracks)
     named = tracks.object[rows] >= 0
     for path, chosen, text in (
@@ -69,20 +70,20 @@ def log_tracks(to: Writer, frame: Frame, tracks: Tracks, config: BevConfig) -> N
 
 
 def log_speeds(to: Writer, tracks: Tracks, rows: Mapping[int, int]) -> None:
-    """``rows``: lane -> row of its track."""
+    """Log the speed of each lane's track. ``rows`` is lane -> row of its track."""
     speeds = np.full(LANES, np.nan)
     speeds[list(rows)] = tracks.speed[list(rows.values())]
     to.write(entities.TRACK_SPEEDS, rr.Scalars(speeds))
 
 
 class Lanes:
-    """Gives each track that is shown one of ``LANES`` numbers, which it keeps until it ends."""
+    """Assignment of tracks to ``LANES`` lanes. A track keeps its lane until it ends."""
 
     def __init__(self) -> None:
         self._lane_of: dict[int, int] = {}  # id -> lane
 
     def update(self, tracks: Tracks | None) -> Mapping[int, int]:
-        """Lane -> row of its track. Where there are more tracks than lanes, the latest have none."""
+        """Return lane -> row of its track. If all lanes are taken, the latest tracks have no lane."""
         row_of = {} if tracks is None else {int(tracks.id[row]): row for row in shown(tracks).tolist()}
         self._lane_of = {number: lane for number, lane in self._lane_of.items() if number in row_of}
         free = self._free()
@@ -100,29 +101,29 @@ class Lanes:
 
 
 def shown(tracks: Tracks | None) -> I64:
-    """Rows of what is drawn."""
+    """Return the rows of confirmed tracks. Only these are drawn."""
     return np.zeros(0, np.int64) if tracks is None else np.flatnonzero(tracks.confirmed)
 
 
 def label(tracks: Tracks, row: int) -> str:
-    """``person #12 1.4 m/s``."""
+    """Return a track's label, such as ``person #12 1.4 m/s``."""
     return f"{anomalies.label(tracks, row)} {tracks.speed[row]:.1f} m/s"
 
 
 def unseen(tracks: Tracks, row: int) -> str:
-    """Why a track that is shown has no object in this frame."""
+    """Return a label that says why a confirmed track has no object in this frame."""
     if tracks.cluster[row] >= 0:
         return f"{anomalies.label(tracks, row)}, not named"
     return f"{anomalies.label(tracks, row)}, unseen for {tracks.coasting[row]:.1f} s"
 
 
 def class_ids(ids: I64) -> np.ndarray[tuple[int], np.dtype[np.uint16]]:
-    """The colours of these tracks, as class ids."""
+    """Return the class ids that colour these tracks."""
     return (ClassId.TRACK + ids % TRACK_COLORS).astype(np.uint16)
 
 
 def of_clusters(tracks: Tracks | None, count: int) -> I64:
-    """(count,) id of each cluster's track; without tracks, or without its own, the cluster's row."""
+    """Return the (count,) track id of each cluster. A cluster without a track gets its own row."""
     ids = np.arange(count)
     if tracks is not None:
         seen = tracks.cluster >= 0
@@ -131,7 +132,7 @@ def of_clusters(tracks: Tracks | None, count: int) -> I64:
 
 
 def of_objects(tracks: Tracks | None, count: int) -> list[int | None]:
-    """Row of the track of each object, None where it has none that is shown."""
+    """Return the row of each object's track. None: the object has no confirmed track."""
     rows: list[int | None] = [None] * count
     if tracks is not None:
         for row in shown(tracks).tolist():
@@ -141,7 +142,11 @@ def of_objects(tracks: Tracks | None, count: int) -> list[int | None]:
 
 
 def trails(tracks: Tracks, rows: I64) -> tuple[F32, I64]:
-    """Where each was, oldest first: (N, 3) points of one after the other, and how many each has."""
+    """Return the trails, oldest position first.
+
+    Returns:
+        (N, 3) points, one track after the other, and the number of points of each track.
+    """
     found = tracks.trail[rows]
     known = np.isfinite(found[:, :, 0])
     return found[known], known.sum(axis=1)

@@ -1,4 +1,4 @@
-"""Images of a camera as a stream of H.264."""
+"""Encode camera images as an H.264 stream."""
 
 from __future__ import annotations
 
@@ -13,23 +13,23 @@ from av.video.reformatter import ColorRange, Colorspace
 
 from bevviz.model.frame import U8
 
-GOP = 1_000_000_000  # nanoseconds from one key frame to the next, at most
-QUALITY = "20"  # x264's constant rate factor: hardly told from the image
-BT709 = 1  # of H.264's tables of matrices, primaries and transfer functions
+GOP = 1_000_000_000  # nanoseconds between key frames, at most
+QUALITY = "20"  # constant rate factor of x264, with hardly visible loss
+BT709 = 1  # entry in H.264's tables of matrices, primaries and transfer functions
 
 
 @dataclass(frozen=True, slots=True)
 class Sample:
-    """One encoded image, in Annex B; a key frame needs none before it."""
+    """One encoded image in Annex B format. A key frame can be decoded without earlier images."""
 
     data: bytes
     key: bool
 
 
 class VideoEncoder:
-    """Encodes images as they come: each is complete at once, without B-frames.
+    """Encoder of images to H.264. There are no B-frames, so each image is complete at once.
 
-    Rows and columns are even in H.264: of an odd one the last is there twice.
+    H.264 needs an even number of rows and columns. An odd last row or column is repeated.
     """
 
     def __init__(self) -> None:
@@ -40,11 +40,16 @@ class VideoEncoder:
         self._again = True
 
     def restart(self) -> None:
-        """The next image needs none before it."""
+        """Make the next image a key frame."""
         self._again = True
 
     def __call__(self, bgr: U8, stamp: int) -> Sample:
-        """The next image, (H, W, 3), and its stamp in nanoseconds."""
+        """Encode the next image.
+
+        Args:
+            bgr: (H, W, 3) image.
+            stamp: nanoseconds.
+        """
         if self._context is None or bgr.shape[:2] != self._size:
             self._size, self._count = (bgr.shape[0], bgr.shape[1]), 0
             self._context, self._again = _opened(bgr), True
@@ -61,7 +66,7 @@ class VideoEncoder:
 
 
 def decode(samples: Sequence[bytes]) -> list[U8]:
-    """(H, W, 3) BGR images of samples of which the first is a key frame."""
+    """Decode samples to (H, W, 3) BGR images. The first sample is a key frame."""
     context = av.CodecContext.create("h264", "r")
     assert isinstance(context, av.VideoCodecContext)
     packets = [av.Packet(sample) for sample in samples]
@@ -75,8 +80,8 @@ def _opened(bgr: U8) -> av.VideoCodecContext:
     assert isinstance(context, av.VideoCodecContext)
     context.width, context.height, context.pix_fmt = width, height, "yuv420p"
     context.time_base = Fraction(1, 10)
-    context.gop_size, context.max_b_frames = 1 << 16, 0  # key frames are asked for by time
-    context.thread_count = 1  # the cores have other work
+    context.gop_size, context.max_b_frames = 1 << 16, 0  # key frames are requested by time
+    context.thread_count = 1  # the other cores are busy
     context.colorspace = context.color_primaries = context.color_trc = BT709
     context.color_range = ColorRange.MPEG
     context.options = {"preset": "superfast", "tune": "zerolatency", "crf": QUALITY, "forced-idr": "1"}

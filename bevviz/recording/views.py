@@ -1,4 +1,4 @@
-"""The views that the layouts in ``blueprints/`` are put together from; for a layout of your own, too."""
+"""Views of the layouts in ``blueprints/``, also for user layouts."""
 
 from __future__ import annotations
 
@@ -32,31 +32,31 @@ def space(
     beside: Sequence[str] = (f"{entities.ROBOT}/**",),
     by: Quantity | None = None,
 ) -> rrb.Spatial3DView:
-    """Points, boxes, frusta and poses around the robot, seen from behind and above it.
+    """Return a 3D view of points, boxes, frustums and poses, seen from behind and above the robot.
 
-    The origin is the LiDAR: the robot stays where it is and the world moves, whichever way it drives. The
-    occupancy on the ground and tracks without an object in the frame are there to be switched on.
+    The origin is the LiDAR, so the robot stays in place and the world moves. The occupancy grid on the ground
+    and tracks without an object are hidden; the user can switch them on.
 
     Args:
         scene: names of the sensors.
-        raw: with every raw point, coloured as ground or obstacle.
-        frustums: with what each detection sees.
-        why: with the chain of what ``bevviz why`` explains.
-        names: of what was found and is near.
-        name: of the view.
+        raw: show every raw point, coloured as ground or obstacle.
+        frustums: show the frustum of each detection.
+        why: show the explanation of ``bevviz why``.
+        names: show the names of near objects.
+        name: name of the view.
         root: entity that the run is logged under.
-        beside: what else is shown.
-        by: what the raw points are coloured by, where they are; None: ground or obstacle.
+        beside: further contents of the view.
+        by: quantity that colours the raw points; None: ground or obstacle.
     """
     hidden = [entities.set_aside(scene.lidar)]
-    # The coloured points of the clusters and the raw cloud already show what is obstacle.
+    # The coloured points of the clusters and the raw cloud already show the obstacles.
     hidden += [entities.ground(scene.lidar)] if scene.raw or why else []
     hidden += [entities.obstacles(scene.lidar)] if raw and scene.raw else []
     clouds = [entities.points(lidar) for lidar in scene.lidars or (scene.lidar,)]
     hidden += [] if raw else clouds
     hidden += [entities.GRID, entities.UNSEEN]
     hidden += [] if frustums else [entities.FRUSTUMS]
-    # The points of what is explained stand out by their colours, which tell another story than the clusters'.
+    # The explained points stand out by colours that differ in meaning from the colours of clusters.
     hidden += [entities.clusters(scene.lidar), entities.FRUSTUMS] if why else []
     hidden += [entities.clusters(scene.lidar), entities.FRUSTUMS] if by is not None else []
     own = entities.names(entities.FUSED), entities.names(entities.FUSION)
@@ -73,7 +73,7 @@ def space(
         contents=[f"{root}{entities.WORLD}/**", *beside, *([f"{entities.WHY}/**"] if why else [])],
         background=_DARK,
         line_grid=False,
-        # Said, as the viewer takes the fixed frame instead where contents lie outside of the origin's tree.
+        # Without this, contents outside of the origin's tree make the viewer use the fixed frame.
         spatial_information=rrb.SpatialInformation(
             target_frame=entities.space(root + entities.sensor(scene.lidar))
         ),
@@ -88,7 +88,7 @@ def space(
 
 
 def spaces(scene: Scene, **looks: Any) -> rrb.Container | rrb.View:
-    """``space``, with a further tab for each quantity that the raw points can be coloured by."""
+    """Return the 3D view, with a further tab for each quantity that can colour the raw points."""
     first = space(scene, **looks)
     if not scene.color_by:
         return first
@@ -97,7 +97,7 @@ def spaces(scene: Scene, **looks: Any) -> rrb.Container | rrb.View:
 
 
 def _beside(place: tuple[float, float, float]) -> tuple[float, float, float]:
-    """Where to look at it from: the robot's side, a few metres before it, to the left and above."""
+    """Return an eye position a few metres from a target: on the robot's side, to the left and above."""
     x, y, z = place
     away = max(math.hypot(x, y), 1e-6)
     back = min(away, 6.0)
@@ -105,10 +105,13 @@ def _beside(place: tuple[float, float, float]) -> tuple[float, float, float]:
 
 
 def camera(scene: Scene, name: str, *, why: bool = False, weak: bool = False) -> rrb.Spatial2DView:
-    """The image with detections and the projected points; what the robot itself detected there, too.
+    """Return a view of a camera's image with its detections, projected points, and the robot's detections.
 
-    ``why``: with the weak detections and what ``bevviz why`` explains instead of the points and names;
-    ``weak``: with the weak detections, too.
+    Args:
+        scene: names of the sensors.
+        name: name of the camera.
+        why: show weak detections and the explanation of ``bevviz why`` instead of points and names.
+        weak: show weak detections too.
     """
     contents = ["$origin/**", *([f"{entities.ROBOT}/**"] if scene.robot else [])]
     told = [entities.projected(name), entities.names(entities.detections(name))]
@@ -122,7 +125,7 @@ def camera(scene: Scene, name: str, *, why: bool = False, weak: bool = False) ->
 
 
 def cameras(scene: Scene, *, why: bool = False) -> rrb.Container | rrb.View:
-    """Every camera; tabs where there are more than two."""
+    """Return the views of all cameras, in tabs if there are more than two."""
     views = [camera(scene, name, why=why) for name in scene.cameras]
     if len(views) == 1:
         return views[0]
@@ -130,7 +133,7 @@ def cameras(scene: Scene, *, why: bool = False) -> rrb.Container | rrb.View:
 
 
 def birds_eye(scene: Scene, root: str = "", name: str = "Bird's-eye view") -> rrb.Spatial2DView:
-    """The bird's-eye image with the outlines of ground truth and of the robot's own boxes."""
+    """Return a view of the bird's-eye image with the outlines of ground truth and of the robot's boxes."""
     bev = root + entities.BEV
     channels = [
         f"- {root}{entities.channel(name)}/**" for name in ("density", "height", "intensity", "occupancy")
@@ -144,74 +147,74 @@ def birds_eye(scene: Scene, root: str = "", name: str = "Bird's-eye view") -> rr
 
 
 def robots_birds_eye() -> rrb.Spatial2DView:
-    """The bird's-eye image that the robot itself publishes."""
+    """Return a view of the bird's-eye image that the robot publishes."""
     origin = entities.robot("/visualization/bev_image")
     return rrb.Spatial2DView(name="The robot's", origin=origin, background=_DARK)
 
 
 def explain(root: str = "", name: str = "Explain") -> rrb.TextDocumentView:
-    """Every decision of the frame in words."""
+    """Return a view of the frame's decisions in words."""
     return rrb.TextDocumentView(name=name, origin=root + entities.EXPLAIN, contents=["$origin"])
 
 
 def why() -> rrb.TextDocumentView:
-    """What ``bevviz why`` answered."""
+    """Return a view of the answer of ``bevviz why``."""
     return rrb.TextDocumentView(name="Why", origin=entities.WHY, contents=["$origin"])
 
 
 def text_log(name: str, origin: str) -> rrb.TextLogView:
-    """Frame, time and text of each line."""
+    """Return a view of a log with frame, time and text of each line."""
     columns = rrb.TextLogColumns(timeline_columns=[entities.FRAME, entities.STAMP], text_log_columns=["body"])
     return rrb.TextLogView(name=name, origin=origin, columns=columns)
 
 
 def log() -> rrb.TextLogView:
-    """Failures, problems and rejected detections of all frames."""
+    """Return a view of failures, problems and rejected detections of all frames."""
     return text_log("Log", entities.EXPLAIN_LOG)
 
 
 def states() -> rrb.StateTimelineView:
-    """What became of the pipeline, of each camera and of the best detection of each class, over time."""
+    """Return a view of the states of the pipeline, the cameras and the best detection of each class."""
     return rrb.StateTimelineView(name="States", origin=entities.STATES)
 
 
 def diagnostics() -> rrb.StateTimelineView:
-    """What the robot's own diagnostics say of its parts, over time."""
+    """Return a view of the levels in the robot's diagnostics over time."""
     return rrb.StateTimelineView(name="Diagnostics", origin=entities.DIAGNOSTICS)
 
 
 def anomalies() -> rrb.StateTimelineView:
-    """What was worth a look, by kind, over time; below it how the pipeline is, which no drive lacks."""
+    """Return a view of anomalies by kind over time, with the state of the pipeline, which every run has."""
     contents = [entities.state("pipeline"), "$origin/**"]
     return rrb.StateTimelineView(name="Anomalies", origin=entities.ANOMALY_STATES, contents=contents)
 
 
 def anomaly_log() -> rrb.TextLogView:
-    """Each anomaly when it began, with its numbers."""
+    """Return a view of a log with each anomaly's begin and numbers."""
     return text_log("Anomaly log", entities.ANOMALY_LOG)
 
 
 def tracks() -> rrb.StateTimelineView:
-    """Who was tracked when."""
+    """Return a view of the tracks over time."""
     return rrb.StateTimelineView(name="Tracks", origin=entities.TRACK_STATES)
 
 
 def speeds() -> rrb.TimeSeriesView:
-    """Of the tracks, in the same lanes."""
+    """Return a view of the tracks' speeds, in the same lanes as the tracks."""
     return rrb.TimeSeriesView(
         name="Speeds, m/s", origin=entities.TRACK_SPEEDS, plot_legend=rrb.PlotLegend(visible=False)
     )
 
 
 def over_time() -> rrb.Tabs:
-    """Lanes of anomalies, decisions and tracks, and the speeds of these."""
+    """Return tabs with anomalies, decisions, tracks and speeds over time."""
     return rrb.Tabs(anomalies(), states(), tracks(), speeds(), name="Over time")
 
 
 def plot(
     name: str, origin: str, contents: Sequence[str] = ("$origin/**",), *, linked: bool = False
 ) -> rrb.TimeSeriesView:
-    """Numbers over time, the legend inside. ``linked``: it shows the same time as the others that are."""
+    """Return a plot over time with the legend inside. ``linked`` plots share their visible time range."""
     return rrb.TimeSeriesView(
         name=name,
         origin=origin,
@@ -222,53 +225,56 @@ def plot(
 
 
 def stage_times() -> rrb.TimeSeriesView:
+    """Return a plot of the stage times."""
     return plot("Stage times, ms", entities.stage_time(""))
 
 
 def clocks() -> rrb.TimeSeriesView:
-    """Image against cloud, and how old the transforms are."""
+    """Return a plot of the time between image and cloud, and of the age of transforms."""
     contents = [entities.sync_error("**"), entities.tf_age("**")]
     return plot("Sync error and TF age, ms", entities.HEALTH, contents)
 
 
 def counts() -> rrb.TimeSeriesView:
-    """Clusters, detections and matches, opinions: the numbers of the same size."""
+    """Return a plot of clusters, detections, matches and opinions, which are numbers of similar size."""
     return plot("Counts", entities.HEALTH, [entities.count(what) for what in (*COUNTS, *OPINIONS)])
 
 
 def rates() -> rrb.TimeSeriesView:
+    """Return a plot of the rates."""
     return plot("Rates, Hz", entities.rate(""))
 
 
 def latencies() -> rrb.TimeSeriesView:
-    """From a cloud's arrival until it is logged, and from there to the viewers."""
+    """Return a plot of the latency from a cloud's arrival to the log call, and of the viewers' lag."""
     contents = [entities.latency("**"), entities.viewer_lag("**")]
     return plot("Latency and lag of viewers, ms", entities.HEALTH, contents)
 
 
 def motion(scene: Scene) -> list[rrb.View]:
-    """What Imus measure, where there are some."""
+    """Return plots of IMU data; empty: there is no IMU."""
     if not scene.imu:
         return []
     return [plot("Rotation, rad/s", entities.ROTATION), plot("Acceleration, m/s²", entities.ACCELERATION)]
 
 
 def health() -> rrb.Tabs:
-    """In tabs: side by side, their legends would hide the curves."""
+    """Return tabs of health plots. Side by side, their legends would hide the curves."""
     return rrb.Tabs(stage_times(), clocks(), counts(), rates(), name="Health")
 
 
 def config() -> rrb.TextDocumentView:
-    """How the recording was made."""
+    """Return a view of how the recording was made."""
     return rrb.TextDocumentView(name="Configuration", origin=entities.CONFIG)
 
 
 def time_panel(
     *, play: rrb.components.PlayState | None = None, timeline: str = entities.STAMP
 ) -> rrb.TimePanel:
-    """Sensor time, collapsed."""
+    """Return a collapsed time panel on sensor time."""
     return rrb.TimePanel(state="collapsed", timeline=timeline, play_state=play)
 
 
 def panels() -> tuple[rrb.BlueprintPanel, rrb.SelectionPanel]:
+    """Return collapsed blueprint and selection panels."""
     return rrb.BlueprintPanel(state="collapsed"), rrb.SelectionPanel(state="collapsed")

@@ -1,4 +1,4 @@
-"""What everything that logs frame after frame has in common: the clocks, and that nothing old stays."""
+"""Common base of writers that log frame after frame: timelines, and clearing of old data."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from bevviz.model.frame import F64, I64, Clip, Codec
 from bevviz.recording import entities
 from bevviz.support.contexts import Closing
 
-STAMPS = (entities.STAMP, entities.TRIED, entities.RECEIVED)  # timelines in nanoseconds; the others count
-STEP = 1_000  # nanoseconds between two packets of video that belong to the same frame, at least
+STAMPS = (entities.STAMP, entities.TRIED, entities.RECEIVED)  # in nanoseconds; the others are sequences
+STEP = 1_000  # nanoseconds between two video packets of a frame, at least
 CODECS: Mapping[Codec, rr.VideoCodec] = {
     "h264": rr.VideoCodec.H264,
     "h265": rr.VideoCodec.H265,
@@ -22,20 +22,20 @@ CODECS: Mapping[Codec, rr.VideoCodec] = {
     "vp8": rr.VideoCodec.VP8,
     "vp9": rr.VideoCodec.VP9,
 }
-WAIT = 1.0  # seconds, for a recording rather than for a robot's operator
+WAIT = 1.0  # seconds; suits a recording, but not a robot's operator
 
 
 class Writer(Closing):
-    """Writes frames to a recording, on the timelines ``stamp``, ``frame`` and ``received``.
+    """Writer of frames to a recording, on the timelines ``stamp``, ``frame`` and ``received``.
 
-    The ``log_*`` functions of this folder, one for each kind of thing, write through one.
+    The ``log_*`` functions of this folder write through a Writer.
 
     Args:
-        recording: where to; it may have any number of sinks.
-        root: entity that everything goes under; empty: paths are as they are.
-        wait: seconds that numbers to plot may wait for those of the next frames: sent together, as columns,
-            they take a fraction of the time. Then close it, which sends the last of them.
-        stamps: timelines of the sensor time. Without ``stamp`` among them, there are no others.
+        recording: recording stream, with any number of sinks.
+        root: entity above all others; empty: paths stay unchanged.
+        wait: seconds that scalars may wait for those of later frames. As columns they take a fraction of the
+            time. The caller must close the writer, which sends the last scalars.
+        stamps: timelines of the sensor time. Without ``stamp`` among them, there are no other timelines.
     """
 
     def __init__(
@@ -47,30 +47,33 @@ class Writer(Closing):
     ) -> None:
         self.recording = recording
         self.root = root
-        self.sequences: Mapping[str, int] = {}  # further timelines, and where on them what comes next is
+        self.sequences: Mapping[str, int] = {}  # further timelines, and the position on each
         self._wait, self._stamps = wait, stamps
-        self._clock: dict[str, int] = {}  # timeline -> where on it this frame is
+        self._clock: dict[str, int] = {}  # timeline -> position of this frame
         self._scalars: dict[str, list[tuple[dict[str, int], float]]] = defaultdict(list)
         self._sent = time.monotonic()
         self._known: set[str] = set()  # entities that any frame had
-        self._shown: set[str] = set()  # entities with something of the frame before
+        self._shown: set[str] = set()  # entities with data of the previous frame
         self._now: set[str] = set()
-        self.apart = False  # whether a frame may be looked at without those just before it
-        self.streams_video = True  # else each picture as an image
-        self._codecs: dict[str, Codec] = {}  # of entities that are video
-        self._reached: dict[str, tuple[tuple[int, int], dict[str, int]]] = {}  # last packet of each, and when
-        self._versions: dict[str, int] = {}  # entity -> what ``keep`` was last called with
+        self.apart = False  # whether frames may be viewed without their previous frames
+        self.streams_video = True  # False: each video picture is logged as an image
+        self._codecs: dict[str, Codec] = {}  # codec of entities that are video
+        self._reached: dict[str, tuple[tuple[int, int], dict[str, int]]] = {}  # last packet and its time
+        self._versions: dict[str, int] = {}  # entity -> version in the last ``keep``
 
     def begin(self, index: int, stamp: int, received: int) -> None:
-        """Start a frame. Stamps in nanoseconds, ``received`` 0 where it is not known."""
+        """Start a frame. Stamps are in nanoseconds; ``received`` is 0 if it is unknown."""
         self._now = set()
         before = self._clock
         self.set_time(index, stamp, received)
         if before.keys() != self._clock.keys():
-            self.flush()  # a column has the same timelines from end to end
+            self.flush()  # all rows of a column have the same timelines
 
     def end(self) -> None:
-        """Clear what the frame before had, or any where they are looked at apart, and this one has not."""
+        """Clear entities that the previous frame had and this frame has not.
+
+        If frames are viewed apart, clear entities that any earlier frame had.
+        """
         self._known |= self._now
         for path in (self._known if self.apart else self._shown) - self._now:
             self.write(path, rr.Clear(recursive=False))
@@ -79,16 +82,16 @@ class Writer(Closing):
             self.flush()
 
     def clear_at(self, index: int, stamp: int, received: int, paths: Set[str]) -> None:
-        """Clear in another frame what was not known when that was written."""
+        """Clear entities in another frame. They were not known when it was written."""
         self.set_time(index, stamp, received)
         for path in paths:
             self.write(path, rr.Clear(recursive=False))
 
     def refresh(self, known: Set[str] = frozenset()) -> None:
-        """Make the next frame whole without those before: what it lacks is cleared, nothing is kept.
+        """Make the next frame complete without earlier frames: clear what it lacks, and keep nothing.
 
         Args:
-            known: further entities that may be there.
+            known: further entities that may exist.
         """
         self._shown = self._known | known
         self._versions.clear()
@@ -100,7 +103,7 @@ class Writer(Closing):
         return frozenset(self._known)
 
     def flush(self) -> None:
-        """Send what waits for more of its kind."""
+        """Send scalars that wait."""
         for path, rows in self._scalars.items():
             clocks, values = zip(*rows, strict=True)
             self._write_columns(path, clocks, rr.Scalars.columns(scalars=values))
@@ -108,25 +111,26 @@ class Writer(Closing):
         self._sent = time.monotonic()
 
     def close(self) -> None:
+        """Send scalars that wait."""
         self.flush()
 
-    # --- what is written -----------------------------------------------------------------------
+    # --- logging -------------------------------------------------------------------------------
 
     def static(self, path: str, *archetypes: rr.AsComponents) -> None:
-        """Something that holds at all times."""
+        """Log data that holds at all times."""
         for archetype in archetypes:
             self.recording.log(self.root + path, archetype, static=True)
 
     def put(self, path: str, *archetypes: rr.AsComponents) -> None:
-        """Something of this frame alone: the next one that has nothing there clears it."""
+        """Log data of this frame alone. The next frame without data for the entity clears it."""
         self.write(path, *archetypes)
         self._now.add(path)
 
     def video(self, path: str, clip: Clip) -> None:
-        """The picture that a clip ends with, by those of its packets that are not there yet.
+        """Log the last image of a clip, with those packets of the clip that are not logged yet.
 
-        What belongs to no frame is earlier on the timelines that count nanoseconds, as its stamps are. Of a
-        clip that does not go on where the last one ended, all of it lies just before the frame.
+        Packets that belong to no frame get earlier times on the nanosecond timelines, from their stamps. If a
+        clip does not continue the previous one, all its packets lie just before the frame.
         """
         if self._codecs.get(path) != clip.codec:
             self._codecs[path] = clip.codec
@@ -151,25 +155,28 @@ class Writer(Closing):
             self.put(path, rr.VideoStream.from_fields(sample=clip.packets[end]))
 
     def keep(self, path: str, version: int) -> bool:
-        """Keep what the frame before put there, if that was of this version; else False: put it anew."""
+        """Keep the previous frame's data if it has this version. Return whether it is kept.
+
+        If it is not kept, the caller must log the data.
+        """
         kept = self._versions.get(path) == version and path in self._shown
         self._versions[path] = version
         self._now.add(path)
         return kept
 
     def write(self, path: str, *archetypes: rr.AsComponents) -> None:
-        """Something that holds from this frame on, until there is more."""
+        """Log data that holds from this frame on, until newer data."""
         self.recording.log(self.root + path, *archetypes)
 
     def scalar(self, path: str, value: float) -> None:
-        """A number to plot."""
+        """Log a number for a plot."""
         if self._wait > 0:
             self._scalars[path].append((self._clock, value))
         else:
             self.write(path, rr.Scalars(value))
 
     def samples(self, path: str, stamps: I64, received: I64, values: F64) -> None:
-        """Numbers to plot that came between the frames, each row at its own time: (N, D)."""
+        """Log (N, D) numbers for a plot, each row at its own time between the frames."""
         clocks = []
         for stamp, received_at in zip(stamps.tolist(), received.tolist(), strict=True):
             clock = self._clock | dict.fromkeys(self._stamps, stamp)
@@ -180,7 +187,7 @@ class Writer(Closing):
         self._write_columns(path, clocks, columns)
 
     def lines(self, path: str, lines: Sequence[tuple[str, str]]) -> None:
-        """Lines of a log: level and text of each."""
+        """Log lines of a log: level and text of each."""
         if lines:
             levels, texts = zip(*lines, strict=True)
             self._write_columns(
@@ -188,7 +195,7 @@ class Writer(Closing):
             )
 
     def set_time(self, index: int, stamp: int, received: int) -> None:
-        """Where on the timelines what comes next is, without a frame; see ``begin``."""
+        """Set the position on the timelines for the data that follows, without a frame; see ``begin``."""
         self._clock = dict.fromkeys(self._stamps, stamp)
         if entities.STAMP in self._stamps:
             self._clock[entities.FRAME] = index
@@ -205,7 +212,7 @@ class Writer(Closing):
     def _write_columns(
         self, path: str, clocks: Sequence[dict[str, int]], columns: rr.ComponentColumnList
     ) -> None:
-        """Several rows of one entity, each with its place on the timelines."""
+        """Log several rows of an entity, each at its own position on the timelines."""
         times = []
         for name in clocks[0]:
             numbers = [clock[name] for clock in clocks]
