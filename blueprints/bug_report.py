@@ -1,4 +1,4 @@
-"""For somebody who was not there: first what was decided and what went wrong, then the scene."""
+"""Layout for a reader who was not there: decisions and problems first, then the scene."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from bevviz.recording import views
 
 
 def blueprint(scene: Scene) -> rrb.Blueprint:
+    """Return the layout."""
     side: list[rrb.Container | rrb.View] = [views.cameras(scene)] if scene.cameras else []
     return rrb.Blueprint(
         rrb.Vertical(

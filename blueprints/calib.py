@@ -1,4 +1,4 @@
-"""Is it the calibration? The points over the image as stated and as corrected, and the score of each axis."""
+"""Layout for calibration: points over the image as stated and as corrected, and the score of each axis."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from bevviz.recording import views
 
 
 def blueprint(scene: Scene) -> rrb.Blueprint:
+    """Return the layout."""
     pages: list[rrb.Container | rrb.View] = [
         rrb.Horizontal(
             alignment(name),

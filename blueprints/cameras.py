@@ -1,4 +1,4 @@
-"""Cameras alone: what a layout becomes where there is no LiDAR."""
+"""Layout for recordings without a LiDAR: cameras only."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from bevviz.recording import views
 
 
 def blueprint(scene: Scene) -> rrb.Blueprint:
+    """Return the layout."""
     images = [views.camera(scene, name, weak=True) for name in scene.cameras]
     said = [views.explain(), views.why(), views.log(), views.anomaly_log(), views.config()]
     return rrb.Blueprint(

@@ -1,4 +1,4 @@
-"""Two runs on the same frames side by side: A, B, and how they differ."""
+"""Layout for two runs on the same frames: A and B side by side, and their differences."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from bevviz.recording import entities, views
 
 
 def blueprint(scene: Scene) -> rrb.Blueprint:
+    """Return the layout."""
     sides = [
         rrb.Vertical(compare.side_space(scene, root), compare.side_pictures(scene, root), row_shares=[3, 2])
         for root in ("", entities.B)

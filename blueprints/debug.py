@@ -1,4 +1,4 @@
-"""Everything of a frame at once: 3D, cameras, bird's-eye view, what was decided, how long it took."""
+"""Layout with everything of a frame: 3D, cameras, bird's-eye view, decisions and times."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from bevviz.recording import views
 
 
 def blueprint(scene: Scene) -> rrb.Blueprint:
+    """Return the layout."""
     side: list[rrb.Container | rrb.View] = [views.cameras(scene)] if scene.cameras else []
     return rrb.Blueprint(
         rrb.Vertical(

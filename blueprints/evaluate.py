@@ -1,4 +1,4 @@
-"""Right and wrong: true, false and missed objects, how many there were, and the worst frames."""
+"""Layout for an evaluation: true, false and missed objects, their counts, and the worst frames."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from bevviz.recording import entities, views
 
 
 def blueprint(scene: Scene) -> rrb.Blueprint:
+    """Return the layout."""
     side: list[rrb.Container | rrb.View] = [views.cameras(scene)] if scene.cameras else []
     judged = (
         f"{entities.ROBOT}/**",

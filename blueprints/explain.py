@@ -1,4 +1,4 @@
-"""One object and its chain through the stages: where its points went, in words, in 3D and in the image."""
+"""Layout for one object and its chain through the stages: in words, in 3D and in the image."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from bevviz.recording import views
 
 
 def blueprint(scene: Scene) -> rrb.Blueprint:
+    """Return the layout."""
     side: list[rrb.Container | rrb.View] = [views.cameras(scene, why=True)] if scene.cameras else []
     return rrb.Blueprint(
         rrb.Horizontal(

@@ -1,4 +1,4 @@
-"""A running robot: light, at the newest frame, without the raw cloud and the texts."""
+"""Layout for a running robot: the newest frame, without raw clouds and texts, to stay fast."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from bevviz.recording import views
 
 
 def blueprint(scene: Scene) -> rrb.Blueprint:
+    """Return the layout."""
     side: list[rrb.Container | rrb.View] = [views.cameras(scene)] if scene.cameras else []
     return rrb.Blueprint(
         rrb.Horizontal(

@@ -1,4 +1,4 @@
-"""One frame under a configuration that changes: the newest version, and what is new in it."""
+"""Layout for tuning: one frame with the newest version of the configuration, and its differences."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from bevviz.recording import entities, views
 
 
 def blueprint(scene: Scene) -> rrb.Blueprint:
+    """Return the layout."""
     side: list[rrb.Container | rrb.View] = [views.cameras(scene)] if scene.cameras else []
     words = rrb.Tabs(
         compare.differences(), views.explain(), compare.difference_log(), views.log(), views.config()

@@ -1,4 +1,4 @@
-"""Beside the workbench's panel: what can be clicked in space, in the images and from above."""
+"""Layout next to the workbench's panel: 3D, images and bird's-eye view, for selection by click."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from bevviz.recording import entities, views
 
 
 def blueprint(scene: Scene) -> rrb.Blueprint:
+    """Return the layout."""
     side: list[rrb.Container | rrb.View] = [views.cameras(scene, why=True)] if scene.cameras else []
     beside = (f"{entities.ROBOT}/**", f"{entities.WHY}/**")
     return rrb.Blueprint(

@@ -1,4 +1,4 @@
-"""Beside a running robot, in the workbench's page: what can be clicked, at the newest frame."""
+"""Layout next to the workbench's panel for a running robot, at the newest frame."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from bevviz.recording import entities, views
 
 
 def blueprint(scene: Scene) -> rrb.Blueprint:
+    """Return the layout."""
     side: list[rrb.Container | rrb.View] = [views.cameras(scene, why=True)] if scene.cameras else []
     beside = (f"{entities.ROBOT}/**", f"{entities.WHY}/**")
     return rrb.Blueprint(
