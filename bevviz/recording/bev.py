@@ -15,7 +15,9 @@ from bevviz.recording import entities, retention
 from bevviz.recording.primitives import blob, jpeg, png
 from bevviz.recording.writer import Writer
 
-_TURNED = np.array([0.0, 0.0, -np.sqrt(0.5), np.sqrt(0.5)])  # rotation by -90 degrees about z, as x, y, z, w
+_GRID_ROTATION = np.array(
+    [0.0, 0.0, -np.sqrt(0.5), np.sqrt(0.5)]
+)  # rotation by -90 degrees about z, as x, y, z, w
 
 
 def log_bev(to: Writer, bev: Bev, config: Config) -> None:
@@ -45,10 +47,10 @@ def log_grid(to: Writer, result: FrameResult, bev: Bev) -> None:
         heights = result.voxels.points[::32, 2].compress(result.ground.mask[::32])
         level = float(np.median(heights)) if len(heights) else 0.0
     corner = np.array([-bev.range_x, bev.range_y, level - 0.05])
-    pose = result.frame.pose @ geometry.transform(corner, _TURNED)
+    pose = result.frame.pose @ geometry.transform(corner, _GRID_ROTATION)
     to.put(
         entities.GRID,
-        _grid_looks(*grid.shape, bev.resolution),
+        _grid_style(*grid.shape, bev.resolution),
         rr.GridMap.from_fields(
             data=blob(grid.view(np.uint8).ravel()),
             translation=pose[:3, 3],
@@ -58,7 +60,7 @@ def log_grid(to: Writer, result: FrameResult, bev: Bev) -> None:
 
 
 @lru_cache(maxsize=2)
-def _grid_looks(rows: int, columns: int, resolution: float) -> rr.GridMap:
+def _grid_style(rows: int, columns: int, resolution: float) -> rr.GridMap:
     return rr.GridMap.from_fields(
         format=rr.components.ImageFormat(width=columns, height=rows, color_model="L", channel_datatype="U8"),
         cell_size=resolution,
@@ -67,12 +69,12 @@ def _grid_looks(rows: int, columns: int, resolution: float) -> rr.GridMap:
     )
 
 
-def seen_from_above(config: BevConfig, points_from_those: F64, those: F32) -> F32:
+def seen_from_above(config: BevConfig, points_from_frame: F64, positions: F32) -> F32:
     """Project (..., 3) positions to (..., 2) pixels of the bird's-eye image."""
     reach = np.array([config.range_x, config.range_y], np.float32)
-    xy = geometry.apply(points_from_those, those.reshape(-1, 3))[:, :2]
+    xy = geometry.apply(points_from_frame, positions.reshape(-1, 3))[:, :2]
     pixels = ((reach - xy) / np.float32(config.resolution))[:, ::-1]
-    return np.asarray(pixels, np.float32).reshape(*those.shape[:-1], 2)
+    return np.asarray(pixels, np.float32).reshape(*positions.shape[:-1], 2)
 
 
 def footprints(corners: F32) -> F32:

@@ -47,17 +47,17 @@ def load(name_or_path: str, scene: Scene, config: Config | None = None) -> rrb.B
         UserError: the name is unknown, the file does not exist, or it does not make a layout.
     """
     if config is not None:
-        whole, log = is_whole(config), config.logging
-        color_by = log.color_by if whole and log.raw_cloud else ()
-        scene = replace(scene, above=_ahead(config.bev), raw=whole, color_by=color_by)
+        is_complete, logging = is_whole(config), config.logging
+        color_by = logging.color_by if is_complete and logging.raw_cloud else ()
+        scene = replace(scene, above=_bounds_ahead(config.bev), raw=is_complete, color_by=color_by)
     if name_or_path in names():
         if not scene.lidar and scene.cameras:
             name_or_path = "cameras"
         return _from_python(_folder() / f"{name_or_path}.py", scene)
     path = Path(name_or_path)
     if path.suffix not in (".py", ".rbl"):
-        near = difflib.get_close_matches(name_or_path, names(), 1, 0.4)
-        hint = f"did you mean '{near[0]}'?" if near else f"there are {', '.join(names())}"
+        close_names = difflib.get_close_matches(name_or_path, names(), 1, 0.4)
+        hint = f"did you mean '{close_names[0]}'?" if close_names else f"there are {', '.join(names())}"
         raise UserError(f"--blueprint {name_or_path}: unknown; {hint} (or give a .py or .rbl file)")
     if not path.is_file():
         raise UserError(f"--blueprint {path}: no such file")
@@ -67,7 +67,7 @@ def load(name_or_path: str, scene: Scene, config: Config | None = None) -> rrb.B
     return Saved(path)
 
 
-def _ahead(config: BevConfig) -> tuple[float, float, float, float]:
+def _bounds_ahead(config: BevConfig) -> tuple[float, float, float, float]:
     """Return the pixel bounds of the area ahead of the robot and close to its sides."""
     rows, columns = config.range_x / config.resolution, config.range_y / config.resolution
     return 0.5 * columns, 0.1 * rows, 1.5 * columns, 1.25 * rows

@@ -28,7 +28,7 @@ from bevviz.recording.labels import (
     log_spoken_in_image,
     log_spoken_looks_in_image,
 )
-from bevviz.recording.primitives import CORNER, boxes2d, encode_image, scored, transform
+from bevviz.recording.primitives import CORNER, boxes2d, encode_image, scored, texts_by_row, transform
 from bevviz.recording.writer import Writer
 
 if TYPE_CHECKING:
@@ -58,8 +58,8 @@ def log_camera_looks(to: Writer, cameras: Iterable[str]) -> None:
 def log_shared_image(to: Writer, camera: str) -> None:
     """Draw the results of a run under a root over the main run's image. There is only one image."""
     boxes = entities.detections(camera)
-    over = (entities.projected(camera), boxes, entities.outlines(boxes), entities.names(boxes))
-    for path in (*over, entities.weak(camera)):
+    paths = (entities.projected(camera), boxes, entities.outlines(boxes), entities.names(boxes))
+    for path in (*paths, entities.weak(camera)):
         to.static(path, over_image(camera))
 
 
@@ -94,8 +94,8 @@ def log_camera(
     if world_from_camera is not None:
         to.put(entities.sensor(camera.name), transform(world_from_camera))
     if camera.image is not None:
-        is_video = camera.image.clip is not None and to.streams_video
-        if videos is not None and not is_video and camera.image.media_type not in retention.LOSSY:
+        is_stream = camera.image.clip is not None and to.streams_video
+        if videos is not None and not is_stream and camera.image.media_type not in retention.LOSSY:
             videos.log(to, camera.name, camera.image)
         else:
             log_image(to, camera.name, camera.image, quality)
@@ -169,25 +169,26 @@ def log_detections(to: Writer, result: CameraResult, explanations: Iterable[Expl
     if len(others):
         to.put(entities.weak(name), _boxes(detections, others))
     if len(kept):
-        colors = [class_color(detections.names[d]) for d in kept]
+        colors = [class_color(detections.names[row]) for row in kept]
         to.put(entities.detections(name), _boxes(detections, kept, colors=colors))
-        texts = {e.row: e.text for e in explanations if e.subject == "detection" and e.camera == name}
+        texts = texts_by_row(explanations, "detection", name)
         if detections.masks is not None:
             _log_masks(to, name, detections, detections.masks, kept)
         xyxy = detections.xyxy[kept]
-        labels = scored((detections.names[d] for d in kept), detections.score[kept])
-        lost = np.zeros(len(kept), bool)
+        labels = scored((detections.names[row] for row in kept), detections.score[kept])
+        unmatched = np.zeros(len(kept), bool)
         if result.fusion is not None:
-            lost = result.fusion.detection_decision[kept] != Decision.MATCHED
+            unmatched = result.fusion.detection_decision[kept] != Decision.MATCHED
         size = _size(result.camera)
-        below = np.stack([xyxy[:, ::2].mean(axis=1), xyxy[:, 3]], axis=1) / size[0]
-        named = apart(below, xyxy[:, 1] - xyxy[:, 3], IN_IMAGE, lost)  # the tallest are usually the nearest
+        label_positions = np.stack([xyxy[:, ::2].mean(axis=1), xyxy[:, 3]], axis=1) / size[0]
+        # The tallest boxes come first, as they are usually the nearest.
+        has_name = apart(label_positions, xyxy[:, 1] - xyxy[:, 3], IN_IMAGE, unmatched)
         log_spoken_in_image(
             to,
             entities.detections(name),
             xyxy,
-            [label if is_named else "" for label, is_named in zip(labels, named, strict=True)],
-            [texts.get(d, label) for d, label in zip(kept.tolist(), labels, strict=True)],
+            [label if is_named else "" for label, is_named in zip(labels, has_name, strict=True)],
+            [texts.get(row, label) for row, label in zip(kept.tolist(), labels, strict=True)],
             colors,
         )
 
@@ -207,25 +208,27 @@ def _size(camera: Camera) -> F32:
 def _log_masks(to: Writer, name: str, detections: Detections, masks: Masks, rows: I64) -> None:
     """Log the outlines of the masks."""
     lines, colors = [], []
-    for d in rows.tolist():
-        if not masks.has(d):
+    for row in rows.tolist():
+        if not masks.has(row):
             continue
-        found, _ = cv2.findContours(masks.cells(d).astype(np.uint8), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_SIMPLE)
-        corner = masks.place[d, :2] + np.float32(0.5) - masks.grid[2:]
-        for outline in found:
+        contours, _ = cv2.findContours(
+            masks.cells(row).astype(np.uint8), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_SIMPLE
+        )
+        corner = masks.place[row, :2] + np.float32(0.5) - masks.grid[2:]
+        for outline in contours:
             closed = np.concatenate([outline[:, 0], outline[:1, 0]])
             lines.append((closed + corner) / masks.grid[:2])
-            colors.append(class_color(detections.names[d]))
+            colors.append(class_color(detections.names[row]))
     if lines:
         to.put(entities.masks(name), rr.LineStrips2D(lines, colors=colors))
 
 
-def _boxes(detections: Detections, rows: I64, **looks: Any) -> rr.Boxes2D:
+def _boxes(detections: Detections, rows: I64, **style: Any) -> rr.Boxes2D:
     return boxes2d(
         detections.xyxy[rows],
-        scored((detections.names[d] for d in rows), detections.score[rows]),
-        class_ids=[entities.DETECTION_CLASS[DetectionState(s)] for s in detections.state[rows]],
-        **looks,
+        scored((detections.names[row] for row in rows), detections.score[rows]),
+        class_ids=[entities.DETECTION_CLASS[DetectionState(state)] for state in detections.state[rows]],
+        **style,
     )
 
 
@@ -239,10 +242,10 @@ def log_projected_points(to: Writer, result: CameraResult, *, packed: bool = Fal
     """
     if result.uv is None or result.depth is None:
         return
-    seen = np.isfinite(result.uv[:, 0])
-    if seen.any():
-        depth = bins(result.depth[seen], 0, entities.DEPTH_RANGE, entities.DEPTH_BINS)
-        uv = result.uv[seen] + CORNER
+    visible = np.isfinite(result.uv[:, 0])
+    if visible.any():
+        depth = bins(result.depth[visible], 0, entities.DEPTH_RANGE, entities.DEPTH_BINS)
+        uv = result.uv[visible] + CORNER
         if packed:
             rows = retention.sorted_rows(uv, retention.PIXEL)
             uv, depth = np.rint(uv[rows] * retention.PIXEL) / np.float32(retention.PIXEL), depth[rows]

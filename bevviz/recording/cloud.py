@@ -30,21 +30,21 @@ def log_cloud_looks(to: Writer, lidars: Iterable[str]) -> None:
             to.static(path, rr.Points3D.from_fields(radii=rr.Radius.ui_points(1.5)))
 
 
-def log_cloud(to: Writer, result: FrameResult, wanted: Sequence[Quantity]) -> None:
+def log_cloud(to: Writer, result: FrameResult, quantities: Sequence[Quantity]) -> None:
     """Log every raw point without loss, with the quantities that can colour it.
 
     With several LiDARs, each cloud is logged in its own frame.
     """
     frame = result.frame
     log_cloud_poses(to, frame)
-    heights = color_by.height_ids(result) if "height" in wanted else np.zeros(len(frame.points), np.uint8)
+    heights = color_by.height_ids(result) if "height" in quantities else np.zeros(len(frame.points), np.uint8)
     fields = {entities.points(cloud.name): cloud.fields for cloud in frame.clouds}
     start = 0
     for path, points, class_ids in raw_clouds(result):
         end = start + len(points)
-        own = fields[path] if len(frame.clouds) > 1 else frame.fields
-        further = color_by.class_ids(wanted, points, heights[start:end], own)
-        to.put(path, color_by.ColoredPoints(rr.Points3D(points, class_ids=class_ids), further))
+        cloud_fields = fields[path] if len(frame.clouds) > 1 else frame.fields
+        ids_by_quantity = color_by.class_ids(quantities, points, heights[start:end], cloud_fields)
+        to.put(path, color_by.ColoredPoints(rr.Points3D(points, class_ids=class_ids), ids_by_quantity))
         start = end
 
 
@@ -60,16 +60,16 @@ def raw_clouds(result: FrameResult) -> list[RawCloud]:
     frame = result.frame
     class_ids = np.zeros(len(frame.points), np.uint16)
     if result.voxels is not None and result.ground is not None:
-        of_voxels = np.where(result.ground.mask, ClassId.GROUND, ClassId.OBSTACLE).astype(np.uint16)
-        class_ids = of_points(of_voxels, result.voxels.inverse)
+        voxel_ids = np.where(result.ground.mask, ClassId.GROUND, ClassId.OBSTACLE).astype(np.uint16)
+        class_ids = of_points(voxel_ids, result.voxels.inverse)
     if len(frame.clouds) <= 1:
         return [(entities.points(frame.lidar), frame.points, class_ids)] if len(frame.points) else []
-    found, end = [], 0
+    clouds, end = [], 0
     for cloud in frame.clouds:
         start, end = end, end + len(cloud.xyz)
         if len(cloud.xyz):
-            found.append((entities.points(cloud.name), cloud.xyz, class_ids[start:end]))
-    return found
+            clouds.append((entities.points(cloud.name), cloud.xyz, class_ids[start:end]))
+    return clouds
 
 
 def log_ground(to: Writer, result: FrameResult, voxel_size: float, *, packed: bool = False) -> None:

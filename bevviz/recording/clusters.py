@@ -57,21 +57,21 @@ def log_clusters(
         if packed is not None:
             rows = retention.sorted_rows(points, packed, labels)
             points, labels = coarse(points.take(rows, axis=0), packed), labels.take(rows)
-        of_points, of_boxes = _colors(clusters, tracked, labels, kept)
+        point_ids, box_ids = _colors(clusters, tracked, labels, kept)
         to.put(
             entities.clusters(frame.lidar),
-            rr.Points3D(points, class_ids=of_points),
-            boxes3d(boxes, kept, [f"{k}" for k in kept], class_ids=of_boxes),
+            rr.Points3D(points, class_ids=point_ids),
+            boxes3d(boxes, kept, [f"{row}" for row in kept], class_ids=box_ids),
         )
     if len(others):
-        states = [ClusterState(s) for s in clusters.state[others].tolist()]
+        states = [ClusterState(state) for state in clusters.state[others].tolist()]
         to.put(
             entities.set_aside(frame.lidar),
             boxes3d(
                 boxes,
                 others,
-                [f"{k}: {n} points" for k, n in zip(others, clusters.count[others], strict=True)],
-                class_ids=[entities.CLUSTER_CLASS[s] for s in states],
+                [f"{row}: {count} points" for row, count in zip(others, clusters.count[others], strict=True)],
+                class_ids=[entities.CLUSTER_CLASS[state] for state in states],
             ),
         )
 

@@ -42,21 +42,24 @@ _STEPS, _DEPTHS, _SHARES, _RINGS = 64, entities.DEPTH_BINS, 32, 256  # ids of ea
 class ColoredPoints(rr.AsComponents):
     """Points with class ids by further quantities."""
 
-    def __init__(self, points: rr.Points3D, further: Mapping[Quantity, ClassIds]) -> None:
-        self._points, self._further = points, further
+    def __init__(self, points: rr.Points3D, ids_by_quantity: Mapping[Quantity, ClassIds]) -> None:
+        self._points, self._ids_by_quantity = points, ids_by_quantity
 
     def as_component_batches(self) -> list[rr.DescribedComponentBatch]:
         """Return the components of the points and of the further class ids."""
         batches = self._points.as_component_batches()
-        if self._further:
-            columns: dict[str, Any] = {name: pa.array(ids) for name, ids in self._further.items()}
+        if self._ids_by_quantity:
+            columns: dict[str, Any] = {name: pa.array(ids) for name, ids in self._ids_by_quantity.items()}
             batches += rr.DynamicArchetype(COMPONENTS, components=columns).as_component_batches()
         return batches
 
 
 @np.errstate(over="ignore", invalid="ignore")  # fields may hold any value
 def class_ids(
-    wanted: Sequence[Quantity], points: F32, heights: NDArray[np.uint8], fields: Mapping[str, NDArray[Any]]
+    quantities: Sequence[Quantity],
+    points: F32,
+    heights: NDArray[np.uint8],
+    fields: Mapping[str, NDArray[Any]],
 ) -> dict[Quantity, ClassIds]:
     """Return class ids of each point by quantity: (N,), or (1,) if the cloud lacks the field.
 
@@ -66,24 +69,24 @@ def class_ids(
         heights: (N,) class ids from ``height_ids``.
         fields: further (N,) fields of the cloud.
     """
-    found: dict[Quantity, ClassIds] = {}
-    for name in wanted:
+    ids_by_quantity: dict[Quantity, ClassIds] = {}
+    for name in quantities:
         if name == "height":
-            found[name] = heights
+            ids_by_quantity[name] = heights
         elif name == "distance":
-            away = np.sqrt(np.einsum("ij,ij->i", points, points))
-            found[name] = _scaled(away, 0.0, entities.DEPTH_RANGE, _DISTANCE, _DEPTHS)
+            distances = np.sqrt(np.einsum("ij,ij->i", points, points))
+            ids_by_quantity[name] = _scaled(distances, 0.0, entities.DEPTH_RANGE, _DISTANCE, _DEPTHS)
         elif (values := next((fields[field] for field in FIELDS[name] if field in fields), None)) is None:
-            found[name] = np.array([_ABSENT], np.uint8)
+            ids_by_quantity[name] = np.array([_ABSENT], np.uint8)
         elif name == "intensity":
-            found[name] = _scaled(values, 0.0, _brightest(values), _INTENSITY, _SHARES)
+            ids_by_quantity[name] = _scaled(values, 0.0, _brightest(values), _INTENSITY, _SHARES)
         elif name == "ring":
-            found[name] = (values.astype(np.int64) % _RINGS + _RING).astype(np.uint16)
+            ids_by_quantity[name] = (values.astype(np.int64) % _RINGS + _RING).astype(np.uint16)
         else:
-            some = values[np.isfinite(values)]
-            first, last = (some.min(), some.max()) if len(some) else (0, 0)
-            found[name] = _scaled(values - first, 0.0, float(last - first), _TIME, _SHARES)
-    return found
+            finite = values[np.isfinite(values)]
+            first, last = (finite.min(), finite.max()) if len(finite) else (0, 0)
+            ids_by_quantity[name] = _scaled(values - first, 0.0, float(last - first), _TIME, _SHARES)
+    return ids_by_quantity
 
 
 def height_ids(result: FrameResult) -> NDArray[np.uint8]:
@@ -92,8 +95,8 @@ def height_ids(result: FrameResult) -> NDArray[np.uint8]:
     Without a ground, the height is measured from the lowest points.
     """
     if result.voxels is not None and result.ground is not None:
-        of_voxels = _scaled(result.ground.height, 0.0, TALLEST, _HEIGHT, _STEPS)
-        return of_points(of_voxels, result.voxels.inverse)
+        voxel_ids = _scaled(result.ground.height, 0.0, TALLEST, _HEIGHT, _STEPS)
+        return of_points(voxel_ids, result.voxels.inverse)
     z = result.frame.points[:, 2]
     lowest = float(np.percentile(z[:: len(z) // 5_000 + 1], 1)) if len(z) else 0.0
     return _scaled(z, lowest, lowest + TALLEST, _HEIGHT, _STEPS)
@@ -107,8 +110,11 @@ def annotation_context() -> rr.AnnotationContext:
     scales = [
         *(_info(_HEIGHT + k, f"{k * TALLEST / _STEPS:.1f} m high", color) for k, color in enumerate(steps)),
         *(_info(_DISTANCE + k, f"{k * depth:.0f} m away", color) for k, color in enumerate(steps[::-1])),
-        *(_info(_INTENSITY + k, f"intensity {100 * k // _SHARES} %", c) for k, c in enumerate(shares)),
-        *(_info(_TIME + k, f"{100 * k // _SHARES} % into the scan", c) for k, c in enumerate(shares)),
+        *(
+            _info(_INTENSITY + k, f"intensity {100 * k // _SHARES} %", color)
+            for k, color in enumerate(shares)
+        ),
+        *(_info(_TIME + k, f"{100 * k // _SHARES} % into the scan", color) for k, color in enumerate(shares)),
         *(_info(_RING + k, f"ring {k}", rings[k % len(rings)]) for k in range(_RINGS)),
         _info(_ABSENT, "not in this cloud", (130, 130, 140)),
     ]
@@ -151,7 +157,7 @@ def _brightest(values: NDArray[Any]) -> float:
 
     The coarse steps keep the scale constant between most scans.
     """
-    some = values[:: len(values) // 5_000 + 1]
-    some = some[np.isfinite(some)]
-    share = float(np.percentile(some, 99)) if len(some) else 0.0
-    return float(2.0 ** (np.ceil(np.log2(share) * 2) / 2)) if share > 0 else 1.0
+    sample = values[:: len(values) // 5_000 + 1]
+    sample = sample[np.isfinite(sample)]
+    percentile = float(np.percentile(sample, 99)) if len(sample) else 0.0
+    return float(2.0 ** (np.ceil(np.log2(percentile) * 2) / 2)) if percentile > 0 else 1.0

@@ -9,14 +9,14 @@ import numpy as np
 
 from bevviz.model.results import Detections, DetectionState, Explanation, FrameResult
 from bevviz.recording import entities
-from bevviz.recording.primitives import document, scored
+from bevviz.recording.primitives import document, explanations_of, scored
 from bevviz.recording.writer import Writer
 from bevviz.support.text import markdown
 
-_WEAK = {"not_kept", "below_threshold", "suppressed"}
-_DOUBT = {"contradicted": 0, "missed": 1, "named otherwise": 2, "confirmed": 3}  # order on the page
-_LINES = 5  # log lines for contradicted objects in a frame: a network may have hundreds
-_MANY = {"out_of_view", "too_small", "too_large"}  # clusters in these states are only counted and numbered
+_NOT_KEPT_STATES = {"not_kept", "below_threshold", "suppressed"}
+_OBJECT_ORDER = {"contradicted": 0, "missed": 1, "named otherwise": 2, "confirmed": 3}  # order on the page
+_MAX_LINES = 5  # log lines for contradicted objects in a frame: a network may have hundreds
+_COUNTED_STATES = {"out_of_view", "too_small", "too_large"}  # clusters that are only counted and numbered
 
 
 def log_decisions(to: Writer, result: FrameResult) -> None:
@@ -35,14 +35,14 @@ def page(result: FrameResult) -> str:
 
 def remarks(result: FrameResult) -> list[tuple[str, str]]:
     """Return log lines (level and text) for failures, problems, unmatched detections and doubtful objects."""
-    lines = [("ERROR", f"{f.stage}: {f.reason}") for f in result.failures]
+    lines = [("ERROR", f"{failure.stage}: {failure.reason}") for failure in result.failures]
     lines += [("WARN", problem) for problem in result.frame.problems]
     for camera in result.cameras:
         lines += [("WARN", f"{camera.camera.name}: {problem}") for problem in camera.camera.problems]
     lines += [
-        ("INFO", f"{e.camera}: {e.text}")
-        for e in result.explanations
-        if e.subject == "detection" and e.state not in _WEAK and e.state != "matched"
+        ("INFO", f"{explanation.camera}: {explanation.text}")
+        for explanation in explanations_of(result.explanations, "detection")
+        if explanation.state not in _NOT_KEPT_STATES and not _is_matched(explanation)
     ]
     return lines + [("INFO", text) for text in _in_doubt(result.explanations)]
 
@@ -51,52 +51,73 @@ def _lines(result: FrameResult) -> Iterator[str]:
     frame = result.frame
     yield f"### Frame {frame.index}"
     yield ""
-    around = frame.around
-    yield from _section("Marks", map(markdown, around.marks if around is not None else ()))
-    yield from _section("Failures", (f"**{f.stage}**: {markdown(f.reason)}" for f in result.failures))
-    problems = list(frame.problems)
-    problems += [e.text for e in result.explanations if e.subject == "camera"]
-    yield from _section("Problems", map(markdown, problems))
-    objects = [e for e in result.explanations if e.subject == "object"]
-    said = [e for e in objects if e.state != "unseen"]
-    missed = [e for e in result.explanations if e.subject == "fused" and e.state == "missed"]
-    worst = sorted([*said, *missed], key=lambda e: _DOUBT.get(e.state, len(_DOUBT)))
-    unseen = [f"{len(objects) - len(said)} unseen"] if len(objects) > len(said) else []
-    yield from _section("Objects, by cameras and our fusion", [*map(_item, worst), *unseen])
+    surroundings = frame.around
+    yield from _section("Marks", map(markdown, surroundings.marks if surroundings is not None else ()))
+    yield from _section(
+        "Failures", (f"**{failure.stage}**: {markdown(failure.reason)}" for failure in result.failures)
+    )
+    explanations = result.explanations
+    camera_problems = [explanation.text for explanation in explanations_of(explanations, "camera")]
+    yield from _section("Problems", map(markdown, [*frame.problems, *camera_problems]))
+    yield from _section("Objects, by cameras and our fusion", _objects(explanations))
     for camera in result.cameras:
         name = camera.camera.name
-        mine = [e for e in result.explanations if e.subject == "detection" and e.camera == name]
-        kept = sorted((e for e in mine if e.state not in _WEAK), key=lambda e: e.state == "matched")
         if camera.detections is not None:
-            yield from _section(f"{name}: detections", map(_item, kept) if kept else ["none"])
-            yield from _section(f"{name}: not kept", map(markdown, _not_kept(mine, camera.detections)))
-        yield from _clusters(
-            [e for e in result.explanations if e.subject == "cluster" and e.camera == name], name
-        )
-        made = [e for e in result.explanations if e.subject == "split" and e.camera == name]
-        yield from _section(f"{name}: clusters split and merged", map(_item, made))
-    yield from _clusters([e for e in result.explanations if e.subject == "cluster" and not e.camera], "")
+            decided = explanations_of(explanations, "detection", name)
+            kept = [explanation for explanation in decided if explanation.state not in _NOT_KEPT_STATES]
+            yield from _section(
+                f"{name}: detections", [*map(_item, sorted(kept, key=_is_matched))] or ["none"]
+            )
+            yield from _section(f"{name}: not kept", map(markdown, _not_kept(decided, camera.detections)))
+        yield from _clusters(explanations_of(explanations, "cluster", name), name)
+        splits = explanations_of(explanations, "split", name)
+        yield from _section(f"{name}: clusters split and merged", map(_item, splits))
+    yield from _clusters(explanations_of(explanations, "cluster", ""), "")
 
 
-def _in_doubt(explanations: Iterable[Explanation]) -> Iterator[str]:
+def _is_matched(explanation: Explanation) -> bool:
+    return explanation.state == "matched"
+
+
+def _objects(explanations: Sequence[Explanation]) -> Iterator[str]:
+    """Yield an item for each object that a camera can judge or that is missed, the worst first."""
+    objects = explanations_of(explanations, "object")
+    judged = [explanation for explanation in objects if explanation.state != "unseen"]
+    fused = explanations_of(explanations, "fused")
+    missed = [explanation for explanation in fused if explanation.state == "missed"]
+    for explanation in sorted([*judged, *missed], key=_severity):
+        yield _item(explanation)
+    if len(objects) > len(judged):
+        yield f"{len(objects) - len(judged)} unseen"
+
+
+def _severity(explanation: Explanation) -> int:
+    """Return the position of an object's opinion on the page."""
+    return _OBJECT_ORDER.get(explanation.state, len(_OBJECT_ORDER))
+
+
+def _in_doubt(explanations: Sequence[Explanation]) -> Iterator[str]:
     """Yield a line for each contradicted object, up to a limit, and for each missed object."""
-    said = [(e.subject, e.state, e.text) for e in explanations]
-    denied = [text for *what, text in said if what == ["object", "contradicted"]]
-    yield from denied[:_LINES]
-    if len(denied) > _LINES:
-        yield f"{len(denied) - _LINES} more objects contradicted"
-    yield from (text for *what, text in said if what == ["fused", "missed"])
+    objects, fused = explanations_of(explanations, "object"), explanations_of(explanations, "fused")
+    contradicted = [explanation.text for explanation in objects if explanation.state == "contradicted"]
+    yield from contradicted[:_MAX_LINES]
+    if len(contradicted) > _MAX_LINES:
+        yield f"{len(contradicted) - _MAX_LINES} more objects contradicted"
+    yield from (explanation.text for explanation in fused if explanation.state == "missed")
 
 
-def _not_kept(explanations: Sequence[Explanation], found: Detections) -> Iterator[str]:
+def _not_kept(explanations: Sequence[Explanation], detections: Detections) -> Iterator[str]:
     """Yield a line for each detection that suppresses others, and one for all below the threshold."""
-    for d in np.unique(found.suppressed_by[found.state == DetectionState.SUPPRESSED]).tolist():
-        names = Counter(found.names[s] for s in np.flatnonzero(found.suppressed_by == d).tolist())
-        [label] = scored([found.names[d]], [found.score[d]])
+    for row in np.unique(detections.suppressed_by[detections.state == DetectionState.SUPPRESSED]).tolist():
+        names = Counter(
+            detections.names[suppressed]
+            for suppressed in np.flatnonzero(detections.suppressed_by == row).tolist()
+        )
+        [label] = scored([detections.names[row]], [detections.score[row]])
         yield f"{_counted(names)} suppressed by {label}"
-    below = [e for e in explanations if e.state == "below_threshold"]
+    below = [explanation for explanation in explanations if explanation.state == "below_threshold"]
     if below:
-        best = max(below, key=lambda e: found.score[e.row])
+        best = max(below, key=lambda explanation: detections.score[explanation.row])
         yield f"{len(below)} more, the best {best.text}" if below[1:] else best.text
 
 
@@ -111,10 +132,10 @@ def _clusters(explanations: list[Explanation], camera: str) -> Iterator[str]:
     if not explanations:
         return
     title = f"{camera}: clusters" if camera else "Clusters"
-    told = [e for e in explanations if e.state not in _MANY]
-    items = [_item(e) for e in sorted(told, key=lambda e: e.state == "matched")]
-    for state in sorted(_MANY):
-        rows = [e.row for e in explanations if e.state == state]
+    detailed = [explanation for explanation in explanations if explanation.state not in _COUNTED_STATES]
+    items = [*map(_item, sorted(detailed, key=_is_matched))]
+    for state in sorted(_COUNTED_STATES):
+        rows = [explanation.row for explanation in explanations if explanation.state == state]
         if rows:
             items.append(f"{len(rows)} {state.replace('_', ' ')}: {', '.join(map(str, rows))}")
     yield from _section(title, items)

@@ -45,11 +45,11 @@ def check_decodes(path: Path, otherwise: str = "cannot be read", *, first: int |
             its reason, when the recording is read.
     """
     with path.open("rb") as file:
-        given: dict[str, Any] = {"stdin": file} if first is None else {"input": file.read(first)}
-        quiet = subprocess.DEVNULL
+        input_arguments: dict[str, Any] = {"stdin": file} if first is None else {"input": file.read(first)}
+        null = subprocess.DEVNULL
         command = rerun_cli.tied([rerun_cli.program(), "rrd", "verify"])
-        ended = subprocess.run(
-            command, **given, stdout=quiet, stderr=quiet, env=rerun_cli.environment(), check=False
+        status = subprocess.run(
+            command, **input_arguments, stdout=null, stderr=null, env=rerun_cli.environment(), check=False
         ).returncode
-    if ended < 0 or ended >= PANIC:
+    if status < 0 or status >= PANIC:
         raise UserError(f"{path}: {otherwise}: it is damaged, Rerun's own reader breaks on it")

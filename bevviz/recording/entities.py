@@ -146,12 +146,12 @@ def image_opinion(camera: str, opinion: str) -> str:
 
     The objects are external, from a 3D detector or a topic, or they are missed by it.
     """
-    return f"{image(camera)}/opinions/{_part(opinion)}"
+    return f"{image(camera)}/opinions/{_path_part(opinion)}"
 
 
 def overlay_opinion(opinion: str) -> str:
     """Return the entity of objects that share an opinion of the cameras, drawn over the bird's-eye image."""
-    return overlay(f"opinions/{_part(opinion)}")
+    return overlay(f"opinions/{_path_part(opinion)}")
 
 
 def channel(name: str) -> str:
@@ -166,27 +166,27 @@ def overlay(what: str) -> str:
 
 def robot(topic: str) -> str:
     """Return the entity of data that the robot published on a topic."""
-    return f"{ROBOT}{_topic(topic)}"
+    return f"{ROBOT}{_topic_path(topic)}"
 
 
 def rotation(topic: str) -> str:
     """Return the entity of an IMU's rotation rates."""
-    return f"{ROTATION}{_topic(topic)}"
+    return f"{ROTATION}{_topic_path(topic)}"
 
 
 def acceleration(topic: str) -> str:
     """Return the entity of an IMU's accelerations."""
-    return f"{ACCELERATION}{_topic(topic)}"
+    return f"{ACCELERATION}{_topic_path(topic)}"
 
 
 def robot_overlay(topic: str) -> str:
     """Return the entity of a topic's boxes, drawn over the bird's-eye image."""
-    return overlay(f"robot{_topic(topic)}")
+    return overlay(f"robot{_topic_path(topic)}")
 
 
 def diagnostic(name: str) -> str:
     """Return the state lane of a component in the robot's diagnostics."""
-    return f"{DIAGNOSTICS}/{_part(name)}"
+    return f"{DIAGNOSTICS}/{_path_part(name)}"
 
 
 def state(*lane: str) -> str:
@@ -196,12 +196,12 @@ def state(*lane: str) -> str:
 
 def topic_state(topic: str) -> str:
     """Return the lane that shows whether a topic's messages arrive and can be used."""
-    return f"{STATES}/topics{_topic(topic)}"
+    return f"{STATES}/topics{_topic_path(topic)}"
 
 
 def class_state(camera: str, class_name: str) -> str:
     """Return the lane that shows the decision about the best detection of a class."""
-    return state(camera, _part(class_name))
+    return state(camera, _path_part(class_name))
 
 
 def why(what: str) -> str:
@@ -226,7 +226,7 @@ def difference_count(change: str) -> str:
 
 def difference_state(class_name: str) -> str:
     """Return the lane of the differences of a class."""
-    return f"{COMPARE_STATES}/{_part(class_name)}"
+    return f"{COMPARE_STATES}/{_path_part(class_name)}"
 
 
 def judged(what: str) -> str:
@@ -241,7 +241,7 @@ def judged_count(what: str) -> str:
 
 def sweep(metric: str) -> str:
     """Return the entity of a metric over the parameter of a sweep."""
-    return f"{SWEEP}/{_part(metric)}"
+    return f"{SWEEP}/{_path_part(metric)}"
 
 
 def track_state(lane: int) -> str:
@@ -322,17 +322,17 @@ def calib_corrected(camera: str) -> str:
     return f"{CALIB}/{camera}/corrected"
 
 
-def _part(name: str) -> str:
+def _path_part(name: str) -> str:
     """Turn an external name into one path part. No character in it ends the part or needs an escape."""
     return re.sub(r"[\s/\\]", "_", name) or "_"
 
 
 def _change(change: str) -> str:
-    return _part(change).lower()
+    return _path_part(change).lower()
 
 
-def _topic(topic: str) -> str:
-    return "".join(f"/{_part(part)}" for part in topic.split("/") if part)
+def _topic_path(topic: str) -> str:
+    return "".join(f"/{_path_part(part)}" for part in topic.split("/") if part)
 
 
 # --- class ids ---------------------------------------------------------------------------------

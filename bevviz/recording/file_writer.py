@@ -36,11 +36,11 @@ class FileWriter(Closing):
         self._failure: OSError | None = None
         self._written = 0  # bytes
         self._handle = os.open(file, os.O_WRONLY | os.O_NOFOLLOW | os.O_CLOEXEC)
-        self._out, self._in = os.pipe()
+        self._read_end, self._write_end = os.pipe()
         if sys.platform == "linux":
             with suppress(OSError):
-                fcntl.fcntl(self._out, fcntl.F_SETPIPE_SZ, PIECE)
-        self.sink = rr.FileSink(f"/dev/fd/{self._in}")
+                fcntl.fcntl(self._read_end, fcntl.F_SETPIPE_SZ, PIECE)
+        self.sink = rr.FileSink(f"/dev/fd/{self._write_end}")
         self._thread = threading.Thread(target=self._run, name="file", daemon=True)
         self._thread.start()
 
@@ -49,8 +49,8 @@ class FileWriter(Closing):
 
         Call it when Rerun has opened the sink.
         """
-        os.close(self._in)
-        self._in = -1
+        os.close(self._write_end)
+        self._write_end = -1
 
     def check(self) -> None:
         """Raise UserError if the file can no longer be written."""
@@ -64,30 +64,30 @@ class FileWriter(Closing):
         """
         if self._handle < 0:
             return
-        if self._in >= 0:
+        if self._write_end >= 0:
             self.begin()
         self._thread.join()
         os.close(self._handle)
-        os.close(self._out)
+        os.close(self._read_end)
         self._handle = -1
 
     def _run(self) -> None:
-        waiting = bytearray()
-        expected = HEAD  # bytes up to the end of the last message seen so far
-        while piece := os.read(self._out, PIECE):
-            waiting += piece
-            whole = 0
-            while len(waiting) >= expected:
-                whole = expected
-                if len(waiting) < whole + MESSAGE.size:
+        buffer = bytearray()
+        message_end = HEAD  # bytes up to the end of the last message seen so far
+        while piece := os.read(self._read_end, PIECE):
+            buffer += piece
+            complete = 0
+            while len(buffer) >= message_end:
+                complete = message_end
+                if len(buffer) < complete + MESSAGE.size:
                     break
-                _, length = MESSAGE.unpack_from(waiting, whole)
-                expected = whole + MESSAGE.size + length
-            with memoryview(waiting) as view, view[:whole] as part:
-                self._write(part)
-            del waiting[:whole]
-            expected -= whole
-        with memoryview(waiting) as view:
+                _, length = MESSAGE.unpack_from(buffer, complete)
+                message_end = complete + MESSAGE.size + length
+            with memoryview(buffer) as view, view[:complete] as messages:
+                self._write(messages)
+            del buffer[:complete]
+            message_end -= complete
+        with memoryview(buffer) as view:
             self._write(view)  # the footer is no message
 
     def _write(self, data: memoryview) -> None:

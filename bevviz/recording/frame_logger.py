@@ -113,43 +113,43 @@ class Logger(Writer):
     ) -> None:
         super().__init__(recording, root, wait, stamps)
         self._inputs = not root if inputs is None else inputs
-        self._brought: set[str] = set()  # entities of the sensors and the robot
+        self._input_entities: set[str] = set()  # entities of the sensors and the robot
         self._config = config
         self.streams_video = config.logging.video == "stream"
         self._scene, self._network = scene, network
         self._intrinsics: dict[str, Intrinsics] = {}
-        self._fixed: dict[str, Fixed] = {}
+        self._static_data: dict[str, Fixed] = {}
         self._track_lanes = Lanes()
         self._state_lanes = StateLanes(COLORS, plain_lanes=entities.ANOMALY_STATES)
-        self._around = AroundLog()
+        self._robot_log = AroundLog()
         self._onsets = Onsets()
-        self._last: Frame | None = None
+        self._last_frame: Frame | None = None
         self._rates = Rates()
-        self._videos, self._around_raw = Videos(), Around()
+        self._videos, self._cloud_selector = Videos(), Around()
         self._raw_shown: set[str] = set()  # entities with the raw clouds of the previous frame
         self._raw_known: set[str] = set()
-        self._watched: dict[str, str] = {}  # state lane of the pipeline or a camera -> its state
-        self._changed = False  # whether the configuration changed before this frame
-        self._late: dict[str, int] = {}  # topic of late robot results -> stamp of the newest
+        self._watched_states: dict[str, str] = {}  # state lane of the pipeline or a camera -> its state
+        self._config_changed = False  # whether the configuration changed before this frame
+        self._late_stamps: dict[str, int] = {}  # topic of late robot results -> stamp of the newest
 
     @property
     def context(self) -> Context:
         """State that the last logged frame relies on."""
-        last = self._last
-        clock = (0, 0, 0) if last is None else (last.index, last.stamp, last.received)
+        frame = self._last_frame
+        clock = (0, 0, 0) if frame is None else (frame.index, frame.stamp, frame.received)
         return Context(
-            self._config, self._scene, clock, self._intrinsics, self._state_lanes.states, self._fixed
+            self._config, self._scene, clock, self._intrinsics, self._state_lanes.states, self._static_data
         )
 
     @property
     def clouds_left_out(self) -> int:
         """Number of events without raw clouds around them, because the limit of raw clouds was reached."""
-        return self._around_raw.left_out
+        return self._cloud_selector.left_out
 
     @property
     def results(self) -> frozenset[str]:
         """Entities that any frame had, except the input of the sensors and the robot."""
-        return self.known - self._brought
+        return self.known - self._input_entities
 
     def refresh(self, known: Set[str] = frozenset()) -> None:
         """Make the next frame complete, as ``Writer.refresh`` does.
@@ -160,7 +160,7 @@ class Logger(Writer):
         self._videos.restart()
         self._raw_shown = set(self._raw_known)
         if not self._inputs:
-            self._shown -= self._brought
+            self._shown -= self._input_entities
 
     # --- once ----------------------------------------------------------------------------------
 
@@ -185,8 +185,8 @@ class Logger(Writer):
         self.log_static()
         for name, intrinsics in context.intrinsics.items():
             self._log_intrinsics(name, intrinsics)
-        for path, fixed in context.fixed.items():
-            self.static(path, *fixed)
+        for path, data in context.fixed.items():
+            self.static(path, *data)
         if context.lanes:
             self.set_time(*context.clock)
             self._state_lanes.log(self, context.lanes)
@@ -195,7 +195,7 @@ class Logger(Writer):
         """Change the configuration and the sensors for the frames that follow."""
         had_opinions = self._has_opinions
         same, self._config, self._scene = scene == self._scene, config, scene
-        self._changed = True
+        self._config_changed = True
         self.streams_video = config.logging.video == "stream"
         if same:  # the viewer loses class colours that are logged twice
             log_origin(self, config, scene, self._network)
@@ -233,9 +233,9 @@ class Logger(Writer):
             cloud: write the raw cloud, coloured as ground and obstacles, even without inputs.
         """
         frame = result.frame
-        for found in late:
-            self._late[found.boxes.topic] = found.boxes.stamp
-            log_late(self, found, self._config.bev)
+        for late_result in late:
+            self._late_stamps[late_result.boxes.topic] = late_result.boxes.stamp
+            log_late(self, late_result, self._config.bev)
         self.begin(frame.index, frame.stamp, frame.received)
         self._log_stages(result, cloud)
         self._log_changes(result, health, notes, states)
@@ -248,12 +248,12 @@ class Logger(Writer):
         frame = result.frame
         if frame.lidar:
             self.put(entities.sensor(frame.lidar), transform(frame.pose))
-        before = set(self._now)
+        entities_before = set(self._now)
         if self._inputs:
             self._log_input(result)
         elif cloud:
             log_cloud(self, result, self._config.logging.color_by)
-        self._brought |= self._now - before
+        self._input_entities |= self._now - entities_before
         self._log_lidar_results(result)
         for camera in result.cameras:
             log_detections(self, camera, result.explanations)
@@ -268,7 +268,7 @@ class Logger(Writer):
             if self._config.logging.keep != "report":
                 log_grid(self, result, result.bev)
         if not self.root:
-            self._log_fixed(frame)
+            self._log_static_data(frame)
             log_shapes(self, frame)
             log_motions(self, frame)
 
@@ -285,27 +285,27 @@ class Logger(Writer):
         log_fusion(self, result)
         if result.tracks is not None:
             log_tracks(self, frame, result.tracks, self._config.bev)
-        lines = marks(frame) if self.root else self._around.lines(frame)
+        lines = marks(frame) if self.root else self._robot_log.lines(frame)
         self.lines(entities.EXPLAIN_LOG, [*notes, *lines])
         started = self._onsets.of(result.anomalies)
         log_anomalies(self, result, started)
         self._log_states(result, states)
-        kept = self._config.logging
-        if self._inputs and kept.keep == "inspect" and kept.raw_cloud:
-            self._log_some_clouds(result, strange=bool(started))
+        logging = self._config.logging
+        if self._inputs and logging.keep == "inspect" and logging.raw_cloud:
+            self._log_selected_clouds(result, is_event=bool(started))
         self._rates.add(frame)
-        log_health(self, result, self._last, self._rates, health)
-        self._last = frame
+        log_health(self, result, self._last_frame, self._rates, health)
+        self._last_frame = frame
 
     def log_meanwhile(
         self, seconds: float, notes: Sequence[tuple[str, str]], states: Mapping[str, str]
     ) -> None:
         """Log notes and states while no frame arrives, ``seconds`` after the last frame was received."""
-        if self._last is None:
+        if self._last_frame is None:
             return
-        later = round(seconds * 1e9)
-        last = self._last
-        self.set_time(last.index, last.stamp + later, last.received + later if last.received else 0)
+        elapsed = round(seconds * 1e9)
+        last = self._last_frame
+        self.set_time(last.index, last.stamp + elapsed, last.received + elapsed if last.received else 0)
         self.lines(entities.EXPLAIN_LOG, notes)
         self._state_lanes.log(self, {**self._state_lanes.states, **states})
 
@@ -323,17 +323,20 @@ class Logger(Writer):
                 self._log_intrinsics(camera.camera.name, camera.camera.intrinsics)
         log_truth(self, frame, config.bev)
         log_robot(self, frame, config.bev)
-        for topic, stamp in list(self._late.items()):
+        for topic, stamp in list(self._late_stamps.items()):
             if frame.stamp - stamp > STALE:
-                del self._late[topic]
+                del self._late_stamps[topic]
                 forget_late(self, topic)
 
-    def _log_fixed(self, frame: Frame) -> None:
+    def _log_static_data(self, frame: Frame) -> None:
         """Log static data that the frame is the first to have."""
-        for path, make in fixed_parts(frame).items():
-            if path not in self._fixed and (fixed := make()) is not None:
-                self._fixed = {**self._fixed, path: fixed}  # a Context may hold the previous mapping
-                self.static(path, *fixed)
+        for path, make_data in fixed_parts(frame).items():
+            if path not in self._static_data and (data := make_data()) is not None:
+                self._static_data = {
+                    **self._static_data,
+                    path: data,
+                }  # a Context may hold the previous mapping
+                self.static(path, *data)
 
     def _log_intrinsics(self, name: str, intrinsics: Intrinsics) -> None:
         """Log intrinsics if they changed."""
@@ -377,7 +380,7 @@ class Logger(Writer):
             scale = step(size, FINE)
             log_clusters(self, frame, clusters, result.tracks, result.obstacles, config.clustering, scale)
 
-    def _log_some_clouds(self, result: FrameResult, *, strange: bool) -> None:
+    def _log_selected_clouds(self, result: FrameResult, *, is_event: bool) -> None:
         """Log the raw clouds of this frame and of buffered earlier frames, if they are wanted.
 
         Call it after anomalies and states are logged, because changes in them select the clouds.
@@ -388,29 +391,29 @@ class Logger(Writer):
             *(entities.state(camera.camera.name) for camera in result.cameras),
         ]
         watched = {lane: self._state_lanes.states.get(lane, "") for lane in lanes}
-        strange |= any(self._watched.get(lane, state) != state for lane, state in watched.items())
-        asked_for = bool(marks(frame)) or self._changed
-        self._watched, self._changed = watched, False
-        now, left_out = (frame.index, frame.stamp, frame.received), self._around_raw.left_out
-        wanted = self._around_raw.see(
-            Held(now, clouds), self._config.logging, strange=strange, wanted=asked_for
+        is_event |= any(self._watched_states.get(lane, state) != state for lane, state in watched.items())
+        is_user_event = bool(marks(frame)) or self._config_changed
+        self._watched_states, self._config_changed = watched, False
+        clock, left_out = (frame.index, frame.stamp, frame.received), self._cloud_selector.left_out
+        selected = self._cloud_selector.see(
+            Held(clock, clouds), self._config.logging, strange=is_event, wanted=is_user_event
         )
-        if self._around_raw.left_out > left_out:
-            often = f"logging.raw_share is reached; {self._around_raw.left_out} times so far"
-            self.lines(entities.EXPLAIN_LOG, [("INFO", f"no raw clouds around what begins here: {often}")])
-        for one in wanted:
-            self.set_time(*one.clock)
-            for path, points, class_ids in one.clouds:
+        if self._cloud_selector.left_out > left_out:
+            text = f"logging.raw_share is reached; {self._cloud_selector.left_out} times so far"
+            self.lines(entities.EXPLAIN_LOG, [("INFO", f"no raw clouds around what begins here: {text}")])
+        for frame_clouds in selected:
+            self.set_time(*frame_clouds.clock)
+            for path, points, class_ids in frame_clouds.clouds:
                 self.write(path, rr.Points3D(points, class_ids=class_ids))
-        self.set_time(*now)
-        shown = {path for path, _, _ in clouds} if wanted else set()
-        for path in sorted(self._raw_shown - shown):
+        self.set_time(*clock)
+        shown_paths = {path for path, _, _ in clouds} if selected else set()
+        for path in sorted(self._raw_shown - shown_paths):
             self.write(path, rr.Clear(recursive=False))
-        self._raw_shown = shown
-        self._raw_known |= shown
+        self._raw_shown = shown_paths
+        self._raw_known |= shown_paths
 
-    def _log_states(self, result: FrameResult, more: Mapping[str, str]) -> None:
-        states = {**states_of(result), **more}
+    def _log_states(self, result: FrameResult, extra_states: Mapping[str, str]) -> None:
+        states = {**states_of(result), **extra_states}
         rows = self._track_lanes.update(result.tracks)
         if result.tracks is not None:
             log_speeds(self, result.tracks, rows)

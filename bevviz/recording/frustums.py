@@ -28,26 +28,27 @@ def log_frustums(to: Writer, frame: Frame, cameras: Sequence[CameraResult]) -> N
     labels: list[str] = []
     for camera in cameras:
         pose, intrinsics = camera_pose(frame, camera), camera.camera.intrinsics
-        found, fusion = camera.detections, camera.fusion
-        if pose is None or intrinsics is None or found is None or fusion is None:
+        detections, fusion = camera.detections, camera.fusion
+        if pose is None or intrinsics is None or detections is None or fusion is None:
             continue
-        rows = np.flatnonzero(found.kept)
+        rows = np.flatnonzero(detections.kept)
         if len(rows) == 0:
             continue
-        far = np.full(len(found), _UNMATCHED_DEPTH, np.float32)
+        far = np.full(len(detections), _UNMATCHED_DEPTH, np.float32)
         matched = fusion.detection_decision == Decision.MATCHED
         pairs = fusion.pairs
-        chosen = matched[pairs.detection] & (fusion.detection_cluster[pairs.detection] == pairs.cluster)
-        far[pairs.detection[chosen]] = pairs.depth[chosen]
+        is_best = matched[pairs.detection] & (fusion.detection_cluster[pairs.detection] == pairs.cluster)
+        far[pairs.detection[is_best]] = pairs.depth[is_best]
         near = np.full(len(rows), _NEAR, np.float32)
-        corners = geometry.frustum(found.xyxy[rows], intrinsics, near, far[rows])
+        corners = geometry.frustum(detections.xyxy[rows], intrinsics, near, far[rows])
         corners = geometry.apply(pose, corners.reshape(-1, 3)).reshape(-1, 8, 3)
-        names = [found.names[d] for d in rows]
+        names = [detections.names[row] for row in rows]
         strips.append(edges(corners))
         colors += [
-            class_color(n) if m else _UNMATCHED_COLOR for n, m in zip(names, matched[rows], strict=True)
+            class_color(name) if is_matched else _UNMATCHED_COLOR
+            for name, is_matched in zip(names, matched[rows], strict=True)
         ]
-        labels += scored(names, found.score[rows])
+        labels += scored(names, detections.score[rows])
     if strips:
         to.put(
             entities.FRUSTUMS,

@@ -37,18 +37,18 @@ class Rates:
 
     def add(self, frame: Frame) -> None:
         """Count a frame."""
-        for times, now in zip(self._times.values(), (frame.stamp, frame.received), strict=True):
-            if times and now < times[-1]:
+        for times, stamp in zip(self._times.values(), (frame.stamp, frame.received), strict=True):
+            if times and stamp < times[-1]:
                 times.clear()
-            times.append(now)
-            while len(times) > 2 and times[1] <= now - WINDOW:
+            times.append(stamp)
+            while len(times) > 2 and times[1] <= stamp - WINDOW:
                 times.popleft()
 
     def __iter__(self) -> Iterator[tuple[str, float]]:
         """By what was counted, in Hz; nothing as long as little is known."""
-        for what, times in self._times.items():
+        for clock, times in self._times.items():
             if len(times) > 1 and times[-1] - times[0] >= LEAST:
-                yield what, (len(times) - 1) * 1e9 / (times[-1] - times[0])
+                yield clock, (len(times) - 1) * 1e9 / (times[-1] - times[0])
 
 
 def log_health_looks(to: Writer) -> None:
@@ -88,10 +88,10 @@ def health(result: FrameResult, last: Frame | None, rates: Rates) -> Iterator[tu
         yield entities.stage_time(stage), seconds * 1e3
     if result.timings.get("total"):
         yield entities.rate("pipeline"), 1 / result.timings["total"]
-    for what, rate in rates:
-        yield entities.rate(what), rate
-    for what, number in counts_of(result, last).items():
-        yield entities.count(what), number
+    for name, rate in rates:
+        yield entities.rate(name), rate
+    for name, number in counts_of(result, last).items():
+        yield entities.count(name), number
     if frame.lidar:
         yield entities.tf_age(frame.lidar), frame.tf_age * 1e3
     for camera in result.cameras:

@@ -26,13 +26,15 @@ EYE, LOOK = (-16.0, 5.0, 11.0), (10.0, 0.0, -1.0)  # default eye position and lo
 IN_SPACE, FROM_ABOVE, IN_IMAGE = (0.24, 0.035), (20.0, 3.5), (0.21, 0.05)
 LETTER = 0.014  # width of a letter in an image, as a fraction of the image width; for longer names
 
-_POINT, _COLOR = rr.Radius.ui_points(0.0), (235, 238, 245)
+_INVISIBLE, _COLOR = rr.Radius.ui_points(0.0), (235, 238, 245)
 
 
 def log_spoken_looks(to: Writer, path: str) -> None:
     """Log the static style of outlines and names of 3D boxes."""
     to.static(entities.outlines(path), rr.LineStrips3D.from_fields(radii=rr.Radius.ui_points(2.5)))
-    to.static(entities.names(path), rr.Points3D.from_fields(radii=_POINT, colors=[_COLOR], show_labels=True))
+    to.static(
+        entities.names(path), rr.Points3D.from_fields(radii=_INVISIBLE, colors=[_COLOR], show_labels=True)
+    )
 
 
 def log_spoken_looks_in_image(to: Writer, path: str, draw_order: float) -> None:
@@ -44,7 +46,9 @@ def log_spoken_looks_in_image(to: Writer, path: str, draw_order: float) -> None:
 
 def log_names_looks(to: Writer, path: str, draw_order: float) -> None:
     """Log the static style of names in an image."""
-    points = rr.Points2D.from_fields(radii=_POINT, colors=[_COLOR], show_labels=True, draw_order=draw_order)
+    points = rr.Points2D.from_fields(
+        radii=_INVISIBLE, colors=[_COLOR], show_labels=True, draw_order=draw_order
+    )
     to.static(entities.names(path), points)
 
 
@@ -66,26 +70,26 @@ def log_spoken(
         sentences: tooltip of each box.
         colors: colour of each outline.
     """
-    rows, words = _rows(len(boxes)), rr.AnyValues(says=_filled(sentences))
+    rows, tooltips = _logged_rows(len(boxes)), rr.AnyValues(says=_repeat_single(sentences))
     lines = edges(geometry.corners(boxes))[rows]
-    to.put(entities.outlines(path), rr.LineStrips3D(lines, colors=[colors[row] for row in rows]), words)
+    to.put(entities.outlines(path), rr.LineStrips3D(lines, colors=[colors[row] for row in rows]), tooltips)
     if any(names):
         tops = boxes.center + boxes.size * np.array([0, 0, 0.5], np.float32)
-        to.put(entities.names(path), rr.Points3D(tops[rows], labels=_filled(names)), words)
+        to.put(entities.names(path), rr.Points3D(tops[rows], labels=_repeat_single(names)), tooltips)
 
 
 def log_spoken_in_image(
     to: Writer, path: str, xyxy: F32, names: Sequence[str], sentences: Sequence[str], colors: Sequence[Color]
 ) -> None:
     """Log outlines and names over boxes in an image. ``xyxy``: (K, 4) pixels in bevviz's convention."""
-    rows, words = _rows(len(xyxy)), rr.AnyValues(says=_filled(sentences))
+    rows, tooltips = _logged_rows(len(xyxy)), rr.AnyValues(says=_repeat_single(sentences))
     corners = (xyxy + CORNER)[rows][:, [0, 1, 2, 1, 2, 3, 0, 3, 0, 1]].reshape(-1, 5, 2)
-    to.put(entities.outlines(path), rr.LineStrips2D(corners, colors=[colors[row] for row in rows]), words)
+    to.put(entities.outlines(path), rr.LineStrips2D(corners, colors=[colors[row] for row in rows]), tooltips)
     if any(names):
         to.put(
             entities.names(path),
-            rr.Points2D((corners[:, 2] + corners[:, 3]) / 2, labels=_filled(names)),
-            words,
+            rr.Points2D((corners[:, 2] + corners[:, 3]) / 2, labels=_repeat_single(names)),
+            tooltips,
         )
 
 
@@ -93,11 +97,11 @@ def log_stroked(
     to: Writer, path: str, strokes: Sequence[F32], names: Sequence[str], sentences: Sequence[str], places: F32
 ) -> None:
     """Log (K,) outlines of (M, 2) pixels with a sentence each, and names at (K, 2) ``places``."""
-    rows, words = _rows(len(strokes)), rr.AnyValues(says=_filled(sentences))
-    chosen = [strokes[row] for row in rows]
-    to.put(path, rr.LineStrips2D(strips(np.concatenate(chosen), np.array([*map(len, chosen)]))), words)
+    rows, tooltips = _logged_rows(len(strokes)), rr.AnyValues(says=_repeat_single(sentences))
+    lines = [strokes[row] for row in rows]
+    to.put(path, rr.LineStrips2D(strips(np.concatenate(lines), np.array([*map(len, lines)]))), tooltips)
     if any(names):
-        to.put(entities.names(path), rr.Points2D(places[rows], labels=_filled(names)), words)
+        to.put(entities.names(path), rr.Points2D(places[rows], labels=_repeat_single(names)), tooltips)
 
 
 def row_of(instance: int, count: int) -> int:
@@ -120,9 +124,9 @@ def named_in_space(places: F32 | F64, first: Bool | None = None, height: float =
     ahead /= np.linalg.norm(ahead)
     right = np.cross(ahead, (0.0, 0.0, 1.0))
     right /= np.linalg.norm(right)
-    seen = (places - np.array(EYE)) @ np.stack([right, np.cross(right, ahead), ahead], axis=1)
-    at = seen[:, :2] / np.maximum(seen[:, 2:], 0.1)
-    return apart(at, _away(places), (IN_SPACE[0] / height, IN_SPACE[1] / height), first)
+    eye_positions = (places - np.array(EYE)) @ np.stack([right, np.cross(right, ahead), ahead], axis=1)
+    tangents = eye_positions[:, :2] / np.maximum(eye_positions[:, 2:], 0.1)
+    return apart(tangents, _distances(places), (IN_SPACE[0] / height, IN_SPACE[1] / height), first)
 
 
 def named_from_above(places: F32) -> Bool:
@@ -131,7 +135,7 @@ def named_from_above(places: F32) -> Bool:
     Args:
         places: (K, 2 or 3) positions around the robot, x ahead.
     """
-    return apart(places[:, 1::-1], _away(places), FROM_ABOVE)
+    return apart(places[:, 1::-1], _distances(places), FROM_ABOVE)
 
 
 def apart(
@@ -146,26 +150,29 @@ def apart(
         first: (K,) mask of names that come before all others.
     """
     chosen: list[tuple[float, float, float]] = []
-    wide = np.broadcast_to(room[0], len(at)).tolist()
-    found: Bool = np.zeros(len(at), bool)
+    widths = np.broadcast_to(room[0], len(at)).tolist()
+    mask: Bool = np.zeros(len(at), bool)
     rows = np.lexsort((order, ~first)) if first is not None else np.argsort(order, kind="stable")
-    places = at.tolist()
+    positions = at.tolist()
     for row in rows.tolist():
-        x, y = places[row]
-        if all(abs(x - u) >= (wide[row] + w) / 2 or abs(y - v) >= room[1] for u, v, w in chosen):
-            found[row] = True
-            chosen.append((x, y, wide[row]))
+        x, y = positions[row]
+        if all(
+            abs(x - other_x) >= (widths[row] + other_width) / 2 or abs(y - other_y) >= room[1]
+            for other_x, other_y, other_width in chosen
+        ):
+            mask[row] = True
+            chosen.append((x, y, widths[row]))
             if len(chosen) == NEAR:
                 break
-    return found
+    return mask
 
 
-def _away(places: F32 | F64) -> F32:
-    away: F32 = np.hypot(places[:, 0], places[:, 1])
-    return away
+def _distances(places: F32 | F64) -> F32:
+    distances: F32 = np.hypot(places[:, 0], places[:, 1])
+    return distances
 
 
-def _rows(count: int) -> list[int]:
+def _logged_rows(count: int) -> list[int]:
     """Return the rows to log. A single row is repeated.
 
     The viewer takes a component with one row for a value of all rows, and shows only its number.
@@ -173,5 +180,5 @@ def _rows(count: int) -> list[int]:
     return list(range(count)) if count > 1 else [0, 0]
 
 
-def _filled(texts: Sequence[str]) -> list[str]:
+def _repeat_single(texts: Sequence[str]) -> list[str]:
     return [*texts] if len(texts) > 1 else [*texts, *texts]

@@ -13,7 +13,7 @@ from bevviz.model.results import SIDES, FrameResult, Objects, Opinion
 from bevviz.recording import entities, tracks
 from bevviz.recording.labels import log_spoken, log_spoken_looks, named_in_space
 from bevviz.recording.opinions import marked
-from bevviz.recording.primitives import boxes3d, scored, transform
+from bevviz.recording.primitives import boxes3d, scored, texts_by_row, transform
 from bevviz.recording.writer import Writer
 
 
@@ -29,23 +29,28 @@ def log_objects(to: Writer, result: FrameResult) -> None:
     objects, tracked = result.objects, result.tracks
     if objects is None or not len(objects):
         return
-    reasons = {(e.camera, e.row): e.text for e in result.explanations if e.subject == "detection"}
+    match_reasons = {
+        (explanation.camera, explanation.row): explanation.text
+        for explanation in result.explanations
+        if explanation.subject == "detection"
+    }
     labels = scored(objects.names, objects.score)
-    odd, is_odd = {anomaly.subject for anomaly in result.anomalies}, np.zeros(len(objects), bool)
+    unusual_subjects = {anomaly.subject for anomaly in result.anomalies}
+    is_unusual = np.zeros(len(objects), bool)
     ids, speeds = np.full(len(objects), -1), np.full(len(objects), np.nan, np.float32)
-    for j, row in enumerate(tracks.of_objects(tracked, len(objects))):
-        if row is not None and tracked is not None:
-            labels[j] = tracks.label(tracked, row)
-            is_odd[j] = anomalies.label(tracked, row) in odd
-            ids[j], speeds[j] = tracked.id[row], tracked.speed[row]
+    for row, track in enumerate(tracks.of_objects(tracked, len(objects))):
+        if track is not None and tracked is not None:
+            labels[row] = tracks.label(tracked, track)
+            is_unusual[row] = anomalies.label(tracked, track) in unusual_subjects
+            ids[row], speeds[row] = tracked.id[track], tracked.speed[track]
     matches = zip(objects.camera, objects.detection.tolist(), strict=True)
-    why = [reasons.get(match, "") for match in matches]
+    reasons = [match_reasons.get(pair, "") for pair in matches]
     opinions, values = result.opinions, dict[str, Any]()
     if opinions is not None:
-        said = {e.row: e.text for e in result.explanations if e.subject == "object"}
-        why = [said.get(j, "") for j in range(len(objects))]
+        opinion_texts = texts_by_row(result.explanations, "object")
+        reasons = [opinion_texts.get(row, "") for row in range(len(objects))]
         values["opinion"] = [Opinion(value).word for value in opinions.opinion.tolist()]
-        is_odd |= opinions.opinion == Opinion.CONTRADICTED
+        is_unusual |= opinions.opinion == Opinion.CONTRADICTED
     colors = [class_color(name) for name in objects.names]
     to.put(
         entities.FUSED,
@@ -59,12 +64,12 @@ def log_objects(to: Writer, result: FrameResult) -> None:
             cluster=objects.cluster,
             camera=list(objects.camera),
             seen=sides(objects),
-            reason=why,
+            reason=reasons,
             **values,
         ),
     )
-    away = np.hypot(*objects.boxes.center[:, :2].T)
-    is_named = named_in_space(objects.boxes.center, is_odd)
+    distances = np.hypot(*objects.boxes.center[:, :2].T)
+    is_named = named_in_space(objects.boxes.center, is_unusual)
     log_spoken(
         to,
         entities.FUSED,
@@ -72,7 +77,7 @@ def log_objects(to: Writer, result: FrameResult) -> None:
         [label if named else "" for label, named in zip(_with_doubts(labels, result), is_named, strict=True)],
         [
             f"{label}, {metres:.1f} m away: {reason.partition(': ')[2] or 'an object'}"
-            for label, metres, reason in zip(labels, away, why, strict=True)
+            for label, metres, reason in zip(labels, distances, reasons, strict=True)
         ],
         marked(result, colors),
     )
@@ -80,7 +85,7 @@ def log_objects(to: Writer, result: FrameResult) -> None:
         rows = np.flatnonzero((objects.measured.size != objects.boxes.size).any(axis=1))
         if len(rows):
             measured = boxes3d(
-                objects.measured, rows, [labels[j] for j in rows], colors=[colors[j] for j in rows]
+                objects.measured, rows, [labels[row] for row in rows], colors=[colors[row] for row in rows]
             )
             to.put(entities.MEASURED, transform(result.frame.pose), measured)
 
@@ -89,11 +94,11 @@ def _with_doubts(labels: list[str], result: FrameResult) -> list[str]:
     """Return the labels, with the opinion of a camera that contradicts the object or its class."""
     if result.opinions is None:
         return labels
-    said = map(Opinion, result.opinions.opinion.tolist())
+    opinions = map(Opinion, result.opinions.opinion.tolist())
     doubts = Opinion.CONTRADICTED, Opinion.NAMED_OTHERWISE
     return [
         f"{label}, {opinion.word}" if opinion in doubts else label
-        for label, opinion in zip(labels, said, strict=True)
+        for label, opinion in zip(labels, opinions, strict=True)
     ]
 
 

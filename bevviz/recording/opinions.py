@@ -27,14 +27,24 @@ from bevviz.recording.labels import (
     log_stroked,
     named_in_space,
 )
-from bevviz.recording.primitives import CORNER, OUTLINE, boxes3d, image_outlines, scored, transform
+from bevviz.recording.primitives import (
+    CORNER,
+    OUTLINE,
+    boxes3d,
+    image_outlines,
+    scored,
+    texts_by_row,
+    transform,
+)
 from bevviz.recording.writer import Writer
 
 DIM = 0.65  # factor on the class colour of objects that both methods have
 MISSED = "missed"
 DOUBTS = ("contradicted", "named otherwise", MISSED)  # opinions whose objects get a name
 
-_MARKED = {opinion: OPINIONS[opinion.word] for opinion in (Opinion.CONTRADICTED, Opinion.NAMED_OTHERWISE)}
+_DOUBT_COLORS = {
+    opinion: OPINIONS[opinion.word] for opinion in (Opinion.CONTRADICTED, Opinion.NAMED_OTHERWISE)
+}
 
 
 def log_opinions_looks(to: Writer, cameras: Iterable[str]) -> None:
@@ -50,12 +60,12 @@ def log_opinions_looks(to: Writer, cameras: Iterable[str]) -> None:
     for camera in cameras:
         for opinion in OPINIONS:
             path = entities.image_opinion(camera, opinion)
-            _log_looks_in_view(to, path, opinion)
+            _log_outline_style(to, path, opinion)
             if to.root:
-                for shown in (path, entities.names(path)):
-                    to.static(shown, over_image(camera))
+                for entity in (path, entities.names(path)):
+                    to.static(entity, over_image(camera))
     for opinion in OPINIONS:
-        _log_looks_in_view(to, entities.overlay_opinion(opinion), opinion)
+        _log_outline_style(to, entities.overlay_opinion(opinion), opinion)
     for what, color in zip(COUNTED, SERIES[len(COUNTS) :], strict=False):
         to.static(entities.count(what), rr.SeriesLines(colors=[color], widths=[1.5]))
 
@@ -66,7 +76,7 @@ def log_fusion(to: Writer, result: FrameResult) -> None:
     if opinions is None or not len(opinions.fused):
         return
     fused, missed = opinions.fused, opinions.missed
-    reasons = {e.row: e.text for e in result.explanations if e.subject == "fused"}
+    reasons = texts_by_row(result.explanations, "fused")
     labels = scored(fused.names, fused.score)
     colors = [
         class_color(name) if is_missed else _dim(class_color(name))
@@ -82,16 +92,16 @@ def log_fusion(to: Writer, result: FrameResult) -> None:
             cluster=fused.cluster,
             camera=list(fused.camera),
             missed=missed,
-            reason=[reasons.get(j, "") for j in range(len(fused))],
+            reason=[reasons.get(row, "") for row in range(len(fused))],
         ),
     )
-    named = named_in_space(fused.boxes.center, missed) & missed
+    has_name = named_in_space(fused.boxes.center, missed) & missed
     log_spoken(
         to,
         entities.FUSION,
         fused.boxes,
-        [f"{label}, missed" if is_named else "" for label, is_named in zip(labels, named, strict=True)],
-        [reasons.get(j, label) for j, label in enumerate(labels)],
+        [f"{label}, missed" if is_named else "" for label, is_named in zip(labels, has_name, strict=True)],
+        [reasons.get(row, label) for row, label in enumerate(labels)],
         colors,
     )
 
@@ -117,9 +127,9 @@ class Told:
 def told_in_image(result: FrameResult, camera: Camera) -> Mapping[str, Told]:
     """Return the outlines of objects in a camera's image, by the entity of their opinion."""
     return {
-        entities.image_opinion(camera.name, opinion): told
+        entities.image_opinion(camera.name, opinion): outlines
         for opinion, boxes, rows in _by_opinion(result)
-        if (told := _told(opinion, rows, image_outlines(boxes.chosen(rows), camera))).rows
+        if (outlines := _visible_outlines(opinion, rows, image_outlines(boxes.chosen(rows), camera))).rows
     }
 
 
@@ -130,31 +140,31 @@ def told_from_above(result: FrameResult) -> Mapping[str, Told]:
     """
     config = result.config.bev
     reach = np.array([config.range_x, config.range_y], np.float32)
-    found = {}
+    outlines_by_entity = {}
     for opinion, boxes, all_rows in _by_opinion(result):
         rows = all_rows[(np.abs(boxes.center[all_rows, :2]) < reach).all(axis=1)]
         if len(rows):
             outlines = footprints(geometry.corners(boxes.chosen(rows)))
             strokes = [*seen_from_above(config, np.eye(4), outlines)]
-            found[entities.overlay_opinion(opinion)] = Told(opinion, rows.tolist(), strokes)
-    return found
+            outlines_by_entity[entities.overlay_opinion(opinion)] = Told(opinion, rows.tolist(), strokes)
+    return outlines_by_entity
 
 
 def log_opinions_in_images(to: Writer, result: FrameResult) -> None:
     """Log object outlines over each image, in the colour of the cameras' opinion."""
-    for found in result.cameras if result.opinions is not None else ():
-        camera = found.camera
-        if (told := told_in_image(result, camera)) and camera.intrinsics is not None:
+    for camera_result in result.cameras if result.opinions is not None else ():
+        camera = camera_result.camera
+        if (outlines := told_in_image(result, camera)) and camera.intrinsics is not None:
             width = camera.intrinsics.width
-            beside = _Beside(np.array(IN_IMAGE) * width, LETTER * width, CORNER, over=True)
-            _log_told(to, result, told, beside)
+            layout = _NameLayout(np.array(IN_IMAGE) * width, LETTER * width, CORNER, over=True)
+            _log_outlines(to, result, outlines, layout)
 
 
 def log_opinions_from_above(to: Writer, result: FrameResult) -> None:
     """Log object outlines over the bird's-eye image, which has the names of the method's objects already."""
     if result.opinions is not None:
         room = np.array(FROM_ABOVE) / result.config.bev.resolution
-        _log_told(to, result, told_from_above(result), _Beside(room, 0.0, 0.0, over=False))
+        _log_outlines(to, result, told_from_above(result), _NameLayout(room, 0.0, 0.0, over=False))
 
 
 def _by_opinion(result: FrameResult) -> Iterator[tuple[str, Boxes3D, I64]]:
@@ -162,22 +172,22 @@ def _by_opinion(result: FrameResult) -> Iterator[tuple[str, Boxes3D, I64]]:
     opinions, objects = result.opinions, result.objects
     if opinions is None or objects is None:
         return
-    said = np.array([Opinion(value).word for value in opinions.opinion.tolist()], np.str_)
+    words = np.array([Opinion(value).word for value in opinions.opinion.tolist()], np.str_)
     for opinion in OPINIONS:
         if opinion == MISSED:
             yield opinion, opinions.fused.boxes, np.flatnonzero(opinions.missed)
         else:
-            yield opinion, objects.boxes, np.flatnonzero(said == opinion)
+            yield opinion, objects.boxes, np.flatnonzero(words == opinion)
 
 
-def _told(opinion: str, rows: I64, strokes: Sequence[F32]) -> Told:
+def _visible_outlines(opinion: str, rows: I64, strokes: Sequence[F32]) -> Told:
     """Return the outlines that are in the view."""
     shown = [(row, stroke) for row, stroke in zip(rows.tolist(), strokes, strict=True) if len(stroke)]
     return Told(opinion, [row for row, _ in shown], [stroke for _, stroke in shown])
 
 
 @dataclass(frozen=True, slots=True)
-class _Beside:
+class _NameLayout:
     """Layout of names in a view.
 
     Attributes:
@@ -198,54 +208,64 @@ class _Beside:
         return (left + right) / 2, max(top - float(self.room[1]), 0.0) if self.over else bottom
 
 
-def _log_told(to: Writer, result: FrameResult, told: Mapping[str, Told], beside: _Beside) -> None:
+def _log_outlines(
+    to: Writer, result: FrameResult, outlines_by_entity: Mapping[str, Told], layout: _NameLayout
+) -> None:
     """Log outlines, and names of doubtful objects as long as names do not overlap.
 
     Missed objects come last, because their detection has a name already. Among the others the nearest comes
     first.
     """
-    doubted = [found for found in told.values() if found.opinion in DOUBTS]
-    places = np.array([beside.place(stroke) for found in doubted for stroke in found.strokes], np.float32)
-    centers = [_of(result, found.opinion).boxes.center[found.rows, :2] for found in doubted]
-    away = np.hypot(*np.concatenate([np.zeros((0, 2), np.float32), *centers]).T)
-    denied = np.array([found.opinion != MISSED for found in doubted for _ in found.rows], bool)
-    letters = [len(name) for found in doubted for name in _names(result, found)]
-    across = np.maximum(beside.room[0], beside.letter * np.array(letters, np.float64))
-    named = iter(apart(places.reshape(-1, 2), away, (across, float(beside.room[1])), denied).tolist())
-    for path, found in told.items():
-        subject = "fused" if found.opinion == MISSED else "object"
-        said = {e.row: e.text for e in result.explanations if e.subject == subject}
-        names = _names(result, found)
-        shown = [next(named) for _ in names] if found.opinion in DOUBTS else [False] * len(names)
+    doubtful = [outlines for outlines in outlines_by_entity.values() if outlines.opinion in DOUBTS]
+    places = np.array(
+        [layout.place(stroke) for outlines in doubtful for stroke in outlines.strokes], np.float32
+    )
+    centers = [
+        _indexed_objects(result, outlines.opinion).boxes.center[outlines.rows, :2] for outlines in doubtful
+    ]
+    distances = np.hypot(*np.concatenate([np.zeros((0, 2), np.float32), *centers]).T)
+    is_contradicted = np.array(
+        [outlines.opinion != MISSED for outlines in doubtful for _ in outlines.rows], bool
+    )
+    letters = [len(name) for outlines in doubtful for name in _outline_names(result, outlines)]
+    across = np.maximum(layout.room[0], layout.letter * np.array(letters, np.float64))
+    named = iter(
+        apart(places.reshape(-1, 2), distances, (across, float(layout.room[1])), is_contradicted).tolist()
+    )
+    for path, outlines in outlines_by_entity.items():
+        subject = "fused" if outlines.opinion == MISSED else "object"
+        sentences = texts_by_row(result.explanations, subject)
+        names = _outline_names(result, outlines)
+        has_name = [next(named) for _ in names] if outlines.opinion in DOUBTS else [False] * len(names)
         log_stroked(
             to,
             path,
-            [stroke + np.float32(beside.corner) for stroke in found.strokes],
-            [name if is_named else "" for name, is_named in zip(names, shown, strict=True)],
-            [said.get(row, name) for row, name in zip(found.rows, names, strict=True)],
-            np.array([beside.place(stroke) for stroke in found.strokes], np.float32),
+            [stroke + np.float32(layout.corner) for stroke in outlines.strokes],
+            [name if is_named else "" for name, is_named in zip(names, has_name, strict=True)],
+            [sentences.get(row, name) for row, name in zip(outlines.rows, names, strict=True)],
+            np.array([layout.place(stroke) for stroke in outlines.strokes], np.float32),
         )
 
 
-def _names(result: FrameResult, found: Told) -> list[str]:
-    theirs = _of(result, found.opinion)
-    return [f"{theirs.names[row]} {found.opinion}" for row in found.rows]
+def _outline_names(result: FrameResult, outlines: Told) -> list[str]:
+    objects = _indexed_objects(result, outlines.opinion)
+    return [f"{objects.names[row]} {outlines.opinion}" for row in outlines.rows]
 
 
-def _of(result: FrameResult, opinion: str) -> Objects:
+def _indexed_objects(result: FrameResult, opinion: str) -> Objects:
     """Return the ``Objects`` that the rows of this opinion index."""
     assert result.opinions is not None and result.objects is not None
     return result.opinions.fused if opinion == MISSED else result.objects
 
 
-def _log_looks_in_view(to: Writer, path: str, opinion: str) -> None:
-    doubted = opinion in DOUBTS
-    radius, order = (2.0, 34.0) if doubted else (0.75, 33.0)
-    looks = rr.LineStrips2D.from_fields(
+def _log_outline_style(to: Writer, path: str, opinion: str) -> None:
+    is_doubtful = opinion in DOUBTS
+    radius, order = (2.0, 34.0) if is_doubtful else (0.75, 33.0)
+    style = rr.LineStrips2D.from_fields(
         colors=[OPINIONS[opinion]], radii=rr.Radius.ui_points(radius), draw_order=order
     )
-    to.static(path, looks)
-    if doubted:
+    to.static(path, style)
+    if is_doubtful:
         log_names_looks(to, path, order + 1)
 
 
@@ -256,8 +276,8 @@ def marked(result: FrameResult, colors: Sequence[Color]) -> list[Color]:
     """Return the colours of the objects' outlines. Doubtful objects have a colour of their own."""
     if result.opinions is None:
         return [*colors]
-    said = map(Opinion, result.opinions.opinion.tolist())
-    return [_MARKED.get(opinion, color) for opinion, color in zip(said, colors, strict=True)]
+    opinions = map(Opinion, result.opinions.opinion.tolist())
+    return [_DOUBT_COLORS.get(opinion, color) for opinion, color in zip(opinions, colors, strict=True)]
 
 
 def _dim(color: Color) -> Color:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from bevviz.model import geometry
 from bevviz.model.frame import F32, F64, U8, Boxes3D, Camera, Image
+from bevviz.model.results import Explanation
 from bevviz.stages.visibility import image_points
 from bevviz.support.kernel import kernel
 
@@ -93,6 +94,26 @@ def strips(points: F32, lengths: NDArray[np.integer]) -> pa.Array:
 def scored(names: Iterable[str], scores: Iterable[Any]) -> list[str]:
     """Format each name with its score, as in ``person 0.90``."""
     return [f"{name} {score:.2f}" for name, score in zip(names, scores, strict=True)]
+
+
+def explanations_of(
+    explanations: Iterable[Explanation], subject: str, camera: str | None = None
+) -> list[Explanation]:
+    """Return the explanations of a subject. ``camera``: of one camera; None: of all."""
+    return [
+        explanation
+        for explanation in explanations
+        if explanation.subject == subject and camera in (None, explanation.camera)
+    ]
+
+
+def texts_by_row(
+    explanations: Iterable[Explanation], subject: str, camera: str | None = None
+) -> dict[int, str]:
+    """Return row -> text of the explanations of a subject, see ``explanations_of``."""
+    return {
+        explanation.row: explanation.text for explanation in explanations_of(explanations, subject, camera)
+    }
 
 
 def document(text: str) -> rr.TextDocument:
