@@ -11,10 +11,10 @@ from bevviz.recording import views
 def blueprint(scene: Scene) -> rrb.Blueprint:
     """Return the layout."""
     images = [views.camera(scene, name, weak=True) for name in scene.cameras]
-    said = [views.explain(), views.why(), views.log(), views.anomaly_log(), views.config()]
+    texts = [views.explain(), views.why(), views.log(), views.anomaly_log(), views.config()]
     return rrb.Blueprint(
         rrb.Vertical(
-            rrb.Horizontal(rrb.Grid(*images), rrb.Tabs(*said, name="Decisions"), column_shares=[3, 1]),
+            rrb.Horizontal(rrb.Grid(*images), rrb.Tabs(*texts, name="Decisions"), column_shares=[3, 1]),
             rrb.Horizontal(views.stage_times(), views.counts(), rrb.Tabs(views.anomalies(), views.states())),
             row_shares=[3, 1],
         ),

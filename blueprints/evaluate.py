@@ -21,7 +21,7 @@ def blueprint(scene: Scene) -> rrb.Blueprint:
         rrb.TextDocumentView(name="Evaluation", origin=entities.EVALUATE_ABOUT),
         views.explain(),
     )
-    counts = [entities.judged_count(what) for what in ("true", "missed", "false")]
+    counts = [entities.judged_count(outcome) for outcome in ("true", "missed", "false")]
     return rrb.Blueprint(
         rrb.Vertical(
             rrb.Horizontal(

@@ -26,6 +26,9 @@ def log_anomalies(to: Writer, result: FrameResult, started: Sequence[Anomaly]) -
         result: results of the frame.
         started: anomalies that begin in this frame.
     """
-    to.lines(entities.ANOMALY_LOG, [(a.severity, f"{a.kind}: {a.text}") for a in started])
+    to.lines(
+        entities.ANOMALY_LOG,
+        [(new_anomaly.severity, f"{new_anomaly.kind}: {new_anomaly.text}") for new_anomaly in started],
+    )
     count = Counter(anomaly.kind for anomaly in result.anomalies)
     to.write(entities.ANOMALY_COUNTS, rr.Scalars([float(count[kind]) for kind in KINDS]))

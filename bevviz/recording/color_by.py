@@ -108,14 +108,23 @@ def annotation_context() -> rr.AnnotationContext:
     depth = entities.DEPTH_RANGE / _DEPTHS
     rings = palette().tolist()
     scales = [
-        *(_info(_HEIGHT + k, f"{k * TALLEST / _STEPS:.1f} m high", color) for k, color in enumerate(steps)),
-        *(_info(_DISTANCE + k, f"{k * depth:.0f} m away", color) for k, color in enumerate(steps[::-1])),
         *(
-            _info(_INTENSITY + k, f"intensity {100 * k // _SHARES} %", color)
-            for k, color in enumerate(shares)
+            _info(_HEIGHT + step, f"{step * TALLEST / _STEPS:.1f} m high", color)
+            for step, color in enumerate(steps)
         ),
-        *(_info(_TIME + k, f"{100 * k // _SHARES} % into the scan", color) for k, color in enumerate(shares)),
-        *(_info(_RING + k, f"ring {k}", rings[k % len(rings)]) for k in range(_RINGS)),
+        *(
+            _info(_DISTANCE + step, f"{step * depth:.0f} m away", color)
+            for step, color in enumerate(steps[::-1])
+        ),
+        *(
+            _info(_INTENSITY + step, f"intensity {100 * step // _SHARES} %", color)
+            for step, color in enumerate(shares)
+        ),
+        *(
+            _info(_TIME + step, f"{100 * step // _SHARES} % into the scan", color)
+            for step, color in enumerate(shares)
+        ),
+        *(_info(_RING + step, f"ring {step}", rings[step % len(rings)]) for step in range(_RINGS)),
         _info(_ABSENT, "not in this cloud", (130, 130, 140)),
     ]
     return rr.AnnotationContext([*point_classes(), *scales])

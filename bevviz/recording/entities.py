@@ -159,9 +159,9 @@ def channel(name: str) -> str:
     return f"{BEV}/{name}"
 
 
-def overlay(what: str) -> str:
+def overlay(layer: str) -> str:
     """Return the entity of an overlay on the bird's-eye image: tracks, trails, ground truth."""
-    return f"{BEV}/overlay/{what}"
+    return f"{BEV}/overlay/{layer}"
 
 
 def robot(topic: str) -> str:
@@ -204,9 +204,9 @@ def class_state(camera: str, class_name: str) -> str:
     return state(camera, _path_part(class_name))
 
 
-def why(what: str) -> str:
+def why(part: str) -> str:
     """Return the entity of a part of a ``bevviz why`` explanation: points by fate, boxes, frustums."""
-    return f"{WHY}/{what}"
+    return f"{WHY}/{part}"
 
 
 def difference(change: str) -> str:
@@ -229,14 +229,14 @@ def difference_state(class_name: str) -> str:
     return f"{COMPARE_STATES}/{_path_part(class_name)}"
 
 
-def judged(what: str) -> str:
+def judged(outcome: str) -> str:
     """Return the entity of objects that are true, false or missed."""
-    return f"{EVALUATE}/objects/{what}"
+    return f"{EVALUATE}/objects/{outcome}"
 
 
-def judged_count(what: str) -> str:
+def judged_count(outcome: str) -> str:
     """Return the entity of the number of true, false or missed objects."""
-    return f"{EVALUATE}/count/{what}"
+    return f"{EVALUATE}/count/{outcome}"
 
 
 def sweep(metric: str) -> str:
@@ -259,14 +259,14 @@ def stage_time(stage: str) -> str:
     return f"{HEALTH}/time_ms/{stage}"
 
 
-def rate(what: str) -> str:
+def rate(name: str) -> str:
     """Return the entity of a rate in Hz."""
-    return f"{HEALTH}/rate_hz/{what}"
+    return f"{HEALTH}/rate_hz/{name}"
 
 
-def count(what: str) -> str:
+def count(name: str) -> str:
     """Return the entity of a count."""
-    return f"{HEALTH}/count/{what}"
+    return f"{HEALTH}/count/{name}"
 
 
 def sync_error(camera: str) -> str:
@@ -279,17 +279,17 @@ def tf_age(sensor: str) -> str:
     return f"{HEALTH}/tf_age_ms/{sensor}"
 
 
-def latency(what: str) -> str:
+def latency(percentile: str) -> str:
     """Return the entity of a latency percentile in milliseconds.
 
     Latency is the time from a cloud's arrival until its results are logged, over the last frames.
     """
-    return f"{HEALTH}/latency_ms/{what}"
+    return f"{HEALTH}/latency_ms/{percentile}"
 
 
-def drops(where: str) -> str:
+def drops(stage: str) -> str:
     """Return the entity of the number of frames dropped so far at one point of the pipeline."""
-    return f"{HEALTH}/drops/{where}"
+    return f"{HEALTH}/drops/{stage}"
 
 
 def viewer_lag(name: str) -> str:
@@ -297,9 +297,9 @@ def viewer_lag(name: str) -> str:
     return f"{HEALTH}/viewer_lag_ms/{name}"
 
 
-def process(what: str) -> str:
+def process(resource: str) -> str:
     """Return the entity of a resource that the process itself uses."""
-    return f"{HEALTH}/process/{what}"
+    return f"{HEALTH}/process/{resource}"
 
 
 def calib_result(camera: str) -> str:

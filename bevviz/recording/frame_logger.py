@@ -160,7 +160,7 @@ class Logger(Writer):
         self._videos.restart()
         self._raw_shown = set(self._raw_known)
         if not self._inputs:
-            self._shown -= self._input_entities
+            self._previous_entities -= self._input_entities
 
     # --- once ----------------------------------------------------------------------------------
 
@@ -248,12 +248,12 @@ class Logger(Writer):
         frame = result.frame
         if frame.lidar:
             self.put(entities.sensor(frame.lidar), transform(frame.pose))
-        entities_before = set(self._now)
+        entities_before = set(self._frame_entities)
         if self._inputs:
             self._log_input(result)
         elif cloud:
             log_cloud(self, result, self._config.logging.color_by)
-        self._input_entities |= self._now - entities_before
+        self._input_entities |= self._frame_entities - entities_before
         self._log_lidar_results(result)
         for camera in result.cameras:
             log_detections(self, camera, result.explanations)
@@ -370,12 +370,12 @@ class Logger(Writer):
         if result.obstacles is None:
             return
         if ground_too:
-            others = result.obstacles
+            unclustered = result.obstacles
             if clusters is not None:
-                others = others.compress(~in_kept(clusters), axis=0)
+                unclustered = unclustered.compress(~in_kept(clusters), axis=0)
             scale = step(size, COARSE)
-            others = coarse(others.take(sorted_rows(others, scale), axis=0), scale)
-            log_obstacles(self, frame, others)
+            unclustered = coarse(unclustered.take(sorted_rows(unclustered, scale), axis=0), scale)
+            log_obstacles(self, frame, unclustered)
         if clusters is not None:
             scale = step(size, FINE)
             log_clusters(self, frame, clusters, result.tracks, result.obstacles, config.clustering, scale)

@@ -59,7 +59,7 @@ def log_health_looks(to: Writer) -> None:
 
 
 def log_health(
-    to: Writer, result: FrameResult, last: Frame | None, rates: Rates, more: Mapping[str, float]
+    to: Writer, result: FrameResult, last: Frame | None, rates: Rates, extra_scalars: Mapping[str, float]
 ) -> None:
     """Log every health scalar of a frame.
 
@@ -68,9 +68,9 @@ def log_health(
         result: results of the frame.
         last: previous frame.
         rates: rates up to this frame.
-        more: further scalars, by entity.
+        extra_scalars: further scalars, by entity.
     """
-    for path, value in (*health(result, last, rates), *more.items()):
+    for path, value in (*health(result, last, rates), *extra_scalars.items()):
         if np.isfinite(value):
             to.scalar(path, float(value))
 

@@ -66,8 +66,8 @@ def log_opinions_looks(to: Writer, cameras: Iterable[str]) -> None:
                     to.static(entity, over_image(camera))
     for opinion in OPINIONS:
         _log_outline_style(to, entities.overlay_opinion(opinion), opinion)
-    for what, color in zip(COUNTED, SERIES[len(COUNTS) :], strict=False):
-        to.static(entities.count(what), rr.SeriesLines(colors=[color], widths=[1.5]))
+    for name, color in zip(COUNTED, SERIES[len(COUNTS) :], strict=False):
+        to.static(entities.count(name), rr.SeriesLines(colors=[color], widths=[1.5]))
 
 
 def log_fusion(to: Writer, result: FrameResult) -> None:

@@ -19,13 +19,15 @@ def own_address(bind: str) -> str:
         UserError: it is no address of this machine.
     """
     try:
-        found = socket.getaddrinfo(bind or LOOPBACK, 0, type=socket.SOCK_STREAM)
-        address = str(found[0][4][0])
-        with socket.socket(found[0][0]) as probe:
+        infos = socket.getaddrinfo(bind or LOOPBACK, 0, type=socket.SOCK_STREAM)
+        address = str(infos[0][4][0])
+        with socket.socket(infos[0][0]) as probe:
             probe.bind((address, 0))
     except (OSError, UnicodeError) as error:
-        why = getattr(error, "strerror", None) or str(error)
-        raise UserError(f"--bind {bind}: no address of this machine ({why}); 0.0.0.0: all of them") from None
+        reason = getattr(error, "strerror", None) or str(error)
+        raise UserError(
+            f"--bind {bind}: no address of this machine ({reason}); 0.0.0.0: all of them"
+        ) from None
     return address
 
 
@@ -78,7 +80,7 @@ def check_port(port: int, option: str = "--serve") -> None:
 
 def free_port(port: int, but: int = 0) -> int:
     """Return the port, or the next free port. ``but`` is excluded."""
-    return next(p for p in range(port, 65536) if p != but and _is_free(p))
+    return next(candidate for candidate in range(port, 65536) if candidate != but and _is_free(candidate))
 
 
 def _is_free(port: int) -> bool:

@@ -31,19 +31,19 @@ def transform(world_from_entity: F64) -> rr.Transform3D:
     )
 
 
-def boxes3d(boxes: Boxes3D, rows: np.ndarray[Any, Any], labels: list[str], **looks: Any) -> rr.Boxes3D:
+def boxes3d(boxes: Boxes3D, rows: np.ndarray[Any, Any], labels: list[str], **style: Any) -> rr.Boxes3D:
     """Convert the boxes in ``rows`` to Rerun boxes."""
-    half = boxes.yaw[rows] / 2
-    turns = np.zeros((len(rows), 4), np.float32)
-    turns[:, 2], turns[:, 3] = np.sin(half), np.cos(half)
+    half_yaw = boxes.yaw[rows] / 2
+    quaternions = np.zeros((len(rows), 4), np.float32)
+    quaternions[:, 2], quaternions[:, 3] = np.sin(half_yaw), np.cos(half_yaw)
     return rr.Boxes3D(
-        centers=boxes.center[rows], sizes=boxes.size[rows], quaternions=turns, labels=labels, **looks
+        centers=boxes.center[rows], sizes=boxes.size[rows], quaternions=quaternions, labels=labels, **style
     )
 
 
-def boxes2d(xyxy: F32, labels: list[str], **looks: Any) -> rr.Boxes2D:
+def boxes2d(xyxy: F32, labels: list[str], **style: Any) -> rr.Boxes2D:
     """Convert (N, 4) boxes to Rerun boxes. Pixels are in bevviz's convention."""
-    return rr.Boxes2D(array=xyxy + CORNER, array_format=rr.Box2DFormat.XYXY, labels=labels, **looks)
+    return rr.Boxes2D(array=xyxy + CORNER, array_format=rr.Box2DFormat.XYXY, labels=labels, **style)
 
 
 def edges(corners: F32) -> F32:
@@ -57,23 +57,23 @@ def image_outlines(boxes: Boxes3D, camera: Camera) -> list[F32]:
     The stroke follows all edges of a box that is completely in the image. Otherwise it is the contour of the
     box, cut at the image border. It is empty for a box outside of the image.
     """
-    nothing = np.zeros((0, 2), np.float32)
-    if camera.intrinsics is None or (found := image_points(boxes, camera)) is None:
-        return [nothing] * len(boxes)
+    empty = np.zeros((0, 2), np.float32)
+    if camera.intrinsics is None or (projected := image_points(boxes, camera)) is None:
+        return [empty] * len(boxes)
     width, height = camera.intrinsics.width - 0.5, camera.intrinsics.height - 0.5
     image = np.array([(-0.5, -0.5), (width, -0.5), (width, height), (-0.5, height)], np.float32)
     with np.errstate(invalid="ignore"):
-        inside = (found >= image[0]) & (found < image[2])
+        inside = (projected >= image[0]) & (projected < image[2])
     is_whole: list[bool] = inside[:, :8].all(axis=(1, 2)).tolist()
     outlines = []
-    for points, whole in zip(found, is_whole, strict=True):
+    for points, whole in zip(projected, is_whole, strict=True):
         if whole:
             outlines.append(edges(points[:8]))
             continue
-        area, cut, known = 0.0, nothing, points[np.isfinite(points[:, 0]) & np.isfinite(points[:, 1])]
-        if len(known):
-            area, cut = cv2.intersectConvexConvex(cv2.convexHull(known), image)
-        outlines.append(np.concatenate([cut[:, 0], cut[:1, 0]]) if area > 0 else nothing)
+        area, cut, visible = 0.0, empty, points[np.isfinite(points[:, 0]) & np.isfinite(points[:, 1])]
+        if len(visible):
+            area, cut = cv2.intersectConvexConvex(cv2.convexHull(visible), image)
+        outlines.append(np.concatenate([cut[:, 0], cut[:1, 0]]) if area > 0 else empty)
     return outlines
 
 
@@ -142,15 +142,15 @@ def png(bgr: U8) -> rr.EncodedImage:
 
 def blob(data: U8) -> pa.Array:
     """Convert (N,) bytes to Rerun's Arrow layout without the copies that Rerun would make."""
-    one = pa.list_(pa.field("item", pa.uint8(), nullable=False))
-    return pa.ListArray.from_arrays(pa.array([0, len(data)], pa.int32()), pa.array(data), type=one)
+    byte_list = pa.list_(pa.field("item", pa.uint8(), nullable=False))
+    return pa.ListArray.from_arrays(pa.array([0, len(data)], pa.int32()), pa.array(data), type=byte_list)
 
 
 @kernel
 def rounded(points: F32, scale: float) -> F32:
     """Round points to the nearest 1 / scale in one pass. It runs on every frame."""
-    found, factor = np.empty_like(points), np.float32(scale)
+    result, factor = np.empty_like(points), np.float32(scale)
     for i in range(len(points)):
         for axis in range(3):
-            found[i, axis] = np.rint(points[i, axis] * factor) / factor
-    return found
+            result[i, axis] = np.rint(points[i, axis] * factor) / factor
+    return result

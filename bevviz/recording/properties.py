@@ -22,20 +22,22 @@ def log_origin(to: Writer, config: Config, scene: Scene, network: str = "") -> N
     stated = stated_lines(config, folders=False)
     packages = [f"{name} {version}" for name, version in versions().items()]
     lines = [*map(markdown, stated), *packages, *([f"network on {markdown(network)}"] if network else [])]
-    lacking = list(left_out(config.logging))
-    lacks = "".join(f"- {line}\n" for line in lacking)
-    lacks = f"## Not in this recording (keep: {config.logging.keep})\n\n{lacks}\n" if lacks else ""
+    omitted = list(left_out(config.logging))
+    omissions = "".join(f"- {line}\n" for line in omitted)
+    omissions = (
+        f"## Not in this recording (keep: {config.logging.keep})\n\n{omissions}\n" if omissions else ""
+    )
     to.static(
         entities.CONFIG,
         document(
             "# How this recording was made\n\n"
             f"Source: **{markdown(scene.name)}**, preset: **{config.preset}**\n\n"
-            f"{lacks}{fenced(settings, 'yaml')}\n\n" + "\n".join(f"- {line}" for line in lines)
+            f"{omissions}{fenced(settings, 'yaml')}\n\n" + "\n".join(f"- {line}" for line in lines)
         ),
     )
     if not to.root:
         to.recording.send_recording_name(scene.name)
-    made: dict[str, Any] = {
+    fields: dict[str, Any] = {
         "source": scene.name,
         "preset": config.preset,
         "config": settings,
@@ -44,9 +46,9 @@ def log_origin(to: Writer, config: Config, scene: Scene, network: str = "") -> N
         "lidars": [name for name in scene.lidars or (scene.lidar,) if name],
         "cameras": list(scene.cameras),
         "keep": config.logging.keep,
-        "left_out": lacking,
+        "left_out": omitted,
         "network": network,
     }
     # Rerun omits None and may omit or keep empty values, depending on names that its process has seen.
-    there = rr.AnyValues(**{name: value for name, value in made.items() if value})
-    to.recording.send_property(entities.PROPERTY + to.root.replace("/", "_"), there)
+    values = rr.AnyValues(**{name: value for name, value in fields.items() if value})
+    to.recording.send_property(entities.PROPERTY + to.root.replace("/", "_"), values)

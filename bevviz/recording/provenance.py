@@ -46,8 +46,8 @@ class Dependency:
 
     def __str__(self) -> str:
         content = f"SHA-256 {self.sha256}" if self.sha256 else ""
-        named = f"{self.file} ({content})" if self.file and content else self.file or content
-        return ", ".join(filter(None, (self.version, named)))
+        file = f"{self.file} ({content})" if self.file and content else self.file or content
+        return ", ".join(filter(None, (self.version, file)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,36 +77,36 @@ def dependencies_of(config: Config) -> dict[str, Dependency]:
 
     A user-defined stage contributes the file of its module and the version of its package.
     """
-    found = {name: Dependency(version=number) for name, number in versions().items()}
+    dependencies = {name: Dependency(version=number) for name, number in versions().items()}
     for key, path in (("detector.model", model_path(config)), ("detector.names", names_path(config))):
         if path is not None:
-            found[key] = Dependency(sha256=file_hash(path), file=path.name)
+            dependencies[key] = Dependency(sha256=file_hash(path), file=path.name)
     for key, file in object_files(config).items():
-        found[key] = Dependency(sha256=file_hash(Path(file)), file=Path(file).name)
+        dependencies[key] = Dependency(sha256=file_hash(Path(file)), file=Path(file).name)
     for section, key in STAGES.items():
         plugin = plugin_of(config, section)
         if plugin is not None:
             content = file_hash(plugin.file) if plugin.file else ""
-            found[f"{section}.{key}"] = Dependency(plugin.version, content, plugin.name)
-    return found
+            dependencies[f"{section}.{key}"] = Dependency(plugin.version, content, plugin.name)
+    return dependencies
 
 
 def differences(then: Provenance, now: Provenance) -> Iterator[str]:
     """Yield one sentence for each difference."""
-    for before, after in ((then.dependencies, now.dependencies), (then.machine, now.machine)):
-        for name in dict.fromkeys([*before, *after]):
-            if before.get(name) != after.get(name):
-                yield f"{name} was {before.get(name, 'absent')}, is {after.get(name, 'absent')}"
+    for old, new in ((then.dependencies, now.dependencies), (then.machine, now.machine)):
+        for name in dict.fromkeys([*old, *new]):
+            if old.get(name) != new.get(name):
+                yield f"{name} was {old.get(name, 'absent')}, is {new.get(name, 'absent')}"
 
 
 @lru_cache(maxsize=1)
 def versions() -> Mapping[str, str]:
     """Return the version of each package that results depend on, by name."""
-    found = {"bevviz": __version__, "python": platform.python_version()}
+    numbers = {"bevviz": __version__, "python": platform.python_version()}
     for name in PACKAGES:
         with suppress(PackageNotFoundError):
-            found[name] = version(name)
-    return found
+            numbers[name] = version(name)
+    return numbers
 
 
 # --- files -------------------------------------------------------------------------------------
@@ -149,14 +149,14 @@ def machine(network: str = "") -> dict[str, str]:
     Args:
         network: device of the detector's network; empty: there is no network.
     """
-    found = {
+    fields = {
         "processor": _processor(),
         "cores": f"{os.cpu_count() or 0}",
         "memory": _memory(),
         "system": _system(),
         "network": network,
     }
-    return {name: value for name, value in found.items() if value}
+    return {name: value for name, value in fields.items() if value}
 
 
 def _processor() -> str:

@@ -51,9 +51,9 @@ def log_robot(to: Writer, frame: Frame, config: BevConfig) -> None:
             _log_boxes(to.put, entities.robot(labelled.topic), labelled, _ROBOT_COLOR)
             path = entities.robot_overlay(labelled.topic)
             _log_outlines(to.put, path, frame.pose, labelled, config, _ROBOT_COLOR)
-    for found in frame.robot_detections:
-        if len(found.xyxy):
-            _log_image_boxes(to.put, found)
+    for detections in frame.robot_detections:
+        if len(detections.xyxy):
+            _log_image_boxes(to.put, detections)
 
 
 def log_late(to: Writer, late: LateResult, config: BevConfig) -> None:
@@ -91,12 +91,17 @@ def _log_boxes(put: Put, path: str, labelled: LabelledBoxes3D, color: Color | No
     )
 
 
-def _log_image_boxes(put: Put, found: LabelledBoxes2D) -> None:
+def _log_image_boxes(put: Put, detections: LabelledBoxes2D) -> None:
     """Log detections under /robot. They have the coordinate frame of the image, so that it can show them."""
     put(
-        entities.robot(found.topic),
-        *([over_image(found.camera)] if found.camera else []),
-        boxes2d(found.xyxy, scored(found.labels, found.scores), colors=[_ROBOT_COLOR], draw_order=25.0),
+        entities.robot(detections.topic),
+        *([over_image(detections.camera)] if detections.camera else []),
+        boxes2d(
+            detections.xyxy,
+            scored(detections.labels, detections.scores),
+            colors=[_ROBOT_COLOR],
+            draw_order=25.0,
+        ),
     )
 
 
@@ -116,7 +121,7 @@ def _log_outlines(
             seen_from_above(config, points_from_boxes, outlines),
             colors=[color],
             radii=rr.Radius.ui_points(0.75),
-            labels=[labelled.labels[k] for k in np.flatnonzero(inside)],
+            labels=[labelled.labels[row] for row in np.flatnonzero(inside)],
             show_labels=False,
             draw_order=10.0,
         ),

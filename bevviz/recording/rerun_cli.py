@@ -20,7 +20,7 @@ Process: TypeAlias = "subprocess.Popen[bytes]"
 
 PATIENCE = 30.0  # seconds until a program listens
 # Ask Linux to end the program with its parent, in every case. The request survives exec.
-_TIED = (
+_END_WITH_PARENT = (
     "import ctypes,os,sys;ctypes.CDLL(None).prctl(1,15);"
     "os.getppid()==int(sys.argv[1]) and os.execvp(sys.argv[2],sys.argv[2:])"
 )
@@ -36,7 +36,7 @@ def tied(command: Sequence[str]) -> list[str]:
     """Return a command that ends with the thread that starts it. A server must not outlive its client."""
     if sys.platform != "linux":
         return list(command)
-    return [sys.executable, "-I", "-S", "-c", _TIED, str(os.getpid()), *command]
+    return [sys.executable, "-I", "-S", "-c", _END_WITH_PARENT, str(os.getpid()), *command]
 
 
 def environment() -> dict[str, str]:
@@ -45,10 +45,10 @@ def environment() -> dict[str, str]:
     Rerun's own setting (``rerun analytics``) holds for all processes of a user, so bevviz does not change it.
     For a single process, the only switch is that Rerun sends nothing in CI.
     """
-    given = dict(os.environ)
-    if not given.get("FORCE_RERUN_ANALYTICS"):
-        given["CI"] = "true"
-    return given
+    variables = dict(os.environ)
+    if not variables.get("FORCE_RERUN_ANALYTICS"):
+        variables["CI"] = "true"
+    return variables
 
 
 def spawn(command: Sequence[str], stdin: int = subprocess.PIPE) -> Process:

@@ -27,7 +27,7 @@ def left_out(config: LoggingConfig) -> tuple[str, ...]:
     """Return one sentence for each kind of data that a recording omits."""
     if config.keep == "everything":
         return ()
-    raw = (
+    clouds = (
         f"raw clouds: there is that of each {config.raw_every}th frame, and those within "
         f"{config.raw_around:g} s of where an anomaly begins, a person's mark, or where the state of the "
         "pipeline, of a camera or the configuration changes; where anomalies and states come thick, of "
@@ -37,7 +37,7 @@ def left_out(config: LoggingConfig) -> tuple[str, ...]:
         "the images and the grid on the ground"
     )
     return (
-        raw,
+        clouds,
         "voxels are rounded, to half a voxel at most in clusters and to a whole one elsewhere, and are there "
         "once: those of clusters with the clusters, not among the obstacles",
         "images that came raw or without loss: they are H.264, and the bird's-eye view is JPEG of quality "
@@ -99,14 +99,14 @@ class Around:
 
     def __init__(self) -> None:
         self.left_out = 0
-        self._held: list[Held] = []
+        self._buffer: list[Held] = []
         self._until = -1
-        self._count = self._spent = 0
+        self._count = self._kept_for_events = 0
 
     @property
     def held(self) -> int:
         """Number of buffered frames."""
-        return len(self._held)
+        return len(self._buffer)
 
     def see(
         self, frame: Held, config: LoggingConfig, *, strange: bool, wanted: bool = False
@@ -119,22 +119,24 @@ class Around:
             strange: whether an anomaly begins or a state changes in this frame.
             wanted: whether a user caused an event in this frame: a mark or a new configuration.
         """
-        stamp, around = frame.clock[1], round(config.raw_around * 1e9)
-        if self._held and stamp < self._held[-1].clock[1]:
-            self._held, self._until = [], -1
-        self._held = [one for one in self._held[-self.LONGEST :] if stamp - one.clock[1] <= around]
-        nth = self._count % config.raw_every == 0
+        stamp, reach = frame.clock[1], round(config.raw_around * 1e9)
+        if self._buffer and stamp < self._buffer[-1].clock[1]:
+            self._buffer, self._until = [], -1
+        self._buffer = [
+            buffered for buffered in self._buffer[-self.LONGEST :] if stamp - buffered.clock[1] <= reach
+        ]
+        is_nth = self._count % config.raw_every == 0
         self._count += 1
         if strange and not wanted:
-            strange = not self._spent or self._spent < config.raw_share * self._count
+            strange = not self._kept_for_events or self._kept_for_events < config.raw_share * self._count
             self.left_out += not strange
         if strange or wanted:
-            self._until = stamp + around
-            found, self._held = [*self._held, frame], []
-            self._spent += len(found) - nth
-            return found
-        if nth or stamp <= self._until:
-            self._spent += not nth
+            self._until = stamp + reach
+            selected, self._buffer = [*self._buffer, frame], []
+            self._kept_for_events += len(selected) - is_nth
+            return selected
+        if is_nth or stamp <= self._until:
+            self._kept_for_events += not is_nth
             return [frame]
-        self._held.append(frame)
+        self._buffer.append(frame)
         return []

@@ -54,12 +54,12 @@ def in_browser(recording: Path, port: int | None = None) -> Iterator[str]:
     """
     if port is not None:
         check_port(port, "--port")
-    page = port or free_port(9090)
-    data = free_port(FIRST_DATA_PORT, but=page)
-    arguments = [str(recording), "--serve-web", "--bind", LOOPBACK, "--web-viewer-port", str(page)]
-    arguments += ["--port", str(data), "--server-memory-limit", MEMORY]
-    process = rerun_cli.start(arguments, LOOPBACK, page)
+    page_port = port or free_port(9090)
+    data_port = free_port(FIRST_DATA_PORT, but=page_port)
+    arguments = [str(recording), "--serve-web", "--bind", LOOPBACK, "--web-viewer-port", str(page_port)]
+    arguments += ["--port", str(data_port), "--server-memory-limit", MEMORY]
+    process = rerun_cli.start(arguments, LOOPBACK, page_port)
     try:
-        yield viewer_address("localhost", page, data)
+        yield viewer_address("localhost", page_port, data_port)
     finally:
         rerun_cli.end(process)

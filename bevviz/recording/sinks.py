@@ -59,9 +59,9 @@ class Sinks:
     @property
     def recording_id(self) -> str:
         """Identifier of the recording."""
-        found = rr.get_recording_id(self.recording)
-        assert found is not None
-        return str(found)
+        identifier = rr.get_recording_id(self.recording)
+        assert identifier is not None
+        return str(identifier)
 
     def check(self) -> None:
         """Raise UserError if the file can no longer be written."""
@@ -115,21 +115,21 @@ def open_recording(
     writer: FileWriter | None = None
     with ExitStack() as stack:
         if save is not None:
-            given = stack.enter_context(_file(save))
-            file = given.path
+            unfinished = stack.enter_context(_open_file(save))
+            file = unfinished.path
             writer = stack.enter_context(FileWriter(file))
             sinks.append(writer.sink)
-            warnings += given.warnings
+            warnings += unfinished.warnings
         if connect is not None:
-            sinks.append(_connection(connect))
+            sinks.append(_connect(connect))
         if spawn:
             sinks.append(_viewer())
         if serve is not None:
-            server, address = stack.enter_context(_served(serve, bind))
+            server, address = stack.enter_context(_serve_web(serve, bind))
             sinks.append(server)
             urls.append(address)
-        watched = connect is not None or spawn or serve is not None
-        recording = _stream(recording_id, batcher=None if watched else batches(config))
+        has_viewer = connect is not None or spawn or serve is not None
+        recording = _new_stream(recording_id, batcher=None if has_viewer else batches(config))
         # The writer waits until Rerun closes the sink. From here on, every interrupt must close it.
         stack.callback(recording.disconnect)
         try:
@@ -145,14 +145,14 @@ def open_recording(
         try:
             yield Sinks(recording, urls, warnings, file, writer)
         finally:
-            _close(recording)
+            _flush_and_disconnect(recording)
             if writer is not None:
                 writer.close()
         if writer is not None:
             writer.check()
 
 
-def _stream(
+def _new_stream(
     recording_id: str | None, *, properties: bool = True, batcher: rr.ChunkBatcherConfig | None = None
 ) -> rr.RecordingStream:
     recording = rr.RecordingStream(
@@ -169,12 +169,12 @@ def batches(config: Config) -> rr.ChunkBatcherConfig | None:
     """
     if is_whole(config):
         return None
-    found = rr.ChunkBatcherConfig()
-    found.flush_tick, found.flush_num_bytes = TICK, CHUNK
-    return found
+    batcher = rr.ChunkBatcherConfig()
+    batcher.flush_tick, batcher.flush_num_bytes = TICK, CHUNK
+    return batcher
 
 
-def _close(recording: rr.RecordingStream) -> None:
+def _flush_and_disconnect(recording: rr.RecordingStream) -> None:
     """Flush and close the recording. An exception that is already being raised takes precedence."""
     pending = sys.exc_info()[0] is not None
     try:
@@ -186,7 +186,7 @@ def _close(recording: rr.RecordingStream) -> None:
         recording.disconnect()
 
 
-def _file(path: Path) -> AbstractContextManager[Unfinished]:
+def _open_file(path: Path) -> AbstractContextManager[Unfinished]:
     for name in (path, path.resolve()):  # a typing error must not overwrite a bag, not even through a link
         if name.suffix != ".rrd":
             link = f" (it is a link to {name})" if name != path else ""
@@ -194,7 +194,7 @@ def _file(path: Path) -> AbstractContextManager[Unfinished]:
     return written(path, "recording")
 
 
-def _connection(url: str) -> rr.GrpcSink:
+def _connect(url: str) -> rr.GrpcSink:
     """Return a sink to a viewer elsewhere. Check the port first, as Rerun reports errors only at the end."""
     check_viewer(url)
     return rr.GrpcSink(url)
@@ -218,8 +218,10 @@ def check_viewer(url: str) -> tuple[str, int]:
     try:
         socket.create_connection((host, port), timeout=5).close()
     except OSError as error:
-        why = error.strerror or str(error)
-        raise UserError(f"--connect {url}: no viewer answers there ({why}); start one with 'rerun'") from None
+        reason = error.strerror or str(error)
+        raise UserError(
+            f"--connect {url}: no viewer answers there ({reason}); start one with 'rerun'"
+        ) from None
     return host, port
 
 
@@ -236,7 +238,7 @@ def _viewer() -> rr.GrpcSink:
 
 
 @contextmanager
-def _served(port: int, bind: str) -> Iterator[tuple[rr.GrpcServerSink, str]]:
+def _serve_web(port: int, bind: str) -> Iterator[tuple[rr.GrpcServerSink, str]]:
     """Serve the web viewer at ``port``, and its data at another port. Yield the sink and the page's URL."""
     address = own_address(bind)
     check_port(port)

@@ -71,19 +71,21 @@ class Place:
             recording: recording that stores the reference; None: it is no file.
             folders: whether the recording may name folders of this machine.
         """
-        size, mark = fingerprint(path)
-        where = Path(os.path.normpath(path.absolute()))  # does not resolve a link
+        size, digest = fingerprint(path)
+        absolute = Path(os.path.normpath(path.absolute()))  # does not resolve a link
         beside = ""
         if recording is not None:
-            beside = os.path.relpath(where, recording.absolute().parent) if folders else where.name
-        return cls(path_text(where.name), size, mark, path_text(beside), path_text(where) if folders else "")
+            beside = os.path.relpath(absolute, recording.absolute().parent) if folders else absolute.name
+        return cls(
+            path_text(absolute.name), size, digest, path_text(beside), path_text(absolute) if folders else ""
+        )
 
     def candidates(self, recording: Path) -> list[Path]:
         """Return paths where the file may be, the likeliest first."""
         folder = recording.absolute().parent
-        found = [folder / (self.beside or self.name), folder / self.name]
-        found += [Path(self.path)] if self.path else []
-        return list(dict.fromkeys(Path(os.path.normpath(path)) for path in found))
+        paths = [folder / (self.beside or self.name), folder / self.name]
+        paths += [Path(self.path)] if self.path else []
+        return list(dict.fromkeys(Path(os.path.normpath(path)) for path in paths))
 
     def is_same(self, path: Path) -> bool:
         """Return whether a file has the size and the fingerprint."""
@@ -92,17 +94,17 @@ class Place:
         except OSError:
             return False
 
-    def found(self, recording: Path) -> tuple[Path | None, str]:
+    def locate(self, recording: Path) -> tuple[Path | None, str]:
         """Return the file's present path and an empty text, or None and the reason why it is not found."""
-        tried = self.candidates(recording)
-        for path in tried:
+        candidates = self.candidates(recording)
+        for path in candidates:
             if self.is_same(path):
                 return path, ""
-        others = [path for path in tried if path.exists()]
-        absent = [str(path) for path in tried if path not in others]
-        said = [f"what is at {path} is another one (size or content)" for path in others]
-        said += [f"there is none at {' or '.join(absent)}"] if absent else []
-        return None, "; ".join(said)
+        changed = [path for path in candidates if path.exists()]
+        absent = [str(path) for path in candidates if path not in changed]
+        reasons = [f"what is at {path} is another one (size or content)" for path in changed]
+        reasons += [f"there is none at {' or '.join(absent)}"] if absent else []
+        return None, "; ".join(reasons)
 
 
 def fingerprint(path: Path) -> tuple[int, str]:
@@ -115,20 +117,20 @@ def fingerprint(path: Path) -> tuple[int, str]:
     Raises:
         OSError: the file does not exist or cannot be read.
     """
-    total, mark = 0, hashlib.sha256()
+    total, digest = 0, hashlib.sha256()
     files = bag_files(path) if path.is_dir() else [path]
     if not files:
         count, files = sampled_files(path)
-        mark.update(count.to_bytes(8, "little"))
+        digest.update(count.to_bytes(8, "little"))
     for file in files:
         with open_regular(file) as content:
             size = os.fstat(content.fileno()).st_size
-            mark.update(size.to_bytes(8, "little"))
+            digest.update(size.to_bytes(8, "little"))
             for start in sorted({0, max(size // 2 - BLOCK // 2, 0), max(size - BLOCK, 0)}):
                 content.seek(start)
-                mark.update(content.read(BLOCK) or b"")  # None: a special file that would block
+                digest.update(content.read(BLOCK) or b"")  # None: a special file that would block
         total += size
-    return total, mark.hexdigest()
+    return total, digest.hexdigest()
 
 
 @dataclass(frozen=True, slots=True)
@@ -166,15 +168,15 @@ class Origin:
             folders: whether the recording may name folders of this machine.
             redacted: see the attribute.
         """
-        named = {"detector.model": model_path(config), "detector.names": names_path(config)}
+        named_files = {"detector.model": model_path(config), "detector.names": names_path(config)}
         if config.detector.model == "demo":
-            named = {}
-        named |= {key: Path(file) for key, file in object_files(config).items()}
+            named_files = {}
+        named_files |= {key: Path(file) for key, file in object_files(config).items()}
         try:
             bag = [Place.of(path, recording, folders=folders) for path in scene.bag]
             files = {
                 key: Place.of(path, recording, folders=folders)
-                for key, path in named.items()
+                for key, path in named_files.items()
                 if path is not None
             }
         except OSError:
@@ -194,8 +196,8 @@ class Origin:
         """
         tree = json.loads(text)
         return cls(
-            [Place(**place) for place in tree["bag"]],
-            {str(key): Place(**place) for key, place in tree["files"].items()},
+            [Place(**reference) for reference in tree["bag"]],
+            {str(key): Place(**reference) for key, reference in tree["files"].items()},
             [str(setting) for setting in tree["topics"]],
             bool(tree["redacted"]),
         )
@@ -244,15 +246,17 @@ class Recorded:
 
     def missing(self, config: Config) -> Layer:
         """Return the recording's frame and detector values that a configuration leaves at their default."""
-        stated, own = values(config), values(load(preset=config.preset))
-        there = flat_yaml(self.yaml, str(self.recording))
-        recorded = {key: value for key, value in there.items() if key.startswith(FRAMES)}
-        if there.get("detector.model"):
-            recorded["detector.model"] = there["detector.model"]
+        stated, defaults = values(config), values(load(preset=config.preset))
+        recording_values = flat_yaml(self.yaml, str(self.recording))
+        recorded = {key: value for key, value in recording_values.items() if key.startswith(FRAMES)}
+        if recording_values.get("detector.model"):
+            recorded["detector.model"] = recording_values["detector.model"]
         for layer in self._received():
             recorded |= layer.values
-        stays = [key for key in recorded if key in own and key not in OBJECTS and stated[key] == own[key]]
-        return Layer(str(self.recording), {key: recorded[key] for key in stays})
+        open_keys = [
+            key for key in recorded if key in defaults and key not in OBJECTS and stated[key] == defaults[key]
+        ]
+        return Layer(str(self.recording), {key: recorded[key] for key in open_keys})
 
     def _received(self) -> list[Layer]:
         return received(self.settings, str(self.recording))
@@ -270,7 +274,7 @@ def follow(recording: Path, bag: Sequence[Path] = (), settings: Sequence[str] = 
         NoBagError: the recording has no bag or does not name it.
         UserError: it is no recording, or the bag or the detector's file is not found or has changed.
     """
-    how, origin = read(recording)
+    yaml, origin = read(recording)
     warnings: list[str] = []
     if origin is None and not bag:
         beside = recording.with_suffix(".mcap")  # 'bevviz live' saves both
@@ -280,47 +284,54 @@ def follow(recording: Path, bag: Sequence[Path] = (), settings: Sequence[str] = 
                 "it: give --bag PATH"
             )
         bag = [beside]
-    given = flat_yaml(how, str(recording))
+    configuration = flat_yaml(yaml, str(recording))
     if bag:
         paths = list(bag)
-        marks = {(p.size, p.fingerprint) for p in origin.bag} if origin is not None else set()
-        if origin is not None and {_mark(path) for path in bag} != marks:
-            names = ", ".join(place.name for place in origin.bag)
+        marks = (
+            {(reference.size, reference.fingerprint) for reference in origin.bag}
+            if origin is not None
+            else set()
+        )
+        if origin is not None and {_fingerprint_of_option(path) for path in bag} != marks:
+            names = ", ".join(reference.name for reference in origin.bag)
             warnings.append(f"--bag is not what {recording.name} was made from, {names} (size or content)")
     else:
         assert origin is not None
-        paths = [_found(place, recording) for place in origin.bag]
+        paths = [_locate(reference, recording) for reference in origin.bag]
     if origin is not None and origin.redacted:
         warnings.append(
             f"the images in {paths[0].name} are redacted: what the detector finds in them is not what "
             f"{recording.name} holds"
         )
-    chosen, files = list(origin.topics) if origin is not None else [], list[str]()
-    own = {key: value for key, _, value in (setting.partition("=") for setting in settings)}
-    named_otherwise = not is_network(own.get("objects.method", ".onnx"))
-    for key, place in origin.files.items() if origin is not None else ():
-        if key in own or (key in OBJECTS and named_otherwise):
+    topics, file_settings = list(origin.topics) if origin is not None else [], list[str]()
+    new_settings = {key: value for key, _, value in (setting.partition("=") for setting in settings)}
+    has_no_network = not is_network(new_settings.get("objects.method", ".onnx"))
+    for key, reference in origin.files.items() if origin is not None else ():
+        if key in new_settings or (key in OBJECTS and has_no_network):
             continue
-        path, where = place.found(recording)
+        path, reason = reference.locate(recording)
         if path is None:
             option = "--model FILE" if key == "detector.model" else f"--set {key}=FILE"
-            raise UserError(f"{recording}: it was made with {key} {place.name}; {where}: give {option}")
-        files.append(f"{key}={json.dumps(str(path))}")
-    stated = [*(one for one in chosen if not given.get(one.partition("=")[0])), *files]
-    return Recorded(recording, tuple(paths), tuple(stated), tuple(warnings), how)
+            raise UserError(f"{recording}: it was made with {key} {reference.name}; {reason}: give {option}")
+        file_settings.append(f"{key}={json.dumps(str(path))}")
+    recorded_settings = [
+        *(topic for topic in topics if not configuration.get(topic.partition("=")[0])),
+        *file_settings,
+    ]
+    return Recorded(recording, tuple(paths), tuple(recorded_settings), tuple(warnings), yaml)
 
 
-def _found(place: Place, recording: Path) -> Path:
-    path, where = place.found(recording)
+def _locate(reference: Place, recording: Path) -> Path:
+    path, reason = reference.locate(recording)
     if path is None:
         raise UserError(
-            f"{recording}: it was made from the bag {place.name}; {where}: move it beside the recording, or "
-            "give --bag PATH"
+            f"{recording}: it was made from the bag {reference.name}; {reason}: move it beside the "
+            "recording, or give --bag PATH"
         )
     return path
 
 
-def _mark(path: Path) -> tuple[int, str]:
+def _fingerprint_of_option(path: Path) -> tuple[int, str]:
     try:
         return fingerprint(path)
     except OSError as error:
@@ -339,22 +350,22 @@ def read(recording: Path) -> tuple[str, Origin | None]:
         if file.read(len(MAGIC)) != MAGIC:
             raise UserError(f"{recording}: no recording: it does not begin as one of Rerun's")
     check_decodes(recording, first=HEAD)
-    how: str | None = None
+    yaml: str | None = None
     origin: Origin | None = None
     try:
         for path, chunk in _properties(recording):
             # A property may be spread over several chunks.
-            if path == entities.PROPERTY and (found := _column(chunk, "config")):
-                how = str(found[-1][0])
-            elif path == entities.BAG and (found := _column(chunk, "about")):
-                origin = Origin.load(found[-1][0])
-            if how is not None and origin is not None:
+            if path == entities.PROPERTY and (column := _column(chunk, "config")):
+                yaml = str(column[-1][0])
+            elif path == entities.BAG and (column := _column(chunk, "about")):
+                origin = Origin.load(column[-1][0])
+            if yaml is not None and origin is not None:
                 break
     except (OSError, ValueError, KeyError, TypeError, RuntimeError) as error:
         raise UserError(f"{recording}: cannot be read as a recording: {first_line(error)}") from None
-    if how is None:
+    if yaml is None:
         raise NoBagError(f"{recording}: no recording of bevviz: it does not say how it was made")
-    return how, origin
+    return yaml, origin
 
 
 def _properties(recording: Path) -> Iterator[tuple[str, Any]]:

@@ -46,13 +46,13 @@ class StateLanes:
 
     def __init__(self, colors: Mapping[Any, Color], plain_lanes: str = "") -> None:
         self._values, self._colors, self._plain_lanes = list(colors), list(colors.values()), plain_lanes
-        self._known: dict[str, list[str]] = {}  # lane of one colour -> its states so far
+        self._plain_states: dict[str, list[str]] = {}  # lane of one colour -> its states so far
         self.states: Mapping[str, str] = {}  # lane -> its latest state
 
     def log(self, to: Writer, states: Mapping[str, str]) -> None:
         """Log the states of a frame, by the entity of their lane."""
-        now = {lane: state for lane, state in states.items() if state or lane in self.states}
-        states = dict.fromkeys(self.states, "") | now
+        current = {lane: state for lane, state in states.items() if state or lane in self.states}
+        states = dict.fromkeys(self.states, "") | current
         for lane, state in states.items():
             self._log_colors(to, lane, state)
             if self.states.get(lane, "") != state:  # a lane begins with its first state
@@ -61,7 +61,7 @@ class StateLanes:
 
     def _log_colors(self, to: Writer, lane: str, state: str) -> None:
         if self._plain_lanes and lane.startswith(self._plain_lanes):
-            known = self._known.setdefault(lane, [])
+            known = self._plain_states.setdefault(lane, [])
             if state and state not in known:
                 known.append(state)
                 colors = [State.DOUBTFUL.value] * len(known)
@@ -72,7 +72,7 @@ class StateLanes:
 
 def states_of(result: FrameResult) -> dict[str, str]:
     """Return lane -> state of the pipeline, of each camera and its classes, and of each anomaly kind."""
-    degraded = result.frame.problems or any(c.camera.problems for c in result.cameras)
+    degraded = result.frame.problems or any(camera_result.camera.problems for camera_result in result.cameras)
     states = {entities.state("pipeline"): "failed" if result.failures else "degraded" if degraded else "ok"}
     if result.frame.around is not None and result.frame.around.marks:
         states[entities.state("marks")] = "; ".join(result.frame.around.marks)
@@ -86,9 +86,11 @@ def states_of(result: FrameResult) -> dict[str, str]:
             states[entities.class_state(name, class_name)] = decision
     for kind in KINDS:
         # Each state of a lane needs a colour, so states have no track numbers. The log has them.
-        subjects = [a.subject.partition(" #")[0] for a in result.anomalies if a.kind == kind]
-        more = f" +{len(subjects) - 1}" if subjects[1:] else ""
-        states[entities.anomaly_state(kind)] = f"{subjects[0]}{more}" if subjects else ""
+        subjects = [
+            anomaly.subject.partition(" #")[0] for anomaly in result.anomalies if anomaly.kind == kind
+        ]
+        suffix = f" +{len(subjects) - 1}" if subjects[1:] else ""
+        states[entities.anomaly_state(kind)] = f"{subjects[0]}{suffix}" if subjects else ""
     return states
 
 
@@ -101,9 +103,9 @@ def _best_decisions(camera: CameraResult) -> Iterator[tuple[str, str]]:
     """Yield each class of a camera with the decision about its best kept detection."""
     if camera.detections is None or camera.fusion is None:
         return
-    found, seen = camera.detections, set()
-    for d in np.flatnonzero(found.kept).tolist():
-        if found.names[d] not in seen:
-            seen.add(found.names[d])
-            decision = Decision(int(camera.fusion.detection_decision[d]))
-            yield found.names[d], decision.name.lower().replace("_", " ")
+    detections, seen_classes = camera.detections, set()
+    for row in np.flatnonzero(detections.kept).tolist():
+        if detections.names[row] not in seen_classes:
+            seen_classes.add(detections.names[row])
+            decision = Decision(int(camera.fusion.detection_decision[row]))
+            yield detections.names[row], decision.name.lower().replace("_", " ")

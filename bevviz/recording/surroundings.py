@@ -39,13 +39,13 @@ def log_shapes(to: Writer, frame: Frame) -> None:
 
 def fixed_parts(frame: Frame) -> dict[str, Callable[[], Fixed | None]]:
     """Return functions that make the static data, by entity: the robot's meshes, and the axes of its IMUs."""
-    around, found = frame.around or Around(), dict[str, Callable[[], Fixed | None]]()
-    for shape in around.shapes:
+    surroundings, makers = frame.around or Around(), dict[str, Callable[[], Fixed | None]]()
+    for shape in surroundings.shapes:
         for number, mesh in enumerate(shape.meshes):
-            found[f"{entities.robot(shape.topic)}/mesh_{number}"] = partial(_mesh, mesh)
-    for motion in around.motions:
-        found[entities.rotation(motion.topic)] = found[entities.acceleration(motion.topic)] = _axes
-    return found
+            makers[f"{entities.robot(shape.topic)}/mesh_{number}"] = partial(_mesh, mesh)
+    for motion in surroundings.motions:
+        makers[entities.rotation(motion.topic)] = makers[entities.acceleration(motion.topic)] = _axes
+    return makers
 
 
 def log_motions(to: Writer, frame: Frame) -> None:
@@ -64,7 +64,7 @@ class AroundLog:
     """Log lines of marks and diagnostics. It remembers the diagnostics, so that only changes make a line."""
 
     def __init__(self) -> None:
-        self._said: dict[str, str] = {}  # name of the status -> its text
+        self._last_texts: dict[str, str] = {}  # name of the status -> its text
 
     def lines(self, frame: Frame) -> list[tuple[str, str]]:
         """Return log lines (level and text) of marks and of changed diagnostics."""
@@ -75,11 +75,11 @@ class AroundLog:
         lines = []
         for status in statuses:
             text = f"{status.name}: {status.level}{f', {status.text}' if status.text else ''}"
-            before = self._said.get(status.name)
+            before = self._last_texts.get(status.name)
             if text != before and not (before is None and status.level == "ok"):
                 level = {"ok": "INFO", "error": "ERROR"}.get(status.level, "WARN")
                 lines.append((level, f"diagnostics: {text}"))
-            self._said[status.name] = text
+            self._last_texts[status.name] = text
         return lines
 
 
@@ -108,8 +108,8 @@ def _log_shape(to: Writer, shape: Shape) -> None:
     if shape.strips:
         to.put(path, rr.LineStrips3D(shape.strips, colors=color, radii=rr.Radius.ui_points(2)))
     if shape.axes is not None:
-        place, turn = shape.axes[:3, 3], shape.axes[:3, :3]
-        to.put(path, rr.Arrows3D(origins=[place], vectors=[turn[:, 0]], colors=color))
+        position, rotation = shape.axes[:3, 3], shape.axes[:3, :3]
+        to.put(path, rr.Arrows3D(origins=[position], vectors=[rotation[:, 0]], colors=color))
     if shape.grid is not None:
         to.put(path, _grid(shape.grid))
     if shape.surface is not None:
@@ -153,8 +153,8 @@ def _mesh(mesh: MeshFile) -> Fixed | None:
         return None
     asset = rr.Asset3D(contents=contents, media_type=_media_type(mesh.path))
     quaternion = rr.Quaternion(xyzw=geometry.quaternion(mesh.pose))
-    place = rr.InstancePoses3D(translations=[mesh.pose[:3, 3]], quaternions=[quaternion], scales=[mesh.scale])
-    return asset, place
+    pose = rr.InstancePoses3D(translations=[mesh.pose[:3, 3]], quaternions=[quaternion], scales=[mesh.scale])
+    return asset, pose
 
 
 def _media_type(path: Path) -> str | rr.components.MediaType | None:

@@ -25,9 +25,9 @@ LANES = 12  # tracks with a lane for state and speed; the viewer never frees an 
 
 def log_tracks_looks(to: Writer) -> None:
     """Log the static style of tracks and trails, in 3D and over the bird's-eye image."""
-    looks = rr.Boxes3D.from_fields(radii=rr.Radius.ui_points(0.75), show_labels=False, fill_mode=OUTLINE)
+    style = rr.Boxes3D.from_fields(radii=rr.Radius.ui_points(0.75), show_labels=False, fill_mode=OUTLINE)
     for path in (entities.TRACKS, entities.UNSEEN):
-        to.static(path, looks)
+        to.static(path, style)
     to.static(entities.TRAILS, rr.LineStrips3D.from_fields(radii=rr.Radius.ui_points(1.5)))
     to.static(entities.TRACK_SPEEDS, rr.SeriesLines(names=[f"{n:02}" for n in range(LANES)]))
     for name, radius in (("tracks", 1.0), ("trails", 1.5)):
@@ -54,8 +54,8 @@ def log_tracks(to: Writer, frame: Frame, tracks: Tracks, config: BevConfig) -> N
     colors, points_from_world = class_ids(tracks.id[rows]), geometry.inverse(frame.pose)
     trail, lengths = trails(tracks, rows)
     to.put(entities.TRAILS, rr.LineStrips3D(strips(trail, lengths), class_ids=colors))
-    seen = seen_from_above(config, points_from_world, trail)
-    to.put(entities.overlay("trails"), rr.LineStrips2D(strips(seen, lengths), class_ids=colors))
+    pixels = seen_from_above(config, points_from_world, trail)
+    to.put(entities.overlay("trails"), rr.LineStrips2D(strips(pixels, lengths), class_ids=colors))
     outlines = footprints(geometry.corners(tracks.boxes)[rows])
     is_named = named_from_above(geometry.apply(points_from_world, tracks.boxes.center[rows]))
     to.put(
@@ -63,7 +63,9 @@ def log_tracks(to: Writer, frame: Frame, tracks: Tracks, config: BevConfig) -> N
         rr.LineStrips2D(
             seen_from_above(config, points_from_world, outlines),
             class_ids=colors,
-            labels=[label(tracks, row) if shown else "" for row, shown in zip(rows, is_named, strict=True)],
+            labels=[
+                label(tracks, row) if is_shown else "" for row, is_shown in zip(rows, is_named, strict=True)
+            ],
             show_labels=True,
         ),
     )
@@ -126,8 +128,8 @@ def of_clusters(tracks: Tracks | None, count: int) -> I64:
     """Return the (count,) track id of each cluster. A cluster without a track gets its own row."""
     ids = np.arange(count)
     if tracks is not None:
-        seen = tracks.cluster >= 0
-        ids[tracks.cluster[seen]] = tracks.id[seen]
+        has_cluster = tracks.cluster >= 0
+        ids[tracks.cluster[has_cluster]] = tracks.id[has_cluster]
     return ids
 
 
@@ -136,8 +138,8 @@ def of_objects(tracks: Tracks | None, count: int) -> list[int | None]:
     rows: list[int | None] = [None] * count
     if tracks is not None:
         for row in shown(tracks).tolist():
-            if (j := int(tracks.object[row])) >= 0:
-                rows[j] = row
+            if (object_row := int(tracks.object[row])) >= 0:
+                rows[object_row] = row
     return rows
 
 
@@ -147,6 +149,6 @@ def trails(tracks: Tracks, rows: I64) -> tuple[F32, I64]:
     Returns:
         (N, 3) points, one track after the other, and the number of points of each track.
     """
-    found = tracks.trail[rows]
-    known = np.isfinite(found[:, :, 0])
-    return found[known], known.sum(axis=1)
+    positions = tracks.trail[rows]
+    known = np.isfinite(positions[:, :, 0])
+    return positions[known], known.sum(axis=1)

@@ -35,13 +35,13 @@ class VideoEncoder:
     def __init__(self) -> None:
         self._context: av.VideoCodecContext | None = None
         self._size: tuple[int, int] = (0, 0)
-        self._key = 0  # stamp of the last key frame
+        self._key_stamp = 0  # stamp of the last key frame
         self._count = 0
-        self._again = True
+        self._forces_key = True
 
     def restart(self) -> None:
         """Make the next image a key frame."""
-        self._again = True
+        self._forces_key = True
 
     def __call__(self, bgr: U8, stamp: int) -> Sample:
         """Encode the next image.
@@ -52,11 +52,11 @@ class VideoEncoder:
         """
         if self._context is None or bgr.shape[:2] != self._size:
             self._size, self._count = (bgr.shape[0], bgr.shape[1]), 0
-            self._context, self._again = _opened(bgr), True
-        key = self._again or not 0 <= stamp - self._key < GOP
+            self._context, self._forces_key = _open_encoder(bgr), True
+        key = self._forces_key or not 0 <= stamp - self._key_stamp < GOP
         if key:
-            self._key, self._again = stamp, False
-        frame = av.VideoFrame.from_ndarray(_even(bgr), format="bgr24").reformat(
+            self._key_stamp, self._forces_key = stamp, False
+        frame = av.VideoFrame.from_ndarray(_pad_to_even(bgr), format="bgr24").reformat(
             format="yuv420p", dst_colorspace=Colorspace.ITU709, dst_color_range=ColorRange.MPEG
         )
         frame.pts = self._count
@@ -74,7 +74,7 @@ def decode(samples: Sequence[bytes]) -> list[U8]:
     return [np.asarray(frame.to_ndarray(format="bgr24"), np.uint8) for frame in frames]
 
 
-def _opened(bgr: U8) -> av.VideoCodecContext:
+def _open_encoder(bgr: U8) -> av.VideoCodecContext:
     height, width = (side + side % 2 for side in bgr.shape[:2])
     context = av.CodecContext.create("libx264", "w")
     assert isinstance(context, av.VideoCodecContext)
@@ -88,7 +88,7 @@ def _opened(bgr: U8) -> av.VideoCodecContext:
     return context
 
 
-def _even(bgr: U8) -> U8:
+def _pad_to_even(bgr: U8) -> U8:
     height, width = bgr.shape[:2]
     if height % 2 or width % 2:
         return np.pad(bgr, ((0, height % 2), (0, width % 2), (0, 0)), "edge")

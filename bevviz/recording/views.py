@@ -59,14 +59,14 @@ def space(
     # The explained points stand out by colours that differ in meaning from the colours of clusters.
     hidden += [entities.clusters(scene.lidar), entities.FRUSTUMS] if why else []
     hidden += [entities.clusters(scene.lidar), entities.FRUSTUMS] if by is not None else []
-    own = entities.names(entities.FUSED), entities.names(entities.FUSION)
-    hidden += [*own] if why or not names else []
+    name_entities = entities.names(entities.FUSED), entities.names(entities.FUSION)
+    hidden += [*name_entities] if why or not names else []
     overrides: dict[Any, Any] = dict.fromkeys((root + path for path in hidden), HIDDEN)
     if by is not None:
         overrides |= {root + path: color_by.visualizer(by) for path in clouds}
     position, target = EYE, LOOK
     if why and scene.focus is not None:
-        position, target = _beside(scene.focus), scene.focus
+        position, target = _eye_near(scene.focus), scene.focus
     return rrb.Spatial3DView(
         name=name if scene.raw else f"{name}, voxels (raw clouds now and then, or none)",
         origin=root + entities.sensor(scene.lidar),
@@ -87,21 +87,27 @@ def space(
     )
 
 
-def spaces(scene: Scene, **looks: Any) -> rrb.Container | rrb.View:
+def spaces(scene: Scene, **options: Any) -> rrb.Container | rrb.View:
     """Return the 3D view, with a further tab for each quantity that can colour the raw points."""
-    first = space(scene, **looks)
+    first = space(scene, **options)
     if not scene.color_by:
         return first
-    tabs = [space(scene, **looks | {"raw": True, "name": by.capitalize(), "by": by}) for by in scene.color_by]
+    tabs = [
+        space(scene, **options | {"raw": True, "name": by.capitalize(), "by": by}) for by in scene.color_by
+    ]
     return rrb.Tabs(first, *tabs, name="3D")
 
 
-def _beside(place: tuple[float, float, float]) -> tuple[float, float, float]:
+def _eye_near(target: tuple[float, float, float]) -> tuple[float, float, float]:
     """Return an eye position a few metres from a target: on the robot's side, to the left and above."""
-    x, y, z = place
-    away = max(math.hypot(x, y), 1e-6)
-    back = min(away, 6.0)
-    return x - back * x / away - 2.0 * y / away, y - back * y / away + 2.0 * x / away, z + 2.5
+    x, y, z = target
+    distance = max(math.hypot(x, y), 1e-6)
+    offset = min(distance, 6.0)
+    return (
+        x - offset * x / distance - 2.0 * y / distance,
+        y - offset * y / distance + 2.0 * x / distance,
+        z + 2.5,
+    )
 
 
 def camera(scene: Scene, name: str, *, why: bool = False, weak: bool = False) -> rrb.Spatial2DView:
@@ -114,8 +120,8 @@ def camera(scene: Scene, name: str, *, why: bool = False, weak: bool = False) ->
         weak: show weak detections too.
     """
     contents = ["$origin/**", *([f"{entities.ROBOT}/**"] if scene.robot else [])]
-    told = [entities.projected(name), entities.names(entities.detections(name))]
-    hidden = told if why else [] if weak else [entities.weak(name)]
+    points_and_names = [entities.projected(name), entities.names(entities.detections(name))]
+    hidden = points_and_names if why else [] if weak else [entities.weak(name)]
     return rrb.Spatial2DView(
         name=name,
         origin=entities.sensor(name),
@@ -237,7 +243,7 @@ def clocks() -> rrb.TimeSeriesView:
 
 def counts() -> rrb.TimeSeriesView:
     """Return a plot of clusters, detections, matches and opinions, which are numbers of similar size."""
-    return plot("Counts", entities.HEALTH, [entities.count(what) for what in (*COUNTS, *OPINIONS)])
+    return plot("Counts", entities.HEALTH, [entities.count(name) for name in (*COUNTS, *OPINIONS)])
 
 
 def rates() -> rrb.TimeSeriesView:

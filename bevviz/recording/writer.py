@@ -51,22 +51,22 @@ class Writer(Closing):
         self._wait, self._stamps = wait, stamps
         self._clock: dict[str, int] = {}  # timeline -> position of this frame
         self._scalars: dict[str, list[tuple[dict[str, int], float]]] = defaultdict(list)
-        self._sent = time.monotonic()
-        self._known: set[str] = set()  # entities that any frame had
-        self._shown: set[str] = set()  # entities with data of the previous frame
-        self._now: set[str] = set()
+        self._flushed_at = time.monotonic()
+        self._all_entities: set[str] = set()  # entities that any frame had
+        self._previous_entities: set[str] = set()  # entities with data of the previous frame
+        self._frame_entities: set[str] = set()
         self.apart = False  # whether frames may be viewed without their previous frames
         self.streams_video = True  # False: each video picture is logged as an image
         self._codecs: dict[str, Codec] = {}  # codec of entities that are video
-        self._reached: dict[str, tuple[tuple[int, int], dict[str, int]]] = {}  # last packet and its time
+        self._last_packets: dict[str, tuple[tuple[int, int], dict[str, int]]] = {}  # last packet and its time
         self._versions: dict[str, int] = {}  # entity -> version in the last ``keep``
 
     def begin(self, index: int, stamp: int, received: int) -> None:
         """Start a frame. Stamps are in nanoseconds; ``received`` is 0 if it is unknown."""
-        self._now = set()
-        before = self._clock
+        self._frame_entities = set()
+        clock = self._clock
         self.set_time(index, stamp, received)
-        if before.keys() != self._clock.keys():
+        if clock.keys() != self._clock.keys():
             self.flush()  # all rows of a column have the same timelines
 
     def end(self) -> None:
@@ -74,11 +74,11 @@ class Writer(Closing):
 
         If frames are viewed apart, clear entities that any earlier frame had.
         """
-        self._known |= self._now
-        for path in (self._known if self.apart else self._shown) - self._now:
+        self._all_entities |= self._frame_entities
+        for path in (self._all_entities if self.apart else self._previous_entities) - self._frame_entities:
             self.write(path, rr.Clear(recursive=False))
-        self._shown = self._now
-        if time.monotonic() - self._sent >= self._wait:
+        self._previous_entities = self._frame_entities
+        if time.monotonic() - self._flushed_at >= self._wait:
             self.flush()
 
     def clear_at(self, index: int, stamp: int, received: int, paths: Set[str]) -> None:
@@ -93,14 +93,14 @@ class Writer(Closing):
         Args:
             known: further entities that may exist.
         """
-        self._shown = self._known | known
+        self._previous_entities = self._all_entities | known
         self._versions.clear()
-        self._reached.clear()
+        self._last_packets.clear()
 
     @property
     def known(self) -> frozenset[str]:
         """Entities that any frame had."""
-        return frozenset(self._known)
+        return frozenset(self._all_entities)
 
     def flush(self) -> None:
         """Send scalars that wait."""
@@ -108,7 +108,7 @@ class Writer(Closing):
             clocks, values = zip(*rows, strict=True)
             self._write_columns(path, clocks, rr.Scalars.columns(scalars=values))
         self._scalars.clear()
-        self._sent = time.monotonic()
+        self._flushed_at = time.monotonic()
 
     def close(self) -> None:
         """Send scalars that wait."""
@@ -124,7 +124,7 @@ class Writer(Closing):
     def put(self, path: str, *archetypes: rr.AsComponents) -> None:
         """Log data of this frame alone. The next frame without data for the entity clears it."""
         self.write(path, *archetypes)
-        self._now.add(path)
+        self._frame_entities.add(path)
 
     def video(self, path: str, clip: Clip) -> None:
         """Log the last image of a clip, with those packets of the clip that are not logged yet.
@@ -135,17 +135,17 @@ class Writer(Closing):
         if self._codecs.get(path) != clip.codec:
             self._codecs[path] = clip.codec
             self.static(path, rr.VideoStream(codec=CODECS[clip.codec]))
-        reached, clock = self._reached.get(path, (None, {}))
-        clock = clock if reached in clip.places else {}
-        begin = clip.places.index(reached) + 1 if reached in clip.places else clip.key
-        self._reached[path] = clip.places[-1], self._clock
+        last_packet, clock = self._last_packets.get(path, (None, {}))
+        clock = clock if last_packet in clip.places else {}
+        begin = clip.places.index(last_packet) + 1 if last_packet in clip.places else clip.key
+        self._last_packets[path] = clip.places[-1], self._clock
         end = len(clip.places) - 1
         clocks = []
         for row in range(begin, end):
-            early = clip.places[end][1] - clip.places[row][1] if clock else 0
+            offset = clip.places[end][1] - clip.places[row][1] if clock else 0
             times = dict(self._clock)
             for name in self._clock.keys() & set(STAMPS):
-                times[name] -= max(early, STEP * (end - row))
+                times[name] -= max(offset, STEP * (end - row))
                 if name in clock:
                     times[name] = max(times[name], clock[name] + STEP * (row - begin + 1))
             clocks.append(times)
@@ -159,10 +159,10 @@ class Writer(Closing):
 
         If it is not kept, the caller must log the data.
         """
-        kept = self._versions.get(path) == version and path in self._shown
+        is_kept = self._versions.get(path) == version and path in self._previous_entities
         self._versions[path] = version
-        self._now.add(path)
-        return kept
+        self._frame_entities.add(path)
+        return is_kept
 
     def write(self, path: str, *archetypes: rr.AsComponents) -> None:
         """Log data that holds from this frame on, until newer data."""
