@@ -10,6 +10,7 @@ from pathlib import Path
 import rerun.blueprint as rrb
 from rerun.recording_stream import RecordingStream
 
+import bevviz
 from bevviz.config import BevConfig, Config
 from bevviz.errors import UserError
 from bevviz.model.frame import Scene
@@ -22,7 +23,7 @@ def _folder() -> Path:
 
     It is inside the package in an installation, and next to the package folder in a checkout.
     """
-    package = Path(__file__).parents[1]
+    package = Path(bevviz.__file__).parent
     installed = package / "blueprints"
     return installed if installed.is_dir() else package.parent / "blueprints"
 
