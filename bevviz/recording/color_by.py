@@ -64,7 +64,7 @@ def class_ids(
     """Return class ids of each point by quantity: (N,), or (1,) if the cloud lacks the field.
 
     Args:
-        wanted: quantities.
+        quantities: quantities to return.
         points: (N, 3) metres, in the LiDAR frame.
         heights: (N,) class ids from ``height_ids``.
         fields: further (N,) fields of the cloud.

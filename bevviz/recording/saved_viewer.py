@@ -24,9 +24,9 @@ def too_large_for_web(recording: Path, size: int) -> str:
     if size <= WEB:
         return ""
     return (
-        f"{recording.name} has {size / 1e9:.1f} GB, and a browser's viewer can hold {WEB / 1e9:.1f} GB: its "
-        f"beginning is missing; Rerun's own viewer reads what it shows from the file (rerun {recording}); "
-        "--keep inspect saves a fifth"
+        f"{recording.name} has {size / 1e9:.1f} GB, and a browser's viewer can hold {WEB / 1e9:.1f} GB: "
+        f"its beginning is missing; Rerun's own viewer reads what it shows from the file (rerun "
+        f"{recording}); --keep inspect saves a fifth"
     )
 
 
