@@ -1,1 +1,1 @@
-"""Page that answers clicks, over a bag or a robot. Imports every package except `cli`."""
+"""Web page that answers clicks, over a bag or a robot. Imports every package except `cli`."""

@@ -1,4 +1,4 @@
-"""Who is let in: whoever has the token, and was not sent by another site."""
+"""Access to the page: a request needs the token and must not come from another site."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ HOSTS = ("127.0.0.1", "localhost")
 
 
 class Guard:
-    """Lets nobody in who has not the token, or whom another site sent.
+    """ASGI middleware that refuses requests without the token and requests from other sites.
 
-    The host has to be this machine's own name: another one that leads here is a trick. The origin, where the
-    browser states one, has to be the page's.
+    The host of a request has to be a name of this machine, so that another name that resolves to it (DNS
+    rebinding) is refused. If the browser sends an origin, it has to be that of the page.
     """
 
     def __init__(self, app: ASGIApp, token: str, port: int) -> None:
@@ -25,11 +25,14 @@ class Guard:
         self._hosts = {f"{host}:{port}" for host in HOSTS}
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Answer a refused request with status 403. Pass every other request to the application."""
         if scope["type"] in ("http", "websocket"):
             refusal = self._refusal(HTTPConnection(scope))
             if refusal and scope["type"] == "websocket":
                 await receive()
-                await send({"type": "websocket.close", "code": 1008, "reason": refusal})  # before accept: 403
+                await send(
+                    {"type": "websocket.close", "code": 1008, "reason": refusal}
+                )  # before accept: status 403
                 return
             if refusal:
                 await PlainTextResponse(f"bevviz: {refusal}\n", 403)(scope, receive, send)
@@ -37,7 +40,7 @@ class Guard:
         await self._app(scope, receive, send)
 
     def _refusal(self, asked: HTTPConnection) -> str:
-        """Why nothing is answered; empty: it is."""
+        """Return the reason to refuse a request. Empty: it is allowed."""
         host, origin = asked.headers.get("host", ""), asked.headers.get("origin")
         if host not in self._hosts:
             return "this page is at 127.0.0.1 alone"
@@ -52,11 +55,12 @@ class Guard:
 
 
 def cookie_name(port: int) -> str:
-    """Cookies know no ports: each server has its own."""
+    """Return the name of the cookie. Cookies do not distinguish ports, so each server has its own name."""
     return f"bevviz_{port}"
 
 
 def _cookie(asked: HTTPConnection, name: str) -> str:
+    """Return the value of a cookie, or an empty text."""
     try:
         found = SimpleCookie(asked.headers.get("cookie", "")).get(name)
     except CookieError:

@@ -1,4 +1,4 @@
-"""The controls of the page: every parameter with its unit, range, value and what it means."""
+"""Parameter controls of the page, with unit, range, value and description of each."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from pydantic_core import to_jsonable_python
 from bevviz.config import Config, unit, values
 from bevviz.config.descriptions import field_of
 
-UNSEEN = ("source.", "live.", "logging.", "sync.", "detector.model")  # nothing that one frame could show anew
+UNSEEN = ("source.", "live.", "logging.", "sync.", "detector.model")  # no effect on a single frame
 
 
 def controls(config: Config, opened: Config | None = None) -> list[dict[str, Any]]:
-    """One for each parameter of the stages that a frame can be run with again.
+    """Return one control for each stage parameter that a frame can be run again with.
 
     Args:
-        config: whose stages they are.
-        opened: whose values they have; of a stage that it does not name, the defaults. None: those of
-            ``config``.
+        config: configuration whose stages have the parameters.
+        opened: configuration with the initial values. A stage that it does not name has its defaults. None:
+            the values of ``config``.
     """
     at_first = values(config if opened is None else opened)
     return [
@@ -32,11 +32,12 @@ def controls(config: Config, opened: Config | None = None) -> list[dict[str, Any
 
 
 def _default(value: Any, info: FieldInfo) -> Any:
-    """Of a parameter; the value where it has none."""
+    """Return the default of a parameter, or ``value`` if it has none."""
     return value if info.is_required() else to_jsonable_python(info.get_default(call_default_factory=True))
 
 
 def _control(key: str, value: Any, info: FieldInfo) -> dict[str, Any]:
+    """Return the control of one parameter as JSON for the page."""
     found: dict[str, Any] = {
         "key": key,
         "value": value,
@@ -55,6 +56,7 @@ def _control(key: str, value: Any, info: FieldInfo) -> dict[str, Any]:
 
 
 def _kind(annotation: Any) -> str:
+    """Return the kind of input for a type annotation: choice, switch, whole, number or text."""
     if get_origin(annotation) is Literal:
         return "choice"
     united = get_args(annotation) if get_origin(annotation) in (Union, UnionType) else ()

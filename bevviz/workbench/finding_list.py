@@ -1,4 +1,4 @@
-"""The list of what is worth a look: one entry for one thing, however many frames it lasts."""
+"""List of findings over the drive. A finding that lasts several frames is one group."""
 
 from __future__ import annotations
 
@@ -15,22 +15,22 @@ from bevviz.model.geometry import iou
 from bevviz.model.results import Anomaly
 from bevviz.workbench.findings import Find, Place
 
-REACH = 2.5  # metres that a thing may have moved since the last frame that it was found in
-GAP = 5  # frames that it may have been away for
+REACH = 2.5  # metres that an object may have moved since the last frame with this finding
+GAP = 5  # frames without the finding after which a new group begins
 SAME_BOX = 0.3  # IoU of the image boxes of one detection in two frames
 
 
 @dataclass(frozen=True, slots=True)
 class Sight:
-    """One frame that an entry is of.
+    """One frame of a finding.
 
     Attributes:
-        frame: number of its scan.
-        stamp: of that, nanoseconds.
-        distance: metres; NaN where it is not known.
-        pick: that asks about it; empty: nothing to ask.
-        tried: whether it is to be seen with what was changed, rather than as the drive was opened.
-        text: why it is so in this frame.
+        frame: number of the scan.
+        stamp: stamp of the scan, in nanoseconds.
+        distance: distance in metres. NaN: unknown.
+        pick: pick that asks about it. Empty: there is nothing to ask.
+        tried: whether the tried side shows it, rather than the drive as it was opened.
+        text: reason in this frame.
     """
 
     frame: int
@@ -41,25 +41,25 @@ class Sight:
     text: str = ""
 
     def as_list(self) -> list[Any]:
-        """For the page, which counts in doubles."""
+        """Return the values for the page. The stamp is text: JavaScript numbers cannot hold it."""
         away = None if math.isnan(self.distance) else round(self.distance, 1)
         return [self.frame, str(self.stamp), away, self.pick, self.tried, self.text]
 
 
 @dataclass(slots=True)
 class Entry:
-    """One thing in all of its frames."""
+    """One finding in all of its frames."""
 
     number: int
     what: str
     name: str
     sights: list[Sight] = field(default_factory=list)
-    place: Place | None = None  # where it was last
+    place: Place | None = None  # position in the last frame
     box: F32 | None = None
 
 
 class Entries:
-    """All of them; written by one thread at a time, read by any."""
+    """All groups of findings. One thread at a time may add to it, any thread may read it."""
 
     def __init__(self) -> None:
         self._entries: dict[int, Entry] = {}
@@ -68,7 +68,10 @@ class Entries:
         self._lock = threading.Lock()
 
     def add(self, found: Iterable[Find], *, tried: bool = False) -> None:
-        """Of the next frame. A thing of the same kind and name near where one just was is that one."""
+        """Add the findings of the next frame.
+
+        A finding near a recent one of the same kind and name joins its group.
+        """
         with self._lock:
             taken: set[int] = set()
             for find in found:
@@ -93,7 +96,7 @@ class Entries:
         return entry
 
     def add_anomalies(self, frame: int, stamp: int, new: Sequence[Anomaly]) -> None:
-        """Those that began with a frame."""
+        """Add the anomalies that begin in a frame."""
         with self._lock:
             for anomaly in new:
                 kind = anomaly.kind.replace("_", " ")
@@ -101,7 +104,7 @@ class Entries:
                 self._new("anomaly", kind).sights.append(sight)
 
     def replace(self, whats: Sequence[str]) -> None:
-        """Drop all of these kinds: others are to come."""
+        """Remove all findings of these kinds, before new ones are added."""
         with self._lock:
             for number in [n for n, entry in self._entries.items() if entry.what in whats]:
                 del self._entries[number]
@@ -109,7 +112,7 @@ class Entries:
                 del self._open[key]
 
     def news(self, told: dict[int, int]) -> Iterator[dict[str, Any]]:
-        """What a page has not been told; ``told``: how many frames of each entry it has been."""
+        """Yield the news for a page. ``told`` counts the frames that it has of each group."""
         with self._lock:
             gone = [number for number in told if number not in self._entries]
             new = [entry for entry in self._entries.values() if len(entry.sights) > told.get(entry.number, 0)]
@@ -130,7 +133,7 @@ class Entries:
 
 
 def _away(entry: Entry, find: Find) -> float:
-    """How far it is from where the entry last was, of how far it may be."""
+    """Return the distance from the last position of a group, divided by the largest allowed distance."""
     if entry.place is not None and find.place is not None:
         return float(np.linalg.norm(np.subtract(entry.place, find.place))) / REACH
     if entry.box is not None and find.box is not None:

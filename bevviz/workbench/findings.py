@@ -1,4 +1,4 @@
-"""What of a frame is worth a click: objects that were missed, false ones, and what nothing explains."""
+"""Findings in a frame: missed objects, false objects, and unexplained detections and clusters."""
 
 from __future__ import annotations
 
@@ -14,25 +14,25 @@ from bevviz.model.results import Decision, FrameResult, Opinion
 from bevviz.why import Questioner, Selection
 from bevviz.why.pick import Pick
 
-FEW = 30  # points, below which a cluster that no detection names is no object that one would miss
+FEW = 30  # points. A smaller cluster without a detection is hardly an object that somebody misses.
 
 Place = tuple[float, float, float]
 
 
 @dataclass(frozen=True, slots=True)
 class Find:
-    """One of them.
+    """One finding.
 
     Attributes:
-        frame: number of its scan.
-        stamp: of that, nanoseconds.
+        frame: number of the scan.
+        stamp: stamp of the scan, in nanoseconds.
         what: missed, false, contradicted, lost, unmatched or unnamed.
-        name: of its class, or of the cluster.
-        distance: horizontal metres; NaN where it is not known.
-        pick: that asks about it.
-        reason: why, in brief.
-        place: in the fixed frame, where it is known.
-        box: (4,) in the image of a camera, of a detection that has no place.
+        name: name of the class, or "cluster".
+        distance: horizontal distance in metres. NaN: unknown.
+        pick: pick that asks about it.
+        reason: short reason.
+        place: position in the fixed frame, if known.
+        box: (4,) box in the image, for a detection without position.
     """
 
     frame: int
@@ -47,11 +47,14 @@ class Find:
 
 
 def finds(result: FrameResult, truth: Truth | None) -> list[Find]:
-    """Those of a frame within 40 m, the nearest first.
+    """Return the findings of a frame within 40 m, nearest first.
 
-    With the truth, which the frame has, too, what had to be found and was not, and objects that are none;
-    without it objects of somebody else's that a camera contradicts, those that they have lost and our fusion
-    has, kept detections that have no cluster, and clusters in view that no detection names.
+    With ground truth these are missed and false objects. Without it they are:
+
+    - objects of another perception that a camera contradicts,
+    - objects that it has lost and our fusion has,
+    - kept detections without a cluster,
+    - clusters in view without a detection.
     """
     found = list(_judged(result, truth) if truth is not None else [*_doubted(result), *_unexplained(result)])
     near = [find for find in found if not find.distance > RANGE]
@@ -59,7 +62,7 @@ def finds(result: FrameResult, truth: Truth | None) -> list[Find]:
 
 
 def with_reasons(found: Sequence[Find], result: FrameResult, questioner: Questioner) -> list[Find]:
-    """The missed objects with the reason of the verdict."""
+    """Return the findings with the reason of the verdict at each missed object."""
     reasons = {}
     for find in found:
         if find.what == "missed":
@@ -69,6 +72,7 @@ def with_reasons(found: Sequence[Find], result: FrameResult, questioner: Questio
 
 
 def _judged(result: FrameResult, truth: Truth) -> Iterator[Find]:
+    """Yield the false and the missed objects by ground truth."""
     when, objects, pose = (result.frame.index, result.frame.stamp), result.objects, result.frame.pose
     free = truth.must.copy()
     if objects is not None and len(objects):
@@ -87,7 +91,7 @@ def _judged(result: FrameResult, truth: Truth) -> Iterator[Find]:
 
 
 def _doubted(result: FrameResult) -> Iterator[Find]:
-    """Of objects that are somebody else's."""
+    """Yield the findings about objects of another perception: contradicted by a camera, or lost."""
     opinions, objects = result.opinions, result.objects
     if opinions is None or objects is None:
         return
@@ -104,6 +108,7 @@ def _doubted(result: FrameResult) -> Iterator[Find]:
 
 
 def _unexplained(result: FrameResult) -> Iterator[Find]:
+    """Yield the detections without a cluster and the clusters without a detection."""
     when, clusters, pose = (result.frame.index, result.frame.stamp), result.clusters, result.frame.pose
     named = np.zeros(0 if clusters is None else len(clusters), bool)
     seen = named.copy()
@@ -130,6 +135,6 @@ def _unexplained(result: FrameResult) -> Iterator[Find]:
 
 
 def fixed_place(pose: F64, center: F32) -> Place:
-    """In the fixed frame."""
+    """Return a point in the fixed frame."""
     x, y, z = geometry.apply(pose, np.asarray(center, np.float32)[None])[0].tolist()
     return x, y, z

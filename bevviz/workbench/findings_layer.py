@@ -1,4 +1,4 @@
-"""What was missed, is false or has no name, drawn so that it can be clicked."""
+"""Clickable boxes of missed, false and unnamed objects in every view."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from bevviz.why.subject import one_of, projected
 from bevviz.workbench.findings import Find
 
 Color = tuple[int, int, int]
-Layer: TypeAlias = Mapping[str, Sequence[Find]]  # by entity: what each row of it is
+Layer: TypeAlias = Mapping[str, Sequence[Find]]  # findings of an entity, one per logged row
 
 LAYERS = {
     "missed": (entities.MISSED, (255, 80, 70)),
@@ -34,10 +34,12 @@ LAYERS = {
 
 
 def log_layer(to: Writer, result: FrameResult, found: Sequence[Find]) -> Layer:
-    """In space, from above and in every image; within a frame of the writer.
+    """Log the boxes in space, in the bird's-eye view and in every image.
+
+    Call this within a frame of the writer.
 
     Returns:
-        What the rows of each entity are.
+        The findings behind the rows of each entity.
     """
     layer: dict[str, Sequence[Find]] = {}
     for what, (path, color) in LAYERS.items():
@@ -78,6 +80,7 @@ def log_layer(to: Writer, result: FrameResult, found: Sequence[Find]) -> Layer:
 
 
 def _box(result: FrameResult, find: Find) -> Boxes3D:
+    """Return the box of a finding in the frame of the points, as one row."""
     row = find.pick.row
     if find.pick.kind == "object" and result.objects is not None:
         return one_of(result.objects.boxes, row)
@@ -90,7 +93,7 @@ def _box(result: FrameResult, find: Find) -> Boxes3D:
 def _log_above(
     to: Writer, path: str, boxes: Boxes3D, labels: Sequence[str], color: Color, config: BevConfig
 ) -> Sequence[int]:
-    """Those whose centre is in the bird's-eye image; returns their rows."""
+    """Log the boxes whose centre is in the bird's-eye image, and return their rows."""
     reach = np.array([config.range_x, config.range_y], np.float32)
     inside: list[int] = np.flatnonzero((np.abs(boxes.center[:, :2]) < reach).all(axis=1)).tolist()
     if inside:

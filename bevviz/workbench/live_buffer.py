@@ -1,4 +1,4 @@
-"""What the pages of a running robot are shown: the newest pieces of what is logged."""
+"""Buffer of the newest recorded data of a running robot, for its pages."""
 
 from __future__ import annotations
 
@@ -18,48 +18,51 @@ from bevviz.recording.frame_logger import Context
 from bevviz.recording.sinks import APPLICATION
 from bevviz.workbench.routes import Heard
 
-AHEAD = 10  # pieces that a page is sent before its viewer has drawn the first of them
-WHOLE = 3  # packets that need none before them, from the oldest of which on all are kept for pages
+AHEAD = 10  # pieces that may be sent before the page's viewer has drawn the first of them
+WHOLE = 3  # self-contained packets that are kept, with all packets after the oldest of them
 
 
 @dataclass(frozen=True, slots=True)
 class _Piece:
+    """One piece of the recording."""
+
     number: int
     data: bytes  # with the header that every recording begins with
-    context: Context | None  # of one that a page can begin with
+    context: Context | None  # only for a piece that a page can begin with
 
 
 class Page:
-    """How far a page is with what it was sent.
+    """Progress of a page: how many pieces it was sent, and how many its viewer has drawn.
 
     Args:
-        heard: what it says of that, a word for each piece that its viewer has drawn.
-        clock: seconds.
+        heard: state of the page, with its acknowledgements.
+        clock: returns the time in seconds.
     """
 
     def __init__(self, heard: Heard, clock: Callable[[], float]) -> None:
         self._heard, self._clock = heard, clock
-        self._sent: deque[float] = deque()  # times, from the first one on that it has not drawn
+        self._sent: deque[float] = deque()  # send times of the pieces that are not drawn yet
         self._drawn = 0
         self._held = threading.Lock()
 
     def send(self) -> None:
-        """A piece is on its way."""
+        """Count a piece that is sent."""
         with self._held:
             self._sent.append(self._clock())
 
     @property
     def ready(self) -> bool:
-        """Whether there may be more."""
+        """Whether the page can take another piece."""
         return self._oldest() is None or len(self._sent) < AHEAD
 
     @property
     def lag(self) -> float:
-        """Seconds since the first piece was sent that it has not drawn; 0 while nobody sees it."""
+        """Seconds since the oldest undrawn piece was sent. 0 while the page is in the background."""
         oldest = self._oldest()
         return 0.0 if oldest is None or self._heard.hidden else self._clock() - oldest
 
     def _oldest(self) -> float | None:
+        """Return the send time of the oldest undrawn piece, if there is one."""
         with self._held:
             while self._sent and self._drawn < self._heard.count:
                 self._sent.popleft()
@@ -68,11 +71,11 @@ class Page:
 
 
 class LiveFilm(Output):
-    """The newest pieces of what is logged, for pages; one that is too slow goes on at the newest.
+    """Buffer of the newest pieces of the recording. A page that is too slow continues at the newest piece.
 
     Args:
-        live: whose results it is.
-        queue: packets that may wait.
+        live: the live run.
+        queue: number of packets that may wait.
     """
 
     def __init__(self, live: Live, queue: int) -> None:
@@ -80,7 +83,7 @@ class LiveFilm(Output):
         self._encoder = live.encoder
         self._sparse = live.config.live.viewer_rate is not None
         self._pages: list[Page] = []
-        self._missed = 0  # pieces, by pages that were too slow
+        self._missed = 0  # pieces that slow pages have skipped
         self._pieces: deque[_Piece] = deque()
         self._next = 0
         self._held = threading.Lock()
@@ -88,21 +91,23 @@ class LiveFilm(Output):
         self._thread.start()
 
     def close(self) -> None:
+        """Stop the thread."""
         self._end()
         self._thread.join(1.0)
 
     @property
     def dropped(self) -> int:
+        """Number of dropped packets and skipped pieces."""
         return super().dropped + self._missed
 
     @property
     def lag(self) -> float | None:
-        """Of the slowest page: what its browser has not drawn counts, too."""
+        """Lag of the slowest page, in seconds. It includes what its browser has not drawn."""
         return max((page.lag for page in self._pages.copy()), default=None)
 
     @contextmanager
     def shown(self, heard: Heard) -> Iterator[Page]:
-        """A page that is there meanwhile."""
+        """Return a context in which a page is connected."""
         page = Page(heard, self._encoder.clock)
         self._pages.append(page)
         try:
@@ -111,23 +116,24 @@ class LiveFilm(Output):
             self._pages.remove(page)
 
     def listen(self, listener: Callable[[], None]) -> Callable[[], None]:
-        """Call it, from some thread, whenever there is more. Returns what ends that."""
+        """Call the listener, from any thread, for each new piece. Return a function that ends this."""
         self._listeners.append(listener)
         return lambda: self._listeners.remove(listener)
 
     def add(self, data: bytes | None) -> None:
-        """A recording of its own that belongs to the same one; None is nothing."""
+        """Append data of a further stream into the same recording. None is ignored."""
         if data:
             self._put(data, None)
 
     def since(self, number: int | None) -> tuple[list[bytes], int]:
-        """What a page is to be given next.
+        """Return the pieces that a page gets next.
 
         Args:
-            number: of the piece that it has not yet; None: it has nothing.
+            number: number of the next piece for the page. None: it has nothing yet.
 
         Returns:
-            Recordings, and the number to go on with. Where pieces were missed they begin anew.
+            The pieces, and the number to continue with. After skipped pieces they start with a self-contained
+            piece.
         """
         with self._held:
             pieces = list(self._pieces)

@@ -1,4 +1,4 @@
-"""The page of a running robot, served beside it."""
+"""The workbench page of a running robot, served by the live process."""
 
 from __future__ import annotations
 
@@ -30,21 +30,21 @@ if TYPE_CHECKING:
     from bevviz.workbench.session import Bench
     from bevviz.workbench.startup import Opening
 
-PATIENCE = 3.0  # seconds that the page's threads may take to end
+PATIENCE = 3.0  # seconds that close() waits for the threads of the page
 
 
 class LivePage(Closing):
-    """The page, served by threads of its own, until it is closed.
+    """Server of the page, in threads of its own, until it is closed.
 
     Args:
-        bench: the robot.
-        port: of the page; None: one that is free.
+        bench: the workbench session of the robot.
+        port: port of the page. None: a free one.
 
     Raises:
         UserError: the port is in use, or the viewer is not installed.
 
     Attributes:
-        address: what to open.
+        address: address of the page, with its token.
     """
 
     def __init__(self, bench: LiveBench, port: int | None) -> None:
@@ -65,6 +65,7 @@ class LivePage(Closing):
         ready.wait(PATIENCE)
 
     def close(self) -> None:
+        """Stop the server, then close the workbench session."""
         self._server.end()
         self._thread.join(PATIENCE)
         self._listening.close()
@@ -72,7 +73,7 @@ class LivePage(Closing):
 
 
 class _Open:
-    """A bench that is there from the beginning."""
+    """Start-up of a workbench session that exists already."""
 
     error = None
 
@@ -80,32 +81,34 @@ class _Open:
         self._bench = bench
 
     async def bench(self) -> LiveBench:
+        """Return the workbench session."""
         return self._bench
 
 
 class LiveVisit(Visit):
-    """A page of a running robot."""
+    """Connection to one page of a running robot."""
 
     def __init__(self, bench: LiveBench, socket: WebSocket, desk: ThreadPoolExecutor, run: str) -> None:
-        super().__init__(cast("Bench", bench), socket, desk, run)  # as far as it is asked below
+        super().__init__(cast("Bench", bench), socket, desk, run)  # It has every method that is called below.
         self._live = bench
         for name in ("drive", "cancel", "report", "note", "unnote"):
             self._handlers[name] = self._refuse
 
     async def _refuse(self, number: int, message: dict[str, Any]) -> None:
+        """Raise a UserError: the request is only possible for a recorded drive."""
         raise UserError("that is for a drive that is over: save what was seen, and open the recording's bag")
 
     async def _ask(self, number: int, message: dict[str, Any]) -> None:
-        """A click is on what is shown; what is asked about again is so with the values of now."""
+        """Answer a click about the shown frame, and a repeated question with the current settings."""
         again = list(self._live.settings) if "pick" in message else []
         await super()._ask(number, {**message, "set": again})
 
     async def _settle(self, number: int, message: dict[str, Any]) -> None:
-        """Nothing is made ready: the next frame comes at once."""
+        """Do nothing: the next frame comes at once, so there is no time to prepare an answer."""
 
 
 class LiveSite(Site):
-    """The page of a running robot."""
+    """Request handlers of the page of a running robot."""
 
     def __init__(self, bench: LiveBench, viewer: Path, version: str, token: str, port: int) -> None:
         super().__init__(cast("Opening", _Open(bench)), viewer, version, token, port, "live")
@@ -115,6 +118,7 @@ class LiveSite(Site):
         return LiveVisit(self._live, socket, self._desk, self._run)
 
     async def page(self, request: Request) -> Response:
+        """Return the HTML page with the script of the robot's panel."""
         response = await super().page(request)
         script = b'<script type="module" src="/page/live.js"></script>\n</body>'
         response.body = bytes(response.body).replace(b"</body>", script)
@@ -122,7 +126,7 @@ class LiveSite(Site):
         return response
 
     async def film(self, socket: WebSocket) -> None:
-        """The newest pieces, as they are made; what was asked is among them."""
+        """Send the newest pieces of the recording as they are made. Marks of answers are among them."""
         await socket.accept()
         film, number = self._live.film, None
         if socket.query_params.get("lane") == "desk":
@@ -149,7 +153,7 @@ class LiveSite(Site):
                     await more.wait()
 
     async def orders(self, socket: WebSocket) -> None:
-        """Hold, snap and mark."""
+        """Execute the commands hold, snap and mark."""
         await socket.accept()
         with contextlib.suppress(WebSocketDisconnect, RuntimeError):
             while True:

@@ -1,4 +1,4 @@
-"""A running robot on the bench: its newest frames are held, and can be asked about."""
+"""The workbench session of a running robot: its newest frames are kept and can be asked about."""
 
 from __future__ import annotations
 
@@ -33,15 +33,15 @@ from bevviz.workbench.findings import finds, with_reasons
 from bevviz.workbench.live_buffer import LiveFilm
 from bevviz.workbench.trials import attempt
 
-KEPT = 4  # frames that pages may hold at once
-TRIED = 2  # results of held frames with other values
+KEPT = 4  # held frames that are kept
+TRIED = 2  # results of held frames with other values that are kept
 LISTED = ("missed", "false", "contradicted", "lost", "unmatched", "unnamed")
 
 Settings = tuple[str, ...]
 
 
 class Robot:
-    """What a page asks of a drive: names, configuration, networks."""
+    """The parts of a drive that a page reads: scene, configuration and pipeline session."""
 
     def __init__(self, live: Live) -> None:
         self._live = live
@@ -51,38 +51,42 @@ class Robot:
 
     @property
     def scene(self) -> Scene:
+        """Scene of the robot."""
         return self._live.scene
 
     @property
     def config(self) -> Config:
+        """Configuration in force."""
         return self._live.config
 
     @property
     def session(self) -> Session:
+        """Pipeline session of the live run."""
         return self._live.session
 
 
 class LiveBench(Closing):
-    """A robot on the bench: its newest frames can be asked about, its parameters changed for all to come.
+    """Workbench session of a running robot.
 
-    Questions are to be asked from one thread.
+    Its newest frames can be asked about. Changed parameters are in force for all later frames. Ask
+    questions from one thread only.
 
     Args:
-        live: before its run.
+        live: the live run, before it starts.
 
     Attributes:
-        entries: what is worth a look in the frame that was held last.
+        entries: findings in the frame that was held last.
     """
 
     def __init__(self, live: Live) -> None:
         self.live, self.drive = live, Robot(live)
         self.film = LiveFilm(live, live.config.live.output_queue)
         self.truth_of: Callable[..., Truth | None] | None = None
-        self.opening: int | None = None  # the page is at the newest frame
+        self.opening: int | None = None  # None: the page opens at the newest frame.
         self.entries, self.notes_changed = Entries(), -1
         self._newest: deque[FrameResult] = deque(maxlen=live.config.live.held)
         self._kept: OrderedDict[int, FrameResult] = OrderedDict()
-        self._lock = threading.Lock()  # of the two
+        self._lock = threading.Lock()  # guards _newest and _kept
         self._tried: OrderedDict[tuple[int, Settings], FrameResult] = OrderedDict()
         self._set: Settings = ()
         self._variants = Variants(live.session.loader)
@@ -95,19 +99,20 @@ class LiveBench(Closing):
         live.attach(self.film, self._see)
 
     def close(self) -> None:
+        """Close the buffer of the pages."""
         self.film.close()
 
     def listen(self, listener: Callable[[], None]) -> Callable[[], None]:
-        """Call it, from any thread, whenever there is a new frame. Returns what ends that."""
+        """Call the listener, from any thread, for each new frame. Return a function that ends this."""
         self._listeners.append(listener)
         return lambda: self._listeners.remove(listener)
 
     def quiet(self) -> AbstractContextManager[None]:
-        """A robot does not wait."""
+        """Return an empty context: a robot does not wait."""
         return nullcontext()
 
     def progress(self) -> dict[str, Any]:
-        """How it goes."""
+        """Return the progress message for the page."""
         status = self.live.status
         drops = ", ".join(f"{count} {where}" for where, count in status.drops.items() if count)
         return {
@@ -132,10 +137,10 @@ class LiveBench(Closing):
     # --- frames --------------------------------------------------------------------------------
 
     def number_at(self, stamp: int) -> int:
-        """Number of the frame that a viewer shows at that time.
+        """Return the number of the frame that a viewer shows at a stamp.
 
         Raises:
-            UserError: it is not held any more.
+            UserError: the frame is no longer in memory.
         """
         frames = sorted((r.frame.stamp, r.frame.index) for r in self._held())
         if not frames:
@@ -153,12 +158,13 @@ class LiveBench(Closing):
             return [*self._kept.values(), *self._newest]
 
     def hold(self, stamp: int) -> FrameResult:
-        """Keep the frame that a viewer shows, to ask about it for as long as one likes; a few at most.
+        """Keep the frame that a viewer shows, so that it can be asked about later.
 
-        Of a viewer that lags behind it is the oldest one that is there still.
+        At most ``KEPT`` frames are kept. If the frame is gone because the viewer lags behind, the oldest
+        frame in memory is held.
 
         Raises:
-            UserError: there is none yet.
+            UserError: no frame has come yet.
         """
         frames = sorted((r.frame.stamp, r.frame.index) for r in self._held())
         shown = [index for at, index in frames if at <= stamp + entities.SLACK]
@@ -179,10 +185,10 @@ class LiveBench(Closing):
         return result
 
     def look(self, number: int, settings: Settings = ()) -> FrameResult:
-        """A held frame as it was made, or with other values.
+        """Return the result of a frame in memory, with other values if ``settings`` names some.
 
         Raises:
-            UserError: it is gone; an unknown parameter, or a wrong value.
+            UserError: the frame is gone, a parameter is unknown, or a value is wrong.
         """
         result = next((r for r in self._held() if r.frame.index == number), None)
         if result is None:
@@ -204,7 +210,7 @@ class LiveBench(Closing):
     def picked(
         self, number: int, settings: Settings, path: str, instance: int | None, position: Sequence[float]
     ) -> Pick | None:
-        """What a click in the frame is on, see ``pick``."""
+        """Return the pick of a click in a frame, see ``pick``."""
         result = self.look(number)
         points = result.config.live.viewer_points
         if instance is not None and points is not None and path == entities.points(result.frame.lidar):
@@ -213,10 +219,13 @@ class LiveBench(Closing):
         return pick(result, result.tracks, path, instance, position)
 
     def ask(self, number: int, settings: Settings, what: Pick) -> tuple[Answer, list[Answer]]:
-        """Why it was reported, or was not, and what else is there; it is shown in every view.
+        """Explain an object: why was it reported or not? The answer is marked in every view.
+
+        Returns:
+            The answer, and the answers about other subjects at the same place.
 
         Raises:
-            UserError: there is no such thing in the frame.
+            UserError: there is no such object in the frame.
         """
         result = self.look(number, settings)
         questioner, there = self._candidates(result, what)
@@ -231,7 +240,7 @@ class LiveBench(Closing):
         return answer, [other for other in there if other.subject.key != answer.subject.key]
 
     def hints(self, number: int, settings: Settings, what: Pick) -> Answer:
-        """The same with what would change it, which takes longer.
+        """Answer with hints: parameter changes that would change the verdict. This takes longer than ``ask``.
 
         Raises:
             UserError: as ``ask``.
@@ -249,24 +258,24 @@ class LiveBench(Closing):
         return Questioner(result, session.loader, session.stages.class_names)
 
     def go_on(self) -> None:
-        """A robot has not waited."""
+        """Do nothing: a robot does not wait for a page."""
 
-    # --- orders --------------------------------------------------------------------------------
+    # --- commands ------------------------------------------------------------------------------
 
     @property
     def settings(self) -> Settings:
-        """That pages have changed."""
+        """Settings that pages have changed."""
         return self._set
 
     def configured(self, settings: Settings) -> Config:
-        """How frames are made, once these have been taken on."""
+        """Return the configuration of the running robot, which has taken on the settings."""
         return self.live.config
 
     def attempt(self, number: int, settings: Settings, what: Pick | None = None) -> dict[str, Any]:
-        """Change parameters of the running session for good, and tell what they do to a frame.
+        """Change parameters of the running robot, and return their effects on one frame.
 
         Raises:
-            UserError: an unknown parameter, or a wrong value; nothing is changed.
+            UserError: a parameter is unknown, or a value is wrong. Nothing is changed.
         """
         before = self.look(number)
         self.change(settings)
@@ -276,26 +285,27 @@ class LiveBench(Closing):
         return attempt(before, after, truth, asked)
 
     def change(self, settings: Settings) -> None:
-        """Change parameters of the running session; those that pages changed before and that are none of
-        these are as they are stated elsewhere.
+        """Change parameters of the running robot.
+
+        A parameter that a page changed before and that is not in ``settings`` gets its configured value back.
 
         Raises:
-            UserError: an unknown parameter, or a wrong value; nothing is changed.
+            UserError: a parameter is unknown, or a value is wrong. Nothing is changed.
         """
         if settings != self._set:
             self.live.update(settings, without=self._set)
         self._set = settings
 
     def snap(self) -> str:
-        """Save the flight recorder. Returns what to say.
+        """Save the flight recorder, and return the message for the user.
 
         Raises:
-            UserError: it holds nothing, or cannot be written.
+            UserError: the recorder is empty, or its file cannot be written.
         """
         return f"saved in {self.live.save()}"
 
     def mark(self, stamp: int, text: str) -> str:
-        """A note at a frame, in every recording and on the terminal. Returns what to say."""
+        """Log a note at a frame, in every recording and on the terminal. Return the message for the user."""
         number = self.number_at(stamp)
         said = f"mark at frame {number}: {text.strip() or 'look here'}"
         self.live.notes.info(said)

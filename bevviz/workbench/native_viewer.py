@@ -1,6 +1,6 @@
-"""Rerun's own viewer beside the panel: it is shown the film, and both are kept at the same time.
+"""Rerun's native viewer beside the page. It gets the recording, and shows the same time as the page.
 
-The native viewer tells where it is in time, but not what is clicked in it.
+The native viewer reports its current time, but not its selection.
 """
 
 from __future__ import annotations
@@ -25,23 +25,23 @@ from bevviz.recording.sinks import check_viewer
 from bevviz.support.contexts import Closing
 from bevviz.workbench.recording_buffer import Film
 
-LOOK = 0.2  # seconds between two looks at the viewer's time
-TIMELINES = (entities.STAMP, entities.TRIED)  # that pages count in
-MAGIC = 4  # bytes that tell a recording
+LOOK = 0.2  # seconds between two queries of the viewer's time
+TIMELINES = (entities.STAMP, entities.TRIED)  # timelines that the page knows
+MAGIC = 4  # bytes that begin every recording
 
-Event = dict[str, Any]  # as the web viewer's events
+Event = dict[str, Any]  # same fields as an event of the web viewer
 
 
 class NativeViewer(Closing):
-    """A viewer that is started, or runs already; a thread each for what it is shown and for its time.
+    """A native viewer, with one thread that sends it the recording and one that watches its time.
 
     Args:
-        films: what it is shown, the one with the layout first.
-        recording_id: of all of them.
-        url: of a viewer that runs; None: one is started on this machine.
+        films: buffers with the recording. The first one holds the layout.
+        recording_id: recording id of all buffers.
+        url: address of a running viewer. None: start one on this machine.
 
     Raises:
-        UserError: it cannot be started or reached, or is too old to be asked for its time.
+        UserError: the viewer cannot be started or reached, or is too old to report its time.
     """
 
     def __init__(self, films: Sequence[Film], recording_id: str, url: str | None = None) -> None:
@@ -49,13 +49,13 @@ class NativeViewer(Closing):
         self._given = url
         self._listeners: list[Callable[[Event], None]] = []
         self._ended, self._wake = threading.Event(), threading.Event()
-        self._wanted: tuple[str, int] | None = None  # timeline and stamp to be shown
-        self._last: dict[str, Event] = {}  # of each type, for a page that comes later
+        self._wanted: tuple[str, int] | None = None  # timeline and stamp to go to
+        self._last: dict[str, Event] = {}  # last event of each type, for a page that connects later
         self._started = threading.Lock()
         self._relay = self._open()
 
     def close(self) -> None:
-        """The relay ends; the viewer's window stays, for its user to close."""
+        """Stop the relay. The viewer's window stays open until the user closes it."""
         self._ended.set()
         self._wake.set()
         rerun_cli.end(self._relay)
@@ -71,7 +71,8 @@ class NativeViewer(Closing):
         begun: Future[rerun_cli.Process] = Future()
 
         def feed() -> None:
-            # Started here: the relay ends with the thread that starts it, and who opens it may end soon.
+            # The relay ends with the thread that starts it. The thread that calls _open may end early,
+            # so this thread starts it.
             try:
                 relay = self._start_relay(url)
             except OSError as error:
@@ -98,19 +99,20 @@ class NativeViewer(Closing):
         return f"rerun+http://{LOOPBACK}:{port}/proxy"
 
     def reopen(self) -> None:
-        """Again from the beginning, where it was closed.
+        """Open the viewer again if it was closed. It gets the recording from the beginning.
 
         Raises:
-            UserError: it cannot be had.
+            UserError: the viewer cannot be started or reached.
         """
         with self._started:
             if self._relay.poll() is not None:
                 self._last.clear()
                 self._relay = self._open()
 
-    # --- what it is shown ----------------------------------------------------------------------
+    # --- recording -----------------------------------------------------------------------------
 
     def _feed(self, relay: rerun_cli.Process) -> None:
+        """Send the pieces of all buffers to the relay until the viewer is closed."""
         more = threading.Event()
         ends = [film.listen(more.set) for film in self._films]
         rows, begun = [0] * len(self._films), False
@@ -129,19 +131,20 @@ class NativeViewer(Closing):
                 more.wait(LOOK)
                 more.clear()
         except (OSError, ValueError):
-            pass  # the viewer is gone, which is told where its time is watched
+            pass  # The viewer is closed. The thread that watches its time reports that.
         finally:
             for end in ends:
                 end()
 
-    # --- its time ------------------------------------------------------------------------------
+    # --- time ----------------------------------------------------------------------------------
 
     def seek(self, timeline: str, stamp: int) -> None:
-        """Have it show that sensor time; from any thread."""
+        """Move the viewer to a stamp. Any thread may call this."""
         self._wanted = timeline, stamp
         self._wake.set()
 
     def _watch(self, relay: rerun_cli.Process, client: ViewerClient) -> None:
+        """Move the viewer to the stamp that the page wants, and report changes of its time."""
         shown: tuple[str | None, int | None] = None, None
         opened = False
         while not self._ended.is_set():
@@ -167,25 +170,27 @@ class NativeViewer(Closing):
                         play_state="paused",
                         recording=mine[0].store_id,
                     )
-                    if self._wanted == wanted:  # else there is a newer one already
+                    if self._wanted == wanted:  # Otherwise the page wants a newer time already.
                         self._wanted = None
                     shown = wanted
                     self._tell({"type": "time_update", "timeline": wanted[0], "time": wanted[1]})
                     continue
             except (RuntimeError, TimeoutError, ValueError, ConnectionError):
-                continue  # it is busy, and is asked again; when it is gone the relay ends
+                continue  # The viewer is busy: ask again. Once it is closed, the relay ends.
             now = mine[0].current_timeline, mine[0].current_time
             if now != shown and now[0] in TIMELINES:
                 shown = now
                 self._tell({"type": "time_update", "timeline": now[0], "time": now[1]})
 
-    # --- the page ------------------------------------------------------------------------------
+    # --- page ----------------------------------------------------------------------------------
 
     def listen(self, listener: Callable[[Event], None]) -> Callable[[], None]:
-        """Call it, from some thread, with every event, and now with the last of each kind.
+        """Call the listener, from any thread, with every event.
+
+        It is called at once with the last event of each type.
 
         Returns:
-            What ends that.
+            A function that ends this.
         """
         for event in list(self._last.values()):
             listener(event)
@@ -198,12 +203,12 @@ class NativeViewer(Closing):
             listener(event)
 
     async def talk(self, socket: WebSocket) -> None:
-        """A page: it is told the events, and says where to go."""
+        """Send the events to a page, and follow its time."""
         await socket.accept()
         loop, news = asyncio.get_running_loop(), asyncio.Queue[Event]()
 
         def told(event: Event) -> None:
-            with contextlib.suppress(RuntimeError):  # the server has ended
+            with contextlib.suppress(RuntimeError):  # The server has ended.
                 loop.call_soon_threadsafe(news.put_nowait, event)
 
         async def tell() -> None:

@@ -1,4 +1,4 @@
-"""One page that is open: what it asks, what it is answered, and what is new."""
+"""The connection to one open page: its questions, the answers, and news of the run."""
 
 from __future__ import annotations
 
@@ -20,20 +20,20 @@ if TYPE_CHECKING:
     from bevviz.why.pick import Pick
     from bevviz.workbench.session import Bench, Settings
 
-BESIDE = 6  # further things that are listed
-TOGETHER = 0.05  # seconds that what is new waits for more of it
+BESIDE = 6  # further answers that are listed
+TOGETHER = 0.05  # seconds in which news are collected before they are sent
 
 _log = logger(__name__)
 
 
 class Visit:
-    """Talks with one page.
+    """Connection to one page.
 
     Args:
-        bench: what it asks about.
-        socket: accepted.
-        desk: answers one question after the other, whoever asks.
-        run: name of this run of the server.
+        bench: the workbench session that the page asks.
+        socket: an accepted socket.
+        desk: executor with one thread that answers the questions of all pages in turn.
+        run: id of this run of the server.
     """
 
     def __init__(self, bench: Bench, socket: WebSocket, desk: ThreadPoolExecutor, run: str) -> None:
@@ -54,7 +54,7 @@ class Visit:
         }
 
     async def stay(self) -> None:
-        """Until the page goes."""
+        """Serve the page until it disconnects."""
         with listening(self._bench.listen) as more:
             await self._send(self._welcome())
             news = asyncio.ensure_future(self._tell(more))
@@ -66,7 +66,7 @@ class Visit:
                 for task in self._tasks:
                     task.cancel()
 
-    # --- what it is told -----------------------------------------------------------------------
+    # --- messages to the page ------------------------------------------------------------------
 
     def _welcome(self) -> dict[str, Any]:
         from bevviz.workbench.controls import controls
@@ -85,7 +85,7 @@ class Visit:
         }
 
     async def _tell(self, more: asyncio.Event) -> None:
-        """What is new of the run, whenever there is something."""
+        """Send news of the run whenever there are any."""
         told: dict[int, int] = {}
         opened, noted, bench = False, -1, self._bench
         while True:
@@ -106,10 +106,10 @@ class Visit:
         async with self._sending:
             await self._socket.send_text(json.dumps(message))
 
-    # --- what it asks --------------------------------------------------------------------------
+    # --- messages from the page ----------------------------------------------------------------
 
     def _take(self, text: str) -> None:
-        """Answer a message of the page, beside those that come next."""
+        """Handle a message of the page in a task of its own, so that the next message need not wait."""
         task = asyncio.ensure_future(self._handle(text))
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
@@ -134,7 +134,7 @@ class Visit:
             await self._send({"type": "error", "id": number, "text": what})
 
     async def _at_desk(self, number: int, work: Callable[[], Any], *, idle: bool = False) -> Any:
-        """Done in its turn; what is idle only if nothing newer was asked meanwhile."""
+        """Run ``work`` on the desk thread. Idle work is skipped once the page has sent a newer message."""
 
         def job() -> Any:
             if idle and number != self._newest:
@@ -185,17 +185,17 @@ class Visit:
         told = await self._at_desk(number, lambda: self._bench.attempt(frame, settings, pick))
         await self._send({"type": "tried", "id": number, "frame": frame, **told})
         there = controls(self._bench.configured(settings), self._opened)
-        if there != self._controls:  # a stage is somebody else's now, or is no longer
+        if there != self._controls:  # A stage was replaced by a user's function, or is no longer replaced.
             self._controls = there
             await self._send({"type": "controls", "controls": there})
 
     async def _settle(self, number: int, message: dict[str, Any]) -> None:
-        """The page shows this frame for a while: questions about it are to come."""
+        """Compute the result of the frame that the page has stopped at, before a question about it comes."""
         frame = await self._frame(message)
         await self._at_desk(number, lambda: self._bench.look(frame, _settings(message)), idle=True)
 
     async def _drive(self, number: int, message: dict[str, Any]) -> None:
-        """Run all of it with other values."""
+        """Run the drive with other values."""
         settings = _settings(message)
         await asyncio.to_thread(self._bench.trials.begin, settings)
 
@@ -221,16 +221,16 @@ class Visit:
         await self._at_desk(number, lambda: self._bench.remove_note(stamp, text))
 
     async def _shown(self, number: int, message: dict[str, Any]) -> None:
-        """The page has drawn its first frame: the run may take the machine."""
+        """Let the run continue: the page has drawn its first frame."""
         self._bench.go_on()
 
     async def _frame(self, message: dict[str, Any]) -> int:
-        """Number of the frame that the page shows; one that has not been run yet is looked for."""
+        """Return the number of the frame that the page shows. The run may not have reached it yet."""
         return await asyncio.to_thread(self._bench.number_at, round(float(message["time"])))
 
 
 def _briefly(answers: Sequence[Answer]) -> Iterator[dict[str, Any]]:
-    """What else is there: the nearest missed first, as the questioner has it."""
+    """Yield the other answers in brief, in the order of the questioner (nearest missed object first)."""
     from bevviz.why.pick_answers import pick_of
 
     for answer in answers[:BESIDE]:
@@ -259,11 +259,11 @@ def _settings(message: dict[str, Any]) -> Settings:
 
 @contextlib.contextmanager
 def listening(listen: Callable[[Callable[[], None]], Callable[[], None]]) -> Iterator[asyncio.Event]:
-    """An event that is set whenever there is more, from whatever thread that is told."""
+    """Return an event that is set whenever there is news, from any thread."""
     more, loop = asyncio.Event(), asyncio.get_running_loop()
 
     def tell() -> None:
-        with contextlib.suppress(RuntimeError):  # the server has ended
+        with contextlib.suppress(RuntimeError):  # The server has ended.
             loop.call_soon_threadsafe(more.set)
 
     end = listen(tell)

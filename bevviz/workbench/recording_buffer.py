@@ -1,4 +1,4 @@
-"""What the viewers of a page are shown: pieces of a recording, from the first for whoever joins late."""
+"""Buffer of the recording that the viewers show. A viewer that connects late reads it from the start."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from bevviz.support.files import on_disk
 
 
 class Film(Closing):
-    """Pieces in the order in which they were made, each a whole ``.rrd``, on disk rather than in memory.
+    """Pieces of a recording in the order of their creation. Each is a whole ``.rrd``. They are kept on disk.
 
-    ``add`` may be called from any thread; every reader goes on at its own pace.
+    Any thread may call ``add``. Every reader has its own position.
 
     Raises:
         UserError: the disk of the temporary folder is full.
@@ -22,22 +22,23 @@ class Film(Closing):
 
     def __init__(self) -> None:
         with on_disk():
-            self._file = tempfile.TemporaryFile(prefix="bevviz-")  # noqa: SIM115, it lives as long as the film
+            self._file = tempfile.TemporaryFile(prefix="bevviz-")  # noqa: SIM115, the file stays open until the buffer is closed
         self._ends = [0]
         self._lock = threading.Lock()
         self._listeners: list[Callable[[], None]] = []
 
     def close(self) -> None:
+        """Delete the temporary file."""
         self._file.close()
 
     def __len__(self) -> int:
         return len(self._ends) - 1
 
     def add(self, piece: bytes | None) -> None:
-        """Append a piece; None is nothing.
+        """Append a piece. None is ignored.
 
         Raises:
-            UserError: the disk of the temporary folder is full. The pieces before it stay.
+            UserError: the disk of the temporary folder is full. The earlier pieces stay.
         """
         if not piece:
             return
@@ -59,7 +60,7 @@ class Film(Closing):
         return os.pread(self._file.fileno(), end - start, start)
 
     def listen(self, listener: Callable[[], None]) -> Callable[[], None]:
-        """Call it, from some thread, whenever there is more. Returns what ends that."""
+        """Call the listener, from any thread, for each new piece. Return a function that ends this."""
         with self._lock:
             self._listeners.append(listener)
 

@@ -1,4 +1,4 @@
-"""Reports of what was found, made behind the page."""
+"""Bug reports that the page requests. A background thread makes them."""
 
 from __future__ import annotations
 
@@ -18,18 +18,23 @@ from bevviz.model.results import FrameResult
 if TYPE_CHECKING:
     from bevviz.workbench.session import Bench, Settings
 
-LONGEST = 600.0  # seconds on either side
+LONGEST = 600.0  # seconds before or after the frame, at most
 
 
 @dataclass(slots=True)
 class Report:
-    """One that is being made, or was.
+    """A finished report, or the one in progress.
 
     Attributes:
-        number: of it, in its address.
-        settings: that differ from those the drive was opened with.
+        number: number in the address of its files.
+        name: file name without suffix.
+        settings: the settings that differ from those the drive was opened with.
         state: running, over, cancelled or failed.
-        files: that it has.
+        error: reason of the failure.
+        done: number of finished frames.
+        total: number of frames.
+        files: paths of its files.
+        stop: cancels the report when it is set.
     """
 
     number: int
@@ -43,7 +48,7 @@ class Report:
     stop: threading.Event = field(default_factory=threading.Event)
 
     def as_dict(self) -> dict[str, Any]:
-        """For the page."""
+        """Return the report as JSON for the page."""
         return {
             "number": self.number,
             "name": self.name,
@@ -57,20 +62,21 @@ class Report:
         }
 
     def _there(self) -> Sequence[Path]:
+        """Return its files that exist."""
         return [path for path in self.files if path.is_file()]
 
     def file(self, name: str) -> Path | None:
-        """One of its files."""
+        """Return the path of a file by its name, if it exists."""
         return next((path for path in self._there() if path.name == name), None)
 
 
 class Reports:
-    """Those of a bench, one at a time.
+    """Reports of a workbench session, made one at a time.
 
     Args:
-        bench: whose drive they are of.
-        news: called when there is something to tell.
-        folder: where they go, see ``folder_of``.
+        bench: the workbench session.
+        news: called when the state of a report has changed.
+        folder: output folder, see ``folder_of``.
     """
 
     def __init__(self, bench: Bench, news: Callable[[], None], folder: Path) -> None:
@@ -79,16 +85,18 @@ class Reports:
         self.made: list[Report] = []
 
     def begin(self, number: int, settings: Settings, before: float, after: float, note: str) -> Report:
-        """Make one.
+        """Start to make a report.
 
         Args:
-            number: of the frame that it is about.
-            settings: that it is made with instead of those that the drive was opened with.
-            before, after: seconds on either side.
+            number: number of the frame that it is about.
+            settings: settings to make it with.
+            before: seconds before the frame.
+            after: seconds after the frame.
             note: what went wrong, in the user's words.
 
         Raises:
-            UserError: one is being made, no such frame, no such time, or a wrong value.
+            UserError: a report is in progress, there is no such frame, the range is too long, or a value is
+                wrong.
         """
         from bevviz.report.make import ReportRequest
 
@@ -121,7 +129,7 @@ class Reports:
         return report
 
     def end(self) -> None:
-        """Cancel what is being made: it is a report of the frames until then."""
+        """Cancel the report in progress. It keeps the frames until then."""
         if self.made:
             self.made[-1].stop.set()
         if self._thread is not None:
@@ -141,6 +149,8 @@ class Reports:
 
 
 class _Counting(Observer[FrameResult]):
+    """Observer that counts the finished frames of a report."""
+
     def __init__(self, report: Report, news: Callable[[], None]) -> None:
         self._report, self._news = report, news
 
@@ -153,13 +163,13 @@ class _Counting(Observer[FrameResult]):
 
 
 def folder_of(paths: Sequence[Path]) -> Path:
-    """Where reports of a drive go: beside its bag; the working directory where it cannot be written there."""
+    """Return the folder of the bag, or the working directory if that folder is read-only."""
     beside = paths[0].resolve().parent
     return beside if os.access(beside, os.W_OK | os.X_OK) else Path.cwd()
 
 
 def _free(folder: Path, stem: str) -> Path:
-    """A name that no report has."""
+    """Return a path that no report has yet."""
     number = 1
     while True:
         path = folder / f"{stem}{f'-{number}' if number > 1 else ''}.rrd"

@@ -1,4 +1,4 @@
-"""What the page is made of: its files, the viewer's, the film that is shown, and the talk about it."""
+"""Routes of the workbench page: its files, the viewer's files, recordings, and questions."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from bevviz.workbench.startup import Opening
 if TYPE_CHECKING:
     from bevviz.workbench.session import Bench
 
-Kind = Literal["page", "native", "live"]  # viewer in the page, in a window of its own, in the page of a robot
+Kind = Literal["page", "native", "live"]  # viewer in the page, native viewer, page of a running robot
 
 PAGE = Path(__file__).parent / "page"
 FILES = (
@@ -47,27 +47,28 @@ POLICY = (
     "img-src 'self' data: blob:; font-src 'self' data:; connect-src 'self'; "
     "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
 )
-AHEAD = 6  # pieces of the film that are sent ahead of what the page says it has
+AHEAD = 6  # pieces of the recording that may be sent before the page acknowledges the first of them
 
 
 def application(
     opening: Opening, viewer: Path, version: str, token: str, port: int, kind: Kind = "page"
 ) -> ASGIApp:
-    """Everything that the page asks for, behind its guard.
+    """Return the application that serves the page behind its access guard.
 
     Args:
-        opening: of the bench.
-        viewer: folder of the viewer's files, of that version.
-        token: without which nothing is answered.
-        port: that this is served at.
-        kind: where the viewer is.
+        opening: start-up of the workbench session.
+        viewer: folder of the viewer's files.
+        version: version of the viewer.
+        token: token that every request has to carry.
+        port: port of the server.
+        kind: kind of viewer.
     """
     site = Site(opening, viewer, version, token, port, kind)
     return Guard(Starlette(routes=routes_of(site)), token, port)
 
 
 def routes_of(site: Site) -> list[BaseRoute]:
-    """What is where."""
+    """Return the routes of a site."""
     return [
         Route("/", site.page),
         Route("/page/{name}", site.file),
@@ -81,19 +82,20 @@ def routes_of(site: Site) -> list[BaseRoute]:
 
 
 class Site:
-    """The page, as routes."""
+    """Request handlers of the page."""
 
     def __init__(
         self, opening: Opening, viewer: Path, version: str, token: str, port: int, kind: Kind
     ) -> None:
         self._opening, self._viewer, self.version, self._kind = opening, viewer, version, kind
         self._token, self._port = token, port
-        self._run = secrets.token_hex(4)  # a page that finds another one starts anew
-        self._desk = ThreadPoolExecutor(1, "desk")  # answers one question after the other
+        self._run = secrets.token_hex(4)  # A page that reconnects to another run reloads.
+        self._desk = ThreadPoolExecutor(1, "desk")  # One thread answers all questions in turn.
 
     # --- files ---------------------------------------------------------------------------------
 
     async def page(self, request: Request) -> Response:
+        """Return the HTML page, and set the cookie with the token."""
         text = (PAGE / "index.html").read_text().replace("VIEWER_VERSION", self.version)
         text = text.replace("VIEWER_KIND", self._kind)
         response = Response(text, media_type="text/html", headers={"Content-Security-Policy": POLICY})
@@ -103,15 +105,17 @@ class Site:
         return response
 
     async def file(self, request: Request) -> Response:
+        """Return a script or style sheet of the page."""
         return _file(PAGE, FILES, request.path_params["name"], "no-cache")
 
     async def viewer(self, request: Request) -> Response:
+        """Return a file of Rerun's web viewer."""
         return _file(
             self._viewer, VIEWER, request.path_params["name"], "private, max-age=31536000, immutable"
         )
 
     async def config(self, request: Request) -> Response:
-        """The configuration with what is being tried, as a file."""
+        """Return the configuration with the tried settings as a YAML file."""
         from bevviz.config import dump, revised
 
         bench = await self._opening.bench()
@@ -125,24 +129,24 @@ class Site:
         return Response(text, media_type="application/yaml", headers=headers)
 
     async def report(self, request: Request) -> Response:
-        """A file of a report that was made here."""
+        """Return a file of a report that this server made."""
         bench, number = await self._opening.bench(), request.path_params["number"]
         made = [] if bench is None else bench.reports.made
         path = made[number].file(request.path_params["name"]) if number < len(made) else None
         if path is None:
             return PlainTextResponse("there is no such file\n", 404)
-        if path.suffix == ".html":  # with a policy of its own
+        if path.suffix == ".html":  # The HTML of a report states its own policy.
             return _File(path, media_type="text/html")
         return _File(path, filename=path.name, media_type="application/octet-stream")
 
-    # --- what is shown -------------------------------------------------------------------------
+    # --- recordings ----------------------------------------------------------------------------
 
     async def film(self, socket: WebSocket) -> None:
-        """Every piece from the one that is asked for on, as they are made.
+        """Send every piece of a recording from the requested one on, as the pieces are made.
 
-        Those of the run are sent no faster than the page takes them, which says so by a word for each; a
-        time instead of it is that of a frame which is to come next. Those of the desk, answers and what is
-        tried, are sent at once.
+        The page acknowledges each piece of the run with a message, and gets no more than ``AHEAD`` pieces in
+        advance. If its message is a stamp instead, the frame of that stamp is sent next. Pieces of the lane
+        ``desk`` (answers and tried results) are sent at once.
         """
         await socket.accept()
         bench = await self._opening.bench()
@@ -175,10 +179,10 @@ class Site:
                     else:
                         await more.wait()
 
-    # --- what is asked -------------------------------------------------------------------------
+    # --- questions -----------------------------------------------------------------------------
 
     async def talk(self, socket: WebSocket) -> None:
-        """Questions and answers, and how far the run is."""
+        """Answer the questions of a page, and send it the progress of the run."""
         await socket.accept()
         with contextlib.suppress(WebSocketDisconnect, RuntimeError):
             bench = await self._opening.bench()
@@ -192,7 +196,7 @@ class Site:
         return Visit(bench, socket, self._desk, self._run)
 
     async def native(self, socket: WebSocket) -> None:
-        """The way to the viewer beside the page."""
+        """Connect the page with the native viewer beside it."""
         bench = await self._opening.bench()
         if bench is None or bench.native is None:
             await socket.close()
@@ -201,8 +205,14 @@ class Site:
 
 
 class Heard:
-    """What the page has said on a socket: a word for each piece that it has, times that it wants, and whether
-    anybody sees it."""
+    """State of a page, from its messages on one socket.
+
+    Attributes:
+        count: number of acknowledged pieces.
+        gone: whether the socket is closed.
+        hidden: whether the page is in the background.
+        wanted: stamps of the frames that the page requests next, newest last.
+    """
 
     def __init__(self) -> None:
         self.count, self.gone, self.hidden = 0, False, False
@@ -211,6 +221,7 @@ class Heard:
 
 @contextlib.asynccontextmanager
 async def heard_on(socket: WebSocket, more: asyncio.Event) -> AsyncIterator[Heard]:
+    """Yield the state of a page, updated by its messages, and set ``more`` at each of them."""
     heard = Heard()
 
     async def listen() -> None:
@@ -235,7 +246,7 @@ async def heard_on(socket: WebSocket, more: asyncio.Event) -> AsyncIterator[Hear
 
 
 class _File(FileResponse):
-    chunk_size = 4 * 2**20  # the viewer has 64 MB, and each chunk waits for a busy interpreter
+    chunk_size = 4 * 2**20  # The viewer has 64 MB, and each chunk waits for a busy interpreter.
 
 
 def _file(folder: Path, names: tuple[str, ...], name: str, cache: str) -> Response:

@@ -1,4 +1,4 @@
-"""The page's server: this machine alone, one origin, a token in the address."""
+"""Server of the page: reachable from this machine only, one origin, a token in the address."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
     from bevviz.workbench.session import Bench
 
-PORT = 9880  # where it is free: browsers keep the viewer, compiled, by the address that they had it from
+PORT = 9880  # The default is fixed, because browsers cache the compiled viewer by its address.
 
 
 def serve(
@@ -32,17 +32,18 @@ def serve(
     ready: Callable[[str], None],
     kind: Kind = "page",
 ) -> None:
-    """Serve the page of a drive until an interrupt; it is opened and run behind it.
+    """Serve the page of a drive until an interrupt. The drive is opened and run in the background.
 
     Args:
-        make: makes the bench, while the page's viewer loads.
-        drive: its paths: a page finds a server that was killed again, if that of the same drive comes back.
-        port: of the page; None: 9880, else one that is free.
-        ready: called with the address when it can be opened.
-        kind: where the viewer is.
+        make: makes the workbench session, while the page loads its viewer.
+        drive: paths of the drive. A page reconnects after a crash if the server of the same drive starts
+            again.
+        port: port of the page. None: 9880, or a free one if that is in use.
+        ready: called with the address once it can be opened.
+        kind: kind of viewer.
 
     Raises:
-        UserError: the port is in use, the viewer is not installed, or what ``make`` raises.
+        UserError: the port is in use, the viewer is not installed, or ``make`` raises one.
     """
     viewer = viewer_folder()
     with bound(port) as listening:
@@ -61,7 +62,7 @@ def serve(
 
 
 def bound(port: int | None) -> socket.socket:
-    """A socket of this machine alone.
+    """Return a socket that is bound to a port of this machine only.
 
     Raises:
         UserError: the port is in use.
@@ -79,7 +80,7 @@ def bound(port: int | None) -> socket.socket:
 
 
 class Server(uvicorn.Server):
-    """Says when it can be reached."""
+    """Server that calls ``ready`` once it can be reached."""
 
     def __init__(self, app: ASGIApp, ready: Callable[[], None]) -> None:
         config = uvicorn.Config(
@@ -93,19 +94,20 @@ class Server(uvicorn.Server):
         self._ready = ready
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
+        """Start to listen, then call ``ready``."""
         await super().startup(sockets)
         self._ready()
 
     def end(self) -> None:
-        """From any thread."""
+        """Stop the server. Any thread may call this."""
         self.should_exit = True
 
 
 def viewer_folder() -> Path:
-    """Where Rerun's web viewer is, of the very version of the SDK: it comes with its notebook package.
+    """Return the folder of Rerun's web viewer, in the version of the SDK. The notebook package contains it.
 
     Raises:
-        UserError: it is not installed, or of another version.
+        UserError: the package is not installed, or has another version.
     """
     spec = importlib.util.find_spec("rerun_notebook")
     folder = Path(spec.origin).parent / "static" if spec is not None and spec.origin else None

@@ -1,4 +1,4 @@
-"""The workbench without its page: a drive that is run and filmed, asked about and tried with other values."""
+"""The workbench session of one drive: run and record it, answer questions, try other parameter values."""
 
 from __future__ import annotations
 
@@ -47,9 +47,9 @@ from bevviz.workbench.truth_frames import TruthOf
 if TYPE_CHECKING:
     from bevviz.workbench.native_viewer import NativeViewer
 
-KEPT = 6  # results of frames that were looked at
-PATIENCE = 10.0  # seconds that the run may take to end
-FIRST = 6.0  # seconds that the run waits for a page to have drawn the first frame
+KEPT = 6  # results of recently viewed frames that are kept
+PATIENCE = 10.0  # seconds that close() waits for the run to end
+FIRST = 6.0  # seconds that the run waits until a page has drawn the first frame
 ASKED = 8  # answers that are kept for reports
 BOTH = (entities.STAMP, entities.TRIED)
 
@@ -57,28 +57,30 @@ Settings = tuple[str, ...]
 
 
 class Bench(Closing):
-    """One drive on the bench. Questions are to be asked from one thread; whoever listens is told from any.
+    """Workbench session of one drive.
 
-    What the run makes of a frame is on the timeline ``stamp`` and, where nothing else was tried on it, on
-    ``tried``; what other values make of it is on ``tried`` alone. To see either is to choose the timeline.
+    Ask questions from one thread only. Listeners are called from any thread. A result of the run is logged
+    on the timeline ``stamp``. It is logged on ``tried`` as well, unless other values were tried on that
+    frame. A result with other values is logged on ``tried`` alone. A viewer shows one or the other by its
+    choice of timeline.
 
     Args:
-        drive: that is asked about.
-        again: the same frames once more, to be run through while others are asked for.
-        paths: of the bag.
-        truth_of: what is known to be there, which the frames of both have, too.
+        drive: the drive that questions are about.
+        again: the same frames a second time. The run reads them while questions read those of ``drive``.
+        paths: paths of the bag.
+        truth_of: returns the ground truth of a frame. The frames of both sources carry it as well.
         first: number of the scan that is shown first.
 
     Attributes:
-        film: what is shown: the whole drive.
-        desk: what was asked and tried, which is shown with it.
-        recording_id: of both.
-        native: the viewer beside the page, where there is one.
-        entries: what is worth a look.
+        film: buffer with the recording of the whole drive.
+        desk: buffer with answers and tried results, shown together with ``film``.
+        recording_id: recording id of both buffers.
+        native: the native viewer beside the page, if there is one.
+        entries: the findings, grouped over frames.
         trials: runs over the drive with other values.
-        reports: of what was found, beside the bag.
-        notes: of the user, beside the bag.
-        opening: stamp of the frame that a page is to open at; None: not run yet.
+        reports: bug reports, saved beside the bag.
+        notes: notes of the user, saved beside the bag.
+        opening: stamp of the frame that a page opens at. None before the first frame is shown.
         over: whether the run over the drive has ended.
     """
 
@@ -97,15 +99,15 @@ class Bench(Closing):
         self.opening: int | None = None
         self.done, self.over, self.error = 0, False, ""
         self._listeners: list[Callable[[], None]] = []
-        self._stamps: list[tuple[int, int]] = []  # stamp, number of each frame on the film, in order
-        self._reached = 0  # stamp that the run is at
-        self._ahead = (0, 0, 0)  # index and times of the frame that was drawn first
-        self._ahead_knows: frozenset[str] = frozenset()  # entities that are cleared there, or its own
-        self._rows: dict[int, int] = {}  # on the film, of each stamp
+        self._stamps: list[tuple[int, int]] = []  # (stamp, number) of each frame in ``film``, sorted
+        self._reached = 0  # newest stamp that the run has reached
+        self._ahead = (0, 0, 0)  # index, stamp and receive time of the frame that was drawn first
+        self._ahead_knows: frozenset[str] = frozenset()  # entities that have data or a clear at that frame
+        self._rows: dict[int, int] = {}  # row in ``film`` by stamp
         self._tracks: dict[int, Tracks] = {}
         self._objects: dict[int, Objects | None] = {}
-        self._layers: dict[tuple[int, bool], Layer] = {}  # by frame, and whether other values made it
-        self._recoloured: set[int] = set()  # frames whose raw cloud was drawn as other values have it
+        self._layers: dict[tuple[int, bool], Layer] = {}  # by frame number and side (tried or not)
+        self._recoloured: set[int] = set()  # numbers of frames whose raw cloud was drawn with other values
         self._onsets = Onsets()
         self._results: OrderedDict[tuple[int, Settings], FrameResult] = OrderedDict()
         self._variants, self._looking = Variants(drive.session.loader), threading.RLock()
@@ -119,7 +121,7 @@ class Bench(Closing):
         layout = blueprints.load("workbench", drive.scene, drive.config)
         self._main.send_blueprint(layout, make_active=True)
         self._logger = Logger(self._main, drive.config, drive.scene, wait=WAIT, stamps=BOTH)
-        self._logger.apart = True  # pages get them in whatever order they are looked at
+        self._logger.apart = True  # Pages receive frames in any order, so each is complete.
         self._logger.log_static()
         self._desk_logger = Logger(self._desk, drive.config, drive.scene, stamps=BOTH)
         self._tried_logger = tried_logger(self._desk, drive.session, self)
@@ -130,16 +132,17 @@ class Bench(Closing):
         self._thread = threading.Thread(target=self._run, name="drive", daemon=True)
 
     def stream(self) -> tuple[rr.RecordingStream, rr.BinaryStream]:
-        """The recording, for a further thread that writes to it."""
+        """Return a new stream into the recording, for a further thread that writes to it."""
         recording = rr.RecordingStream(APPLICATION, recording_id=self.recording_id)
         recording.set_log_time_enabled(False)
         return recording, rr.binary_stream(recording)
 
     def start(self) -> None:
-        """Film the frame that is shown first, then all of them in order."""
+        """Start the run: record the frame that is shown first, then all frames in order."""
         self._thread.start()
 
     def close(self) -> None:
+        """Stop the run, the trials and the reports, then close the buffers and both sources."""
         self._stop.set()
         self._quiet.set()
         self._go.set()
@@ -150,21 +153,21 @@ class Bench(Closing):
         if self.native is not None:
             self.native.close()
         for stream in (self._film_main, self._film_desk, self.trials.film):
-            stream.read()  # it would complain of what nobody has read
+            stream.read()  # Rerun warns about a binary stream with unread data.
         self.film.close()
         self.desk.close()
         self.drive.close()
         self.again.close()
 
-    # --- the run behind it ---------------------------------------------------------------------
+    # --- background run ------------------------------------------------------------------------
 
     def listen(self, listener: Callable[[], None]) -> Callable[[], None]:
-        """Call it, from any thread, whenever the run is further. Returns what ends that."""
+        """Call the listener, from any thread, after each step of the run. Return a function that ends it."""
         self._listeners.append(listener)
         return lambda: self._listeners.remove(listener)
 
     def progress(self) -> dict[str, Any]:
-        """How far the run is."""
+        """Return the progress message for the page."""
         return {
             "type": "progress",
             "done": self.done,
@@ -191,11 +194,11 @@ class Bench(Closing):
         self.tell()
 
     def go_on(self) -> None:
-        """A page shows the first frame: run the others."""
+        """Let the run continue: a page shows the first frame."""
         self._go.set()
 
     def see(self, result: FrameResult) -> None:
-        """The next frame of the run; while a question is being answered, it waits."""
+        """Record the next frame of the run. Then wait while a question is being answered."""
         frame = result.frame
         found = finds(result, self.truth(frame))
         if any(find.what == "missed" for find in found):
@@ -214,7 +217,7 @@ class Bench(Closing):
         self.wait_for_quiet()
 
     def wait_for_quiet(self) -> None:
-        """Until no question is being answered."""
+        """Wait until no question is being answered."""
         self._quiet.wait()
 
     def _show(self, result: FrameResult, found: Sequence[Find]) -> None:
@@ -243,27 +246,28 @@ class Bench(Closing):
         self._layers[result.frame.index, tried] = layers[0]
 
     def draw_tried(self, logger: Logger, result: FrameResult, found: Sequence[Find]) -> None:
-        """A frame as other values make it, beside what the run has made of it."""
+        """Log a frame with other values beside the result of the run."""
         logger.refresh(self._logger.results)
-        # Its colours tell ground from obstacles; once they are others, they have to be put back, too.
+        # The colours of the cloud show ground and obstacles. A frame that was recoloured once is
+        # always drawn again, so that its colours change back, too.
         config, opened, number = result.config, self.drive.config, result.frame.index
         if (config.voxel, config.ground) != (opened.voxel, opened.ground):
             self._recoloured.add(number)
         self._draw(logger, result, found, tried=True, cloud=number in self._recoloured)
 
     def end(self) -> None:
-        """The run's last numbers."""
+        """Record the last scalars of the run."""
         self._logger.flush()
         self.film.add(self._film_main.read())
 
     def tell(self) -> None:
-        """There is something new."""
+        """Notify all listeners."""
         for listener in tuple(self._listeners):
             listener()
 
     @contextmanager
     def quiet(self) -> Iterator[None]:
-        """Within, the run waits after the frame that it is at."""
+        """Return a context in which the run pauses after its current frame."""
         self._quiet.clear()
         try:
             yield
@@ -273,10 +277,10 @@ class Bench(Closing):
     # --- questions -----------------------------------------------------------------------------
 
     def number_at(self, stamp: int) -> int:
-        """Number of the frame that a viewer shows at that time, whether it has been run yet or not.
+        """Return the number of the frame that a viewer shows at a stamp. The run may not have reached it yet.
 
         Raises:
-            UserError: no frame is there yet.
+            UserError: no frame has been run yet.
         """
         stamps = list(self._stamps)
         if not stamps:
@@ -288,7 +292,7 @@ class Bench(Closing):
         return self._sought(stamp, number)
 
     def _sought(self, stamp: int, near: int) -> int:
-        """The last frame whose stamp is not behind that time, from where the log times say that it is."""
+        """Return the last frame that is not later. The search starts at the estimate from the log times."""
         with self._looking:
             scans, frame = self.drive.frames.scans, self.look(near).frame
             number = int(np.abs(scans - (stamp + int(scans[near]) - frame.stamp)).argmin())
@@ -299,28 +303,28 @@ class Bench(Closing):
             return number
 
     def _stamp_of(self, number: int) -> int:
-        """Its log time, where it cannot be read."""
+        """Return the stamp of a frame, or its log time if the frame cannot be read."""
         frame = self.drive.frames.frame(number)
         return int(self.drive.frames.scans[number]) if frame is None else frame.stamp
 
     def film_row(self, stamp: int) -> int | None:
-        """Piece of the film that has the frame which a viewer shows at that time."""
+        """Return the row in ``film`` of the frame that a viewer shows at a stamp."""
         place = bisect.bisect_right(self._stamps, (stamp + entities.SLACK, 2**62)) - 1
         return self._rows.get(self._stamps[place][0]) if place >= 0 else None
 
     def truth(self, frame: Frame) -> Truth | None:
-        """What has to be found in a frame, where that is known."""
+        """Return the ground truth of a frame, if there is any."""
         return None if self.truth_of is None else self.truth_of(frame)
 
     def objects(self, number: int) -> Objects | None:
-        """That the run has found in a frame."""
+        """Return the objects that the run found in a frame."""
         return self._objects.get(number)
 
     def look(self, number: int, settings: Settings = ()) -> FrameResult:
-        """What the stages make of a frame, with other values; with those in force the tracks of the run.
+        """Return the result of a frame, with other values if ``settings`` names some.
 
         Raises:
-            UserError: no such frame, an unknown parameter, or a wrong value.
+            UserError: there is no such frame, a parameter is unknown, or a value is wrong.
         """
         with self._looking:
             return self._look(number, settings)
@@ -341,17 +345,20 @@ class Bench(Closing):
     def picked(
         self, number: int, settings: Settings, path: str, instance: int | None, position: Sequence[float]
     ) -> Pick | None:
-        """What a click in the frame is on, see ``pick``."""
+        """Return the pick of a click in a frame, see ``pick``."""
         layer = self._layers.get((number, bool(settings)), {})
         if instance is not None and 0 <= instance < len(rows := layer.get(path, ())):
             return rows[instance].pick
         return pick(self.look(number, settings), self._tracks.get(number), path, instance, position)
 
     def ask(self, number: int, settings: Settings, what: Pick) -> tuple[Answer, list[Answer]]:
-        """Why it was reported, or was not, and what else is there; it is shown in every view.
+        """Explain an object: why was it reported or not? The answer is marked in every view.
+
+        Returns:
+            The answer, and the answers about other subjects at the same place.
 
         Raises:
-            UserError: there is no such thing in the frame.
+            UserError: there is no such object in the frame.
         """
         questioner = self._questioner(self.look(number, settings))
         wanted = selection(what)
@@ -368,7 +375,7 @@ class Bench(Closing):
         return answer, beside
 
     def hints(self, number: int, settings: Settings, what: Pick) -> Answer:
-        """The same with what would change it, which takes longer.
+        """Answer with hints: parameter changes that would change the verdict. This takes longer than ``ask``.
 
         Raises:
             UserError: as ``ask``.
@@ -381,7 +388,7 @@ class Bench(Closing):
         return answer
 
     def _keep(self, number: int, settings: Settings, what: Pick, answer: Answer) -> None:
-        """For reports, with its hints once they are known."""
+        """Keep an answer for reports. One with hints replaces one without."""
         key = number, settings, str(what)
         if answer.hints or key not in self._answers:
             self._answers[key] = self.look(number).frame.received, answer
@@ -390,17 +397,17 @@ class Bench(Closing):
             self._answers.popitem(last=False)
 
     def asked_within(self, low: int, high: int, settings: Settings = ()) -> list[Answer]:
-        """What was asked about frames of these log times, with these values, the newest first."""
+        """Return the answers about frames in a range of log times, with these settings, newest first."""
         kept = reversed(self._answers.items())
         return [answer for (_, own, _), (at, answer) in kept if own == settings and low <= at <= high]
 
     # --- notes ---------------------------------------------------------------------------------
 
     def note(self, number: int, text: str, what: Pick | None) -> None:
-        """Keep a note of a frame, or of a thing in it.
+        """Save a note about a frame, or about an object in it.
 
         Raises:
-            UserError: it cannot be written, or there is no such thing.
+            UserError: the note cannot be written, or there is no such object.
         """
         frame = self.look(number).frame
         about = "" if what is None else self.ask(number, (), what)[0].subject.name
@@ -410,7 +417,11 @@ class Bench(Closing):
         self.tell()
 
     def remove_note(self, stamp: int, text: str) -> None:
-        """Raises UserError where the file cannot be written."""
+        """Remove a note.
+
+        Raises:
+            UserError: the file cannot be written.
+        """
         for note in list(self.notes):
             if (note.stamp, note.text) == (stamp, text):
                 self.notes.remove(note)
@@ -418,7 +429,7 @@ class Bench(Closing):
         self.tell()
 
     def _questioner(self, result: FrameResult) -> Questioner:
-        """What questions about one result have in common is worked out once."""
+        """Return the questioner of a result. Further questions about it reuse the same one."""
         if self._asked is None or self._asked.traces.result is not result:
             session = self.drive.session
             self._asked = Questioner(result, session.loader, session.stages.class_names)
@@ -431,20 +442,20 @@ class Bench(Closing):
     # --- other values --------------------------------------------------------------------------
 
     def configured(self, settings: Settings) -> Config:
-        """How frames are made with other values.
+        """Return the configuration with other values.
 
         Raises:
-            UserError: an unknown parameter, or a wrong value.
+            UserError: a parameter is unknown, or a value is wrong.
         """
         return revised(self.drive.config, settings)
 
     def attempt(self, number: int, settings: Settings, what: Pick | None = None) -> dict[str, Any]:
-        """Show the frame as it is with other values, and tell what they do to it.
+        """Log a frame with other values, and return their effects.
 
         Args:
-            number: of the frame.
-            settings: the values.
-            what: they are tried for, which is told first.
+            number: number of the frame.
+            settings: the other values.
+            what: the object that the values are tried for. Its effect comes first.
 
         Raises:
             UserError: as ``look``.
@@ -459,7 +470,7 @@ class Bench(Closing):
 
 
 class _Filming(Observer[FrameResult]):
-    """The run's way onto the bench."""
+    """Observer of the background run. It passes each frame to the workbench session."""
 
     def __init__(self, bench: Bench) -> None:
         self._bench = bench

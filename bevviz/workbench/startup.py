@@ -1,4 +1,4 @@
-"""The bench while it is being made: the page is served meanwhile, and its viewer loads."""
+"""Start-up of a workbench session. The page is served meanwhile and loads its viewer."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ if TYPE_CHECKING:
 
 
 class Opening(Closing):
-    """Makes the bench in a thread of its own.
+    """Start-up that makes the workbench session in a thread of its own.
 
     Args:
-        make: makes it.
-        failed: called, from that thread, where it cannot be made.
+        make: makes the session.
+        failed: called from that thread if ``make`` raises.
     """
 
     def __init__(self, make: Callable[[], Bench], failed: Callable[[], None]) -> None:
@@ -31,6 +31,7 @@ class Opening(Closing):
         self.error: BaseException | None = None
 
     def start(self) -> None:
+        """Start the thread."""
         self._thread.start()
 
     def _open(self) -> None:
@@ -50,12 +51,13 @@ class Opening(Closing):
         self._over.set()
 
     async def bench(self) -> Bench | None:
-        """Once it is there; None: it cannot be made."""
+        """Wait until the session is made, and return it. None: it could not be made."""
         while not self._over.is_set():
             await asyncio.sleep(0.02)
         return self._bench
 
     def close(self) -> None:
+        """Close the session, now or as soon as it is made."""
         with self._lock:
             self._closed = True
             if self._bench is not None:

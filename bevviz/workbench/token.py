@@ -1,4 +1,4 @@
-"""The token of a server, kept while it runs, so that pages find one that was killed and started again."""
+"""The access token of a server. A file keeps it while the server runs, so that pages survive a crash."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from pathlib import Path
 
 @contextmanager
 def kept_token(port: int, drive: str) -> Iterator[str]:
-    """A token for the server of a drive at a port.
+    """Yield the token for the server of a drive at a port.
 
-    It is a new one, unless the last server of the same drive at the same port had no time to forget its own.
-    Only this user can read where it is kept; where it cannot be kept it is a new one each time.
+    A token that a killed server of the same drive left at the same port is used again. Otherwise the token is
+    new. Only this user can read its file. If the file cannot be written, every start makes a new token.
 
     Args:
-        port: of the server, which is listening there: nobody else is.
-        drive: the paths of the drive.
+        port: port of the server, which listens there already. So no other server uses the file.
+        drive: paths of the drive.
     """
     path = _folder() / f"workbench-{port}.json"
     token = _left(path, drive) or secrets.token_urlsafe(16)
@@ -36,12 +36,13 @@ def kept_token(port: int, drive: str) -> Iterator[str]:
 
 
 def _folder() -> Path:
+    """Return the folder of the token files."""
     runtime = os.environ.get("XDG_RUNTIME_DIR") or os.environ.get("XDG_CACHE_HOME")
     return Path(runtime or Path.home() / ".cache") / "bevviz"
 
 
 def _left(path: Path, drive: str) -> str:
-    """What a server that was killed left; empty: nothing that can be used."""
+    """Return the token that a killed server left. Empty: there is none that can be used."""
     try:
         about = path.lstat()
         if about.st_uid != os.getuid() or about.st_mode & 0o077:

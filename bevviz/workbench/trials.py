@@ -1,4 +1,4 @@
-"""A drive with other values: one frame of it at once, all of them behind it, and where that is better."""
+"""Trials of other parameter values: on one frame at once, and on the whole drive in the background."""
 
 from __future__ import annotations
 
@@ -31,18 +31,25 @@ from bevviz.workbench.findings import Find, finds, fixed_place
 if TYPE_CHECKING:
     from bevviz.workbench.session import Bench, Settings
 
-DIFFERENCES = ("fixed", "broken", "new false", "false gone", "new", "gone")  # kinds of entries
+DIFFERENCES = ("fixed", "broken", "new false", "false gone", "new", "gone")  # kinds of findings
 
 
 @dataclass(slots=True)
 class Trial:
-    """A run over the drive with other values, and what it does to each frame.
+    """A run over the drive with other values, and its effect on each frame.
 
     Attributes:
-        settings: that differ from those the drive was opened with.
+        settings: the settings that differ from those the drive was opened with.
+        total: number of frames of the drive.
         state: waiting, running, over, cancelled or failed.
-        strip: stamp of each frame, how many objects it makes better and how many worse; without a ground
-            truth, how many come and how many go.
+        error: reason of the failure.
+        done: number of finished frames.
+        strip: per frame its stamp, how many objects get better and how many get worse. Without ground truth,
+            how many objects appear and how many disappear.
+        counts: number of changes by kind.
+        scores: score before and after.
+        known: whether there is ground truth.
+        stop: cancels the run when it is set.
     """
 
     settings: Settings
@@ -58,10 +65,11 @@ class Trial:
 
     @property
     def going(self) -> bool:
+        """Whether the trial is waiting or running."""
         return self.state in ("waiting", "running")
 
     def as_dict(self) -> dict[str, Any]:
-        """For the page."""
+        """Return the trial as JSON for the page."""
         return {
             "settings": list(self.settings),
             "state": self.state,
@@ -77,11 +85,11 @@ class Trial:
 
 
 class Trials:
-    """Runs one trial at a time over a bench's drive.
+    """Runner of trials over the drive of a workbench session, one at a time.
 
     Args:
-        bench: whose drive it is.
-        news: called when there is something to tell.
+        bench: the workbench session.
+        news: called when the state of the trial has changed.
     """
 
     def __init__(self, bench: Bench, news: Callable[[], None]) -> None:
@@ -91,10 +99,10 @@ class Trials:
         self.trial: Trial | None = None
 
     def begin(self, settings: Settings) -> None:
-        """Run the drive with these, in place of what is being run.
+        """Run the drive with these settings. A trial that is running is cancelled.
 
         Raises:
-            UserError: nothing is changed, an unknown parameter, or a wrong value.
+            UserError: nothing is changed, a parameter is unknown, or a value is wrong.
         """
         bench = self._bench
         config = revised(bench.drive.config, settings)
@@ -110,7 +118,7 @@ class Trials:
         self._news()
 
     def end(self) -> None:
-        """Cancel what is being run; what was made until then stays."""
+        """Cancel the running trial. Its results until then stay."""
         if self.trial is not None:
             self.trial.stop.set()
         if self._thread is not None:
@@ -120,7 +128,7 @@ class Trials:
         bench = self._bench
         try:
             while not bench.over and not trial.stop.wait(0.1):
-                pass  # the first run has what this one is compared with
+                pass  # The results of the first run are needed for comparison.
             trial.state = "running"
             logger = tried_logger(self._recording, session, bench)
             run(bench.again, session, [_Trying(bench, trial, logger, self._show)], stop=trial.stop)
@@ -136,7 +144,7 @@ class Trials:
 
 
 class _Trying(Observer[FrameResult]):
-    """Shows each frame as it is with other values, and counts what that changes."""
+    """Observer of a trial. It logs each frame with the other values and counts the changes."""
 
     def __init__(self, bench: Bench, trial: Trial, logger: Logger, show: Callable[[], None]) -> None:
         self._bench, self._trial, self._logger, self._show = bench, trial, logger, show
@@ -171,7 +179,7 @@ class _Trying(Observer[FrameResult]):
 
 
 def tried_logger(recording: Any, session: Session, bench: Bench) -> Logger:
-    """Writes results beside those of the run, on a timeline of their own."""
+    """Return a logger that writes tried results on a timeline of their own, beside those of the run."""
     return Logger(
         recording, session.config, bench.drive.scene, wait=WAIT, stamps=(entities.TRIED,), inputs=False
     )
@@ -180,7 +188,7 @@ def tried_logger(recording: Any, session: Session, bench: Bench) -> Logger:
 def difference_entries(
     result: FrameResult, found: Effects, truth: Sequence[Subject], before: Objects | None
 ) -> Iterator[tuple[Find, bool]]:
-    """What other values change in a frame, and whether it is to be seen with them."""
+    """Yield the findings that other values cause in a frame, and whether the tried side shows them."""
     when, pose = (result.frame.index, result.frame.stamp), result.frame.pose
 
     def find(what: str, name: str, center: Any, pick: Pick) -> Find:
@@ -210,7 +218,14 @@ def difference_entries(
 
 
 def attempt(before: FrameResult, after: FrameResult, truth: Truth | None, asked: int = -1) -> dict[str, Any]:
-    """What other values do to one frame, for the page; what was asked about, a row of the truth, first."""
+    """Return the effects of other values on one frame, for the page.
+
+    Args:
+        before: result as opened.
+        after: result with the other values.
+        truth: ground truth of the frame.
+        asked: row of the ground truth object that was asked about. Its effect comes first. -1: none.
+    """
     subjects = truth_subjects(after.frame, _names(before))
     found = effects(before.objects, after.objects, subjects, asked)
     told: dict[str, Any] = {
@@ -225,14 +240,14 @@ def attempt(before: FrameResult, after: FrameResult, truth: Truth | None, asked:
 
 
 def _opinions(before: FrameResult, after: FrameResult) -> dict[str, list[int | None]]:
-    """Of which there are more or fewer, how many there were and are; None: the objects are ours."""
+    """Return the counts of opinions that changed, before and after. None: the objects are our own."""
     was, now = opinions_in(before), opinions_in(after)
     counts = {what: [was.get(what), now.get(what)] for what in OPINIONS}
     return {what.replace("_", " "): [a, b] for what, (a, b) in counts.items() if (a or 0) != (b or 0)}
 
 
 def effects_dict(found: Effects) -> dict[str, Any]:
-    """In words, as those of a hint."""
+    """Return effects as JSON for the page, in the same form as those of a hint."""
     return {
         "fixed": list(found.fixed),
         "added": list(found.added),
@@ -256,5 +271,5 @@ def _f1(result: FrameResult, truth: Truth) -> float | None:
 
 
 def rounded(value: float) -> float | None:
-    """For the page; None where there is nothing to tell."""
+    """Return a number rounded to three digits for the page, or None for NaN."""
     return None if np.isnan(value) else round(value, 3)

@@ -1,4 +1,4 @@
-"""Frames that hold the truth, wherever it comes from: whatever asks about a frame finds it there."""
+"""Frames with ground truth, from any origin."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ TruthOf = Callable[[Frame], Truth | None]
 
 
 class Labelled:
-    """A source whose frames have their truth.
+    """A source of frames that adds the ground truth to each frame.
 
     Args:
         frames: the source.
-        truth_of: what is known to be there.
+        truth_of: returns the ground truth of a frame.
     """
 
     def __init__(self, frames: Frames, truth_of: TruthOf) -> None:
@@ -27,31 +27,38 @@ class Labelled:
 
     @property
     def scene(self) -> Scene:
+        """Scene of the source."""
         return self._frames.scene
 
     @property
     def total(self) -> int:
+        """Number of frames."""
         return self._frames.total
 
     @property
     def warnings(self) -> Sequence[str]:
+        """Warnings of the source."""
         return self._frames.warnings
 
     @property
     def scans(self) -> I64:
+        """Log times of the scans, in nanoseconds."""
         return self._frames.scans
 
     def __iter__(self) -> Iterator[Frame]:
         return map(self._labelled, self._frames)
 
     def number_at(self, time: str | float) -> int:
+        """Return the number of the frame at a time."""
         return self._frames.number_at(time)
 
     def frame(self, number: int) -> Frame | None:
+        """Return a frame with its ground truth."""
         found = self._frames.frame(number)
         return None if found is None else self._labelled(found)
 
     def close(self) -> None:
+        """Close the source."""
         self._frames.close()
 
     def _labelled(self, frame: Frame) -> Frame:
