@@ -1,1 +1,1 @@
-"""Bug reports: a window of a bag, its results, and their check. Imports `pipeline` and below."""
+"""Bug reports: a short bag, its results, and a check that repeats them. Imports `pipeline` and below."""

@@ -1,4 +1,4 @@
-"""The part of a bag that a report is about, cut out as a bag of its own that runs again."""
+"""Cut the time window of a report out of a bag, into a bag that can be run again."""
 
 from __future__ import annotations
 
@@ -29,29 +29,33 @@ Edit = Callable[[RawMessage, bytes | memoryview], Edited]
 
 
 def as_it_is(message: RawMessage, data: bytes | memoryview) -> Edited:
+    """Return a message unchanged."""
     return message.connection, data
 
 
 @dataclass(frozen=True, slots=True)
 class Window:
-    """Log times in nanoseconds. ``low`` and ``high`` are whole milliseconds, so that they can be written."""
+    """Time window of a report, as log times in nanoseconds.
 
-    at: int  # of the scan that the report is about
-    low: int  # scans from here
-    high: int  # to before here
-    start: int  # of the whole recording
+    ``low`` and ``high`` are whole milliseconds, so that they can be written exactly as text.
+    """
+
+    at: int  # scan that the report is about
+    low: int  # first scan, inclusive
+    high: int  # last scan, exclusive
+    start: int  # start of the whole recording
 
 
 @dataclass(frozen=True, slots=True)
 class Cut:
-    """What a bag was made of."""
+    """Content of a bag that was cut out."""
 
     counts: Counter[str]  # messages by topic
-    left_out: tuple[str, ...]  # one sentence each
+    left_out: tuple[str, ...]  # messages that are missing, one sentence each
 
 
 def find_window(source: BagSource, at: int, before: float, after: float) -> Window:
-    """The window from the first scan to the last one within ``before`` and ``after`` seconds of ``at``."""
+    """Return the window from the first to the last scan within ``before`` and ``after`` seconds of ``at``."""
     times = source.recording.scan_times(source.roles.driver)
     first, last = np.searchsorted(times, [at - round(before * SECOND), at + round(after * SECOND) + 1])
     low = int(times[first]) // MILLISECOND * MILLISECOND
@@ -60,15 +64,15 @@ def find_window(source: BagSource, at: int, before: float, after: float) -> Wind
 
 
 def open_window(paths: Sequence[Path], config: Config, low: int, high: int) -> BagSource:
-    """The scans of a window, in the whole bag as in the one cut out."""
+    """Open the scans of a window, in the whole bag or in the one that was cut out."""
     return BagSource(paths, config, start=iso(low), end=iso(high))
 
 
 def choose_topics(recording: Recording, roles: Roles, patterns: Sequence[str] | None) -> list[str]:
-    """Those that the pipeline reads, and those of the others that a pattern names; None: all of them.
+    """Return the topics that the pipeline reads, and the others that fit a pattern. None: all topics.
 
     Raises:
-        UserError: a pattern that no topic fits.
+        UserError: a pattern fits no topic.
     """
     there = [topic.name for topic in recording.topics]
     if patterns is None:
@@ -79,7 +83,11 @@ def choose_topics(recording: Recording, roles: Roles, patterns: Sequence[str] | 
 
 
 def fits(recording: Recording, patterns: Sequence[str], option: str) -> None:
-    """Raises UserError for a pattern that no topic fits."""
+    """Check that every pattern fits a topic.
+
+    Raises:
+        UserError: a pattern fits none.
+    """
     there = [topic.name for topic in recording.topics]
     for pattern in patterns:
         if not any(fnmatchcase(name, pattern) for name in there):
@@ -87,7 +95,7 @@ def fits(recording: Recording, patterns: Sequence[str], option: str) -> None:
 
 
 def _read(roles: Roles) -> list[str]:
-    """Every topic that the pipeline reads."""
+    """Return every topic that the pipeline reads."""
     cameras = [name for camera in roles.cameras for name in (camera.topic, camera.info_topic)]
     single = [roles.odometry, roles.truth]
     return [
@@ -108,20 +116,24 @@ def cut(
     path: Path,
     edit: Edit = as_it_is,
 ) -> Cut:
-    """Write the messages of a window to an MCAP file, byte for byte, with all that it needs to run again.
+    """Write the messages of a window to an MCAP file, byte for byte, with all that a run of it needs.
 
-    That is: files with calibrations of LiDARs, ``MARGIN`` on either side, as ``BagSource`` reads it,
-    everything that was said on the ``static`` topics, of video what was before and is needed to decode it,
-    and of each topic that is silent in the window the last message before it, else the first one after it
-    (a calibration, a map or a robot's description that was published once).
+    The file also gets:
+
+    - the calibration files of LiDARs,
+    - the messages within ``MARGIN`` on either side, which ``BagSource`` reads, too,
+    - all messages of the ``static`` topics,
+    - the earlier packets of a video that its first image is decoded from,
+    - for a topic that is silent in the window, its last message before it, else its first one after it (a
+      calibration, a map or a robot description that was published once).
 
     Args:
         recording: the whole bag.
         window: the scans.
-        topics: those to be written.
+        topics: the topics to write.
         static: topics of static transforms.
-        path: of the MCAP file.
-        edit: gives what is to be written for a message, and of which type; None: leave it out.
+        path: path of the MCAP file.
+        edit: returns the connection and the bytes to write for a message. None: leave it out.
 
     Raises:
         UserError: the file cannot be written.
@@ -164,13 +176,13 @@ def cut(
 
 
 def _needed(recording: Recording, topic: str, low: int) -> list[RawMessage]:
-    """The messages of a video before the window that its first pictures are decoded from."""
+    """Return the video messages before the window that its first image is decoded from."""
     times = sorted({packet.received for packet in recording.packets(topic, low - 1)})
     return [m for time in times for m in recording.messages([topic], time, time + 1)]
 
 
 def _last(recording: Recording, topic: str, low: int, high: int) -> RawMessage | None:
-    """What holds in the window, of a topic without a message in it; None where it has one."""
+    """Return the message that is valid in the window, for a topic that is silent in it. Otherwise None."""
     times = recording.times(topic)
     first, last = np.searchsorted(times, [low, high])
     if first < last or not len(times):

@@ -1,4 +1,4 @@
-"""Runs a report again and compares the results with those that it holds."""
+"""Run a report again and compare the results with the stored ones."""
 
 from __future__ import annotations
 
@@ -44,30 +44,30 @@ UNREADABLE = "cannot be read as a report"
 
 @dataclass(frozen=True, slots=True)
 class StoredReport:
-    """A report as its recording holds it."""
+    """Content of a report's recording."""
 
     info: ReportInfo
     config: str  # YAML
-    frames: dict[int, tuple[StageDigest, ...]]  # by number
+    frames: dict[int, tuple[StageDigest, ...]]  # by frame number
 
 
 @dataclass(slots=True)
 class CheckResult:
-    """How a second run compares. ``changed``: what it was made with that is not as it was then."""
+    """Result of a check. ``changed``: inputs and versions that differ from those of the report."""
 
     frames: int = 0
-    exact: int = 0  # frames that are the same in every bit
-    rounding: float = 0.0  # largest relative difference of a number in those that are the same but for it
+    exact: int = 0  # frames that are equal in every bit
+    rounding: float = 0.0  # largest relative difference in frames that are equal except for rounding
     differing: int = 0
-    first: tuple[int, DigestDifference] | None = None  # frame and what differs
+    first: tuple[int, DigestDifference] | None = None  # frame number and difference
     changed: list[str] = field(default_factory=list)
     redacted: bool = False
-    sound: bool = True  # the bag is, byte for byte, the one that the report was made with
-    sealed: bool = True  # and the recording that which its page tells of
+    sound: bool = True  # whether the bag is, byte for byte, the one of the report
+    sealed: bool = True  # whether a page beside the recording confirms its checksum
 
     @property
     def same(self) -> bool:
-        """Bag and every frame."""
+        """Whether the bag and every frame are the same."""
         return self.frames > 0 and not self.differing and self.sound
 
     def add(self, number: int, difference: DigestDifference | None) -> None:
@@ -82,7 +82,7 @@ class CheckResult:
             self.first = self.first or (number, difference)
 
     def lines(self) -> Iterator[str]:
-        """For people."""
+        """Yield the result as text."""
         if self.first is not None:
             number, difference = self.first
             yield (
@@ -116,15 +116,15 @@ class CheckResult:
 
 
 def check(rrd: Path, *, model: Path | None = None, settings: Sequence[str] = ()) -> CheckResult:
-    """Run the bag beside a report's recording as the recording says, and compare each frame.
+    """Run the bag beside a report's recording with the stored configuration, and compare each frame.
 
     Args:
-        rrd: the recording; ``NAME.mcap`` lies beside it.
-        model: the detector's file, where it does not lie beside it.
-        settings: ``key=value`` to be changed.
+        rrd: the recording. The bag ``NAME.mcap`` lies beside it.
+        model: model file of the detector, if it does not lie beside the recording.
+        settings: ``key=value`` settings to change.
 
     Raises:
-        UserError: no report, no bag, or no model.
+        UserError: the report, the bag or the model is missing, or cannot be read.
     """
     if not rrd.is_file():
         raise UserError(f"{rrd}: {'it is no file' if rrd.exists() else 'no such file'}")
@@ -157,11 +157,12 @@ def check(rrd: Path, *, model: Path | None = None, settings: Sequence[str] = ())
 
 
 class _Comparer(Observer[FrameResult]):
-    """Compares each frame with that of the report."""
+    """Observer that compares each frame with the stored one."""
 
     def __init__(self, stored: StoredReport, result: CheckResult) -> None:
         self.left = dict(stored.frames)
-        self.complete = Event()  # of a report that was interrupted: there is no more to compare
+        # An interrupted report has no results for the rest of its bag: the run ends early.
+        self.complete = Event()
         self._interrupted, self._result = stored.info.interrupted, result
 
     def see(self, result: FrameResult) -> None:
@@ -172,10 +173,10 @@ class _Comparer(Observer[FrameResult]):
 
 
 def read(rrd: Path) -> StoredReport:
-    """The report in a recording.
+    """Read the report in a recording.
 
     Raises:
-        UserError: no recording, or none of a report.
+        UserError: it is no recording, or not that of a report.
     """
     info = config = None
     frames: dict[int, tuple[StageDigest, ...]] = {}
@@ -200,6 +201,7 @@ def read(rrd: Path) -> StoredReport:
 
 
 def _column(chunk: Any, name: str) -> list[Any]:
+    """Return a column of a chunk as a list."""
     found: list[Any] = chunk.to_record_batch().column(name).to_pylist()
     return found
 
@@ -207,11 +209,12 @@ def _column(chunk: Any, name: str) -> list[Any]:
 def _configs(
     rrd: Path, stored: StoredReport, model: Path | None, settings: Sequence[str], folder: Path
 ) -> tuple[Config, Config]:
-    """The configuration as it is stored, and as it is to be run on this machine."""
+    """Return the configuration as it is stored, and with the paths of this machine."""
     info, names = stored.info, folder / "names.txt"
     names.write_bytes(info.names.encode())
     recorded = Layer(str(rrd), flat_yaml(stored.config, str(rrd)))
-    same = [text for text in settings if _is_in(recorded, text)]  # the user names its functions, too
+    # The user's own functions run only if the user names them again.
+    same = [text for text in settings if _is_in(recorded, text)]
     then = load(settings=same, layers=[recorded])
     needed = model_path(then)
     here = [f"detector.names={names}"] if info.names else []
@@ -234,17 +237,18 @@ def _configs(
 
 
 def _is_in(layer: Layer, setting: str) -> bool:
-    """Whether a ``key=value`` is what the layer states anyway."""
+    """Return whether a layer already contains this ``key=value``."""
     key, _, value = setting.partition("=")
     return str(layer.values.get(key)) == value
 
 
 def _other(bag: Path) -> str:
+    """Return the sentence for a bag whose checksum differs."""
     return f"{bag.name} is not the file that the report was made with (SHA-256)"
 
 
 def _changed_input(info: ReportInfo, bag: Path, then: Config, now: Config) -> Iterator[str]:
-    """The bag and the configuration, but for the files that this names, which are dependencies."""
+    """Yield the changes of the bag and of the configuration. Files that it names count as dependencies."""
     if file_hash(bag) != info.bag_sha256:
         yield _other(bag)
     for key, change in changes(then, now).items():
@@ -253,8 +257,9 @@ def _changed_input(info: ReportInfo, bag: Path, then: Config, now: Config) -> It
 
 
 def _changed_provenance(info: ReportInfo, now: Config, network: str) -> Iterator[str]:
+    """Yield the changes of versions, machine and dependencies."""
     then = info.provenance
-    if info.redacted:  # the network is not run: what it found is in the report
+    if info.redacted:  # The network is not run. The report holds its detections.
         left = {name: d for name, d in then.dependencies.items() if not name.startswith("detector.")}
         then = replace(then, dependencies=left)
         now = now.model_copy(update={"detector": now.detector.model_copy(update={"model": ""})})

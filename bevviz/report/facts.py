@@ -1,4 +1,4 @@
-"""What a report states beside its results: where it comes from, what lies beside it, how to run it again."""
+"""Text of a report beside the results: its origin, its files, and the commands that run it again."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from bevviz.report.bag_window import Window
 from bevviz.support.text import fenced, markdown
 from bevviz.support.version import __version__
 
-TRACEBACKS = 5  # that are told
+TRACEBACKS = 5  # tracebacks that are listed
 _FOLDERS = re.compile(r'(?<=File ").*?([^/\\"]+[/\\][^/\\"]+)(?=")')
 
 
 @dataclass(frozen=True, slots=True)
 class Asked:
-    """What was asked about, and why it is as it is: the verdict, and stage by stage."""
+    """Answer to a question of the user: the verdict, and the decision of each stage."""
 
     verdict: str
     reported: bool
@@ -32,25 +32,25 @@ class Asked:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Facts:
-    """What a page states beside the results. All of it is text, and escaped where it is written."""
+    """Text of a page beside the results. It is escaped where it is written."""
 
     title: str
     note: str
-    notes: Mapping[str, str]  # of the drive, in the window, by their time
+    notes: Mapping[str, str]  # notes of the drive within the window, by time
     asked: Sequence[Asked]
-    where: str  # the bag, its window, and the place in it
-    start: int  # log time of the recording's start: seconds count from here
-    config: str  # preset in a sentence
-    changes: Mapping[str, ParameterChange]  # by key; before: as the preset has it
+    where: str  # the bag, its window and the frame
+    start: int  # log time of the recording's start, from which seconds are counted
+    config: str  # one sentence about preset and changes
+    changes: Mapping[str, ParameterChange]  # by key, before: value of the preset
     versions: Sequence[str]
     hardware: Sequence[str]
     warnings: Sequence[str]
-    tracebacks: Mapping[str, str]  # of errors in stages that nobody foresaw, by a heading
-    files: Sequence[str]  # what lies beside the page
+    tracebacks: Mapping[str, str]  # unexpected errors in stages, by heading
+    files: Sequence[str]  # files beside the page
     commands: Sequence[str]
 
     def markdown(self) -> str:
-        """The same for the recording, without what it holds already."""
+        """Return the text for the recording, without what the recording holds already."""
         lines = [f"# {markdown(self.title)}", "", markdown(self.where), ""]
         lines += [f"> {markdown(line)}" for line in self.note.splitlines()]
         lines += [f"- {markdown(when)}: {markdown(text)}" for when, text in self.notes.items()]
@@ -66,19 +66,19 @@ class Facts:
 
 
 def window_text(name: str, window: Window) -> str:
-    """Where in a bag, in both kinds of time."""
+    """Return the sentence about the window of a bag, in seconds and in UTC."""
     first, last, at = ((t - window.start) / SECOND for t in (window.low, window.high, window.at))
     return f"{name}, {first:.1f} to {last:.1f} s of it, at {at:.3f} s ({iso(window.at)})"
 
 
 def commands(rrd: Path, window: Window, config: Config, redacted: bool) -> list[str]:
-    """What to type where the files are, to see, to prove and to run it again.
+    """Return the commands that show, check and repeat the report, to be typed in the folder of its files.
 
     Args:
-        rrd: the recording; the bag lies beside it.
+        rrd: the recording. The bag lies beside it.
         window: the scans.
-        config: without the folders of this machine.
-        redacted: whether the bag's images are.
+        config: the configuration without folders of this machine.
+        redacted: whether the images of the bag are redacted.
     """
     run = ["bevviz", "bag", rrd.with_suffix(".mcap").name]
     run += ["--start", iso(window.low), "--end", iso(window.high)]
@@ -97,7 +97,7 @@ def commands(rrd: Path, window: Window, config: Config, redacted: bool) -> list[
 
 
 def traceback_texts(tracebacks: Counter[tuple[str, str]]) -> dict[str, str]:
-    """The most common ones by a heading, without the folders of this machine."""
+    """Return the most common tracebacks by heading, without folders of this machine."""
     return {
         f"Traceback of stage '{stage}' ({times} frame{'s' * (times > 1)})": _FOLDERS.sub(r"\1", text)
         for (stage, text), times in reversed(tracebacks.most_common(TRACEBACKS))
@@ -105,7 +105,7 @@ def traceback_texts(tracebacks: Counter[tuple[str, str]]) -> dict[str, str]:
 
 
 def file_lines(sizes: Mapping[str, str], counts: Mapping[str, int], model: Dependency | None) -> list[str]:
-    """The files of a report, and the model that it needs."""
+    """Return one line per file of a report, and one about its model."""
     lines = [f"{name}: {size}" for name, size in sizes.items()]
     if counts:
         topics = ", ".join(f"{topic} ({n})" for topic, n in sorted(counts.items()))

@@ -1,4 +1,4 @@
-"""The results of a frame as fingerprints, so that a second run can be proven to give the same ones."""
+"""Fingerprints of the results of a frame, so that a second run can be compared with the first."""
 
 from __future__ import annotations
 
@@ -17,31 +17,34 @@ from bevviz.model.results import Detections, FrameResult, Masks
 
 Arrays = Mapping[str, NDArray[Any]]
 
-WHOLE = 1 << 14  # elements up to which an array is kept beside its fingerprint, so that a change has a size
-ROUNDING = 1e-5  # of a number, or of 1: networks and geometry round differently on another processor
+WHOLE = 1 << 14  # Arrays of up to this many elements are stored, so that the size of a change can be stated.
+ROUNDING = 1e-5  # relative to the number, or to 1 if it is smaller. Processors round differently.
 
 
 class LargeArray(NamedTuple):
-    """An array that is too large to be kept."""
+    """Fingerprint of an array that is too large to be stored."""
 
     fingerprint: str
     rows: str
-    total: str  # sum of its elements
+    total: str  # sum of the elements
 
 
 @dataclass(frozen=True, slots=True)
 class StageDigest:
-    """What one stage made of a frame."""
+    """Fingerprint of the results of one stage in a frame."""
 
-    name: str  # with the camera behind it where there is one: "detector zed"
+    name: str  # followed by the camera if there is one: "detector zed"
     fingerprint: str  # SHA-256 over names, types, shapes and bytes of its arrays
-    whole: Arrays  # those of at most ``WHOLE`` elements
-    large: Mapping[str, LargeArray]  # what is kept of the others
+    whole: Arrays  # arrays of at most ``WHOLE`` elements
+    large: Mapping[str, LargeArray]  # the other arrays
 
 
 @dataclass(frozen=True, slots=True)
 class DigestDifference:
-    """Where two runs part. ``amount``: see ``ROUNDING``; infinite where it is no question of numbers."""
+    """Difference between two runs of a stage.
+
+    ``amount`` is relative, as ``ROUNDING``. It is infinite if more than numbers differ.
+    """
 
     stage: str
     text: str
@@ -49,18 +52,18 @@ class DigestDifference:
 
 
 def digest(result: FrameResult) -> tuple[StageDigest, ...]:
-    """Each stage's results, in the order in which they depend on each other.
+    """Return the fingerprint of each stage, in the order in which the stages depend on each other.
 
-    Times, words and the picture's encoding are no part of it: the first differ from run to run, the others
-    are made from the rest.
+    Times and texts are left out, because times differ from run to run and texts follow from the arrays. The
+    encoded image is left out as well, because its pixels are included.
     """
     return tuple(_stage(name, arrays) for name, arrays in _stages(result))
 
 
 def compare(then: tuple[StageDigest, ...], now: tuple[StageDigest, ...]) -> DigestDifference | None:
-    """The first stage that differs by more than rounding, else the one that rounds worst, else None.
+    """Return the first stage that differs by more than rounding, else the largest rounding, else None.
 
-    Numbers within ``ROUNDING`` of each other, with everything else being equal, are rounding.
+    Numbers within ``ROUNDING`` of each other count as rounding if everything else is equal.
     """
     worst: DigestDifference | None = None
     before, after = {s.name: s for s in then}, {s.name: s for s in now}
@@ -79,7 +82,7 @@ def compare(then: tuple[StageDigest, ...], now: tuple[StageDigest, ...]) -> Dige
 
 
 def pack(stages: tuple[StageDigest, ...]) -> tuple[list[str], U8]:
-    """Lines of text and a compressed block of arrays, as a recording can hold them."""
+    """Pack fingerprints for a recording: lines of text and a compressed block of arrays."""
     block: dict[str, NDArray[Any]] = {}
     for stage in stages:
         block |= {f"whole/{stage.name}/{name}": array for name, array in stage.whole.items()}
@@ -92,7 +95,7 @@ def pack(stages: tuple[StageDigest, ...]) -> tuple[list[str], U8]:
 
 
 def unpack(lines: list[str], block: U8) -> tuple[StageDigest, ...]:
-    """What ``pack`` packed."""
+    """Return the fingerprints that ``pack`` packed."""
     whole: dict[str, dict[str, NDArray[Any]]] = defaultdict(dict)
     large: dict[str, dict[str, LargeArray]] = defaultdict(dict)
     with np.load(io.BytesIO(block.tobytes()), allow_pickle=False) as archive:
@@ -107,7 +110,7 @@ def unpack(lines: list[str], block: U8) -> tuple[StageDigest, ...]:
 
 
 def detections_of(stages: tuple[StageDigest, ...]) -> dict[tuple[str, int], Detections]:
-    """What the network found, exactly, by camera and stamp of the image."""
+    """Return the detections of the network, bit by bit, by camera and stamp of the image."""
     arrays = {stage.name: stage.whole for stage in stages}
     found = {}
     for name, values in arrays.items():
@@ -125,6 +128,7 @@ def detections_of(stages: tuple[StageDigest, ...]) -> dict[tuple[str, int], Dete
 
 
 def _stages(result: FrameResult) -> Iterator[tuple[str, Arrays]]:
+    """Yield the name and the arrays of each stage."""
     frame = result.frame
     yield "cloud", {"xyz": frame.points, "stamp": np.array([frame.stamp])}
     yield "fields", dict(sorted(frame.fields.items()))
@@ -156,7 +160,7 @@ def _stages(result: FrameResult) -> Iterator[tuple[str, Arrays]]:
 
 
 def _arrays(part: Any, prefix: str = "") -> Iterator[tuple[str, NDArray[Any]]]:
-    """The arrays of a dataclass, and of those inside it."""
+    """Yield the arrays of a dataclass and of the dataclasses in it."""
     if part is None:
         return
     for entry in fields(part):
@@ -170,6 +174,7 @@ def _arrays(part: Any, prefix: str = "") -> Iterator[tuple[str, NDArray[Any]]]:
 
 
 def _stage(name: str, arrays: Arrays) -> StageDigest:
+    """Return the fingerprint of one stage."""
     content = sha256()
     whole, large = {}, {}
     for key, given in arrays.items():
@@ -178,7 +183,8 @@ def _stage(name: str, arrays: Arrays) -> StageDigest:
         own = sha256(data).hexdigest()
         kind = "text" if array.dtype.kind == "U" else array.dtype.str
         content.update(f"{key} {kind} {array.shape} {own}\n".encode())
-        if array.size <= WHOLE or key == "masks.packed":  # the network need not run again to check the rest
+        # Masks are always stored, so that a check does not have to run the network again.
+        if array.size <= WHOLE or key == "masks.packed":
             whole[key] = array
         else:
             large[key] = LargeArray(own, str(len(array)), f"{np.sum(array, dtype=np.float64):.17g}")
@@ -189,7 +195,7 @@ def _stage(name: str, arrays: Arrays) -> StageDigest:
 
 
 def _difference(then: StageDigest, now: StageDigest) -> DigestDifference:
-    """How two stages with different fingerprints differ: the array that does so by most."""
+    """Return the largest difference between two stages whose fingerprints differ."""
     worst = DigestDifference(now.name, "equal in value, but not in every bit", 0.0)  # 0.0 and -0.0
     for name in dict.fromkeys([*then.whole, *then.large, *now.whole, *now.large]):
         amount, text = _array_difference(then, now, name)
@@ -199,7 +205,7 @@ def _difference(then: StageDigest, now: StageDigest) -> DigestDifference:
 
 
 def _array_difference(then: StageDigest, now: StageDigest, name: str) -> tuple[float, str]:
-    """By how much, infinite where that is no question of numbers, and in words."""
+    """Return the difference of one array: its amount, infinite if more than numbers differ, and its text."""
     rows, new_rows = _rows(then, name), _rows(now, name)
     if rows != new_rows:
         return float("inf"), f"{rows} rows became {new_rows}"
@@ -221,6 +227,7 @@ def _array_difference(then: StageDigest, now: StageDigest, name: str) -> tuple[f
 
 
 def _step(old: NDArray[Any], new: NDArray[Any]) -> tuple[float, str]:
+    """Return the largest relative difference of two float arrays, and its text."""
     same = (old == new) | (np.isnan(old) & np.isnan(new))
     with np.errstate(invalid="ignore"):
         step = np.nan_to_num(np.abs(new.astype(np.float64) - old), nan=np.inf)[~same]
@@ -230,6 +237,7 @@ def _step(old: NDArray[Any], new: NDArray[Any]) -> tuple[float, str]:
 
 
 def _rows(stage: StageDigest, name: str) -> int:
+    """Return the number of rows of an array."""
     if name in stage.large:
         return int(stage.large[name].rows)
     return len(stage.whole[name]) if name in stage.whole else 0

@@ -1,4 +1,4 @@
-"""What of a message may be a picture, found by walking its definition."""
+"""Find the fields of a message that may hold an image, from its message definition."""
 
 from __future__ import annotations
 
@@ -15,42 +15,42 @@ from rosbags.typesys import Stores, get_typestore
 
 from bevviz.messages.decoding import MessageError
 
-Definitions: TypeAlias = Mapping[str, Any]  # as rosbags has them: type -> constants, fields
+Definitions: TypeAlias = Mapping[str, Any]  # message type -> (constants, fields), as rosbags returns them
 
 IMAGE, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 CLOUD, OLD_CLOUD = "sensor_msgs/msg/PointCloud2", "sensor_msgs/msg/PointCloud"
-PLAIN = {"nav_msgs/msg/OccupancyGrid"}  # its bytes are what it says
-# Pictures in other clothes, which nothing here can decode.
+PLAIN = {"nav_msgs/msg/OccupancyGrid"}  # Its bytes are occupancy values, no pixels.
+# Types with encoded images that this module cannot decode.
 PICTURES = re.compile(r"image|video|ffmpeg|theora|h26[45]|jpeg|png|disparity", re.IGNORECASE)
-COLOUR_FIELDS = {"rgb", "rgba", "r", "red", "color"}  # of a cloud that is a picture, too
+COLOUR_FIELDS = {"rgb", "rgba", "r", "red", "color"}  # fields of a cloud that shows an image
 PIXELS = {"uint8", "int8", "byte", "octet", "char", "uint16", "int16"}
-SMALL = 256  # values that are no picture: a key, a name
+SMALL = 256  # Arrays of up to this many values hold no image, but for example a key or a name.
 
 
 @cache
 def known_types() -> frozenset[str]:
-    """Those whose every field means what ROS says."""
+    """Return the message types of ROS, whose fields are all documented."""
     stores = (get_typestore(Stores.ROS2_JAZZY), get_typestore(Stores.ROS1_NOETIC))
     return frozenset(name for store in stores for name in store.fielddefs)
 
 
 def is_known(msgtype: str) -> bool:
-    """Whether what its fields mean is known; of vision_msgs every version."""
+    """Return whether the meaning of its fields is known. This includes every version of vision_msgs."""
     return msgtype in known_types() or msgtype.startswith(("vision_msgs/", "tf2_msgs/"))
 
 
 def is_coloured(cloud: Any) -> bool:
-    """Whether a PointCloud2 or PointCloud has the colours of a picture."""
+    """Return whether a PointCloud2 or PointCloud has the colours of an image."""
     columns = cloud.fields if hasattr(cloud, "fields") else cloud.channels
     return not COLOUR_FIELDS.isdisjoint(column.name.lower() for column in columns)
 
 
 class Contents:
-    """Looks into the messages of one type.
+    """Search for images in the messages of one type.
 
     Args:
-        msgtype: the type, normalised.
-        definitions: of it and of all that it is made of.
+        msgtype: the normalised type.
+        definitions: definitions of this type and of all types in it.
 
     Raises:
         MessageError: a type in it is not defined.
@@ -62,20 +62,20 @@ class Contents:
         self.may_show = self._look(msgtype)
 
     def without_pictures(self, message: Any, lenient: bool = False) -> tuple[Any, Counter[str]]:
-        """The message with every image and every coloured cloud in it emptied, and which these were.
+        """Return the message with every image and coloured cloud emptied, and the paths of these fields.
 
         Args:
-            message: as it was decoded.
-            lenient: leave bytes that nobody can look into as they are.
+            message: the decoded message.
+            lenient: keep bytes of unknown meaning.
 
         Raises:
-            MessageError: there are such bytes.
+            MessageError: the message has bytes of unknown meaning.
         """
         found: Counter[str] = Counter()
         return self._strip(message, self._msgtype, "", found, lenient), found
 
     def _look(self, msgtype: str, within: tuple[str, ...] = ()) -> bool:
-        """Whether anything in a type has to be looked at; where this is told, all of it is known."""
+        """Return whether a type may hold images. Every type within it is looked up."""
         if msgtype in self._inside:
             return self._inside[msgtype]
         if msgtype not in self._definitions or msgtype in within:
@@ -89,7 +89,7 @@ class Contents:
         return inside
 
     def _is_opaque(self, msgtype: str, kind: Any) -> bool:
-        """Whether a field is bytes or numbers that may be pixels."""
+        """Return whether a field is an array of bytes or numbers that may be pixels."""
         node, about = kind
         if node not in (Nodetype.ARRAY, Nodetype.SEQUENCE) or msgtype in PLAIN:
             return False
@@ -99,6 +99,7 @@ class Contents:
         return basic[0] in PIXELS or msgtype.endswith("MultiArray")
 
     def _strip(self, message: Any, msgtype: str, path: str, found: Counter[str], lenient: bool) -> Any:
+        """Return a message with its images emptied. ``found`` counts the emptied fields by path."""
         if not self._inside[msgtype]:
             return message
         if msgtype in _EMPTIED:
@@ -121,7 +122,7 @@ class Contents:
 
 
 def _part(kind: Any) -> str:
-    """The type that a field is made of; empty where it is none but a number or a text."""
+    """Return the message type of a field, or an empty text for a basic type."""
     node, about = kind
     if node in (Nodetype.ARRAY, Nodetype.SEQUENCE):
         node, about = about[0]

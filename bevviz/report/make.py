@@ -1,4 +1,4 @@
-"""Makes a report: cuts the window, runs it, and writes the recording, the page and the bag."""
+"""Make a report: cut the window, run it, and write the recording, the page and the bag."""
 
 from __future__ import annotations
 
@@ -71,18 +71,29 @@ from bevviz.support.files import written as write_beside
 if TYPE_CHECKING:
     from bevviz.why import Answer
 
-Found = Mapping[tuple[str, int], Detections]  # by camera and stamp of the image
+Found = Mapping[tuple[str, int], Detections]  # by camera name and image stamp
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ReportRequest:
-    """What is asked for.
+    """Request for a report.
 
-    ``before`` and ``after`` are in seconds; ``topics``: patterns of those that go into the bag beside the
-    ones that the pipeline reads, None: all; ``redact``: hide people and vehicles; ``unredacted``: patterns of
-    topics that are kept even so where nobody can tell what they show; ``force``: overwrite; ``asked``: the
-    answers that go in; ``asked_before``: others, of the configuration that other values were then tried in
-    place of; ``notes``: of the whole drive.
+    Attributes:
+        paths: paths of the bag.
+        config: configuration of the run.
+        at: time of the frame that the report is about.
+        before: seconds before it.
+        after: seconds after it.
+        output: path of the recording.
+        note: what went wrong, in the user's words.
+        topics: patterns of topics for the bag, beside those that the pipeline reads. None: all topics.
+        redact: hide people and vehicles.
+        unredacted: patterns of topics that are kept even if their content is unknown.
+        include_model: copy the model file.
+        force: overwrite files.
+        asked: answers to include.
+        asked_before: answers with the original configuration, if ``config`` has tried values.
+        notes: notes of the whole drive.
     """
 
     paths: Sequence[Path]
@@ -104,7 +115,7 @@ class ReportRequest:
 
 @dataclass(slots=True)
 class WrittenReport:
-    """What came of it."""
+    """Outcome of ``make``."""
 
     files: list[Path] = field(default_factory=list)
     frames: int = 0
@@ -117,19 +128,19 @@ def make(
     observers: Sequence[Observer[FrameResult]] = (),
     stop: threading.Event | None = None,
 ) -> WrittenReport:
-    """Write the report. Interrupted while it runs, it is a report of the frames until then.
+    """Write the report. If the run is interrupted, the report has the frames until then.
+
+    The pipeline runs on the bag that was cut out, so that a later run of it gives the same results. With
+    ``redact`` the images of that bag are changed, and the network would see less in them. So the network runs
+    on the original images, its detections are stored in the recording, and every check uses these.
 
     Args:
-        request: what is asked for.
-        observers: that see its frames, too.
+        request: the request.
+        observers: further observers of the run.
         stop: ends the run when it is set, as an interrupt does.
 
-    The pipeline runs on the bag that was cut out, not on the whole one: so does whoever runs it again. With
-    ``redact`` that bag's images are no longer those that the network should see; its detections, made on
-    the whole images, are kept in the recording instead, and stand in for the network in every later check.
-
     Raises:
-        UserError: wrong input, a time outside the bag, files that exist, or that cannot be written.
+        UserError: the input is wrong, the time is outside the bag, or a file exists or cannot be written.
     """
     written = WrittenReport()
     rrd, html, bag = (request.output.with_suffix(suffix) for suffix in (".rrd", ".html", ".mcap"))
@@ -145,7 +156,8 @@ def make(
             redactor = Redactor(
                 request.config.detector, whole.recording, whole.roles.lidars, request.unredacted
             )
-        # Whatever ends this run, nobody must take an older report for this one, least of all unredacted.
+        # Delete an older report first. If this run fails, nobody may take the old files, perhaps
+        # unredacted, for the new ones.
         for target in (rrd, html, bag):
             unfinished = claim(target, "report")
             target.unlink(missing_ok=True)
@@ -156,7 +168,7 @@ def make(
         detect = None if found is None else replay(found)
         session = Session(request.config, detect)
         part = _cut(whole, window, topics, bag, redactor)
-        cleanup.remember(bag, partial(bag.unlink, missing_ok=True))  # alone it is no report
+        cleanup.remember(bag, partial(bag.unlink, missing_ok=True))  # A bag alone is no report.
         stack.callback(cleanup.forget, bag)
         written.files.append(bag)
         written.warnings += [*whole.recording.warnings, *part.left_out, *(redactor.notes if redactor else ())]
@@ -170,7 +182,7 @@ def make(
         public = shareable(request.config)
         source = stack.enter_context(open_window([bag], request.config, window.low, window.high))
         origin = Origin.of(source.scene, request.config, rrd, folders=False, redacted=request.redact)
-        scene = replace(whole.scene, bag=())  # where that lies is nobody's concern
+        scene = replace(whole.scene, bag=())  # The recording must not contain the path of the bag.
         sinks = stack.enter_context(
             open_recording(scene, public, save=rrd, blueprint="bug_report", origin=origin)
         )
@@ -198,7 +210,7 @@ def make(
 
 
 class _ReportRecorder(Recorder):
-    """Logs each frame with its fingerprints and the note, and gathers what the page tells."""
+    """Recorder that also logs fingerprints and the note, and collects the summary for the page."""
 
     def __init__(
         self,
@@ -225,7 +237,7 @@ class _ReportRecorder(Recorder):
 
 
 def replay(found: Found) -> Callable[[Camera], Detections | None]:
-    """In place of the network: what it found when the report was made."""
+    """Return a stand-in for the network that returns the stored detections."""
 
     def detect(camera: Camera) -> Detections | None:
         return None if camera.image is None else found.get((camera.name, camera.image.stamp))
@@ -234,6 +246,11 @@ def replay(found: Found) -> Callable[[Camera], Detections | None]:
 
 
 def _check_targets(request: ReportRequest, targets: Sequence[Path], model: Path | None) -> None:
+    """Check that the output files may be written.
+
+    Raises:
+        UserError: the name is wrong, a file is an input, or a file exists already.
+    """
     output = request.output
     if output.suffix != ".rrd":
         raise UserError(f"-o {output}: expected a file name that ends in .rrd")
@@ -251,7 +268,7 @@ def _check_targets(request: ReportRequest, targets: Sequence[Path], model: Path 
 
 
 class _Detections(Observer[Found]):
-    """What the network finds in the images as they are, which nobody else is going to see."""
+    """Run of the network alone, on the original images."""
 
     def __init__(self, config: Config) -> None:
         self.found: dict[tuple[str, int], Detections] = {}
@@ -272,6 +289,7 @@ class _Detections(Observer[Found]):
 
 
 def _detect(request: ReportRequest, window: Window) -> Found:
+    """Return the detections in the original images of a window."""
     detections = _Detections(request.config)
     with open_window(request.paths, request.config, window.low, window.high) as source:
         if run(source, detections, [detections, Progress("detect")]).interrupted:
@@ -282,6 +300,7 @@ def _detect(request: ReportRequest, window: Window) -> Found:
 def _cut(
     source: BagSource, window: Window, topics: Sequence[str], bag: Path, redactor: Redactor | None
 ) -> Cut:
+    """Cut the window out of the bag, with a progress bar."""
     low, high = window.low - MARGIN, window.high + MARGIN
     times = [source.recording.times(name) for name in topics]
     total = sum(int(((t >= low) & (t < high)).sum()) for t in times)
@@ -297,6 +316,7 @@ def _cut(
 def _info(
     request: ReportRequest, window: Window, written: WrittenReport, made_with: Provenance, bag: Path
 ) -> ReportInfo:
+    """Return the machine-readable description of the report."""
     return ReportInfo(
         low=window.low,
         high=window.high,
@@ -322,6 +342,7 @@ def _facts(
     name: str,
     notes: Sequence[Note],
 ) -> Facts:
+    """Return the text of the report."""
     sizes = {
         path.name: f"{what}, {megabytes(path.stat().st_size)}"
         for path, what in (
@@ -360,18 +381,20 @@ def _facts(
 
 
 def _asked(answer: Answer, when: str = "") -> Asked:
+    """Return an answer as text, with ``when`` before its verdict."""
     text = answer.verdict.text
     steps = [(step.stage, step.text) for step in answer.steps]
     return Asked(f"{when}{text}", answer.verdict.reported, steps)
 
 
 def _class_names(config: Config) -> str:
-    """The file that the configuration names, which does not come along."""
+    """Return the content of the file with class names. The file itself is not part of the report."""
     path = names_path(config)
     return "" if path is None else path.read_bytes().decode()
 
 
 def _without_folders(text: str, paths: Sequence[Path]) -> str:
+    """Remove the folders of these paths from a text."""
     for path in paths:
         text = text.replace(str(path), path.name)
         if len(path.parent.parts) > 0 and str(path.parent) != path.root:

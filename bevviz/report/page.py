@@ -1,4 +1,4 @@
-"""The report as one HTML file that needs nothing else: any browser shows it, online or not."""
+"""The report as one self-contained HTML file that every browser shows, also offline."""
 
 from __future__ import annotations
 
@@ -23,6 +23,8 @@ _QUIET = {"below_threshold", "suppressed", "not_kept", "out_of_view", "too_small
 
 @dataclass(frozen=True, slots=True)
 class Picture:
+    """A picture with its caption."""
+
     data: bytes  # JPEG
     caption: str
     tall: bool = False
@@ -30,18 +32,18 @@ class Picture:
 
 @dataclass(frozen=True, slots=True)
 class FramePage:
-    """What the page shows of the scan that it is about."""
+    """Content of the page about its frame."""
 
     when: str
-    verdict: Sequence[str]  # the few lines to read first
+    verdict: Sequence[str]  # a few lines to read first
     pictures: Sequence[Picture]
-    decisions: Sequence[Explanation]  # of detections, what went wrong first
-    folded: Mapping[str, Sequence[Explanation]]  # the others, by title
+    decisions: Sequence[Explanation]  # of detections, failed ones first
+    folded: Mapping[str, Sequence[Explanation]]  # further decisions, by title
 
 
 @dataclass(frozen=True, slots=True)
 class StripFrame:
-    """One frame of the window, in small. ``here``: it is the nearest to what the page is about."""
+    """Small pictures of one frame of the window. ``here``: it is nearest to the frame of the report."""
 
     label: str
     pictures: Mapping[str, bytes]  # JPEG by sensor
@@ -50,7 +52,7 @@ class StripFrame:
 
 @dataclass(frozen=True, slots=True)
 class DecisionTotal:
-    """How often it was decided so, and in which frames."""
+    """Number of equal decisions in the window, and the frames that have them."""
 
     what: str
     state: str
@@ -59,7 +61,7 @@ class DecisionTotal:
 
 
 def page(facts: Facts, summary: WindowSummary, seal: str) -> str:
-    """The whole file. ``seal``: SHA-256 of the recording."""
+    """Return the HTML text. ``seal`` is the SHA-256 of the recording."""
     bad = [frame for frame in summary.frames if frame.problems]
     common = Counter(problem for frame in bad for problem in frame.problems).most_common(COMMON)
     return render(
@@ -78,10 +80,11 @@ def page(facts: Facts, summary: WindowSummary, seal: str) -> str:
     )
 
 
-# --- at the time -------------------------------------------------------------------------------
+# --- the frame of the report -------------------------------------------------------------------
 
 
 def _frame(result: FrameResult, facts: Facts) -> FramePage:
+    """Return the content about the frame of the report."""
     loud = [e for e in result.explanations if e.state not in _QUIET]
     detections = [e for e in loud if e.subject == "detection"]
     clusters = [e for e in loud if e.subject in ("cluster", "split")]
@@ -101,10 +104,12 @@ def _frame(result: FrameResult, facts: Facts) -> FramePage:
 
 
 def _when(received: int, facts: Facts) -> str:
+    """Return a log time as text, in seconds since the start of the recording."""
     return f"{(received - facts.start) / SECOND:.3f} s"
 
 
 def _verdict(result: FrameResult) -> Iterator[str]:
+    """Yield the lines that summarise a frame."""
     kept = [e for e in result.explanations if e.subject == "detection" and e.state not in _QUIET]
     if kept:
         counts = Counter(e.state.replace("_", " ") for e in kept)
@@ -122,6 +127,7 @@ def _verdict(result: FrameResult) -> Iterator[str]:
 
 
 def _pictures(result: FrameResult) -> Iterator[Picture]:
+    """Yield the camera images and the bird's-eye image of a frame."""
     for camera in result.cameras:
         picture = camera_picture(camera, PICTURE_WIDTH, labels=True, points=True)
         if picture is not None:
@@ -132,10 +138,11 @@ def _pictures(result: FrameResult) -> Iterator[Picture]:
         yield Picture(jpeg(picture), f"bird's-eye view: {reach}", tall=True)
 
 
-# --- over the window ---------------------------------------------------------------------------
+# --- the whole window --------------------------------------------------------------------------
 
 
 def _strip(summary: WindowSummary, facts: Facts) -> Iterator[StripFrame]:
+    """Yield the strip of small frames."""
     distances = [abs(frame.received - summary.at) for frame, _ in summary.strip]
     for (frame, pictures), distance in zip(summary.strip, distances, strict=True):
         label = f"{(frame.received - facts.start) / SECOND:.2f} s, frame {frame.index}"
@@ -143,7 +150,7 @@ def _strip(summary: WindowSummary, facts: Facts) -> Iterator[StripFrame]:
 
 
 def _totals(summary: WindowSummary) -> Iterator[DecisionTotal]:
-    """How many of each decision, and in which frames what is neither matched nor quiet."""
+    """Yield the number of each decision and its frames, with matched and quiet decisions last."""
     frames: dict[tuple[str, str, str], list[int]] = defaultdict(list)
     total: Counter[tuple[str, str, str]] = Counter()
     for frame in summary.frames:
@@ -156,7 +163,7 @@ def _totals(summary: WindowSummary) -> Iterator[DecisionTotal]:
 
 
 def spans(numbers: Sequence[int]) -> str:
-    """Numbers in order, neighbours as a span.
+    """Return sorted numbers as text, with neighbours joined to spans.
 
     >>> spans([1, 2, 3, 7, 9, 10])
     '1-3, 7, 9-10'
@@ -171,6 +178,7 @@ def spans(numbers: Sequence[int]) -> str:
 
 
 def _plots(summary: WindowSummary, facts: Facts) -> Iterator[Plot]:
+    """Yield the plots of health data over the window."""
     at = (summary.at - facts.start) / SECOND
     counted = ("clusters", "detections", "matches", "problems", "failures")
     for title, prefix, names in (
@@ -188,7 +196,7 @@ def _plots(summary: WindowSummary, facts: Facts) -> Iterator[Plot]:
 def _series(
     summary: WindowSummary, facts: Facts, prefix: str, names: Sequence[str] | None
 ) -> Mapping[str, Series]:
-    """Seconds and value of each number below ``prefix``, by name."""
+    """Return (seconds, value) pairs of each scalar below ``prefix``, by name."""
     found: dict[str, list[tuple[float, float]]] = defaultdict(list)
     for frame in summary.frames:
         for path, value in frame.health.items():

@@ -1,4 +1,4 @@
-"""What a frame looks like, as small pictures for a page."""
+"""Small pictures of a frame for a page."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from bevviz.recording.entities import DEPTH_BINS, DEPTH_RANGE
 def camera_picture(
     result: CameraResult, width: int, *, labels: bool = False, points: bool = False
 ) -> U8 | None:
-    """The camera's image with its kept detections, (h, width, 3) BGR; None where there is no image.
+    """Return the camera's image with its kept detections, (h, width, 3) BGR, or None without an image.
 
-    A matched box is drawn thick, another one thin.
+    A matched box is drawn thick, an unmatched one thin.
 
     Args:
-        result: of one camera.
-        width: of the picture, in pixels; a smaller image is not enlarged.
-        labels: with class and score, and the reason where there is no match, as far as there is room.
-        points: with the obstacle points on top, by depth: near red, far blue.
+        result: result of one camera.
+        width: width in pixels. A smaller image is not enlarged.
+        labels: draw class, score and the reason of a missing match, where there is room.
+        points: draw the obstacle points by depth, near red and far blue.
     """
     if result.camera.image is None:
         return None
@@ -42,7 +42,7 @@ def camera_picture(
         width = 2 if matched[d] else 1
         cv2.rectangle(picture, (x0, y0), (x1, y1), class_color(found.names[d])[::-1], width, cv2.LINE_AA)
     taken = np.zeros(picture.shape[:2], bool)
-    for d in sorted(kept.tolist(), key=lambda d: bool(matched[d])) if labels else ():  # the unmatched first
+    for d in sorted(kept.tolist(), key=lambda d: bool(matched[d])) if labels else ():  # unmatched first
         text = f"{found.names[d]} {found.score[d]:.2f}"
         if not matched[d] and result.fusion is not None:
             decision = Decision(int(result.fusion.detection_decision[d]))
@@ -53,7 +53,7 @@ def camera_picture(
 
 
 def shrink(bgr: U8, width: int) -> tuple[U8, float]:
-    """A copy of at most this width, and its scale."""
+    """Return a copy with at most this width, and its scale."""
     scale = min(1.0, width / bgr.shape[1])
     if scale == 1.0:
         return bgr.copy(), scale
@@ -63,17 +63,19 @@ def shrink(bgr: U8, width: int) -> tuple[U8, float]:
 
 
 def ahead(bev: Bev) -> U8:
-    """What of a bird's-eye image lies ahead and not far to the sides."""
+    """Return the part of a bird's-eye image that is ahead and not far to the sides."""
     rows, columns = bev.image.shape[:2]
     return bev.image[rows // 20 : 5 * rows // 8, columns // 4 : 3 * columns // 4]
 
 
 def jpeg(bgr: U8, quality: int = 80) -> bytes:
+    """Return an image as JPEG."""
     _, data = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, quality])
     return bytes(data.tobytes())
 
 
 def _draw_points(picture: U8, result: CameraResult, scale: float) -> None:
+    """Draw the obstacle points of a camera, coloured by depth."""
     if result.uv is None or result.depth is None:
         return
     seen = np.isfinite(result.uv[:, 0])
@@ -84,7 +86,7 @@ def _draw_points(picture: U8, result: CameraResult, scale: float) -> None:
 
 
 def _label(picture: U8, taken: Bool, text: str, x: int, y: int, color: tuple[int, ...]) -> None:
-    """A text above the point, where no other one is."""
+    """Draw a text above a point, unless another text is there."""
     font, size = cv2.FONT_HERSHEY_SIMPLEX, 0.45
     (width, height), below = cv2.getTextSize(text, font, size, 1)
     x = max(0, min(x, picture.shape[1] - width - 4))

@@ -1,4 +1,4 @@
-"""Line plots, laid out to be drawn as SVG by a page's template."""
+"""Line plots, laid out for the SVG in a page's template."""
 
 from __future__ import annotations
 
@@ -7,21 +7,23 @@ from dataclasses import dataclass
 
 import numpy as np
 
-Series = Sequence[tuple[float, float]]  # x, y
+Series = Sequence[tuple[float, float]]  # (x, y) pairs
 
 WIDTH, HEIGHT = 560, 190
-LEFT, RIGHT, TOP, BOTTOM = 52, 18, 10, 24  # margins of the lines
+LEFT, RIGHT, TOP, BOTTOM = 52, 18, 10, 24  # margins around the lines, pixels
 
 
 @dataclass(frozen=True, slots=True)
 class Tick:
+    """A tick of an axis, at a pixel."""
+
     at: float
     label: str
 
 
 @dataclass(frozen=True, slots=True)
 class Line:
-    """A series, or its legend."""
+    """A line in pixels, with the name of its series."""
 
     name: str
     points: Sequence[tuple[float, float]]
@@ -29,23 +31,23 @@ class Line:
 
 @dataclass(frozen=True, slots=True)
 class Plot:
-    """Everything in pixels, from the top left."""
+    """A plot. All lengths are in pixels from the top left corner."""
 
     title: str
     lines: Sequence[Line]
     x_ticks: Sequence[Tick]
     y_ticks: Sequence[Tick]
-    mark: float  # column of the time that the plot is about
+    mark: float  # column of the marked time
     width: int = WIDTH
     height: int = HEIGHT
-    left: int = LEFT  # of the lines
+    left: int = LEFT  # edge of the area of the lines
     right: int = WIDTH - RIGHT
     top: int = TOP
     bottom: int = HEIGHT - BOTTOM
 
 
 def plot(title: str, series: Mapping[str, Series], at: float) -> Plot | None:
-    """One line for each series over seconds, and a mark at the time ``at``; None where there is nothing."""
+    """Lay out one line per series over seconds, with a mark at the time ``at``. None: there is no data."""
     shown = {name: points for name, points in series.items() if points}
     if not shown:
         return None
@@ -71,7 +73,7 @@ def plot(title: str, series: Mapping[str, Series], at: float) -> Plot | None:
 
 
 def ticks(low: float, high: float, count: int) -> list[float]:
-    """About ``count`` round numbers that enclose ``low`` to ``high``, at least two.
+    """Return about ``count`` round numbers that enclose ``low`` to ``high``, at least two.
 
     >>> ticks(0, 9.3, 4)
     [0.0, 2.5, 5.0, 7.5, 10.0]

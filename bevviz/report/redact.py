@@ -1,4 +1,4 @@
-"""People and vehicles made unrecognisable in images, before anything of them is written."""
+"""Hide people and vehicles in images before they are written."""
 
 from __future__ import annotations
 
@@ -39,13 +39,13 @@ from bevviz.report.image_fields import (
 from bevviz.stages.detector import MAX_CANDIDATES, Detector
 from bevviz.sync.video import Video
 
-SCORE = 0.01  # candidates from here on are hidden: rather too much than too little
-CELLS = 8  # along the longer side of a box: one or two for a face or a plate
-SMALLEST = 8  # pixels of a cell's edge, at least
-MARGIN = 0.15  # of a box's sides, on each side of it
-QUALITY = 95  # of JPEGs that are encoded anew
+SCORE = 0.01  # Candidates from this score on are hidden: too much is better than too little.
+CELLS = 8  # cells along the longer side of a box, so that a face or a plate has one or two
+SMALLEST = 8  # pixels, minimum edge of a cell
+MARGIN = 0.15  # of the box's width or height, added on each side
+QUALITY = 95  # of encoded JPEGs
 
-PLAIN_FOXGLOVE = {"CameraCalibration", "FrameTransform", "FrameTransforms"}  # numbers and frames
+PLAIN_FOXGLOVE = {"CameraCalibration", "FrameTransform", "FrameTransforms"}  # types without images
 PEOPLE = re.compile(r"person|people|pedestrian|rider|cyclist|human|man\b|child|face|head")
 VEHICLES = re.compile(
     r"car\b|van\b|truck|bus\b|tram|train|motor|bike|bicycle|cycle|trailer|caravan|vehicle|taxi|scooter|plate"
@@ -53,20 +53,20 @@ VEHICLES = re.compile(
 
 
 class Redactor:
-    """Hides people and vehicles in the image messages of a recording.
+    """Editor that hides people and vehicles in the image messages of a recording.
 
-    A box is hidden with ``MARGIN`` around it: each of at most ``CELLS`` x ``CELLS`` cells gets its mean
-    colour. Of vehicles the whole box goes, since a plate may be anywhere in it. What the detector does not
-    find stays as it is.
+    A box is hidden with ``MARGIN`` around it. It is divided into at most ``CELLS`` x ``CELLS`` cells. Each
+    cell gets its mean colour. The whole box of a vehicle is hidden, because a plate may be anywhere in it.
+    Objects that the detector misses stay visible.
 
     Args:
-        config: the detector. Its thresholds, limits and choice of classes do not count here.
-        recording: which the messages are of.
-        lidars: topics whose clouds are kept even where their points have colours.
-        unredacted: patterns of topics that are written even where nobody can tell what they show.
+        config: the detector. Its thresholds, limits and classes are not used.
+        recording: recording of the messages.
+        lidars: topics whose clouds are kept even if their points have colours.
+        unredacted: patterns of topics that are written even if their content is unknown.
 
     Raises:
-        UserError: no model, or one that knows no people or no vehicles.
+        UserError: there is no model, or it detects no people or no vehicles.
     """
 
     def __init__(
@@ -84,7 +84,8 @@ class Redactor:
             "classes": (),
             "conf_threshold": SCORE,
             "explain_threshold": SCORE,
-            "iou_threshold": 1.0,  # nothing is suppressed: what lies outside the image would do that, too
+            # No suppression: a box that reaches outside the image could suppress another.
+            "iou_threshold": 1.0,
             "max_candidates": MAX_CANDIDATES,
         }
         self._detector = Detector(config.model_copy(update=settings))
@@ -103,17 +104,18 @@ class Redactor:
         self._contents: dict[tuple[str, MessageDefinition], Contents] = {}
         self._left_out: Counter[str] = Counter()
         self.images = 0
-        self.hidden = 0  # boxes
+        self.hidden = 0  # hidden boxes
 
     @property
     def notes(self) -> list[str]:
-        """What is not in the report, one sentence each."""
+        """Messages that are missing in the report, one sentence each."""
         return [f"{n} message(s) of {why}" for why, n in self._left_out.items()]
 
     def __call__(self, message: RawMessage, data: bytes | memoryview) -> Edited:
-        """The message as it may be written: untouched where it shows nobody, None where nobody can tell.
+        """Return the message to write. None: its content is unknown.
 
-        Of a video each picture becomes a CompressedImage of its own.
+        A message without people and vehicles is unchanged. Each image of a video becomes a CompressedImage
+        of its own.
         """
         asked = any(fnmatchcase(message.topic, pattern) for pattern in self._unredacted)
         try:
@@ -127,6 +129,7 @@ class Redactor:
             return (message.connection, data) if asked else None
 
     def _looked_into(self, message: RawMessage, data: bytes | memoryview, asked: bool) -> bytes | memoryview:
+        """Return the bytes to write for a message that is no video packet."""
         msgtype = normalized(message.connection.msgtype)
         if msgtype in (IMAGE, COMPRESSED):
             return self._redacted(message, data, msgtype == COMPRESSED)
@@ -158,6 +161,7 @@ class Redactor:
     def _redacted(
         self, message: RawMessage, data: bytes | memoryview, compressed: bool
     ) -> bytes | memoryview:
+        """Return the bytes of an image message with hidden boxes."""
         decode = decode_compressed_image if compressed else decode_image
         content = self._recording.decode(message)
         bgr = guard(message, decode, content, message.topic, message.received).bgr
@@ -182,6 +186,7 @@ class Redactor:
         return self._recording.encode(message, replace(content, **values))
 
     def _picture(self, message: RawMessage, video: Video) -> Edited:
+        """Return an image of a video as a CompressedImage with hidden boxes. None for a header."""
         content = self._recording.decode(message)
         packet = guard(message, decode_packet, content, message.topic, message.received)
         video.add(packet)
@@ -205,7 +210,7 @@ class Redactor:
         return connection, typestore().serialize_cdr(image, COMPRESSED)
 
     def find(self, bgr: U8) -> F32:
-        """(B, 4) boxes of people and vehicles in an (H, W, 3) image, the largest last."""
+        """Return (B, 4) boxes of people and vehicles in an (H, W, 3) image, the largest last."""
         found = self._detector(bgr)
         rows = [
             i for i, n in enumerate(found.names) if PEOPLE.search(n.lower()) or VEHICLES.search(n.lower())
@@ -216,7 +221,7 @@ class Redactor:
 
 
 def hide(bgr: U8, boxes: F32) -> U8:
-    """A copy of an (H, W, 3) image in which the (B, 4) boxes and their margins are a few flat cells."""
+    """Return a copy of an (H, W, 3) image. Flat cells hide the (B, 4) boxes and their margins."""
     hidden = bgr.copy()
     height, width = bgr.shape[:2]
     for x0, y0, x1, y1 in grown(boxes, width, height):
@@ -229,9 +234,9 @@ def hide(bgr: U8, boxes: F32) -> U8:
 
 
 def grown(boxes: F32, width: int, height: int) -> Sequence[tuple[int, int, int, int]]:
-    """Whole pixels of the boxes with their margin: first column and row, and those after the last.
+    """Return the boxes with their margin in whole pixels: first column and row, and those after the last.
 
-    A box outside the image has none.
+    A box outside the image is left out.
     """
     found = []
     for x0, y0, x1, y1 in boxes.tolist():
@@ -244,7 +249,7 @@ def grown(boxes: F32, width: int, height: int) -> Sequence[tuple[int, int, int, 
 
 
 def _encoded(bgr: U8, magic: bytes) -> U8:
-    """In the form that the first bytes tell: PNG without loss, JPEG and WebP with little."""
+    """Encode an image in the format of the magic bytes: PNG without loss, JPEG and WebP with little loss."""
     form, options = ".jpg", [cv2.IMWRITE_JPEG_QUALITY, QUALITY]
     if magic.startswith(b"\x89PNG"):
         form, options = ".png", []

@@ -1,4 +1,4 @@
-"""What a recording keeps of the report that it belongs to. Nothing personal."""
+"""Description of a report within its recording. It holds no personal data."""
 
 from __future__ import annotations
 
@@ -15,25 +15,30 @@ from bevviz.recording.provenance import Provenance, model_path
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ReportInfo:
-    """Which frames of which bag, and what they were run with. Times are log times in nanoseconds."""
+    """Description of a report: bag, window, provenance and options. Times are log times in nanoseconds."""
 
     low: int
     high: int
     at: int
     bag_sha256: str
     provenance: Provenance
-    names: str  # content of the file with class names that was given, as it does not come along
+    names: str  # content of the file with class names, which is not part of the report
     redacted: bool
     interrupted: bool
     note: str
     warnings: Sequence[str]
 
     def dump(self) -> str:
+        """Return the description as JSON."""
         return json.dumps(asdict(self))
 
     @staticmethod
     def load(text: str) -> ReportInfo:
-        """Raises ValueError where ``text`` is not what ``dump`` makes."""
+        """Read a description from JSON.
+
+        Raises:
+            ValueError: ``text`` is not from ``dump``.
+        """
         return _INFO.validate_json(text, strict=True)
 
 
@@ -41,7 +46,7 @@ _INFO = TypeAdapter(ReportInfo)
 
 
 def shareable(config: Config) -> Config:
-    """The configuration without the folders of this machine."""
+    """Return the configuration without folders of this machine."""
     detector, live, model = config.detector, config.live, model_path(config)
     calibrations = {topic: Path(file).name for topic, file in config.source.lidar_calibration.items()}
     name = detector.model if model is None or detector.model == "demo" else model.name

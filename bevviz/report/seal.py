@@ -1,4 +1,4 @@
-"""What the page of a report says of the recording beside it: that it is this very file."""
+"""Seal of a recording: the page beside it states its checksum."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ _SEAL = re.compile(rb'id="seal">SHA-256 of the recording: ([0-9a-f]{64})<')
 
 
 def check_seal(rrd: Path) -> bool:
-    """Whether there is a page beside the recording that tells of it.
+    """Return whether a page beside the recording states its checksum.
 
     Raises:
-        UserError: it tells of another file. A reader may take what is damaged for something else, or break.
+        UserError: the checksum differs. A damaged file could be misread, or crash its reader.
     """
     page = rrd.with_suffix(".html")
     try:

@@ -1,4 +1,4 @@
-"""What a page tells of a run, gathered frame by frame: small, however many frames there are."""
+"""Summary of a run for a page. It is collected frame by frame and stays small."""
 
 from __future__ import annotations
 
@@ -11,18 +11,18 @@ from bevviz.model.results import FrameResult
 from bevviz.recording.health import Rates, health
 from bevviz.report.pictures import camera_picture, jpeg, shrink
 
-STRIP_PICTURES = 48  # of all cameras and the bird's-eye view together
+STRIP_PICTURES = 48  # pictures of all cameras and the bird's-eye view together
 STRIP_WIDTH = 400
 
 
 @dataclass(frozen=True, slots=True)
 class FrameSummary:
-    """One frame. ``states``: subject, class and state of each decision."""
+    """Summary of one frame. ``states`` counts decisions by subject, class and state."""
 
     index: int
     stamp: int
     received: int
-    health: Mapping[str, float]  # by entity
+    health: Mapping[str, float]  # by entity path
     states: Counter[tuple[str, str, str]]
     problems: tuple[str, ...]
     marks: tuple[str, ...] = ()  # notes of people
@@ -30,12 +30,12 @@ class FrameSummary:
 
 @dataclass(slots=True)
 class WindowSummary:
-    """The frames of a window.
+    """Summary of the frames of a window.
 
     Args:
-        at: time of receipt, in nanoseconds, of the scan that the report is about.
-        total: frames to expect.
-        cameras: how many there are.
+        at: receive time, in nanoseconds, of the scan that the report is about.
+        total: expected number of frames.
+        cameras: number of cameras.
     """
 
     at: int
@@ -43,13 +43,13 @@ class WindowSummary:
     cameras: int
     frames: list[FrameSummary] = field(default_factory=list)
     strip: list[tuple[FrameSummary, dict[str, bytes]]] = field(default_factory=list)  # JPEGs by sensor
-    result: FrameResult | None = None  # of the scan nearest to ``at``
-    tracebacks: Counter[tuple[str, str]] = field(default_factory=Counter)  # stage and traceback
+    result: FrameResult | None = None  # scan nearest to ``at``
+    tracebacks: Counter[tuple[str, str]] = field(default_factory=Counter)  # by stage and traceback
     _last: Frame | None = None
     _rates: Rates = field(default_factory=Rates)
 
     def add(self, result: FrameResult) -> FrameSummary:
-        """Take in the next frame."""
+        """Add the next frame, and return its summary."""
         frame = result.frame
         names = {c.camera.name: c.detections.names for c in result.cameras if c.detections is not None}
         states = Counter(
@@ -76,12 +76,13 @@ class WindowSummary:
         return moment
 
     def _is_for_strip(self, number: int) -> bool:
-        """Evenly spread over the window."""
+        """Return whether the strip shows a frame. Its frames are spread evenly over the window."""
         wanted = min(self.total, max(2, STRIP_PICTURES // (1 + self.cameras)))
         return number * wanted // self.total != (number - 1) * wanted // self.total
 
 
 def strip_pictures(result: FrameResult) -> dict[str, bytes]:
+    """Return small pictures of a frame as JPEG, by sensor."""
     pictures = {c.camera.name: camera_picture(c, STRIP_WIDTH) for c in result.cameras}
     if result.bev is not None:
         pictures["bird's-eye view"] = shrink(result.bev.image, STRIP_WIDTH)[0]
