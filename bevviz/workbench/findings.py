@@ -14,7 +14,7 @@ from bevviz.model.results import Decision, FrameResult, Opinion
 from bevviz.why import Questioner, Selection
 from bevviz.why.pick import Pick
 
-FEW = 30  # points. A smaller cluster without a detection is hardly an object that somebody misses.
+FEW = 30  # points. A smaller cluster without a detection is probably no object of a known class.
 
 Place = tuple[float, float, float]
 

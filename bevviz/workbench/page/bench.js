@@ -1,4 +1,4 @@
-// The panel beside Rerun's viewer. What was clicked goes to the server, which holds the drive; it answers here.
+// The panel beside Rerun's viewer. It sends clicks to the server, which holds the drive, and shows the answers.
 
 import * as list from "./list.js";
 import { $, asked, element, remember, state, stated } from "./state.js";
@@ -7,7 +7,7 @@ import { drawnThen, isTried, kind, seek, showSide, tell } from "./viewer.js";
 import * as work from "./work.js";
 
 let controls = [];
-let opened = []; // the controls as they were first
+let opened = []; // controls of the configuration that the drive was opened with
 
 // --- questions and answers ----------------------------------------------------------------------
 
@@ -20,7 +20,7 @@ function ask(what) {
   asking = send({ type: "ask", time: Number(state.time), set: isTried() ? state.set : [], ...what });
 }
 
-// Rows of a result are not those of another one: of an object that is none of the truth, its place is asked about.
+// Row numbers differ between results, only those of the ground truth stay. So ask about the object's position.
 const askAgain = () => ask({ pick: state.pick.startsWith("truth/") ? state.pick : state.place || state.pick });
 
 function answer(message) {
@@ -29,10 +29,10 @@ function answer(message) {
   state.pick = message.pick;
   state.place = message.position ? `point//${message.position.join(",")}` : "";
   remember();
-  // What a camera denies is no good news, although it was reported.
+  // An object that a camera contradicts is no success, although it was reported.
   $("answer").className = message.reported && message.reason !== "contradicted" ? "reported" : "missed";
   $("answer").dataset.took = took.toFixed(0);
-  $("answer").dataset.server = (performance.now() - asked.sent).toFixed(0); // of it, what is not the viewer's
+  $("answer").dataset.server = (performance.now() - asked.sent).toFixed(0); // without the time that the viewer took
   $("verdict").textContent = message.verdict;
   const parts = [message.name, `frame ${message.frame}`];
   if (message.distance !== null) parts.push(`${message.distance} m away`);
@@ -75,7 +75,7 @@ function hints(message) {
   }));
 }
 
-// What other values do to a frame, by one rule for a hint and for what is tried.
+// Describe the effects of other values on a frame. Hints and tried values use the same words.
 function effects(found) {
   const rest = (all, some) => all.filter((name) => !some.includes(name));
   const parts = Object.entries({
@@ -91,7 +91,7 @@ function effects(found) {
 function change(settings) {
   state.undo.push(state.set);
   const keys = new Set(settings.map((one) => one.split("=")[0]));
-  // What was set of a method goes with it.
+  // The parameters of a method are removed with it.
   const gone = [...keys].filter((key) => key.endsWith(".method")).map((key) => key.replace(/method$/, "params."));
   const stays = (key) => !keys.has(key) && !gone.some((start) => key.startsWith(start));
   state.set = [...state.set.filter((one) => stays(one.split("=")[0])), ...settings];
@@ -115,7 +115,7 @@ function attempt() {
   if (state.time === null) return;
   tryingSince = performance.now();
   showSide();
-  if (state.set.length || kind === "live") { // a robot has to be told that it is undone
+  if (state.set.length || kind === "live") { // A robot needs empty settings, too.
     $("effect").textContent = "Running the stages ...";
     trying = send({ type: "try", time: Number(state.time), set: state.set, pick: state.pick });
   } else {
@@ -138,7 +138,7 @@ function tried(message) {
   $("effect").textContent = `${parts.join("; ")}.`;
 }
 
-// The same frame as it was opened, and back.
+// Switch between the frame as opened and as tried.
 function flip() {
   if (!state.set.length) return;
   state.flipped = !state.flipped;
@@ -149,7 +149,7 @@ function flip() {
   if (state.pick) askAgain();
 }
 
-// For what is listed: with what the drive was run with last, or as it was opened.
+// Show the side of a listed finding: with the settings of the newest trial, or as opened.
 function tryOut(withThem) {
   const wanted = work.settings();
   if (wanted && wanted.join() !== state.set.join()) {
@@ -167,7 +167,7 @@ function showControls() {
   const own = new Map(state.set.map((one) => [one.slice(0, one.indexOf("=")), one.slice(one.indexOf("=") + 1)]));
   const wanted = controls.filter((one) => own.has(one.key) || (words.length
     && words.every((word) => `${one.key} ${one.about} ${one.unit}`.toLowerCase().includes(word))));
-  // What is changed stays on top, then what is named so; 'eps' is in 'keeps', too.
+  // Changed parameters first, then those with the words in their name: 'eps' is also in 'keeps' of a description.
   const rank = (one) => (own.has(one.key) ? 0 : 1 + Number(!words.every((word) => one.key.includes(word))));
   wanted.sort((a, b) => rank(a) - rank(b));
   const focused = document.activeElement?.id;
@@ -175,7 +175,7 @@ function showControls() {
   if (focused?.startsWith("control-")) $(focused)?.focus();
 }
 
-// A stage that somebody else's function stands in for has parameters of its own.
+// Show new controls. A user's function that replaces a stage has parameters of its own.
 function offer(message) {
   controls = message.controls;
   showControls();
@@ -202,7 +202,7 @@ function control(one, own) {
   return element("div", own.has(one.key) ? "control changed" : "control", "", label, input, about);
 }
 
-// --- what the server says of itself -------------------------------------------------------------
+// --- session state from the server --------------------------------------------------------------
 
 function open({ stamp }) {
   if (state.opening !== null) return;
@@ -275,7 +275,7 @@ $("reset").onclick = () => { state.undo.push(state.set); state.set = []; state.f
 $("copy").onclick = () => navigator.clipboard.writeText(state.set.map((one) => `--set '${one}'`).join(" "));
 $("search").oninput = showControls;
 window.addEventListener("keydown", (event) => {
-  const own = event.target.closest?.("aside"); // the viewer has inputs of its own, hidden ones
+  const own = event.target.closest?.("aside"); // The viewer has hidden inputs of its own.
   const typing = own && ["INPUT", "SELECT"].includes(event.target.tagName);
   if (typing && event.key === "Escape") event.target.blur();
   if (typing || event.ctrlKey || event.metaKey || event.altKey || !(event.key in actions)) return;

@@ -1,20 +1,20 @@
-// What is worth a look: one ranked list of what was missed, is false, differs, is strange, or was noted.
+// Ranked list of findings: missed and false objects, differences, anomalies and notes.
 
 import { $, element, remember, seconds, state } from "./state.js";
 import { seek, showSide } from "./viewer.js";
 
-const SHOWN = 300; // rows that are in the page at once
-const PAUSE = 200; // ms between two drawings of it
+const SHOWN = 300; // rows in the page, at most
+const PAUSE = 200; // ms between two updates of the page
 const KINDS = ["missed", "lost", "contradicted", "unmatched", "broken", "new false", "fixed", "false gone", "new", "gone",
   "unnamed", "false", "anomaly", "note"];
 const RANK = new Map(KINDS.map((kind, row) => [kind, row]));
 RANK.set("unmatched", 0);
 
-const entries = new Map(); // by number; notes by their text and time
-const hidden = new Set(); // kinds
-let rows = []; // that are listed
-let current = null; // key of the entry that was chosen
-let sight = 0; // which of its frames
+const entries = new Map(); // findings by number, notes by stamp and text
+const hidden = new Set(); // kinds that the user has switched off
+let rows = []; // findings in the list, in order
+let current = null; // key of the chosen finding
+let sight = 0; // index of the chosen frame of the finding
 let ask = () => {};
 let tryOut = () => {};
 

@@ -1,6 +1,6 @@
-// Beside a running robot: hold a frame, follow again, save what was seen, mark a frame.
+// Panel of a running robot: hold a frame, follow the newest one, save the flight recorder, mark a frame.
 
-const RETRY = 1500; // ms between two tries to find the server again
+const RETRY = 1500; // ms between attempts to reach the server
 const panel = document.createElement("section");
 panel.id = "live";
 panel.innerHTML = `<h2>The robot</h2><p id="said" class="faint" role="status">At the newest frame.</p>
@@ -9,11 +9,11 @@ panel.innerHTML = `<h2>The robot</h2><p id="said" class="faint" role="status">At
 <p class="buttons"><input id="mark-text" placeholder="a note" aria-label="a note" size="24">
 <button id="mark" title="M">mark this frame</button></p>`;
 document.querySelector("aside header").after(panel);
-for (const id of ["drive", "flip"]) document.getElementById(id).hidden = true; // of a drive that is over
+for (const id of ["drive", "flip"]) document.getElementById(id).hidden = true; // These need a recorded drive.
 document.getElementById("words").closest("section").hidden = true;
 const $ = (id) => document.getElementById(id);
 
-let time = null; // of the viewer
+let time = null; // of the viewer, nanoseconds
 let newest = null;
 window.addEventListener("viewer-event", ({ detail }) => {
   if (detail.type === "time_update") time = detail.time;

@@ -1,6 +1,6 @@
-// In place of the widget: the viewer is a window of its own, which the server speaks with.
+// Stand-in for the widget: the viewer is a window of its own, and the server talks to it.
 
-const RETRY = 1500; // ms between two tries to find the server again
+const RETRY = 1500; // ms between attempts to reach the server
 
 function gone(again) {
   const said = document.createElement("p");
@@ -20,7 +20,7 @@ function render({ model }) {
   const waiting = [];
   const send = (message) => {
     if (socket?.readyState === WebSocket.OPEN) socket.send(JSON.stringify(message));
-    else waiting.splice(0, waiting.length, message); // only the newest place counts
+    else waiting.splice(0, waiting.length, message); // Only the newest time counts.
   };
   model.on("msg:custom", (message) => { if (message.type === "time_ctrl") send(message); });
 

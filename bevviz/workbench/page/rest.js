@@ -1,9 +1,9 @@
-// With a view of space or an image the viewer (Rerun 0.41) begins its next picture as soon as one is drawn, although
-// nothing changes: without a graphics card that is more than a core, for ever. Its pictures are held back while nothing
-// happens: no input, nothing new for it, nothing that it tells.
+// The viewer (Rerun 0.41) redraws a 3D view or an image all the time, although nothing changes. Without a graphics card
+// that takes more than one CPU core. So this module holds back its pictures while the viewer gets no input and no data,
+// and sends no event.
 
-const AWAKE = 3000; // ms after what happened last
-const PICTURES = 6; // that it may begin at least after that, however long they take
+const AWAKE = 3000; // ms of drawing after the last input, data or event
+const PICTURES = 6; // pictures that it may always draw after that, on a slow machine as well
 const SIGNS = ["pointerdown", "pointermove", "pointerup", "wheel", "keydown", "keyup", "touchstart", "touchmove", "resize",
   "focus", "blur", "dragover", "drop", "paste"];
 

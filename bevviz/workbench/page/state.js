@@ -1,13 +1,13 @@
-// What the page is at. The address holds it: opened again, it shows the same.
+// State of the page. The address holds it, so that the same address shows the same again.
 
 export const $ = (id) => document.getElementById(id);
 
 export const state = {
   bag: "", run: "", time: null, pick: "", place: "", set: [], undo: [], flipped: false,
-  opening: null, // stamp that is shown first
-  first: 0, // stamp that times count from
+  opening: null, // stamp of the frame that is shown first
+  first: 0, // stamp that seconds are counted from
 };
-// When the pointer was let go, when the newest question began for whoever clicked, and when it was sent.
+// Times in ms: the pointer was released, the newest question began for the user, and it was sent.
 export const asked = { released: 0, at: 0, sent: 0 };
 export const stated = new URLSearchParams(location.hash.slice(1));
 

@@ -1,22 +1,22 @@
-// The server: what is said to it, what it says, and that it may be gone.
+// Connection to the server: send questions, receive answers and recordings, reconnect.
 
 import { nextPicture } from "./rest.js";
 import { $, state } from "./state.js";
 import { kind, toViewer, viewerReady } from "./viewer.js";
 
-const RETRY = 1500; // ms between two tries to find the server again
+const RETRY = 1500; // ms between attempts to reach the server
 
 let talk = null;
-let question = 0; // number of the newest one
+let question = 0; // number of the newest question
 const handlers = {};
 export const on = (more) => Object.assign(handlers, more);
 
 const socketAt = (path) => new WebSocket(`ws://${location.host}${path}`);
-const pieces = { film: 0, desk: 0 }; // that the viewer has
-let early = 0; // of those of the film that may have come before their turn
+const pieces = { film: 0, desk: 0 }; // number of pieces that the viewer has received
+let early = 0; // number of frames that were requested out of order
 let lanes = [];
 
-// The frame of this time next, if the viewer has it not yet.
+// Request the frame of this stamp next, if the viewer does not have it yet.
 export function want(stamp) {
   if (lanes[0]?.readyState !== WebSocket.OPEN) return;
   early += 1;
@@ -30,10 +30,10 @@ function film(lane) {
     if (!pieces.film) performance.mark("piece");
     pieces[lane] += 1;
     toViewer({ type: "rrd" }, [new DataView(data)]);
-    if (lanes.length === 1) lanes.push(film("desk")); // the layout has to be there first
+    if (lanes.length === 1) lanes.push(film("desk")); // The layout has to arrive first.
     if (lane === "film") nextPicture(() => { if (socket.readyState === WebSocket.OPEN) socket.send(""); });
   };
-  if (lane === "film" && kind === "live") { // a page that nobody sees draws nothing, and is not late
+  if (lane === "film" && kind === "live") { // A page in the background draws nothing, and does not count as slow.
     socket.onopen = () => { if (document.hidden) socket.send("hidden"); };
   }
   return socket;
@@ -61,7 +61,7 @@ export function connect() {
       try {
         const answer = await fetch("/page/bench.js", { method: "HEAD", cache: "no-store" });
         if (answer.status === 403) gone("Another server is there now: open the address that it printed.");
-      } catch { /* still gone */ }
+      } catch { /* The server is still gone. */ }
       connect();
     }, RETRY);
   };

@@ -1,25 +1,25 @@
-// Rerun's viewer: its notebook widget, which keeps its own wrapper of the viewer up to date; this page is its notebook.
+// Rerun's viewer, as its notebook widget. The widget wraps the viewer of its version; this page acts as the notebook.
 
 import { nextPicture, wake } from "./rest.js";
 import { $, asked, state } from "./state.js";
 
-console.debug = () => {}; // the viewer tells it fifty thousand lines at its start, which takes seconds
+console.debug = () => {}; // The viewer logs 50,000 lines at its start, which takes seconds.
 const version = $("viewer").dataset.version;
-export const kind = $("viewer").dataset.kind; // page; native: a window of its own; live: of a robot
+export const kind = $("viewer").dataset.kind; // page, native (a window of its own) or live (of a robot)
 if (kind !== "native") keepCompiled(new URL(`/viewer/${version}/re_viewer_bg.wasm`, location.href).href);
 const widget = (await import(kind === "native" ? "/page/native.js" : `/viewer/${version}/widget.js`)).default;
 
-// What the run made of a frame, and what other values make of it, are on two timelines of the same recording.
+// Results of the run and results with other values are on two timelines of the same recording.
 const OPENED = "stamp";
 const TRIED = "tried";
-const SETTLED = 150; // ms without a change after which a frame is taken for one that is looked at
+const SETTLED = 150; // ms without a change of time, after which the user is looking at the frame
 
 const listeners = {};
 const settings = {
   _url: null, _width: "auto", _height: "auto", _theme: "dark", _fallback_token: null,
   _panel_states: { top: "hidden", blueprint: "hidden", selection: "hidden", time: "collapsed" },
 };
-const told = { settled: () => {}, clicked: () => {}, shown: () => {}, sought: () => {} }; // whom the viewer's events are for
+const told = { settled: () => {}, clicked: () => {}, shown: () => {}, sought: () => {} }; // callbacks for its events
 export const viewerReady = new Promise((ready) => {
   widget.render({
     model: {
@@ -34,20 +34,20 @@ function begun(ready) {
   performance.mark("viewer");
   ready();
 }
-// What is before the viewer now has been drawn when two pictures more have begun.
+// The viewer has drawn its current data once two more pictures have begun.
 export const drawnThen = (then) => nextPicture(() => nextPicture(then));
 export function toViewer(message, buffers) {
   wake();
   listeners["msg:custom"](message, buffers);
-  if (message.type === "rrd" && target !== null) { // which may have what it is on its way to
+  if (message.type === "rrd" && target !== null) { // It may hold the frame that the viewer has to go to.
     tries = TRIES;
     nextPicture(() => { if (target !== null) move(target); });
   }
 }
 export const tell = (whom) => Object.assign(told, whom);
 
-// The widget compiles a copy of the response, which counts its bytes: late, through this thread, and nothing that a
-// browser could keep. This one is compiled as it comes, from the page's first moment on.
+// The widget compiles a copy of the response, which counts its bytes. That starts late, blocks this thread, and the
+// browser cannot cache it. So compile the response while it loads, from the start of the page on.
 function keepCompiled(url) {
   const { fetch } = window;
   const compile = WebAssembly.compileStreaming.bind(WebAssembly);
@@ -58,16 +58,16 @@ function keepCompiled(url) {
 
 window.addEventListener("to-viewer", ({ detail }) => { target = null; toViewer(detail); });
 
-export const isTried = () => kind !== "live" && state.set.length > 0 && !state.flipped; // a robot has one side
+export const isTried = () => kind !== "live" && state.set.length > 0 && !state.flipped; // A robot has no tried side.
 const timeline = () => (isTried() ? TRIED : OPENED);
 const move = (stamp) => toViewer({ type: "time_ctrl", timeline: timeline(), timestamp_nanos: stamp, play: false });
 
-// A viewer that has just opened a recording goes to its beginning of itself, and takes no time before that.
-// One that is opened again with other values has their timeline only when the first of them has come.
-const TRIES = 3; // before there is something new
-let target = null; // stamp that the viewer is to show, until somebody moves it
+// A viewer that opens a recording goes to its start by itself, and ignores any time before that.
+// A page that is reopened with other values gets their timeline only with the first tried result.
+const TRIES = 3; // attempts until new data arrives
+let target = null; // stamp that the viewer has to show, until the user moves it
 let tries = 0;
-let current = null; // timeline
+let current = null; // timeline of the viewer
 for (const sign of ["pointerdown", "keydown", "wheel"]) {
   window.addEventListener(sign, (event) => { if ($("viewer").contains(event.target)) target = null; }, true);
 }
@@ -79,17 +79,17 @@ export function seek(stamp) {
   move(target);
 }
 
-// The same time with the other values, or without.
+// Show the same time on the chosen side, as opened or as tried.
 export const showSide = () => { if (kind !== "live" && state.time !== null) seek(state.time); };
 
 window.addEventListener("pointerup", () => { asked.released = performance.now(); }, true);
 
-let drawn = false; // whether a frame has been on the screen
+let drawn = false; // whether a frame has been drawn
 let settling = 0;
 function viewerEvent(event) {
   wake();
   window.dispatchEvent(new CustomEvent("viewer-event", { detail: event }));
-  if (event.type === "recording_open" && state.time !== null) seek(state.time); // somebody may have chosen another one
+  if (event.type === "recording_open" && state.time !== null) seek(state.time); // The user may have chosen another.
   if (event.type === "time_update" || event.type === "timeline_change") moved(event);
   if (event.type === "selection_change") {
     const item = event.items.find((one) => one.type === "entity");
@@ -102,8 +102,8 @@ function viewerEvent(event) {
 function moved(event) {
   if (event.type === "timeline_change") current = event.timeline;
   const there = Number(target) === event.time && (current ?? timeline()) === timeline();
-  if (there && kind === "native") target = null; // whose own slider is not seen here
-  if (target !== null && !there && event.type === "time_update") { // late, of where it was before
+  if (there && kind === "native") target = null; // The page does not see its time slider.
+  if (target !== null && !there && event.type === "time_update") { // a late event about the previous time
     if (tries > 0) move(target);
     tries -= 1;
     return;

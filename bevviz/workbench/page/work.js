@@ -1,10 +1,10 @@
-// What is made behind the page: the drive with other values, reports; and the user's own words.
+// Background work: trials of other values over the drive, and reports. Also the text field for notes.
 
 import { $, element, seconds, state } from "./state.js";
 import { isTried, seek } from "./viewer.js";
 import { send } from "./talk.js";
 
-let trial = null; // the newest, as the server tells it
+let trial = null; // the newest trial, from the server
 
 export const settings = () => trial?.settings ?? null;
 
@@ -14,7 +14,7 @@ export function start() {
   $("report").onclick = () => {
     const number = (id) => Number($(id).value) || 0;
     const range = { before: number("before"), after: number("after") };
-    const set = isTried() ? state.set : []; // of what is shown
+    const set = isTried() ? state.set : []; // settings of the shown side
     send({ type: "report", time: Number(state.time), set, text: $("words").value, ...range });
   };
   $("note").onclick = () => send({ type: "note", time: Number(state.time), pick: state.pick, text: $("words").value });
@@ -38,7 +38,7 @@ export function progress(message) {
   $("reports").replaceChildren(...message.reports.map(report));
 }
 
-// --- the drive with other values ----------------------------------------------------------------
+// --- trial over the drive -----------------------------------------------------------------------
 
 function drive(told) {
   trial = told;
@@ -66,7 +66,7 @@ function summary(told) {
   return parts.join("; ");
 }
 
-// A bar a frame: what is better upwards, what is worse downwards.
+// Draw one bar per frame: improvements upwards, deteriorations downwards.
 function strip(frames) {
   const canvas = $("strip");
   const [width, height] = [canvas.clientWidth || 360, 36];
