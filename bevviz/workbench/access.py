@@ -39,17 +39,17 @@ class Guard:
                 return
         await self._app(scope, receive, send)
 
-    def _refusal(self, asked: HTTPConnection) -> str:
+    def _refusal(self, request: HTTPConnection) -> str:
         """Return the reason to refuse a request. Empty: it is allowed."""
-        host, origin = asked.headers.get("host", ""), asked.headers.get("origin")
+        host, origin = request.headers.get("host", ""), request.headers.get("origin")
         if host not in self._hosts:
             return "this page is at 127.0.0.1 alone"
         if origin is not None and origin != f"http://{host}":
             return "another site's page may not ask here"
-        if asked.scope["type"] == "websocket" and origin is None:
+        if request.scope["type"] == "websocket" and origin is None:
             return "only the page itself may ask here"
-        given = (*parse_qs(asked.url.query).get("token", ()), _cookie(asked, cookie_name(self._port)))
-        if not any(secrets.compare_digest(one.encode(), self._token.encode()) for one in given):
+        tokens = (*parse_qs(request.url.query).get("token", ()), _cookie(request, cookie_name(self._port)))
+        if not any(secrets.compare_digest(candidate.encode(), self._token.encode()) for candidate in tokens):
             return "wrong or no token: open the address that was printed"
         return ""
 
@@ -59,10 +59,10 @@ def cookie_name(port: int) -> str:
     return f"bevviz_{port}"
 
 
-def _cookie(asked: HTTPConnection, name: str) -> str:
+def _cookie(request: HTTPConnection, name: str) -> str:
     """Return the value of a cookie, or an empty text."""
     try:
-        found = SimpleCookie(asked.headers.get("cookie", "")).get(name)
+        cookie = SimpleCookie(request.headers.get("cookie", "")).get(name)
     except CookieError:
         return ""
-    return found.value if found is not None else ""
+    return cookie.value if cookie is not None else ""

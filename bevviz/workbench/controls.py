@@ -38,7 +38,7 @@ def _default(value: Any, info: FieldInfo) -> Any:
 
 def _control(key: str, value: Any, info: FieldInfo) -> dict[str, Any]:
     """Return the control of one parameter as JSON for the page."""
-    found: dict[str, Any] = {
+    control: dict[str, Any] = {
         "key": key,
         "value": value,
         "unit": unit(key),
@@ -47,12 +47,12 @@ def _control(key: str, value: Any, info: FieldInfo) -> dict[str, Any]:
     }
     for rule in info.metadata:
         if isinstance(rule, annotated_types.Ge | annotated_types.Gt):
-            found["low"] = rule.ge if isinstance(rule, annotated_types.Ge) else rule.gt
+            control["low"] = rule.ge if isinstance(rule, annotated_types.Ge) else rule.gt
         if isinstance(rule, annotated_types.Le | annotated_types.Lt):
-            found["high"] = rule.le if isinstance(rule, annotated_types.Le) else rule.lt
+            control["high"] = rule.le if isinstance(rule, annotated_types.Le) else rule.lt
     if get_origin(info.annotation) is Literal:
-        found["choices"] = list(get_args(info.annotation))
-    return found
+        control["choices"] = list(get_args(info.annotation))
+    return control
 
 
 def _kind(annotation: Any) -> str:

@@ -21,10 +21,10 @@ from bevviz.recording.writer import Writer
 from bevviz.stages.robot_results import in_points_frame
 from bevviz.why.frame_index import joined
 from bevviz.why.subject import one_of, projected
-from bevviz.workbench.findings import Find
+from bevviz.workbench.findings import Finding
 
 Color = tuple[int, int, int]
-Layer: TypeAlias = Mapping[str, Sequence[Find]]  # findings of an entity, one per logged row
+FindingRows: TypeAlias = Mapping[str, Sequence[Finding]]  # findings of an entity, one per logged row
 
 LAYERS = {
     "missed": (entities.MISSED, (255, 80, 70)),
@@ -33,7 +33,7 @@ LAYERS = {
 }
 
 
-def log_layer(to: Writer, result: FrameResult, found: Sequence[Find]) -> Layer:
+def log_layer(writer: Writer, result: FrameResult, findings: Sequence[Finding]) -> FindingRows:
     """Log the boxes in space, in the bird's-eye view and in every image.
 
     Call this within a frame of the writer.
@@ -41,64 +41,73 @@ def log_layer(to: Writer, result: FrameResult, found: Sequence[Find]) -> Layer:
     Returns:
         The findings behind the rows of each entity.
     """
-    layer: dict[str, Sequence[Find]] = {}
-    for what, (path, color) in LAYERS.items():
-        rows = [find for find in found if find.what == what]
-        if not rows:
+    layer: dict[str, Sequence[Finding]] = {}
+    for kind, (path, color) in LAYERS.items():
+        layer_findings = [finding for finding in findings if finding.what == kind]
+        if not layer_findings:
             continue
-        boxes = joined([_box(result, find) for find in rows])
-        labels = [f"{find.name} {what}{f': {find.reason}' if find.reason else ''}" for find in rows]
-        beside = named_in_space(boxes.center).tolist() if what == "missed" else [False] * len(rows)
-        to.put(
+        boxes = joined([_box(result, finding) for finding in layer_findings])
+        labels = [
+            f"{finding.name} {kind}{f': {finding.reason}' if finding.reason else ''}"
+            for finding in layer_findings
+        ]
+        shows_label = (
+            named_in_space(boxes.center).tolist() if kind == "missed" else [False] * len(layer_findings)
+        )
+        writer.put(
             path,
             transform(result.frame.pose),
             boxes3d(
                 boxes,
-                np.arange(len(rows)),
-                [label if named else "" for label, named in zip(labels, beside, strict=True)],
+                np.arange(len(layer_findings)),
+                [label if named else "" for label, named in zip(labels, shows_label, strict=True)],
                 colors=[color],
                 radii=rr.Radius.ui_points(1.5),
-                show_labels=what == "missed",
+                show_labels=kind == "missed",
                 fill_mode=OUTLINE,
             ),
             rr.AnyValues(says=labels),
         )
-        layer[path] = rows
+        layer[path] = layer_findings
         for camera in result.frame.cameras:
-            around = [projected(one_of(boxes, row), camera) for row in range(len(rows))]
-            there = [row for row, box in enumerate(around) if box is not None]
-            if there:
-                image = f"{entities.image(camera.name)}/{what}"
-                xyxy = np.array([around[row] for row in there])
-                looks = {"colors": [color], "draw_order": 35.0, "show_labels": False}
-                to.put(image, over_image(camera.name), boxes2d(xyxy, [labels[row] for row in there], **looks))
-                layer[image] = [rows[row] for row in there]
-        above = entities.overlay(what)
-        if inside := _log_above(to, above, boxes, labels, color, result.config.bev):
-            layer[above] = [rows[row] for row in inside]
+            image_boxes = [projected(one_of(boxes, index), camera) for index in range(len(layer_findings))]
+            visible_rows = [index for index, box in enumerate(image_boxes) if box is not None]
+            if visible_rows:
+                image = f"{entities.image(camera.name)}/{kind}"
+                xyxy = np.array([image_boxes[index] for index in visible_rows])
+                style = {"colors": [color], "draw_order": 35.0, "show_labels": False}
+                writer.put(
+                    image,
+                    over_image(camera.name),
+                    boxes2d(xyxy, [labels[index] for index in visible_rows], **style),
+                )
+                layer[image] = [layer_findings[index] for index in visible_rows]
+        above = entities.overlay(kind)
+        if inside := _log_above(writer, above, boxes, labels, color, result.config.bev):
+            layer[above] = [layer_findings[index] for index in inside]
     return layer
 
 
-def _box(result: FrameResult, find: Find) -> Boxes3D:
+def _box(result: FrameResult, finding: Finding) -> Boxes3D:
     """Return the box of a finding in the frame of the points, as one row."""
-    row = find.pick.row
-    if find.pick.kind == "object" and result.objects is not None:
+    row = finding.pick.row
+    if finding.pick.kind == "object" and result.objects is not None:
         return one_of(result.objects.boxes, row)
-    if find.pick.kind == "cluster" and result.clusters is not None:
+    if finding.pick.kind == "cluster" and result.clusters is not None:
         return one_of(result.clusters.boxes(result.config.clustering), row)
     assert result.frame.truth is not None
     return one_of(in_points_frame(result.frame, result.frame.truth), row)
 
 
 def _log_above(
-    to: Writer, path: str, boxes: Boxes3D, labels: Sequence[str], color: Color, config: BevConfig
+    writer: Writer, path: str, boxes: Boxes3D, labels: Sequence[str], color: Color, config: BevConfig
 ) -> Sequence[int]:
     """Log the boxes whose centre is in the bird's-eye image, and return their rows."""
     reach = np.array([config.range_x, config.range_y], np.float32)
     inside: list[int] = np.flatnonzero((np.abs(boxes.center[:, :2]) < reach).all(axis=1)).tolist()
     if inside:
         outlines = footprints(geometry.corners(boxes)[inside])
-        to.put(
+        writer.put(
             path,
             rr.LineStrips2D(
                 seen_from_above(config, np.eye(4), outlines),

@@ -31,23 +31,23 @@ class _Piece:
     context: Context | None  # only for a piece that a page can begin with
 
 
-class Page:
+class PageProgress:
     """Progress of a page: how many pieces it was sent, and how many its viewer has drawn.
 
     Args:
-        heard: state of the page, with its acknowledgements.
+        state: state of the page, with its acknowledgements.
         clock: returns the time in seconds.
     """
 
-    def __init__(self, heard: Heard, clock: Callable[[], float]) -> None:
-        self._heard, self._clock = heard, clock
+    def __init__(self, state: Heard, clock: Callable[[], float]) -> None:
+        self._state, self._clock = state, clock
         self._sent: deque[float] = deque()  # send times of the pieces that are not drawn yet
         self._drawn = 0
-        self._held = threading.Lock()
+        self._lock = threading.Lock()
 
     def send(self) -> None:
         """Count a piece that is sent."""
-        with self._held:
+        with self._lock:
             self._sent.append(self._clock())
 
     @property
@@ -59,12 +59,12 @@ class Page:
     def lag(self) -> float:
         """Seconds since the oldest undrawn piece was sent. 0 while the page is in the background."""
         oldest = self._oldest()
-        return 0.0 if oldest is None or self._heard.hidden else self._clock() - oldest
+        return 0.0 if oldest is None or self._state.hidden else self._clock() - oldest
 
     def _oldest(self) -> float | None:
         """Return the send time of the oldest undrawn piece, if there is one."""
-        with self._held:
-            while self._sent and self._drawn < self._heard.count:
+        with self._lock:
+            while self._sent and self._drawn < self._state.count:
                 self._sent.popleft()
                 self._drawn += 1
             return self._sent[0] if self._sent else None
@@ -82,11 +82,11 @@ class LiveFilm(Output):
         super().__init__("page", queue)
         self._encoder = live.encoder
         self._sparse = live.config.live.viewer_rate is not None
-        self._pages: list[Page] = []
+        self._pages: list[PageProgress] = []
         self._missed = 0  # pieces that slow pages have skipped
         self._pieces: deque[_Piece] = deque()
         self._next = 0
-        self._held = threading.Lock()
+        self._lock = threading.Lock()
         self._listeners: list[Callable[[], None]] = []
         self._thread.start()
 
@@ -106,9 +106,9 @@ class LiveFilm(Output):
         return max((page.lag for page in self._pages.copy()), default=None)
 
     @contextmanager
-    def shown(self, heard: Heard) -> Iterator[Page]:
+    def shown(self, state: Heard) -> Iterator[PageProgress]:
         """Return a context in which a page is connected."""
-        page = Page(heard, self._encoder.clock)
+        page = PageProgress(state, self._encoder.clock)
         self._pages.append(page)
         try:
             yield page
@@ -135,19 +135,19 @@ class LiveFilm(Output):
             The pieces, and the number to continue with. After skipped pieces they start with a self-contained
             piece.
         """
-        with self._held:
+        with self._lock:
             pieces = list(self._pieces)
             following = self._next
-        begin = next((piece for piece in reversed(pieces) if piece.context is not None), None)
+        start = next((piece for piece in reversed(pieces) if piece.context is not None), None)
         if number is not None and (not pieces or number >= pieces[0].number):
             return [piece.data for piece in pieces if piece.number >= number], following
-        if begin is None or begin.context is None:
+        if start is None or start.context is None:
             return [], -1 if number is None else number
         if number is not None:
-            self._missed += begin.number - number
-        head = [] if number is not None else [self._layout(begin.context)]
-        head.append(self._encoder.prelude(begin.context, blueprint=False))
-        return head + [piece.data for piece in pieces if piece.number >= begin.number], following
+            self._missed += start.number - number
+        head = [] if number is not None else [self._layout(start.context)]
+        head.append(self._encoder.prelude(start.context, blueprint=False))
+        return head + [piece.data for piece in pieces if piece.number >= start.number], following
 
     def _layout(self, context: Context) -> bytes:
         recording = rr.RecordingStream(APPLICATION, recording_id=self._encoder.recording_id)
@@ -163,7 +163,7 @@ class LiveFilm(Output):
         return True
 
     def _put(self, data: bytes, context: Context | None) -> None:
-        with self._held:
+        with self._lock:
             self._pieces.append(_Piece(self._next, data, context))
             self._next += 1
             while sum(piece.context is not None for piece in self._pieces) > WHOLE:

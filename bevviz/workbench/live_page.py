@@ -22,13 +22,13 @@ from bevviz.errors import UserError
 from bevviz.support.contexts import Closing
 from bevviz.workbench.access import HOSTS, Guard
 from bevviz.workbench.live_session import LiveBench
-from bevviz.workbench.page_connection import Visit, listening
-from bevviz.workbench.routes import Site, heard_on, routes_of
-from bevviz.workbench.server import Server, bound, viewer_folder
+from bevviz.workbench.page_connection import PageConnection, news_event
+from bevviz.workbench.routes import Site, page_state, site_routes
+from bevviz.workbench.server import Server, bound_socket, viewer_folder
 
 if TYPE_CHECKING:
     from bevviz.workbench.session import Bench
-    from bevviz.workbench.startup import Opening
+    from bevviz.workbench.startup import SessionStartup
 
 PATIENCE = 3.0  # seconds that close() waits for the threads of the page
 
@@ -37,7 +37,7 @@ class LivePage(Closing):
     """Server of the page, in threads of its own, until it is closed.
 
     Args:
-        bench: the workbench session of the robot.
+        workbench: the workbench session of the robot.
         port: port of the page. None: a free one.
 
     Raises:
@@ -47,19 +47,19 @@ class LivePage(Closing):
         address: address of the page, with its token.
     """
 
-    def __init__(self, bench: LiveBench, port: int | None) -> None:
-        self._bench = bench
+    def __init__(self, workbench: LiveBench, port: int | None) -> None:
+        self._workbench = workbench
         viewer, token = viewer_folder(), secrets.token_urlsafe(16)
-        listening = bound(port)
-        port = listening.getsockname()[1]
-        site = LiveSite(bench, viewer, version("rerun-sdk"), token, port)
-        routes = [*routes_of(site), WebSocketRoute("/live", site.orders)]
+        news_event = bound_socket(port)
+        port = news_event.getsockname()[1]
+        site = LiveSite(workbench, viewer, version("rerun-sdk"), token, port)
+        routes = [*site_routes(site), WebSocketRoute("/live", site.orders)]
         self.address = f"http://{HOSTS[0]}:{port}/?token={token}"
         ready = threading.Event()
         self._server = Server(Guard(Starlette(routes=routes), token, port), ready.set)
-        self._listening = listening
+        self._listening = news_event
         self._thread = threading.Thread(
-            target=lambda: self._server.run(sockets=[listening]), name="page", daemon=True
+            target=lambda: self._server.run(sockets=[news_event]), name="page", daemon=True
         )
         self._thread.start()
         ready.wait(PATIENCE)
@@ -69,28 +69,29 @@ class LivePage(Closing):
         self._server.end()
         self._thread.join(PATIENCE)
         self._listening.close()
-        self._bench.close()
+        self._workbench.close()
 
 
-class _Open:
+class _OpenSession:
     """Start-up of a workbench session that exists already."""
 
     error = None
 
-    def __init__(self, bench: LiveBench) -> None:
-        self._bench = bench
+    def __init__(self, workbench: LiveBench) -> None:
+        self._workbench = workbench
 
-    async def bench(self) -> LiveBench:
+    async def session(self) -> LiveBench:
         """Return the workbench session."""
-        return self._bench
+        return self._workbench
 
 
-class LiveVisit(Visit):
+class LivePageConnection(PageConnection):
     """Connection to one page of a running robot."""
 
-    def __init__(self, bench: LiveBench, socket: WebSocket, desk: ThreadPoolExecutor, run: str) -> None:
-        super().__init__(cast("Bench", bench), socket, desk, run)  # It has every method that is called below.
-        self._live = bench
+    def __init__(self, workbench: LiveBench, socket: WebSocket, desk: ThreadPoolExecutor, run: str) -> None:
+        # A live session has every method that is called below.
+        super().__init__(cast(Any, workbench), socket, desk, run)
+        self._live = workbench
         for name in ("drive", "cancel", "report", "note", "unnote"):
             self._handlers[name] = self._refuse
 
@@ -110,12 +111,14 @@ class LiveVisit(Visit):
 class LiveSite(Site):
     """Request handlers of the page of a running robot."""
 
-    def __init__(self, bench: LiveBench, viewer: Path, version: str, token: str, port: int) -> None:
-        super().__init__(cast("Opening", _Open(bench)), viewer, version, token, port, "live")
-        self._live = bench
+    def __init__(self, workbench: LiveBench, viewer: Path, version: str, token: str, port: int) -> None:
+        super().__init__(
+            cast("SessionStartup", _OpenSession(workbench)), viewer, version, token, port, "live"
+        )
+        self._live = workbench
 
-    def _visit(self, bench: Bench, socket: WebSocket) -> Visit:
-        return LiveVisit(self._live, socket, self._desk, self._run)
+    def _visit(self, workbench: Bench, socket: WebSocket) -> PageConnection:
+        return LivePageConnection(self._live, socket, self._desk, self._run)
 
     async def page(self, request: Request) -> Response:
         """Return the HTML page with the script of the robot's panel."""
@@ -125,32 +128,32 @@ class LiveSite(Site):
         response.headers["Content-Length"] = str(len(response.body))
         return response
 
-    async def film(self, socket: WebSocket) -> None:
+    async def recording(self, socket: WebSocket) -> None:
         """Send the newest pieces of the recording as they are made. Marks of answers are among them."""
         await socket.accept()
-        film, number = self._live.film, None
+        buffer, number = self._live.film, None
         if socket.query_params.get("lane") == "desk":
             with contextlib.suppress(WebSocketDisconnect, RuntimeError):
                 await socket.receive_text()
             return
         with (
-            contextlib.ExitStack() as there,
-            listening(film.listen) as more,
+            contextlib.ExitStack() as stack,
+            news_event(buffer.listen) as news,
             contextlib.suppress(WebSocketDisconnect, RuntimeError),
         ):
-            async with heard_on(socket, more) as heard:
-                page = there.enter_context(film.shown(heard))
-                while not heard.gone:
-                    more.clear()
+            async with page_state(socket, news) as state:
+                page = stack.enter_context(buffer.shown(state))
+                while not state.gone:
+                    news.clear()
                     if not page.ready:
-                        await more.wait()
+                        await news.wait()
                         continue
-                    pieces, following = await asyncio.to_thread(film.since, number)
+                    pieces, following = await asyncio.to_thread(buffer.since, number)
                     number = None if following < 0 else following
                     for piece in pieces:
                         page.send()
                         await socket.send_bytes(piece)
-                    await more.wait()
+                    await news.wait()
 
     async def orders(self, socket: WebSocket) -> None:
         """Execute the commands hold, snap and mark."""
@@ -159,21 +162,21 @@ class LiveSite(Site):
             while True:
                 text = await socket.receive_text()
                 try:
-                    said = await asyncio.to_thread(self._order, json.loads(text))
+                    reply = await asyncio.to_thread(self._order, json.loads(text))
                 except UserError as error:
-                    said = {"type": "said", "text": str(error), "wrong": True}
+                    reply = {"type": "said", "text": str(error), "wrong": True}
                 except (ValueError, KeyError, TypeError, AttributeError):
-                    said = {"type": "said", "text": "that message cannot be understood", "wrong": True}
-                await socket.send_text(json.dumps(said))
+                    reply = {"type": "said", "text": "that message cannot be understood", "wrong": True}
+                await socket.send_text(json.dumps(reply))
 
     def _order(self, message: dict[str, Any]) -> dict[str, Any]:
-        what = message["type"]
-        if what == "snap":
+        command = message["type"]
+        if command == "snap":
             return {"type": "said", "text": self._live.snap()}
         stamp = round(float(message["time"]))
-        if what == "hold":
+        if command == "hold":
             frame = self._live.hold(stamp).frame
             return {"type": "held", "frame": frame.index, "stamp": str(frame.stamp)}
-        if what == "mark":
+        if command == "mark":
             return {"type": "said", "text": self._live.mark(stamp, str(message.get("text", "")))}
-        raise ValueError(what)
+        raise ValueError(command)

@@ -28,7 +28,7 @@ from bevviz.why import Answer, Questioner
 from bevviz.why.log import mark_answers
 from bevviz.why.pick import Pick, pick
 from bevviz.why.pick_answers import selection, surroundings
-from bevviz.workbench.finding_list import Entries
+from bevviz.workbench.finding_list import FindingList
 from bevviz.workbench.findings import finds, with_reasons
 from bevviz.workbench.live_buffer import LiveFilm
 from bevviz.workbench.trials import attempt
@@ -40,7 +40,7 @@ LISTED = ("missed", "false", "contradicted", "lost", "unmatched", "unnamed")
 Settings = tuple[str, ...]
 
 
-class Robot:
+class RobotDrive:
     """The parts of a drive that a page reads: scene, configuration and pipeline session."""
 
     def __init__(self, live: Live) -> None:
@@ -79,18 +79,18 @@ class LiveBench(Closing):
     """
 
     def __init__(self, live: Live) -> None:
-        self.live, self.drive = live, Robot(live)
+        self.live, self.drive = live, RobotDrive(live)
         self.film = LiveFilm(live, live.config.live.output_queue)
         self.truth_of: Callable[..., Truth | None] | None = None
         self.opening: int | None = None  # None: the page opens at the newest frame.
-        self.entries, self.notes_changed = Entries(), -1
+        self.entries, self.notes_changed = FindingList(), -1
         self._newest: deque[FrameResult] = deque(maxlen=live.config.live.held)
         self._kept: OrderedDict[int, FrameResult] = OrderedDict()
         self._lock = threading.Lock()  # guards _newest and _kept
-        self._tried: OrderedDict[tuple[int, Settings], FrameResult] = OrderedDict()
-        self._set: Settings = ()
+        self._tried_results: OrderedDict[tuple[int, Settings], FrameResult] = OrderedDict()
+        self._settings: Settings = ()
         self._variants = Variants(live.session.loader)
-        self._asked: Questioner | None = None
+        self._questioner: Questioner | None = None
         self._listeners: list[Callable[[], None]] = []
         recording = rr.RecordingStream(APPLICATION, recording_id=live.encoder.recording_id)
         recording.set_log_time_enabled(False)
@@ -142,16 +142,16 @@ class LiveBench(Closing):
         Raises:
             UserError: the frame is no longer in memory.
         """
-        frames = sorted((r.frame.stamp, r.frame.index) for r in self._held())
+        frames = sorted((result.frame.stamp, result.frame.index) for result in self._held())
         if not frames:
             raise UserError("no frame has come yet")
-        there = [index for at, index in frames if at <= stamp + entities.SLACK]
-        if not there:
+        numbers = [index for frame_stamp, index in frames if frame_stamp <= stamp + entities.SLACK]
+        if not numbers:
             raise UserError(
                 f"that frame is gone: the newest {self._newest.maxlen} can be asked about "
                 "(live.held); hold one with H, and ask then"
             )
-        return there[-1]
+        return numbers[-1]
 
     def _held(self) -> list[FrameResult]:
         with self._lock:
@@ -166,20 +166,20 @@ class LiveBench(Closing):
         Raises:
             UserError: no frame has come yet.
         """
-        frames = sorted((r.frame.stamp, r.frame.index) for r in self._held())
-        shown = [index for at, index in frames if at <= stamp + entities.SLACK]
+        frames = sorted((held_result.frame.stamp, held_result.frame.index) for held_result in self._held())
+        numbers = [index for frame_stamp, index in frames if frame_stamp <= stamp + entities.SLACK]
         if not frames:
             raise UserError("no frame has come yet")
-        result = self.look(shown[-1] if shown else frames[0][1])
+        result = self.look(numbers[-1] if numbers else frames[0][1])
         index = result.frame.index
         with self._lock:
             self._kept[index] = result
             self._kept.move_to_end(index)
             while len(self._kept) > KEPT:
                 self._kept.popitem(last=False)
-        found = finds(result, None if self.truth_of is None else self.truth_of(result.frame))
+        findings = finds(result, None if self.truth_of is None else self.truth_of(result.frame))
         self.entries.replace(LISTED)
-        self.entries.add(with_reasons(found, result, self._new_questioner(result)))
+        self.entries.add(with_reasons(findings, result, self._new_questioner(result)))
         for listener in tuple(self._listeners):
             listener()
         return result
@@ -190,7 +190,7 @@ class LiveBench(Closing):
         Raises:
             UserError: the frame is gone, a parameter is unknown, or a value is wrong.
         """
-        result = next((r for r in self._held() if r.frame.index == number), None)
+        result = next((candidate for candidate in self._held() if candidate.frame.index == number), None)
         if result is None:
             raise UserError(f"frame {number} is gone: hold one with H, and ask then")
         if not settings:
@@ -199,11 +199,11 @@ class LiveBench(Closing):
         if config == result.config:
             return result
         key = number, settings
-        if key not in self._tried:
-            self._tried[key] = describe(self._variants.perceive(result.frame, config))
-            while len(self._tried) > TRIED:
-                self._tried.popitem(last=False)
-        return self._tried[key]
+        if key not in self._tried_results:
+            self._tried_results[key] = describe(self._variants.perceive(result.frame, config))
+            while len(self._tried_results) > TRIED:
+                self._tried_results.popitem(last=False)
+        return self._tried_results[key]
 
     # --- questions -----------------------------------------------------------------------------
 
@@ -218,7 +218,7 @@ class LiveBench(Closing):
             instance = int(rows[instance]) if instance < len(rows) else None
         return pick(result, result.tracks, path, instance, position)
 
-    def ask(self, number: int, settings: Settings, what: Pick) -> tuple[Answer, list[Answer]]:
+    def ask(self, number: int, settings: Settings, target: Pick) -> tuple[Answer, list[Answer]]:
         """Explain an object: why was it reported or not? The answer is marked in every view.
 
         Returns:
@@ -228,30 +228,31 @@ class LiveBench(Closing):
             UserError: there is no such object in the frame.
         """
         result = self.look(number, settings)
-        questioner, there = self._candidates(result, what)
-        found = there or questioner.ask(selection(what))
-        if not found:
-            raise UserError(f"there is nothing to say about {what}")
-        answer = found[0]
-        if not there and (around := surroundings(what, answer)) is not None:
-            there = questioner.candidates(around)
+        questioner, candidates = self._candidates(result, target)
+        answers = candidates or questioner.ask(selection(target))
+        if not answers:
+            raise UserError(f"there is nothing to say about {target}")
+        answer = answers[0]
+        if not candidates and (nearby := surroundings(target, answer)) is not None:
+            candidates = questioner.candidates(nearby)
         mark_answers(self._marker, result.frame, [answer], result.config.bev)
         self.film.add(self._marks.read())
-        return answer, [other for other in there if other.subject.key != answer.subject.key]
+        return answer, [other for other in candidates if other.subject.key != answer.subject.key]
 
-    def hints(self, number: int, settings: Settings, what: Pick) -> Answer:
+    def hints(self, number: int, settings: Settings, target: Pick) -> Answer:
         """Answer with hints: parameter changes that would change the verdict. This takes longer than ``ask``.
 
         Raises:
             UserError: as ``ask``.
         """
-        questioner, there = self._candidates(self.look(number, settings), what)
-        return questioner.with_hints((there or questioner.ask(selection(what)))[0])
+        questioner, candidates = self._candidates(self.look(number, settings), target)
+        return questioner.with_hints((candidates or questioner.ask(selection(target)))[0])
 
-    def _candidates(self, result: FrameResult, what: Pick) -> tuple[Questioner, list[Answer]]:
-        if self._asked is None or self._asked.traces.result is not result:
-            self._asked = self._new_questioner(result)
-        return self._asked, list(self._asked.candidates(selection(what))) if what.is_place else []
+    def _candidates(self, result: FrameResult, target: Pick) -> tuple[Questioner, list[Answer]]:
+        if self._questioner is None or self._questioner.traces.result is not result:
+            self._questioner = self._new_questioner(result)
+        candidates = self._questioner.candidates(selection(target)) if target.is_place else []
+        return self._questioner, list(candidates)
 
     def _new_questioner(self, result: FrameResult) -> Questioner:
         session = self.live.session
@@ -265,13 +266,13 @@ class LiveBench(Closing):
     @property
     def settings(self) -> Settings:
         """Settings that pages have changed."""
-        return self._set
+        return self._settings
 
     def configured(self, settings: Settings) -> Config:
         """Return the configuration of the running robot, which has taken on the settings."""
         return self.live.config
 
-    def attempt(self, number: int, settings: Settings, what: Pick | None = None) -> dict[str, Any]:
+    def attempt(self, number: int, settings: Settings, target: Pick | None = None) -> dict[str, Any]:
         """Change parameters of the running robot, and return their effects on one frame.
 
         Raises:
@@ -280,9 +281,9 @@ class LiveBench(Closing):
         before = self.look(number)
         self.change(settings)
         after = describe(self._variants.perceive(before.frame, self.live.config))
-        asked = what.row if what is not None and what.kind == "truth" else -1
+        truth_row = target.row if target is not None and target.kind == "truth" else -1
         truth = None if self.truth_of is None else self.truth_of(before.frame)
-        return attempt(before, after, truth, asked)
+        return attempt(before, after, truth, truth_row)
 
     def change(self, settings: Settings) -> None:
         """Change parameters of the running robot.
@@ -292,9 +293,9 @@ class LiveBench(Closing):
         Raises:
             UserError: a parameter is unknown, or a value is wrong. Nothing is changed.
         """
-        if settings != self._set:
-            self.live.update(settings, without=self._set)
-        self._set = settings
+        if settings != self._settings:
+            self.live.update(settings, without=self._settings)
+        self._settings = settings
 
     def snap(self) -> str:
         """Save the flight recorder, and return the message for the user.
@@ -307,9 +308,9 @@ class LiveBench(Closing):
     def mark(self, stamp: int, text: str) -> str:
         """Log a note at a frame, in every recording and on the terminal. Return the message for the user."""
         number = self.number_at(stamp)
-        said = f"mark at frame {number}: {text.strip() or 'look here'}"
-        self.live.notes.info(said)
-        return said
+        message = f"mark at frame {number}: {text.strip() or 'look here'}"
+        self.live.notes.info(message)
+        return message
 
 
 def _own_truth(frame: Any) -> Truth | None:

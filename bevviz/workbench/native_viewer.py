@@ -46,10 +46,10 @@ class NativeViewer(Closing):
 
     def __init__(self, films: Sequence[Film], recording_id: str, url: str | None = None) -> None:
         self._films, self._recording_id = films, recording_id
-        self._given = url
+        self._url = url
         self._listeners: list[Callable[[Event], None]] = []
         self._ended, self._wake = threading.Event(), threading.Event()
-        self._wanted: tuple[str, int] | None = None  # timeline and stamp to go to
+        self._target: tuple[str, int] | None = None  # timeline and stamp to go to
         self._last: dict[str, Event] = {}  # last event of each type, for a page that connects later
         self._started = threading.Lock()
         self._relay = self._open()
@@ -61,14 +61,14 @@ class NativeViewer(Closing):
         rerun_cli.end(self._relay)
 
     def _open(self) -> rerun_cli.Process:
-        url = self._given or self._start()
+        url = self._url or self._start()
         check_viewer(url)
         client = ViewerClient.connect(url)
         try:
             client.get_state()
         except (RuntimeError, TimeoutError, ValueError) as error:
             raise UserError(f"the viewer at {url} does not tell its time: {first_line(error)}") from None
-        begun: Future[rerun_cli.Process] = Future()
+        relay_future: Future[rerun_cli.Process] = Future()
 
         def feed() -> None:
             # The relay ends with the thread that starts it. The thread that calls _open may end early,
@@ -76,13 +76,13 @@ class NativeViewer(Closing):
             try:
                 relay = self._start_relay(url)
             except OSError as error:
-                begun.set_exception(error)
+                relay_future.set_exception(error)
                 return
-            begun.set_result(relay)
+            relay_future.set_result(relay)
             self._feed(relay)
 
         threading.Thread(target=feed, name="native viewer", daemon=True).start()
-        relay = begun.result()
+        relay = relay_future.result()
         threading.Thread(target=self._watch, args=(relay, client), name="native viewer", daemon=True).start()
         return relay
 
@@ -113,39 +113,41 @@ class NativeViewer(Closing):
 
     def _feed(self, relay: rerun_cli.Process) -> None:
         """Send the pieces of all buffers to the relay until the viewer is closed."""
-        more = threading.Event()
-        ends = [film.listen(more.set) for film in self._films]
-        rows, begun = [0] * len(self._films), False
+        news = threading.Event()
+        stop_listening = [film.listen(news.set) for film in self._films]
+        rows, header_sent = [0] * len(self._films), False
         assert relay.stdin is not None
         try:
             while not self._ended.is_set() and relay.poll() is None:
-                for place, film in enumerate(self._films):
-                    while rows[place] < len(film) and not self._ended.is_set() and (begun or place == 0):
-                        piece = film[rows[place]]
-                        for part in (piece,) if begun else (piece[:MAGIC], piece):
-                            relay.stdin.write(len(part).to_bytes(8, "little"))
-                            relay.stdin.write(part)
+                for index, film in enumerate(self._films):
+                    while (
+                        rows[index] < len(film) and not self._ended.is_set() and (header_sent or index == 0)
+                    ):
+                        piece = film[rows[index]]
+                        for block in (piece,) if header_sent else (piece[:MAGIC], piece):
+                            relay.stdin.write(len(block).to_bytes(8, "little"))
+                            relay.stdin.write(block)
                         relay.stdin.flush()
-                        rows[place] += 1
-                        begun = True
-                more.wait(LOOK)
-                more.clear()
+                        rows[index] += 1
+                        header_sent = True
+                news.wait(LOOK)
+                news.clear()
         except (OSError, ValueError):
             pass  # The viewer is closed. The thread that watches its time reports that.
         finally:
-            for end in ends:
-                end()
+            for stop in stop_listening:
+                stop()
 
     # --- time ----------------------------------------------------------------------------------
 
     def seek(self, timeline: str, stamp: int) -> None:
         """Move the viewer to a stamp. Any thread may call this."""
-        self._wanted = timeline, stamp
+        self._target = timeline, stamp
         self._wake.set()
 
     def _watch(self, relay: rerun_cli.Process, client: ViewerClient) -> None:
         """Move the viewer to the stamp that the page wants, and report changes of its time."""
-        shown: tuple[str | None, int | None] = None, None
+        last_shown: tuple[str | None, int | None] = None, None
         opened = False
         while not self._ended.is_set():
             self._wake.wait(LOOK)
@@ -154,33 +156,35 @@ class NativeViewer(Closing):
                 self._tell({"type": "viewer_gone"})
                 return
             try:
-                mine = [
-                    one for one in client.get_state().recordings if one.store_id.endswith(self._recording_id)
+                matching = [
+                    recording
+                    for recording in client.get_state().recordings
+                    if recording.store_id.endswith(self._recording_id)
                 ]
-                if not mine or mine[0].current_time is None:
+                if not matching or matching[0].current_time is None:
                     continue
                 if not opened:
                     opened = True
                     self._tell({"type": "recording_open"})
-                wanted = self._wanted
-                if wanted is not None:
+                target = self._target
+                if target is not None:
                     client.set_time(
-                        wanted[0],
-                        timestamp=np.datetime64(wanted[1], "ns"),
+                        target[0],
+                        timestamp=np.datetime64(target[1], "ns"),
                         play_state="paused",
-                        recording=mine[0].store_id,
+                        recording=matching[0].store_id,
                     )
-                    if self._wanted == wanted:  # Otherwise the page wants a newer time already.
-                        self._wanted = None
-                    shown = wanted
-                    self._tell({"type": "time_update", "timeline": wanted[0], "time": wanted[1]})
+                    if self._target == target:  # Otherwise the page wants a newer time already.
+                        self._target = None
+                    last_shown = target
+                    self._tell({"type": "time_update", "timeline": target[0], "time": target[1]})
                     continue
             except (RuntimeError, TimeoutError, ValueError, ConnectionError):
                 continue  # The viewer is busy: ask again. Once it is closed, the relay ends.
-            now = mine[0].current_timeline, mine[0].current_time
-            if now != shown and now[0] in TIMELINES:
-                shown = now
-                self._tell({"type": "time_update", "timeline": now[0], "time": now[1]})
+            current = matching[0].current_timeline, matching[0].current_time
+            if current != last_shown and current[0] in TIMELINES:
+                last_shown = current
+                self._tell({"type": "time_update", "timeline": current[0], "time": current[1]})
 
     # --- page ----------------------------------------------------------------------------------
 
@@ -205,27 +209,27 @@ class NativeViewer(Closing):
     async def talk(self, socket: WebSocket) -> None:
         """Send the events to a page, and follow its time."""
         await socket.accept()
-        loop, news = asyncio.get_running_loop(), asyncio.Queue[Event]()
+        loop, events = asyncio.get_running_loop(), asyncio.Queue[Event]()
 
-        def told(event: Event) -> None:
+        def queue_event(event: Event) -> None:
             with contextlib.suppress(RuntimeError):  # The server has ended.
-                loop.call_soon_threadsafe(news.put_nowait, event)
+                loop.call_soon_threadsafe(events.put_nowait, event)
 
-        async def tell() -> None:
+        async def send_events() -> None:
             while True:
-                await socket.send_text(json.dumps(await news.get()))
+                await socket.send_text(json.dumps(await events.get()))
 
-        end = self.listen(told)
-        telling = asyncio.ensure_future(tell())
+        stop = self.listen(queue_event)
+        sender = asyncio.ensure_future(send_events())
         try:
             with contextlib.suppress(WebSocketDisconnect, RuntimeError):
                 while True:
-                    await self._take(json.loads(await socket.receive_text()), told)
+                    await self._take(json.loads(await socket.receive_text()), queue_event)
         finally:
-            telling.cancel()
-            end()
+            sender.cancel()
+            stop()
 
-    async def _take(self, message: Event, told: Callable[[Event], None]) -> None:
+    async def _take(self, message: Event, queue_event: Callable[[Event], None]) -> None:
         if message.get("type") == "time_ctrl" and str(message.get("timestamp_nanos", "")).isdecimal():
             timeline = message.get("timeline")
             self.seek(timeline if timeline in TIMELINES else entities.STAMP, int(message["timestamp_nanos"]))
@@ -233,4 +237,4 @@ class NativeViewer(Closing):
             try:
                 await asyncio.to_thread(self.reopen)
             except UserError as error:
-                told({"type": "viewer_gone", "text": str(error)})
+                queue_event({"type": "viewer_gone", "text": str(error)})

@@ -26,18 +26,18 @@ TOGETHER = 0.05  # seconds in which news are collected before they are sent
 _log = logger(__name__)
 
 
-class Visit:
+class PageConnection:
     """Connection to one page.
 
     Args:
-        bench: the workbench session that the page asks.
+        workbench: the workbench session that the page asks.
         socket: an accepted socket.
         desk: executor with one thread that answers the questions of all pages in turn.
         run: id of this run of the server.
     """
 
-    def __init__(self, bench: Bench, socket: WebSocket, desk: ThreadPoolExecutor, run: str) -> None:
-        self._bench, self._socket, self._desk, self._run = bench, socket, desk, run
+    def __init__(self, workbench: Bench, socket: WebSocket, desk: ThreadPoolExecutor, run: str) -> None:
+        self._workbench, self._socket, self._desk, self._run = workbench, socket, desk, run
         self._sending = asyncio.Lock()
         self._tasks: set[asyncio.Task[None]] = set()
         self._newest = 0
@@ -55,14 +55,14 @@ class Visit:
 
     async def stay(self) -> None:
         """Serve the page until it disconnects."""
-        with listening(self._bench.listen) as more:
+        with news_event(self._workbench.listen) as news:
             await self._send(self._welcome())
-            news = asyncio.ensure_future(self._tell(more))
+            sender = asyncio.ensure_future(self._tell(news))
             try:
                 while True:
                     self._take(await self._socket.receive_text())
             finally:
-                news.cancel()
+                sender.cancel()
                 for task in self._tasks:
                     task.cancel()
 
@@ -71,35 +71,35 @@ class Visit:
     def _welcome(self) -> dict[str, Any]:
         from bevviz.workbench.controls import controls
 
-        bench = self._bench
-        self._opened = bench.drive.config
+        workbench = self._workbench
+        self._opened = workbench.drive.config
         self._controls = controls(self._opened)
         return {
             "type": "welcome",
             "run": self._run,
-            "bag": bench.drive.scene.name,
-            "scans": len(bench.drive),
-            "truth": bench.truth_of is not None,
-            "detector": bool(bench.drive.config.detector.model),
+            "bag": workbench.drive.scene.name,
+            "scans": len(workbench.drive),
+            "truth": workbench.truth_of is not None,
+            "detector": bool(workbench.drive.config.detector.model),
             "controls": self._controls,
         }
 
-    async def _tell(self, more: asyncio.Event) -> None:
+    async def _tell(self, news: asyncio.Event) -> None:
         """Send news of the run whenever there are any."""
-        told: dict[int, int] = {}
-        opened, noted, bench = False, -1, self._bench
+        sent_counts: dict[int, int] = {}
+        opening_sent, notes_version, workbench = False, -1, self._workbench
         while True:
-            more.clear()
-            if not opened and bench.opening is not None:
-                opened = True
-                await self._send({"type": "opening", "stamp": str(bench.opening)})
-            for news in bench.entries.news(told):
-                await self._send(news)
-            if noted != bench.notes_changed:
-                noted = bench.notes_changed
-                await self._send(await asyncio.to_thread(_notes, bench))
-            await self._send(bench.progress())
-            await more.wait()
+            news.clear()
+            if not opening_sent and workbench.opening is not None:
+                opening_sent = True
+                await self._send({"type": "opening", "stamp": str(workbench.opening)})
+            for message in workbench.entries.news(sent_counts):
+                await self._send(message)
+            if notes_version != workbench.notes_changed:
+                notes_version = workbench.notes_changed
+                await self._send(await asyncio.to_thread(_notes, workbench))
+            await self._send(workbench.progress())
+            await news.wait()
             await asyncio.sleep(TOGETHER)
 
     async def _send(self, message: dict[str, Any]) -> None:
@@ -130,8 +130,8 @@ class Visit:
             await self._send({"type": "error", "id": number, "text": "that message cannot be understood"})
         except Exception as error:
             _log.error("a question that failed", exc_info=error)
-            what = f"error of bevviz itself: {type(error).__name__}: {first_line(error)}"
-            await self._send({"type": "error", "id": number, "text": what})
+            description = f"error of bevviz itself: {type(error).__name__}: {first_line(error)}"
+            await self._send({"type": "error", "id": number, "text": description})
 
     async def _at_desk(self, number: int, work: Callable[[], Any], *, idle: bool = False) -> Any:
         """Run ``work`` on the desk thread. Idle work is skipped once the page has sent a newer message."""
@@ -139,7 +139,7 @@ class Visit:
         def job() -> Any:
             if idle and number != self._newest:
                 return None
-            with self._bench.quiet():
+            with self._workbench.quiet():
                 return work()
 
         return await asyncio.get_running_loop().run_in_executor(self._desk, job)
@@ -147,23 +147,25 @@ class Visit:
     async def _ask(self, number: int, message: dict[str, Any]) -> None:
         from bevviz.why.pick import Pick
 
-        bench, settings = self._bench, _settings(message)
+        workbench, settings = self._workbench, _settings(message)
         frame = await self._frame(message)
 
-        def what() -> Pick | None:
+        def requested_pick() -> Pick | None:
             if "pick" in message:
                 return Pick.parse(str(message["pick"]))
             position = tuple(float(v) for v in message.get("position") or () if v is not None)
             instance = message.get("instance")
             path = str(message["entity"])
-            return bench.picked(frame, settings, path, None if instance is None else int(instance), position)
+            return workbench.picked(
+                frame, settings, path, None if instance is None else int(instance), position
+            )
 
         def work() -> dict[str, Any] | None:
-            picked = what()
+            picked = requested_pick()
             if picked is None:
                 return None
-            answer, beside = bench.ask(frame, settings, picked)
-            return {"pick": str(picked), **answer.as_dict(), "beside": list(_briefly(beside))}
+            answer, others = workbench.ask(frame, settings, picked)
+            return {"pick": str(picked), **answer.as_dict(), "beside": list(_briefly(others))}
 
         answer = await self._at_desk(number, work)
         head = {"id": number, "frame": frame}
@@ -172,7 +174,7 @@ class Visit:
             return
         await self._send({"type": "answer", **head, **answer})
         pick = Pick.parse(answer["pick"])
-        hints = await self._at_desk(number, lambda: bench.hints(frame, settings, pick), idle=True)
+        hints = await self._at_desk(number, lambda: workbench.hints(frame, settings, pick), idle=True)
         if hints is not None:
             await self._send({"type": "hints", **head, "hints": hints.as_dict()["hints"]})
 
@@ -182,51 +184,53 @@ class Visit:
 
         settings, frame = _settings(message), await self._frame(message)
         pick = Pick.parse(str(message["pick"])) if message.get("pick") else None
-        told = await self._at_desk(number, lambda: self._bench.attempt(frame, settings, pick))
-        await self._send({"type": "tried", "id": number, "frame": frame, **told})
-        there = controls(self._bench.configured(settings), self._opened)
-        if there != self._controls:  # A stage was replaced by a user's function, or is no longer replaced.
-            self._controls = there
-            await self._send({"type": "controls", "controls": there})
+        effects = await self._at_desk(number, lambda: self._workbench.attempt(frame, settings, pick))
+        await self._send({"type": "tried", "id": number, "frame": frame, **effects})
+        new_controls = controls(self._workbench.configured(settings), self._opened)
+        if new_controls != self._controls:  # a stage was replaced by a user's function, or is no longer
+            self._controls = new_controls
+            await self._send({"type": "controls", "controls": new_controls})
 
     async def _settle(self, number: int, message: dict[str, Any]) -> None:
         """Compute the result of the frame that the page has stopped at, before a question about it comes."""
         frame = await self._frame(message)
-        await self._at_desk(number, lambda: self._bench.look(frame, _settings(message)), idle=True)
+        await self._at_desk(number, lambda: self._workbench.look(frame, _settings(message)), idle=True)
 
     async def _drive(self, number: int, message: dict[str, Any]) -> None:
         """Run the drive with other values."""
         settings = _settings(message)
-        await asyncio.to_thread(self._bench.trials.begin, settings)
+        await asyncio.to_thread(self._workbench.trials.begin, settings)
 
     async def _cancel(self, number: int, message: dict[str, Any]) -> None:
-        what = self._bench.reports if message["what"] == "report" else self._bench.trials
-        await asyncio.to_thread(what.end)
+        runner = self._workbench.reports if message["what"] == "report" else self._workbench.trials
+        await asyncio.to_thread(runner.end)
 
     async def _report(self, number: int, message: dict[str, Any]) -> None:
         frame, settings, text = await self._frame(message), _settings(message), str(message["text"])
         before, after = float(message["before"]), float(message["after"])
-        await self._at_desk(number, lambda: self._bench.reports.begin(frame, settings, before, after, text))
+        await self._at_desk(
+            number, lambda: self._workbench.reports.begin(frame, settings, before, after, text)
+        )
 
     async def _note(self, number: int, message: dict[str, Any]) -> None:
         from bevviz.why.pick import Pick
 
         frame, text = await self._frame(message), str(message["text"])
         pick = Pick.parse(str(message["pick"])) if message.get("pick") else None
-        await self._at_desk(number, lambda: self._bench.note(frame, text, pick))
-        await self._send({"type": "noted", "id": number, "file": self._bench.notes.path.name})
+        await self._at_desk(number, lambda: self._workbench.note(frame, text, pick))
+        await self._send({"type": "noted", "id": number, "file": self._workbench.notes.path.name})
 
     async def _unnote(self, number: int, message: dict[str, Any]) -> None:
         stamp, text = int(message["stamp"]), str(message["text"])
-        await self._at_desk(number, lambda: self._bench.remove_note(stamp, text))
+        await self._at_desk(number, lambda: self._workbench.remove_note(stamp, text))
 
     async def _shown(self, number: int, message: dict[str, Any]) -> None:
         """Let the run continue: the page has drawn its first frame."""
-        self._bench.go_on()
+        self._workbench.go_on()
 
     async def _frame(self, message: dict[str, Any]) -> int:
         """Return the number of the frame that the page shows. The run may not have reached it yet."""
-        return await asyncio.to_thread(self._bench.number_at, round(float(message["time"])))
+        return await asyncio.to_thread(self._workbench.number_at, round(float(message["time"])))
 
 
 def _briefly(answers: Sequence[Answer]) -> Iterator[dict[str, Any]]:
@@ -244,13 +248,13 @@ def _briefly(answers: Sequence[Answer]) -> Iterator[dict[str, Any]]:
             }
 
 
-def _notes(bench: Bench) -> dict[str, Any]:
+def _notes(workbench: Bench) -> dict[str, Any]:
     try:
-        notes = list(bench.notes)
+        notes = list(workbench.notes)
     except UserError as error:
         return {"type": "notes", "notes": [], "error": str(error)}
-    told = [{**asdict(note), "stamp": str(note.stamp), "received": str(note.received)} for note in notes]
-    return {"type": "notes", "notes": told, "error": ""}
+    records = [{**asdict(note), "stamp": str(note.stamp), "received": str(note.received)} for note in notes]
+    return {"type": "notes", "notes": records, "error": ""}
 
 
 def _settings(message: dict[str, Any]) -> Settings:
@@ -258,16 +262,16 @@ def _settings(message: dict[str, Any]) -> Settings:
 
 
 @contextlib.contextmanager
-def listening(listen: Callable[[Callable[[], None]], Callable[[], None]]) -> Iterator[asyncio.Event]:
+def news_event(listen: Callable[[Callable[[], None]], Callable[[], None]]) -> Iterator[asyncio.Event]:
     """Return an event that is set whenever there is news, from any thread."""
-    more, loop = asyncio.Event(), asyncio.get_running_loop()
+    news, loop = asyncio.Event(), asyncio.get_running_loop()
 
-    def tell() -> None:
+    def notify() -> None:
         with contextlib.suppress(RuntimeError):  # The server has ended.
-            loop.call_soon_threadsafe(more.set)
+            loop.call_soon_threadsafe(news.set)
 
-    end = listen(tell)
+    stop = listen(notify)
     try:
-        yield more
+        yield news
     finally:
-        end()
+        stop()

@@ -22,7 +22,7 @@ LONGEST = 600.0  # seconds before or after the frame, at most
 
 
 @dataclass(slots=True)
-class Report:
+class ReportJob:
     """A finished report, or the one in progress.
 
     Attributes:
@@ -57,34 +57,36 @@ class Report:
             "error": self.error,
             "done": self.done,
             "total": self.total,
-            "files": [{"name": path.name, "megabytes": path.stat().st_size / 1e6} for path in self._there()],
+            "files": [
+                {"name": path.name, "megabytes": path.stat().st_size / 1e6} for path in self._existing_files()
+            ],
             "folder": str(self.files[0].parent) if self.files else "",
         }
 
-    def _there(self) -> Sequence[Path]:
+    def _existing_files(self) -> Sequence[Path]:
         """Return its files that exist."""
         return [path for path in self.files if path.is_file()]
 
     def file(self, name: str) -> Path | None:
         """Return the path of a file by its name, if it exists."""
-        return next((path for path in self._there() if path.name == name), None)
+        return next((path for path in self._existing_files() if path.name == name), None)
 
 
-class Reports:
+class ReportMaker:
     """Reports of a workbench session, made one at a time.
 
     Args:
-        bench: the workbench session.
-        news: called when the state of a report has changed.
+        workbench: the workbench session.
+        on_change: called when the state of a report has changed.
         folder: output folder, see ``folder_of``.
     """
 
-    def __init__(self, bench: Bench, news: Callable[[], None], folder: Path) -> None:
-        self._bench, self._news, self._folder = bench, news, folder
+    def __init__(self, workbench: Bench, on_change: Callable[[], None], folder: Path) -> None:
+        self._workbench, self._on_change, self._folder = workbench, on_change, folder
         self._thread: threading.Thread | None = None
-        self.made: list[Report] = []
+        self.made: list[ReportJob] = []
 
-    def begin(self, number: int, settings: Settings, before: float, after: float, note: str) -> Report:
+    def begin(self, number: int, settings: Settings, before: float, after: float, note: str) -> ReportJob:
         """Start to make a report.
 
         Args:
@@ -104,28 +106,28 @@ class Reports:
             raise UserError("a report is being made: wait for it, or cancel it")
         if not (0 <= before <= LONGEST and 0 <= after <= LONGEST):
             raise UserError(f"a report is of up to {LONGEST:g} seconds before and after")
-        bench = self._bench
-        received = bench.look(number, settings).frame.received
-        seconds = (received - int(bench.drive.frames.scans[0])) / 1e9
-        output = _free(self._folder, f"{bench.paths[0].resolve().stem}-{seconds:.1f}s")
+        workbench = self._workbench
+        received = workbench.look(number, settings).frame.received
+        seconds = (received - int(workbench.drive.frames.scans[0])) / 1e9
+        output = _free(self._folder, f"{workbench.paths[0].resolve().stem}-{seconds:.1f}s")
         low, high = received - round(before * 1e9), received + round(after * 1e9)
         request = ReportRequest(
-            paths=bench.paths,
-            config=revised(bench.drive.config, settings),
+            paths=workbench.paths,
+            config=revised(workbench.drive.config, settings),
             at=iso(received),
             before=before,
             after=after,
             output=output,
             note=note.strip(),
-            asked=bench.asked_within(low, high, settings),
-            asked_before=bench.asked_within(low, high) if settings else (),
-            notes=list(bench.notes),
+            asked=workbench.asked_within(low, high, settings),
+            asked_before=workbench.asked_within(low, high) if settings else (),
+            notes=list(workbench.notes),
         )
-        report = Report(len(self.made), output.stem, settings)
+        report = ReportJob(len(self.made), output.stem, settings)
         self.made.append(report)
         self._thread = threading.Thread(target=self._make, args=(report, request), name="report", daemon=True)
         self._thread.start()
-        self._news()
+        self._on_change()
         return report
 
     def end(self) -> None:
@@ -135,37 +137,37 @@ class Reports:
         if self._thread is not None:
             self._thread.join()
 
-    def _make(self, report: Report, request: Any) -> None:
+    def _make(self, report: ReportJob, request: Any) -> None:
         from bevviz.report.make import make
 
         try:
-            written = make(request, [_Counting(report, self._news)], report.stop)
+            written = make(request, [_ReportProgress(report, self._on_change)], report.stop)
             report.files = written.files
             report.state = "cancelled" if written.interrupted else "over"
         except Exception as error:
             report.error = str(error) if isinstance(error, UserError) else first_line(error)
             report.state = "failed"
-        self._news()
+        self._on_change()
 
 
-class _Counting(Observer[FrameResult]):
+class _ReportProgress(Observer[FrameResult]):
     """Observer that counts the finished frames of a report."""
 
-    def __init__(self, report: Report, news: Callable[[], None]) -> None:
-        self._report, self._news = report, news
+    def __init__(self, report: ReportJob, on_change: Callable[[], None]) -> None:
+        self._report, self._on_change = report, on_change
 
     def begin(self, items: Items[object]) -> None:
         self._report.total = items.total or 0
 
     def see(self, result: FrameResult) -> None:
         self._report.done += 1
-        self._news()
+        self._on_change()
 
 
 def folder_of(paths: Sequence[Path]) -> Path:
     """Return the folder of the bag, or the working directory if that folder is read-only."""
-    beside = paths[0].resolve().parent
-    return beside if os.access(beside, os.W_OK | os.X_OK) else Path.cwd()
+    folder = paths[0].resolve().parent
+    return folder if os.access(folder, os.W_OK | os.X_OK) else Path.cwd()
 
 
 def _free(folder: Path, stem: str) -> Path:

@@ -19,8 +19,8 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from bevviz.errors import UserError
 from bevviz.workbench.access import Guard, cookie_name
-from bevviz.workbench.page_connection import Visit, listening
-from bevviz.workbench.startup import Opening
+from bevviz.workbench.page_connection import PageConnection, news_event
+from bevviz.workbench.startup import SessionStartup
 
 if TYPE_CHECKING:
     from bevviz.workbench.session import Bench
@@ -51,23 +51,23 @@ AHEAD = 6  # pieces of the recording that may be sent before the page acknowledg
 
 
 def application(
-    opening: Opening, viewer: Path, version: str, token: str, port: int, kind: Kind = "page"
+    startup: SessionStartup, viewer: Path, version: str, token: str, port: int, kind: Kind = "page"
 ) -> ASGIApp:
     """Return the application that serves the page behind its access guard.
 
     Args:
-        opening: start-up of the workbench session.
+        startup: start-up of the workbench session.
         viewer: folder of the viewer's files.
         version: version of the viewer.
         token: token that every request has to carry.
         port: port of the server.
         kind: kind of viewer.
     """
-    site = Site(opening, viewer, version, token, port, kind)
-    return Guard(Starlette(routes=routes_of(site)), token, port)
+    site = Site(startup, viewer, version, token, port, kind)
+    return Guard(Starlette(routes=site_routes(site)), token, port)
 
 
-def routes_of(site: Site) -> list[BaseRoute]:
+def site_routes(site: Site) -> list[BaseRoute]:
     """Return the routes of a site."""
     return [
         Route("/", site.page),
@@ -75,7 +75,7 @@ def routes_of(site: Site) -> list[BaseRoute]:
         Route(f"/viewer/{site.version}/{{name}}", site.viewer),
         Route("/config.yaml", site.config),
         Route("/report/{number:int}/{name}", site.report),
-        WebSocketRoute("/film", site.film),
+        WebSocketRoute("/film", site.recording),
         WebSocketRoute("/talk", site.talk),
         WebSocketRoute("/native", site.native),
     ]
@@ -85,9 +85,9 @@ class Site:
     """Request handlers of the page."""
 
     def __init__(
-        self, opening: Opening, viewer: Path, version: str, token: str, port: int, kind: Kind
+        self, startup: SessionStartup, viewer: Path, version: str, token: str, port: int, kind: Kind
     ) -> None:
-        self._opening, self._viewer, self.version, self._kind = opening, viewer, version, kind
+        self._startup, self._viewer, self.version, self._kind = startup, viewer, version, kind
         self._token, self._port = token, port
         self._run = secrets.token_hex(4)  # A page that reconnects to another run reloads.
         self._desk = ThreadPoolExecutor(1, "desk")  # One thread answers all questions in turn.
@@ -118,11 +118,11 @@ class Site:
         """Return the configuration with the tried settings as a YAML file."""
         from bevviz.config import dump, revised
 
-        bench = await self._opening.bench()
-        if bench is None:
+        workbench = await self._startup.session()
+        if workbench is None:
             return PlainTextResponse("the drive cannot be opened\n", 503)
         try:
-            text = dump(revised(bench.drive.config, request.query_params.getlist("set")))
+            text = dump(revised(workbench.drive.config, request.query_params.getlist("set")))
         except UserError as error:
             return PlainTextResponse(str(error), 400)
         headers = {"Content-Disposition": 'attachment; filename="bevviz.yaml"'}
@@ -130,9 +130,9 @@ class Site:
 
     async def report(self, request: Request) -> Response:
         """Return a file of a report that this server made."""
-        bench, number = await self._opening.bench(), request.path_params["number"]
-        made = [] if bench is None else bench.reports.made
-        path = made[number].file(request.path_params["name"]) if number < len(made) else None
+        workbench, number = await self._startup.session(), request.path_params["number"]
+        reports = [] if workbench is None else workbench.reports.made
+        path = reports[number].file(request.path_params["name"]) if number < len(reports) else None
         if path is None:
             return PlainTextResponse("there is no such file\n", 404)
         if path.suffix == ".html":  # The HTML of a report states its own policy.
@@ -141,7 +141,7 @@ class Site:
 
     # --- recordings ----------------------------------------------------------------------------
 
-    async def film(self, socket: WebSocket) -> None:
+    async def recording(self, socket: WebSocket) -> None:
         """Send every piece of a recording from the requested one on, as the pieces are made.
 
         The page acknowledges each piece of the run with a message, and gets no more than ``AHEAD`` pieces in
@@ -149,35 +149,39 @@ class Site:
         ``desk`` (answers and tried results) are sent at once.
         """
         await socket.accept()
-        bench = await self._opening.bench()
-        if bench is None:
+        workbench = await self._startup.session()
+        if workbench is None:
             await socket.close()
             return
         desk = socket.query_params.get("lane") == "desk"
-        film, ahead = (bench.desk, None) if desk else (bench.film, AHEAD)
+        buffer, ahead = (workbench.desk, None) if desk else (workbench.film, AHEAD)
         text = socket.query_params.get("from", "0")
-        row, early, count = int(text) if text.isdecimal() else 0, set[int](), 0
+        row, sent_early, count = int(text) if text.isdecimal() else 0, set[int](), 0
 
-        async def put(number: int) -> None:
+        async def send(number: int) -> None:
             nonlocal count
             count += 1
-            await socket.send_bytes(await asyncio.to_thread(film.__getitem__, number))
+            await socket.send_bytes(await asyncio.to_thread(buffer.__getitem__, number))
 
-        with listening(film.listen) as more, contextlib.suppress(WebSocketDisconnect, RuntimeError):
-            async with heard_on(socket, more) as heard:
-                while not heard.gone:
-                    more.clear()
-                    while heard.wanted:
-                        wanted = bench.film_row(heard.wanted.pop())
-                        if wanted is not None and wanted >= row and wanted not in early:
-                            early.add(wanted)
-                            await put(wanted)
-                    if row < len(film) and (ahead is None or count < heard.count + ahead):
-                        if row not in early:
-                            await put(row)
+        with news_event(buffer.listen) as news, contextlib.suppress(WebSocketDisconnect, RuntimeError):
+            async with page_state(socket, news) as state:
+                while not state.gone:
+                    news.clear()
+                    while state.requested:
+                        requested_row = workbench.film_row(state.requested.pop())
+                        if (
+                            requested_row is not None
+                            and requested_row >= row
+                            and requested_row not in sent_early
+                        ):
+                            sent_early.add(requested_row)
+                            await send(requested_row)
+                    if row < len(buffer) and (ahead is None or count < state.count + ahead):
+                        if row not in sent_early:
+                            await send(row)
                         row += 1
                     else:
-                        await more.wait()
+                        await news.wait()
 
     # --- questions -----------------------------------------------------------------------------
 
@@ -185,23 +189,23 @@ class Site:
         """Answer the questions of a page, and send it the progress of the run."""
         await socket.accept()
         with contextlib.suppress(WebSocketDisconnect, RuntimeError):
-            bench = await self._opening.bench()
-            if bench is None:
-                error = self._opening.error
+            workbench = await self._startup.session()
+            if workbench is None:
+                error = self._startup.error
                 await socket.send_json({"type": "failed", "text": str(error)})
                 return
-            await self._visit(bench, socket).stay()
+            await self._visit(workbench, socket).stay()
 
-    def _visit(self, bench: Bench, socket: WebSocket) -> Visit:
-        return Visit(bench, socket, self._desk, self._run)
+    def _visit(self, workbench: Bench, socket: WebSocket) -> PageConnection:
+        return PageConnection(workbench, socket, self._desk, self._run)
 
     async def native(self, socket: WebSocket) -> None:
         """Connect the page with the native viewer beside it."""
-        bench = await self._opening.bench()
-        if bench is None or bench.native is None:
+        workbench = await self._startup.session()
+        if workbench is None or workbench.native is None:
             await socket.close()
             return
-        await bench.native.talk(socket)
+        await workbench.native.talk(socket)
 
 
 class Heard:
@@ -211,36 +215,36 @@ class Heard:
         count: number of acknowledged pieces.
         gone: whether the socket is closed.
         hidden: whether the page is in the background.
-        wanted: stamps of the frames that the page requests next, newest last.
+        requested: stamps of the frames that the page requests next, newest last.
     """
 
     def __init__(self) -> None:
         self.count, self.gone, self.hidden = 0, False, False
-        self.wanted: list[int] = []
+        self.requested: list[int] = []
 
 
 @contextlib.asynccontextmanager
-async def heard_on(socket: WebSocket, more: asyncio.Event) -> AsyncIterator[Heard]:
+async def page_state(socket: WebSocket, news: asyncio.Event) -> AsyncIterator[Heard]:
     """Yield the state of a page, updated by its messages, and set ``more`` at each of them."""
-    heard = Heard()
+    state = Heard()
 
     async def listen() -> None:
         with contextlib.suppress(WebSocketDisconnect, RuntimeError):
             while True:
                 text = await socket.receive_text()
                 if text.isdecimal():
-                    heard.wanted.append(int(text))
+                    state.requested.append(int(text))
                 elif text in ("hidden", "seen"):
-                    heard.hidden = text == "hidden"
+                    state.hidden = text == "hidden"
                 else:
-                    heard.count += 1
-                more.set()
-        heard.gone = True
-        more.set()
+                    state.count += 1
+                news.set()
+        state.gone = True
+        news.set()
 
     task = asyncio.ensure_future(listen())
     try:
-        yield heard
+        yield state
     finally:
         task.cancel()
 

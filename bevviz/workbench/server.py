@@ -14,7 +14,7 @@ import uvicorn
 from bevviz.errors import UserError
 from bevviz.workbench.access import HOSTS
 from bevviz.workbench.routes import VIEWER, Kind, application
-from bevviz.workbench.startup import Opening
+from bevviz.workbench.startup import SessionStartup
 from bevviz.workbench.token import kept_token
 
 if TYPE_CHECKING:
@@ -46,22 +46,22 @@ def serve(
         UserError: the port is in use, the viewer is not installed, or ``make`` raises one.
     """
     viewer = viewer_folder()
-    with bound(port) as listening:
+    with bound_socket(port) as listening:
         port = listening.getsockname()[1]
-        with kept_token(port, drive) as token, Opening(make, lambda: server.end()) as opening:
-            app = application(opening, viewer, version("rerun-sdk"), token, port, kind)
+        with kept_token(port, drive) as token, SessionStartup(make, lambda: server.end()) as startup:
+            app = application(startup, viewer, version("rerun-sdk"), token, port, kind)
 
             def begin() -> None:
                 ready(f"http://{HOSTS[0]}:{port}/?token={token}")
-                opening.start()
+                startup.start()
 
             server = Server(app, begin)
             server.run(sockets=[listening])
-        if opening.error is not None:
-            raise opening.error
+        if startup.error is not None:
+            raise startup.error
 
 
-def bound(port: int | None) -> socket.socket:
+def bound_socket(port: int | None) -> socket.socket:
     """Return a socket that is bound to a port of this machine only.
 
     Raises:
@@ -69,9 +69,9 @@ def bound(port: int | None) -> socket.socket:
     """
     listening = socket.socket()
     listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-    for wanted in (PORT, 0) if port is None else (port,):
+    for candidate in (PORT, 0) if port is None else (port,):
         try:
-            listening.bind((HOSTS[0], wanted))
+            listening.bind((HOSTS[0], candidate))
             return listening
         except OSError as error:
             reason = error.strerror
@@ -113,7 +113,9 @@ def viewer_folder() -> Path:
     folder = Path(spec.origin).parent / "static" if spec is not None and spec.origin else None
     if folder is None or not all((folder / name).is_file() for name in VIEWER):
         raise UserError("the workbench needs Rerun's web viewer: pip install 'bevviz[workbench]'")
-    own, sdk = version("rerun-notebook"), version("rerun-sdk")
-    if own != sdk:
-        raise UserError(f"rerun-notebook {own} does not fit rerun-sdk {sdk}: pip install 'bevviz[workbench]'")
+    installed, sdk = version("rerun-notebook"), version("rerun-sdk")
+    if installed != sdk:
+        raise UserError(
+            f"rerun-notebook {installed} does not fit rerun-sdk {sdk}: pip install 'bevviz[workbench]'"
+        )
     return folder

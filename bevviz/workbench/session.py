@@ -36,12 +36,12 @@ from bevviz.why import Answer, Questioner
 from bevviz.why.log import mark_answers
 from bevviz.why.pick import Pick, pick
 from bevviz.why.pick_answers import selection, surroundings
-from bevviz.workbench.finding_list import Entries
-from bevviz.workbench.findings import Find, finds, with_reasons
-from bevviz.workbench.findings_layer import Layer, log_layer
+from bevviz.workbench.finding_list import FindingList
+from bevviz.workbench.findings import Finding, finds, with_reasons
+from bevviz.workbench.findings_layer import FindingRows, log_layer
 from bevviz.workbench.recording_buffer import Film
-from bevviz.workbench.reports import Reports, folder_of
-from bevviz.workbench.trials import Trials, attempt, tried_logger
+from bevviz.workbench.reports import ReportMaker, folder_of
+from bevviz.workbench.trials import TrialRunner, attempt, tried_logger
 from bevviz.workbench.truth_frames import TruthOf
 
 if TYPE_CHECKING:
@@ -95,29 +95,29 @@ class Bench(Closing):
         self.drive, self.again, self.paths, self.truth_of = drive, again, paths, truth_of
         self._first = first
         self.film, self.desk = Film(), Film()
-        self.entries = Entries()
+        self.entries = FindingList()
         self.opening: int | None = None
         self.done, self.over, self.error = 0, False, ""
         self._listeners: list[Callable[[], None]] = []
         self._stamps: list[tuple[int, int]] = []  # (stamp, number) of each frame in ``film``, sorted
         self._reached = 0  # newest stamp that the run has reached
-        self._ahead = (0, 0, 0)  # index, stamp and receive time of the frame that was drawn first
-        self._ahead_knows: frozenset[str] = frozenset()  # entities that have data or a clear at that frame
+        self._first_times = (0, 0, 0)  # index, stamp and receive time of the frame that was drawn first
+        self._first_entities: frozenset[str] = frozenset()  # entities that have data or a clear at that frame
         self._rows: dict[int, int] = {}  # row in ``film`` by stamp
         self._tracks: dict[int, Tracks] = {}
         self._objects: dict[int, Objects | None] = {}
-        self._layers: dict[tuple[int, bool], Layer] = {}  # by frame number and side (tried or not)
+        self._layers: dict[tuple[int, bool], FindingRows] = {}  # by frame number and side (tried or not)
         self._recoloured: set[int] = set()  # numbers of frames whose raw cloud was drawn with other values
         self._onsets = Onsets()
         self._results: OrderedDict[tuple[int, Settings], FrameResult] = OrderedDict()
         self._variants, self._looking = Variants(drive.session.loader), threading.RLock()
-        self._asked: Questioner | None = None
+        self._last_questioner: Questioner | None = None
         self._stop, self._quiet, self._go = threading.Event(), threading.Event(), threading.Event()
         self._quiet.set()
         self.native: NativeViewer | None = None
         self.recording_id = f"bench-{time.time_ns()}"
-        self._main, self._film_main = self.stream()
-        self._desk, self._film_desk = self.stream()
+        self._main, self._main_stream = self.stream()
+        self._desk, self._desk_stream = self.stream()
         layout = blueprints.load("workbench", drive.scene, drive.config)
         self._main.send_blueprint(layout, make_active=True)
         self._logger = Logger(self._main, drive.config, drive.scene, wait=WAIT, stamps=BOTH)
@@ -125,7 +125,10 @@ class Bench(Closing):
         self._logger.log_static()
         self._desk_logger = Logger(self._desk, drive.config, drive.scene, stamps=BOTH)
         self._tried_logger = tried_logger(self._desk, drive.session, self)
-        self.trials, self.reports = Trials(self, self.tell), Reports(self, self.tell, folder_of(paths))
+        self.trials, self.reports = (
+            TrialRunner(self, self.tell),
+            ReportMaker(self, self.tell, folder_of(paths)),
+        )
         self.notes = Notes(paths)
         self.notes_changed = 0
         self._answers: OrderedDict[tuple[int, Settings, str], tuple[int, Answer]] = OrderedDict()
@@ -152,7 +155,7 @@ class Bench(Closing):
             self._thread.join(PATIENCE)
         if self.native is not None:
             self.native.close()
-        for stream in (self._film_main, self._film_desk, self.trials.film):
+        for stream in (self._main_stream, self._desk_stream, self.trials.film):
             stream.read()  # Rerun warns about a binary stream with unread data.
         self.film.close()
         self.desk.close()
@@ -185,7 +188,7 @@ class Bench(Closing):
             self._show(first, finds(first, self.truth(first.frame)))
             self._go.wait(FIRST)
             session = self.drive.new_session()
-            run(self.again, session, [_Filming(self)], stop=self._stop)
+            run(self.again, session, [_RunObserver(self)], stop=self._stop)
         except Exception as error:
             self.error = (
                 str(error) if isinstance(error, UserError) else f"the run failed: {first_line(error)}"
@@ -200,17 +203,17 @@ class Bench(Closing):
     def see(self, result: FrameResult) -> None:
         """Record the next frame of the run. Then wait while a question is being answered."""
         frame = result.frame
-        found = finds(result, self.truth(frame))
-        if any(find.what == "missed" for find in found):
+        findings = finds(result, self.truth(frame))
+        if any(finding.what == "missed" for finding in findings):
             names = self.drive.session.stages.class_names
-            found = with_reasons(found, result, Questioner(result, self.drive.session.loader, names))
-        self._show(result, found)
+            findings = with_reasons(findings, result, Questioner(result, self.drive.session.loader, names))
+        self._show(result, findings)
         self._reached = max(self._reached, frame.stamp)
         if result.tracks is not None:
             bare = np.zeros((len(result.tracks), 0, 3), np.float32)
             self._tracks[frame.index] = replace(result.tracks, trail=bare)
         self._objects[frame.index] = result.objects
-        self.entries.add(found)
+        self.entries.add(findings)
         self.entries.add_anomalies(frame.index, frame.stamp, self._onsets.of(result.anomalies))
         self.done += 1
         self.tell()
@@ -220,32 +223,39 @@ class Bench(Closing):
         """Wait until no question is being answered."""
         self._quiet.wait()
 
-    def _show(self, result: FrameResult, found: Sequence[Find]) -> None:
+    def _show(self, result: FrameResult, findings: Sequence[Finding]) -> None:
         frame = result.frame
-        self._draw(self._logger, result, found, tried=False)
+        self._draw(self._logger, result, findings, tried=False)
         if self.opening is None:
-            self._ahead, self._ahead_knows = (frame.index, frame.stamp, frame.received), self._logger.known
-        elif frame.stamp < self._ahead[1]:
-            self._logger.clear_at(*self._ahead, self._logger.known - self._ahead_knows)
-            self._ahead_knows = self._logger.known
-        entry = (frame.stamp, frame.index)
-        place = bisect.bisect_left(self._stamps, entry)
-        if self._stamps[place : place + 1] != [entry]:
-            self._stamps.insert(place, entry)
+            self._first_times = (frame.index, frame.stamp, frame.received)
+            self._first_entities = self._logger.known
+        elif frame.stamp < self._first_times[1]:
+            self._logger.clear_at(*self._first_times, self._logger.known - self._first_entities)
+            self._first_entities = self._logger.known
+        key = (frame.stamp, frame.index)
+        index = bisect.bisect_left(self._stamps, key)
+        if self._stamps[index : index + 1] != [key]:
+            self._stamps.insert(index, key)
         self._rows[frame.stamp] = len(self.film)
-        self.film.add(self._film_main.read())
+        self.film.add(self._main_stream.read())
         if self.opening is None:
             self.opening = frame.stamp
             self.tell()
 
     def _draw(
-        self, logger: Logger, result: FrameResult, found: Sequence[Find], *, tried: bool, cloud: bool = False
+        self,
+        logger: Logger,
+        result: FrameResult,
+        findings: Sequence[Finding],
+        *,
+        tried: bool,
+        cloud: bool = False,
     ) -> None:
-        layers: list[Layer] = []
-        logger.log(result, beside=lambda: layers.append(log_layer(logger, result, found)), cloud=cloud)
+        layers: list[FindingRows] = []
+        logger.log(result, beside=lambda: layers.append(log_layer(logger, result, findings)), cloud=cloud)
         self._layers[result.frame.index, tried] = layers[0]
 
-    def draw_tried(self, logger: Logger, result: FrameResult, found: Sequence[Find]) -> None:
+    def draw_tried(self, logger: Logger, result: FrameResult, findings: Sequence[Finding]) -> None:
         """Log a frame with other values beside the result of the run."""
         logger.refresh(self._logger.results)
         # The colours of the cloud show ground and obstacles. A frame that was recoloured once is
@@ -253,12 +263,12 @@ class Bench(Closing):
         config, opened, number = result.config, self.drive.config, result.frame.index
         if (config.voxel, config.ground) != (opened.voxel, opened.ground):
             self._recoloured.add(number)
-        self._draw(logger, result, found, tried=True, cloud=number in self._recoloured)
+        self._draw(logger, result, findings, tried=True, cloud=number in self._recoloured)
 
     def end(self) -> None:
         """Record the last scalars of the run."""
         self._logger.flush()
-        self.film.add(self._film_main.read())
+        self.film.add(self._main_stream.read())
 
     def tell(self) -> None:
         """Notify all listeners."""
@@ -285,17 +295,17 @@ class Bench(Closing):
         stamps = list(self._stamps)
         if not stamps:
             raise UserError("no frame has been run yet")
-        place = bisect.bisect_right(stamps, (stamp + entities.SLACK, 2**62)) - 1
-        at, number = stamps[max(place, 0)]
+        index = bisect.bisect_right(stamps, (stamp + entities.SLACK, 2**62)) - 1
+        at, number = stamps[max(index, 0)]
         if self.over or stamp <= self._reached or abs(stamp - at) <= entities.SLACK:
             return number
-        return self._sought(stamp, number)
+        return self._find_frame(stamp, number)
 
-    def _sought(self, stamp: int, near: int) -> int:
+    def _find_frame(self, stamp: int, start: int) -> int:
         """Return the last frame that is not later. The search starts at the estimate from the log times."""
         with self._looking:
-            scans, frame = self.drive.frames.scans, self.look(near).frame
-            number = int(np.abs(scans - (stamp + int(scans[near]) - frame.stamp)).argmin())
+            scans, frame = self.drive.frames.scans, self.look(start).frame
+            number = int(np.abs(scans - (stamp + int(scans[start]) - frame.stamp)).argmin())
             while number > 0 and self._stamp_of(number) > stamp + entities.SLACK:
                 number -= 1
             while number + 1 < len(scans) and self._stamp_of(number + 1) <= stamp + entities.SLACK:
@@ -309,8 +319,8 @@ class Bench(Closing):
 
     def film_row(self, stamp: int) -> int | None:
         """Return the row in ``film`` of the frame that a viewer shows at a stamp."""
-        place = bisect.bisect_right(self._stamps, (stamp + entities.SLACK, 2**62)) - 1
-        return self._rows.get(self._stamps[place][0]) if place >= 0 else None
+        index = bisect.bisect_right(self._stamps, (stamp + entities.SLACK, 2**62)) - 1
+        return self._rows.get(self._stamps[index][0]) if index >= 0 else None
 
     def truth(self, frame: Frame) -> Truth | None:
         """Return the ground truth of a frame, if there is any."""
@@ -334,8 +344,8 @@ class Bench(Closing):
         if key not in self._results:
             config = revised(self.drive.config, settings) if settings else self.drive.config
             check_same_frames({"the drive": self.drive.config, "what is tried": config})
-            known = next((r.frame for (n, _), r in self._results.items() if n == number), None)
-            frame = known if known is not None else self.drive.raw(number)
+            known_frames = [result.frame for (n, _), result in self._results.items() if n == number]
+            frame = known_frames[0] if known_frames else self.drive.raw(number)
             self._results[key] = describe(self._variants.perceive(frame, config))
             while len(self._results) > KEPT:
                 self._results.popitem(last=False)
@@ -351,7 +361,7 @@ class Bench(Closing):
             return rows[instance].pick
         return pick(self.look(number, settings), self._tracks.get(number), path, instance, position)
 
-    def ask(self, number: int, settings: Settings, what: Pick) -> tuple[Answer, list[Answer]]:
+    def ask(self, number: int, settings: Settings, target: Pick) -> tuple[Answer, list[Answer]]:
         """Explain an object: why was it reported or not? The answer is marked in every view.
 
         Returns:
@@ -361,35 +371,35 @@ class Bench(Closing):
             UserError: there is no such object in the frame.
         """
         questioner = self._questioner(self.look(number, settings))
-        wanted = selection(what)
-        there = questioner.candidates(wanted) if what.is_place else []
-        found = there or questioner.ask(wanted)
-        if not found:
-            raise UserError(f"there is nothing to say about {what}")
-        answer = found[0]
-        if not there and (around := surroundings(what, answer)) is not None:
-            there = questioner.candidates(around)
-        beside = [other for other in there if other.subject.key != answer.subject.key]
+        selected = selection(target)
+        candidates = questioner.candidates(selected) if target.is_place else []
+        answers = candidates or questioner.ask(selected)
+        if not answers:
+            raise UserError(f"there is nothing to say about {target}")
+        answer = answers[0]
+        if not candidates and (nearby := surroundings(target, answer)) is not None:
+            candidates = questioner.candidates(nearby)
+        others = [other for other in candidates if other.subject.key != answer.subject.key]
         self._mark(questioner.traces.result, answer)
-        self._keep(number, settings, what, answer)
-        return answer, beside
+        self._keep(number, settings, target, answer)
+        return answer, others
 
-    def hints(self, number: int, settings: Settings, what: Pick) -> Answer:
+    def hints(self, number: int, settings: Settings, target: Pick) -> Answer:
         """Answer with hints: parameter changes that would change the verdict. This takes longer than ``ask``.
 
         Raises:
             UserError: as ``ask``.
         """
         questioner = self._questioner(self.look(number, settings))
-        wanted = selection(what)
-        there = questioner.candidates(wanted) if what.is_place else []
-        answer = questioner.with_hints((there or questioner.ask(wanted))[0])
-        self._keep(number, settings, what, answer)
+        selected = selection(target)
+        candidates = questioner.candidates(selected) if target.is_place else []
+        answer = questioner.with_hints((candidates or questioner.ask(selected))[0])
+        self._keep(number, settings, target, answer)
         return answer
 
-    def _keep(self, number: int, settings: Settings, what: Pick, answer: Answer) -> None:
+    def _keep(self, number: int, settings: Settings, target: Pick, answer: Answer) -> None:
         """Keep an answer for reports. One with hints replaces one without."""
-        key = number, settings, str(what)
+        key = number, settings, str(target)
         if answer.hints or key not in self._answers:
             self._answers[key] = self.look(number).frame.received, answer
         self._answers.move_to_end(key)
@@ -398,20 +408,24 @@ class Bench(Closing):
 
     def asked_within(self, low: int, high: int, settings: Settings = ()) -> list[Answer]:
         """Return the answers about frames in a range of log times, with these settings, newest first."""
-        kept = reversed(self._answers.items())
-        return [answer for (_, own, _), (at, answer) in kept if own == settings and low <= at <= high]
+        newest_first = reversed(self._answers.items())
+        return [
+            answer
+            for (_, asked_settings, _), (received, answer) in newest_first
+            if asked_settings == settings and low <= received <= high
+        ]
 
     # --- notes ---------------------------------------------------------------------------------
 
-    def note(self, number: int, text: str, what: Pick | None) -> None:
+    def note(self, number: int, text: str, target: Pick | None) -> None:
         """Save a note about a frame, or about an object in it.
 
         Raises:
             UserError: the note cannot be written, or there is no such object.
         """
         frame = self.look(number).frame
-        about = "" if what is None else self.ask(number, (), what)[0].subject.name
-        pick = "" if what is None else str(what)
+        about = "" if target is None else self.ask(number, (), target)[0].subject.name
+        pick = "" if target is None else str(target)
         self.notes.add(Note(frame.stamp, frame.received, text.strip(), about.removeprefix("the "), pick))
         self.notes_changed += 1
         self.tell()
@@ -430,14 +444,14 @@ class Bench(Closing):
 
     def _questioner(self, result: FrameResult) -> Questioner:
         """Return the questioner of a result. Further questions about it reuse the same one."""
-        if self._asked is None or self._asked.traces.result is not result:
+        if self._last_questioner is None or self._last_questioner.traces.result is not result:
             session = self.drive.session
-            self._asked = Questioner(result, session.loader, session.stages.class_names)
-        return self._asked
+            self._last_questioner = Questioner(result, session.loader, session.stages.class_names)
+        return self._last_questioner
 
     def _mark(self, result: FrameResult, answer: Answer) -> None:
         mark_answers(self._desk_logger, result.frame, [answer], result.config.bev)
-        self.desk.add(self._film_desk.read())
+        self.desk.add(self._desk_stream.read())
 
     # --- other values --------------------------------------------------------------------------
 
@@ -449,13 +463,13 @@ class Bench(Closing):
         """
         return revised(self.drive.config, settings)
 
-    def attempt(self, number: int, settings: Settings, what: Pick | None = None) -> dict[str, Any]:
+    def attempt(self, number: int, settings: Settings, target: Pick | None = None) -> dict[str, Any]:
         """Log a frame with other values, and return their effects.
 
         Args:
             number: number of the frame.
             settings: the other values.
-            what: the object that the values are tried for. Its effect comes first.
+            target: the object that the values are tried for. Its effect comes first.
 
         Raises:
             UserError: as ``look``.
@@ -464,22 +478,22 @@ class Bench(Closing):
         truth = self.truth(after.frame)
         self.draw_tried(self._tried_logger, after, finds(after, truth))
         self._tried_logger.flush()
-        self.desk.add(self._film_desk.read())
-        asked = what.row if what is not None and what.kind == "truth" else -1
-        return attempt(before, after, truth, asked)
+        self.desk.add(self._desk_stream.read())
+        truth_row = target.row if target is not None and target.kind == "truth" else -1
+        return attempt(before, after, truth, truth_row)
 
 
-class _Filming(Observer[FrameResult]):
+class _RunObserver(Observer[FrameResult]):
     """Observer of the background run. It passes each frame to the workbench session."""
 
-    def __init__(self, bench: Bench) -> None:
-        self._bench = bench
+    def __init__(self, workbench: Bench) -> None:
+        self._workbench = workbench
 
     def begin(self, items: Items[object]) -> None:
         pass
 
     def see(self, result: FrameResult) -> None:
-        self._bench.see(result)
+        self._workbench.see(result)
 
     def end(self) -> None:
-        self._bench.end()
+        self._workbench.end()

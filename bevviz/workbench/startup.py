@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from bevviz.workbench.session import Bench
 
 
-class Opening(Closing):
+class SessionStartup(Closing):
     """Start-up that makes the workbench session in a thread of its own.
 
     Args:
@@ -23,7 +23,7 @@ class Opening(Closing):
 
     def __init__(self, make: Callable[[], Bench], failed: Callable[[], None]) -> None:
         self._make, self._failed = make, failed
-        self._bench: Bench | None = None
+        self._workbench: Bench | None = None
         self._over = threading.Event()
         self._closed = False
         self._lock = threading.Lock()
@@ -36,29 +36,29 @@ class Opening(Closing):
 
     def _open(self) -> None:
         try:
-            bench = self._make()
+            workbench = self._make()
         except BaseException as error:
             self.error = error
             self._over.set()
             self._failed()
             return
         with self._lock:
-            self._bench = bench
+            self._workbench = workbench
             if self._closed:
-                bench.close()
+                workbench.close()
                 return
-            bench.start()
+            workbench.start()
         self._over.set()
 
-    async def bench(self) -> Bench | None:
+    async def session(self) -> Bench | None:
         """Wait until the session is made, and return it. None: it could not be made."""
         while not self._over.is_set():
             await asyncio.sleep(0.02)
-        return self._bench
+        return self._workbench
 
     def close(self) -> None:
         """Close the session, now or as soon as it is made."""
         with self._lock:
             self._closed = True
-            if self._bench is not None:
-                self._bench.close()
+            if self._workbench is not None:
+                self._workbench.close()

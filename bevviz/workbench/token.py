@@ -22,7 +22,7 @@ def kept_token(port: int, drive: str) -> Iterator[str]:
         drive: paths of the drive.
     """
     path = _folder() / f"workbench-{port}.json"
-    token = _left(path, drive) or secrets.token_urlsafe(16)
+    token = _leftover_token(path, drive) or secrets.token_urlsafe(16)
     with suppress(OSError):
         path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
         path.unlink(missing_ok=True)
@@ -41,13 +41,13 @@ def _folder() -> Path:
     return Path(runtime or Path.home() / ".cache") / "bevviz"
 
 
-def _left(path: Path, drive: str) -> str:
+def _leftover_token(path: Path, drive: str) -> str:
     """Return the token that a killed server left. Empty: there is none that can be used."""
     try:
-        about = path.lstat()
-        if about.st_uid != os.getuid() or about.st_mode & 0o077:
+        status = path.lstat()
+        if status.st_uid != os.getuid() or status.st_mode & 0o077:
             return ""
-        kept = json.loads(path.read_text())
-        return str(kept["token"]) if kept["drive"] == drive and len(kept["token"]) >= 16 else ""
+        content = json.loads(path.read_text())
+        return str(content["token"]) if content["drive"] == drive and len(content["token"]) >= 16 else ""
     except (OSError, ValueError, KeyError, TypeError):
         return ""

@@ -26,7 +26,7 @@ from bevviz.why.frame_index import truth_subjects
 from bevviz.why.pick import Pick
 from bevviz.why.side_effects import Effects, effects
 from bevviz.why.subject import Subject
-from bevviz.workbench.findings import Find, finds, fixed_place
+from bevviz.workbench.findings import Finding, finds, fixed_position
 
 if TYPE_CHECKING:
     from bevviz.workbench.session import Bench, Settings
@@ -84,17 +84,17 @@ class Trial:
         }
 
 
-class Trials:
+class TrialRunner:
     """Runner of trials over the drive of a workbench session, one at a time.
 
     Args:
-        bench: the workbench session.
-        news: called when the state of the trial has changed.
+        workbench: the workbench session.
+        on_change: called when the state of the trial has changed.
     """
 
-    def __init__(self, bench: Bench, news: Callable[[], None]) -> None:
-        self._bench, self._news = bench, news
-        self._recording, self.film = bench.stream()
+    def __init__(self, workbench: Bench, on_change: Callable[[], None]) -> None:
+        self._workbench, self._on_change = workbench, on_change
+        self._recording, self.film = workbench.stream()
         self._thread: threading.Thread | None = None
         self.trial: Trial | None = None
 
@@ -104,18 +104,18 @@ class Trials:
         Raises:
             UserError: nothing is changed, a parameter is unknown, or a value is wrong.
         """
-        bench = self._bench
-        config = revised(bench.drive.config, settings)
-        check_same_frames({"the drive": bench.drive.config, "what is tried": config})
-        if not changes(bench.drive.config, config):
+        workbench = self._workbench
+        config = revised(workbench.drive.config, settings)
+        check_same_frames({"the drive": workbench.drive.config, "what is tried": config})
+        if not changes(workbench.drive.config, config):
             raise UserError("nothing is changed: press a hint, or change a parameter first")
-        session = Session(config, loader=bench.drive.session.loader)
+        session = Session(config, loader=workbench.drive.session.loader)
         self.end()
-        trial = self.trial = Trial(settings, bench.again.total, known=bench.truth_of is not None)
-        bench.entries.replace(DIFFERENCES)
+        trial = self.trial = Trial(settings, workbench.again.total, known=workbench.truth_of is not None)
+        workbench.entries.replace(DIFFERENCES)
         self._thread = threading.Thread(target=self._run, args=(trial, session), name="trial", daemon=True)
         self._thread.start()
-        self._news()
+        self._on_change()
 
     def end(self) -> None:
         """Cancel the running trial. Its results until then stay."""
@@ -125,45 +125,54 @@ class Trials:
             self._thread.join()
 
     def _run(self, trial: Trial, session: Session) -> None:
-        bench = self._bench
+        workbench = self._workbench
         try:
-            while not bench.over and not trial.stop.wait(0.1):
+            while not workbench.over and not trial.stop.wait(0.1):
                 pass  # The results of the first run are needed for comparison.
             trial.state = "running"
-            logger = tried_logger(self._recording, session, bench)
-            run(bench.again, session, [_Trying(bench, trial, logger, self._show)], stop=trial.stop)
+            logger = tried_logger(self._recording, session, workbench)
+            run(
+                workbench.again,
+                session,
+                [_TrialObserver(workbench, trial, logger, self._show)],
+                stop=trial.stop,
+            )
             trial.state = "cancelled" if trial.stop.is_set() else "over"
         except Exception as error:
             trial.state = "failed"
             trial.error = str(error) if isinstance(error, UserError) else first_line(error)
-        self._news()
+        self._on_change()
 
     def _show(self) -> None:
-        self._bench.film.add(self.film.read())
-        self._news()
+        self._workbench.film.add(self.film.read())
+        self._on_change()
 
 
-class _Trying(Observer[FrameResult]):
+class _TrialObserver(Observer[FrameResult]):
     """Observer of a trial. It logs each frame with the other values and counts the changes."""
 
-    def __init__(self, bench: Bench, trial: Trial, logger: Logger, show: Callable[[], None]) -> None:
-        self._bench, self._trial, self._logger, self._show = bench, trial, logger, show
+    def __init__(self, workbench: Bench, trial: Trial, logger: Logger, show: Callable[[], None]) -> None:
+        self._workbench, self._trial, self._logger, self._show = workbench, trial, logger, show
 
     def begin(self, items: Items[object]) -> None:
         pass
 
     def see(self, result: FrameResult) -> None:
-        bench, trial, frame = self._bench, self._trial, result.frame
-        before, truth = bench.objects(frame.index), bench.truth(frame)
-        bench.draw_tried(self._logger, result, finds(result, truth))
-        subjects = truth_subjects(frame, bench.drive.session.stages.class_names)
-        found = effects(before, result.objects, subjects)
-        entries = list(difference_entries(result, found, subjects, before))
-        trial.counts.update(find.what for find, _ in entries)
-        trial.counts["changed"] += found.changed
+        workbench, trial, frame = self._workbench, self._trial, result.frame
+        before, truth = workbench.objects(frame.index), workbench.truth(frame)
+        workbench.draw_tried(self._logger, result, finds(result, truth))
+        subjects = truth_subjects(frame, workbench.drive.session.stages.class_names)
+        side_effects = effects(before, result.objects, subjects)
+        findings = list(difference_findings(result, side_effects, subjects, before))
+        trial.counts.update(finding.what for finding, _ in findings)
+        trial.counts["changed"] += side_effects.changed
         for tried in (False, True):
-            bench.entries.add((find for find, side in entries if side == tried), tried=tried)
-        good, bad = (found.good, found.harm) if found.known else (len(found.more), len(found.gone))
+            workbench.entries.add((finding for finding, side in findings if side == tried), tried=tried)
+        good, bad = (
+            (side_effects.good, side_effects.harm)
+            if side_effects.known
+            else (len(side_effects.more), len(side_effects.gone))
+        )
         trial.strip.append((frame.stamp, good, bad))
         if truth is not None:
             for score, objects in zip(trial.scores, (before, result.objects), strict=True):
@@ -171,95 +180,107 @@ class _Trying(Observer[FrameResult]):
                     score.add(objects, truth)
         trial.done += 1
         self._show()
-        bench.wait_for_quiet()
+        workbench.wait_for_quiet()
 
     def end(self) -> None:
         self._logger.flush()
         self._show()
 
 
-def tried_logger(recording: Any, session: Session, bench: Bench) -> Logger:
+def tried_logger(recording: Any, session: Session, workbench: Bench) -> Logger:
     """Return a logger that writes tried results on a timeline of their own, beside those of the run."""
     return Logger(
-        recording, session.config, bench.drive.scene, wait=WAIT, stamps=(entities.TRIED,), inputs=False
+        recording, session.config, workbench.drive.scene, wait=WAIT, stamps=(entities.TRIED,), inputs=False
     )
 
 
-def difference_entries(
-    result: FrameResult, found: Effects, truth: Sequence[Subject], before: Objects | None
-) -> Iterator[tuple[Find, bool]]:
+def difference_findings(
+    result: FrameResult, side_effects: Effects, truth: Sequence[Subject], before: Objects | None
+) -> Iterator[tuple[Finding, bool]]:
     """Yield the findings that other values cause in a frame, and whether the tried side shows them."""
-    when, pose = (result.frame.index, result.frame.stamp), result.frame.pose
+    frame_ids, pose = (result.frame.index, result.frame.stamp), result.frame.pose
 
-    def find(what: str, name: str, center: Any, pick: Pick) -> Find:
-        away = float(np.hypot(*center[:2]))
-        return Find(*when, what, name.rsplit(" at ", 1)[0], away, pick, place=fixed_place(pose, center))
+    def make_finding(kind: str, name: str, center: Any, pick: Pick) -> Finding:
+        distance = float(np.hypot(*center[:2]))
+        return Finding(
+            *frame_ids, kind, name.rsplit(" at ", 1)[0], distance, pick, position=fixed_position(pose, center)
+        )
 
     after = result.objects
-    for effect in found.made:
+    for effect in side_effects.made:
         if effect.truth >= 0 and (box := truth[effect.truth].box) is not None:
-            yield find("fixed", effect.name, box.center[0], Pick("truth", effect.truth)), True
-    for effect in found.more:
+            yield make_finding("fixed", effect.name, box.center[0], Pick("truth", effect.truth)), True
+    for effect in side_effects.more:
         assert after is not None
-        if not found.known or effect.truth < 0:
-            what = "new false" if found.known else "new"
+        if not side_effects.known or effect.truth < 0:
+            kind = "new false" if side_effects.known else "new"
             yield (
-                find(what, effect.name, after.boxes.center[effect.after], Pick("object", effect.after)),
+                make_finding(
+                    kind, effect.name, after.boxes.center[effect.after], Pick("object", effect.after)
+                ),
                 True,
             )
-    for effect in found.gone:
+    for effect in side_effects.gone:
         assert before is not None
         center = before.boxes.center[effect.before]
         if effect.missed:
-            yield find("broken", effect.name, center, Pick("truth", effect.truth)), True
-        elif not found.known or effect.truth < 0:
-            what = "false gone" if found.known else "gone"
-            yield find(what, effect.name, center, Pick("object", effect.before)), False
+            yield make_finding("broken", effect.name, center, Pick("truth", effect.truth)), True
+        elif not side_effects.known or effect.truth < 0:
+            kind = "false gone" if side_effects.known else "gone"
+            yield make_finding(kind, effect.name, center, Pick("object", effect.before)), False
 
 
-def attempt(before: FrameResult, after: FrameResult, truth: Truth | None, asked: int = -1) -> dict[str, Any]:
+def attempt(
+    before: FrameResult, after: FrameResult, truth: Truth | None, truth_row: int = -1
+) -> dict[str, Any]:
     """Return the effects of other values on one frame, for the page.
 
     Args:
         before: result as opened.
         after: result with the other values.
         truth: ground truth of the frame.
-        asked: row of the ground truth object that was asked about. Its effect comes first. -1: none.
+        truth_row: row of the ground truth object that was asked about. Its effect comes first. -1: none.
     """
     subjects = truth_subjects(after.frame, _names(before))
-    found = effects(before.objects, after.objects, subjects, asked)
-    told: dict[str, Any] = {
-        "changes": {k: str(c) for k, c in changes(before.config, after.config).items()},
-        "effects": effects_dict(found),
+    side_effects = effects(before.objects, after.objects, subjects, truth_row)
+    message: dict[str, Any] = {
+        "changes": {key: str(change) for key, change in changes(before.config, after.config).items()},
+        "effects": effects_dict(side_effects),
         "opinions": _opinions(before, after),
         "failures": [f"{failure.stage}: {failure.reason}" for failure in after.failures],
     }
     if truth is not None:
-        told["f1"] = [_f1(result, truth) for result in (before, after)]
-    return told
+        message["f1"] = [_f1(result, truth) for result in (before, after)]
+    return message
 
 
 def _opinions(before: FrameResult, after: FrameResult) -> dict[str, list[int | None]]:
     """Return the counts of opinions that changed, before and after. None: the objects are our own."""
-    was, now = opinions_in(before), opinions_in(after)
-    counts = {what: [was.get(what), now.get(what)] for what in OPINIONS}
-    return {what.replace("_", " "): [a, b] for what, (a, b) in counts.items() if (a or 0) != (b or 0)}
+    counts_before, counts_after = opinions_in(before), opinions_in(after)
+    counts = {opinion: [counts_before.get(opinion), counts_after.get(opinion)] for opinion in OPINIONS}
+    return {
+        opinion.replace("_", " "): [old, new]
+        for opinion, (old, new) in counts.items()
+        if (old or 0) != (new or 0)
+    }
 
 
-def effects_dict(found: Effects) -> dict[str, Any]:
+def effects_dict(side_effects: Effects) -> dict[str, Any]:
     """Return effects as JSON for the page, in the same form as those of a hint."""
     return {
-        "fixed": list(found.fixed),
-        "added": list(found.added),
-        "false": list(found.false),
-        "lost": list(found.lost),
-        "right": list(found.right),
-        "changed": found.changed,
+        "fixed": list(side_effects.fixed),
+        "added": list(side_effects.added),
+        "false": list(side_effects.false),
+        "lost": list(side_effects.lost),
+        "right": list(side_effects.right),
+        "changed": side_effects.changed,
     }
 
 
 def _names(result: FrameResult) -> list[str]:
-    return [name for c in result.cameras if c.detections is not None for name in c.detections.names]
+    return [
+        name for camera in result.cameras if camera.detections is not None for name in camera.detections.names
+    ]
 
 
 def _f1(result: FrameResult, truth: Truth) -> float | None:

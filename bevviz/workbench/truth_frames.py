@@ -54,8 +54,8 @@ class Labelled:
 
     def frame(self, number: int) -> Frame | None:
         """Return a frame with its ground truth."""
-        found = self._frames.frame(number)
-        return None if found is None else self._labelled(found)
+        frame = self._frames.frame(number)
+        return None if frame is None else self._labelled(frame)
 
     def close(self) -> None:
         """Close the source."""
