@@ -74,12 +74,12 @@ def choose_topics(recording: Recording, roles: Roles, patterns: Sequence[str] | 
     Raises:
         UserError: a pattern fits no topic.
     """
-    there = [topic.name for topic in recording.topics]
+    names = [topic.name for topic in recording.topics]
     if patterns is None:
-        return there
+        return names
     fits(recording, patterns, "--topics")
     needed = {*_read(roles), *(metadata_of(topic.name) for topic in recording.topics if topic.scans)}
-    return [n for n in there if n in needed or any(fnmatchcase(n, pattern) for pattern in patterns)]
+    return [n for n in names if n in needed or any(fnmatchcase(n, pattern) for pattern in patterns)]
 
 
 def fits(recording: Recording, patterns: Sequence[str], option: str) -> None:
@@ -88,10 +88,10 @@ def fits(recording: Recording, patterns: Sequence[str], option: str) -> None:
     Raises:
         UserError: a pattern fits none.
     """
-    there = [topic.name for topic in recording.topics]
+    names = [topic.name for topic in recording.topics]
     for pattern in patterns:
-        if not any(fnmatchcase(name, pattern) for name in there):
-            raise UserError(f"{option} {pattern}: no topic fits among {', '.join(there)}")
+        if not any(fnmatchcase(name, pattern) for name in names):
+            raise UserError(f"{option} {pattern}: no topic fits among {', '.join(names)}")
 
 
 def _read(roles: Roles) -> list[str]:
@@ -160,17 +160,19 @@ def cut(
                 counts[message.topic] += 1
 
         videos = {topic.name for topic in recording.topics if topic.kind == "CompressedVideo"}
-        silent = [_last(recording, name, low, high) for name in chosen if name not in videos]
-        early = [m for m in silent if m is not None and m.received < low]
-        late = [m for m in silent if m is not None and m.received >= high]
-        early += recording.messages(static, None, low)
-        early += [m for name in chosen if name in videos for m in _needed(recording, name, low)]
-        for message in sorted(early, key=lambda m: m.received):
+        valid = [_last(recording, name, low, high) for name in chosen if name not in videos]
+        messages_before = [message for message in valid if message is not None and message.received < low]
+        messages_after = [message for message in valid if message is not None and message.received >= high]
+        messages_before += recording.messages(static, None, low)
+        messages_before += [
+            message for name in chosen if name in videos for message in _needed(recording, name, low)
+        ]
+        for message in sorted(messages_before, key=lambda message: message.received):
             put(message)
         for message in recording.messages(topics, low, high):
             put(message)
-        late += recording.messages(static, high)
-        for message in sorted(late, key=lambda m: m.received):
+        messages_after += recording.messages(static, high)
+        for message in sorted(messages_after, key=lambda message: message.received):
             put(message)
     return Cut(counts, tuple(damage.sentences))
 
@@ -178,7 +180,7 @@ def cut(
 def _needed(recording: Recording, topic: str, low: int) -> list[RawMessage]:
     """Return the video messages before the window that its first image is decoded from."""
     times = sorted({packet.received for packet in recording.packets(topic, low - 1)})
-    return [m for time in times for m in recording.messages([topic], time, time + 1)]
+    return [message for time in times for message in recording.messages([topic], time, time + 1)]
 
 
 def _last(recording: Recording, topic: str, low: int, high: int) -> RawMessage | None:

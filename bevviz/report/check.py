@@ -136,22 +136,25 @@ def check(rrd: Path, *, model: Path | None = None, settings: Sequence[str] = ())
     if not bag.is_file():
         raise UserError(f"{bag}: the bag of the report is not there; it has the name of the recording")
     with closing(Scratch()) as scratch:
-        then, now = _configs(rrd, stored, model, settings, scratch.new())
+        stored_config, current_config = _configs(rrd, stored, model, settings, scratch.new())
         result = CheckResult(redacted=info.redacted, sealed=sealed, sound=file_hash(bag) == info.bag_sha256)
         with readable(rrd, UNREADABLE):
             frames = stored.frames.values()
             detections = {key: value for stages in frames for key, value in detections_of(stages).items()}
-        session = Session(now, replay(detections) if info.redacted else None)
+        session = Session(current_config, replay(detections) if info.redacted else None)
         network = session.stages.provider
-        result.changed = [*_changed_input(info, bag, then, now), *_changed_provenance(info, now, network)]
+        result.changed = [
+            *_changed_input(info, bag, stored_config, current_config),
+            *_changed_provenance(info, current_config, network),
+        ]
         comparer = _Comparer(stored, result)
         try:
-            with open_window([bag], now, info.low, info.high) as source:
+            with open_window([bag], current_config, info.low, info.high) as source:
                 if run(source, session, [comparer, Progress("check")], stop=comparer.complete).interrupted:
                     raise KeyboardInterrupt
         except UserError as error:
             raise error if result.sound else UserError(f"{error}; {_other(bag)}") from None
-    for number in sorted(comparer.left):
+    for number in sorted(comparer.remaining):
         result.add(number, DigestDifference("cloud", "this run makes no such frame", inf))
     return result
 
@@ -160,15 +163,15 @@ class _Comparer(Observer[FrameResult]):
     """Observer that compares each frame with the stored one."""
 
     def __init__(self, stored: StoredReport, result: CheckResult) -> None:
-        self.left = dict(stored.frames)
+        self.remaining = dict(stored.frames)
         # An interrupted report has no results for the rest of its bag: the run ends early.
         self.complete = Event()
         self._interrupted, self._result = stored.info.interrupted, result
 
     def see(self, result: FrameResult) -> None:
         number = result.frame.index
-        self._result.add(number, compare(self.left.pop(number, ()), digest(result)))
-        if self._interrupted and not self.left:
+        self._result.add(number, compare(self.remaining.pop(number, ()), digest(result)))
+        if self._interrupted and not self.remaining:
             self.complete.set()
 
 
@@ -202,8 +205,8 @@ def read(rrd: Path) -> StoredReport:
 
 def _column(chunk: Any, name: str) -> list[Any]:
     """Return a column of a chunk as a list."""
-    found: list[Any] = chunk.to_record_batch().column(name).to_pylist()
-    return found
+    values: list[Any] = chunk.to_record_batch().column(name).to_pylist()
+    return values
 
 
 def _configs(
@@ -214,26 +217,26 @@ def _configs(
     names.write_bytes(info.names.encode())
     recorded = Layer(str(rrd), flat_yaml(stored.config, str(rrd)))
     # The user's own functions run only if the user names them again.
-    same = [text for text in settings if _is_in(recorded, text)]
-    then = load(settings=same, layers=[recorded])
-    needed = model_path(then)
-    here = [f"detector.names={names}"] if info.names else []
+    repeated_settings = [text for text in settings if _is_in(recorded, text)]
+    stored_config = load(settings=repeated_settings, layers=[recorded])
+    model_file = model_path(stored_config)
+    local_settings = [f"detector.names={names}"] if info.names else []
     if model is not None:
-        here.append(f"detector.model={model}")
-    elif needed is not None and needed != DEMO_MODEL and not info.redacted:
-        beside = rrd.with_name(needed.name)
-        if not beside.exists():
-            used = info.provenance.dependencies.get("detector.model", then.detector.model)
+        local_settings.append(f"detector.model={model}")
+    elif model_file is not None and model_file != DEMO_MODEL and not info.redacted:
+        path = rrd.with_name(model_file.name)
+        if not path.exists():
+            used = info.provenance.dependencies.get("detector.model", stored_config.detector.model)
             raise UserError(f"{rrd}: it was made with {used}, which is not beside it: give --model FILE")
-        here.append(f"detector.model={beside}")
-    for key, name in object_files(then).items():
+        local_settings.append(f"detector.model={path}")
+    for key, name in object_files(stored_config).items():
         if any(text.partition("=")[0] in (key, key.replace(".params", "")) for text in settings):
             continue
-        beside = rrd.with_name(name)
-        if not beside.exists():
+        path = rrd.with_name(name)
+        if not path.exists():
             raise UserError(f"{rrd}: it was made with {name}, which is not beside it: add --set {key}=FILE")
-        here.append(f"{key}={beside}")
-    return then, load(settings=[*here, *settings], layers=[recorded])
+        local_settings.append(f"{key}={path}")
+    return stored_config, load(settings=[*local_settings, *settings], layers=[recorded])
 
 
 def _is_in(layer: Layer, setting: str) -> bool:
@@ -247,20 +250,28 @@ def _other(bag: Path) -> str:
     return f"{bag.name} is not the file that the report was made with (SHA-256)"
 
 
-def _changed_input(info: ReportInfo, bag: Path, then: Config, now: Config) -> Iterator[str]:
+def _changed_input(
+    info: ReportInfo, bag: Path, stored_config: Config, current_config: Config
+) -> Iterator[str]:
     """Yield the changes of the bag and of the configuration. Files that it names count as dependencies."""
     if file_hash(bag) != info.bag_sha256:
         yield _other(bag)
-    for key, change in changes(then, now).items():
-        if key not in ("detector.model", "detector.names", *object_files(then)):
+    for key, change in changes(stored_config, current_config).items():
+        if key not in ("detector.model", "detector.names", *object_files(stored_config)):
             yield f"{key} was {change.before}, is {change.after}"
 
 
-def _changed_provenance(info: ReportInfo, now: Config, network: str) -> Iterator[str]:
+def _changed_provenance(info: ReportInfo, current_config: Config, network: str) -> Iterator[str]:
     """Yield the changes of versions, machine and dependencies."""
-    then = info.provenance
+    stored = info.provenance
     if info.redacted:  # The network is not run. The report holds its detections.
-        left = {name: d for name, d in then.dependencies.items() if not name.startswith("detector.")}
-        then = replace(then, dependencies=left)
-        now = now.model_copy(update={"detector": now.detector.model_copy(update={"model": ""})})
-    return differences(then, provenance(now, network))
+        dependencies = {
+            name: dependency
+            for name, dependency in stored.dependencies.items()
+            if not name.startswith("detector.")
+        }
+        stored = replace(stored, dependencies=dependencies)
+        current_config = current_config.model_copy(
+            update={"detector": current_config.detector.model_copy(update={"model": ""})}
+        )
+    return differences(stored, provenance(current_config, network))

@@ -22,7 +22,7 @@ _FOLDERS = re.compile(r'(?<=File ").*?([^/\\"]+[/\\][^/\\"]+)(?=")')
 
 
 @dataclass(frozen=True, slots=True)
-class Asked:
+class AnswerText:
     """Answer to a question of the user: the verdict, and the decision of each stage."""
 
     verdict: str
@@ -37,7 +37,7 @@ class Facts:
     title: str
     note: str
     notes: Mapping[str, str]  # notes of the drive within the window, by time
-    asked: Sequence[Asked]
+    asked: Sequence[AnswerText]
     where: str  # the bag, its window and the frame
     start: int  # log time of the recording's start, from which seconds are counted
     config: str  # one sentence about preset and changes
@@ -54,9 +54,9 @@ class Facts:
         lines = [f"# {markdown(self.title)}", "", markdown(self.where), ""]
         lines += [f"> {markdown(line)}" for line in self.note.splitlines()]
         lines += [f"- {markdown(when)}: {markdown(text)}" for when, text in self.notes.items()]
-        for one in self.asked:
-            lines += ["", f"**{markdown(one.verdict)}**", ""]
-            lines += [f"- *{stage}*: {markdown(text)}" for stage, text in one.chain]
+        for answer in self.asked:
+            lines += ["", f"**{markdown(answer.verdict)}**", ""]
+            lines += [f"- *{stage}*: {markdown(text)}" for stage, text in answer.chain]
         for title, items in (("Files", self.files), ("Warnings", self.warnings), ("Hardware", self.hardware)):
             lines += ["", f"## {title}", "", *(f"- {markdown(item)}" for item in items)] if items else []
         for title, traceback in self.tracebacks.items():

@@ -60,24 +60,24 @@ def digest(result: FrameResult) -> tuple[StageDigest, ...]:
     return tuple(_stage(name, arrays) for name, arrays in _stages(result))
 
 
-def compare(then: tuple[StageDigest, ...], now: tuple[StageDigest, ...]) -> DigestDifference | None:
+def compare(stored: tuple[StageDigest, ...], current: tuple[StageDigest, ...]) -> DigestDifference | None:
     """Return the first stage that differs by more than rounding, else the largest rounding, else None.
 
     Numbers within ``ROUNDING`` of each other count as rounding if everything else is equal.
     """
     worst: DigestDifference | None = None
-    before, after = {s.name: s for s in then}, {s.name: s for s in now}
+    before, after = {stage.name: stage for stage in stored}, {stage.name: stage for stage in current}
     for name in dict.fromkeys([*before, *after]):
         if name not in after or name not in before:
-            there = "the report has" if name in before else "this run has"
-            return DigestDifference(name, f"only {there} results of it", float("inf"))
+            owner = "the report has" if name in before else "this run has"
+            return DigestDifference(name, f"only {owner} results of it", float("inf"))
         if before[name].fingerprint == after[name].fingerprint:
             continue
-        found = _difference(before[name], after[name])
-        if found.amount > ROUNDING:
-            return found
-        if worst is None or found.amount > worst.amount:
-            worst = found
+        difference = _difference(before[name], after[name])
+        if difference.amount > ROUNDING:
+            return difference
+        if worst is None or difference.amount > worst.amount:
+            worst = difference
     return worst
 
 
@@ -112,7 +112,7 @@ def unpack(lines: list[str], block: U8) -> tuple[StageDigest, ...]:
 def detections_of(stages: tuple[StageDigest, ...]) -> dict[tuple[str, int], Detections]:
     """Return the detections of the network, bit by bit, by camera and stamp of the image."""
     arrays = {stage.name: stage.whole for stage in stages}
-    found = {}
+    detections = {}
     for name, values in arrays.items():
         kind, _, camera = name.partition(" ")
         if kind == "detector" and values:
@@ -120,8 +120,8 @@ def detections_of(stages: tuple[StageDigest, ...]) -> dict[tuple[str, int], Dete
             masks = {key.removeprefix("masks."): boxes.pop(key) for key in values if key.startswith("masks.")}
             if masks:
                 boxes["masks"] = Masks(**masks)
-            found[camera, int(arrays[f"image {camera}"]["stamp"][0])] = Detections(**boxes)
-    return found
+            detections[camera, int(arrays[f"image {camera}"]["stamp"][0])] = Detections(**boxes)
+    return detections
 
 
 # --- stages ------------------------------------------------------------------------------------
@@ -134,8 +134,8 @@ def _stages(result: FrameResult) -> Iterator[tuple[str, Arrays]]:
     yield "fields", dict(sorted(frame.fields.items()))
     poses = {} if frame.world_from_points is None else {"world_from_points": frame.world_from_points}
     yield "transforms", poses
-    for found in result.cameras:
-        camera = found.camera
+    for camera_result in result.cameras:
+        camera = camera_result.camera
         if camera.image is not None:
             yield (
                 f"image {camera.name}",
@@ -144,79 +144,86 @@ def _stages(result: FrameResult) -> Iterator[tuple[str, Arrays]]:
                     "stamp": np.array([camera.image.stamp]),
                 },
             )
-        placed = {"camera_from_points": camera.camera_from_points}
+        calibration = {"camera_from_points": camera.camera_from_points}
         if camera.intrinsics is not None:
-            placed |= {"K": camera.intrinsics.K, "D": camera.intrinsics.D}
-        yield f"transforms {camera.name}", {k: v for k, v in placed.items() if v is not None}
+            calibration |= {"K": camera.intrinsics.K, "D": camera.intrinsics.D}
+        yield (
+            f"transforms {camera.name}",
+            {key: value for key, value in calibration.items() if value is not None},
+        )
     for name in ("voxels", "ground", "clusters"):
         yield name, dict(_arrays(getattr(result, name)))
-    for found in result.cameras:
-        for name, part in (("detector", found.detections), ("fusion", found.fusion)):
-            yield f"{name} {found.camera.name}", dict(_arrays(part))
+    for camera_result in result.cameras:
+        for name, stage_result in (("detector", camera_result.detections), ("fusion", camera_result.fusion)):
+            yield f"{name} {camera_result.camera.name}", dict(_arrays(stage_result))
     yield "objects", dict(_arrays(result.objects))
     if result.bev is not None:
         yield "bev", {"picture": result.bev.image, **result.bev.channels}
-    yield "failures", {"stage": np.array([f.stage for f in result.failures], np.str_)}
+    yield "failures", {"stage": np.array([failure.stage for failure in result.failures], np.str_)}
 
 
-def _arrays(part: Any, prefix: str = "") -> Iterator[tuple[str, NDArray[Any]]]:
+def _arrays(instance: Any, prefix: str = "") -> Iterator[tuple[str, NDArray[Any]]]:
     """Yield the arrays of a dataclass and of the dataclasses in it."""
-    if part is None:
+    if instance is None:
         return
-    for entry in fields(part):
-        value = getattr(part, entry.name)
+    for attribute in fields(instance):
+        value = getattr(instance, attribute.name)
         if isinstance(value, np.ndarray):
-            yield prefix + entry.name, value
+            yield prefix + attribute.name, value
         elif isinstance(value, tuple):
-            yield prefix + entry.name, np.array(value, np.str_)
+            yield prefix + attribute.name, np.array(value, np.str_)
         elif is_dataclass(value):
-            yield from _arrays(value, f"{prefix}{entry.name}.")
+            yield from _arrays(value, f"{prefix}{attribute.name}.")
 
 
 def _stage(name: str, arrays: Arrays) -> StageDigest:
     """Return the fingerprint of one stage."""
     content = sha256()
     whole, large = {}, {}
-    for key, given in arrays.items():
-        array = np.ascontiguousarray(given)
+    for key, value in arrays.items():
+        array = np.ascontiguousarray(value)
         data = "\n".join(array.tolist()).encode() if array.dtype.kind == "U" else array.tobytes()
-        own = sha256(data).hexdigest()
+        fingerprint = sha256(data).hexdigest()
         kind = "text" if array.dtype.kind == "U" else array.dtype.str
-        content.update(f"{key} {kind} {array.shape} {own}\n".encode())
+        content.update(f"{key} {kind} {array.shape} {fingerprint}\n".encode())
         # Masks are always stored, so that a check does not have to run the network again.
         if array.size <= WHOLE or key == "masks.packed":
             whole[key] = array
         else:
-            large[key] = LargeArray(own, str(len(array)), f"{np.sum(array, dtype=np.float64):.17g}")
+            large[key] = LargeArray(fingerprint, str(len(array)), f"{np.sum(array, dtype=np.float64):.17g}")
     return StageDigest(name, content.hexdigest(), whole, large)
 
 
 # --- differences -------------------------------------------------------------------------------
 
 
-def _difference(then: StageDigest, now: StageDigest) -> DigestDifference:
+def _difference(stored: StageDigest, current: StageDigest) -> DigestDifference:
     """Return the largest difference between two stages whose fingerprints differ."""
-    worst = DigestDifference(now.name, "equal in value, but not in every bit", 0.0)  # 0.0 and -0.0
-    for name in dict.fromkeys([*then.whole, *then.large, *now.whole, *now.large]):
-        amount, text = _array_difference(then, now, name)
+    worst = DigestDifference(current.name, "equal in value, but not in every bit", 0.0)  # 0.0 and -0.0
+    for name in dict.fromkeys([*stored.whole, *stored.large, *current.whole, *current.large]):
+        amount, text = _array_difference(stored, current, name)
         if amount > worst.amount:
-            worst = DigestDifference(now.name, f"{name}: {text}", amount)
+            worst = DigestDifference(current.name, f"{name}: {text}", amount)
     return worst
 
 
-def _array_difference(then: StageDigest, now: StageDigest, name: str) -> tuple[float, str]:
+def _array_difference(stored: StageDigest, current: StageDigest, name: str) -> tuple[float, str]:
     """Return the difference of one array: its amount, infinite if more than numbers differ, and its text."""
-    rows, new_rows = _rows(then, name), _rows(now, name)
+    rows, new_rows = _rows(stored, name), _rows(current, name)
     if rows != new_rows:
         return float("inf"), f"{rows} rows became {new_rows}"
-    if name in then.large and name in now.large:
-        if then.large[name] == now.large[name]:
+    if name in stored.large and name in current.large:
+        if stored.large[name] == current.large[name]:
             return 0.0, ""
-        change = float(now.large[name].total) - float(then.large[name].total)
+        change = float(current.large[name].total) - float(stored.large[name].total)
         return float("inf"), f"{rows} rows as before with other values, their sum {change:+g}"
-    if name not in then.whole or name not in now.whole or then.whole[name].shape != now.whole[name].shape:
+    if (
+        name not in stored.whole
+        or name not in current.whole
+        or stored.whole[name].shape != current.whole[name].shape
+    ):
         return float("inf"), "another shape"
-    old, new = then.whole[name].reshape(-1), now.whole[name].reshape(-1)
+    old, new = stored.whole[name].reshape(-1), current.whole[name].reshape(-1)
     if old.dtype.kind == "f" and new.dtype.kind == "f":
         return _step(old, new)
     changed = np.flatnonzero(old != new)

@@ -71,8 +71,8 @@ class Contents:
         Raises:
             MessageError: the message has bytes of unknown meaning.
         """
-        found: Counter[str] = Counter()
-        return self._strip(message, self._msgtype, "", found, lenient), found
+        emptied: Counter[str] = Counter()
+        return self._strip(message, self._msgtype, "", emptied, lenient), emptied
 
     def _look(self, msgtype: str, within: tuple[str, ...] = ()) -> bool:
         """Return whether a type may hold images. Every type within it is looked up."""
@@ -83,8 +83,8 @@ class Contents:
         inside = msgtype in _EMPTIED
         for _, kind in self._definitions[msgtype][1]:
             inside |= self._is_opaque(msgtype, kind)
-            if part := _part(kind):
-                inside |= self._look(part, (*within, msgtype))
+            if inner_type := _inner_type(kind):
+                inside |= self._look(inner_type, (*within, msgtype))
         self._inside[msgtype] = inside
         return inside
 
@@ -98,13 +98,13 @@ class Contents:
             return False
         return basic[0] in PIXELS or msgtype.endswith("MultiArray")
 
-    def _strip(self, message: Any, msgtype: str, path: str, found: Counter[str], lenient: bool) -> Any:
-        """Return a message with its images emptied. ``found`` counts the emptied fields by path."""
+    def _strip(self, message: Any, msgtype: str, path: str, emptied: Counter[str], lenient: bool) -> Any:
+        """Return a message with its images emptied. ``emptied`` counts the emptied fields by path."""
         if not self._inside[msgtype]:
             return message
         if msgtype in _EMPTIED:
             if _EMPTIED[msgtype][0](message):
-                found[path] += 1
+                emptied[path] += 1
                 return replace(message, **_EMPTIED[msgtype][1])
             return message
         changed = {}
@@ -113,15 +113,17 @@ class Contents:
             if self._is_opaque(msgtype, kind):
                 if len(value) > SMALL and not lenient:
                     raise MessageError(f"nobody can tell what the {len(value)} values of '{inner}' show")
-            elif (part := _part(kind)) and self._inside[part]:
+            elif (inner_type := _inner_type(kind)) and self._inside[inner_type]:
                 if kind[0] == Nodetype.NAME:
-                    changed[name] = self._strip(value, part, inner, found, lenient)
+                    changed[name] = self._strip(value, inner_type, inner, emptied, lenient)
                 else:
-                    changed[name] = [self._strip(v, part, inner, found, lenient) for v in value]
+                    changed[name] = [
+                        self._strip(element, inner_type, inner, emptied, lenient) for element in value
+                    ]
         return replace(message, **changed)
 
 
-def _part(kind: Any) -> str:
+def _inner_type(kind: Any) -> str:
     """Return the message type of a field, or an empty text for a basic type."""
     node, about = kind
     if node in (Nodetype.ARRAY, Nodetype.SEQUENCE):

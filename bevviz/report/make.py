@@ -51,7 +51,7 @@ from bevviz.report.bag_window import (
     open_window,
 )
 from bevviz.report.facts import (
-    Asked,
+    AnswerText,
     Facts,
     commands,
     file_lines,
@@ -71,7 +71,7 @@ from bevviz.support.files import written as write_beside
 if TYPE_CHECKING:
     from bevviz.why import Answer
 
-Found = Mapping[tuple[str, int], Detections]  # by camera name and image stamp
+DetectionsByImage = Mapping[tuple[str, int], Detections]  # by camera name and image stamp
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -147,14 +147,14 @@ def make(
     model = model_path(request.config) if request.include_model else None
     _check_targets(request, [rrd, html, bag], model)
     with ExitStack() as stack:
-        whole = stack.enter_context(BagSource(request.paths, request.config, at=request.at))
-        window = find_window(whole, whole.span[0], request.before, request.after)
-        topics = choose_topics(whole.recording, whole.roles, request.topics)
-        redactor = found = None
+        whole_bag = stack.enter_context(BagSource(request.paths, request.config, at=request.at))
+        window = find_window(whole_bag, whole_bag.span[0], request.before, request.after)
+        topics = choose_topics(whole_bag.recording, whole_bag.roles, request.topics)
+        redactor = detections = None
         if request.redact:
-            fits(whole.recording, request.unredacted, "--unredacted")
+            fits(whole_bag.recording, request.unredacted, "--unredacted")
             redactor = Redactor(
-                request.config.detector, whole.recording, whole.roles.lidars, request.unredacted
+                request.config.detector, whole_bag.recording, whole_bag.roles.lidars, request.unredacted
             )
         # Delete an older report first. If this run fails, nobody may take the old files, perhaps
         # unredacted, for the new ones.
@@ -164,43 +164,49 @@ def make(
             unfinished.discard()
             written.warnings += unfinished.warnings
         if request.redact:
-            found = _detect(request, window)
-        detect = None if found is None else replay(found)
+            detections = _detect(request, window)
+        detect = None if detections is None else replay(detections)
         session = Session(request.config, detect)
-        part = _cut(whole, window, topics, bag, redactor)
+        content = _cut(whole_bag, window, topics, bag, redactor)
         cleanup.remember(bag, partial(bag.unlink, missing_ok=True))  # A bag alone is no report.
         stack.callback(cleanup.forget, bag)
         written.files.append(bag)
-        written.warnings += [*whole.recording.warnings, *part.left_out, *(redactor.notes if redactor else ())]
+        written.warnings += [
+            *whole_bag.recording.warnings,
+            *content.left_out,
+            *(redactor.notes if redactor else ()),
+        ]
         if model is not None:
-            beside = rrd.with_name(model.name)
-            with write_beside(beside, "model") as given:
-                shutil.copyfile(model, given.path)
-            written.files.append(beside)
+            model_copy = rrd.with_name(model.name)
+            with write_beside(model_copy, "model") as file:
+                shutil.copyfile(model, file.path)
+            written.files.append(model_copy)
 
         notes = [note for note in request.notes if window.low <= note.received < window.high]
         public = shareable(request.config)
         source = stack.enter_context(open_window([bag], request.config, window.low, window.high))
         origin = Origin.of(source.scene, request.config, rrd, folders=False, redacted=request.redact)
-        scene = replace(whole.scene, bag=())  # The recording must not contain the path of the bag.
+        scene = replace(whole_bag.scene, bag=())  # The recording must not contain the path of the bag.
         sinks = stack.enter_context(
             open_recording(scene, public, save=rrd, blueprint="bug_report", origin=origin)
         )
         cleanup.forget(bag)
         recording = sinks.recording
         written.files.insert(0, rrd)
-        summary = WindowSummary(window.at, source.total, len(whole.scene.cameras))
+        summary = WindowSummary(window.at, source.total, len(whole_bag.scene.cameras))
         recorder = _ReportRecorder(
             recording, public, summary, window.at, request.note, notes, session.stages.provider
         )
         watchers = [recorder, DiskWatch(sinks), Progress("run"), *observers]
-        ended = run(source, session, watchers, stop=stop)
-        written.interrupted = ended.interrupted or (stop is not None and stop.is_set())
+        outcome = run(source, session, watchers, stop=stop)
+        written.interrupted = outcome.interrupted or (stop is not None and stop.is_set())
         written.frames = len(summary.frames)
-        written.warnings += [w for w in source.warnings if w not in written.warnings]
-        written.warnings = [_without_folders(w, [*request.paths, bag]) for w in written.warnings]
+        written.warnings += [warning for warning in source.warnings if warning not in written.warnings]
+        written.warnings = [_without_folders(warning, [*request.paths, bag]) for warning in written.warnings]
         made_with = provenance(request.config, session.stages.provider)
-        facts = _facts(request, public, window, part, written, made_with, summary, whole.scene.name, notes)
+        facts = _facts(
+            request, public, window, content, written, made_with, summary, whole_bag.scene.name, notes
+        )
         info = _info(request, window, written, made_with, bag)
         recording.send_property("report", rr.AnyValues(about=info.dump()))
         recording.log(entities.REPORT, document(facts.markdown()), static=True)
@@ -236,11 +242,11 @@ class _ReportRecorder(Recorder):
         self._summary.add(result)
 
 
-def replay(found: Found) -> Callable[[Camera], Detections | None]:
+def replay(detections: DetectionsByImage) -> Callable[[Camera], Detections | None]:
     """Return a stand-in for the network that returns the stored detections."""
 
     def detect(camera: Camera) -> Detections | None:
-        return None if camera.image is None else found.get((camera.name, camera.image.stamp))
+        return None if camera.image is None else detections.get((camera.name, camera.image.stamp))
 
     return detect
 
@@ -258,43 +264,43 @@ def _check_targets(request: ReportRequest, targets: Sequence[Path], model: Path 
         raise UserError(f"-o {output}: there is no folder {output.parent}")
     if request.include_model and model is None:
         raise UserError("--include-model: there is no model: give --model FILE.onnx")
-    copy = [] if model is None else [output.with_name(model.name)]
-    given = {path.resolve() for path in request.paths} | ({model.resolve()} if model is not None else set())
-    for target in [*targets, *copy]:
-        if target.resolve() in given:
+    copies = [] if model is None else [output.with_name(model.name)]
+    inputs = {path.resolve() for path in request.paths} | ({model.resolve()} if model is not None else set())
+    for target in [*targets, *copies]:
+        if target.resolve() in inputs:
             raise UserError(f"-o {output}: {target} is what is read; give another name")
         if target.exists() and not request.force:
             raise UserError(f"{target} exists already; --force overwrites it")
 
 
-class _Detections(Observer[Found]):
+class _Detections(Observer[DetectionsByImage]):
     """Run of the network alone, on the original images."""
 
     def __init__(self, config: Config) -> None:
-        self.found: dict[tuple[str, int], Detections] = {}
+        self.detections: dict[tuple[str, int], Detections] = {}
         self._detector = Detector(config.detector)
 
-    def perceive(self, frame: Frame, network: Executor | None = None) -> Found:
+    def perceive(self, frame: Frame, network: Executor | None = None) -> DetectionsByImage:
         return {
             (camera.name, camera.image.stamp): self._detector(camera.image.bgr)
             for camera in frame.cameras
-            if camera.image is not None and (camera.name, camera.image.stamp) not in self.found
+            if camera.image is not None and (camera.name, camera.image.stamp) not in self.detections
         }
 
-    def finish(self, found: Found) -> Found:
-        return found
+    def finish(self, detections: DetectionsByImage) -> DetectionsByImage:
+        return detections
 
-    def see(self, found: Found) -> None:
-        self.found |= found
+    def see(self, detections: DetectionsByImage) -> None:
+        self.detections |= detections
 
 
-def _detect(request: ReportRequest, window: Window) -> Found:
+def _detect(request: ReportRequest, window: Window) -> DetectionsByImage:
     """Return the detections in the original images of a window."""
-    detections = _Detections(request.config)
+    observer = _Detections(request.config)
     with open_window(request.paths, request.config, window.low, window.high) as source:
-        if run(source, detections, [detections, Progress("detect")]).interrupted:
+        if run(source, observer, [observer, Progress("detect")]).interrupted:
             raise KeyboardInterrupt
-    return detections.found
+    return observer.detections
 
 
 def _cut(
@@ -335,7 +341,7 @@ def _facts(
     request: ReportRequest,
     public: Config,
     window: Window,
-    part: Cut,
+    content: Cut,
     written: WrittenReport,
     made_with: Provenance,
     summary: WindowSummary,
@@ -344,8 +350,8 @@ def _facts(
 ) -> Facts:
     """Return the text of the report."""
     sizes = {
-        path.name: f"{what}, {megabytes(path.stat().st_size)}"
-        for path, what in (
+        path.name: f"{description}, {megabytes(path.stat().st_size)}"
+        for path, description in (
             (request.output.with_suffix(".mcap"), "the raw messages of the window"),
             *((path, "the model") for path in written.files[2:]),
         )
@@ -375,16 +381,16 @@ def _facts(
         hardware=[f"{name}: {value}" for name, value in made_with.machine.items()],
         warnings=written.warnings,
         tracebacks=traceback_texts(summary.tracebacks),
-        files=file_lines(sizes, part.counts, made_with.dependencies.get("detector.model")),
+        files=file_lines(sizes, content.counts, made_with.dependencies.get("detector.model")),
         commands=commands(request.output, window, public, request.redact),
     )
 
 
-def _asked(answer: Answer, when: str = "") -> Asked:
+def _asked(answer: Answer, when: str = "") -> AnswerText:
     """Return an answer as text, with ``when`` before its verdict."""
     text = answer.verdict.text
     steps = [(step.stage, step.text) for step in answer.steps]
-    return Asked(f"{when}{text}", answer.verdict.reported, steps)
+    return AnswerText(f"{when}{text}", answer.verdict.reported, steps)
 
 
 def _class_names(config: Config) -> str:

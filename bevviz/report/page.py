@@ -85,20 +85,25 @@ def page(facts: Facts, summary: WindowSummary, seal: str) -> str:
 
 def _frame(result: FrameResult, facts: Facts) -> FramePage:
     """Return the content about the frame of the report."""
-    loud = [e for e in result.explanations if e.state not in _QUIET]
-    detections = [e for e in loud if e.subject == "detection"]
-    clusters = [e for e in loud if e.subject in ("cluster", "split")]
-    doubted = sorted((e for e in loud if e.subject in ("object", "fused")), key=lambda e: e.state)
+    loud = [explanation for explanation in result.explanations if explanation.state not in _QUIET]
+    detections = [explanation for explanation in loud if explanation.subject == "detection"]
+    clusters = [explanation for explanation in loud if explanation.subject in ("cluster", "split")]
+    doubted = sorted(
+        (explanation for explanation in loud if explanation.subject in ("object", "fused")),
+        key=lambda explanation: explanation.state,
+    )
     objects = {"objects, by cameras and our fusion": doubted} if doubted else {}
     return FramePage(
         when=_when(result.frame.received, facts),
         verdict=list(_verdict(result)),
         pictures=list(_pictures(result)),
-        decisions=sorted(detections, key=lambda e: e.state == "matched"),
+        decisions=sorted(detections, key=lambda explanation: explanation.state == "matched"),
         folded={
             **objects,
-            "clusters": sorted(clusters, key=lambda e: e.state == "matched"),
-            "more: not kept, or out of view": [e for e in result.explanations if e.state in _QUIET],
+            "clusters": sorted(clusters, key=lambda explanation: explanation.state == "matched"),
+            "more: not kept, or out of view": [
+                explanation for explanation in result.explanations if explanation.state in _QUIET
+            ],
         },
     )
 
@@ -110,17 +115,25 @@ def _when(received: int, facts: Facts) -> str:
 
 def _verdict(result: FrameResult) -> Iterator[str]:
     """Yield the lines that summarise a frame."""
-    kept = [e for e in result.explanations if e.subject == "detection" and e.state not in _QUIET]
-    if kept:
-        counts = Counter(e.state.replace("_", " ") for e in kept)
+    decisions = [
+        explanation
+        for explanation in result.explanations
+        if explanation.subject == "detection" and explanation.state not in _QUIET
+    ]
+    if decisions:
+        counts = Counter(explanation.state.replace("_", " ") for explanation in decisions)
         states = ", ".join(f"{n} {state}" for state, n in counts.most_common())
-        yield f"{len(kept)} detection{'s' * (len(kept) > 1)}: {states}"
-        yield from (f"{e.camera}: {e.text}" for e in kept if e.state != "matched")
+        yield f"{len(decisions)} detection{'s' * (len(decisions) > 1)}: {states}"
+        yield from (
+            f"{explanation.camera}: {explanation.text}"
+            for explanation in decisions
+            if explanation.state != "matched"
+        )
     elif any(camera.detections is not None for camera in result.cameras):
         yield "nothing was detected"
     yield from (f"{failure.stage} failed: {failure.reason}" for failure in result.failures)
     yield from result.frame.problems
-    yield from (e.text for e in result.explanations if e.subject == "camera")
+    yield from (explanation.text for explanation in result.explanations if explanation.subject == "camera")
     if result.objects is not None:
         names = Counter(result.objects.names)
         yield "objects: " + (", ".join(f"{n} {name}" for name, n in names.items()) or "none")
@@ -157,7 +170,7 @@ def _totals(summary: WindowSummary) -> Iterator[DecisionTotal]:
         total += frame.states
         for key in frame.states:
             frames[key].append(frame.index)
-    for key in sorted(total, key=lambda k: (k[0] != "detection", k[1], k[2] in _QUIET, -total[k])):
+    for key in sorted(total, key=lambda key: (key[0] != "detection", key[1], key[2] in _QUIET, -total[key])):
         subject, name, state = key
         yield DecisionTotal(f"{name} {subject}".strip(), state, total[key], spans(frames[key]))
 
@@ -168,13 +181,13 @@ def spans(numbers: Sequence[int]) -> str:
     >>> spans([1, 2, 3, 7, 9, 10])
     '1-3, 7, 9-10'
     """
-    found: list[list[int]] = []
+    groups: list[list[int]] = []
     for number in numbers:
-        if found and number == found[-1][1] + 1:
-            found[-1][1] = number
+        if groups and number == groups[-1][1] + 1:
+            groups[-1][1] = number
         else:
-            found.append([number, number])
-    return ", ".join(f"{a}-{b}" if a < b else f"{a}" for a, b in found)
+            groups.append([number, number])
+    return ", ".join(f"{first}-{last}" if first < last else f"{first}" for first, last in groups)
 
 
 def _plots(summary: WindowSummary, facts: Facts) -> Iterator[Plot]:
@@ -197,10 +210,10 @@ def _series(
     summary: WindowSummary, facts: Facts, prefix: str, names: Sequence[str] | None
 ) -> Mapping[str, Series]:
     """Return (seconds, value) pairs of each scalar below ``prefix``, by name."""
-    found: dict[str, list[tuple[float, float]]] = defaultdict(list)
+    series: dict[str, list[tuple[float, float]]] = defaultdict(list)
     for frame in summary.frames:
         for path, value in frame.health.items():
             name = path.removeprefix(prefix)
             if path.startswith(prefix) and value == value and (names is None or name in names):
-                found[name].append(((frame.received - facts.start) / SECOND, value))
-    return found
+                series[name].append(((frame.received - facts.start) / SECOND, value))
+    return series

@@ -29,26 +29,29 @@ def camera_picture(
     picture, scale = shrink(result.camera.image.bgr, width)
     if points:
         _draw_points(picture, result, scale)
-    found = result.detections
-    if found is None:
+    detections = result.detections
+    if detections is None:
         return picture
-    kept = np.flatnonzero(found.kept)
-    matched = np.zeros(len(found), bool)
+    kept_rows = np.flatnonzero(detections.kept)
+    matched = np.zeros(len(detections), bool)
     if result.fusion is not None:
         matched = result.fusion.detection_decision == Decision.MATCHED
-    corners = np.round((found.xyxy + 0.5) * scale - 0.5).astype(int)
-    for d in kept[::-1].tolist():
-        x0, y0, x1, y1 = corners[d].tolist()
-        width = 2 if matched[d] else 1
-        cv2.rectangle(picture, (x0, y0), (x1, y1), class_color(found.names[d])[::-1], width, cv2.LINE_AA)
-    taken = np.zeros(picture.shape[:2], bool)
-    for d in sorted(kept.tolist(), key=lambda d: bool(matched[d])) if labels else ():  # unmatched first
-        text = f"{found.names[d]} {found.score[d]:.2f}"
-        if not matched[d] and result.fusion is not None:
-            decision = Decision(int(result.fusion.detection_decision[d]))
+    corners = np.round((detections.xyxy + 0.5) * scale - 0.5).astype(int)
+    for row in kept_rows[::-1].tolist():
+        x0, y0, x1, y1 = corners[row].tolist()
+        width = 2 if matched[row] else 1
+        cv2.rectangle(
+            picture, (x0, y0), (x1, y1), class_color(detections.names[row])[::-1], width, cv2.LINE_AA
+        )
+    occupied = np.zeros(picture.shape[:2], bool)
+    unmatched_first = sorted(kept_rows.tolist(), key=lambda row: bool(matched[row]))
+    for row in unmatched_first if labels else ():
+        text = f"{detections.names[row]} {detections.score[row]:.2f}"
+        if not matched[row] and result.fusion is not None:
+            decision = Decision(int(result.fusion.detection_decision[row]))
             text += f", {decision.name.lower().replace('_', ' ')}"
-        x, y = corners[d, :2].tolist()
-        _label(picture, taken, text, x, y, class_color(found.names[d])[::-1])
+        x, y = corners[row, :2].tolist()
+        _label(picture, occupied, text, x, y, class_color(detections.names[row])[::-1])
     return picture
 
 
@@ -78,23 +81,23 @@ def _draw_points(picture: U8, result: CameraResult, scale: float) -> None:
     """Draw the obstacle points of a camera, coloured by depth."""
     if result.uv is None or result.depth is None:
         return
-    seen = np.isfinite(result.uv[:, 0])
-    u, v = np.floor((result.uv[seen] + 0.5) * scale).astype(int).T
-    colors = turbo(DEPTH_BINS)[::-1, ::-1][bins(result.depth[seen], 0, DEPTH_RANGE, DEPTH_BINS)]
+    visible = np.isfinite(result.uv[:, 0])
+    u, v = np.floor((result.uv[visible] + 0.5) * scale).astype(int).T
+    colors = turbo(DEPTH_BINS)[::-1, ::-1][bins(result.depth[visible], 0, DEPTH_RANGE, DEPTH_BINS)]
     height, width = picture.shape[:2]
     picture[np.clip(v, 0, height - 1), np.clip(u, 0, width - 1)] = colors
 
 
-def _label(picture: U8, taken: Bool, text: str, x: int, y: int, color: tuple[int, ...]) -> None:
+def _label(picture: U8, occupied: Bool, text: str, x: int, y: int, color: tuple[int, ...]) -> None:
     """Draw a text above a point, unless another text is there."""
     font, size = cv2.FONT_HERSHEY_SIMPLEX, 0.45
     (width, height), below = cv2.getTextSize(text, font, size, 1)
     x = max(0, min(x, picture.shape[1] - width - 4))
     y = max(y, height + below + 2)
-    place = np.s_[y - height - below - 2 : y, x : x + width + 4]
-    if taken[place].any():
+    area = np.s_[y - height - below - 2 : y, x : x + width + 4]
+    if occupied[area].any():
         return
-    taken[place] = True
-    picture[place] = color
+    occupied[area] = True
+    picture[area] = color
     ink = (0, 0, 0) if sum(color) > 330 else (255, 255, 255)
     cv2.putText(picture, text, (x + 2, y - below), font, size, ink, 1, cv2.LINE_AA)

@@ -48,10 +48,10 @@ class Plot:
 
 def plot(title: str, series: Mapping[str, Series], at: float) -> Plot | None:
     """Lay out one line per series over seconds, with a mark at the time ``at``. None: there is no data."""
-    shown = {name: points for name, points in series.items() if points}
-    if not shown:
+    nonempty = {name: points for name, points in series.items() if points}
+    if not nonempty:
         return None
-    x, y = np.array([point for points in shown.values() for point in points], np.float64).T
+    x, y = np.array([point for points in nonempty.values() for point in points], np.float64).T
     bottom, top = min(y.min(), 0.0), max(y.max(), 0.0)
     x_ticks, y_ticks = ticks(x.min(), x.max(), 6), ticks(bottom, top if top > bottom else 1.0, 4)
     left, right = min(x.min(), at), max(x.max(), at, x.min() + 1e-9)
@@ -65,7 +65,10 @@ def plot(title: str, series: Mapping[str, Series], at: float) -> Plot | None:
 
     return Plot(
         title=title,
-        lines=[Line(name, [(column(a), row(b)) for a, b in points]) for name, points in shown.items()],
+        lines=[
+            Line(name, [(column(seconds), row(number)) for seconds, number in points])
+            for name, points in nonempty.items()
+        ],
         x_ticks=[Tick(column(tick), f"{tick:g} s") for tick in x_ticks if left <= tick <= right],
         y_ticks=[Tick(row(tick), f"{tick:g}") for tick in y_ticks],
         mark=column(at),
@@ -80,6 +83,8 @@ def ticks(low: float, high: float, count: int) -> list[float]:
     """
     span = max(float(high - low), abs(float(high)) * 1e-9, 1e-9)
     power = 10.0 ** np.floor(np.log10(span / count))
-    step = float(power * next(m for m in (1, 2, 2.5, 5, 10, 20) if m * power * count >= span * 0.999))
+    step = float(
+        power * next(factor for factor in (1, 2, 2.5, 5, 10, 20) if factor * power * count >= span * 0.999)
+    )
     first, last = int(np.floor(low / step + 1e-9)), int(np.ceil(high / step - 1e-9))
     return [round(n * step, 12) for n in range(first, max(last, first + 1) + 1)]

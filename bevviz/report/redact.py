@@ -90,10 +90,10 @@ class Redactor:
         }
         self._detector = Detector(config.model_copy(update=settings))
         names = [name.lower() for name in self._detector.names]
-        for what, pattern in (("people", PEOPLE), ("vehicles, which plates are on", VEHICLES)):
+        for kind, pattern in (("people", PEOPLE), ("vehicles, which plates are on", VEHICLES)):
             if not any(pattern.search(name) for name in names):
                 raise UserError(
-                    f"--redact: {config.model} finds no {what}, but {', '.join(names) or 'unnamed'}"
+                    f"--redact: {config.model} finds no {kind}, but {', '.join(names) or 'unnamed'}"
                 )
         self._recording, self._lidars, self._unredacted = recording, lidars, unredacted
         self._videos = {
@@ -117,27 +117,29 @@ class Redactor:
         A message without people and vehicles is unchanged. Each image of a video becomes a CompressedImage
         of its own.
         """
-        asked = any(fnmatchcase(message.topic, pattern) for pattern in self._unredacted)
+        keep_unknown = any(fnmatchcase(message.topic, pattern) for pattern in self._unredacted)
         try:
             if message.topic in self._videos:
-                return self._picture(message, self._videos[message.topic])
-            return message.connection, self._looked_into(message, data, asked)
+                return self._edited_video(message, self._videos[message.topic])
+            return message.connection, self._edited_message(message, data, keep_unknown)
         except MessageError as error:
             reason = str(error).removeprefix(f"{message.topic}: ")
-            kept = "as it was recorded, as --unredacted says" if asked else "left out"
-            self._left_out[f"{message.topic} {kept}: {reason}"] += 1
-            return (message.connection, data) if asked else None
+            action = "as it was recorded, as --unredacted says" if keep_unknown else "left out"
+            self._left_out[f"{message.topic} {action}: {reason}"] += 1
+            return (message.connection, data) if keep_unknown else None
 
-    def _looked_into(self, message: RawMessage, data: bytes | memoryview, asked: bool) -> bytes | memoryview:
+    def _edited_message(
+        self, message: RawMessage, data: bytes | memoryview, keep_unknown: bool
+    ) -> bytes | memoryview:
         """Return the bytes to write for a message that is no video packet."""
         msgtype = normalized(message.connection.msgtype)
         if msgtype in (IMAGE, COMPRESSED):
-            return self._redacted(message, data, msgtype == COMPRESSED)
+            return self._edited_image(message, data, msgtype == COMPRESSED)
         if message.topic in self._lidars or short_of(msgtype) in PLAIN_FOXGLOVE:
             return data
         if PICTURES.search(msgtype):
             raise MessageError(f"a {msgtype} cannot be looked into")
-        if not is_known(msgtype) and not asked:
+        if not is_known(msgtype) and not keep_unknown:
             raise MessageError(f"bevviz does not know what a {msgtype} shows (--unredacted keeps it)")
         key = msgtype, message.connection.msgdef
         contents = self._contents.get(key)
@@ -151,14 +153,14 @@ class Redactor:
             if guard(message, is_coloured, content):
                 raise MessageError("its points have the colours of a picture")
             return data
-        stripped, pictures = contents.without_pictures(content, lenient=asked)
+        stripped, pictures = contents.without_pictures(content, lenient=keep_unknown)
         if not pictures:
             return data
         for path in pictures:
             self._left_out[f"{message.topic} without the pictures in it ({path} of {msgtype})"] += 1
         return self._recording.encode(message, stripped)
 
-    def _redacted(
+    def _edited_image(
         self, message: RawMessage, data: bytes | memoryview, compressed: bool
     ) -> bytes | memoryview:
         """Return the bytes of an image message with hidden boxes."""
@@ -185,7 +187,7 @@ class Redactor:
             }
         return self._recording.encode(message, replace(content, **values))
 
-    def _picture(self, message: RawMessage, video: Video) -> Edited:
+    def _edited_video(self, message: RawMessage, video: Video) -> Edited:
         """Return an image of a video as a CompressedImage with hidden boxes. None for a header."""
         content = self._recording.decode(message)
         packet = guard(message, decode_packet, content, message.topic, message.received)
@@ -211,11 +213,13 @@ class Redactor:
 
     def find(self, bgr: U8) -> F32:
         """Return (B, 4) boxes of people and vehicles in an (H, W, 3) image, the largest last."""
-        found = self._detector(bgr)
+        detections = self._detector(bgr)
         rows = [
-            i for i, n in enumerate(found.names) if PEOPLE.search(n.lower()) or VEHICLES.search(n.lower())
+            i
+            for i, n in enumerate(detections.names)
+            if PEOPLE.search(n.lower()) or VEHICLES.search(n.lower())
         ]
-        boxes = found.xyxy[rows]
+        boxes = detections.xyxy[rows]
         sizes = boxes[:, 2:] - boxes[:, :2]
         return boxes[np.argsort(sizes.prod(axis=1), kind="stable")]
 
@@ -225,11 +229,11 @@ def hide(bgr: U8, boxes: F32) -> U8:
     hidden = bgr.copy()
     height, width = bgr.shape[:2]
     for x0, y0, x1, y1 in grown(boxes, width, height):
-        part = hidden[y0:y1, x0:x1]
-        edge = max(SMALLEST, -(-max(part.shape[:2]) // CELLS))
-        cells = [max(1, side // edge) for side in part.shape[1::-1]]
-        means = cv2.resize(part, cells, interpolation=cv2.INTER_AREA)
-        part[:] = cv2.resize(means, part.shape[1::-1], interpolation=cv2.INTER_NEAREST)
+        region = hidden[y0:y1, x0:x1]
+        edge = max(SMALLEST, -(-max(region.shape[:2]) // CELLS))
+        cells = [max(1, side // edge) for side in region.shape[1::-1]]
+        means = cv2.resize(region, cells, interpolation=cv2.INTER_AREA)
+        region[:] = cv2.resize(means, region.shape[1::-1], interpolation=cv2.INTER_NEAREST)
     return hidden
 
 
@@ -238,14 +242,14 @@ def grown(boxes: F32, width: int, height: int) -> Sequence[tuple[int, int, int, 
 
     A box outside the image is left out.
     """
-    found = []
+    pixels = []
     for x0, y0, x1, y1 in boxes.tolist():
         dx, dy = MARGIN * (x1 - x0) + 2, MARGIN * (y1 - y0) + 2
         left, top = max(0, int(np.floor(x0 - dx + 0.5))), max(0, int(np.floor(y0 - dy + 0.5)))
         right, bottom = min(width, int(np.ceil(x1 + dx + 0.5))), min(height, int(np.ceil(y1 + dy + 0.5)))
         if left < right and top < bottom:
-            found.append((left, top, right, bottom))
-    return found
+            pixels.append((left, top, right, bottom))
+    return pixels
 
 
 def _encoded(bgr: U8, magic: bytes) -> U8:

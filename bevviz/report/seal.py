@@ -19,12 +19,12 @@ def check_seal(rrd: Path) -> bool:
     """
     page = rrd.with_suffix(".html")
     try:
-        said = _SEAL.findall(page.read_bytes()) if page.is_file() else []
+        checksums = _SEAL.findall(page.read_bytes()) if page.is_file() else []
     except OSError:
-        said = []
-    if said and said[-1].decode() != file_hash(rrd):
+        checksums = []
+    if checksums and checksums[-1].decode() != file_hash(rrd):
         raise UserError(
             f"{rrd}: changed or damaged: it is not the file that {page.name}, its page, tells of "
             "(SHA-256); without that page beside it, it is compared even so"
         )
-    return bool(said)
+    return bool(checksums)

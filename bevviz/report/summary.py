@@ -51,39 +51,56 @@ class WindowSummary:
     def add(self, result: FrameResult) -> FrameSummary:
         """Add the next frame, and return its summary."""
         frame = result.frame
-        names = {c.camera.name: c.detections.names for c in result.cameras if c.detections is not None}
+        names = {
+            camera_result.camera.name: camera_result.detections.names
+            for camera_result in result.cameras
+            if camera_result.detections is not None
+        }
         states = Counter(
-            (e.subject, names[e.camera][e.row] if e.subject == "detection" else "", e.state)
-            for e in result.explanations
-            if e.subject != "camera"
+            (
+                explanation.subject,
+                names[explanation.camera][explanation.row] if explanation.subject == "detection" else "",
+                explanation.state,
+            )
+            for explanation in result.explanations
+            if explanation.subject != "camera"
         )
-        self.tracebacks.update((f.stage, f.traceback) for f in result.failures if f.traceback)
-        problems = [f"{f.stage}: {f.reason}" for f in result.failures]
+        self.tracebacks.update(
+            (failure.stage, failure.traceback) for failure in result.failures if failure.traceback
+        )
+        problems = [f"{failure.stage}: {failure.reason}" for failure in result.failures]
         problems += frame.problems
-        problems += [f"{c.camera.name}: {p}" for c in result.cameras for p in c.camera.problems]
+        problems += [
+            f"{camera_result.camera.name}: {problem}"
+            for camera_result in result.cameras
+            for problem in camera_result.camera.problems
+        ]
         self._rates.add(frame)
         measured = dict(health(result, self._last, self._rates))
         marks = frame.around.marks if frame.around is not None else ()
-        moment = FrameSummary(
+        summary = FrameSummary(
             frame.index, frame.stamp, frame.received, measured, states, tuple(problems), marks
         )
         if self._is_for_strip(len(self.frames)):
-            self.strip.append((moment, strip_pictures(result)))
+            self.strip.append((summary, strip_pictures(result)))
         if self.result is None or abs(frame.received - self.at) < abs(self.result.frame.received - self.at):
             self.result = result
-        self.frames.append(moment)
+        self.frames.append(summary)
         self._last = frame
-        return moment
+        return summary
 
     def _is_for_strip(self, number: int) -> bool:
         """Return whether the strip shows a frame. Its frames are spread evenly over the window."""
-        wanted = min(self.total, max(2, STRIP_PICTURES // (1 + self.cameras)))
-        return number * wanted // self.total != (number - 1) * wanted // self.total
+        count = min(self.total, max(2, STRIP_PICTURES // (1 + self.cameras)))
+        return number * count // self.total != (number - 1) * count // self.total
 
 
 def strip_pictures(result: FrameResult) -> dict[str, bytes]:
     """Return small pictures of a frame as JPEG, by sensor."""
-    pictures = {c.camera.name: camera_picture(c, STRIP_WIDTH) for c in result.cameras}
+    pictures = {
+        camera_result.camera.name: camera_picture(camera_result, STRIP_WIDTH)
+        for camera_result in result.cameras
+    }
     if result.bev is not None:
         pictures["bird's-eye view"] = shrink(result.bev.image, STRIP_WIDTH)[0]
     return {name: jpeg(picture, 70) for name, picture in pictures.items() if picture is not None}
