@@ -18,10 +18,11 @@ from hypothesis import strategies as st
 from bevviz.bags.source import BagSource
 from bevviz.cli import main
 from bevviz.config import Config
-from bevviz.drivers import cloudini, point_cloud_interfaces
-from bevviz.drivers.point_cloud_interfaces import COMPRESSED
+from bevviz.drivers import cloudini
+from bevviz.drivers.compressed_clouds import COMPRESSED
 from bevviz.live.live_message import LiveMessage
 from bevviz.messages.clouds import decode_cloud
+from bevviz.messages.decoders import register_definitions
 from bevviz.messages.decoding import MessageError
 from bevviz.model.frame import F32
 from tests import bags
@@ -46,7 +47,7 @@ FIELDS = (("x", 0, 7), ("y", 4, 7), ("z", 8, 7), ("intensity", 12, 7), ("ring", 
 
 def messages(ros1: bool = False) -> bags.Messages:
     made = bags.Messages(ros1)
-    point_cloud_interfaces.register(made.store)
+    register_definitions(made.store)
     return made
 
 

@@ -24,7 +24,6 @@ from rosbags.typesys.store import Typestore
 from bevviz.bags.source import BagSource
 from bevviz.cli import main
 from bevviz.config import Config, SourceConfig
-from bevviz.drivers import video
 from bevviz.live.live_message import LiveMessage
 from bevviz.messages.decoding import MessageError, stamp_ns
 from bevviz.messages.encode import typestore
@@ -110,7 +109,6 @@ def definitions() -> Mapping[str, Any]:
     store = Typestore()
     store.fielddefs.update(typestore().fielddefs)
     store.types.update(typestore().types)
-    video.register(store)
     store.register(get_types_from_msg(OBJECTS, "autoware_perception_msgs/msg/TrackedObjects"))
     return dict(store.fielddefs)
 

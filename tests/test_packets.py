@@ -17,7 +17,7 @@ from rosbags.typesys import get_types_from_msg
 from bevviz.bags.source import BagSource
 from bevviz.cli import main
 from bevviz.config import Config
-from bevviz.drivers import packets
+from bevviz.drivers import velodyne
 from bevviz.drivers.hesai import MODELS, NOMINAL, Model
 from bevviz.live.live_message import LiveMessage
 from bevviz.messages.clouds import decode_cloud
@@ -257,7 +257,7 @@ def test_a_velodyne_scan() -> None:
 def test_without_its_library_a_velodyne_says_what_to_install(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(packets, "find_spec", lambda name: None)
+    monkeypatch.setattr(velodyne, "find_spec", lambda name: None)
     made = messages()
     item = bags.Item("/velodyne_packets", VELODYNE, bags.START, scan(made, bags.START, [b""], VELODYNE))
     assert main(["info", str(bags.write(tmp_path / "bag", [item], made))]) == 0

@@ -30,8 +30,9 @@ from tqdm import tqdm
 
 from benchmarks.torture import fuzz
 from benchmarks.torture.worker import Outcome, Worker
-from bevviz.drivers import driver_msgs, point_cloud_interfaces
+from bevviz.drivers.compressed_clouds import COMPRESSED
 from bevviz.messages import grid_map_msgs
+from bevviz.messages.decoders import register_definitions
 from tests import bags, videos
 
 SCANS = 52  # of a drive
@@ -108,8 +109,8 @@ def _messages() -> bags.Messages:
     from tests import test_objects
 
     made = bags.Messages()
-    for known in (grid_map_msgs, point_cloud_interfaces, driver_msgs):
-        known.register(made.store)
+    grid_map_msgs.register(made.store)
+    register_definitions(made.store)
     for name, text in videos.DEFINITIONS.items():
         made.store.register(get_types_from_msg(text, name))
     for package, texts in (
@@ -210,7 +211,7 @@ def _compressed_cloud(form: str) -> list[Row]:
             message = samples.compressed(made, cloud, form, samples.packed(form, cloud.data.tobytes()))
         return replace(message, header=cloud.header)
 
-    return _drive(point_cloud_interfaces.COMPRESSED, make, without=CLOUD)
+    return _drive(COMPRESSED, make, without=CLOUD)
 
 
 def _video(kind: str, codec: str = "h264") -> list[Row]:
@@ -532,7 +533,7 @@ def bombs(name: str, rows: Sequence[Row]) -> list[tuple[int, Row]]:
         packer = zlib.compressobj()
         packed = b"".join(packer.compress(zeros) for _ in range(160)) + packer.flush()
     victims = [place for place, row in enumerate(rows) if row.topic == TOPIC]
-    store, kind = _messages().store, point_cloud_interfaces.COMPRESSED
+    store, kind = _messages().store, COMPRESSED
     message: Any = store.deserialize_cdr(rows[victims[-1]].data, kind)
     message = replace(message, compressed_data=np.frombuffer(packed, np.uint8))
     data = bytes(store.serialize_cdr(message, kind))

@@ -31,16 +31,14 @@ from bevviz.datasets.reader import DatasetReader
 from bevviz.datasets.unread_files import unread
 from bevviz.drivers import ouster
 from bevviz.drivers.calibration_file import read_calibration
-from bevviz.drivers.compressed_clouds import decompress, is_compressed
-from bevviz.drivers.livox import fields_of, is_livox, read_custom
-from bevviz.drivers.packets import is_packets, read_scan
 from bevviz.drivers.video import Packet, decode_packet, is_video
 from bevviz.errors import UserError
-from bevviz.messages import foxglove, vision_msgs
+from bevviz.messages import vision_msgs
+from bevviz.messages.decoders import Serialization, reads_bytes
 from bevviz.messages.decoding import MessageError
-from bevviz.messages.guard import guard
+from bevviz.messages.guard import decode_message, guard
 from bevviz.messages.surroundings import decode_mark
-from bevviz.messages.topics import Topic
+from bevviz.messages.topics import NOT_LIDAR, Topic
 from bevviz.model.frame import I64
 from bevviz.support import progress
 from bevviz.support.contexts import Closing
@@ -247,7 +245,7 @@ class Recording(Closing):
             return ""
         message = self.first(connection.topic)
         small = message is not None and len(message.data) <= ouster.SMALLEST
-        return ouster.NOT_LIDAR if small else ouster.LACKS
+        return NOT_LIDAR if small else ouster.LACKS
 
     def first(self, topic: str) -> RawMessage | None:
         return next(self.messages([topic]), None)
@@ -286,28 +284,21 @@ class Recording(Closing):
         """
         if message.packets:
             return guard(message, partial(ouster.decode, self._sensors[message.topic]), message.packets)
+        data = guard(message, RawMessage.content, message)
         if form_of(message.connection):
-            return guard(message, foxglove.as_ros, self._parsed(message), message.connection.msgtype)
-        found = guard(message, self._deserialized, message)
-        if is_compressed(message.type):
-            return guard(message, decompress, found)
-        if foxglove.short_of(message.type):
-            return guard(message, foxglove.as_ros, found, message.type)
-        return found
+            return decode_message(message, data, message.parsed, Serialization(message.type))
+        serialization = Serialization(
+            message.type,
+            is_ros1(message.connection),
+            self.calibrations.get(message.topic, ""),
+            self.types.fields(message.connection),
+        )
+        return decode_message(message, data, partial(self._deserialized, message), serialization)
 
-    def _parsed(self, message: RawMessage) -> Any:
-        return message.parsed(guard(message, RawMessage.content, message))
-
-    def _deserialized(self, message: RawMessage) -> Any:
-        """Return the message as its definition has it; the messages of LiDAR drivers as a PointCloud2."""
-        connection, msgtype, data = message.connection, message.type, message.content()
+    def _deserialized(self, message: RawMessage, data: bytes | memoryview) -> Any:
+        """Return the message as its definition has it."""
+        connection, msgtype = message.connection, message.type
         store = self.types.store(connection)
-        if is_livox(msgtype):
-            fields = fields_of(store.fielddefs, msgtype)
-            return read_custom(data, ros1=is_ros1(connection), fields=fields)
-        if is_packets(msgtype):
-            calibration = self.calibrations.get(message.topic, "")
-            return read_scan(data, msgtype, ros1=is_ros1(connection), calibration=calibration)
         try:
             if is_ros1(connection):
                 return store.deserialize_ros1(data, msgtype)
@@ -330,7 +321,7 @@ class Recording(Closing):
         try:
             _, fields = self.types.store(connection).fielddefs[normalized(connection.msgtype)]
         except KeyError:
-            return is_livox(connection.msgtype) or is_packets(connection.msgtype)
+            return reads_bytes(connection.msgtype)
         names = [name for name, _ in fields[:2]]
         return bool(fields) and (fields[0][1][1] == "std_msgs/msg/Header" or names == STAMPED)
 

@@ -16,9 +16,8 @@ from rosbags.typesys.stores import empty
 
 from bevviz.bags.message import is_ros1
 from bevviz.bags.reader import normalized
-from bevviz.drivers import point_cloud_interfaces, video
 from bevviz.errors import first_line
-from bevviz.messages import grid_map_msgs, vision_msgs
+from bevviz.messages import decoders, grid_map_msgs, vision_msgs
 
 PREPROCESSED = re.compile(r"^[ \t]*#.*$", re.MULTILINE)  # of IDL: rosbags takes no #include
 _MADE: Mapping[str, Callable[[Any, Typestore], Any]] = {
@@ -77,8 +76,7 @@ class MessageTypes:
                 store = get_typestore(Stores.ROS1_NOETIC if ros1 else self.release)
                 vision_msgs.register(store)
                 grid_map_msgs.register(store)
-                video.register(store)
-                point_cloud_interfaces.register(store)
+                decoders.register_definitions(store)
             self._stores[key] = store
         return self._stores[key]
 

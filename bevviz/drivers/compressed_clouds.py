@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import zlib
 from typing import Any
 
@@ -12,15 +11,12 @@ from backports import zstd
 from bevviz.drivers import cloudini
 from bevviz.errors import first_line
 from bevviz.messages.clouds import MOST_POINTS, SCALARS
+from bevviz.messages.decoders import Decoder
 from bevviz.messages.encode import make
 
 LEAST, LONGEST = 1 << 24, 1 << 30  # bytes that a cloud may be unpacked to, whatever it says
 DRACO = "which DracoPy reads: pip install 'bevviz[draco]'"
-_NAME = re.compile(r"point_cloud_interfaces/(msg/)?CompressedPointCloud2$")
-
-
-def is_compressed(msgtype: str) -> bool:
-    return _NAME.search(msgtype) is not None
+COMPRESSED = "point_cloud_interfaces/msg/CompressedPointCloud2"
 
 
 def decompress(msg: Any) -> Any:
@@ -121,3 +117,11 @@ def _of_draco(msg: Any, data: bytes) -> Any:
         shape, steps = values.shape, (step, kind.itemsize)
         np.ndarray(shape, kind, points, int(field.offset), steps)[...] = values
     return points
+
+
+DEFINITIONS = {
+    COMPRESSED: "std_msgs/Header header\nuint32 height\nuint32 width\nsensor_msgs/PointField[] fields\n"
+    "bool is_bigendian\nuint32 point_step\nuint32 row_step\nuint8[] compressed_data\nbool is_dense\n"
+    "string format\n"
+}
+DECODER = Decoder(types=(COMPRESSED,), kind="PointCloud2", from_message=decompress, definitions=DEFINITIONS)

@@ -7,17 +7,16 @@ from dataclasses import dataclass
 from functools import cache
 from io import StringIO
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from bevviz.drivers.calibration_file import read_calibration
+from bevviz.drivers.packets import Packets, split
 from bevviz.errors import UserError
+from bevviz.messages.decoders import Bytes, Decoder, Serialization
 from bevviz.messages.encode import encode_points
 from bevviz.model.frame import F32, I64
-
-if TYPE_CHECKING:
-    from bevviz.drivers.packets import Packets
 
 NOMINAL = Path(__file__).parents[1] / "data" / "hesai_angles.csv"  # as Hesai's own drivers bring them
 AZIMUTHS = 36_000  # units of a circle
@@ -230,3 +229,21 @@ def _read(path: Path, model: Model) -> Angles:
             f"the packets are a {model.name}'s, which has {model.channels} channels, numbered from 1"
         )
     return _angles(rows)
+
+
+def read_scan(data: Bytes, serialization: Serialization) -> Any:
+    """Decode a PandarScan, by the sensor's own angles if their file is stated."""
+    packets = split(data, 1500, sized=True, ros1=serialization.ros1)
+    return decode(packets, Path(serialization.calibration) if serialization.calibration else None)
+
+
+DEFINITIONS = {
+    "pandar_msgs/msg/PandarPacket": "builtin_interfaces/Time stamp\nuint8[1500] data\nuint32 size\n",
+    "pandar_msgs/msg/PandarScan": "std_msgs/Header header\nPandarPacket[] packets\n",
+}
+DECODER = Decoder(
+    types=("pandar_msgs/msg/PandarScan",),
+    kind="PointCloud2",
+    from_bytes=read_scan,
+    definitions=DEFINITIONS,
+)

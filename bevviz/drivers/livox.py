@@ -5,7 +5,6 @@ The serialised message is read as an array: as objects its points, up to 500,000
 
 from __future__ import annotations
 
-import re
 import struct
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -13,9 +12,9 @@ from typing import Any
 import numpy as np
 
 from bevviz.messages.clouds import MOST_POINTS
+from bevviz.messages.decoders import Bytes, Decoder, Serialization
 from bevviz.messages.encode import encode_points
 
-NAME = re.compile(r"livox_ros_driver2?/(msg/)?CustomMsg$")
 # Of a CustomPoint of both drivers; a bag that defines it otherwise is believed.
 FIELDS = (
     ("offset_time", "uint32"),
@@ -28,11 +27,6 @@ FIELDS = (
 )
 READ = {"reflectivity": "intensity"}  # as the drivers' own PointCloud2 has it, a float32
 SECOND = 1_000_000_000
-
-
-def is_livox(msgtype: str) -> bool:
-    """Whether a message of that type is read here."""
-    return NAME.search(msgtype) is not None
 
 
 def read_custom(data: bytes | memoryview, *, ros1: bool, fields: Sequence[tuple[str, str]] = FIELDS) -> Any:
@@ -108,3 +102,28 @@ def fields_of(definitions: Mapping[str, Any], msgtype: str) -> Sequence[tuple[st
             raise ValueError(f"its points have a field {name} that is no number")
         found.append((str(name), str(content[0])))
     return found
+
+
+def read_message(data: Bytes, serialization: Serialization) -> Any:
+    """Decode a CustomMsg, by the definition of the bag if there is one."""
+    fields = fields_of(serialization.definitions, serialization.type)
+    return read_custom(data, ros1=serialization.ros1, fields=fields)
+
+
+_POINT = "uint32 offset_time\nfloat32 x\nfloat32 y\nfloat32 z\nuint8 reflectivity\nuint8 tag\nuint8 line\n"
+_MESSAGE = (
+    "std_msgs/Header header\nuint64 timebase\nuint32 point_num\nuint8 lidar_id\nuint8[3] rsvd\n"
+    "CustomPoint[] points\n"
+)
+_PACKAGES = ("livox_ros_driver", "livox_ros_driver2")
+DEFINITIONS = {
+    f"{package}/msg/{name}": text
+    for package in _PACKAGES
+    for name, text in (("CustomPoint", _POINT), ("CustomMsg", _MESSAGE))
+}
+DECODER = Decoder(
+    types=tuple(f"{package}/msg/CustomMsg" for package in _PACKAGES),
+    kind="PointCloud2",
+    from_bytes=read_message,
+    definitions=DEFINITIONS,
+)

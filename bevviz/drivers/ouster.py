@@ -7,7 +7,6 @@ benchmarks/ouster.py.
 from __future__ import annotations
 
 import json
-import re
 from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -16,16 +15,15 @@ from typing import Any
 import numpy as np
 
 from bevviz.errors import UserError
+from bevviz.messages.decoders import Decoder, declared_decoder
 from bevviz.messages.encode import encode_points
 from bevviz.model.frame import F32, U8
 
-PACKET = re.compile(r"(ouster_sensor_msgs|ouster_msgs|ouster_ros)/(msg/)?PacketMsg$")
 FRAME = "os_lidar"  # of the clouds that Ouster's driver publishes
 LACKS = (
     "packets of an Ouster without its metadata: record its metadata topic (std_msgs/String) with them, "
     "--set 'source.lidar_calibration={TOPIC: metadata.json}', or play them through its driver"
 )
-NOT_LIDAR = "packets of an Ouster's IMU"
 SMALLEST = 1000  # bytes: those of the IMU have 48
 MINUTE = 60_000_000_000
 Packet = tuple[int, bytes | memoryview]  # when it was received, nanoseconds, and its bytes
@@ -157,7 +155,8 @@ class Scans:
 
 
 def is_packet(msgtype: str) -> bool:
-    return PACKET.search(msgtype) is not None
+    """Return whether messages of a type are packets of an Ouster."""
+    return declared_decoder(msgtype) is DECODER
 
 
 def metadata_of(topic: str) -> str:
@@ -282,3 +281,13 @@ def decode(sensor: Sensor, packets: Sequence[Packet]) -> Any:
     points["ring"] = pixel
     points["time"] = times[row]
     return encode_points(stamp, FRAME, points, sensor.columns * pixels)
+
+
+_TYPES = tuple(f"{package}/msg/PacketMsg" for package in ("ouster_sensor_msgs", "ouster_msgs", "ouster_ros"))
+DEFINITIONS = dict.fromkeys(_TYPES, "uint8[] buf\n")
+DECODER = Decoder(
+    types=_TYPES,
+    kind="PointCloud2",
+    definitions=DEFINITIONS,
+    metadata_topic=metadata_of,
+)

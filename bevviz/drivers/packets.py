@@ -5,21 +5,13 @@ The serialised message is read as an array: as objects its packets, up to 9,000 
 
 from __future__ import annotations
 
-import re
 import struct
 from dataclasses import dataclass
-from importlib.util import find_spec
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from bevviz.drivers import hesai, velodyne
-from bevviz.errors import UserError
 from bevviz.model.frame import I64, U8
 
-VELODYNE = re.compile(r"velodyne_msgs/(msg/)?VelodyneScan$")
-PANDAR = re.compile(r"pandar_msgs/(msg/)?PandarScan$")
 MOST_PACKETS = 100_000
 SECOND = 1_000_000_000
 
@@ -42,43 +34,6 @@ class Packets:
     data: U8
     sizes: I64
     lost: int
-
-
-def is_packets(msgtype: str) -> bool:
-    """Whether a message of that type is read here."""
-    return PANDAR.search(msgtype) is not None or (
-        VELODYNE.search(msgtype) is not None and find_spec("velodyne_decoder") is not None
-    )
-
-
-def lacks(msgtype: str) -> str:
-    """What is to be installed for messages of that type, and why; empty: nothing."""
-    if VELODYNE.search(msgtype) and not is_packets(msgtype):
-        return "packets of the sensor, which velodyne-decoder reads: pip install 'bevviz[velodyne]'"
-    return ""
-
-
-def read_scan(data: bytes | memoryview, msgtype: str, *, ros1: bool, calibration: str = "") -> Any:
-    """The sensor_msgs/PointCloud2 that a serialised scan stands for, see ``velodyne`` and ``hesai``.
-
-    Args:
-        data: as serialised by ROS 1, or as CDR.
-        msgtype: the message's type.
-        ros1: how it is serialised.
-        calibration: path of the sensor's own angles, where they are known.
-
-    Raises:
-        ValueError: no such message, or packets of a model that is not decoded.
-        UserError: the file of angles cannot be read.
-    """
-    if VELODYNE.search(msgtype):
-        if calibration:
-            raise UserError(
-                f"source.lidar_calibration: {calibration}: a Velodyne has none: its packets tell its model"
-            )
-        return velodyne.decode(split(data, 1206, sized=False, ros1=ros1))
-    packets = split(data, 1500, sized=True, ros1=ros1)
-    return hesai.decode(packets, Path(calibration) if calibration else None)
 
 
 def split(data: bytes | memoryview, size: int, *, sized: bool, ros1: bool) -> Packets:

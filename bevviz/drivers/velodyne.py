@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from importlib.util import find_spec
+from typing import Any
 
 import numpy as np
 
-from bevviz.errors import first_line
+from bevviz.drivers.packets import Packets, split
+from bevviz.errors import UserError, first_line
+from bevviz.messages.decoders import Bytes, Decoder, Serialization
 from bevviz.messages.encode import encode_points
-
-if TYPE_CHECKING:
-    from bevviz.drivers.packets import Packets
 
 FIELDS = ("x", "y", "z", "intensity", "time", "ring")
 MODEL = 1205  # byte that tells it
@@ -45,3 +45,34 @@ def decode(packets: Packets) -> Any:
     # It counts from the last packet.
     points["time"] += np.float32((int(packets.received[usable[-1]]) - packets.stamp) * 1e-9)
     return encode_points(packets.stamp, packets.frame_id, points[list(FIELDS)])
+
+
+def read_scan(data: Bytes, serialization: Serialization) -> Any:
+    """Decode a VelodyneScan.
+
+    Raises:
+        UserError: a file of angles is stated for the sensor.
+    """
+    if file := serialization.calibration:
+        raise UserError(f"source.lidar_calibration: {file}: a Velodyne has none: its packets tell its model")
+    return decode(split(data, 1206, sized=False, ros1=serialization.ros1))
+
+
+def _missing() -> str:
+    """Return the library that is to be installed; empty: it is installed."""
+    if find_spec("velodyne_decoder") is not None:
+        return ""
+    return "packets of the sensor, which velodyne-decoder reads: pip install 'bevviz[velodyne]'"
+
+
+DEFINITIONS = {
+    "velodyne_msgs/msg/VelodynePacket": "builtin_interfaces/Time stamp\nuint8[1206] data\n",
+    "velodyne_msgs/msg/VelodyneScan": "std_msgs/Header header\nVelodynePacket[] packets\n",
+}
+DECODER = Decoder(
+    types=("velodyne_msgs/msg/VelodyneScan",),
+    kind="PointCloud2",
+    from_bytes=read_scan,
+    missing=_missing,
+    definitions=DEFINITIONS,
+)

@@ -6,16 +6,11 @@ import re
 from dataclasses import dataclass
 from typing import Any
 
-from rosbags.typesys import get_types_from_msg
-from rosbags.typesys.store import Typestore
-
 from bevviz.drivers.bitstream import is_key
+from bevviz.messages.decoders import Decoder
 from bevviz.messages.decoding import MessageError, frame_name, stamp_ns
 
-DEFINITIONS = {  # of types that bags of older releases do not define
-    "foxglove_msgs/msg/CompressedVideo": (
-        "builtin_interfaces/Time timestamp\nstring frame_id\nuint8[] data\nstring format\n"
-    ),
+DEFINITIONS = {  # bags of older releases do not define these types
     "ffmpeg_image_transport_msgs/msg/FFMPEGPacket": (
         "std_msgs/Header header\nint32 width\nint32 height\nstring encoding\nuint64 pts\nuint8 flags\n"
         "bool is_bigendian\nuint8[] data\n"
@@ -54,14 +49,6 @@ class Packet:
         return self.received, self.stamp
 
 
-def register(typestore: Typestore) -> None:
-    """Add the types that hold video to a store that has those of std_msgs."""
-    types = {}
-    for name, text in DEFINITIONS.items():
-        types.update(get_types_from_msg(text, name))
-    typestore.register(types)
-
-
 def is_video(message: Any) -> bool:
     """Whether a CompressedImage holds a packet of video."""
     return bytes(message.data[:4]).startswith(ANNEX_B)
@@ -91,3 +78,9 @@ def decode_packet(msg: Any, topic: str, received: int) -> Packet:
     if codec in ("h264", "h265") and not data.startswith(ANNEX_B):
         raise MessageError(f"{topic}: {len(data)} bytes of '{form}' are no {codec.upper()} in Annex B's form")
     return Packet(topic, received, stamp, frame_name(header.frame_id), codec, data, is_key(codec, data))
+
+
+DECODERS = tuple(
+    Decoder(types=(name,), kind="CompressedVideo", definitions={name: text})
+    for name, text in DEFINITIONS.items()
+)

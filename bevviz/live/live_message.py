@@ -9,12 +9,10 @@ from types import MappingProxyType
 from typing import Any
 
 from bevviz.drivers import ouster
-from bevviz.drivers.compressed_clouds import decompress, is_compressed
-from bevviz.drivers.livox import is_livox, read_custom
-from bevviz.drivers.packets import is_packets, read_scan
+from bevviz.messages.decoders import Serialization
 from bevviz.messages.decoding import read_header
 from bevviz.messages.definitions import store_of
-from bevviz.messages.guard import guard
+from bevviz.messages.guard import decode_message, guard
 from bevviz.messages.vision_msgs import deserialize
 
 
@@ -40,10 +38,9 @@ class LiveMessage:
         """
         if self.sensor is not None:
             return guard(self, partial(ouster.decode, self.sensor), self.packets)
-        if is_livox(self.type):
-            return guard(self, partial(read_custom, ros1=False), self.data)
-        if is_packets(self.type):
-            file = calibration.get(self.topic, "")
-            return guard(self, partial(read_scan, ros1=False, calibration=file), self.data, self.type)
-        found = guard(self, partial(deserialize, store_of(self.type)), self.data, self.type)
-        return guard(self, decompress, found) if is_compressed(self.type) else found
+        serialization = Serialization(self.type, calibration=calibration.get(self.topic, ""))
+        return decode_message(self, self.data, self._deserialized, serialization)
+
+    def _deserialized(self, data: bytes | memoryview) -> Any:
+        """Return the message as its definition has it."""
+        return deserialize(store_of(self.type), data, self.type)

@@ -10,7 +10,7 @@ from bevviz.drivers import ouster
 from bevviz.drivers.calibration_file import read_calibration
 from bevviz.errors import UserError
 from bevviz.messages.decoding import MessageError
-from bevviz.messages.topics import Topic
+from bevviz.messages.topics import NOT_LIDAR, Topic
 
 
 class Ousters:
@@ -52,7 +52,7 @@ class Ousters:
         if not ouster.is_packet(topic.type):
             return topic
         if name in self._imus or "imu" in name.rpartition("/")[2]:
-            return replace(topic, aside=ouster.NOT_LIDAR)
+            return replace(topic, aside=NOT_LIDAR)
         if file := calibration.get(name, ""):
             if name not in self._scans:
                 self._add(name, read_calibration(Path(file)), f"source.lidar_calibration: {file}")

@@ -12,9 +12,6 @@ from typing import Any
 
 from bevviz.config import Config, SourceConfig, stage_topics
 from bevviz.drivers import ouster
-from bevviz.drivers.livox import is_livox
-from bevviz.drivers.packets import is_packets
-from bevviz.drivers.point_cloud_interfaces import COMPRESSED
 from bevviz.errors import UserError
 from bevviz.live.arrival_watch import SILENCE, Watch
 from bevviz.live.graph import (
@@ -33,6 +30,7 @@ from bevviz.live.stated_topics import resolved, stated_topics, without_absent
 from bevviz.live.type_sources import TypeSources
 from bevviz.live.typesupport import message_type
 from bevviz.messages import surroundings
+from bevviz.messages.decoders import declared_decoder, reads_bytes
 from bevviz.messages.definitions import store_of
 from bevviz.messages.foreign_boxes import holds_boxes
 from bevviz.messages.guard import guard
@@ -57,7 +55,6 @@ PIECE = 65_000  # bytes that DDS sends at once; what is larger goes in pieces
 
 KINDS = {
     "sensor_msgs/msg/PointCloud2",
-    COMPRESSED,
     "sensor_msgs/msg/Image",
     "sensor_msgs/msg/CompressedImage",
     "sensor_msgs/msg/CameraInfo",
@@ -316,7 +313,7 @@ class LiveSource(Closing):
         first = self._watch.add(topic, len(data))
         before = self._sync.cameras.intrinsics.get(topic)
         try:
-            if first and (kind.endswith(("PointCloud2", "Image")) or is_livox(kind) or is_packets(kind)):
+            if first and Topic(topic, kind).kind.endswith(("PointCloud2", "Image")):
                 self.frame_ids[topic] = message.header()[1]
                 self._assign()
             if (handler := self._handlers.get(topic)) is not None:
@@ -493,7 +490,7 @@ class LiveSource(Closing):
 
         try:
             kind = message_type(topic.type)
-            if not (is_livox(topic.type) or is_packets(topic.type)):
+            if not reads_bytes(topic.type):
                 store_of(topic.type)
         except UserError as error:
             why = self._type_sources.ask(topic)
@@ -542,8 +539,7 @@ def _concerns(topic: PublishedTopic) -> bool:
     """Whether a topic can play a role, or holds what could, in a form that nothing here reads."""
     return (
         topic.type in KINDS
-        or is_livox(topic.type)
-        or is_packets(topic.type)
+        or declared_decoder(topic.type) is not None
         or holds_boxes(topic.type)
         or bool(foreign(Topic(topic.name, topic.type, None, "")))
     )

@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
-from bevviz.drivers import driver_msgs, point_cloud_interfaces
-from bevviz.messages import grid_map_msgs, vision_msgs
+from bevviz.messages import decoders, grid_map_msgs, vision_msgs
 from bevviz.model import geometry
 from bevviz.model.frame import (
     F32,
@@ -43,8 +42,7 @@ def typestore() -> Typestore:
     store = get_typestore(Stores.ROS2_JAZZY)
     vision_msgs.register(store)
     grid_map_msgs.register(store)
-    point_cloud_interfaces.register(store)
-    driver_msgs.register(store)
+    decoders.register_definitions(store)
     store.register(get_types_from_msg(_LABELLED, "bevviz_msgs/msg/Detection3DArray"))
     return store
 

@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from bevviz.messages.decoders import Decoder
 from bevviz.messages.decoding import nanoseconds
 from bevviz.messages.encode import encode_box_3d, encode_camera, encode_pose_edges, make
 from bevviz.model import geometry
@@ -321,3 +322,16 @@ _CONVERT: Mapping[str, Callable[[Any], Any]] = {
     "FrameTransforms": _transforms,
     "SceneUpdate": _scene,
 }
+_VIDEO = "foxglove_msgs/msg/CompressedVideo"
+DEFINITIONS = {  # bags of older releases do not define it
+    _VIDEO: "builtin_interfaces/Time timestamp\nstring frame_id\nuint8[] data\nstring format\n"
+}
+DECODERS = tuple(
+    Decoder(
+        types=(f"foxglove_msgs/msg/{name}", f"foxglove/msg/{name}"),
+        kind=kind,
+        from_message=_CONVERT[name],
+        definitions=DEFINITIONS if _VIDEO.endswith(f"/{name}") else {},
+    )
+    for name, kind in KINDS.items()
+)

@@ -11,6 +11,7 @@ import numpy as np
 from rosbags.interfaces import Nodetype
 
 from bevviz.errors import UserError, first_line
+from bevviz.messages.decoders import Bytes, Serialization, find_decoder
 from bevviz.messages.decoding import MessageError
 from bevviz.messages.encode import typestore
 from bevviz.support.loggers import logger
@@ -61,6 +62,33 @@ def guard(
         _log.debug("%s: a %s cannot be used", message.topic, message.type, exc_info=True)
         reason = _reason(error, content, message.type)
         raise MessageError(f"{message.topic}: not a {message.type}: {reason}") from None
+
+
+def decode_message(
+    message: TypedMessage, data: Bytes, deserialize: Callable[[Bytes], Any], serialization: Serialization
+) -> Any:
+    """Decode a message of a bag or of a live graph.
+
+    Args:
+        message: names the topic and the type in errors.
+        data: the serialised message.
+        deserialize: makes an object with the fields of the definition.
+        serialization: passed on to the decoder.
+
+    Returns:
+        The result of the decoder; the deserialised message if its type has no decoder.
+
+    Raises:
+        MessageError: the data cannot be decoded.
+        UserError: a file that the configuration names for the topic cannot be used.
+    """
+    decoder = find_decoder(serialization.type)
+    if decoder is not None and decoder.from_bytes is not None:
+        return guard(message, decoder.from_bytes, data, serialization)
+    content = guard(message, deserialize, data)
+    if decoder is None or decoder.from_message is None:
+        return content
+    return guard(message, decoder.from_message, content)
 
 
 def _reason(error: Exception, content: Any, msgtype: str) -> str:

@@ -11,7 +11,6 @@ from types import MappingProxyType
 from typing import Literal
 
 from bevviz.config import SourceConfig
-from bevviz.drivers import ouster
 from bevviz.errors import UserError
 from bevviz.messages.foreign_boxes import check
 from bevviz.messages.foxglove import short_of
@@ -142,8 +141,8 @@ def find_roles(
     obstacles = [topic for key, topic in staged.items() if key == "ground.method"]
     for name in config.lidar_calibration:
         stated_topic(name, topics, "source.lidar_calibration", "PointCloud2")
-    told = {ouster.metadata_of(t.name) for t in topics if t.scans}
-    note(notes, [t for t in topics if t.name in told], "metadata of the LiDAR")
+    metadata = {t.metadata_topic for t in topics}
+    note(notes, [t for t in topics if t.name in metadata], "metadata of the LiDAR")
     lidars = find_lidars([t for t in topics if t not in obstacles], config, notes)
     images = find_images(topics, config, notes)
     names = unique_names(

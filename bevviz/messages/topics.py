@@ -7,18 +7,13 @@ import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
-from bevviz.drivers import ouster
-from bevviz.drivers.compressed_clouds import is_compressed
-from bevviz.drivers.livox import is_livox
-from bevviz.drivers.ouster import is_packet
-from bevviz.drivers.packets import is_packets, lacks
 from bevviz.errors import UserError
+from bevviz.messages.decoders import declared_decoder, find_decoder
 from bevviz.messages.foreign_boxes import holds_boxes
-from bevviz.messages.foxglove import KINDS, short_of
 
 IMAGES = ("Image", "CompressedImage", "CompressedVideo")
 VIDEO = "video of a kind that is not decoded here: republish it as images (image_transport) and record these"
-_VIDEO = re.compile(r"ffmpeg_image_transport_msgs/(msg/)?FFMPEGPacket$|theora_image_transport/(msg/)?Packet$")
+NOT_LIDAR = "packets of an Ouster's IMU"  # Topic.aside of packets that are no part of a scan
 
 # Entities that a recording has beside those of its sensors (docs/recordings.md). No sensor may be called so.
 RESERVED = frozenset(
@@ -47,13 +42,18 @@ class Topic:
     @property
     def kind(self) -> str:
         """What it is read as: the type without its package, but for types that stand for others."""
-        if self.scans or is_livox(self.type) or is_packets(self.type) or is_compressed(self.type):
-            return "PointCloud2"
-        if short := short_of(self.type):
-            return KINDS[short]
-        if self.video or _VIDEO.search(self.type):
+        decoder = find_decoder(self.type)
+        if decoder is not None and (self.scans or decoder.metadata_topic is None):
+            return decoder.kind
+        if self.video:
             return "CompressedVideo"
         return "Detection3DArray" if self.boxes or holds_boxes(self.type) else self.type.rpartition("/")[2]
+
+    @property
+    def metadata_topic(self) -> str:
+        """Topic with the metadata of the LiDAR whose packets these are; empty for other topics."""
+        decoder = declared_decoder(self.type) if self.scans else None
+        return decoder.metadata_topic(self.name) if decoder and decoder.metadata_topic else ""
 
 
 _FOREIGN = (  # what holds points or pixels in a form that nothing here reads, and what would help
@@ -82,9 +82,10 @@ def foreign(topic: Topic, sensor: str = "") -> str:
     """What a topic that nothing here reads holds and what would help; empty where it is not known."""
     if topic.kind == "PointCloud2":
         return ""
-    if is_packet(topic.type) and topic.aside:
-        return topic.aside if not sensor or (sensor == "LiDAR" and topic.aside != ouster.NOT_LIDAR) else ""
-    if sensor in ("", "LiDAR") and (why := lacks(topic.type)):
+    decoder = declared_decoder(topic.type)
+    if decoder is not None and decoder.metadata_topic is not None and topic.aside:
+        return topic.aside if not sensor or (sensor == "LiDAR" and topic.aside != NOT_LIDAR) else ""
+    if decoder is not None and sensor in ("", "LiDAR") and (why := decoder.missing()):
         return why
     return next((why for of, kind, why in _FOREIGN if sensor in ("", of) and kind.search(topic.type)), "")
 

@@ -1,0 +1,222 @@
+"""The registry of decoders: bags and live graphs read the same, and packages add their own."""
+
+from __future__ import annotations
+
+import ast
+import dataclasses
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from rosbags.typesys import get_types_from_msg
+
+from bevviz.bags.bag import Recording
+from bevviz.drivers.compressed_clouds import COMPRESSED
+from bevviz.errors import UserError
+from bevviz.live.live_message import LiveMessage
+from bevviz.live.ouster_sensors import Ousters
+from bevviz.messages.clouds import decode_cloud
+from bevviz.messages.decoders import BUILT_IN, declared_decoder, decoders, find_decoder
+from bevviz.messages.topics import Topic
+from tests import bags, test_compressed_clouds, test_livox, test_ouster, test_packets, videos
+
+ROOT = Path(__file__).parents[1]
+MINE = """
+from bevviz.messages.decoders import Decoder
+from bevviz.messages.encode import encode_points
+import numpy as np
+
+def read(data, serialization):
+    points = np.frombuffer(data, [("x", "<f4"), ("y", "<f4"), ("z", "<f4")], offset=4)
+    return encode_points(7, serialization.type, points)
+
+DECODER = Decoder(types=("my_lidar_msgs/msg/Sweep",), kind="PointCloud2", from_bytes=read)
+"""
+
+
+def assert_same(one: Any, other: Any) -> None:
+    """Compare two messages field by field."""
+    assert type(one).__name__ == type(other).__name__
+    if dataclasses.is_dataclass(one):
+        for field in dataclasses.fields(one):
+            assert_same(getattr(one, field.name), getattr(other, field.name))
+    elif isinstance(one, list):
+        assert len(one) == len(other)
+        for left, right in zip(one, other, strict=True):
+            assert_same(left, right)
+    else:
+        np.testing.assert_array_equal(one, other)
+
+
+def both(path: Path, item: bags.Item, made: bags.Messages) -> tuple[Any, Any]:
+    """Decode the message of a bag, and the same bytes as of a live graph."""
+    with Recording([bags.write(path, [item], made)]) as recording:
+        message = recording.first(item.topic)
+        assert message is not None
+        data = bytes(message.content())
+        return recording.decode(message), LiveMessage(item.topic, item.type, bags.START, data).decode()
+
+
+def test_bags_and_live_decode_livox_alike(tmp_path: Path) -> None:
+    package = "livox_ros_driver2"
+    made = test_livox.messages(False, package)
+    content = test_livox.scan(made, package, bags.START)
+    in_bag, live = both(tmp_path / "bag", bags.Item("/l", f"{package}/msg/CustomMsg", 1, content), made)
+    assert in_bag.width == 50
+    assert_same(in_bag, live)
+
+
+def test_bags_and_live_decode_hesai_packets_alike(tmp_path: Path) -> None:
+    made, data = test_packets.messages(), test_packets.packet(test_packets.BY_NAME["PandarXT16"], 0)
+    item = bags.Item("/p", test_packets.SCAN, 1, test_packets.scan(made, bags.START, [data]))
+    in_bag, live = both(tmp_path / "bag", item, made)
+    assert in_bag.width > 100
+    assert_same(in_bag, live)
+
+
+def test_bags_and_live_decode_velodyne_packets_alike(tmp_path: Path) -> None:
+    pytest.importorskip("velodyne_decoder")
+    made, kind = test_packets.messages(), test_packets.VELODYNE
+    block = b"\xff\xee\0\0" + b"\xe8\x03\x10" * 32
+    data = block * 12 + bytes(4) + b"\x37\x22"  # a VLP-16 in the mode of strongest returns
+    item = bags.Item("/v", kind, 1, test_packets.scan(made, bags.START, [data], kind))
+    # As clouds: the library leaves bytes between its fields as they are.
+    in_bag, live = (decode_cloud(m, "/v", 0) for m in both(tmp_path / "bag", item, made))
+    assert len(in_bag.xyz) > 100 and in_bag.stamp == live.stamp
+    np.testing.assert_array_equal(in_bag.xyz, live.xyz)
+    assert in_bag.fields.keys() == live.fields.keys()
+    for name, values in in_bag.fields.items():
+        np.testing.assert_array_equal(values, live.fields[name])
+
+
+def test_bags_and_live_decode_ouster_scans_alike(tmp_path: Path) -> None:
+    text, kind = test_ouster.metadata("RNG15_RFL8_NIR8"), test_ouster.KIND
+    path = test_ouster.bag(tmp_path / "bag", told=text, scans=1)
+    ousters, live = Ousters(), list[Any]()
+    ousters.look([Topic(test_ouster.LIDAR, kind)], {})
+    ousters.add_metadata(test_ouster.TOLD, text)
+    sensor = ousters.sensor(test_ouster.LIDAR)
+    with Recording([path]) as recording:
+        for message in recording.messages([test_ouster.LIDAR]):
+            for packets in ousters.add_packet(message.topic, message.received, bytes(message.content())):
+                scan = LiveMessage(message.topic, kind, message.received, b"", sensor, packets)
+                live.append(scan.decode())
+        in_bag = [recording.decode(scan) for scan in recording.scans([test_ouster.LIDAR])]
+    assert len(in_bag) == 1 and in_bag[0].width > 100
+    assert_same(in_bag, live)
+
+
+@pytest.mark.parametrize("form", ["zstd", "zlib"])
+def test_bags_and_live_decode_compressed_clouds_alike(tmp_path: Path, form: str) -> None:
+    made = test_compressed_clouds.messages()
+    cloud = made.cloud(bags.START, test_compressed_clouds.points(0))
+    data = test_compressed_clouds.packed(form, bytes(cloud.data))
+    content = test_compressed_clouds.compressed(made, cloud, form, data)
+    in_bag, live = both(tmp_path / "bag", bags.Item("/c", COMPRESSED, 1, content), made)
+    assert in_bag.width == 500
+    assert_same(in_bag, live)
+
+
+@pytest.mark.parametrize("kind", list(videos.DEFINITIONS))
+def test_bags_and_live_decode_video_alike(tmp_path: Path, kind: str) -> None:
+    made = videos.messages()
+    item = bags.Item("/v", kind, 1, videos.message(made, kind, bags.START, b"\0\0\0\1\x67"))
+    in_bag, live = both(tmp_path / "bag", item, made)
+    assert bytes(in_bag.data) == b"\0\0\0\1\x67"
+    assert_same(in_bag, live)
+    assert Topic("/v", kind).kind == "CompressedVideo"
+
+
+def test_a_foxglove_cloud_is_a_point_cloud_in_live_as_in_bags(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made, kind = bags.Messages(), "foxglove_msgs/msg/PointCloud"
+    field = "foxglove_msgs/msg/PackedElementField"
+    made.store.register(
+        get_types_from_msg("string name\nuint32 offset\nuint8 type\n", field)
+        | get_types_from_msg(
+            "builtin_interfaces/Time timestamp\nstring frame_id\ngeometry_msgs/Pose pose\n"
+            "uint32 point_stride\nPackedElementField[] fields\nuint8[] data\n",
+            kind,
+        )
+    )
+    header = made.header(bags.START, "lidar")
+    point = made.make("geometry_msgs/msg/Point", x=1.0, y=0.0, z=0.0)
+    turn = made.make("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=0.0, w=1.0)
+    content = made.make(
+        kind,
+        timestamp=header.stamp,
+        frame_id="lidar",
+        pose=made.make("geometry_msgs/msg/Pose", position=point, orientation=turn),
+        point_stride=12,
+        fields=[made.make(field, name=name, offset=4 * i, type=7) for i, name in enumerate("xyz")],
+        data=np.ones((5, 3), np.float32).view(np.uint8).reshape(-1),
+    )
+    monkeypatch.setattr("bevviz.live.live_message.store_of", lambda name: made.store)
+    in_bag, live = both(tmp_path / "bag", bags.Item("/f", kind, 1, content), made)
+    assert in_bag.width == 5 and bytes(in_bag.data[:4]) == b"\0\0\0\x40"  # x: 1 m, moved by 1 m
+    assert_same(in_bag, live)
+
+
+@pytest.fixture
+def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """An installed package with a decoder."""
+    metadata = tmp_path / "my_lidar-1.0.dist-info"
+    metadata.mkdir()
+    (metadata / "METADATA").write_text("Metadata-Version: 2.1\nName: my_lidar\nVersion: 1.0\n")
+    (metadata / "entry_points.txt").write_text("[bevviz.decoders]\nmine = my_lidar_decoder:DECODER\n")
+    (tmp_path / "my_lidar_decoder.py").write_text(MINE)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    decoders.cache_clear()
+    yield tmp_path
+    monkeypatch.undo()
+    decoders.cache_clear()
+
+
+def test_a_decoder_of_a_package_reads_its_messages(package: Path) -> None:
+    kind = "my_lidar_msgs/msg/Sweep"
+    decoder = find_decoder("my_lidar_msgs/Sweep")
+    assert decoder is not None and decoder.kind == Topic("/sweep", kind).kind == "PointCloud2"
+    data = bytes([0, 1, 0, 0]) + np.arange(6, dtype="<f4").tobytes()
+    cloud = LiveMessage("/sweep", kind, 0, data).decode()
+    assert cloud.width == 2 and cloud.header.stamp.nanosec == 7
+    assert list(decoders())[-1] == kind  # ours come first
+
+
+@pytest.mark.parametrize(
+    ("source", "said"),
+    [
+        ("import nothing_of_this_name", "cannot be loaded: ModuleNotFoundError: No module named"),
+        ("DECODER = 5", "is a int, not a bevviz.messages.decoders.Decoder"),
+    ],
+)
+def test_a_broken_decoder_of_a_package_is_one_line(package: Path, source: str, said: str) -> None:
+    (package / "broken_decoder.py").write_text(source)
+    points = package / "my_lidar-1.0.dist-info" / "entry_points.txt"
+    points.write_text("[bevviz.decoders]\nmine = broken_decoder:DECODER\n")
+    sys.modules.pop("broken_decoder", None)
+    with pytest.raises(UserError, match=rf"^the decoder 'mine' \(broken_decoder:DECODER\) .*{said}"):
+        find_decoder("my_lidar_msgs/msg/Sweep")
+
+
+def test_every_decoder_of_bevviz_is_in_the_registry() -> None:
+    listed = {name.partition(":")[0] for name in BUILT_IN}
+    written = {
+        ".".join(path.relative_to(ROOT).with_suffix("").parts)
+        for path in (ROOT / "bevviz").rglob("*.py")
+        if any(line.startswith(("DECODER = ", "DECODERS = ")) for line in path.read_text().splitlines())
+    }
+    assert listed == written
+    assert declared_decoder("ouster_ros/PacketMsg") is declared_decoder("ouster_sensor_msgs/msg/PacketMsg")
+    assert find_decoder("sensor_msgs/msg/PointCloud2") is None
+
+
+def test_no_module_of_messages_imports_a_driver() -> None:
+    for path in (ROOT / "bevviz" / "messages").glob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text())):
+            names = [name.name for name in node.names] if isinstance(node, ast.Import) else []
+            names += [node.module or ""] if isinstance(node, ast.ImportFrom) else []
+            assert not any(name.startswith("bevviz.drivers") for name in names), path
