@@ -1,1 +1,1 @@
-"""Decoders of LiDAR packets, compressed clouds and video. Imports `messages` and below."""
+"""Decoders of LiDAR packets, compressed clouds and video. Imports `messages` and layers below it."""

@@ -1,6 +1,6 @@
-"""What is to be known of packets of video before they are decoded: where that can begin, what is missing.
+"""Headers of video packets: key frames and gaps, found without decoding the pictures.
 
-ITU-T H.264 and H.265, sections 7.3 and 7.4; the AV1 and VP9 bitstream specifications.
+Sources: ITU-T H.264 and H.265, sections 7.3 and 7.4; the AV1 and VP9 bitstream specifications.
 """
 
 from __future__ import annotations
@@ -10,42 +10,44 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 _START = re.compile(b"\0\0\1")
-_HEAD = 96  # bytes of a unit that are looked at
+_HEAD = 96  # bytes that are kept of a unit: the header fields read here are within them
 _H264_SPS, _H264_SEI, _H264_SLICES, _H264_IDR = 7, 6, (1, 5), 5
-_H264_INTRA = (2, 4, 7, 9)  # types of slices that need no other picture
+_H264_INTRA = (2, 4, 7, 9)  # types of slices that refer to no other picture
 _H265_SPS, _H265_SEI, _H265_SLICES, _H265_IRAP = 33, 39, range(32), range(16, 24)
-_RECOVERY = 6  # of the messages in an SEI: from here on pictures become whole
-_HIGH = {100, 110, 122, 244, 44, 83, 86, 118, 128, 138, 139, 134, 135}  # profiles with more in their SPS
+_RECOVERY = 6  # type of the SEI message "recovery point": the following pictures become complete
+# Profiles with additional fields in their sequence parameter set.
+_HIGH = {100, 110, 122, 244, 44, 83, 86, 118, 128, 138, 139, 134, 135}
 
 
 def units(data: bytes) -> Iterator[bytes]:
-    """The beginning of each unit of an H.264 or H.265 stream in the form of Annex B."""
+    """Yield the first bytes of each unit of an H.264 or H.265 stream in Annex B format."""
     for found in _START.finditer(data):
         yield data[found.end() : found.end() + _HEAD]
 
 
 def is_key(codec: str, data: bytes) -> bool:
-    """Whether decoding can begin with a packet.
+    """Return whether decoding can begin with a packet.
 
-    Of H.264 and H.265, that it has a sequence parameter set, and no picture that needs others: there are
-    encoders that put one before each picture.
+    A packet of H.264 or H.265 must have a sequence parameter set, because some encoders put one before each
+    picture, and no picture that refers to other pictures.
     """
     if codec == "h264":
         return _begins_h264(data)
     if codec == "h265":
         return _begins_h265(data)
     if codec == "av1":
-        return 1 in _obus(data)  # a sequence header
+        return 1 in _obus(data)  # type of a sequence header
     if codec == "vp9":
         profile_3 = data[:1] and data[0] >> 4 & 3 == 3
         rest = data[0] << (1 if profile_3 else 0) if data else 255
-        return not rest & 0b1100  # neither an existing frame shown again, nor one that needs others
+        return not rest & 0b1100  # neither a repeated frame nor one that refers to other frames
     if codec == "vp8":
         return bool(data) and not data[0] & 1
-    return bool(data) and data[0] & 0xC0 == 0  # Theora
+    return bool(data) and data[0] & 0xC0 == 0  # the bit of Theora that marks inter frames
 
 
 def _begins_h264(data: bytes) -> bool:
+    """Return whether decoding of H.264 can begin with a packet."""
     said = recovers = False
     for unit in filter(None, units(data)):
         kind = unit[0] & 31
@@ -53,12 +55,13 @@ def _begins_h264(data: bytes) -> bool:
         recovers |= kind == _H264_SEI and _RECOVERY in _messages(unit[1:])
         if kind in _H264_SLICES:
             bits = _Bits(unit[1:])
-            bits.number()  # place of the slice
+            bits.number()  # first macroblock of the slice
             return said and (recovers or kind == _H264_IDR or bits.number() in _H264_INTRA)
     return said
 
 
 def _begins_h265(data: bytes) -> bool:
+    """Return whether decoding of H.265 can begin with a packet."""
     said = recovers = False
     for unit in filter(None, units(data)):
         kind = unit[0] >> 1 & 63
@@ -70,7 +73,10 @@ def _begins_h265(data: bytes) -> bool:
 
 
 def _messages(sei: bytes) -> Iterator[int]:
-    """Types of the messages in an SEI; each is behind its type and its size, of which 255 are a byte."""
+    """Iterate over the types of the messages in an SEI unit.
+
+    The type and the size of a message precede it. Each byte of 255 continues the number.
+    """
     plain = iter(sei.replace(b"\0\0\3", b"\0\0"))
     for byte in plain:
         kind, size = byte, next(plain, 0)
@@ -87,7 +93,7 @@ def _messages(sei: bytes) -> Iterator[int]:
 
 
 def _obus(data: bytes) -> Iterator[int]:
-    """Types of the units of an AV1 packet."""
+    """Iterate over the types of the units (OBUs) of an AV1 packet."""
     at = 0
     while at < len(data):
         header = data[at]
@@ -106,16 +112,16 @@ def _obus(data: bytes) -> Iterator[int]:
 
 @dataclass(slots=True)
 class Continuity:
-    """Tells that pictures of an H.264 stream are missing, which its decoders paint over (section 7.4.3).
+    """Counter of missing pictures in an H.264 stream (section 7.4.3). H.264 decoders conceal such gaps.
 
-    Each picture that others may refer to has the number after the last one's.
+    Each reference picture has a frame number, one higher than that of the reference picture before it.
     """
 
-    _bits: int = 0  # of a number; 0: not known
+    _bits: int = 0  # number of bits of a frame number; 0: not known
     _last: int | None = None
 
     def missing(self, data: bytes) -> int:
-        """How many pictures that are referred to are missing before this packet."""
+        """Return the number of reference pictures that are missing before this packet."""
         lost = 0
         for unit in units(data):
             kind = unit[0] & 31 if unit else 0
@@ -124,7 +130,7 @@ class Continuity:
                 self._last = self._last if bits_before == self._bits else None
             elif kind in _H264_SLICES and self._bits:
                 bits = _Bits(unit[1:])
-                bits.number(), bits.number(), bits.number()  # place, type and parameter set of the slice
+                bits.number(), bits.number(), bits.number()  # first macroblock, type, parameter set
                 number = bits.take(self._bits)
                 if kind == _H264_IDR:
                     self._last = number
@@ -138,15 +144,15 @@ class Continuity:
 
 
 def _number_bits(sps: bytes) -> int:
-    """Bits of a picture's number; 0: not to be told."""
+    """Return the number of bits of a frame number, by the sequence parameter set; 0 if it cannot be read."""
     profile, bits = (sps[1] if len(sps) > 1 else 0), _Bits(sps[4:])
-    bits.number()  # of the parameter set
+    bits.number()  # number of the parameter set
     if profile in _HIGH:
         if bits.number() == 3:
             bits.take(1)
-        bits.number(), bits.number(), bits.take(1)  # depths, and whether nothing is transformed
+        bits.number(), bits.number(), bits.take(1)  # bit depths, and the flag for the lossless transform
         if bits.take(1):
-            return 0  # scaling lists
+            return 0  # there are scaling lists, which are not parsed
     size = bits.number() + 4
     order = bits.number()
     if order == 0:
@@ -155,25 +161,26 @@ def _number_bits(sps: bytes) -> int:
         bits.take(1), bits.number(), bits.number()
         for _ in range(bits.number() % 256):
             bits.number()
-    bits.number()  # of pictures that are referred to
-    return 0 if bits.take(1) else size  # gaps may be meant
+    bits.number()  # number of reference frames
+    return 0 if bits.take(1) else size  # the stream allows gaps
 
 
 class _Bits:
-    """The bits of a unit, without the bytes that keep start codes out of it. Zeros follow its end."""
+    """Bit reader for a unit, without the bytes that prevent start codes. Bits beyond the end are zero."""
 
     def __init__(self, data: bytes) -> None:
         plain = data.replace(b"\0\0\3", b"\0\0")
         self._value, self._left = int.from_bytes(plain), 8 * len(plain)
 
     def take(self, count: int) -> int:
+        """Read an unsigned number of ``count`` bits."""
         self._left -= count
         if self._left < 0:
             return 0
         return self._value >> self._left & (1 << count) - 1
 
     def number(self) -> int:
-        """Unsigned, as Exp-Golomb has it."""
+        """Read an unsigned Exp-Golomb number."""
         zeros = 0
         while not self.take(1):
             zeros += 1

@@ -1,4 +1,4 @@
-"""What a user states of a LiDAR whose packets are decoded here."""
+"""Reader of the LiDAR calibration files that ``source.lidar_calibration`` names."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from bevviz.support.files import read_text
 
 
 def read_calibration(path: Path) -> str:
-    """The text of a file that ``source.lidar_calibration`` names.
+    """Return the text of a file that ``source.lidar_calibration`` names.
 
     Raises:
-        UserError: it cannot be read.
+        UserError: the file cannot be read.
     """
     return read_text(path, problem=f"source.lidar_calibration: {path}: cannot be read")

@@ -1,8 +1,8 @@
-"""Clouds that cloudini compressed (github.com/facontidavide/cloudini), in its formats 3 to 5.
+"""Decoder for clouds that cloudini compressed (github.com/facontidavide/cloudini), formats 3 to 5.
 
-A header says what the fields are; then come chunks of points. Of each field a chunk holds the differences
-from point to point as zigzag varints, floats as multiples of their resolution; what is kept exactly is stored
-as it is, or as its exclusive or with the value before it. All of a chunk is compressed again by zstd or LZ4.
+A header lists the fields. Chunks of points follow. A chunk holds the differences of a field from point to
+point as zigzag varints; floats are multiples of their resolution. Lossless fields are stored unchanged or as
+the exclusive or with the previous value. zstd or LZ4 compresses each chunk.
 """
 
 from __future__ import annotations
@@ -23,23 +23,30 @@ from bevviz.model.frame import F64, I64, U8
 from bevviz.support.kernel import kernel
 
 MAGIC = b"CLOUDINI_V"
-CHUNK = 32 * 1024  # points
-MOST_BYTES = 1 << 30  # of a cloud
-LONGEST_HEADER = 1 << 13  # bytes in YAML: those of 20 fields take 1.5 kB, and it is read slowly
+CHUNK = 32 * 1024  # points of a chunk
+MOST_BYTES = 1 << 30  # largest cloud, in bytes
+LONGEST_HEADER = 1 << 13  # longest YAML header, in bytes: 20 fields take 1.5 kB, and the YAML parser is slow
 TYPES = ("", "INT8", "UINT8", "INT16", "UINT16", "INT32", "UINT32", "FLOAT32", "FLOAT64", "INT64", "UINT64")
 SIZES = (0, 1, 1, 2, 2, 4, 4, 4, 8, 8, 8)
 FLOAT32, FLOAT64 = 7, 8
-NOWHERE = 0xFFFFFFFF  # offset of a field that is encoded and not kept
+NOWHERE = 0xFFFFFFFF  # offset of a field that is encoded but not kept
 U64 = NDArray[np.uint64]
 ENCODINGS = ("NONE", "LOSSY", "LOSSLESS")
 COMPRESSIONS = ("NONE", "LZ4", "ZSTD")
-COPIED, DELTAS, MULTIPLES, XORED, PACKED = range(5)  # how a field is encoded
-CUT = -1  # what the kernels return where the data ends, or is none of theirs
+COPIED, DELTAS, MULTIPLES, XORED, PACKED = range(5)  # encodings of a field
+CUT = -1  # returned by the kernels if the data are cut or damaged
 
 
 @dataclass(frozen=True, slots=True)
 class Field:
-    """``type`` as a PointField has it, 9 and 10 being int64 and uint64; ``resolution`` of 0: none."""
+    """Field of a point.
+
+    Attributes:
+        name: field name.
+        offset: byte within the point, or ``NOWHERE``.
+        type: datatype as in a PointField; 9 is int64 and 10 is uint64.
+        resolution: step of the quantised values; 0: not quantised.
+    """
 
     name: str
     offset: int
@@ -48,12 +55,22 @@ class Field:
 
     @property
     def size(self) -> int:
+        """Size in bytes."""
         return SIZES[self.type]
 
 
 @dataclass(frozen=True, slots=True)
 class Header:
-    """What the data say of themselves. ``encoding`` and ``compression``: by ENCODINGS, COMPRESSIONS."""
+    """Header of a compressed cloud.
+
+    Attributes:
+        version: format, 3 to 5.
+        width, height: size of the cloud in points.
+        point_step: bytes of a point.
+        encoding: index in ``ENCODINGS``.
+        compression: index in ``COMPRESSIONS``.
+        fields: fields of a point.
+    """
 
     version: int
     width: int
@@ -65,24 +82,25 @@ class Header:
 
     @property
     def points(self) -> int:
+        """Number of points."""
         return self.width * self.height
 
     @property
     def adaptive(self) -> Sequence[Field]:
-        """Integers that stand behind all points of a chunk, each encoded as it takes least room."""
+        """Integer fields that a chunk stores column by column behind its points."""
         if self.version < 5 or ENCODINGS[self.encoding] != "LOSSY":
             return ()
         return [f for f in self.fields if f.type not in (FLOAT32, FLOAT64) and f.size > 1]
 
 
-EMPTY = Header(5, 0, 1, 0, 0, 0, ())  # of a cloud without points, of which there are no data
+EMPTY = Header(5, 0, 1, 0, 0, 0, ())  # cloud without points: its message has no data
 
 
 def decode(data: bytes) -> tuple[Header, U8]:
-    """The header, and the (points * point_step,) bytes of the points.
+    """Decode a compressed cloud. Return its header and the (points * point_step,) bytes of its points.
 
     Raises:
-        ValueError: no data of cloudini's, of a version that is not known here, or damaged.
+        ValueError: the data are not cloudini's, of an unsupported version, or damaged.
     """
     header, at = read_header(data)
     fields, adaptive = header.fields, header.adaptive
@@ -117,10 +135,10 @@ def decode(data: bytes) -> tuple[Header, U8]:
 
 
 def read_header(data: bytes) -> tuple[Header, int]:
-    """The header, and the byte where the chunks begin.
+    """Parse the header. Return it and the byte at which the chunks begin.
 
     Raises:
-        ValueError: it is none.
+        ValueError: the header is missing, of an unsupported version, or damaged.
     """
     if not data.startswith(MAGIC) or not data[10:12].isdigit():
         raise ValueError("its data do not begin as cloudini's do")
@@ -136,10 +154,10 @@ def read_header(data: bytes) -> tuple[Header, int]:
         raise ValueError(f"its cloudini header is damaged ({first_line(error)})") from None
 
 
-@lru_cache(
-    maxsize=64
-)  # all messages of a topic have the same one, which takes longer to read than the points
+# All messages of a topic have the same header. Parsing it takes longer than decoding the points.
+@lru_cache(maxsize=64)
 def _of_yaml(version: int, text: str) -> Header:
+    """Parse a header in YAML. Raise ValueError, LookupError or TypeError if it is damaged."""
     from ruamel.yaml import YAML
     from ruamel.yaml.error import YAMLError
 
@@ -159,11 +177,12 @@ def _of_yaml(version: int, text: str) -> Header:
 
 
 def _single(resolution: object) -> float:
-    """As cloudini holds it, in single precision; 0: none."""
+    """Return a resolution in single precision, as cloudini stores it; 0 if there is none."""
     return float(np.float32(0 if resolution is None else str(resolution)))
 
 
 def _of_binary(version: int, data: bytes) -> tuple[Header, int]:
+    """Parse a binary header. Return it and the byte at which the chunks begin."""
     width, height, step, encoding, compression, count = struct.unpack_from("<IIIBBH", data, 12)
     at, fields = 28, list[Field]()
     for _ in range(count):
@@ -178,6 +197,7 @@ def _of_binary(version: int, data: bytes) -> tuple[Header, int]:
 
 
 def _way(header: Header, field: Field) -> int:
+    """Return how a field is encoded: ``COPIED``, ``DELTAS``, ``MULTIPLES``, ``XORED`` or ``PACKED``."""
     encoding = ENCODINGS[header.encoding]
     if encoding == "NONE" or field.size == 1:
         return COPIED
@@ -191,6 +211,7 @@ def _way(header: Header, field: Field) -> int:
 
 
 def _unpacked(header: Header, chunk: bytes) -> U8:
+    """Decompress a chunk. Raise ValueError if it is damaged or larger than a chunk can be."""
     compression = COMPRESSIONS[header.compression]
     most = CHUNK * (sum(11 for _ in header.fields) + header.point_step) + 4096
     try:
@@ -208,7 +229,7 @@ def _unpacked(header: Header, chunk: bytes) -> U8:
 
 @kernel
 def _varint(data: U8, at: int) -> tuple[np.uint64, int]:
-    """An unsigned number of seven bits a byte, lowest first, and the byte behind it."""
+    """Read a varint. Return it and the next byte, ``CUT`` if the data end within it."""
     value, shift = np.uint64(0), np.uint64(0)
     while 0 <= at < len(data) and shift < 64:
         byte = np.uint64(data[at])
@@ -222,7 +243,7 @@ def _varint(data: U8, at: int) -> tuple[np.uint64, int]:
 
 @kernel
 def _difference(value: np.uint64) -> np.int64:
-    """Of a zigzag number that is one more, 0 being NaN."""
+    """Decode a zigzag number. It is stored plus one, because 0 stands for NaN."""
     value -= np.uint64(1)
     return np.int64(value >> np.uint64(1)) ^ -np.int64(value & np.uint64(1))
 
@@ -238,7 +259,7 @@ def _points(
     out: U8,
     step: int,
 ) -> int:
-    """Decode the fields that stand together, point after point; the byte behind them."""
+    """Decode the fields that are stored point by point. Return the byte behind them."""
     at, fields = 0, len(ways)
     before, bits = np.zeros(fields, np.int64), np.zeros(fields, np.uint64)
     leading, meaningful = np.zeros(fields, np.int64), np.zeros(fields, np.int64)
@@ -282,7 +303,7 @@ def _points(
 
 @kernel
 def _packed(data: U8, at: int, first: bool, field: int, bits: U64, leading: I64, meaningful: I64) -> int:
-    """A double by Gorilla (Pelkonen et al. 2015), whose bits begin with a byte; the byte behind it."""
+    """Decode a double by Gorilla (Pelkonen et al. 2015), from a whole byte on. Return the byte behind it."""
     place = at * 8
     if first:
         value, place = _bits(data, place, 64)
@@ -305,7 +326,7 @@ def _packed(data: U8, at: int, first: bool, field: int, bits: U64, leading: I64,
 
 @kernel
 def _bits(data: U8, place: int, count: int) -> tuple[np.uint64, int]:
-    """A number of so many bits, the lowest first, at a bit of the data; the bit behind it."""
+    """Read a number of ``count`` bits, the lowest first. Return it and the bit behind it."""
     value = np.uint64(0)
     if place == CUT or place + count > len(data) * 8:
         return value, CUT
@@ -321,7 +342,10 @@ def _bits(data: U8, place: int, count: int) -> tuple[np.uint64, int]:
 
 @kernel
 def _column(data: U8, at: int, count: int, size: int, offset: int, out: U8, step: int) -> int:
-    """Decode one integer of all points of a chunk: differences, a palette, or runs of either."""
+    """Decode an integer field of all points of a chunk: differences, a palette, or runs of either.
+
+    Return the byte behind it.
+    """
     if at >= len(data):
         return CUT
     mode = data[at]
@@ -379,6 +403,7 @@ def _column(data: U8, at: int, count: int, size: int, offset: int, out: U8, step
 
 @kernel
 def _load(data: U8, at: int, size: int) -> np.uint64:
+    """Read an unsigned little-endian number of ``size`` bytes."""
     value = np.uint64(0)
     for i in range(size):
         value |= np.uint64(data[at + i]) << np.uint64(8 * i)
@@ -387,5 +412,6 @@ def _load(data: U8, at: int, size: int) -> np.uint64:
 
 @kernel
 def _store(out: U8, at: int, size: int, value: np.uint64) -> None:
+    """Write an unsigned little-endian number of ``size`` bytes."""
     for i in range(size):
         out[at + i] = np.uint8((value >> np.uint64(8 * i)) & np.uint64(0xFF))

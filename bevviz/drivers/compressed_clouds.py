@@ -1,4 +1,4 @@
-"""Clouds that point_cloud_transport compressed: CompressedPointCloud2 of its plugins, cloudini among them."""
+"""Decoder for CompressedPointCloud2 messages of point_cloud_transport: zstd, zlib, draco and cloudini."""
 
 from __future__ import annotations
 
@@ -14,18 +14,19 @@ from bevviz.messages.clouds import MOST_POINTS, SCALARS
 from bevviz.messages.decoders import Decoder
 from bevviz.messages.encode import make
 
-LEAST, LONGEST = 1 << 24, 1 << 30  # bytes that a cloud may be unpacked to, whatever it says
+LEAST, LONGEST = 1 << 24, 1 << 30  # limits in bytes of a decompressed cloud, whatever size its message states
 DRACO = "which DracoPy reads: pip install 'bevviz[draco]'"
 COMPRESSED = "point_cloud_interfaces/msg/CompressedPointCloud2"
 
 
 def decompress(msg: Any) -> Any:
-    """The sensor_msgs/PointCloud2 that a CompressedPointCloud2 stands for.
+    """Decompress a CompressedPointCloud2 into a sensor_msgs/PointCloud2.
 
     Raises:
-        ValueError: a format that is not read here, or damaged data.
+        ValueError: the format is not supported, or the data are damaged.
     """
-    data = memoryview(msg.compressed_data).tobytes()  # of a number, bytes() would make so many zeros
+    # Not bytes(msg...): if the field is a number, bytes() would allocate that many zeros.
+    data = memoryview(msg.compressed_data).tobytes()
     if msg.format == "cloudini":
         return _of_cloudini(msg, data)
     width, height = int(msg.width), int(msg.height)
@@ -33,9 +34,8 @@ def decompress(msg: Any) -> Any:
     if msg.format == "zstd":
         unpacked = np.frombuffer(_unpacked(zstd.ZstdDecompressor(), data, size), np.uint8)
     elif msg.format == "zlib":
-        unpacked = np.frombuffer(
-            _unpacked(zlib.decompressobj(47), data, size), np.uint8
-        )  # of zlib or of gzip
+        # 32 + 15: accepts headers of zlib and of gzip.
+        unpacked = np.frombuffer(_unpacked(zlib.decompressobj(47), data, size), np.uint8)
     elif msg.format == "draco":
         unpacked = _of_draco(msg, data)
         width, height = len(unpacked) // max(int(msg.point_step), 1), 1
@@ -58,7 +58,10 @@ def decompress(msg: Any) -> Any:
 
 
 def _of_cloudini(msg: Any, data: bytes) -> Any:
-    """What its header says holds: points may be fewer than the message has."""
+    """Make a PointCloud2 from cloudini data.
+
+    The size is that of the data's own header. The message may state more points.
+    """
     told, points = cloudini.decode(data) if data else (cloudini.EMPTY, np.zeros(0, np.uint8))
     fields = [
         make("sensor_msgs/msg/PointField", name=f.name, offset=f.offset, datatype=f.type, count=1)
@@ -80,7 +83,7 @@ def _of_cloudini(msg: Any, data: bytes) -> Any:
 
 
 def _unpacked(stream: Any, data: bytes, size: int) -> bytes:
-    """Unpack a cloud that has ``size`` bytes by its own word, with as much memory as that takes."""
+    """Decompress a cloud. ``size`` is the number of bytes that the message states, and limits the memory."""
     try:
         found: bytes = stream.decompress(data, min(max(size, LEAST), LONGEST))
     except (zlib.error, zstd.ZstdError) as error:
@@ -91,14 +94,17 @@ def _unpacked(stream: Any, data: bytes, size: int) -> bytes:
 
 
 def _of_draco(msg: Any, data: bytes) -> Any:
-    """(N * point_step,) bytes: the plugin makes an attribute of each field, in their order."""
+    """Decompress draco data into (N * point_step,) bytes.
+
+    point_cloud_transport's plugin stores one attribute for each field, in their order.
+    """
     try:
         import DracoPy
     except ImportError:
         raise ValueError(f"it is compressed by draco, {DRACO}") from None
     try:
         attributes = DracoPy.decode(data).attributes
-    except Exception as error:  # the library's own, and what its extension makes of C++'s
+    except Exception as error:  # exceptions of DracoPy, and others that its C++ extension raises
         raise ValueError(f"its draco data is damaged ({first_line(error)})") from None
     step, count = int(msg.point_step), len(attributes[0]["data"]) if attributes else 0
     if len(attributes) != len(msg.fields) or count > MOST_POINTS or not 0 < step < 1 << 16:
@@ -109,7 +115,7 @@ def _of_draco(msg: Any, data: bytes) -> Any:
     for field, attribute in zip(msg.fields, attributes, strict=True):
         values = np.asarray(attribute["data"]).reshape(count, -1)
         kind = np.dtype(SCALARS.get(int(field.datatype), "u1"))
-        if values.dtype == np.uint8 and values.shape[1] == kind.itemsize:  # rgb, as its four bytes
+        if values.dtype == np.uint8 and values.shape[1] == kind.itemsize:  # rgb is stored as four bytes
             kind = np.dtype(np.uint8)
         end = int(field.offset) + values.shape[1] * kind.itemsize
         if end > step:

@@ -1,4 +1,4 @@
-"""Packets of Hesai's mechanical LiDARs, by the layouts of their manuals."""
+"""Decoder for packets of Hesai's mechanical LiDARs, by the layouts in their manuals."""
 
 from __future__ import annotations
 
@@ -18,29 +18,29 @@ from bevviz.messages.decoders import Bytes, Decoder, Serialization
 from bevviz.messages.encode import encode_points
 from bevviz.model.frame import F32, I64
 
-NOMINAL = Path(__file__).parents[1] / "data" / "hesai_angles.csv"  # as Hesai's own drivers bring them
-AZIMUTHS = 36_000  # units of a circle
+NOMINAL = Path(__file__).parents[1] / "data" / "hesai_angles.csv"  # the angles that Hesai's drivers contain
+AZIMUTHS = 36_000  # units of a full circle
 POINT = np.dtype([(n, "<f4") for n in ("x", "y", "z", "intensity", "time")] + [("ring", "<u2")])
 
 
 @dataclass(frozen=True, slots=True)
 class Model:
-    """Where what is in a packet.
+    """Packet layout of a sensor model.
 
     Attributes:
-        name: as Hesai has it.
-        head: what its packets begin with; a None is any byte.
+        name: Hesai's name of the model.
+        head: first bytes of a packet; None is any byte.
         first: bytes before the first block.
         start: bytes of a block before its azimuth.
-        blocks: in a packet.
-        channels: of a block.
-        unit: bytes of a measurement: distance (2), reflectivity (1), and what is not read.
+        blocks: number of blocks in a packet.
+        channels: number of channels in a block.
+        unit: bytes of a measurement: distance (2), reflectivity (1), and bytes that are not used.
         behind: bytes between the last block and the tail.
-        mode: byte of the return mode, in the tail.
-        clock: byte of the microseconds of the clock, in the tail.
-        tail: bytes of the tail that are read.
-        scale: byte with the millimetres of a unit of distance; None: 4 mm.
-        period: between two blocks, microseconds; negative where the clock tells the time of the last one.
+        mode: byte of the return mode within the tail.
+        clock: byte of the clock's microseconds within the tail.
+        tail: bytes of the tail that are used.
+        scale: byte with the unit of distance in millimetres; None: the unit is 4 mm.
+        period: microseconds between two blocks; negative if the clock gives the time of the last block.
     """
 
     name: str
@@ -59,6 +59,7 @@ class Model:
 
     @property
     def block(self) -> np.dtype[np.void]:
+        """Data type of a block."""
         measured = np.dtype(
             {"names": ["distance", "reflectivity"], "formats": ["<u2", "u1"], "itemsize": self.unit}
         )
@@ -72,19 +73,19 @@ class Model:
 
     @property
     def end(self) -> int:
-        """Byte where the tail begins."""
+        """Byte at which the tail begins."""
         return self.first + self.blocks * self.block.itemsize + self.behind
 
     @property
     def size(self) -> int:
-        """Bytes that a packet has at least."""
+        """Smallest size of a packet in bytes."""
         return self.end + self.tail
 
 
 def _with_header(
     name: str, version: tuple[int, int], channels: int, blocks: int, period: float, **places: int
 ) -> Model:
-    """Of those whose packets say what they hold: version, channels, blocks, unit of distance."""
+    """Make the layout of a model whose packets state version, channels, blocks and unit of distance."""
     head = (0xEE, 0xFF, *version, None, None, channels, blocks)
     return Model(name, head, 12, 0, blocks, channels, 4, scale=9, period=period, **places)
 
@@ -99,26 +100,27 @@ MODELS = (
     _with_header("PandarXT32", (6, 1), 32, 8, -50.0, **XT),
     _with_header("PandarXT32M", (6, 1), 32, 6, -50.0, **XT),
 )
-# Blocks of one direction, by the return mode: first, second, strongest or last; two of them; three.
+# Number of blocks for one direction, by return mode: first, second, strongest or last; two of these; three.
 RETURNS = {0x33: 1, 0x34: 1, 0x37: 1, 0x38: 1, 0x39: 2, 0x3A: 2, 0x3B: 2, 0x3C: 2, 0x3D: 3, 0x3E: 2}
 
 
 def decode(packets: Packets, angles: Path | None = None) -> Any:
-    """The sensor_msgs/PointCloud2 of a scan, as Hesai's driver makes it: y is where azimuth 0 is.
+    """Decode a scan into a sensor_msgs/PointCloud2, as Hesai's driver does: y points to azimuth 0.
 
-    ``ring`` is the number of the channel from 0. ``time`` is in seconds after the stamp of the scan, by the
-    clock of the sensor, and that of a block: its channels fire within 0.15 ms. Of several returns of a beam
-    those at different distances are given. The cloud announces a point for each beam, also for those that met
-    nothing and those in packets that are lost.
+    ``ring`` is the channel number from 0. ``time`` is in seconds after the stamp of the scan, by the sensor's
+    clock. All channels of a block get the same time, because they fire within 0.15 ms. If a beam has several
+    returns, those at different distances become points. The width of the cloud counts every beam, also beams
+    without a return and beams of lost packets.
 
     Args:
-        packets: those of another model or return mode than most, and those that are cut, count as lost.
-        angles: elevation and azimuth of each channel in degrees, as the sensor's own CSV states them; without
-            it those of its kind, which may be off by half a degree.
+        packets: packets of the scan. Cut packets, and packets of another model or return mode than most,
+            count as lost.
+        angles: CSV file with elevation and azimuth of each channel in degrees. None: nominal angles of the
+            model, which may be off by half a degree.
 
     Raises:
-        ValueError: a model or a return mode that is not known.
-        UserError: angles that cannot be read, or are another model's.
+        ValueError: the model or the return mode is not known.
+        UserError: the angles cannot be read, or are those of another model.
     """
     model, usable = _model_of(packets)
     data = np.ascontiguousarray(packets.data[usable])
@@ -160,7 +162,7 @@ def decode(packets: Packets, angles: Path | None = None) -> Any:
 
 
 def _model_of(packets: Packets) -> tuple[Model, I64]:
-    """What most of the packets are of, and which these are."""
+    """Return the model of most packets, and the row numbers of its complete packets."""
     most = np.zeros(0, np.int64)
     found = None
     for model in MODELS:
@@ -183,14 +185,15 @@ def _model_of(packets: Packets) -> tuple[Model, I64]:
 
 
 def _times(packets: Packets, usable: I64, model: Model, returns: int) -> F32:
-    """(N, directions) seconds after the scan's stamp.
+    """Return the (N, directions) seconds after the scan's stamp.
 
-    The clock of the sensor goes on from when the first packet was received: it may be set wrongly.
+    The sensor's clock may be set wrongly. Only its differences are used, from the time at which the first
+    packet was received.
     """
     at = model.end + model.clock
     clock = np.ascontiguousarray(packets.data[usable, at : at + 4]).view("<u4")[:, 0].astype(np.int64)
     steps = np.diff(clock, prepend=clock[0])
-    steps[steps < 0] += 1_000_000  # it counts within a second
+    steps[steps < 0] += 1_000_000  # the clock counts microseconds within a second
     since = (int(packets.received[usable[0]]) - packets.stamp) * 1e-9 + np.cumsum(steps) * 1e-6
     groups = model.blocks // returns
     number = np.arange(groups) if model.period > 0 else np.arange(groups) - (groups - 1)
@@ -202,6 +205,7 @@ Angles = tuple[F32, F32]  # elevation and azimuth of each channel, degrees
 
 @cache
 def _nominal() -> dict[str, Angles]:
+    """Read the nominal angles of each model."""
     rows = list(csv.reader(NOMINAL.read_text().splitlines()))[1:]
     return {
         model.name: _angles([[float(v) for v in row[1:]] for row in rows if row[0] == model.name])
@@ -210,18 +214,19 @@ def _nominal() -> dict[str, Angles]:
 
 
 def _angles(rows: list[list[float]]) -> Angles:
+    """Return elevation and azimuth of rows of channel, elevation and azimuth, sorted by channel."""
     _, elevation, azimuth = np.array(sorted(rows), np.float32).T
     return elevation, azimuth
 
 
 def _read(path: Path, model: Model) -> Angles:
-    """A CSV as the sensor's web page gives it: number of the channel, elevation, azimuth."""
+    """Read the CSV of the sensor's web page: channel number, elevation, azimuth."""
     rows = list[list[float]]()
     for row in csv.reader(StringIO(read_calibration(path))):
         try:
             rows.append([float(value) for value in row[:3]])
         except ValueError:
-            continue  # the names of the columns, a comment, a checksum
+            continue  # column names, comment or checksum
     rows = [row for row in rows if len(row) == 3]
     if [row[0] for row in sorted(rows)] != list(range(1, model.channels + 1)):
         raise UserError(
@@ -232,7 +237,7 @@ def _read(path: Path, model: Model) -> Angles:
 
 
 def read_scan(data: Bytes, serialization: Serialization) -> Any:
-    """Decode a PandarScan, by the sensor's own angles if their file is stated."""
+    """Decode a serialised PandarScan, with the sensor's own angles if the configuration states their file."""
     packets = split(data, 1500, sized=True, ros1=serialization.ros1)
     return decode(packets, Path(serialization.calibration) if serialization.calibration else None)
 

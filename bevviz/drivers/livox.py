@@ -1,6 +1,6 @@
-"""Livox's own kind of cloud, CustomMsg of livox_ros_driver and livox_ros_driver2, as a PointCloud2.
+"""Decoder for Livox's CustomMsg of livox_ros_driver and livox_ros_driver2 into a PointCloud2.
 
-The serialised message is read as an array: as objects its points, up to 500,000 a second, would be slow.
+It reads the serialised message as an array. Deserialising up to 500,000 points a second as objects is slow.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from bevviz.messages.clouds import MOST_POINTS
 from bevviz.messages.decoders import Bytes, Decoder, Serialization
 from bevviz.messages.encode import encode_points
 
-# Of a CustomPoint of both drivers; a bag that defines it otherwise is believed.
+# Fields of a CustomPoint of both drivers. A definition in the bag takes precedence.
 FIELDS = (
     ("offset_time", "uint32"),
     ("x", "float32"),
@@ -25,32 +25,33 @@ FIELDS = (
     ("tag", "uint8"),
     ("line", "uint8"),
 )
-READ = {"reflectivity": "intensity"}  # as the drivers' own PointCloud2 has it, a float32
+# Name of the field in the drivers' own PointCloud2, where it is a float32.
+READ = {"reflectivity": "intensity"}
 SECOND = 1_000_000_000
 
 
 def read_custom(data: bytes | memoryview, *, ros1: bool, fields: Sequence[tuple[str, str]] = FIELDS) -> Any:
-    """The sensor_msgs/PointCloud2 that a serialised CustomMsg stands for.
+    """Decode a serialised CustomMsg into a sensor_msgs/PointCloud2.
 
-    The stamp is that of the header; ``offset_time`` of a point is in nanoseconds after the first one. Points
-    that the message announces and does not hold are announced in the result, too.
+    The stamp is that of the header; ``offset_time`` of a point is in nanoseconds after the first point. The
+    width of the cloud also counts points that the message announces but does not hold.
 
     Args:
-        data: as serialised by ROS 1, or as CDR.
-        ros1: which of the two.
-        fields: name and type of those of a point.
+        data: message as serialised by ROS 1, or as CDR.
+        ros1: whether ROS 1 serialised the message.
+        fields: name and type of each field of a point.
 
     Raises:
-        ValueError: no such message, or it ends before its points.
+        ValueError: the data are no CustomMsg, or end before its points.
     """
     order = "<" if ros1 or data[1:2] != b"\0" else ">"
-    at = 4  # behind the encoding, or the seq
+    at = 4  # behind the encapsulation header of CDR, or the seq of ROS 1
     try:
         sec, nanosec, length = struct.unpack_from(f"{order}III", data, at)
         frame_id = bytes(data[at + 12 : at + 12 + length]).rstrip(b"\0").decode()
         at += 12 + length
         at += 0 if ros1 else -(at - 4) % 8
-        at += 8 + 4 + 4  # timebase, point_num, lidar_id and three bytes in reserve
+        at += 8 + 4 + 4  # timebase, point_num, lidar_id and three reserved bytes
         (count,) = struct.unpack_from(f"{order}I", data, at)
     except (struct.error, UnicodeDecodeError) as error:
         raise ValueError(f"{len(data)} bytes are no CustomMsg") from error
@@ -59,12 +60,12 @@ def read_custom(data: bytes | memoryview, *, ros1: bool, fields: Sequence[tuple[
         raise ValueError(f"a cloud of {count} points is not taken: {MOST_POINTS} at most")
     formats = [np.dtype(kind).newbyteorder("<" if order == "<" else ">") for _, kind in fields]
     offsets, size = list[int](), 0
-    for kind in formats:  # CDR aligns each number, and each point, to its own size
+    for kind in formats:  # CDR aligns each number to its size, and each point to that of its largest number.
         size += 0 if ros1 else -size % kind.itemsize
         offsets.append(size)
         size += kind.itemsize
     step = size if ros1 else size + -size % max(kind.itemsize for kind in formats)
-    # Behind the last point nothing is padded.
+    # The last point has no padding behind it.
     there = min(count, max(0, (len(data) - at - size) // step + 1))
     names = [name for name, _ in fields]
     point: np.dtype[np.void] = np.dtype(
@@ -75,7 +76,7 @@ def read_custom(data: bytes | memoryview, *, ros1: bool, fields: Sequence[tuple[
 
 
 def _as_read(given: Any) -> Any:
-    """(N,) contiguous, x, y and z first."""
+    """Return the points as a contiguous (N,) array with x, y and z first and the names of ``READ``."""
     names = sorted(given.dtype.names, key=lambda name: (name not in ("x", "y", "z"), name != "reflectivity"))
     layout = [
         (READ.get(name, name), "<f4" if name in READ else given.dtype[name].newbyteorder("<"))
@@ -88,10 +89,10 @@ def _as_read(given: Any) -> Any:
 
 
 def fields_of(definitions: Mapping[str, Any], msgtype: str) -> Sequence[tuple[str, str]]:
-    """Name and type of the fields of a point, as rosbags has a bag's definitions; without them those known.
+    """Return name and type of each field of a point, by the bag's definitions or else by ``FIELDS``.
 
     Raises:
-        ValueError: they are no numbers.
+        ValueError: a field is not a number.
     """
     _, stated = definitions.get(msgtype.replace("CustomMsg", "CustomPoint"), (None, None))
     if stated is None:

@@ -1,7 +1,6 @@
-"""Packets of Ouster's LiDARs, by the layouts of the sensors' manuals and with the metadata of the one sensor.
+"""Decoder for packets of Ouster's LiDARs, by the layouts in their manuals and the sensor's metadata.
 
-ouster-sdk, which does the same, is bound to an old release of rosbags; ours is held against it in
-benchmarks/ouster.py.
+ouster-sdk requires an old release of rosbags. benchmarks/ouster.py compares this decoder with it.
 """
 
 from __future__ import annotations
@@ -19,14 +18,14 @@ from bevviz.messages.decoders import Decoder, declared_decoder
 from bevviz.messages.encode import encode_points
 from bevviz.model.frame import F32, U8
 
-FRAME = "os_lidar"  # of the clouds that Ouster's driver publishes
+FRAME = "os_lidar"  # frame of the clouds that Ouster's driver publishes
 LACKS = (
     "packets of an Ouster without its metadata: record its metadata topic (std_msgs/String) with them, "
     "--set 'source.lidar_calibration={TOPIC: metadata.json}', or play them through its driver"
 )
-SMALLEST = 1000  # bytes: those of the IMU have 48
+SMALLEST = 1000  # bytes; packets of the IMU have 48
 MINUTE = 60_000_000_000
-Packet = tuple[int, bytes | memoryview]  # when it was received, nanoseconds, and its bytes
+Packet = tuple[int, bytes | memoryview]  # time of receipt in nanoseconds, and the bytes
 POINT = np.dtype(
     [(n, "<f4") for n in ("x", "y", "z", "intensity", "time")] + [("reflectivity", "<u2"), ("ring", "<u2")]
 )
@@ -34,19 +33,21 @@ POINT = np.dtype(
 
 @dataclass(frozen=True, slots=True)
 class Profile:
-    """Where what is in a packet: in bytes, and of a measurement as little-endian numbers.
+    """Packet layout. Offsets and sizes are in bytes; numbers are little-endian.
 
     Attributes:
-        head: of a packet.
-        column: of a column before its measurements.
-        status: type and byte of what tells whether a column is valid; negative: from its end.
-        valid: the bits that are set then.
-        number: byte of the number of the scan, in the packet.
-        measured: of a measurement.
-        mask: bits of the distance, a 32 bit number at its beginning.
-        scale: millimetres of its unit.
-        reflectivity: its byte.
-        signal: byte of its intensity; None: there is none, and the reflectivity is taken.
+        head: size of the packet header.
+        column: size of the column header.
+        status: type and offset of the column status; a negative offset counts from the end of the column.
+        valid: status bits that are set in a valid column.
+        number: offset of the scan number in the packet.
+        measured: size of a measurement.
+        mask: bits of the distance in the first 32 bits of a measurement.
+        scale: unit of the distance in millimetres.
+        reflectivity: offset of the reflectivity in a measurement.
+        signal: offset of the intensity in a measurement; None: the reflectivity is used.
+        foot: size of the packet footer.
+        after: size of the column footer.
     """
 
     head: int
@@ -59,8 +60,8 @@ class Profile:
     scale: float
     reflectivity: int
     signal: int | None
-    foot: int  # of a packet
-    after: int  # of a column
+    foot: int
+    after: int
 
 
 _NEW: dict[str, Any] = {
@@ -78,14 +79,15 @@ PROFILES = {
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sensor:
-    """What the metadata of one sensor say.
+    """Properties of a sensor, from its metadata.
 
     Attributes:
-        columns: of a whole turn.
-        per_packet: columns.
-        sent: packets of a whole scan; fewer than a turn's where the sensor measures a part of it.
+        profile: layout of its packets.
+        columns: number of columns in a full turn.
+        per_packet: number of columns in a packet.
+        sent: number of packets in a complete scan; smaller if the sensor measures only a part of the turn.
         directions: (pixels, 2) altitude and azimuth of the beams, radians.
-        origin: (2,) where beams begin, metres from the axis and above its origin.
+        origin: (2,) start of the beams: metres from the axis, and metres above the sensor's origin.
     """
 
     profile: Profile
@@ -97,44 +99,50 @@ class Sensor:
 
     @property
     def pixels(self) -> int:
+        """Number of beams."""
         return len(self.directions)
 
     @property
     def step(self) -> int:
-        """Bytes of a column."""
+        """Size of a column in bytes."""
         return self.profile.column + self.pixels * self.profile.measured + self.profile.after
 
     @property
     def size(self) -> int:
-        """Bytes of a packet."""
+        """Size of a packet in bytes."""
         return self.profile.head + self.per_packet * self.step + self.profile.foot
 
     def number(self, packet: bytes | memoryview) -> int:
-        """The number of the scan that a packet is of."""
+        """Return the scan number of a packet."""
         at = self.profile.number
         return int.from_bytes(packet[at : at + 2], "little")
 
     def begin(self, packet: bytes | memoryview) -> int:
-        """The number of its first column."""
+        """Return the number of the first column of a packet."""
         at = self.profile.head + 8
         return int.from_bytes(packet[at : at + 2], "little")
 
 
 class Scans:
-    """Scans of the packets of one sensor, as these come.
+    """Collector that groups the packets of a sensor into scans.
 
-    A scan is whole with its last packet; where some are lost, when the next one begins. What comes later, or
-    a second time, is left out.
+    A scan is complete with its last packet. If packets are lost, it ends when the next scan begins. Late and
+    repeated packets are discarded.
     """
 
     def __init__(self, sensor: Sensor) -> None:
         self.sensor = sensor
         self._current = -1
-        self._gone: deque[int] = deque(maxlen=2)  # numbers of the scans before
-        self._held: dict[int, Packet] = {}  # first column -> packet
+        self._gone: deque[int] = deque(maxlen=2)  # numbers of the previous scans
+        self._held: dict[int, Packet] = {}  # packets of the current scan by their first column
 
     def add(self, received: int, packet: bytes | memoryview) -> Iterator[tuple[Packet, ...]]:
-        """The scans that are whole now: of a packet of ``sensor.size`` bytes, received at that time."""
+        """Add a packet. Yield each scan that it ends.
+
+        Args:
+            received: time of receipt, nanoseconds.
+            packet: ``sensor.size`` bytes.
+        """
         number, begin = self.sensor.number(packet), self.sensor.begin(packet)
         if number in self._gone or begin >= self.sensor.columns:
             return
@@ -146,7 +154,7 @@ class Scans:
             yield from self.rest()
 
     def rest(self) -> Iterator[tuple[Packet, ...]]:
-        """What there is of the scan that is not whole; another packet of it is one that comes too late."""
+        """Yield the incomplete scan. Its further packets are then too late."""
         if self._held:
             found, self._held = tuple(self._held.values()), {}
             self._gone.append(self._current)
@@ -160,12 +168,12 @@ def is_packet(msgtype: str) -> bool:
 
 
 def metadata_of(topic: str) -> str:
-    """The topic beside that of packets on which the driver gives the metadata, as a std_msgs/String."""
+    """Return the topic of the metadata (std_msgs/String), for a topic of packets."""
     return f"{topic.rpartition('/')[0]}/metadata"
 
 
 def waits(topic: str) -> str:
-    """What is said beside a robot of packets whose metadata are not there yet."""
+    """Return the note on a live topic of packets whose metadata have not arrived yet."""
     return (
         f"packets of an Ouster whose metadata are waited for on {metadata_of(topic)} (std_msgs/String); "
         f"--set 'source.lidar_calibration={{{topic}: metadata.json}}' gives them from a file"
@@ -173,10 +181,14 @@ def waits(topic: str) -> str:
 
 
 def read_sensor(text: str, where: str) -> Sensor:
-    """What metadata as the sensor gives them (JSON, of firmware 2 and 3) say.
+    """Parse a sensor's metadata (JSON, firmware 2 and 3).
+
+    Args:
+        text: the metadata.
+        where: file or topic of the metadata, for errors.
 
     Raises:
-        UserError: they are none, or of a sensor whose packets are not decoded here.
+        UserError: the text is no metadata, or the packets of the sensor are not supported.
     """
     try:
         told = json.loads(text)
@@ -214,7 +226,7 @@ def read_sensor(text: str, where: str) -> Sensor:
 
 
 def payload(data: bytes | memoryview, *, ros1: bool) -> memoryview:
-    """The packet in a serialised PacketMsg, whose only field is its bytes."""
+    """Return the packet of a serialised PacketMsg. Its bytes are the only field of the message."""
     at = 0 if ros1 else 4
     big = not ros1 and data[1:2] == b"\0"
     length = int.from_bytes(data[at : at + 4], "big" if big else "little")
@@ -222,15 +234,17 @@ def payload(data: bytes | memoryview, *, ros1: bool) -> memoryview:
 
 
 def decode(sensor: Sensor, packets: Sequence[Packet]) -> Any:
-    """The sensor_msgs/PointCloud2 of the packets of one scan, in the frame os_lidar.
+    """Decode the packets of one scan into a sensor_msgs/PointCloud2 in the frame os_lidar.
 
-    The stamp is that of the first column: by the sensor's clock where this is within a minute of the time of
-    receipt, else (it counts from its start) the time when its packet was received. ``time`` is in seconds
-    after it. Of two returns the first one is taken. The cloud announces a point for each measurement of a
-    whole turn, so that those that met nothing, and those in lost packets, are counted.
+    The stamp is that of the first column, by the sensor's clock if this is within a minute of the time of
+    receipt. Otherwise the clock counts from the sensor's start, and the stamp is the time at which the packet
+    of the column was received. ``time`` is in seconds after the stamp. Of two returns the first one is used.
+    The width of the cloud counts all measurements of a full turn, also those without a return and those in
+    lost packets.
 
     Args:
-        packets: each of ``sensor.size`` bytes.
+        sensor: sensor that sent the packets.
+        packets: packets of ``sensor.size`` bytes each.
     """
     received, contents = zip(*packets, strict=True)
     profile, pixels = sensor.profile, sensor.pixels
@@ -269,7 +283,7 @@ def decode(sensor: Sensor, packets: Sequence[Packet]) -> Any:
     altitude, azimuth = sensor.directions.T
     out, up = sensor.origin
     turned = encoder[row] - azimuth[pixel]
-    # From where the beam begins, which goes round the axis.
+    # The range includes the distance from the axis to the start of the beam, which turns around the axis.
     length = ranges[row, pixel] - np.hypot(out, up)
     flat = length * np.cos(altitude)[pixel]
     points = np.empty(len(row), POINT)

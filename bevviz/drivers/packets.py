@@ -1,6 +1,6 @@
-"""Scans of a LiDAR's packets as its driver recorded them, VelodyneScan and PandarScan, as a PointCloud2.
+"""Scans of LiDAR packets in VelodyneScan and PandarScan messages.
 
-The serialised message is read as an array: as objects its packets, up to 9,000 a second, would be slow.
+The serialised message is read as an array. Deserialising up to 9,000 packets a second as objects is slow.
 """
 
 from __future__ import annotations
@@ -18,14 +18,15 @@ SECOND = 1_000_000_000
 
 @dataclass(frozen=True, slots=True)
 class Packets:
-    """What a driver recorded of one scan.
+    """Packets of one scan.
 
     Attributes:
-        stamp: of the header, nanoseconds.
-        received: (N,) when each packet was, nanoseconds.
-        data: (N, M) bytes of each, a view of the message; of shorter ones the rest is zero.
-        sizes: (N,) bytes that each packet has.
-        lost: packets that the message announces and does not hold.
+        stamp: stamp of the header, nanoseconds.
+        frame_id: frame of the header.
+        received: (N,) time at which the driver received each packet, nanoseconds.
+        data: (N, M) bytes of the packets, a view of the message. Shorter packets end with zeros.
+        sizes: (N,) size of each packet in bytes.
+        lost: number of packets that the message announces but does not hold.
     """
 
     stamp: int
@@ -37,16 +38,23 @@ class Packets:
 
 
 def split(data: bytes | memoryview, size: int, *, sized: bool, ros1: bool) -> Packets:
-    """The packets of a message that is a header and a list of packets with a stamp and ``size`` bytes each.
+    """Split a message into its packets.
 
-    ``sized``: how many of them are the packet's follows.
+    The message has a header and a list of packets, each with a stamp and ``size`` bytes.
+
+    Args:
+        data: serialised message.
+        size: bytes of the packet field.
+        sized: whether a field with the number of used bytes follows each packet.
+        ros1: whether ROS 1 serialised the message; otherwise it is CDR.
 
     Raises:
-        ValueError: no such message, or none of its packets is whole.
+        ValueError: the data are no such message, or no packet is complete.
     """
     order = "<" if ros1 or data[1:2] != b"\0" else ">"
     try:
-        sec, nanosec, length = struct.unpack_from(f"{order}III", data, 4)  # behind the encoding, or the seq
+        # Behind the encapsulation header of CDR, or the seq of ROS 1.
+        sec, nanosec, length = struct.unpack_from(f"{order}III", data, 4)
         frame_id = bytes(data[16 : 16 + length]).rstrip(b"\0").decode()
         at = 16 + length
         at += 0 if ros1 else -at % 4
@@ -60,7 +68,7 @@ def split(data: bytes | memoryview, size: int, *, sized: bool, ros1: bool) -> Pa
     if sized:
         names, formats = [*names, "size"], [*formats, f"{order}u4"]
     packet = np.dtype({"names": names, "formats": formats})
-    # CDR aligns the stamp of the next one, and nothing behind the last.
+    # CDR aligns the stamp of the next packet. The last packet has no padding behind it.
     step = packet.itemsize + (0 if ros1 else -packet.itemsize % 4)
     there = min(count, max(0, (len(data) - at - packet.itemsize) // step + 1))
     if not there:

@@ -1,4 +1,4 @@
-"""Packets of Velodyne's LiDARs, decoded by velodyne-decoder (an extra of its own)."""
+"""Decoder for packets of Velodyne's LiDARs, by the library velodyne-decoder (``bevviz[velodyne]``)."""
 
 from __future__ import annotations
 
@@ -13,45 +13,46 @@ from bevviz.messages.decoders import Bytes, Decoder, Serialization
 from bevviz.messages.encode import encode_points
 
 FIELDS = ("x", "y", "z", "intensity", "time", "ring")
-MODEL = 1205  # byte that tells it
-FAR = 1000.0  # metres: no model measures as far
+MODEL = 1205  # offset of the byte that states the model
+FAR = 1000.0  # metres; no model measures farther
 
 
 def decode(packets: Packets) -> Any:
-    """The sensor_msgs/PointCloud2 of a scan, as velodyne_pointcloud makes it.
+    """Decode a scan into a sensor_msgs/PointCloud2, as velodyne_pointcloud does.
 
-    The model is what the packets say it is, with the angles that all of its kind have. ``time`` is in seconds
-    after the stamp of the scan, which drivers give it as that of its first or of its last packet.
+    The packets state the model. The nominal angles of the model are used. ``time`` is in seconds after the
+    stamp of the scan, which is that of its first or of its last packet, depending on the driver.
 
     Raises:
-        ValueError: a model that the library does not know by its packets.
+        ValueError: velodyne-decoder does not know the model.
     """
     import velodyne_decoder as vd
 
     kinds = packets.data[:, MODEL]
-    usable = np.flatnonzero(kinds == np.bincount(kinds).argmax())  # the library takes all or none
+    # The library refuses a scan if one of its packets is unknown.
+    usable = np.flatnonzero(kinds == np.bincount(kinds).argmax())
     found = vd.PacketVector(
         [
             vd.VelodynePacket(received * 1e-9, data.tobytes())
             for received, data in zip(packets.received[usable].tolist(), packets.data[usable], strict=True)
         ]
     )
-    # One decoder for each scan: it holds on to the first model that it meets.
+    # Each scan needs a new decoder: a decoder keeps the first model that it meets.
     decoder = vd.ScanDecoder(vd.Config(min_range=0.0, max_range=FAR))
     try:
         _, points = decoder.decode(found, as_pcl_structs=True)
     except RuntimeError as error:
         raise ValueError(f"velodyne-decoder does not take the packets ({first_line(error)})") from None
-    # It counts from the last packet.
+    # The library's times are relative to the last packet.
     points["time"] += np.float32((int(packets.received[usable[-1]]) - packets.stamp) * 1e-9)
     return encode_points(packets.stamp, packets.frame_id, points[list(FIELDS)])
 
 
 def read_scan(data: Bytes, serialization: Serialization) -> Any:
-    """Decode a VelodyneScan.
+    """Decode a serialised VelodyneScan.
 
     Raises:
-        UserError: a file of angles is stated for the sensor.
+        UserError: the configuration states a file of angles.
     """
     if file := serialization.calibration:
         raise UserError(f"source.lidar_calibration: {file}: a Velodyne has none: its packets tell its model")
@@ -59,7 +60,7 @@ def read_scan(data: Bytes, serialization: Serialization) -> Any:
 
 
 def _missing() -> str:
-    """Return the library that is to be installed; empty: it is installed."""
+    """Return the library to install; empty if it is installed."""
     if find_spec("velodyne_decoder") is not None:
         return ""
     return "packets of the sensor, which velodyne-decoder reads: pip install 'bevviz[velodyne]'"

@@ -1,4 +1,4 @@
-"""Video in messages: foxglove's CompressedVideo, FFMPEGPacket, Theora's Packet, and CompressedImage."""
+"""Video packets of foxglove's CompressedVideo, FFMPEGPacket, Theora's Packet, and CompressedImage."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ DEFINITIONS = {  # bags of older releases do not define these types
         "std_msgs/Header header\nuint8[] data\nint32 b_o_s\nint32 e_o_s\nint64 granulepos\nint64 packetno\n"
     ),
 }
-ANNEX_B = (b"\0\0\0\1", b"\0\0\1")  # what every unit of an H.264 or H.265 stream begins with
+ANNEX_B = (b"\0\0\0\1", b"\0\0\1")  # start code of every unit of an H.264 or H.265 stream
 _CODECS = (
     ("h264", re.compile(r"h\.?264|avc|x264", re.IGNORECASE)),
     ("h265", re.compile(r"h\.?265|hevc|x265", re.IGNORECASE)),
@@ -31,38 +31,51 @@ _CODECS = (
 
 @dataclass(frozen=True, slots=True)
 class Packet:
-    """One picture of a video, as far as it differs from those before it."""
+    """Packet of a video: one encoded picture.
+
+    Attributes:
+        topic: topic of the message.
+        received: time of receipt, nanoseconds.
+        stamp: stamp of the message, nanoseconds.
+        frame_id: frame of the camera.
+        codec: h264, h265, av1, vp9, vp8 or theora.
+        data: encoded bytes.
+        is_key: whether decoding can begin with this packet.
+        is_header: whether it is a header packet of Theora, which precedes the first picture.
+        number: packet number of Theora; None for other codecs.
+    """
 
     topic: str
     received: int
     stamp: int
     frame_id: str
-    codec: str  # h264, h265, av1, vp9, vp8 or theora
+    codec: str
     data: bytes
-    is_key: bool  # decoding can begin here
-    is_header: bool = False  # no picture: what Theora says before the first one
-    number: int | None = None  # of Theora, which counts its packets
+    is_key: bool
+    is_header: bool = False
+    number: int | None = None
 
     @property
     def place(self) -> tuple[int, int]:
-        """In its topic."""
+        """Position within the topic: time of receipt and stamp."""
         return self.received, self.stamp
 
 
 def is_video(message: Any) -> bool:
-    """Whether a CompressedImage holds a packet of video."""
+    """Return whether a CompressedImage holds a packet of video."""
     return bytes(message.data[:4]).startswith(ANNEX_B)
 
 
 def decode_packet(msg: Any, topic: str, received: int) -> Packet:
-    """The packet of a foxglove CompressedVideo, an FFMPEGPacket, a Theora Packet or a CompressedImage.
+    """Make a packet from a foxglove CompressedVideo, an FFMPEGPacket, a Theora Packet or a CompressedImage.
 
     Raises:
-        MessageError: a codec that is not known.
+        MessageError: the codec is not supported, or the data are not in Annex B format.
     """
-    header = getattr(msg, "header", msg)  # foxglove's has its two fields itself
+    header = getattr(msg, "header", msg)  # foxglove's message has stamp and frame_id itself, without a header
     stamp = stamp_ns(header.stamp if hasattr(header, "stamp") else header.timestamp)
-    data = bytes(memoryview(msg.data))  # of a number, bytes() would make as many zeros
+    # Not bytes(msg...): if the field is a number, bytes() would allocate that many zeros.
+    data = bytes(memoryview(msg.data))
     if hasattr(msg, "granulepos"):
         first, key = data[:1] >= b"\x80", is_key("theora", data)
         frame_id = frame_name(header.frame_id)
