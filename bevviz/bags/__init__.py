@@ -1,1 +1,1 @@
-"""Readers of recorded bags, sound or damaged. Imports `datasets` and below."""
+"""Readers of recorded bags, sound or damaged. Imports `datasets` and the layers below it."""

@@ -1,4 +1,4 @@
-"""One recording on disk, whatever its files: MCAP, sqlite3 or ROS 1, compressed, split or cut."""
+"""A recording on disk: bags of MCAP, sqlite3 or ROS 1 (compressed, split or cut) and data sets."""
 
 from __future__ import annotations
 
@@ -45,31 +45,32 @@ from bevviz.support.contexts import Closing
 from bevviz.support.files import Scratch, bag_files, drive_files, full_disk, read_text
 from bevviz.support.text import path_text
 
-ATTACHED = "lidar_calibration"  # then the topic and the file: what an attachment with one is called
+ATTACHED = "lidar_calibration"  # name prefix of an attached calibration; the topic and the file name follow
 METADATA = "metadata.yaml"
 COMPRESSED = "sensor_msgs/msg/CompressedImage"
-STAMPED = ["timestamp", "frame_id"]  # what foxglove's messages begin with, which are laid out as a Header
-REWIND = 2_000_000_000  # nanoseconds that a key frame is looked for in first
-LONGEST_SCAN = 1_000_000_000  # nanoseconds from its first packet to its last
-MOST_HEADERS = 16  # messages that a video begins with and are no pictures
+STAMPED = ["timestamp", "frame_id"]  # first fields of Foxglove messages whose layout is that of a Header
+REWIND = 2_000_000_000  # nanoseconds of the first search for a key frame; each next one spans four times more
+LONGEST_SCAN = 1_000_000_000  # nanoseconds from the first packet of a scan to the last
+MOST_HEADERS = 16  # messages at the start of a video that may be codec headers
 
 
 class Recording(Closing):
-    """The messages of one or several bags, or data sets, as a single stream in order of log time.
+    """Messages of one or several bags or data sets as one stream in order of log time.
 
     Args:
-        paths: bag files and folders, and folders of data sets, in any order.
-        config: which data set they are, and which drive of it, where that is stated.
+        paths: bag files, bag folders and data set folders, in any order.
+        config: name of the data set and its sequence, where the user states them.
 
     Attributes:
-        single_frames: nothing in one scan is in the next, and their times are made up.
-        calibrations: files of LiDARs by their topics, as ``source.lidar_calibration`` states them, or as they
-            are in the bag.
-        is_dataset: messages are made of a data set's files; what cannot be is empty, and among ``warnings``.
-        types: of the messages.
+        single_frames: the scans are unrelated, and their times are made up.
+        calibrations: calibration file of a LiDAR by topic, from ``source.lidar_calibration`` or from an
+            attachment of the bag.
+        is_dataset: the messages are made from data set files. An unreadable file gives an empty message
+            and a line in ``warnings``.
+        types: message types.
 
     Raises:
-        UserError: a path that does not exist, cannot be read, is empty or is neither.
+        UserError: a path does not exist, cannot be read, is empty, or is neither a bag nor a data set.
     """
 
     def __init__(self, paths: Sequence[Path], config: SourceConfig | None = None) -> None:
@@ -95,17 +96,19 @@ class Recording(Closing):
             raise
 
     def close(self) -> None:
+        """Close all files and delete the temporary ones."""
         while self.files:
             self.files.pop().close()
         self._scratch.close()
 
     @property
     def name(self) -> str:
+        """Name of the first path without its folder."""
         return path_text(self.paths[0].resolve().name)
 
     @cached_property
     def size(self) -> int:
-        """Bytes on disk."""
+        """Size on disk in bytes."""
         files = [f for p in self.paths for f in (drive_files(p) if p.is_dir() else [p])]
         return sum(f.stat().st_size for f in files)
 
@@ -121,16 +124,17 @@ class Recording(Closing):
 
     @property
     def message_count(self) -> int:
+        """Number of messages of all files."""
         return sum(c.msgcount for f in self.files for c in f.connections)
 
     @property
     def warnings(self) -> list[str]:
-        """What is missing or damaged, as far as it was met."""
+        """Missing or damaged data met so far, one sentence each."""
         return [*self._notes, *(text for file in self.files for text in file.warnings)]
 
     @cached_property
     def topics(self) -> tuple[Topic, ...]:
-        """Every topic by name, with the frame_id of its first message."""
+        """All topics by name, each with the frame_id of its first message."""
         counts: Counter[str] = Counter()
         first: dict[str, Connection] = {}
         for connection in (c for f in self.files for c in f.connections):
@@ -164,7 +168,7 @@ class Recording(Closing):
     def messages(
         self, topics: Collection[str], start: int | None = None, stop: int | None = None
     ) -> Iterator[RawMessage]:
-        """Messages of ``topics`` with start <= log time < stop (nanoseconds), in order of log time."""
+        """Yield messages of ``topics`` with start <= log time < stop in nanoseconds, in order of log time."""
         sources = [_lazily(f, topics, start, stop) for f in self.files]
         for _, message in heapq.merge(*sources, key=itemgetter(0)):
             if message is not None:
@@ -173,9 +177,9 @@ class Recording(Closing):
     def scans(
         self, topics: Collection[str], start: int | None = None, stop: int | None = None
     ) -> Iterator[RawMessage]:
-        """As ``messages``, but of a LiDAR whose messages are single packets one for each scan.
+        """Yield messages as ``messages`` does, but collect the packets of a LiDAR into one message per scan.
 
-        It is received when its last packet is, see ``ouster.Scans``.
+        A scan is received at the time of its last packet, see ``ouster.Scans``.
         """
         single = [topic for topic in topics if topic in self._sensors]
         others = [topic for topic in topics if topic not in self._sensors]
@@ -200,12 +204,15 @@ class Recording(Closing):
                 packet = ouster.payload(message.content(), ros1=is_ros1(message.connection))
             except zstd.ZstdError:
                 continue
-            if len(packet) == sensor.size:  # else it counts as lost
+            if len(packet) == sensor.size:  # else the packet counts as lost
                 yield from given(scans.add(message.received, packet))
         yield from given(scans.rest())
 
     def scan_times(self, topic: str) -> I64:
-        """As ``times``, of what ``scans`` gives. Where messages are single packets, all are read, once."""
+        """Return the log times of the scans of a topic, as ``times`` does for messages.
+
+        Where messages are single packets, all of them are read. The result is kept.
+        """
         if topic not in self._sensors:
             return self.times(topic)
         if topic not in self._scan_times:
@@ -215,7 +222,7 @@ class Recording(Closing):
 
     @cached_property
     def _sensors(self) -> Mapping[str, ouster.Sensor]:
-        """The topics whose messages are single packets of a LiDAR, with the metadata to decode them."""
+        """Sensor metadata of the topics whose messages are single LiDAR packets."""
         found = {}
         for connection in {c.topic: c for f in self.files for c in f.connections}.values():
             if (
@@ -229,7 +236,7 @@ class Recording(Closing):
         return found
 
     def _metadata(self, topic: str) -> tuple[str, str] | None:
-        """The metadata of an Ouster and where they are; None: there are none."""
+        """Return the metadata of an Ouster sensor and their origin; None if there are none."""
         if file := self.calibrations.get(topic, ""):
             return read_calibration(Path(file)), f"source.lidar_calibration: {file}"
         name = ouster.metadata_of(topic)
@@ -240,7 +247,7 @@ class Recording(Closing):
             return None
 
     def _lacks(self, connection: Connection) -> str:
-        """Why packets of an Ouster are not read; empty: they are, or it is another topic."""
+        """Return why the packets of an Ouster topic are not read. Empty: they are, or it is another topic."""
         if not ouster.is_packet(connection.msgtype) or connection.topic in self._sensors:
             return ""
         message = self.first(connection.topic)
@@ -248,18 +255,19 @@ class Recording(Closing):
         return NOT_LIDAR if small else ouster.LACKS
 
     def first(self, topic: str) -> RawMessage | None:
+        """Return the first message of a topic; None if it has none."""
         return next(self.messages([topic]), None)
 
     def times(self, topic: str) -> I64:
-        """Log times of all messages of a topic in nanoseconds, sorted, without reading them."""
+        """Return the sorted log times in nanoseconds of all messages of a topic. Their data is not read."""
         parts = [f.times([c for c in f.connections if c.topic == topic]) for f in self.files]
         return np.sort(np.concatenate(parts))
 
     def packets(self, topic: str, received: int) -> list[Packet]:
-        """The packets of a topic with video that the one received at that time needs, and that one.
+        """Return the video packets that the picture received at a given time needs, including its own.
 
-        They begin with the last key frame before it, or with the recording where there is none, and what a
-        stream says before its first picture.
+        The list begins with the codec headers from the start of the stream. The last key frame before the
+        picture follows, or the start of the recording if there is no key frame.
         """
         start, found = received + 1, list[Packet]()
         back = REWIND
@@ -272,7 +280,7 @@ class Recording(Closing):
 
     def _packets(self, topic: str, start: int | None, stop: int | None) -> Iterator[Packet]:
         for message in self.messages([topic], start, stop):
-            with suppress(MessageError):  # counted when its turn comes
+            with suppress(MessageError):  # The error is counted when the message itself is handled.
                 yield guard(message, decode_packet, self.decode(message), topic, message.received)
 
     def decode(self, message: RawMessage) -> Any:
@@ -309,7 +317,7 @@ class Recording(Closing):
             ) from None
 
     def encode(self, message: RawMessage, content: Any) -> memoryview:
-        """``content``, as ``decode`` gave it and changed since, serialised as the message was."""
+        """Serialise ``content``, a changed result of ``decode``, in the format of ``message``."""
         store, msgtype = self.types.store(message.connection), normalized(message.connection.msgtype)
         if is_ros1(message.connection):
             return store.serialize_ros1(content, msgtype)
@@ -333,7 +341,7 @@ class Recording(Closing):
             return ""
 
     def _holds_video(self, topic: str) -> bool:
-        """Whether images are packets of video."""
+        """Tell whether the images of a topic are video packets."""
         message = self.first(topic)
         try:
             return message is not None and guard(message, is_video, self.decode(message))
@@ -355,14 +363,15 @@ class Recording(Closing):
         except PermissionError:
             raise UserError(f"{path}: permission denied: you may not read it") from None
         except OSError as error:
-            if (full := full_disk(error)) is not None:  # of the temporary folder: a file is unpacked there
+            if (full := full_disk(error)) is not None:  # Unpacking a file filled the temporary folder.
                 raise full from None
             raise UserError(f"{path}: cannot be read: {error.strerror or error}") from None
 
     def _attached(self) -> dict[str, str]:
-        """Files of LiDARs' calibrations that are in the bag, by topic, where the stated ones are not here.
+        """Extract the LiDAR calibrations attached to the bags. Return the files by topic.
 
-        So that a bag that was cut out runs anywhere, with the configuration of where it comes from, too.
+        An attachment replaces the stated file only where that file does not exist here. So a part cut out
+        of a bag runs on another machine with the configuration of the original bag.
         """
         found = dict[str, str]()
         stated = self._config.lidar_calibration
@@ -417,7 +426,7 @@ class Recording(Closing):
             )
 
     def _open_dataset(self, folder: Path, name: str) -> bool:
-        """Whether it is one."""
+        """Open a folder as a data set. Return False if it is none."""
         dataset = open_dataset(folder, name, self._config.sequence)
         if dataset is None:
             return False
@@ -450,7 +459,10 @@ class Recording(Closing):
 def _lazily(
     file: BagFile, topics: Collection[str], start: int | None, stop: int | None
 ) -> Iterator[tuple[int, RawMessage | None]]:
-    """The messages of one file behind an empty item, so that a merge reads a file only at its time."""
+    """Yield the messages of one file after an empty item.
+
+    A merge draws the first item of every file at once. The empty item defers opening the file until its time.
+    """
     types: dict[str, str] = {}
     connections = [
         c for c in file.connections if c.topic in topics and types.setdefault(c.topic, c.msgtype) == c.msgtype

@@ -1,4 +1,7 @@
-"""Files of chunks, MCAP and ROS 1: rosbags reads a sound one, its index or a scan leads through others."""
+"""Readers of files that consist of chunks: MCAP and ROS 1 bags.
+
+rosbags reads a sound file. An index or a scan of the whole file leads to the messages of others.
+"""
 
 from __future__ import annotations
 
@@ -31,29 +34,29 @@ from bevviz.support.loggers import logger
 
 _log = logger(__name__)
 
-NAMED = 3  # topics in a note
+NAMED = 3  # topics listed in a warning
 PublicReader = rosbags.rosbag1.Reader | rosbags.rosbag2.Reader
 
 
 @dataclass(slots=True)
 class Chunk:
-    """Where a chunk lies and what is in it, as the file's index says or as was found by looking into it."""
+    """Position and content of a chunk, by the index of the file or by a scan."""
 
     start: int  # log time of the first message
-    end: int  # of the last one
-    data: int  # offset of its packed content
-    packed: int  # bytes of it
-    size: int  # bytes unpacked
+    end: int  # log time of the last message
+    data: int  # offset of the packed content
+    packed: int  # packed size in bytes
+    size: int  # unpacked size in bytes
     compression: str
     counts: Mapping[int, int]  # messages by connection
-    crc: int | None = None  # checksum of the content, 0: it has none, None: not read yet
-    times: Mapping[int, I64] | None = None  # log times by connection; None: to be read by ``index``
-    index: Mapping[int, int] = field(default_factory=dict)  # offset of the times by connection
-    cut: bool = False  # the end is missing
-    damage: str = ""  # what is wrong with its content, as a scan has found it
+    crc: int | None = None  # checksum of the content; 0: none; None: not read yet
+    times: Mapping[int, I64] | None = None  # log times by connection; None: read them by ``index``
+    index: Mapping[int, int] = field(default_factory=dict)  # offset of the index record by connection
+    cut: bool = False  # the end of the chunk is missing
+    damage: str = ""  # damage of the content that a scan found; empty: none
 
     def fill(self, times: Mapping[int, array[int]]) -> None:
-        """Take the log times that were found by looking into it."""
+        """Set the log times, counts and span from the messages that a scan found."""
         self.times = {number: np.frombuffer(found, np.int64) for number, found in times.items()}
         self.counts = {number: len(found) for number, found in times.items()}
         if times:
@@ -63,7 +66,7 @@ class Chunk:
 
 @dataclass(slots=True)
 class Index:
-    """What is in a file and where."""
+    """Chunks and connections of a file."""
 
     chunks: list[Chunk]
     connections: list[Connection]
@@ -74,7 +77,7 @@ class Index:
 
     @property
     def span(self) -> tuple[int, int]:
-        """Log time of the first message, and just after that of the last one."""
+        """Log time of the first message, and log time of the last message plus one nanosecond."""
         times = self.outside[:, 0].tolist()
         filled = [c for c in self.chunks if c.counts]
         first = min([c.start for c in filled] + times, default=LAST)
@@ -83,36 +86,37 @@ class Index:
 
 @dataclass
 class Scan:
-    """What was found by looking through a file, and what was not."""
+    """Result of a scan through a file, with counts of everything lost."""
 
     index: Index = field(default_factory=lambda: Index([], []))
-    missing: int = 0  # messages that the file says were in its chunks
-    undescribed: int = 0  # messages of connections that nothing describes
-    stated: int | None = None  # messages by the file's statistics
-    cut: int = 0  # bytes of the chunk whose end is missing
-    rescued: int = 0  # messages found in it
+    missing: int = 0  # messages that the index of a chunk lists and that are lost
+    undescribed: int = 0  # messages of connections without a description
+    stated: int | None = None  # message count by the statistics of the file
+    cut: int = 0  # bytes of the last chunk if its end is missing
+    rescued: int = 0  # messages found in this last chunk
     broken: int = 0  # places without a sound record
-    passed: int = 0  # bytes there
-    listed: Counter[int] = field(default_factory=Counter)  # messages of the newest chunk by its own index
+    passed: int = 0  # bytes passed over in these places
+    listed: Counter[int] = field(default_factory=Counter)  # counts by the newest chunk's own index
 
     @property
     def count(self) -> int:
+        """Number of messages found."""
         return sum(c.msgcount for c in self.index.connections)
 
     def begin(self, chunk: Chunk) -> None:
-        """A further chunk; ``listed`` is what its own index then lists."""
+        """Add a chunk. ``listed`` collects the counts of its own index afterwards."""
         self.end()
         self.index.chunks.append(chunk)
 
     def end(self) -> None:
-        """Count what the index of the newest chunk lists and it does not have."""
+        """Count the messages that the index of the newest chunk lists and that the chunk does not have."""
         if self.index.chunks:
             there = self.index.chunks[-1].counts
             self.missing += sum(max(0, n - there.get(number, 0)) for number, n in self.listed.items())
         self.listed.clear()
 
     def finish(self, known: Container[int], outside: array[int]) -> Counter[int]:
-        """Leave out what is of no known connection, and count the rest by connection."""
+        """Drop messages of unknown connections. Return the counts of the others by connection."""
         counts: Counter[int] = Counter()
         for chunk in self.index.chunks:
             unknown = {number for number in chunk.counts if number not in known}
@@ -127,7 +131,7 @@ class Scan:
         return counts
 
     def notes(self, repair: str) -> list[str]:
-        """What was found and what was not; ``repair`` says which command writes a sound copy."""
+        """Return warnings about rescued and lost messages. ``repair`` says how to get a sound copy."""
         part = f", {self.rescued} of them from the incomplete last {megabytes(self.cut)}" if self.cut else ""
         notes = [f"read {self.count} messages{part}; {repair}"]
         damaged = [chunk for chunk in self.index.chunks if chunk.damage]
@@ -146,7 +150,7 @@ class Scan:
 
 
 def _damage_note(damages: Sequence[str], lost: int, kept: int) -> str:
-    """Tell what is wrong with damaged chunks, and how many of their messages are lost and kept."""
+    """Describe damaged chunks and count their lost and kept messages."""
     ((why, _),) = Counter(damages).most_common(1)
     doubt = f", {kept} that were kept may be wrong" if kept else ""
     return f"{len(damages)} damaged chunk(s), {why}: {lost} messages lost{doubt}"
@@ -158,32 +162,32 @@ ChunkMessage = tuple[int, int, memoryview]
 
 @dataclass(frozen=True, slots=True)
 class Form:
-    """What differs between the formats."""
+    """Functions of one chunked file format."""
 
-    public: Callable[[Path], PublicReader]  # rosbags' reader
+    public: Callable[[Path], PublicReader]  # reader of rosbags
     views: bool  # messages are read by our index, see SoundChunks
-    read_index: Callable[[Path], Index]  # DamageError: it is not to be believed
-    read_times: Callable[[Bytes, Chunk, int], I64]  # of one connection in a chunk, by its own index; the same
-    look_into: Callable[[Bytes, Chunk], tuple[list[ChunkMessage], str]]  # and what is wrong with the chunk
-    scan: Callable[[Bytes, Scan, Callable[[int], object]], None]  # the last one is told how far it has come
-    repair: str  # what writes a sound copy
+    read_index: Callable[[Path], Index]  # raises DamageError if the index cannot be right
+    read_times: Callable[[Bytes, Chunk, int], I64]  # log times of a connection by the index
+    look_into: Callable[[Bytes, Chunk], tuple[list[ChunkMessage], str]]  # messages of a chunk, and its damage
+    scan: Callable[[Bytes, Scan, Callable[[int], object]], None]  # the last argument gets the offset
+    repair: str  # command that writes a sound copy
 
 
 class SoundChunks:
-    """A file whose index is to be believed: rosbags opens it, and reads what it reads as fast as we do.
+    """Reader of a file with a valid index. rosbags opens the file, and reads the messages of ROS 1 bags.
 
-    That is ROS 1. The messages of an MCAP file are read by the index, as views of its chunks: rosbags copies
-    each one twice, which takes 1.2 s a GB instead of 0.5 s where chunks have 4 MB, and it passes over what
-    is broken in a chunk without a checksum. What rosbags refuses, messages that are not ROS 2's beside those
-    that are or ROS 1's in MCAP, is read the same way.
+    The messages of an MCAP file are read by our index, as views into its chunks. rosbags copies each message
+    twice: 1.2 s per GB instead of 0.5 s with chunks of 4 MB. It also skips broken records in a chunk without
+    a checksum. Files that rosbags refuses are read by our index too: ROS 1 messages in MCAP, and files that
+    mix ROS 2 messages with others.
 
     Args:
-        path: of the file.
-        form: of its format.
-        public: the same file under a name that rosbags knows the format by.
+        path: file.
+        form: functions of its format.
+        public: the same file with the suffix by which rosbags knows the format.
 
     Raises:
-        DamageError: there is no index, or it cannot be right.
+        DamageError: the file has no index, or the index cannot be right.
     """
 
     def __init__(self, path: Path, form: Form, public: Path) -> None:
@@ -197,7 +201,7 @@ class SoundChunks:
         except DamageError as error:
             _log.info("%s: read by its index, for rosbags says: %s", path, error)
         else:
-            # With their quality of service; corrected connections are not those of the index.
+            # rosbags knows the quality of service. Corrected connections differ from those of the index.
             known = {c.id: c for c in reader.connections if c.id not in index.corrected}
             index.connections = [
                 known.get(c.id, c)._replace(msgcount=c.msgcount, owner=None) for c in index.connections
@@ -213,48 +217,58 @@ class SoundChunks:
 
     @property
     def connections(self) -> Sequence[Connection]:
+        """Connections with their message counts."""
         return self._own.connections
 
     @property
     def compression(self) -> str:
+        """Names of the compressions of the chunks."""
         return self._own.compression
 
     @property
     def span(self) -> tuple[int, int]:
+        """Log time of the first message, and log time of the last message plus one nanosecond."""
         return self._own.span
 
     @property
     def warnings(self) -> Sequence[str]:
+        """Missing data met so far, one sentence each."""
         return self._own.warnings
 
     def messages(self, ids: Collection[int], start: int, stop: int) -> Iterator[Message]:
+        """Yield messages of the connections ``ids`` with start <= log time < stop, in order of log time."""
         if self._public is None:
             return self._own.messages(ids, start, stop)
         wanted = [c for c in self._public.connections if c.id in ids]
         return public_messages(self._public.messages(wanted, start, stop))
 
     def times(self, ids: Collection[int]) -> I64:
+        """Return the sorted log times of the connections ``ids``."""
         return self._times(ids, 0, LAST)
 
     def sums(self, ids: Collection[int], start: int, stop: int) -> tuple[int, int]:
+        """Return the number of messages and the sum of their log times, both by the index."""
         times = self._times(ids, start, stop)
         times = times[(times >= start) & (times < stop)]
-        high, low = times >> 32, times & 0xFFFFFFFF  # whose sums fit an int64
+        # The sum of 64-bit times would overflow an int64; the sums of their halves do not.
+        high, low = times >> 32, times & 0xFFFFFFFF
         return len(times), (int(high.sum()) << 32) + int(low.sum())
 
     def rescuer(self) -> Reader:
+        """Return a reader by the index, or by a scan if the index is damaged."""
         if self._index is None:
             return rescue(self._path, self._form)
         return IndexedChunks(self._path, self._form, self._index)
 
     def close(self) -> None:
+        """Close the file."""
         self._bytes.close()
         self._own.close()
         if self._public is not None:
             self._public.close()
 
     def _times(self, ids: Collection[int], start: int, stop: int) -> I64:
-        """Log times in the chunks that reach into a span, sorted."""
+        """Return the sorted log times of all chunks that overlap a time span."""
         if self._public is None:
             return self._own.times(ids, start, stop)
         parts = [np.zeros(0, np.int64)]
@@ -270,26 +284,29 @@ class SoundChunks:
 
 
 class IndexedChunks:
-    """Messages by an index, in order of log time. What a damaged chunk costs is counted."""
+    """Reader of messages by an index, in order of log time. It counts the losses of damaged chunks."""
 
     def __init__(self, path: Path, form: Form, index: Index, notes: Sequence[str] = ()) -> None:
         self._form, self._index, self._notes = form, index, notes
         self._bytes = Bytes(path)
-        # Of damaged chunks: messages lost by connection, log times of the others, and what is wrong.
+        # By number of a damaged chunk: lost messages by connection, log times of the kept ones, the damage.
         self._damaged: dict[int, tuple[Counter[int], Mapping[int, I64], str]] = {}
         self.compression = ", ".join(sorted({c.compression for c in index.chunks} - {"", "none"}))
 
     @property
     def connections(self) -> Sequence[Connection]:
+        """Connections with their message counts, without the lost messages."""
         lost = sum((lost for lost, _, _ in self._damaged.values()), Counter[int]())
         return [c._replace(msgcount=c.msgcount - lost[c.id]) for c in self._index.connections]
 
     @property
     def span(self) -> tuple[int, int]:
+        """Log time of the first message, and log time of the last message plus one nanosecond."""
         return self._index.span
 
     @property
     def warnings(self) -> Sequence[str]:
+        """Corrected descriptions and lost messages, one sentence each."""
         notes = list(self._notes)
         if corrected := self._index.corrected:
             topics = {c.topic: corrected[c.id] for c in self._index.connections if c.id in corrected}
@@ -308,6 +325,7 @@ class IndexedChunks:
         return notes
 
     def messages(self, ids: Collection[int], start: int, stop: int) -> Iterator[Message]:
+        """Yield messages of the connections ``ids`` with start <= log time < stop, in order of log time."""
         wanted = {c.id: c for c in self.connections if c.id in ids}
         sources: list[Iterator[tuple[int, Connection | None, bytes | memoryview]]] = [
             self._of_chunk(number, wanted, start, stop)
@@ -321,7 +339,7 @@ class IndexedChunks:
                 yield connection, time, data
 
     def times(self, ids: Collection[int], start: int = 0, stop: int = LAST) -> I64:
-        """As of any reader, but at least those with start <= log time < stop."""
+        """Return sorted log times of the connections ``ids``, at least those with start <= time < stop."""
         outside = self._index.outside
         parts = [outside[np.isin(outside[:, 1], list(ids)), 0]]
         reaching = [(n, c) for n, c in enumerate(self._index.chunks) if c.start < stop and c.end >= start]
@@ -336,6 +354,7 @@ class IndexedChunks:
         return np.sort(np.concatenate(parts))
 
     def close(self) -> None:
+        """Close the file."""
         self._bytes.close()
 
     def _times_of(self, number: int, connection: int) -> I64:
@@ -347,14 +366,14 @@ class IndexedChunks:
     def _of_chunk(
         self, number: int, wanted: Mapping[int, Connection], start: int, stop: int
     ) -> Iterator[tuple[int, Connection | None, bytes | memoryview]]:
-        # The merge draws the first item of every source at once: this one costs no reading.
+        # The merge draws the first item of every source at once. This empty item needs no reading.
         yield self._index.chunks[number].start, None, b""
         found = [(t, wanted[c], d) for t, c, d in self._content(number) if c in wanted and start <= t < stop]
         found.sort(key=itemgetter(0))
         yield from found
 
     def _content(self, number: int) -> list[ChunkMessage]:
-        """Return the messages of a chunk, of a damaged one those that can be read."""
+        """Return the messages of a chunk. A damaged chunk gives only the readable ones."""
         chunk = self._index.chunks[number]
         found, damage = self._form.look_into(self._bytes, chunk)
         found = [item for item in found if chunk.start <= item[0] <= chunk.end]
@@ -377,7 +396,7 @@ class IndexedChunks:
 
 
 def rescue(path: Path, form: Form) -> IndexedChunks:
-    """A reader of what is found by looking through a file from front to back."""
+    """Scan a file from front to back. Return a reader of the messages found."""
     found, file = Scan(), Bytes(path)
     try:
         bar = progress.bar(total=file.size, unit="B", unit_scale=True, desc=f"rescue {path.name}", delay=1)

@@ -1,4 +1,4 @@
-"""What a file is by its first bytes, and what reads it."""
+"""File formats by their first bytes, and the readers of each format."""
 
 from __future__ import annotations
 
@@ -27,12 +27,20 @@ FRAME = re.compile(re.escape(ZSTD))
 
 @dataclass(frozen=True, slots=True)
 class Kind:
-    """A format of files."""
+    """One file format and its readers.
+
+    Attributes:
+        name: name for messages to the user.
+        magic: first bytes of a file.
+        suffix: file suffix by which rosbags knows the format.
+        sound: opens a sound file. Its second argument is the same file under a name with that suffix.
+        rescue: opens a damaged file.
+    """
 
     name: str
     magic: bytes
-    suffix: str  # that rosbags knows it by
-    sound: Callable[[Path, Path], SoundReader]  # of the file, and of the same by a name with that suffix
+    suffix: str
+    sound: Callable[[Path, Path], SoundReader]
     rescue: Callable[[Path], Reader]
 
 
@@ -52,7 +60,7 @@ KINDS = (
     _of_chunks("ROS 1 bag", ros1.MAGIC, ".bag", ros1.FORM),
     SQLITE,
 )
-HEAD = 16  # bytes that tell what a file is
+HEAD = 16  # bytes read to recognise a format
 OTHERS = {
     b"RRF": "a Rerun recording: open it with 'rerun'",
     b"PK\x03\x04": "a zip archive: unpack it first",
@@ -66,18 +74,18 @@ OTHERS = {
 
 
 def open_file(path: Path, scratch: Scratch, tell: Callable[[str], object]) -> BagFile:
-    """A file of a recording, by its first bytes; a compressed one is unpacked.
+    """Open a file of a recording by its first bytes. A compressed file is unpacked.
 
     Args:
-        path: of the file.
-        scratch: where it is unpacked.
-        tell: gets a sentence on what could not be unpacked.
+        path: file.
+        scratch: temporary folders for unpacked files.
+        tell: receives a warning if a file cannot be unpacked completely.
 
     Raises:
-        OSError: it is not there, or cannot be read.
-        UserError: it is no bag, or there is nothing in it.
+        OSError: the file does not exist or cannot be read.
+        UserError: the file is no bag or is empty.
     """
-    if path.exists() and not path.is_file():  # a pipe would be waited for
+    if path.exists() and not path.is_file():  # Reading a pipe would block.
         raise UserError(f"{path}: no bag: it is no file")
     with path.open("rb") as file:
         head = file.read(HEAD)
@@ -88,7 +96,7 @@ def open_file(path: Path, scratch: Scratch, tell: Callable[[str], object]) -> Ba
     if kind := next((kind for kind in KINDS if head.startswith(kind.magic)), None):
         return _open_as(kind, path, scratch)
     what = next((text for magic, text in OTHERS.items() if head.startswith(magic)), None)
-    # The first bytes may be damaged; and of a database all may still lie in its log.
+    # The first bytes may be damaged. All messages of a database may still lie in its log.
     kind = next((kind for kind in KINDS if path.suffix == kind.suffix), None)
     if not head and not (kind is SQLITE and sqlite_pages.log_of(path).exists()):
         raise UserError(f"{path}: the file is empty")
@@ -106,7 +114,7 @@ def open_file(path: Path, scratch: Scratch, tell: Callable[[str], object]) -> Ba
 
 def _open_as(kind: Kind, path: Path, scratch: Scratch) -> BagFile:
     public = path
-    if path.suffix != kind.suffix or set("?#%") & set(str(path)):  # the latter mean something in a URI
+    if path.suffix != kind.suffix or set("?#%") & set(str(path)):  # These characters have a meaning in a URI.
         public = scratch.new() / f"bag{kind.suffix}"
         public.symlink_to(path.resolve())
     return BagFile(path, kind.name, lambda: kind.sound(path, public), lambda: kind.rescue(path))
@@ -125,10 +133,10 @@ def _unpack(path: Path, scratch: Scratch, tell: Callable[[str], object]) -> Path
 
 
 def unpack_file(path: Path, target: Path) -> tuple[int, bool]:
-    """Unpack a zstd file; behind a damaged place its next frame is searched for.
+    """Unpack a zstd file. After damage, go on at the next frame.
 
     Returns:
-        How many places are damaged, and whether the last frame is whole.
+        Number of damaged places, and whether the last frame is complete.
     """
     source, damaged, stream = Bytes(path), 0, zstd.ZstdDecompressor()
     bar = progress.bar(total=source.size, unit="B", unit_scale=True, desc=f"unpack {path.name}", delay=1)
@@ -136,7 +144,7 @@ def unpack_file(path: Path, target: Path) -> tuple[int, bool]:
         with target.open("wb") as out, bar:
             offset = 0
             while offset < source.size:
-                # In small pieces: what the decompressor makes of the one that it stumbles over is lost.
+                # The decompressor drops its output for the piece with the damage, so pieces are small.
                 piece = source.read(offset, PIECE)
                 try:
                     out.write(stream.decompress(piece))

@@ -1,4 +1,4 @@
-"""What an MCAP file is made of (https://mcap.dev/spec), and the index of a sound one."""
+"""Records of an MCAP file (https://mcap.dev/spec), and the index of a sound file."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _log = logger(__name__)
 MAGIC = b"\x89MCAP0\r\n"
 HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX, CHUNK_INDEX, ATTACHMENT = range(1, 10)
 ATTACHMENT_INDEX, STATISTICS, DATA_END = 0x0A, 0x0B, 0x0F
-MOST_ATTACHED = 1 << 26  # bytes of one that is read
+MOST_ATTACHED = 1 << 26  # bytes; a larger attachment is not read
 FORMATS = {
     "ros2msg": MessageDefinitionFormat.MSG,
     "ros1msg": MessageDefinitionFormat.MSG,
@@ -32,7 +32,7 @@ FORMATS = {
     "omgidl": MessageDefinitionFormat.IDL,
 }
 RECORD = struct.Struct("<BQ")
-CHUNK_HEAD = struct.Struct("<QQQII")  # first and last log time, size, CRC, length of the compression's name
+CHUNK_HEAD = struct.Struct("<QQQII")  # first and last log time, size, CRC, length of the compression name
 MESSAGE_HEAD = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
 _FOOTER = struct.Struct("<BQQQI8s")  # opcode, length, start of the summary and of its offsets, CRC, magic
 _STATISTICS = struct.Struct("<QHIIIIQQ")  # messages, schemas, channels, ..., chunks, first and last log time
@@ -42,7 +42,7 @@ NOTHING = MessageDefinition(MessageDefinitionFormat.NONE, "")
 
 
 class Channels:
-    """The connections that schema and channel records make."""
+    """Connections built from schema and channel records."""
 
     def __init__(self) -> None:
         self.schemas: dict[int, tuple[str, MessageDefinition]] = {}
@@ -55,7 +55,7 @@ class Channels:
         return bool(self._channels)
 
     def note(self, opcode: int, record: bytes) -> None:
-        """Take what a schema or a channel says; of two with one number, the first."""
+        """Add a schema or channel record. The first of two with the same number counts."""
         if opcode == SCHEMA:
             (number,) = struct.unpack_from("<H", record)
             msgtype, encoding, text = strings(record, 2, 3)
@@ -70,7 +70,7 @@ class Channels:
             self._channels.setdefault(number, (schema, topic, form))
 
     def correct(self, others: Channels) -> dict[int, str]:
-        """Take the descriptions of ``others`` where they differ. Return the former topics by channel."""
+        """Use the descriptions of ``others`` where they differ. Return the former topics by channel."""
         known = self._channels.keys() & others._channels.keys()
         before = {number: (self._channels[number][1], self._description(number)) for number in known}
         self.schemas |= others.schemas
@@ -86,6 +86,7 @@ class Channels:
         return topic, encoding, self.schemas.get(schema)
 
     def connections(self, counts: Mapping[int, int]) -> list[Connection]:
+        """Return the connections with their message counts."""
         found = []
         for number, (schema, topic, encoding) in self._channels.items():
             msgtype, definition = self.schemas.get(schema, ("", NOTHING))
@@ -97,10 +98,10 @@ class Channels:
 
 
 def read_index(path: Path) -> Index:
-    """The index at the end of a file, which is believed where it agrees with the statistics.
+    """Read the index at the end of a file. It must agree with the statistics.
 
     Raises:
-        DamageError: there is none, it ends early, or it disagrees with them.
+        DamageError: there is no index, it ends early, or it disagrees with the statistics.
     """
     file = Bytes(path)
     try:
@@ -123,7 +124,7 @@ def read_index(path: Path) -> Index:
         index = _parse_summary(summary[: end - start], start, channels)
         if not crc:
             _correct_channels(file, index, channels)
-        for chunk in index.chunks[-1:]:  # where bytes are missing or too many, at least the last one is moved
+        for chunk in index.chunks[-1:]:  # If bytes are missing or inserted, at least the last chunk is moved.
             at = chunk.data - RECORD.size - CHUNK_HEAD.size - len(chunk.compression) - 8
             length = CHUNK_HEAD.size + len(chunk.compression) + 8 + chunk.packed
             if file.read(at, RECORD.size) != RECORD.pack(CHUNK, length):
@@ -138,9 +139,9 @@ def read_index(path: Path) -> Index:
 
 
 def read_attachments(path: Path) -> dict[str, bytes]:
-    """Those that a file begins with, by name, as ``McapWriter.attach`` writes them; also of one that is cut.
+    """Read the attachments at the start of a file by name, also of a file that is cut.
 
-    One that is damaged is left out.
+    ``McapWriter.attach`` writes them there. A damaged attachment is left out.
     """
     file, found = Bytes(path), dict[str, bytes]()
     try:
@@ -167,11 +168,11 @@ def read_attachments(path: Path) -> dict[str, bytes]:
 
 
 def _correct_channels(file: Bytes, index: Index, channels: Channels) -> None:
-    """Describe channels as the data does where a summary without a checksum differs.
+    """Correct channel descriptions by the data if the summary has no checksum.
 
-    To read all data takes too long. A writer describes a channel at its first message at the latest, so the
-    chunk with that message is enough: one chunk of most files, a few of others. A channel that is described
-    in none of these stays as it is.
+    Reading all data takes too long. A writer describes a channel at its first message at the latest, so the
+    chunk with this message is enough. That is one chunk of most files and a few of others. A channel without
+    a description in these chunks stays unchanged.
     """
     in_data, seen = Channels(), set[int]()
     for chunk in sorted(index.chunks, key=attrgetter("data")):
@@ -179,7 +180,7 @@ def _correct_channels(file: Bytes, index: Index, channels: Channels) -> None:
             continue
         seen |= chunk.counts.keys()
         content, damage, _ = unpack_chunk(file, chunk)
-        if not damage:  # reading its messages says so
+        if not damage:  # Reading its messages reports the damage.
             _note_all(content, in_data)
     index.corrected = channels.correct(in_data)
     if index.corrected:
@@ -199,9 +200,9 @@ def _note_all(content: bytes, channels: Channels) -> None:
 
 
 def unpack_chunk(file: Bytes, chunk: Chunk) -> tuple[bytes, str, bool]:
-    """Return the content of a chunk, what is wrong with it, and whether it fits its checksum."""
+    """Return the content of a chunk, its damage, and whether the content fits its checksum."""
     crc = chunk.crc
-    if crc is None:  # it stands before the content
+    if crc is None:  # The checksum stands before the content.
         crc = int.from_bytes(file.read(chunk.data - 16 - len(chunk.compression), 4), "little")
     packed = file.read(chunk.data, chunk.packed)
     cut = chunk.cut or len(packed) < chunk.packed
@@ -210,7 +211,7 @@ def unpack_chunk(file: Bytes, chunk: Chunk) -> tuple[bytes, str, bool]:
 
 
 def _parse_summary(summary: bytes, end: int, channels: Channels) -> Index:
-    """The index in a summary, which ends at ``end``; ``channels`` is filled with its schemas and channels."""
+    """Parse the index in a summary section that begins at ``end``. Fill ``channels`` from its records."""
     chunks = []
     statistics: tuple[Any, ...] | None = None
     counted: Mapping[int, int] = {}
@@ -258,7 +259,7 @@ def _parse_chunk_index(record: bytes, end: int) -> Chunk:
     name = record[at + 12 : at + 12 + name_size]
     packed, unpacked = struct.unpack_from("<QQ", record, at + 12 + name_size)
     listed = dict(_COUNT.iter_unpack(record[36:at]))
-    stop = offset + length + index_length  # of the message indexes, one behind the other
+    stop = offset + length + index_length  # end of the message indexes, which follow the chunk
     if not (offset < offset + length <= stop <= end) or max(start, last) >= LAST or packed > length:
         raise DamageError("its index leads out of the file, or out of time")
     if listed and (min(listed.values()) < offset + length or max(listed.values()) >= stop):
@@ -275,10 +276,10 @@ def _parse_chunk_index(record: bytes, end: int) -> Chunk:
 
 
 def read_times(file: Bytes, chunk: Chunk, channel: int) -> I64:
-    """Log times of the messages of a channel, as a message index has them.
+    """Return the log times of the messages of a channel by the message index of a chunk.
 
     Raises:
-        DamageError: it is none, or it disagrees with the index of the chunk.
+        DamageError: the record is no message index, or it disagrees with the chunk index.
     """
     entries = 16 * chunk.counts[channel]
     record = file.read(chunk.index[channel], 15 + entries)
@@ -292,7 +293,7 @@ def read_times(file: Bytes, chunk: Chunk, channel: int) -> I64:
 
 
 def strings(record: bytes, offset: int, count: int) -> list[bytes]:
-    """``count`` strings, each behind its length.
+    """Parse ``count`` strings, each after its length.
 
     Raises:
         struct.error: the record ends before them.

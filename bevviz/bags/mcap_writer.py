@@ -1,4 +1,4 @@
-"""Raw messages into an MCAP file, byte for byte as they were recorded (https://mcap.dev/spec)."""
+"""Writer of raw messages into an MCAP file, byte for byte as recorded (https://mcap.dev/spec)."""
 
 from __future__ import annotations
 
@@ -46,27 +46,27 @@ from bevviz.support.files import claim, lock, rename_new, write_all
 from bevviz.support.version import __version__
 
 HEADER, CHUNK_INDEX, STATISTICS = 1, 8, 0x0B
-CHUNK_SIZE = 1 << 22  # bytes that a chunk is closed at
+CHUNK_SIZE = 1 << 22  # bytes at which a chunk is closed
 
-_SCHEMAS = {"protobuf": "protobuf", "json": "jsonschema"}  # of messages that are not ROS's
+_SCHEMAS = {"protobuf": "protobuf", "json": "jsonschema"}  # schema encodings of messages other than ROS's
 
 
 class McapWriter:
-    """Context manager: ``write`` messages in order of log time. The file appears when all went well.
+    """Context manager that writes messages in order of log time. The file appears after a successful end.
 
-    Until then it is NAME.partial-XXXXXXXX.mcap, which a process that is killed leaves, and which can be read.
-    Where ``write`` finds the disk full, what was written until then becomes a complete file if the context is
-    left without an error.
+    Until then its name is NAME.partial-XXXXXXXX.mcap. A killed process leaves this file, and it can be read.
+    If ``write`` finds the disk full, the caller can leave the context without an error. The messages written
+    so far then become a complete file.
 
-    The messages of ROS 1 stay what they are: with the encoding ``ros1``, which MCAP has beside ``cdr``.
+    ROS 1 messages are not converted. They get the encoding ``ros1``, which MCAP has besides ``cdr``.
 
     Args:
         path: the ``.mcap`` file.
-        define: tells what the type of a connection is made of.
-        ros1: the profile that the file states.
-        compress: chunks with zstd.
-        replace: overwrite an existing file. Otherwise that stays, and a bag that cannot get its name, or its
-            summary, keeps its unfinished name.
+        define: returns the message definition of a connection.
+        ros1: write the profile ``ros1`` instead of ``ros2``.
+        compress: compress chunks with zstd.
+        replace: overwrite an existing file. Without it, an existing file stays. A bag that cannot be renamed
+            or completed then keeps its unfinished name.
 
     Raises:
         UserError: the file cannot be written.
@@ -88,14 +88,15 @@ class McapWriter:
         self._compression = "zstd" if compress else ""
         self._schemas: dict[tuple[str, MessageDefinition], int] = {}
         self._channels: dict[tuple[str, str, MessageDefinition], int] = {}
-        self._declared = BytesIO()  # schemas and channels, for the summary
-        self._declared_count: Counter[int] = Counter()  # by opcode
+        self._declared = BytesIO()  # schema and channel records, for the summary
+        self._declared_count: Counter[int] = Counter()  # number of these records by opcode
         self._chunk = BytesIO()
-        self._index: dict[int, list[tuple[int, int]]] = defaultdict(list)  # of the open chunk, by channel
-        self._chunks = BytesIO()  # their records of the summary
+        # (log time, offset) of the messages of the open chunk, by channel
+        self._index: dict[int, list[tuple[int, int]]] = defaultdict(list)
+        self._chunks = BytesIO()  # chunk index records, for the summary
         self._chunk_count = 0
         self._counts: Counter[int] = Counter()
-        self._attachments = list[bytes]()  # their records of the summary
+        self._attachments = list[bytes]()  # attachment index records, for the summary
         self._span = (2**63 - 1, 0)
         self._end = 0
 
@@ -131,15 +132,15 @@ class McapWriter:
             if not keep:
                 self._part.unlink(missing_ok=True)
             cleanup.forget(self)
-            os.close(self._file)  # and with it the lock
+            os.close(self._file)  # releases the lock as well
 
     @property
     def size(self) -> int:
-        """Bytes so far, as far as they are in the file."""
+        """Bytes in the file so far, without the open chunk."""
         return self._end
 
     def attach(self, name: str, data: bytes) -> None:
-        """A file that belongs to the messages; to be called before the first of them.
+        """Attach a file to the bag. Call it before the first message.
 
         Raises:
             UserError: the disk is full.
@@ -162,10 +163,11 @@ class McapWriter:
         """Append a message.
 
         Args:
-            connection: where it was recorded: its topic, type, encoding and quality of service are kept.
-            time: log time, nanoseconds.
-            data: the serialised message.
-            sent: time of publication, nanoseconds; None: not known, the log time.
+            connection: connection that recorded the message. Its topic, type, encoding and quality of service
+                are kept.
+            time: log time in nanoseconds.
+            data: serialised message.
+            sent: time of publication in nanoseconds; None: unknown, so the log time.
 
         Raises:
             UserError: the disk is full.
@@ -201,7 +203,7 @@ class McapWriter:
         )
         metadata = b""
         if isinstance(extra, ConnectionExtRosbag2) and extra.offered_qos_profiles:
-            # So that a player offers what is published once to whoever comes late, as the robot did.
+            # A player then offers a latched topic to late subscribers, as the robot did.
             profiles = BytesIO()
             YAML(typ="safe", pure=True).dump([_profile(qos) for qos in extra.offered_qos_profiles], profiles)
             metadata = _text("offered_qos_profiles") + _text(profiles.getvalue().decode())
@@ -244,7 +246,7 @@ class McapWriter:
             self._put(RECORD.pack(CHUNK, len(head) + len(packed)) + head)
             self._put(packed)
             self._put(_listed(index)[0])
-        except OSError:  # whole chunks are left, and place for the summary of them
+        except OSError:  # Whole chunks stay, and their summary still has room.
             os.ftruncate(self._file, start)
             os.lseek(self._file, start, os.SEEK_SET)
             self._end = start
@@ -255,7 +257,7 @@ class McapWriter:
     def _note_chunk(
         self, start: int, length: int, index: Mapping[int, Sequence[tuple[int, int]]], packed: int, size: int
     ) -> None:
-        """Add a chunk that is in the file to the summary."""
+        """Add a written chunk to the summary."""
         times = [time for entries in index.values() for time, _ in entries]
         first, last = min(times, default=0), max(times, default=0)
         listed, places = _listed(index)
@@ -268,21 +270,21 @@ class McapWriter:
             self._span = min(first, self._span[0]), max(last, self._span[1])
 
     def _resume(self, data: mmap, handle: int) -> bool:
-        """Go on where a killed writer ended, behind its last whole message.
+        """Continue after the last whole message of a killed writer.
 
         Returns:
-            Whether there was anything to go on with. False: the file is whole already.
+            False if the file is complete already.
 
         Raises:
-            ValueError: a writer like this one has not written it, or it is damaged before its end.
+            ValueError: another writer wrote the file, or it is damaged before its end.
         """
         size, at = len(data), len(MAGIC)
         if data[:at] != MAGIC:
             raise ValueError("it is no MCAP file")
         if size > at and data[-len(MAGIC) :] == MAGIC:
             return False
-        missing = b""  # behind the last chunk
-        declared: set[tuple[int, int]] = set()  # opcode and number
+        missing = b""  # missing bytes of the index after the last chunk
+        declared: set[tuple[int, int]] = set()  # (opcode, number)
         while not missing and at + RECORD.size <= size:
             opcode, length = RECORD.unpack_from(data, at)
             end = at + RECORD.size + length
@@ -290,7 +292,7 @@ class McapWriter:
                 at = end
                 continue
             if opcode != CHUNK:
-                if opcode != DATA_END and any(data[at:]):  # a power cut leaves zeros
+                if opcode != DATA_END and any(data[at:]):  # A power cut leaves zeros.
                     raise ValueError(f"it is damaged at byte {at}")
                 break
             content = at + RECORD.size + CHUNK_HEAD.size
@@ -299,7 +301,7 @@ class McapWriter:
             *_, unpacked, _, named = CHUNK_HEAD.unpack_from(data, at + RECORD.size)
             self._compression = data[content : content + named].decode()
             content += named + 8
-            if end > size:  # a part of the chunk is there
+            if end > size:  # Only a part of the chunk was written.
                 if not self._compression:
                     whole = self._take(data[content:], declared, self._index)
                     self._chunk.write(data[content : content + whole])
@@ -331,7 +333,7 @@ class McapWriter:
             Bytes of the whole records.
 
         Raises:
-            ValueError: what follows them is no part of a record.
+            ValueError: the bytes after them are no part of a record.
         """
         at = 0
         while at + RECORD.size <= len(data):
@@ -366,7 +368,7 @@ class McapWriter:
             self._declared_count[SCHEMA],
             self._declared_count[CHANNEL],
             len(self._attachments),
-            0,  # metadata
+            0,  # metadata records
             self._chunk_count,
             *(self._span if self._counts else (0, 0)),
         )
@@ -376,13 +378,13 @@ class McapWriter:
 
 
 def complete(path: Path) -> int:
-    """Complete a bag in place that a killed process has left: whole messages stay, and get an index.
+    """Complete a bag of a killed process in place: keep its whole messages and write the index.
 
     Returns:
-        How many messages there are.
+        Number of messages.
 
     Raises:
-        UserError: the file cannot be completed. It is as it was.
+        UserError: the file cannot be completed. It is unchanged.
     """
     writer = McapWriter(path, _undefined)
     try:
@@ -410,7 +412,7 @@ def _undefined(connection: Connection) -> MessageDefinition:
 
 
 def _listed(index: Mapping[int, Sequence[tuple[int, int]]]) -> tuple[bytes, dict[int, int]]:
-    """Encode the index of a chunk's messages. Return it, and where in it each channel's record begins."""
+    """Encode the index of the messages of a chunk. Return it with the offset of each channel's record."""
     listed, places = b"", {}
     for channel, entries in index.items():
         places[channel] = len(listed)
@@ -420,7 +422,7 @@ def _listed(index: Mapping[int, Sequence[tuple[int, int]]]) -> tuple[bytes, dict
 
 
 def _profile(qos: Qos) -> dict[str, object]:
-    """A quality of service as metadata.yaml of version 9 has it."""
+    """Convert a quality of service to the layout of metadata.yaml version 9."""
 
     def duration(time: QosTime) -> dict[str, int]:
         return {"sec": time.sec, "nsec": time.nsec}

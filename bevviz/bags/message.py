@@ -1,4 +1,4 @@
-"""Messages as they lie in a recording, and how they are serialised."""
+"""Messages as a recording stores them, and their serialisation formats."""
 
 from __future__ import annotations
 
@@ -16,21 +16,32 @@ from bevviz.messages.guard import guard
 
 @dataclass(frozen=True, slots=True)
 class RawMessage:
+    """One serialised message of a recording.
+
+    Attributes:
+        topic: name of the topic.
+        received: log time in nanoseconds.
+        data: serialised message, possibly compressed with zstd.
+        connection: connection that recorded the message.
+        packets: time in nanoseconds and bytes of each LiDAR packet of one scan; see ``Recording.scans``.
+    """
+
     topic: str
-    received: int  # log time, nanoseconds
+    received: int
     data: bytes | memoryview
     connection: Connection
-    packets: tuple[tuple[int, bytes | memoryview], ...] = ()  # with the time of each: a scan, see ``scans``
+    packets: tuple[tuple[int, bytes | memoryview], ...] = ()
 
     @property
     def type(self) -> str:
+        """Type of the message as ROS 2 spells it."""
         return normalized(self.connection.msgtype)
 
     def content(self) -> bytes | memoryview:
-        """The serialised message; a compressed one is unpacked.
+        """Return the serialised message. A compressed message is unpacked.
 
         Raises:
-            zstd.ZstdError: it cannot be, or has more than ``LONGEST`` bytes.
+            zstd.ZstdError: the message cannot be unpacked, or it has more than ``LONGEST`` bytes.
         """
         if self.data[:4] != ZSTD:
             return self.data
@@ -41,10 +52,10 @@ class RawMessage:
         return data
 
     def header(self) -> tuple[int, str]:
-        """Stamp in nanoseconds and frame_id of a message that begins with a Header; the rest is not decoded.
+        """Return the stamp in nanoseconds and the frame_id. Only the Header at the start is decoded.
 
         Raises:
-            MessageError: there is no header.
+            MessageError: the message has no header.
         """
         try:
             data = self.content()
@@ -56,22 +67,22 @@ class RawMessage:
         return read_header(data, "<" if little else ">", self.topic)
 
     def parsed(self, data: bytes | memoryview) -> Any:
-        """The message of Foxglove's that these bytes are.
+        """Parse ``data`` as a Foxglove message.
 
         Raises:
-            MessageError: they are none.
+            MessageError: the bytes do not fit the Foxglove type.
         """
         about = self.connection
         return guard(self, foxglove.parse, data, about.msgtype, form_of(about), about.msgdef.data)
 
 
 def form_of(connection: Connection) -> str:
-    """How messages of Foxglove's are serialised where ROS does not: protobuf or json; else empty."""
+    """Return the serialisation of a Foxglove message that ROS cannot decode: protobuf, json, or empty."""
     form = getattr(connection.ext, "serialization_format", "")
     return form if form in foxglove.ENCODINGS and foxglove.short_of(connection.msgtype) else ""
 
 
 def is_ros1(connection: Connection) -> bool:
-    """Whether its messages are serialised as in ROS 1."""
+    """Tell whether the messages of a connection are serialised as in ROS 1."""
     extra = connection.ext
     return isinstance(extra, ConnectionExtRosbag1) or extra.serialization_format == "ros1"

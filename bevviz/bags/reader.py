@@ -1,4 +1,4 @@
-"""What a bag file offers, whatever its format: rosbags reads a sound one, a rescuer what is damaged."""
+"""Common interface of bag readers. rosbags reads a sound file, a rescuer a damaged one."""
 
 from __future__ import annotations
 
@@ -29,35 +29,35 @@ _log = logger(__name__)
 Message = tuple[Connection, int, bytes | memoryview]
 """Where it was recorded, log time in nanoseconds, and the serialised message."""
 
-ZSTD = b"\x28\xb5\x2f\xfd"  # what its files and messages begin with
-LAST = 2**63 - 1  # a log time beyond it is damage: it fits no int64, and no date
-LEAST, LONGEST = 1 << 26, 1 << 30  # bytes that a chunk or a message may be unpacked to, whatever it says
-PIECE = 1 << 12  # compressed bytes that are unpacked at once where the next ones may be damaged
-BLOCK = 1 << 14  # bytes read at once where few are asked for
-STRETCH = 1 << 20  # bytes looked through at once for the next record
+ZSTD = b"\x28\xb5\x2f\xfd"  # first bytes of a zstd file or message
+LAST = 2**63 - 1  # A later log time is damage: it fits no int64 and no date.
+LEAST, LONGEST = 1 << 26, 1 << 30  # limits of unpacked bytes, independent of the stated size
+PIECE = 1 << 12  # compressed bytes unpacked at once where the following bytes may be damaged
+BLOCK = 1 << 14  # bytes of a small read, kept for the next read
+STRETCH = 1 << 20  # bytes searched at once for the next record
 
 
 class DamageError(Exception):
-    """What is wrong with a file, for the end of a sentence."""
+    """Damage of a file. The text ends a sentence."""
 
 
 class UnindexedError(DamageError):
-    """A file that its recorder has ended, without an index."""
+    """A complete file without an index."""
 
 
-# What rosbags and the libraries below it raise when bytes are not what they should be.
+# Exceptions of rosbags and its libraries for damaged bytes.
 _DAMAGE: tuple[type[Exception], ...] = (
     *(rosbags.rosbag1.ReaderError, rosbags.rosbag2.ReaderError, apsw.Error),
-    *(zstd.ZstdError, EOFError, RuntimeError),  # the last one is lz4's
-    *(OSError, ValueError),  # bz2's, those of text that is no UTF-8, and a disk's
-    *(struct.error, LookupError, TypeError, AssertionError),  # what is missing or leads nowhere
-    *(OverflowError, MemoryError),  # lengths and times beyond all measure
+    *(zstd.ZstdError, EOFError, RuntimeError),  # RuntimeError is lz4's.
+    *(OSError, ValueError),  # bz2, text that is not UTF-8, disk errors
+    *(struct.error, LookupError, TypeError, AssertionError),  # missing fields, references that lead nowhere
+    *(OverflowError, MemoryError),  # lengths and times out of range
 )
 
 
 @contextmanager
 def as_damage() -> Iterator[None]:
-    """Around what rosbags does, and nothing else: what it raises on damage becomes a DamageError."""
+    """Turn the exceptions of rosbags for damaged bytes into a DamageError. Wrap calls of rosbags alone."""
     try:
         yield
     except _DAMAGE as error:
@@ -65,61 +65,67 @@ def as_damage() -> Iterator[None]:
 
 
 def public_messages(messages: Iterator[Message]) -> Iterator[Message]:
-    """The messages that rosbags reads; what it raises on damage becomes a DamageError."""
+    """Yield the messages that rosbags reads. Its exceptions on damage become a DamageError."""
     with as_damage():
         yield from messages
 
 
 class Reader(Protocol):
-    """The messages of one file. ``connections`` have their ``msgcount``."""
+    """Reader of one file. Its ``connections`` have their ``msgcount``."""
 
     @property
-    def connections(self) -> Sequence[Connection]: ...
+    def connections(self) -> Sequence[Connection]:
+        """Connections of the file."""
+        ...
 
     @property
-    def compression(self) -> str: ...
+    def compression(self) -> str:
+        """Names of the compressions of the file; empty without compression."""
+        ...
 
     @property
     def span(self) -> tuple[int, int]:
-        """Log time of the first message, and just after that of the last one."""
+        """Log time of the first message, and log time of the last message plus one nanosecond."""
         ...
 
     @property
     def warnings(self) -> Sequence[str]:
-        """What is missing, as far as it was met."""
+        """Missing data met so far, one sentence each."""
         ...
 
     def messages(self, ids: Collection[int], start: int, stop: int) -> Iterator[Message]:
-        """Messages of the connections ``ids`` with start <= log time < stop, in order of log time."""
+        """Yield messages of the connections ``ids`` with start <= log time < stop, in order of log time."""
         ...
 
     def times(self, ids: Collection[int]) -> I64:
-        """Log times of all messages of the connections ``ids``, sorted, without their data."""
+        """Return the sorted log times of all messages of the connections ``ids``. Their data is not read."""
         ...
 
-    def close(self) -> None: ...
+    def close(self) -> None:
+        """Close the file."""
+        ...
 
 
 class SoundReader(Reader, Protocol):
-    """Any of its methods may raise DamageError."""
+    """Reader of an undamaged file. Every method may raise DamageError."""
 
     def sums(self, ids: Collection[int], start: int, stop: int) -> tuple[int, int]:
-        """How many messages there are as the index has it, and the sum of their log times."""
+        """Return the number of messages and the sum of their log times, both by the index."""
         ...
 
     def rescuer(self) -> Reader:
-        """Who goes on where this one cannot."""
+        """Return the reader to continue with after damage."""
         ...
 
 
 class BagFile:
-    """One file, whose readers are changed at the first damage.
+    """One bag file. At the first damage its sound reader is replaced by a rescuer.
 
     Args:
-        path: of the file.
-        form: name of its format.
-        sound: opens the reader of a sound file; raises DamageError.
-        rescue: opens the reader of a damaged one; raises UserError where nothing is left of it.
+        path: file.
+        form: name of the format.
+        sound: opens the reader of a sound file. Raises DamageError.
+        rescue: opens the reader of a damaged file. Raises UserError if no message is left.
     """
 
     def __init__(
@@ -137,34 +143,38 @@ class BagFile:
 
     @property
     def connections(self) -> Sequence[Connection]:
+        """Connections of the file with their message counts."""
         return self._reader.connections
 
     @property
     def compression(self) -> str:
+        """Names of the compressions of the file; empty without compression."""
         return self._reader.compression
 
     @property
     def span(self) -> tuple[int, int]:
+        """Log time of the first message, and log time of the last message plus one nanosecond."""
         return self._reader.span
 
     @property
     def warnings(self) -> list[str]:
+        """Missing or damaged data met so far, with the file name."""
         return [f"{self.path.name}: {note}" for note in (*self._notes, *self._reader.warnings)]
 
     def messages(
         self, connections: Collection[Connection], start: int | None = None, stop: int | None = None
     ) -> Iterator[Message]:
-        """Messages of ``connections`` with start <= log time < stop, in order of log time."""
+        """Yield messages of ``connections`` with start <= log time < stop, in order of log time."""
         known = {c.id: c for c in connections}
         low = max(0, start or 0)
         high = LAST if stop is None else min(stop, LAST)
         given, total, latest = 0, 0, low
-        at_latest: list[tuple[int, bytes | memoryview]] = []  # what was given of the latest log time
+        at_latest: list[tuple[int, bytes | memoryview]] = []  # yielded messages of the latest log time
         if self._sound is None:
             for connection, time, data in self._reader.messages(known, low, high):
                 yield known[connection.id], time, data
             return
-        resume = low  # where the rescuer begins
+        resume = low  # log time at which the rescuer begins
         try:
             for connection, time, data in self._sound.messages(known, low, high):
                 if time != latest:
@@ -174,7 +184,7 @@ class BagFile:
                 given += 1
                 total += time
                 yield known[connection.id], time, data
-            latest, resume = LAST, low  # all of it was given, as far as it is known
+            latest, resume = LAST, low  # All messages that the index knows are yielded.
             self._check(known, low, high, (given, total))
         except DamageError as error:
             self._change(error)
@@ -189,7 +199,7 @@ class BagFile:
                 self._notes.append(f"{late} message(s) were found too late to be given in order of time")
 
     def times(self, connections: Collection[Connection]) -> I64:
-        """Log times of all messages of ``connections``, sorted, without reading them."""
+        """Return the sorted log times of all messages of ``connections``. Their data is not read."""
         ids = [c.id for c in connections]
         if self._sound is not None:
             try:
@@ -199,13 +209,14 @@ class BagFile:
         return self._reader.times(ids)
 
     def close(self) -> None:
+        """Close the current reader."""
         self._reader.close()
 
     def _check(self, ids: Collection[int], start: int, stop: int, given: tuple[int, int]) -> None:
-        """Compare what was given with what the index has.
+        """Compare the count and the time sum of the yielded messages with the index.
 
         Raises:
-            DamageError: the index has others.
+            DamageError: they differ.
         """
         assert self._sound is not None
         listed = self._sound.sums(ids, start, stop)
@@ -215,7 +226,7 @@ class BagFile:
             raise DamageError("its index has other times than its messages")
 
     def _change(self, error: DamageError) -> None:
-        """From here on the rescuer reads."""
+        """Replace the sound reader by its rescuer."""
         self._tell(error)
         sound, self._sound = self._sound, None
         assert sound is not None
@@ -231,18 +242,20 @@ class BagFile:
 
 
 class Bytes:
-    """The bytes of a file by offset. Not mapped: a file that is cut meanwhile is short, and no fault."""
+    """Bytes of a file by offset. The file is not memory-mapped: if it shrinks meanwhile, reads are short."""
 
     def __init__(self, path: Path) -> None:
         self._file = path.open("rb", buffering=0)
         self.size = os.fstat(self._file.fileno()).st_size
-        self._latest = 0, b""  # block that was read last, in one piece for whoever reads in another thread
+        # Offset and bytes of the last block. One tuple, because another thread may read at the same time.
+        self._latest = 0, b""
 
     def close(self) -> None:
+        """Close the file."""
         self._file.close()
 
     def read(self, offset: int, size: int) -> bytes:
-        """``size`` bytes, fewer at the end of the file."""
+        """Return ``size`` bytes, or fewer at the end of the file."""
         start, block = self._latest
         at = offset - start
         if at < 0 or at + size > len(block):
@@ -256,7 +269,7 @@ class Bytes:
         return block[at : at + size]
 
     def search(self, pattern: re.Pattern[bytes], start: int, reach: int = 64) -> Iterator[int]:
-        """Offsets that ``pattern`` is found at, from ``start`` on; it needs ``reach`` bytes at most."""
+        """Yield the offsets from ``start`` on where ``pattern`` matches. It needs at most ``reach`` bytes."""
         while start < self.size:
             data = self._pread(start, STRETCH + reach)
             for match in pattern.finditer(data):
@@ -274,35 +287,38 @@ class Bytes:
 
 
 class Content(Bytes):
-    """The same of bytes that are there already: of the content of a chunk."""
+    """Bytes in memory with the interface of ``Bytes``, for the unpacked content of a chunk."""
 
     def __init__(self, data: bytes) -> None:
         self._data, self.size = data, len(data)
 
     def close(self) -> None:
+        """Release the bytes."""
         del self._data
 
     def read(self, offset: int, size: int) -> bytes:
+        """Return ``size`` bytes, or fewer at the end."""
         return self._data[offset : offset + size] if offset >= 0 else b""
 
     def search(self, pattern: re.Pattern[bytes], start: int, reach: int = 64) -> Iterator[int]:
+        """Return the offsets from ``start`` on where ``pattern`` matches."""
         return (match.start() for match in pattern.finditer(self._data, start))
 
 
 def unpack(
     compression: str, packed: bytes, size: int, crc: int = 0, *, cut: bool = False
 ) -> tuple[bytes, str]:
-    """Unpack the content of a chunk, of a damaged one the part before the damage.
+    """Unpack the content of a chunk. A damaged chunk gives the part before the damage.
 
     Args:
-        compression: zstd, lz4, bz2, or nothing.
-        packed: as it lies in the file.
-        size: bytes that it should have.
-        crc: its checksum, 0: it has none.
-        cut: the end of ``packed`` is missing. That alone is no damage.
+        compression: zstd, lz4, bz2, none or empty.
+        packed: compressed bytes.
+        size: unpacked size that the file states.
+        crc: checksum of the content; 0: none.
+        cut: the end of ``packed`` is missing, which alone is no damage.
 
     Returns:
-        The content, and what is wrong with it. The latter is empty for a sound chunk.
+        Content, and a description of its damage. The description is empty for a sound chunk.
     """
     most, whole = min(max(size, LEAST), LONGEST), True
     if compression in ("", "none"):
@@ -331,11 +347,11 @@ _STREAMS: dict[str, Callable[[], Any]] = {
     "lz4": LZ4FrameDecompressor,
     "bz2": BZ2Decompressor,
 }
-_STUMBLES = (OSError, ValueError, RuntimeError, EOFError, zstd.ZstdError)  # what these raise on damage
+_STUMBLES = (OSError, ValueError, RuntimeError, EOFError, zstd.ZstdError)  # exceptions of these on damage
 
 
 def _drawn(stream: Any, packed: bytes, most: int) -> bytes:
-    """Return what a decompressor makes of some bytes, ``most`` bytes of it."""
+    """Decompress bytes into at most ``most`` bytes."""
     parts = [stream.decompress(packed, most)]
     most -= len(parts[0])
     while most > 0 and not stream.eof and not stream.needs_input:
@@ -347,8 +363,8 @@ def _drawn(stream: Any, packed: bytes, most: int) -> bytes:
 def _before_damage(new_stream: Callable[[], Any], packed: bytes, most: int) -> bytes:
     """Return the content of all compressed blocks before the damage.
 
-    A decompressor keeps what it made of the piece that it stumbles over. So the first pass finds this
-    piece, and the second one feeds it byte by byte.
+    A decompressor that fails drops its output for the current piece. So the first pass finds this piece,
+    and the second pass feeds it byte by byte.
     """
     data, sound = bytearray(), 0
     for step in (PIECE, 1):
@@ -365,15 +381,15 @@ def _before_damage(new_stream: Callable[[], Any], packed: bytes, most: int) -> b
 
 
 def megabytes(size: int) -> str:
-    """A file size for people: ``3.1 MB``."""
+    """Format a file size for people: ``3.1 MB``."""
     return f"{size / 1e6:.1f} MB" if size >= 100_000 else f"{size / 1e3:.1f} kB"
 
 
 @cache
 def normalized(msgtype: str) -> str:
-    """The name of a type as ROS 2 spells it: sensor_msgs/msg/Image."""
+    """Return a type name as ROS 2 spells it: sensor_msgs/msg/Image."""
     package, _, name = msgtype.rpartition("/")
-    if not package and "." in name:  # protobuf's: foxglove.PointCloud
+    if not package and "." in name:  # a protobuf name: foxglove.PointCloud
         return msgtype
     if package.rpartition("/")[2] in ("msg", "action"):
         return msgtype

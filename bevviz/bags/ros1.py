@@ -1,4 +1,4 @@
-"""ROS 1 bags (http://wiki.ros.org/Bags/Format/2.0): the index of a sound one, a scan of a damaged one."""
+"""ROS 1 bags (http://wiki.ros.org/Bags/Format/2.0): the index of a sound bag, a scan of a damaged bag."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ from bevviz.bags.reader import LAST, Bytes, Content, DamageError, normalized, un
 from bevviz.model.frame import I64
 
 MAGIC = b"#ROSBAG V2.0\n"
-OPCODE = re.compile(rb"(?=\x04\0\0\0op=)")  # every header has one
-LONGEST_HEADER = 1 << 16  # bytes; but for what a connection's data says, which is of the same form
-SEARCHED = 160  # bytes of a header that may stand before its opcode
+OPCODE = re.compile(rb"(?=\x04\0\0\0op=)")  # Every header contains an opcode.
+LONGEST_HEADER = 1 << 16  # bytes; the data of a connection has the form of a header and may be longer
+SEARCHED = 160  # bytes of a header before its opcode that are searched
 
-# What a record is, is told by its fields: an opcode can be damaged without a trace, the others hardly.
-KINDS: Mapping[str, Mapping[str, int | None]] = {  # fields and their sizes
+# The fields of a record determine its kind. A damaged opcode leaves no trace; damaged fields do.
+KINDS: Mapping[str, Mapping[str, int | None]] = {  # field sizes in bytes; None: any
     "chunk": {"compression": None, "size": 4},
     "message": {"conn": 4, "time": 8},
     "connection": {"conn": 4, "topic": None},
@@ -37,23 +37,34 @@ Fields = dict[str, bytes]
 
 @dataclass(slots=True)
 class Record:
-    kind: str  # one of KINDS, "": another one
+    """A record of a bag.
+
+    Attributes:
+        kind: key of KINDS; empty: another kind.
+        fields: header fields by name.
+        start: offset of the record.
+        body: offset of the data.
+        end: offset of the end. It lies beyond the end of the file if the record is cut.
+    """
+
+    kind: str
     fields: Fields
-    start: int  # offset
-    body: int  # offset of the data
-    end: int  # offset; beyond that of the file where the record is cut
+    start: int
+    body: int
+    end: int
 
     def number(self, name: str) -> int:
+        """Return a field as an unsigned integer."""
         return int.from_bytes(self.fields[name], "little")
 
     def time(self, name: str) -> int:
-        """Nanoseconds."""
+        """Return a time field in nanoseconds."""
         sec, nsec = struct.unpack("<II", self.fields[name])
         return int(sec) * 10**9 + int(nsec)
 
 
 def read_record(source: Bytes, offset: int) -> Record | None:
-    """The record at an offset, None where there is none. Its data may be cut."""
+    """Read the record at an offset. Return None if there is none. Its data may be cut."""
     size = int.from_bytes(source.read(offset, 4), "little")
     if not 4 <= size <= LONGEST_HEADER:
         return None
@@ -67,7 +78,7 @@ def read_record(source: Bytes, offset: int) -> Record | None:
 
 
 def read_fields(header: bytes, size: int) -> Fields | None:
-    """The fields of a header of ``size`` bytes, None where it is none."""
+    """Parse the fields of a header of ``size`` bytes. Return None if the bytes are no header."""
     if len(header) < size:
         return None
     fields: Fields = {}
@@ -87,7 +98,10 @@ def _fits(fields: Fields, layout: Mapping[str, int | None]) -> bool:
 
 
 def _is_sane(record: Record, size: int) -> bool:
-    """Whether its data have the size that its fields say, and end within ``size`` bytes or are a chunk."""
+    """Tell whether the data of a record has the size that its fields state.
+
+    The data must end within ``size`` bytes, except that of a chunk.
+    """
     length = record.end - record.body
     if record.kind == "index":
         return length == 12 * record.number("count") and record.end <= size
@@ -101,7 +115,7 @@ def _is_sane(record: Record, size: int) -> bool:
 
 
 class Connections:
-    """The connections of a bag, as its connection records describe them."""
+    """Connections of a bag by its connection records."""
 
     def __init__(self) -> None:
         self._known: dict[int, Connection] = {}
@@ -110,7 +124,7 @@ class Connections:
         return number in self._known
 
     def note(self, record: Record, data: bytes) -> None:
-        """Take a connection; of two with one number, the first."""
+        """Add a connection record. The first of two with the same number counts."""
         about = read_fields(data, len(data))
         topic = record.fields["topic"].decode(errors="replace")
         if about is None or not topic or record.number("conn") in self:
@@ -131,6 +145,7 @@ class Connections:
         )
 
     def counted(self, counts: Mapping[int, int]) -> list[Connection]:
+        """Return the connections with their message counts."""
         return [c._replace(msgcount=counts.get(number, 0)) for number, c in self._known.items()]
 
 
@@ -138,10 +153,10 @@ class Connections:
 
 
 def read_index(path: Path) -> Index:
-    """The index of a bag, which is believed where its parts agree with each other.
+    """Read the index of a bag. Its parts must agree with each other.
 
     Raises:
-        DamageError: there is none, it ends early, or it disagrees with itself.
+        DamageError: there is no index, it ends early, or it contradicts itself.
     """
     file = Bytes(path)
     try:
@@ -193,7 +208,7 @@ def _read_index(file: Bytes, offset: int, connection_count: int, chunk_count: in
 
 
 def _read_chunk(file: Bytes, info: Record, end: int) -> Chunk:
-    """A chunk and the index records behind it, held against what the index of the bag says of it."""
+    """Read the head of a chunk and the index records after it. Compare them with the index of the bag."""
     pairs = np.frombuffer(file.read(info.body, info.end - info.body), "<u4").reshape(-1, 2)
     counts = {number: count for number, count in pairs.tolist() if count}
     record = read_record(file, info.number("chunk_pos"))
@@ -218,10 +233,10 @@ def _read_chunk(file: Bytes, info: Record, end: int) -> Chunk:
 
 
 def read_times(file: Bytes, chunk: Chunk, number: int) -> I64:
-    """Log times of the messages of a connection, as the index of a chunk has them.
+    """Return the log times of the messages of a connection by the index of a chunk.
 
     Raises:
-        DamageError: it ends early, or disagrees with that of the bag.
+        DamageError: the index ends early, or it disagrees with that of the bag.
     """
     size = 12 * chunk.counts[number]
     data = file.read(chunk.index[number], size)
@@ -238,9 +253,9 @@ def read_times(file: Bytes, chunk: Chunk, number: int) -> I64:
 
 
 class Walker:
-    """The records of a bag or of a chunk; behind one that makes no sense the next one that does.
+    """Iterator over the records of a bag or of a chunk. After a broken record it finds the next sound one.
 
-    Only a chunk may be cut: it ends behind the bytes.
+    Only a chunk may be cut: it may end beyond the bytes.
     """
 
     def __init__(self, source: Bytes) -> None:
@@ -248,6 +263,7 @@ class Walker:
         self.broken = self.passed = 0
 
     def __call__(self, offset: int) -> Iterator[Record]:
+        """Yield the records from ``offset`` on."""
         size = self._source.size
         record = self._at(offset)
         while offset < size:
@@ -261,7 +277,7 @@ class Walker:
             assert record is not None
             following = self._at(record.end)
             if following is None and record.end != size:
-                # Its length is wrong and what follows lies within, or the next record is broken.
+                # The length is wrong and the next record lies within, or the next record is broken.
                 is_chunk = record.kind == "chunk"
                 nearer = self._search(record.body, min(record.end, size), is_chunk)
                 if nearer is not None and is_chunk:
@@ -280,7 +296,7 @@ class Walker:
         return record if record is not None and _is_sane(record, self._source.size) else None
 
     def _search(self, start: int, stop: int, chunk: bool = False) -> Record | None:
-        """The next record that makes sense, or the next chunk; followed by another, or by the end."""
+        """Return the next sound record, or the next chunk. It must precede another record or the end."""
         for at in self._source.search(OPCODE, start):
             if at >= stop:
                 return None
@@ -298,7 +314,7 @@ class Walker:
 
 
 def scan(file: Bytes, found: Scan, tell: Callable[[int], object]) -> None:
-    """Look through a bag from front to back, and into every chunk."""
+    """Scan a bag from front to back, with the content of every chunk."""
     connections, walker = Connections(), Walker(file)
     outside = array("q")  # messages of an uncompressed chunk whose head is damaged
     for record in walker(len(MAGIC)):
@@ -326,7 +342,7 @@ def scan(file: Bytes, found: Scan, tell: Callable[[int], object]) -> None:
 
 
 def _describe(file: Bytes, chunk: Chunk, connections: Connections, found: Scan) -> None:
-    """Fill in what is in a chunk."""
+    """Fill in the messages and connections of a chunk."""
     times: dict[int, array[int]] = defaultdict(lambda: array("q"))
     content, chunk.damage = _unpacked(file, chunk)
     walker = Walker(content)
@@ -342,7 +358,7 @@ def _describe(file: Bytes, chunk: Chunk, connections: Connections, found: Scan) 
 
 
 def look_into(file: Bytes, chunk: Chunk) -> tuple[list[ChunkMessage], str]:
-    """Return the messages of a chunk on the connections of its index, and what is wrong with its content."""
+    """Return the messages of a chunk on the connections of its index, and the damage of its content."""
     content, damage = _unpacked(file, chunk)
     data = memoryview(content.read(0, content.size))
     found = [
@@ -354,7 +370,7 @@ def look_into(file: Bytes, chunk: Chunk) -> tuple[list[ChunkMessage], str]:
 
 
 def _unpacked(file: Bytes, chunk: Chunk) -> tuple[Content, str]:
-    """Return the content of a chunk and what is wrong with it."""
+    """Return the content of a chunk and its damage."""
     packed = file.read(chunk.data, chunk.packed)
     cut = chunk.cut or len(packed) < chunk.packed
     data, damage = unpack(chunk.compression, packed, chunk.size, cut=cut)

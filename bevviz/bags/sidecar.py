@@ -1,4 +1,4 @@
-"""The bag that belongs to a recording by its name, as ``bevviz live`` and ``bevviz report`` save them."""
+"""The bag that ``bevviz live`` and ``bevviz report`` save next to a recording."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from bevviz.errors import UserError
 
 
 def bag_beside(path: Path) -> Path:
-    """What to read where a bag is wanted: NAME.mcap for a NAME.rrd, anything else itself.
+    """Return the bag NAME.mcap next to a recording NAME.rrd. Return any other path unchanged.
 
     Raises:
-        UserError: there is none beside the recording.
+        UserError: there is no such bag next to the recording.
     """
     if path.suffix != ".rrd" or not path.is_file():
         return path

@@ -1,4 +1,4 @@
-"""Frames from a recorded bag: read once from front to back, so that its length costs no memory."""
+"""Frames from a recorded bag. It is read once from front to back, so memory does not grow with its length."""
 
 from __future__ import annotations
 
@@ -27,14 +27,14 @@ from bevviz.sync.synchronizer import Synchronizer
 from bevviz.sync.unusable_messages import Damage
 
 SECOND = 1_000_000_000
-MARGIN = 2 * SECOND  # what else belongs to the first and the last cloud is looked for this far outside
-MOST_HELD = 2000  # messages of a topic with transforms that are read to begin in the midst of a drive
-EPOCH = 1e8  # a larger number of seconds is a date
+MARGIN = 2 * SECOND  # search range in nanoseconds for data of the first and the last cloud
+MOST_HELD = 2000  # latched transform messages read before a start in the middle of a drive
+EPOCH = 1e8  # seconds; a larger number is a date since 1970
 
 
 @dataclass(frozen=True)
 class FrameSelection:
-    """Which frames of a bag, as in ``BagSource``."""
+    """Selection of frames of a bag, with the options of ``BagSource``."""
 
     start: str | None = None
     end: str | None = None
@@ -42,19 +42,20 @@ class FrameSelection:
     frames: tuple[int | None, int | None] | None = None
 
     def source(self, paths: Sequence[Path], config: Config) -> BagSource:
+        """Open the bag with this selection."""
         return BagSource(paths, config, start=self.start, end=self.end, every=self.every, frames=self.frames)
 
 
 @dataclass(slots=True)
 class ReadingState:
-    """Position in a recording between two messages, and what the messages so far left behind.
+    """Position in a recording between two messages, and the state that earlier messages built up.
 
     Attributes:
-        sync: the synchroniser with its queues.
+        sync: synchroniser with its queues.
         stop: log time in nanoseconds at which reading ends; 0: not known yet.
-        number: number of the last scan met, from the first that is read; -1: none.
-        numbers: numbers of the scans that are not yet delivered, by time of receipt.
-        damage: messages that could not be used.
+        number: number of the last scan read, counted from the first scan read; -1: none.
+        numbers: numbers of the scans not delivered yet, by time of receipt.
+        damage: unusable messages.
     """
 
     sync: Synchronizer
@@ -65,19 +66,19 @@ class ReadingState:
 
 
 class BagSource(Closing):
-    """The frames of one recording, kept in one or several bags.
+    """Frames of one recording, which may consist of several bags.
 
     Args:
         paths: bag files or folders.
-        config: roles and synchronisation.
+        config: topic roles and synchronisation.
         start: first log time, see ``parse_time``.
         end: log time to stop at.
-        every: only each N-th scan becomes a frame; the others are not decoded.
-        frames: only scans A to B - 1 of those between ``start`` and ``end``, as in a Python slice.
-        at: only the scan whose log time is nearest to this time, numbered as in the whole recording.
+        every: use only each N-th scan; the others are not decoded.
+        frames: use only the scans A to B - 1 between ``start`` and ``end``, as in a Python slice.
+        at: use only the scan nearest to this log time. It keeps its number of the whole recording.
 
     Raises:
-        UserError: no bag, nothing in it, no LiDAR, or nothing in the part asked for.
+        UserError: no bag, an empty bag, no LiDAR, or no scan in the selected part.
     """
 
     def __init__(
@@ -99,29 +100,33 @@ class BagSource(Closing):
             self._driver = self._find_driver()
             self._low = self._time(start, self.recording.start)
             self._high = self._time(end, self.recording.end + 1)
-            self._first = 0  # number of the first scan that is read
+            self._first = 0  # number of the first scan in the selected part
             if at is not None:
                 self._narrow(self._time(at, 0))
             self._chosen = self._choose(every, frames or (None, None))
         except BaseException:
             self.close()
             raise
-        self._state: ReadingState | None = None  # of the frames read last
+        self._state: ReadingState | None = None  # state of the latest read
 
     def close(self) -> None:
+        """Close the recording."""
         self.recording.close()
 
     @property
     def scene(self) -> Scene:
+        """Static scene with the bag paths and the topics in use."""
         scene = self.roles.scene(self.recording.name)
         return replace(scene, bag=self.recording.paths, topics=self.roles.settings)
 
     @property
     def total(self) -> int:
+        """Number of selected frames."""
         return len(self._chosen)
 
     @property
     def warnings(self) -> Sequence[str]:
+        """All warnings about the recording and the frames read so far."""
         report = self._state.sync.report if self._state else None
         synced = report.warnings() if report else ()
         blind = blindness(self.config, self.roles, report)
@@ -130,12 +135,12 @@ class BagSource(Closing):
 
     @property
     def _damage(self) -> Sequence[str]:
-        """Messages that could not be used, a sentence for each topic."""
+        """Unusable messages, one sentence for each topic."""
         return self._state.damage.sentences if self._state else ()
 
     @property
     def doubts(self) -> Sequence[str]:
-        """What could not be used of the frames read so far, and what may make all of them wrong."""
+        """Unusable data of the frames read so far, and problems that may affect all frames."""
         if self._state is None:
             return []
         report = self._state.sync.report
@@ -143,41 +148,41 @@ class BagSource(Closing):
 
     @property
     def span(self) -> tuple[int, int]:
-        """Log times of the scans that are read: from the first, to before the second."""
+        """Log times of the selected part: start <= time < stop."""
         return self._low, self._high
 
     @property
     def tree(self) -> Mapping[str, str]:
-        """Child to parent of the transforms met so far."""
+        """Transforms met so far: parent by child."""
         return self._state.sync.tf.tree() if self._state else {}
 
     def pose(self, frame: Frame, stamp: int) -> F64 | None:
-        """(4, 4) fixed_from_points at a stamp near that of a frame that was read last or a little before.
+        """Return (4, 4) fixed_from_points at a stamp close to that of a recent frame.
 
-        None: no fixed frame above the points, or the transforms read so far do not reach the stamp.
+        None: there is no fixed frame above the points, or the transforms read so far do not reach the stamp.
         """
         return self._state.sync.placing.pose(frame, stamp) if self._state else None
 
     @cached_property
     def scans(self) -> I64:
-        """Log time of every scan of the recording in nanoseconds, in order; its place is its number."""
+        """Log times of all scans of the recording in nanoseconds. The index of a scan is its frame number."""
         return self.recording.scan_times(self._driver)
 
     def number_at(self, time: str | float) -> int:
-        """Number of the scan that is nearest to a time, see ``parse_time``.
+        """Return the number of the scan nearest to a time, see ``parse_time``.
 
         Raises:
-            UserError: no time, or one outside the recording.
+            UserError: the text is no time, or the time is outside the recording.
         """
         if not len(self.scans):
             raise UserError(f"{self.recording.name}: {self._driver} has no scan that can be read")
         return int(np.abs(self.scans - self._time(str(time), 0)).argmin())
 
     def checked(self, number: int) -> int:
-        """The number of a scan.
+        """Return the number of a scan if the scan exists.
 
         Raises:
-            UserError: there is none of that number.
+            UserError: there is no scan with this number.
         """
         if not 0 <= number < len(self.scans):
             raise UserError(
@@ -186,10 +191,10 @@ class BagSource(Closing):
         return number
 
     def frame(self, number: int) -> Frame | None:
-        """The frame of one scan of the recording, whichever were chosen; None where it cannot be read.
+        """Read the frame of one scan of the recording, selected or not; None if it cannot be read.
 
         Raises:
-            UserError: there is no scan of that number.
+            UserError: there is no scan with this number.
         """
         low = int(self.scans[self.checked(number)])
         return next(self._frames(low, low + 1, number, range(1)), None)
@@ -198,7 +203,7 @@ class BagSource(Closing):
         return self._frames(self._low, self._high, self._first, self._chosen)
 
     def _frames(self, low: int, high: int, first: int, chosen: range) -> Iterator[Frame]:
-        """The chosen ones of the scans with low <= log time < high, the first of which is ``first``."""
+        """Yield the chosen frames of the scans with low <= log time < high, numbered from ``first``."""
         return self._deliver(self._begin(low), low, high, first, chosen)
 
     def _begin(self, low: int) -> ReadingState:
@@ -213,7 +218,7 @@ class BagSource(Closing):
     def _deliver(
         self, state: ReadingState, low: int, high: int, first: int, chosen: range
     ) -> Iterator[Frame]:
-        """Yield the frames; ``state`` follows the reading."""
+        """Yield the frames and update ``state``."""
         sync = state.sync
         handlers = self._handlers(sync)
         state.stop = high + MARGIN
@@ -238,29 +243,29 @@ class BagSource(Closing):
         yield from self._numbered(sync.flush(), state)
 
     def _numbered(self, frames: Iterator[Frame], state: ReadingState) -> Iterator[Frame]:
-        """The frames, each with the number of its scan in the part of the recording that is read."""
+        """Yield the frames with the numbers of their scans."""
         numbers = state.numbers
         for frame in frames:
             same = numbers.get(frame.received, ())
             yield replace(frame, index=same.pop(0) if same else frame.index)
             for received in [t for t in numbers if t < frame.received - 10 * MARGIN]:
-                del numbers[received]  # of scans that were dropped
+                del numbers[received]  # dropped scans
 
     def _handle(self, handler: Handler[RawMessage], message: RawMessage, state: ReadingState) -> None:
         try:
             handler(message)
         except MessageError as error:
-            if message.data or not self.recording.is_dataset:  # of an empty one its file was told
+            # An empty message of a data set has a warning already.
+            if message.data or not self.recording.is_dataset:
                 state.damage.add(message.topic, str(error))
 
     def _hold_throughout(
         self, state: ReadingState, handlers: Mapping[str, Handler[RawMessage]], low: int
     ) -> None:
-        """Give what is published once to all frames, wherever in the bag it is.
+        """Feed data that is published once, such as static transforms, before the first frame.
 
-        Of each static transform the last one before the start, else the first one after it; of transforms
-        that hold until there are others, those before the start, or where they are many those of the first
-        second.
+        Each static transform is the last one before the start, or else the first one after it. Latched
+        transforms are those before the start, or only those of the first second if there are too many.
         """
         counts = {topic.name: topic.count or 0 for topic in self.recording.topics}
         for name in self.roles.tf_held:
@@ -276,16 +281,16 @@ class BagSource(Closing):
                     if message.received <= low or transform.child not in static:
                         static[transform.child] = transform
             except MessageError:
-                continue  # counted when its turn comes
+                continue  # The error is counted when the message itself is handled.
         for transform in static.values():
             state.sync.add_transform(transform, static=True)
         for topic in {camera.info_topic for camera in self.roles.cameras} - {""}:
             if (info := self.recording.first(topic)) is not None:
-                with suppress(MessageError):  # counted when its turn comes
+                with suppress(MessageError):  # The error is counted when the message itself is handled.
                     handlers[topic](info)
 
     def _find_driver(self) -> str:
-        """The first LiDAR: its scans make the frames. Without one, the first camera."""
+        """Return the first LiDAR topic, or else the first camera topic. Its messages make the frames."""
         driver = self.roles.driver
         if not driver:
             raise UserError(f"{self.recording.name}: {self.roles.no_lidar}")
@@ -317,7 +322,7 @@ class BagSource(Closing):
         return time
 
     def _narrow(self, time: int) -> None:
-        """Read the scan nearest to ``time`` alone."""
+        """Select only the scan nearest to ``time``."""
         if not len(self.scans):
             return
         self._first = int(np.abs(self.scans - time).argmin())
@@ -339,12 +344,13 @@ class BagSource(Closing):
 
 
 def parse_time(text: str, origin: int) -> int:
-    """Nanoseconds since 1970 of ``12.5`` (seconds after ``origin``), ``1700000000.0`` or an ISO 8601 date.
+    """Parse a time to nanoseconds since 1970.
 
+    Accepted are seconds after ``origin`` (``12.5``), seconds since 1970 (``1700000000.0``) and ISO 8601.
     A date without a zone is in UTC.
 
     Raises:
-        UserError: none of the three.
+        UserError: the text has none of these forms.
     """
     try:
         seconds = float(text)
@@ -364,6 +370,6 @@ def parse_time(text: str, origin: int) -> int:
 
 
 def iso(nanoseconds: int) -> str:
-    """A time in UTC to the millisecond: ``2026-11-21T10:00:00.500Z``."""
+    """Format a time in UTC to the millisecond: ``2026-11-21T10:00:00.500Z``."""
     date = datetime.fromtimestamp(nanoseconds // SECOND, UTC)
     return f"{date:%Y-%m-%dT%H:%M:%S}.{nanoseconds % SECOND // 1_000_000:03d}Z"

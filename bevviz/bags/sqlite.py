@@ -1,4 +1,4 @@
-"""sqlite3 bags: rosbags reads a sound one; of others the pages are read, see ``sqlite_rescue``."""
+"""sqlite3 bags. rosbags reads a sound file; ``rescue.sqlite`` reads the pages of a damaged one."""
 
 from __future__ import annotations
 
@@ -27,14 +27,14 @@ from bevviz.model.frame import I64
 
 
 class SoundSqlite:
-    """rosbags' reader, for a file that is all there.
+    """Reader of a complete sqlite3 bag, by rosbags.
 
     Args:
-        path: of the file.
-        public: the same file under a name that rosbags knows the format by.
+        path: file.
+        public: the same file with the suffix by which rosbags knows the format.
 
     Raises:
-        DamageError: its end is missing, or messages lie in a log beside it.
+        DamageError: the end of the file is missing, or messages lie in a log beside it.
     """
 
     compression = ""
@@ -64,21 +64,25 @@ class SoundSqlite:
 
     @property
     def span(self) -> tuple[int, int]:
+        """Log time of the first message, and log time of the last message plus one nanosecond."""
         return self._public.start_time, self._public.end_time
 
     def messages(self, ids: Collection[int], start: int, stop: int) -> Iterator[Message]:
+        """Yield messages of the connections ``ids`` with start <= log time < stop, in order of log time."""
         wanted = [c for c in self.connections if c.id in ids]
         for message in public_messages(self._public.messages(wanted, start, stop)):
-            # Where pages are missing sqlite3 reads zeros.
+            # sqlite3 reads zeros where pages are missing.
             if os.fstat(self._file.fileno()).st_size < self._size:
                 raise DamageError("the file was cut while it was read")
             yield message
 
     def times(self, ids: Collection[int]) -> I64:
+        """Return the sorted log times of the connections ``ids``."""
         query = f"SELECT timestamp FROM messages WHERE topic_id IN ({_marks(ids)}) ORDER BY timestamp"
         return np.array([time for (time,) in self._numbers(query, *ids)], np.int64)
 
     def sums(self, ids: Collection[int], start: int, stop: int) -> tuple[int, int]:
+        """Return the number of messages and the sum of their log times, both by the index."""
         query = (
             "SELECT count(*), sum(timestamp >> 32), sum(timestamp & 4294967295) "
             "FROM messages NOT INDEXED "
@@ -88,10 +92,11 @@ class SoundSqlite:
         return count, ((high or 0) << 32) + (low or 0)
 
     def rescuer(self) -> Reader:
+        """Return a reader of the pages."""
         return SqliteRescuer(self._path)
 
     def _check(self) -> None:
-        """Hold the tables and the index against each other.
+        """Compare the tables and the index with each other.
 
         Raises:
             DamageError: they disagree.
@@ -113,6 +118,7 @@ class SoundSqlite:
             return list(self._queries.execute(query, values))
 
     def close(self) -> None:
+        """Close the file."""
         self._file.close()
         self._public.close()
         self._queries.close()

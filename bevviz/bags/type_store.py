@@ -1,4 +1,4 @@
-"""What messages are made of: as the bag says, else as the ROS release does."""
+"""Message definitions: those of the bag, or else those of the ROS release."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from bevviz.bags.reader import normalized
 from bevviz.errors import first_line
 from bevviz.messages import decoders, grid_map_msgs, vision_msgs
 
-PREPROCESSED = re.compile(r"^[ \t]*#.*$", re.MULTILINE)  # of IDL: rosbags takes no #include
+PREPROCESSED = re.compile(r"^[ \t]*#.*$", re.MULTILINE)  # IDL lines such as #include; rosbags rejects them
 _MADE: Mapping[str, Callable[[Any, Typestore], Any]] = {
     "deserialize_cdr_le": lambda fields, store: generate_deserialize_cdr(fields, store, "le"),
     "deserialize_cdr_be": lambda fields, store: generate_deserialize_cdr(fields, store, "be"),
@@ -28,13 +28,13 @@ _MADE: Mapping[str, Callable[[Any, Typestore], Any]] = {
 
 
 class MessageTypes:
-    """The types of a recording's messages.
+    """Message types of a recording.
 
     Args:
-        tell: gets a sentence on each definition of the bag's that cannot be used.
+        tell: receives a warning for each definition of the bag that cannot be used.
 
     Attributes:
-        release: of ROS 2, that says what the bag does not.
+        release: ROS 2 release that defines the types without a definition in the bag.
     """
 
     def __init__(self, tell: Callable[[str], object]) -> None:
@@ -43,7 +43,10 @@ class MessageTypes:
         self._stores: dict[tuple[object, ...], Typestore] = {}
 
     def definition(self, connection: Connection) -> MessageDefinition:
-        """What a type is made of: as the bag says, else as the ROS release does; NONE where nobody knows."""
+        """Return the definition of a type from the bag, or else from the ROS release.
+
+        The format NONE means that neither defines the type.
+        """
         if connection.msgdef.format != MessageDefinitionFormat.NONE:
             return connection.msgdef
         version: Literal[1, 2] = 1 if is_ros1(connection) else 2
@@ -55,11 +58,11 @@ class MessageTypes:
         return MessageDefinition(MessageDefinitionFormat.MSG, text)
 
     def fields(self, connection: Connection) -> Mapping[str, Any]:
-        """The fields of every type that a connection's messages may be made of, as rosbags has them."""
+        """Return the fields of all types in the messages of a connection, in the form of rosbags."""
         return self.store(connection).fielddefs
 
     def store(self, connection: Connection) -> Typestore:
-        """The types that the bag itself defines, else those of the ROS release."""
+        """Return the types that the bag defines for a connection, or else those of the ROS release."""
         ros1, definition = is_ros1(connection), connection.msgdef
         key = (ros1, connection.msgtype, definition)
         if key not in self._stores:
@@ -67,7 +70,7 @@ class MessageTypes:
             if definition.format != MessageDefinitionFormat.NONE:
                 try:
                     store = _defined(connection)
-                except Exception as error:  # a definition that rosbags cannot parse
+                except Exception as error:  # rosbags raises many types for a definition that it cannot parse.
                     self._tell(
                         f"{connection.topic}: the bag's own definition of {connection.msgtype} is not usable "
                         f"({first_line(error).rstrip(':')}); that of {self.release.value} is taken"
@@ -82,7 +85,7 @@ class MessageTypes:
 
 
 def _defined(connection: Connection) -> Typestore:
-    """A store of the types that a connection's own definition lists."""
+    """Build a store of the types in the definition of a connection."""
     text, msgtype = connection.msgdef.data, normalized(connection.msgtype)
     if connection.msgdef.format == MessageDefinitionFormat.MSG:
         types = get_types_from_msg(text, msgtype)
@@ -97,22 +100,23 @@ def _defined(connection: Connection) -> Typestore:
 
 
 class ReadTypes(Typestore):
-    """As rosbags' own, which compiles twelve functions for each type: here one is, when it is wanted.
+    """Type store that compiles only the functions in use. The store of rosbags compiles twelve for each type.
 
-    Of the types of a usual bag that takes 2 ms where all take 100 to 300 ms. rosbags 0.11 has no public way
-    to one of them alone, and ``get_msgdef`` is what its own readers of messages go through.
+    That takes 2 ms for the types of a usual bag instead of 100 to 300 ms. rosbags 0.11 has no public way to
+    compile one function alone. Its own readers of messages call ``get_msgdef``.
     """
 
     def __init__(self) -> None:
-        super().__init__(empty)  # time and duration, which no ROS 1 definition says
+        super().__init__(empty)  # time and duration, which ROS 1 definitions do not include
 
     def get_msgdef(self, typename: str) -> Any:
+        """Return a message definition that compiles its functions at first use."""
         if typename not in self.cache:
             self.cache[typename] = _Read(self, typename)  # type: ignore[assignment]
         return self.cache[typename]
 
     def whole(self, typename: str) -> Any:
-        """With all twelve."""
+        """Return the message definition of rosbags with all twelve functions."""
         made = self.cache.pop(typename)
         try:
             return super().get_msgdef(typename)
@@ -121,7 +125,7 @@ class ReadTypes(Typestore):
 
 
 class _Read:
-    """A ``Msgdef`` of rosbags."""
+    """Replacement of a rosbags ``Msgdef`` whose functions are compiled at first use."""
 
     def __init__(self, store: ReadTypes, typename: str) -> None:
         self._store, self.name, self.cls = store, typename, store.types[typename]

@@ -1,4 +1,4 @@
-"""An MCAP file looked through record by record; behind a broken one the next sound one is searched for."""
+"""Scan of a damaged MCAP file record by record. After a broken record it searches for the next sound one."""
 
 from __future__ import annotations
 
@@ -35,41 +35,50 @@ from bevviz.bags.mcap import (
 )
 from bevviz.bags.reader import LAST, Bytes, Content
 
-HEAD = re.compile(  # an opcode with a length below 2^40, or the first bytes of a compressed chunk's content
+HEAD = re.compile(  # an opcode with a length below 2^40, or the start of a compressed chunk's content
     rb"(?=[\x01-\x0f].{5}\0\0\0|\x04\0\0\0zstd.{8}\x28\xb5\x2f\xfd|\x03\0\0\0lz4.{8}\x04\x22\x4d\x18)",
     re.DOTALL,
 )
 COMPRESSIONS = (b"", b"lz4", b"zstd")
 HOUR, DAY = 3600 * 10**9, 24 * 3600 * 10**9
-PRIVATE = 0x80  # opcodes from here on are anybody's own
+PRIVATE = 0x80  # Opcodes from here on are private to applications.
 _SUMMARY = {CHUNK_INDEX, STATISTICS, 0x0A, 0x0C, 0x0D, 0x0E}
 
 
 class Record(NamedTuple):
+    """A record of an MCAP file.
+
+    Attributes:
+        opcode: kind of the record.
+        body: offset of the content.
+        end: offset of the end. It lies beyond the end of the file if the record is cut.
+    """
+
     opcode: int
-    body: int  # offset
-    end: int  # offset; beyond that of the file where the record is cut
+    body: int
+    end: int
 
     @property
     def start(self) -> int:
+        """Offset of the record."""
         return self.body - RECORD.size
 
 
 class Walker:
-    """The records of a file or of a chunk's content.
+    """Iterator over the records of a file or of the content of a chunk.
 
     Args:
-        source: the bytes.
-        channels: those that are known; filled meanwhile.
-        span: first and last log time that a message found by searching may have; None: not known yet.
+        source: bytes to walk.
+        channels: known channels. The caller adds channels during the walk.
+        span: first and last plausible log time of a message found by searching; None: not known yet.
     """
 
     def __init__(self, source: Bytes, channels: Container[int], span: tuple[int, int] | None = None) -> None:
         self._source, self._channels, self._span = source, channels, span
-        self.broken = self.passed = 0  # places without a sound record, and bytes there
+        self.broken = self.passed = 0  # places without a sound record, and their bytes
 
     def __call__(self, offset: int) -> Iterator[Record]:
-        """Records from ``offset`` on. Only a chunk may be cut: it ends behind the bytes."""
+        """Yield the records from ``offset`` on. Only a chunk may be cut: it may end beyond the bytes."""
         size = self._source.size
         record = self._at(offset)
         while offset < size:
@@ -92,14 +101,14 @@ class Walker:
             record = following
 
     def _settle(self, record: Record) -> tuple[Record | None, Record | None]:
-        """The record, its end put right, None: it is broken; and the one behind it, None: not known."""
+        """Return a record with its corrected end (None: broken), and the next record (None: unknown)."""
         size, is_chunk = self._source.size, record.opcode == CHUNK
         if record.end == size or record.opcode == FOOTER:
             return record, None
         following = self._at(record.end) if record.end < size else None
         if following is not None or self._skip(record.end) is not None:
             return record, following
-        # Its length is wrong, and what follows lies within or a little behind; or the next record is broken.
+        # The length is wrong and the next record lies within or slightly behind; or the next one is broken.
         nearer = self._search(record.body, min(record.end, size), is_chunk)
         if is_chunk:
             return (record._replace(end=nearer.start) if nearer else record), nearer
@@ -109,7 +118,7 @@ class Walker:
         return None, nearer
 
     def _begins_message(self, offset: int) -> bool:
-        """Whether there is a message but for its length, or the end."""
+        """Tell whether a message with a possibly wrong length begins here. The end of the file counts."""
         head = self._source.read(offset, RECORD.size + MESSAGE_HEAD.size)
         if len(head) < RECORD.size + MESSAGE_HEAD.size:
             return True
@@ -126,7 +135,7 @@ class Walker:
             self._span = min(first, time), max(last, time)
 
     def _skip(self, offset: int) -> Record | None:
-        """The record behind one that makes no sense, where its length still leads to it."""
+        """Return the record after a broken one if the broken one's length still leads to it."""
         head = self._source.read(offset, RECORD.size)
         if len(head) < RECORD.size:
             return None
@@ -134,7 +143,7 @@ class Walker:
         return self._at(end, searched=True) if end < self._source.size else None
 
     def _search(self, start: int, stop: int, chunk: bool = False) -> Record | None:
-        """The next record that makes sense, or only the next chunk."""
+        """Return the next sound record, or only the next chunk."""
         for offset in self._source.search(HEAD, start):
             if offset >= stop:
                 return None
@@ -149,11 +158,11 @@ class Walker:
         return None
 
     def _at(self, offset: int, searched: bool = False) -> Record | None:
-        """The record at an offset, None where it makes no sense.
+        """Return the record at an offset, None if it makes no sense.
 
         Args:
-            offset: of the record.
-            searched: nothing leads here, so that more must fit.
+            offset: offset of the record.
+            searched: no other record leads to this offset, so the checks are stricter.
         """
         head = self._source.read(offset, RECORD.size)
         if len(head) < RECORD.size:
@@ -177,7 +186,7 @@ class Walker:
         return record
 
     def _fits(self, body: int) -> bool:
-        """Whether a message is of a known channel and of the time of the others."""
+        """Tell whether a message has a known channel and a time close to that of the others."""
         head = self._source.read(body, MESSAGE_HEAD.size)
         channel, _, time, published = MESSAGE_HEAD.unpack(head)
         if self._channels and channel not in self._channels:
@@ -188,7 +197,7 @@ class Walker:
         return bool(first - HOUR <= time <= last + HOUR)
 
     def _is_sane(self, record: Record) -> bool:
-        """Whether the lengths within a record fit its own, as far as its bytes are there."""
+        """Tell whether the lengths within a record fit its own length, as far as its bytes exist."""
         opcode, body, end = record
         length = end - body
         if opcode == MESSAGE:
@@ -209,10 +218,10 @@ class Walker:
                 return False
         if opcode in (FOOTER, DATA_END):
             return length == (20 if opcode == FOOTER else 4)
-        return opcode in _SUMMARY or opcode == 9  # an attachment
+        return opcode in _SUMMARY or opcode == 9  # 9: an attachment
 
     def _is_chunk(self, offset: int) -> bool:
-        """Whether a record with another opcode is one, by the two lengths that agree in a chunk."""
+        """Tell whether a record with another opcode is a chunk, by the two lengths that agree in a chunk."""
         head = self._source.read(offset, RECORD.size + CHUNK_HEAD.size + 12)
         name_size = int.from_bytes(head[RECORD.size + 28 : RECORD.size + 32], "little")
         if name_size > 4 or len(head) < RECORD.size + CHUNK_HEAD.size + 12:
@@ -225,7 +234,7 @@ class Walker:
         )
 
     def _chunk(self, offset: int) -> Record | None:
-        """A chunk, whose length stands there twice."""
+        """Return the chunk at an offset. A chunk states its length twice, so one of them may be damaged."""
         body = offset + RECORD.size
         head = self._source.read(offset, RECORD.size + CHUNK_HEAD.size + 12)
         if len(head) < RECORD.size + CHUNK_HEAD.size:
@@ -248,7 +257,7 @@ class Walker:
 
 
 def scan(file: Bytes, found: Scan, tell: Callable[[int], object]) -> None:
-    """Look through a file from front to back, and into every chunk."""
+    """Scan a file from front to back, with the content of every chunk."""
     channels = Channels()
     walker = Walker(file, channels)
     outside = array("q")
@@ -285,7 +294,7 @@ def _read_head(file: Bytes, body: int, end: int) -> Chunk:
 
 
 def _describe(file: Bytes, chunk: Chunk, channels: Channels, found: Scan) -> None:
-    """Fill in what is in a chunk."""
+    """Fill in the messages and channels of a chunk."""
     times: dict[int, array[int]] = defaultdict(lambda: array("q"))
     data, chunk.damage, _ = unpack_chunk(file, chunk)
     content = Content(data)
@@ -303,7 +312,7 @@ def _describe(file: Bytes, chunk: Chunk, channels: Channels, found: Scan) -> Non
 
 
 def look_into(file: Bytes, chunk: Chunk) -> tuple[list[ChunkMessage], str]:
-    """Return the messages of a chunk on the channels of its index, and what is wrong with its content."""
+    """Return the messages of a chunk on the channels of its index, and the damage of its content."""
     content, damage, checked = unpack_chunk(file, chunk)
     data = memoryview(content)
     found, whole = _messages(data, chunk.counts)
@@ -315,7 +324,7 @@ def look_into(file: Bytes, chunk: Chunk) -> tuple[list[ChunkMessage], str]:
 
 
 def _messages(data: memoryview, channels: Container[int]) -> tuple[list[ChunkMessage], bool]:
-    """The messages of a content by the lengths of its records, and whether these lead to its end."""
+    """Return the messages of a chunk by the record lengths, and whether the lengths lead to its end."""
     found, offset, size = [], 0, len(data)
     while offset + RECORD.size <= size:
         opcode, length = RECORD.unpack_from(data, offset)

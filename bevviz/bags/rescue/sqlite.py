@@ -1,7 +1,7 @@
-"""A damaged sqlite3 bag: its rows are read page by page, without the trees that lead to them.
+"""Reader of a damaged sqlite3 bag: rows are read page by page, without the trees that lead to them.
 
-A bag only grows, so every row that lies before a cut is found even where the tree that should lead to it
-is not. A write-ahead log beside the file, which a recorder leaves that was killed, is read with it.
+A bag only grows, so every row before a cut is found even if the tree that leads to it is lost. The
+write-ahead log that a killed recorder leaves beside the file is read as well.
 """
 
 from __future__ import annotations
@@ -22,31 +22,31 @@ from bevviz.errors import UserError
 from bevviz.model.frame import I64
 from bevviz.support import progress
 
-INTEGER_SIZES = {0: 0, 1: 1, 2: 2, 3: 3, 4: 4, 5: 6, 6: 8, 7: 8, 8: 0, 9: 0}  # by serial type
-COLUMNS = 16  # more than a table of any version of rosbag2 has
+INTEGER_SIZES = {0: 0, 1: 1, 2: 2, 3: 3, 4: 4, 5: 6, 6: 8, 7: 8, 8: 0, 9: 0}  # bytes by serial type
+COLUMNS = 16  # more columns than any table of rosbag2 has
 
 
 @dataclass(frozen=True, slots=True)
 class Cell:
-    """A row of a table: ``local`` bytes of it lie at ``offset`` of its page, the rest on overflow pages."""
+    """A table row: ``local`` bytes lie at ``offset`` of its page, the other bytes on overflow pages."""
 
     page: bytes
     rowid: int
     offset: int
     local: int
     size: int
-    overflow: int  # the first of those pages, 0: none
+    overflow: int  # first overflow page; 0: none
     columns: tuple[tuple[int, int], ...]  # serial type, offset in the row
 
 
 class SqliteRescuer:
-    """The rows of a file, page by page, without the trees that lead to them.
+    """Reader of the rows of a damaged file, page by page.
 
     Args:
-        path: of the file.
+        path: file.
 
     Raises:
-        UserError: there is nothing left of it.
+        UserError: the file has no readable row.
     """
 
     compression = ""
@@ -68,11 +68,13 @@ class SqliteRescuer:
 
     @property
     def span(self) -> tuple[int, int]:
+        """Log time of the first message, and log time of the last message plus one nanosecond."""
         times = self._rows[:, 0]
         return (int(times[0]), int(times[-1]) + 1) if len(times) else (LAST, 0)
 
     @property
     def warnings(self) -> list[str]:
+        """Rescued and lost messages, one sentence each."""
         found = [f"read {len(self._rows)} messages"]
         if self._incomplete:
             found.append(f"{self._incomplete} more are incomplete: lost")
@@ -87,6 +89,7 @@ class SqliteRescuer:
         return found
 
     def messages(self, ids: Collection[int], start: int, stop: int) -> Iterator[Message]:
+        """Yield messages of the connections ``ids`` with start <= log time < stop, in order of log time."""
         known = {c.id: c for c in self.connections}
         for number, (time, topic, page, at) in enumerate(self._rows.tolist()):
             if topic in ids and start <= time < stop:
@@ -99,10 +102,12 @@ class SqliteRescuer:
                 yield known[topic], time, data
 
     def times(self, ids: Collection[int]) -> I64:
+        """Return the sorted log times of the connections ``ids``."""
         times: I64 = self._rows[np.isin(self._rows[:, 1], list(ids)), 0]
         return times
 
     def close(self) -> None:
+        """Close the file."""
         self._pages.close()
 
     def _collect(self, path: Path) -> None:
@@ -126,7 +131,7 @@ class SqliteRescuer:
         known = np.isin(found[:, 1], list(topics))
         self._undescribed = int((~known).sum())
         found = found[known]
-        found = found[np.lexsort((found[:, 4], found[:, 0]))]  # rows of one time in order of their ids
+        found = found[np.lexsort((found[:, 4], found[:, 0]))]  # rows with the same time in order of their ids
         self._rows: I64 = found[:, :4]  # time, topic, page, offset of the cell
         counts = Counter(found[:, 1].tolist())
         self.connections: Sequence[Connection] = [
@@ -139,7 +144,7 @@ class SqliteRescuer:
         ]
 
     def _pointers(self, page: bytes, number: int) -> list[int]:
-        """Offsets of the cells of a leaf."""
+        """Return the cell offsets of a leaf page."""
         head = 100 if number == 1 else 0
         count = int.from_bytes(page[head + 3 : head + 5], "big")
         listed = page[head + 8 : head + 8 + 2 * count]
@@ -148,10 +153,10 @@ class SqliteRescuer:
         return [int(at) for at in np.frombuffer(listed[: len(listed) // 2 * 2], ">u2")]
 
     def _cell(self, page: bytes, at: int) -> Cell:
-        """A row by its offset in a page.
+        """Parse the row at an offset of a page.
 
         Raises:
-            DamageError: it makes no sense.
+            DamageError: the bytes are no row.
         """
         size, offset = _varint(page, at)
         rowid, offset = _varint(page, offset)
@@ -186,7 +191,7 @@ class SqliteRescuer:
         definitions: dict[str, MessageDefinition],
         seen: set[int],
     ) -> None:
-        """Tell from its columns which table a row is of."""
+        """Add a row to the table that its columns indicate."""
         kinds = [kind for kind, _ in cell.columns[1:]]
         if len(kinds) == 3 and max(kinds[:2]) < 10 and kinds[2] >= 12 and kinds[2] % 2 == 0:
             # messages: id, topic_id, timestamp, data
@@ -210,10 +215,10 @@ class SqliteRescuer:
                 topics[cell.rowid] = text[0], text[1], text[2]
 
     def _overflow(self, cell: Cell) -> list[int]:
-        """The overflow pages of a row.
+        """Return the overflow pages of a row.
 
         Raises:
-            DamageError: they are not all there.
+            DamageError: a page is missing.
         """
         pages, number = [], cell.overflow
         left, room = cell.size - cell.local, self._pages.usable - 4
@@ -229,10 +234,10 @@ class SqliteRescuer:
         return pages
 
     def _content(self, cell: Cell) -> bytes:
-        """All bytes of a row.
+        """Return all bytes of a row.
 
         Raises:
-            DamageError: they are not all there.
+            DamageError: a page is missing.
         """
         pages = self._overflow(cell)
         parts = [cell.page[cell.offset : cell.offset + cell.local]]
@@ -243,7 +248,7 @@ class SqliteRescuer:
         return content[: cell.size]
 
     def _texts(self, cell: Cell) -> list[str]:
-        """The columns behind the first one; of those that are no text nothing."""
+        """Return the columns after the first one. A column without text is empty."""
         content = self._content(cell)
         return [
             content[start : start + (kind - 13) // 2].decode(errors="replace")
@@ -262,7 +267,7 @@ def _integer(cell: Cell, column: int) -> int:
 
 
 def _varint(data: bytes, offset: int) -> tuple[int, int]:
-    """A variable-length integer and the offset behind it.
+    """Parse a variable-length integer. Return it with the offset after it.
 
     Raises:
         DamageError: the data ends before it.

@@ -1,4 +1,4 @@
-"""The pages of a sqlite3 file and of the log beside it (https://www.sqlite.org/fileformat2.html)."""
+"""Pages of a sqlite3 file and of its write-ahead log (https://www.sqlite.org/fileformat2.html)."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ LOG_HEAD, FRAME_HEAD = struct.Struct(">8I"), struct.Struct(">6I")
 
 
 class Pages:
-    """The pages of a file, those of the log beside it before its own. Numbers count from 1."""
+    """Pages of a file, numbered from 1. A page in the log replaces that of the file."""
 
     def __init__(self, path: Path) -> None:
         self._file = Bytes(path)
         log = log_of(path)
         self._log = Bytes(log) if log.exists() else None
-        self.in_log: dict[int, int] = {}  # page -> offset of its newest version
-        self.log_frames = 0  # that are not sound
+        self.in_log: dict[int, int] = {}  # offset of the newest version by page number
+        self.log_frames = 0  # number of log frames with a wrong checksum
         head = self._file.read(0, 100)
         self.size = page_size_of(head) or 0
         if self._log is not None:
@@ -39,36 +39,38 @@ class Pages:
 
     @property
     def usable(self) -> int:
+        """Usable bytes of a page."""
         return self.size - self.reserved
 
     @property
     def count(self) -> int:
+        """Number of pages of the file and the log."""
         own = -(-self._file.size // self.size)
         return max([own, *self.in_log])
 
     @property
     def length(self) -> int:
-        """Bytes."""
+        """Size of all pages in bytes."""
         return self.count * self.size
 
     def read(self, number: int) -> bytes:
-        """A page; shorter where the file is cut, empty where there is none."""
+        """Read a page. It is shorter at the cut of a file, and empty if it does not exist."""
         if (offset := self.in_log.get(number)) is not None and self._log is not None:
             return self._log.read(offset, self.size)
         return self._file.read((number - 1) * self.size, self.size) if number > 0 else b""
 
     def has(self, number: int, size: int) -> bool:
-        """Whether the first ``size`` bytes of a page are there."""
+        """Tell whether the first ``size`` bytes of a page exist."""
         return number > 0 and (number in self.in_log or (number - 1) * self.size + size <= self._file.size)
 
     def first(self, number: int) -> int:
-        """The number that a page begins with: of the next overflow page."""
+        """Read the number at the start of an overflow page: the next overflow page."""
         if (offset := self.in_log.get(number)) is not None and self._log is not None:
             return int.from_bytes(self._log.read(offset, 4), "big")
         return int.from_bytes(self._file.read((number - 1) * self.size, 4), "big")
 
     def leaves(self) -> Iterator[int]:
-        """Numbers of the pages with table rows."""
+        """Yield the numbers of the pages with table rows."""
         step = max(1, (1 << 22) // self.size)
         for first in range(1, self.count + 1, step):
             block = self._file.read((first - 1) * self.size, step * self.size)
@@ -82,12 +84,13 @@ class Pages:
             yield from (first + int(i) for i in np.flatnonzero(np.frombuffer(kinds, np.uint8) == LEAF))
 
     def close(self) -> None:
+        """Close the files."""
         self._file.close()
         if self._log is not None:
             self._log.close()
 
     def _read_log(self, log: Bytes) -> None:
-        """Find the newest version of each page among what was committed, by frames whose checksums fit."""
+        """Find the newest committed version of each page in the log, without frames of a wrong checksum."""
         head = log.read(0, LOG_HEAD.size)
         if len(head) < LOG_HEAD.size:
             return
@@ -105,7 +108,7 @@ class Pages:
             number, committed, *salts = FRAME_HEAD.unpack(frame)[:4]
             after = struct.unpack(">2I", frame[16:])
             if salts != [salt, salt2]:
-                offset += FRAME_HEAD.size + page_size  # of an older round of the log
+                offset += FRAME_HEAD.size + page_size  # a frame of an older round of the log
                 continue
             data = frame[:8] + log.read(offset + FRAME_HEAD.size, page_size)
             if checksum_of(data, order, before) == after and number:
@@ -121,28 +124,30 @@ class Pages:
 
 
 def page_size_of(head: bytes) -> int | None:
-    """None: it is not the head of a file."""
+    """Return the page size that the head of a file states. None: it is no sqlite3 head."""
     size = int.from_bytes(head[16:18], "big")
     size = 65536 if size == 1 else size
     return size if head[: len(MAGIC)] == MAGIC and size in PAGE_SIZES else None
 
 
 def log_of(path: Path) -> Path:
+    """Return the path of the write-ahead log of a database."""
     return path.with_name(path.name + "-wal")
 
 
 @cache
 def _weights(size: int) -> NDArray[np.uint32]:
-    """(size / 4 + 2, 2) what each number of a frame, and the two of the checksum before, add to its checksum.
+    """Return a (size / 4 + 2, 2) array: the factors of each 32-bit word in the two sums of a checksum.
 
-    The checksum takes two numbers at a time: s0 += x0 + s1; s1 += x1 + s0. So it is a sum of multiples.
+    The first two words are the previous checksum, the others those of the frame. The checksum takes two words
+    at a time: s0 += x0 + s1; s1 += x1 + s0. So both sums are linear in the words.
     """
     steps = size // 8
     weights = np.zeros((size // 4 + 2, 2), np.uint32)
-    # What a change of s0 and of s1 before the last n steps does in the end, n = 0, 1, ...
+    # Effect of a change of s0 and of s1 before the last n steps on the result, n = 0, 1, ...
     a, b, c, d = 1, 0, 0, 1  # s0 -> (a, b), s1 -> (c, d)
     for step in range(steps - 1, -1, -1):
-        # x0 goes into s0, and through it into s1; x1 goes into s1 alone.
+        # x0 goes into s0 and through it into s1; x1 goes into s1 alone.
         weights[2 * step + 2] = (a + c) & 0xFFFFFFFF, (b + d) & 0xFFFFFFFF
         weights[2 * step + 3] = c, d
         # One more step before: s0' = s0 + s1, s1' = s1 + s0' = s0 + 2 s1.
@@ -152,7 +157,7 @@ def _weights(size: int) -> NDArray[np.uint32]:
 
 
 def checksum_of(data: bytes, order: str, before: tuple[int, int]) -> tuple[int, int]:
-    """The checksum of a frame of the log, which goes on from that of the frame before."""
+    """Return the checksum of a log frame. It continues that of the previous frame."""
     numbers = np.concatenate(
         [np.array(before, np.uint32), np.frombuffer(data, order + "u4").astype(np.uint32)]
     )
