@@ -1,4 +1,4 @@
-"""Readers of data set folders as streams of messages. Imports `sync` and below."""
+"""Readers of data set folders as streams of messages. Imports `sync` and the layers below it."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from bevviz.errors import UserError
 
 @cache
 def loaders() -> dict[str, type[Dataset]]:
-    """Every loader by its name; the one that takes any folder is last."""
+    """Return all loaders by name. The loader of any folder is last."""
     for module in iter_modules(__path__):
         import_module(f"{__name__}.{module.name}")
     found = sorted(Dataset.__subclasses__(), key=lambda loader: (loader.any_folder, loader.name))
@@ -22,22 +22,22 @@ def loaders() -> dict[str, type[Dataset]]:
 
 
 def find_loader(path: Path) -> type[Dataset] | None:
-    """Who recognises a folder; None: nobody."""
+    """Return the loader that recognises a folder; None if there is none."""
     if not path.is_dir():
         return None
     return next((loader for loader in loaders().values() if loader.fits(path)), None)
 
 
 def open_dataset(path: Path, name: str = "", sequence: str = "") -> Dataset | None:
-    """The drive in a folder; None: no loader recognises it.
+    """Open the drive in a folder. Return None if no loader recognises the folder.
 
     Args:
-        path: the folder.
-        name: of the loader; "": the one that recognises it.
-        sequence: which drive, where there are several.
+        path: folder.
+        name: name of the loader; empty: the loader that recognises the folder.
+        sequence: name of the drive if the folder has several.
 
     Raises:
-        UserError: no such loader, or the folder is not as its data set asks for.
+        UserError: there is no such loader, or the folder does not have the layout of its data set.
     """
     if not name:
         loader = find_loader(path)

@@ -1,4 +1,4 @@
-"""What a loader of a data set is: the topics of one drive as in a bag, made when they are read."""
+"""Base class of data set loaders. A loader presents one drive as topics whose messages are made on demand."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ from bevviz.support.files import (
 from bevviz.support.files import read_bytes as read_limited
 
 SECOND = 1_000_000_000
-LOOKED_AT = 500_000  # bytes of a BIN file, for the number of its columns
-MOST_OF_POINTER = 1024  # bytes, by Git LFS's specification
+LOOKED_AT = 500_000  # bytes of a BIN file from which the number of columns is estimated
+MOST_OF_POINTER = 1024  # bytes of a pointer file, by the specification of Git LFS
 FIELDS = ("x", "y", "z", "intensity")
 BOXES = "bevviz_msgs/msg/Detection3DArray"
 HIDDEN = re.compile(r"\.|__MACOSX$")
@@ -38,29 +38,29 @@ CLOUDS = (".pcd", ".ply", ".bin", ".npy")
 IMAGES = (".png", ".jpg", ".jpeg", ".webp")
 
 
-# What a loader raises where a file holds something else than its data set documents.
+# Exceptions of a loader for files that do not follow the documentation of the data set.
 NOT_AS_DOCUMENTED = (
     *(KeyError, IndexError, TypeError, ValueError, AttributeError, OverflowError),
-    *(struct.error, RecursionError, MemoryError),  # a number, a depth or a size beyond all measure
+    *(struct.error, RecursionError, MemoryError),  # numbers, depths or sizes out of range
 )
 
 
 def describe(error: Exception) -> str:
-    """In a few words."""
+    """Format an exception as its type and first line."""
     return f"{type(error).__name__}: {first_line(error)}"
 
 
 @dataclass(frozen=True, slots=True)
 class Stream:
-    """One topic.
+    """One topic of a drive.
 
     Attributes:
-        topic: as a driver would call it, so that roles are found as in a bag.
-        type: ROS 2 type of its messages.
-        times: (N,) stamps in nanoseconds, sorted; what is made has them in its header.
-        make: the message of a row of ``times``, from ``bevviz.messages.encode``; may raise UserError.
-        aside: why the topic plays no role unless it is asked for; "": it plays.
-        files: of clouds that may be cut, each that of a message.
+        topic: name that a driver would give it. So roles are found as in a bag.
+        type: ROS 2 type of the messages.
+        times: (N,) sorted stamps in nanoseconds. The header of a message has the same stamp.
+        make: makes the message of a row of ``times`` with ``bevviz.messages.encode``. May raise UserError.
+        aside: reason why the topic gets no role by default; empty: it gets one.
+        files: cloud file of each message, for clouds that may be cut.
     """
 
     topic: str
@@ -72,27 +72,27 @@ class Stream:
 
 
 class Dataset:
-    """One drive of a data set. A subclass in a file of this package is a loader: it is found by itself.
+    """One drive of a data set. A subclass in a module of this package is a loader; it registers itself.
 
     Attributes:
-        name: as ``--dataset`` takes it.
-        about: what it is called in sentences.
-        single_frames: nothing in one frame is in the next; the stamps are made up.
-        any_folder: it takes what no other loader knows.
-        streams: of messages with the same stamp those of the earlier stream come first.
-        warnings: what is missing or damaged, as far as it was met, one sentence each.
+        name: name for ``--dataset``.
+        about: name in messages to the user.
+        single_frames: the frames are unrelated, and their stamps are made up.
+        any_folder: the loader takes folders that no other loader recognises.
+        streams: topics. Of messages with the same stamp, those of the earlier stream come first.
+        warnings: missing or damaged data met so far, one sentence each.
 
     Args:
-        path: the folder.
-        sequence: which of several drives in it; "": not said.
+        path: folder.
+        sequence: name of one of several drives; empty: not stated.
 
     Raises:
-        UserError: something is missing or wrong; the sentence names the file and what to do.
+        UserError: data is missing or wrong. The message names the file and the remedy.
     """
 
     name: ClassVar[str]
     about: ClassVar[str]
-    expects: ClassVar[str]  # what a folder of it looks like, for the end of a sentence
+    expects: ClassVar[str]  # layout of a folder, for the end of a sentence
     single_frames: ClassVar[bool] = False
     any_folder: ClassVar[bool] = False
 
@@ -103,29 +103,29 @@ class Dataset:
 
     @classmethod
     def fits(cls, path: Path) -> bool:
-        """Whether a folder looks like one of it; quick, and at most one small file is opened."""
+        """Tell whether a folder looks like this data set. The check opens at most one small file."""
         raise NotImplementedError
 
     @classmethod
     def drives(cls, path: Path) -> list[Path]:
-        """The folders that are one drive each, as far as drives have folders."""
+        """Return the folders of the drives if each drive has its own."""
         return [path]
 
     def warn(self, text: str) -> None:
-        """Once."""
+        """Add a warning unless it is there already."""
         if text not in self.warnings:
             self.warnings.append(text)
 
     def columns_in(self, files: Sequence[Path], names: Sequence[str] = FIELDS, hint: str = "") -> list[str]:
-        """Names of the columns of BIN files of float32, of as many as the values of the largest tell.
+        """Return the column names of BIN files of float32. The values of the largest file give their number.
 
         Args:
-            files: of any kind.
-            names: of the columns that the data set has, taken where the values do not tell.
-            hint: how the columns can be stated.
+            files: files of any kind.
+            names: documented columns, used if the values give no number.
+            hint: advice on how to state the columns.
 
         Raises:
-            UserError: it holds float64, or Git LFS has not fetched it.
+            UserError: the file holds float64 or integers, or it is a Git LFS pointer.
         """
         raw = [file for file in files if file.suffix.lower() == ".bin"]
         if not raw:
@@ -146,7 +146,12 @@ class Dataset:
         return fields
 
     def check_sizes(self, files: Sequence[Path], step: int) -> None:
-        """Tell of scans that are no whole number of points, as cut ones are not."""
+        """Warn about scans that are cut, empty, or pointers of Git LFS.
+
+        Args:
+            files: BIN files.
+            step: bytes of a point.
+        """
         sizes = {file: file.stat().st_size for file in files}
         away = sorted(file for file in files if sizes[file] < MOST_OF_POINTER and is_pointer(file))
         if away:
@@ -162,15 +167,19 @@ class Dataset:
             self.warn(f"{self._first(empty)}: no point in it")
 
     def _first(self, files: Sequence[Path]) -> str:
-        """The first one, and how many more there are."""
+        """Name the first file and count the others."""
         more = f" and {len(files) - 1} more" if len(files) > 1 else ""
         return f"{files[0].relative_to(self.path)}{more}"
 
     def one_of(self, sequences: Sequence[str], others: str = "") -> str:
-        """The drive that was asked for; ``others``: what is said of those that are not among these.
+        """Return the drive that the user chose.
+
+        Args:
+            sequences: names of the drives.
+            others: clause about drives that are not among these, for the error message.
 
         Raises:
-            UserError: none of that name, or several to choose from.
+            UserError: there is no drive with this name, or several drives and no choice.
         """
         there = f"there are {', '.join(sequences[:8])}{' ...' if len(sequences) > 8 else ''}{others}"
         if not sequences:
@@ -185,10 +194,10 @@ class Dataset:
 
 
 def read_points(path: Path, fields: Sequence[str]) -> NDArray[np.void]:
-    """(N,) the whole points of a BIN file with these columns of float32.
+    """Return the (N,) whole points of a BIN file with these columns of float32.
 
     Raises:
-        UserError: it cannot be read, or Git LFS has not fetched it.
+        UserError: the file cannot be read, or it is a Git LFS pointer.
     """
     data = read_bytes(path)
     whole = np.frombuffer(data, "<f4", len(data) // (4 * len(fields)) * len(fields))
@@ -198,7 +207,7 @@ def read_points(path: Path, fields: Sequence[str]) -> NDArray[np.void]:
 def pictures(
     camera: str, times: I64, files: Sequence[Path], *, rectified: bool = True, aside: str = ""
 ) -> Stream:
-    """Images of a camera, as their files have them."""
+    """Return the stream of a camera's image files. The images stay compressed."""
 
     def make(row: int) -> Any:
         kind = files[row].suffix.lower().lstrip(".").replace("jpg", "jpeg")
@@ -211,9 +220,9 @@ def pictures(
 def files_in(
     folder: Path, suffixes: Sequence[str], chosen: Callable[[os.DirEntry[str]], bool] = os.DirEntry.is_file
 ) -> list[Path]:
-    """Files with these suffixes, in lower or upper case, by name; none where there is no such folder.
+    """Return the files with these suffixes in lower or upper case by name; none if the folder does not exist.
 
-    What systems hide there is left out. Of many thousands none is looked at by itself.
+    Hidden system files are left out. The files are not opened, which matters for many thousands.
     """
     if not folder.is_dir():
         return []
@@ -226,11 +235,11 @@ def read_bytes(path: Path, first: int = 0) -> bytes:
     """Read a scan, an image or labels.
 
     Args:
-        path: of the file.
-        first: how many bytes from its beginning on; 0: all of it.
+        path: file.
+        first: number of bytes to read from the start; 0: all.
 
     Raises:
-        UserError: it cannot be read, is larger than ``SENSOR_LIMIT``, or Git LFS has not fetched it.
+        UserError: the file cannot be read, is larger than ``SENSOR_LIMIT``, or is a Git LFS pointer.
     """
     try:
         data = read_head(path, first) if first else read_limited(path, SENSOR_LIMIT)
@@ -242,22 +251,26 @@ def read_bytes(path: Path, first: int = 0) -> bytes:
 
 
 def is_pointer(path: Path) -> bool:
-    """Whether Git LFS has yet to fetch a file. Raises OSError: it cannot be read."""
+    """Tell whether a file is a pointer that Git LFS has not replaced yet.
+
+    Raises:
+        OSError: the file cannot be read.
+    """
     return read_head(path, len(LFS_POINTER)) == LFS_POINTER
 
 
 def read_table(path: Path, columns: int, names: str = "") -> NDArray[np.float64]:
-    """(N, columns) numbers, a row a line, of which further ones are left out; comments begin with #.
+    """Read a (N, columns) table of numbers from a text file with one row per line. A comment begins with #.
 
     Args:
-        path: the file.
-        columns: how many numbers are taken of each line.
-        names: what they are, where a line may have no others.
+        path: file.
+        columns: number of values taken from each line.
+        names: names of the columns. If given, a line must not have more values.
 
     Raises:
-        UserError: it cannot be read, or a line has something else.
+        UserError: the file cannot be read, or a line has other content.
     """
-    numbers = array("d")  # a list of lists would take ten times the memory
+    numbers = array("d")  # A list of lists would take ten times the memory.
     for number, line in enumerate(read_lines(path, TABLE_LIMIT), 1):
         values = line.split()
         if not values or values[0].startswith("#"):
@@ -273,12 +286,12 @@ def read_table(path: Path, columns: int, names: str = "") -> NDArray[np.float64]
 
 
 def frames_at(rate: float, numbers: Sequence[int]) -> I64:
-    """(N,) stamps of frames by their number, at so many a second, from one second on."""
+    """Return (N,) stamps of frame numbers at a rate in Hz. Frame 0 is at one second."""
     return SECOND + np.round(np.asarray(numbers, np.float64) * (SECOND / rate)).astype(np.int64)
 
 
 def joined_columns(points: NDArray[np.void], more: dict[str, NDArray[Any]]) -> NDArray[np.void]:
-    """The points with further fields."""
+    """Return points with additional fields."""
     layout = np.dtype(
         [*((n, points.dtype[n]) for n in points.dtype.names or ()), *((n, v.dtype) for n, v in more.items())]
     )
@@ -291,6 +304,6 @@ def joined_columns(points: NDArray[np.void], more: dict[str, NDArray[Any]]) -> N
 
 
 def columns_of(values: F32, names: Sequence[str]) -> NDArray[np.void]:
-    """(N, C) float32 as (N,) points with those fields, without a copy."""
+    """View (N, C) float32 values as (N,) points with named fields. Contiguous values are not copied."""
     layout = np.dtype([(name, "<f4") for name in names])
     return np.ascontiguousarray(values, "<f4").view(layout).reshape(-1)

@@ -1,4 +1,4 @@
-"""A plain folder of clouds and images."""
+"""A plain folder of clouds and images as a drive."""
 
 from __future__ import annotations
 
@@ -54,35 +54,35 @@ from bevviz.support.files import (
     read_text,
 )
 
-MOST_COLUMNS = 64  # of an NPY file; a grid of heights has more, and so has a table the other way round
+MOST_COLUMNS = 64  # columns of an NPY file; height grids and transposed tables have more
 NOTES = (".json", ".yaml", ".yml", ".xml", ".txt", ".toml")
 MAP, BASE = "map", "base_link"
 CALIBRATION, STAMPS, POSES = "calibration.yaml", "stamps.csv", "poses.txt"
-OF_SENSORS = re.compile(  # a folder with one for each camera or LiDAR
+OF_SENSORS = re.compile(  # folders that contain one folder per camera or LiDAR
     "cam|im(g|age)|lidar|velo|point|cloud|pcd|scan", re.IGNORECASE
 )
 OF_DRIVES = re.compile(
     r"(\d{3,}|(train|test)(ing)?|val(idation)?)$", re.IGNORECASE
-)  # a folder of one drive or part, not sensor
-NEAREST = {"i8": "<f8", "u8": "<f8", "f2": "<f4", "b1": "u1"}  # that a PointCloud2 can hold
+)  # folders of a drive or a split, not of a sensor
+NEAREST = {"i8": "<f8", "u8": "<f8", "f2": "<f4", "b1": "u1"}  # nearest types that a PointCloud2 can hold
 KEYS = {"rate", "fields", "lidars", "cameras"}
 LENS = {"D", "distortion_model"}
 SENSOR_KEYS = {"pose", "rate", "fields", "K", "size", *LENS}
 STAMP = r"\d{1,19}(\.\d*)?"
-MOST_PIXELS = 1 << 31  # of a side of an image, far more than there are
+MOST_PIXELS = 1 << 31  # limit of an image side, larger than any image
 SECONDS, NANOSECONDS = re.compile(r"\d{1,6}|\d{10}"), re.compile(r"\d{1,9}")
-MOST_SECONDS = 1e10  # of a stamp: more is another unit
-UNIT = 0.01  # how far the length of a quaternion may be from one
-FAR = 100  # metres between sensors of a vehicle
-FEW = 5  # frames, which tell no rate
-SLOWEST = 1e-6  # frames a second
-MUCH_FURTHER = 1.5  # times as many frames, which another rate gives
+MOST_SECONDS = 1e10  # seconds; a larger stamp has another unit
+UNIT = 0.01  # tolerance of a quaternion's length
+FAR = 100  # metres; sensors of one vehicle are closer together
+FEW = 5  # Fewer frames say nothing about a rate.
+SLOWEST = 1e-6  # frames per second
+MUCH_FURTHER = 1.5  # ratio of frame counts that another rate explains
 
 
 class Folder(Dataset):
-    """Clouds and images in it or in folders of it, one folder a sensor, which is called like it.
+    """Drive of clouds and images in a folder or its subfolders, one subfolder per sensor with its name.
 
-    Beside them may lie ``calibration.yaml``, ``stamps.csv`` (file, stamp) and ``poses.txt`` (as TUM's).
+    ``calibration.yaml``, ``stamps.csv`` (file, stamp) and ``poses.txt`` (TUM format) may lie beside them.
     """
 
     name = "folder"
@@ -92,6 +92,7 @@ class Folder(Dataset):
 
     @classmethod
     def fits(cls, path: Path) -> bool:
+        """Tell whether a folder or a sensor folder in it has clouds."""
         return any(files_in(folder, CLOUDS) for folder in _places(path))
 
     def __init__(self, path: Path, sequence: str) -> None:
@@ -114,7 +115,7 @@ class Folder(Dataset):
                 raise UserError(f"{path / CALIBRATION}: no {unknown[0]} among the {kind}; {names}")
         stamped = self._stamps({"lidars": lidars, "cameras": cameras}, about)
         edges, streams = [], list[Stream]()
-        # Where nothing says how the only LiDAR is mounted, its own frame need not be upright.
+        # Without a stated mounting, the only LiDAR's frame may be tilted.
         placed = len(lidars) > 1 or (path / POSES).is_file() or any("pose" in s for s in _stated(about))
         loose = [name for name in lidars if "pose" not in about.get("lidars", {}).get(name, {})]
         if len(lidars) > 1 and loose:
@@ -142,7 +143,7 @@ class Folder(Dataset):
         self.streams = [*_mounted(min(stamped.values()), edges), *self._poses(), *streams]
 
     def _sensors(self, about: Mapping[str, Any]) -> tuple[dict[str, list[Path]], dict[str, list[Path]]]:
-        """LiDARs and cameras by their names, with their files."""
+        """Return the LiDARs and the cameras: files by sensor name."""
         found: dict[str, dict[str, list[Path]]] = {"lidars": {}, "cameras": {}}
         places = _places(self.path)
         for folder in places:
@@ -160,7 +161,7 @@ class Folder(Dataset):
         return lidars, found["cameras"]
 
     def _apart(self, sensor: str, files: Sequence[Path], stated: Collection[str]) -> dict[str, list[Path]]:
-        """Files by their sensor: in one folder they may be of several, which their names tell."""
+        """Split the files of a folder by sensor. File names may show several sensors in one folder."""
         groups = sensors_of(files)
         if len(groups) > 1 and sensor not in stated:
             groups = {f"{sensor}_{name}" if name else sensor: found for name, found in groups.items()}
@@ -169,7 +170,7 @@ class Folder(Dataset):
         return {sensor: list(files)} if files else {}
 
     def _calibration(self) -> Mapping[str, Any]:
-        """What ``calibration.yaml`` says; empty where there is none."""
+        """Return the content of ``calibration.yaml``; empty if there is none."""
         file = self.path / CALIBRATION
         if not file.is_file():
             return {}
@@ -188,10 +189,10 @@ class Folder(Dataset):
         return about
 
     def _fields(self, stated: Sequence[Any] | None, files: Sequence[Path]) -> list[str]:
-        """Names of the columns of BIN and NPY files, as stated, else as the largest BIN file tells.
+        """Return the column names of BIN and NPY files, as stated or estimated from the largest BIN file.
 
         Raises:
-            UserError: it holds float64.
+            UserError: the file holds float64.
         """
         if stated is not None:
             if not isinstance(stated, list) or not {"x", "y", "z"} <= {*stated}:
@@ -207,7 +208,7 @@ class Folder(Dataset):
         return fields
 
     def _pose(self, values: Any, sensor: str) -> F64:
-        """(4, 4) base_link from a sensor, of 7 numbers or of 16."""
+        """Return (4, 4) base_link_from_sensor from 7 or 16 numbers."""
         try:
             numbers = np.array(values, np.float64).reshape(-1)
             if len(numbers) == 16:
@@ -250,7 +251,7 @@ class Folder(Dataset):
             ) from None
         model = str(stated.get("distortion_model", "plumb_bob" if len(distortion) else ""))
         if model in geometry.FISHEYE and "D" not in stated:
-            distortion = np.zeros(4)  # r = f theta
+            distortion = np.zeros(4)  # equidistant: r = f theta
         about = Intrinsics(width, height, matrix, model, distortion)
         return Stream(
             f"/{name}/camera_info",
@@ -262,7 +263,10 @@ class Folder(Dataset):
     def _stamps(
         self, sensors: Mapping[str, dict[str, list[Path]]], about: Mapping[str, Any]
     ) -> dict[Path, int]:
-        """Of each file, in nanoseconds; what has no time is taken out of the sensors, which is said."""
+        """Return the stamp of each file in nanoseconds.
+
+        A file without a time is removed from ``sensors`` with a warning.
+        """
         everyone = [(kind, name, files) for kind, group in sensors.items() for name, files in group.items()]
         if (self.path / STAMPS).is_file():
             return self._listed(self.path / STAMPS, [files for _, _, files in everyone])
@@ -318,7 +322,7 @@ class Folder(Dataset):
     def _hold_against(
         self, lead: str, frames: Mapping[Path, int], name: str, mine: Mapping[Path, int]
     ) -> None:
-        """Tell of a sensor whose numbers of frames go much further than those of the LiDAR."""
+        """Warn if the frame numbers of a sensor reach much further than those of the LiDAR."""
         (first, last), (start, end) = [(min(n.values()), max(n.values())) for n in (frames, mine)]
         if min(len(frames), len(mine)) >= FEW and end - start > MUCH_FURTHER * (last - first + 1):
             self.warn(
@@ -327,7 +331,7 @@ class Folder(Dataset):
             )
 
     def _listed(self, table: Path, sensors: Sequence[Sequence[Path]]) -> dict[Path, int]:
-        """By ``stamps.csv``."""
+        """Return the stamps in ``stamps.csv``."""
         found = dict[Path, str]()
         for number, row in enumerate(_csv_rows(table), 1):
             if len(row) < 2 or (number == 1 and not re.search(r"\d", row[1])):
@@ -346,7 +350,7 @@ class Folder(Dataset):
         return stamped
 
     def _poses(self) -> list[Stream]:
-        """Where the vehicle is: a line has stamp x y z qx qy qz qw."""
+        """Return the stream of vehicle poses. A line has stamp x y z qx qy qz qw."""
         file = self.path / POSES
         if not file.is_file():
             return []
@@ -372,15 +376,15 @@ def _csv_rows(table: Path) -> Iterator[list[str]]:
 
 
 def _stated(about: Mapping[str, Any]) -> list[Any]:
-    """What the calibration says of each sensor."""
+    """Return the stated calibration of each sensor."""
     return [sensor for kind in ("lidars", "cameras") for sensor in about.get(kind, {}).values()]
 
 
 def _rate(*stated: Mapping[str, Any]) -> float:
-    """Frames a second, as the last of them states it.
+    """Return the frames per second that the last of these mappings states.
 
     Raises:
-        UserError: it is no number, or one that no sensor has.
+        UserError: the value is no number, or no sensor has this rate.
     """
     rate = next((about["rate"] for about in reversed(stated) if "rate" in about), 10.0)
     if not isinstance(rate, int | float) or not SLOWEST <= rate <= 1 / SLOWEST:
@@ -389,7 +393,10 @@ def _rate(*stated: Mapping[str, Any]) -> float:
 
 
 def _places(path: Path) -> dict[Path, str]:
-    """The folder, those in it, and those in one of cameras or LiDARs, with what sensors there are called."""
+    """Return the possible sensor folders with sensor names.
+
+    They are the folder, its subfolders, and the subfolders of camera or LiDAR folders.
+    """
     places = {path: "", **{folder: folder.name for folder in _folders(path)}}
     for folder in [folder for folder, name in places.items() if OF_SENSORS.match(name)]:
         for within in _folders(folder):
@@ -402,7 +409,7 @@ def _folders(path: Path) -> list[Path]:
 
 
 def _notes(path: Path) -> str:
-    """A clause on other programs' calibrations and labels, which are not read; "": there are none."""
+    """Return a clause about calibrations and labels of other programs, which are not read; empty: none."""
     folders = [path, *(inner for folder in _folders(path) for inner in (folder, *_folders(folder)))]
     found = [file for folder in folders for file in files_in(folder, NOTES)]
     found = [file for file in found if file.name not in (CALIBRATION, STAMPS, POSES)]
@@ -438,7 +445,7 @@ def _clouds(name: str, times: I64, files: Sequence[Path], fields: Sequence[str])
 
 
 def shape_of(file: Path) -> tuple[int, ...]:
-    """Of the array in an NPY file; empty where it has named columns, or cannot be read."""
+    """Return the shape of the array in an NPY file; empty if it has named columns or cannot be read."""
     try:
         there = _load_array(file)
     except (OSError, ValueError, EOFError):
@@ -447,11 +454,11 @@ def shape_of(file: Path) -> tuple[int, ...]:
 
 
 def _load_array(file: Path) -> NDArray[Any]:
-    """Map an NPY file into memory: one that announces more numbers than it has is refused.
+    """Map an NPY file into memory. Refuse a file with fewer numbers than its header states.
 
     Raises:
-        OSError: it cannot be read.
-        ValueError: it is no NPY file, is cut, or is larger than ``SENSOR_LIMIT``.
+        OSError: the file cannot be read.
+        ValueError: the file is no NPY file, is cut, or is larger than ``SENSOR_LIMIT``.
     """
     with open_regular(file) as opened:
         if os.fstat(opened.fileno()).st_size > SENSOR_LIMIT:
@@ -463,7 +470,7 @@ def _load_array(file: Path) -> NDArray[Any]:
 
 
 def no_points(file: Path) -> str:
-    """Why what looks like a cloud by its suffix is none, such as labels and matrices; "": nothing says so."""
+    """Return why a file with a cloud suffix is no cloud, such as labels or matrices; empty: it may be one."""
     suffix = file.suffix.lower()
     if suffix == ".bin":
         return "whole numbers, no points of float32" if are_whole(read_head(file, LOOKED_AT)) else ""
@@ -474,14 +481,14 @@ def no_points(file: Path) -> str:
 
 
 def read_cloud(file: Path, fields: Sequence[str]) -> tuple[NDArray[np.void], int]:
-    """(N,) points with x, y, z and what else the file has, and how many it says to have, where it does.
+    """Return (N,) points with x, y, z and further fields, and the number that the header states, else 0.
 
     Args:
-        file: PCD, PLY, BIN (float32) or NPY.
-        fields: columns of the last two.
+        file: PCD, PLY, BIN (float32) or NPY file.
+        fields: columns of a BIN or NPY file.
 
     Raises:
-        UserError: it cannot be read, or is damaged.
+        UserError: the file cannot be read or is damaged.
     """
     suffix = file.suffix.lower()
     try:
@@ -504,7 +511,7 @@ def read_cloud(file: Path, fields: Sequence[str]) -> tuple[NDArray[np.void], int
 
 
 def _encodable(points: NDArray[np.void]) -> NDArray[np.void]:
-    """Points with fields of types that a PointCloud2 can hold, little-endian."""
+    """Convert fields to little-endian types that a PointCloud2 can hold."""
     names = points.dtype.names or ()
     types = {name: points.dtype[name].newbyteorder("<") for name in names}
     types = {name: np.dtype(NEAREST.get(kind.str[1:], kind)) for name, kind in types.items()}

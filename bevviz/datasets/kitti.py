@@ -1,4 +1,4 @@
-"""What KITTI's data sets have in common: calibration, labels, and poses (Geiger, Lenz and Urtasun 2012)."""
+"""Calibration, labels and poses common to KITTI's data sets (Geiger, Lenz and Urtasun 2012)."""
 
 from __future__ import annotations
 
@@ -27,17 +27,17 @@ COLUMNS = (
     *("truncation", "occlusion", "alpha", "image box's left", "image box's top", "image box's right"),
     *("image box's bottom", "height", "width", "length", "x", "y", "z", "rotation_y"),
 )
-EARTH = 6378137.0  # metres, the radius that KITTI's development kit has
+EARTH = 6378137.0  # metres; the radius in KITTI's development kit
 
 
 # --- labels ------------------------------------------------------------------------------------
 
 
 def label_files(path: Path) -> Sequence[Path]:
-    """The label files of a drive's scans in their order: a file is one scan, a folder many.
+    """Return the label files of a drive in the order of its scans. A file stands for one scan.
 
     Raises:
-        UserError: there is none.
+        UserError: there is no label file.
     """
     files = files_in(path, [".txt"]) if path.is_dir() else [path]
     if not files or not files[0].is_file():
@@ -46,13 +46,12 @@ def label_files(path: Path) -> Sequence[Path]:
 
 
 def read_labels(file: Path) -> LabelledBoxes3D:
-    """The labelled objects in the frame of the LiDAR, with the calibration of the same number beside them.
+    """Read the objects of ``label_2/NUMBER.txt`` in the LiDAR frame, with ``calib/NUMBER.txt`` next to it.
 
-    The file is ``label_2/NUMBER.txt`` and the calibration ``calib/NUMBER.txt``. Of ``DontCare`` the region
-    in the image is kept.
+    A ``DontCare`` label keeps its region in the image.
 
     Raises:
-        UserError: a file cannot be read, or is none of KITTI's.
+        UserError: a file cannot be read, or has not KITTI's format.
     """
     calibration = Calibration(file.parent.parent / "calib" / file.name)
     lines = list(enumerate(read_text(file).splitlines(), 1))
@@ -62,18 +61,19 @@ def read_labels(file: Path) -> LabelledBoxes3D:
 def labelled_boxes(
     file: Path, lines: Sequence[tuple[int, str]], rectified_from_lidar: F64, ids: Sequence[str] = ()
 ) -> LabelledBoxes3D:
-    """Labels in the frame of the LiDAR: of every type but Misc, as sets in KITTI's form have their own.
+    """Convert label lines to boxes in the LiDAR frame.
+
+    Every type but Misc counts, because data sets in KITTI's format have types of their own. A label with
+    non-finite numbers or a negative size is left out and listed in ``unusable``.
 
     Args:
-        file: that they are in.
-        lines: each with its number: type, truncated, occluded, alpha, image box, size, location, turn.
-        rectified_from_lidar: (4, 4).
-        ids: of each line.
-
-    A label whose numbers are not finite, or whose size is negative, is left out and told in ``unusable``.
+        file: label file, for messages.
+        lines: (line number, line): type, truncated, occluded, alpha, image box, size, location, rotation.
+        rectified_from_lidar: (4, 4) transform.
+        ids: object name of each line.
 
     Raises:
-        UserError: a line is none of KITTI's.
+        UserError: a line has not KITTI's format.
     """
     lidar_from_camera = geometry.inverse(rectified_from_lidar)
     labels, rows, dont_care, kept, unusable = [], [], [], [], []
@@ -98,9 +98,9 @@ def labelled_boxes(
         kept.append(at)
     table = np.array(rows, np.float64).reshape(-1, 14)
     height, width, length, x, y, z, turn = table[:, 7:].T
-    # A location is the middle of the bottom, in the reference camera: x right, y down, z forward.
+    # A location is the centre of the bottom in the reference camera: x right, y down, z forward.
     center = geometry.apply(lidar_from_camera, np.column_stack([x, y - height / 2, z]))
-    # The heading is (cos, 0, -sin) there.
+    # The heading is (cos, 0, -sin) in this frame.
     heading = (
         np.column_stack([np.cos(turn), np.zeros(len(turn)), -np.sin(turn)]) @ lidar_from_camera[:3, :3].T
     )
@@ -123,10 +123,10 @@ def labelled_boxes(
 
 
 def _why_unusable(kind: str, row: Sequence[float]) -> str:
-    """Say what is wrong with the 14 numbers of a label; empty: it can be used."""
+    """Describe the error in the 14 numbers of a label; empty: none."""
     needed = COLUMNS[3:7] if kind == "DontCare" else COLUMNS
     for name, value in zip(COLUMNS, row, strict=True):
-        if name in needed and name != "alpha" and not abs(value) < LARGEST:  # NaN is not, either
+        if name in needed and name != "alpha" and not abs(value) < LARGEST:  # This form is also true for NaN.
             return f"its {name} is {value}"
     size = row[7:10]
     if kind != "DontCare" and min(size) < 0:
@@ -138,10 +138,10 @@ def _why_unusable(kind: str, row: Sequence[float]) -> str:
 
 
 class Calibration:
-    """A text file of ``NAME: numbers``; the tracking benchmark leaves some colons out.
+    """Calibration file with lines of ``NAME: numbers``. The tracking benchmark omits some colons.
 
     Raises:
-        UserError: it cannot be read, or has no projections or mounting of the LiDAR.
+        UserError: the file cannot be read, or has no projections or LiDAR mounting.
     """
 
     def __init__(self, file: Path) -> None:
@@ -149,17 +149,18 @@ class Calibration:
         self._rows = named_rows(file)
         reference = self._matrix(3, 4, "Tr_velo_to_cam", "Tr_velo_cam", "Tr")
         rectified = np.eye(4)
-        if not {"R0_rect", "R_rect"}.isdisjoint(self._rows):  # the odometry benchmark has it in Tr
+        if not {"R0_rect", "R_rect"}.isdisjoint(self._rows):  # The odometry benchmark includes it in Tr.
             rectified[:3, :3] = self._matrix(3, 3, "R0_rect", "R_rect")
         self.rectified_from_lidar = rectified @ np.vstack([reference, [0, 0, 0, 1]])
 
     def camera(self, number: int) -> tuple[F64, F64]:
-        """(3, 3) K and (4, 4) camera from LiDAR, of the left colour camera (2) or another."""
+        """Return (3, 3) K and (4, 4) camera_from_lidar of a camera. Camera 2 is the left colour camera."""
         matrix, beside = split_projection(self._matrix(3, 4, f"P{number}"))
         return matrix, beside @ self.rectified_from_lidar
 
     @property
     def lidar_from_imu(self) -> F64:
+        """(4, 4) transform from the IMU to the LiDAR."""
         return np.vstack([self._matrix(3, 4, "Tr_imu_to_velo", "Tr_imu_velo"), [0, 0, 0, 1]])
 
     def _matrix(self, rows: int, columns: int, *names: str) -> F64:
@@ -172,7 +173,7 @@ class Calibration:
 
 
 def named_rows(file: Path) -> Mapping[str, F64]:
-    """The numbers behind each name; lines with something else are left out.
+    """Read the numbers after each name. Other lines are left out.
 
     Raises:
         UserError: the file cannot be read.
@@ -188,7 +189,7 @@ def named_rows(file: Path) -> Mapping[str, F64]:
 
 
 def split_projection(projection: F64) -> tuple[F64, F64]:
-    """(3, 3) K and (4, 4) camera from the rectified reference camera, of a (3, 4) projection."""
+    """Split a (3, 4) projection into (3, 3) K and (4, 4) camera_from_reference, both rectified cameras."""
     beside = np.eye(4)
     try:
         beside[:3, 3] = np.linalg.solve(projection[:, :3], projection[:, 3])
@@ -201,15 +202,15 @@ def split_projection(projection: F64) -> tuple[F64, F64]:
 
 
 def poses_of_oxts(table: F64) -> F64:
-    """(N, 4, 4) first pose of the IMU from each, as the development kit has them.
+    """Return (N, 4, 4) first_from_each IMU poses, computed as in the development kit.
 
     Args:
-        table: (N, 6 or more) latitude, longitude, altitude in metres, roll, pitch, yaw.
+        table: (N, 6 or more) latitude, longitude in degrees, altitude in metres, roll, pitch, yaw in radians.
     """
     latitude, longitude, altitude, roll, pitch, yaw = table[:, :6].T
     scale = np.cos(np.radians(latitude[0])) if len(table) else 1.0
     poses = np.tile(np.eye(4), (len(table), 1, 1))
-    poses[:, 0, 3] = scale * EARTH * np.radians(longitude)  # Mercator's projection
+    poses[:, 0, 3] = scale * EARTH * np.radians(longitude)  # Mercator projection
     poses[:, 1, 3] = scale * EARTH * np.log(np.tan(np.radians(90.0 + latitude) / 2))
     poses[:, 2, 3] = altitude
     poses[:, :3, :3] = _turns(2, yaw) @ _turns(1, pitch) @ _turns(0, roll)
@@ -217,7 +218,7 @@ def poses_of_oxts(table: F64) -> F64:
 
 
 def _turns(axis: int, angles: F64) -> F64:
-    """(N, 3, 3) rotations about an axis."""
+    """Return (N, 3, 3) rotations about an axis."""
     a, b = (axis + 1) % 3, (axis + 2) % 3
     turns = np.tile(np.eye(3), (len(angles), 1, 1))
     turns[:, a, a] = turns[:, b, b] = np.cos(angles)
@@ -229,7 +230,7 @@ def _turns(axis: int, angles: F64) -> F64:
 
 
 def clouds(times: I64, files: Sequence[Path], fields: Sequence[str]) -> Stream:
-    """Scans of x, y, z and reflectance, and what else sets in KITTI's form have (Waymo's: 6 columns)."""
+    """Return the stream of scans with x, y, z, reflectance and further columns (Waymo's has 6 columns)."""
 
     def make(row: int) -> Any:
         return encode_points(int(times[row]), LIDAR, read_points(files[row], fields))
@@ -238,7 +239,7 @@ def clouds(times: I64, files: Sequence[Path], fields: Sequence[str]) -> Stream:
 
 
 def camera_info(camera: str, times: I64, matrix: F64) -> Stream:
-    """One calibration for all images."""
+    """Return a stream with one calibration for all images."""
     once = times[:1]
 
     def make(row: int) -> Any:
@@ -248,7 +249,7 @@ def camera_info(camera: str, times: I64, matrix: F64) -> Stream:
 
 
 def mountings(start: int, edges: Sequence[tuple[str, str, F64]]) -> Stream:
-    """Of (parent, child, parent_from_child)."""
+    """Return the stream of static transforms (parent, child, parent_from_child)."""
     at = np.array([start], np.int64)
     return Stream(
         "/tf_static", "tf2_msgs/msg/TFMessage", at, lambda row: encode_transforms(int(at[row]), edges)
@@ -256,7 +257,7 @@ def mountings(start: int, edges: Sequence[tuple[str, str, F64]]) -> Stream:
 
 
 def places(times: I64, child: str, poses: F64) -> Stream:
-    """Where a frame of the vehicle is in the map, (N, 4, 4)."""
+    """Return the stream of (N, 4, 4) poses of a vehicle frame in the map."""
 
     def make(row: int) -> Any:
         return encode_transforms(int(times[row]), [(MAP, child, poses[row])])
@@ -265,7 +266,7 @@ def places(times: I64, child: str, poses: F64) -> Stream:
 
 
 def truth(message_type: str, times: I64, label: Any) -> Stream:
-    """Ground truth in the frame of the LiDAR; ``label`` gives that of a row."""
+    """Return the stream of ground truth in the LiDAR frame. ``label`` returns the labels of a row."""
 
     def make(row: int) -> Any:
         there: LabelledBoxes3D = label(row)

@@ -1,4 +1,4 @@
-"""The KITTI object benchmark: labelled frames of many drives, none of which follows the one before."""
+"""The KITTI object benchmark: labelled, unrelated frames of many drives."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ from bevviz.model import geometry
 from bevviz.model.frame import Intrinsics
 
 CAMERA = "image_2"
-APART = 100 * SECOND  # of single frames: nothing in one is in the next
+APART = 100 * SECOND  # nanoseconds between frames: they are unrelated, so none may influence the next
 
 
 class KittiObject(Dataset):
-    """``velodyne/000000.bin``, ``calib/000000.txt``, and ``image_2`` and ``label_2`` where there are any."""
+    """Frames of ``velodyne/000000.bin`` and ``calib/000000.txt``; optional ``image_2``, ``label_2``."""
 
     name = "kitti-object"
     about = "KITTI object benchmark"
@@ -38,9 +38,10 @@ class KittiObject(Dataset):
 
     @classmethod
     def fits(cls, path: Path) -> bool:
+        """Tell whether a folder has the layout of the benchmark."""
         if any((path / "calib").glob("[0-9]" * 6 + ".txt")):
             return (path / "velodyne").is_dir()
-        # Sets in its form name frames otherwise: View of Delft by five digits, converters by tokens.
+        # Sets in this layout name frames differently: View of Delft by five digits, converters by tokens.
         beside = [path / f"calib/{scan.stem}.txt" for scan in files_in(path / "velodyne", [".bin"])[:1]]
         return any("Tr_velo_to_cam" in named_rows(file) for file in beside if file.is_file())
 
@@ -63,7 +64,7 @@ class KittiObject(Dataset):
             edge = (LIDAR, CAMERA, geometry.inverse(camera_from_lidar))
             return encode_transforms(int(times[row]), [edge])
 
-        # Each frame has a map of its own, in which the LiDAR is at the origin.
+        # Each frame has its own map with the LiDAR at the origin.
         self.streams = [
             mountings(int(times[0]), [(MAP, LIDAR, np.eye(4))]),
             Stream("/tf", "tf2_msgs/msg/TFMessage", times, mounting),

@@ -35,8 +35,8 @@ from bevviz.messages.encode import encode_points
 from bevviz.model import geometry
 from bevviz.model.frame import F64, I64, Boxes3D, LabelledBoxes3D
 
-RATE = 10.0  # Hz, where there is no times.txt
-# Numbers of its labels that are objects; from 252 on the moving ones.
+RATE = 10.0  # Hz, used without times.txt
+# SemanticKITTI label numbers of objects; moving objects begin at 252.
 OBJECTS = {
     10: "car",
     11: "bicycle",
@@ -61,7 +61,7 @@ CAMERAS = {"image_2": "", "image_3": "the right eye of a stereo pair", "image_0"
 
 
 class KittiOdometry(Dataset):
-    """``velodyne``, ``calib.txt``; ``times.txt``, ``poses.txt``, ``labels``, ``image_2`` where they are."""
+    """Drive of ``velodyne`` and ``calib.txt``; optional ``times.txt``, ``poses.txt``, ``labels``, images."""
 
     name = "kitti-odometry"
     about = "KITTI odometry or SemanticKITTI sequence"
@@ -69,12 +69,14 @@ class KittiOdometry(Dataset):
 
     @classmethod
     def fits(cls, path: Path) -> bool:
+        """Tell whether a folder is a sequence or has a folder ``sequences``."""
         if (path / "sequences").is_dir():
             return any((path / "sequences").glob("*/velodyne"))
         return (path / "velodyne").is_dir() and (path / "calib.txt").is_file()
 
     @classmethod
     def drives(cls, path: Path) -> list[Path]:
+        """Return the folders of the sequences."""
         if not (path / "sequences").is_dir():
             return [path]
         return sorted(found.parent for found in (path / "sequences").glob("*/velodyne"))
@@ -152,7 +154,7 @@ class KittiOdometry(Dataset):
         return SECOND + np.round(table[numbers] * 1e9).astype(np.int64)
 
     def _poses(self, folder: Path, calibration: Calibration) -> F64 | None:
-        """(P, 4, 4) first scan from each; None: there are none."""
+        """Return (P, 4, 4) first_scan_from_scan poses; None if there are none."""
         beside = folder.parent.parent / "poses" / f"{folder.name}.txt"
         file = folder / "poses.txt" if (folder / "poses.txt").is_file() else beside
         if not file.is_file():
@@ -160,12 +162,12 @@ class KittiOdometry(Dataset):
         table = read_table(file, 12)
         poses = np.tile(np.eye(4), (len(table), 1, 1))
         poses[:, :3] = table.reshape(-1, 3, 4)
-        reference_from_lidar = calibration.rectified_from_lidar  # they are those of the camera
+        reference_from_lidar = calibration.rectified_from_lidar  # The poses are those of the camera.
         moved = geometry.inverse(reference_from_lidar) @ poses @ reference_from_lidar
         return np.asarray(moved)
 
     def _labels(self, file: Path, points: int) -> np.ndarray[Any, np.dtype[np.uint32]]:
-        """(points,) of each point."""
+        """Return the (points,) label of each point."""
         data = read_bytes(file)
         labels = np.frombuffer(data[: len(data) // 4 * 4], "<u4")
         if len(labels) != points:
@@ -176,14 +178,14 @@ class KittiOdometry(Dataset):
 
 
 def boxes_of(file: Path, points: Any, labels: Any) -> LabelledBoxes3D:
-    """A box around the points of each object: as much of it as the LiDAR sees.
+    """Return a box around the labelled points of each object. It covers only the visible part of the object.
 
-    Seen from above it is the smallest turned rectangle around them, from below to above all of them.
+    From above, the box is the smallest rotated rectangle. Its height spans all points.
 
     Args:
-        file: for the result.
-        points: (N,) with x, y, z.
-        labels: (N,) class in the lower half, number of the object in the upper one, 0: it has none.
+        file: label file, named in the result.
+        points: (N,) points with x, y, z.
+        labels: (N,) labels: the class in the lower 16 bits, the object number in the upper; 0: no object.
     """
     import cv2
 

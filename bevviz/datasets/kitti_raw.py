@@ -1,4 +1,4 @@
-"""A drive of KITTI's raw data (Geiger, Lenz, Stiller and Urtasun 2013), its tracklets being the truth."""
+"""A drive of KITTI's raw data (Geiger, Lenz, Stiller and Urtasun 2013), with tracklets as ground truth."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ CAMERAS = {
 
 
 class KittiRaw(Dataset):
-    """``2011_09_26/2011_09_26_drive_0001_sync``, the calibration being in ``2011_09_26``."""
+    """Drive ``2011_09_26/2011_09_26_drive_0001_sync`` with its calibration in ``2011_09_26``."""
 
     name = "kitti-raw"
     about = "KITTI raw drive"
@@ -46,10 +46,12 @@ class KittiRaw(Dataset):
 
     @classmethod
     def fits(cls, path: Path) -> bool:
+        """Tell whether a folder is a drive or contains drives."""
         return (path / "velodyne_points").is_dir() or any(path.glob("*_drive_*/velodyne_points"))
 
     @classmethod
     def drives(cls, path: Path) -> list[Path]:
+        """Return the folders of the drives."""
         if (path / "velodyne_points").is_dir():
             return [path]
         return sorted(found.parent for found in path.glob("*_drive_*/velodyne_points"))
@@ -94,7 +96,7 @@ class KittiRaw(Dataset):
         self.streams.append(clouds(times, scans, fields))
 
     def _cameras(self, folder: Path) -> tuple[list[tuple[str, str, F64]], list[Stream]]:
-        """Where they are, and what they saw."""
+        """Return the mountings and the streams of the cameras."""
         edges, streams = [], list[Stream]()
         for camera, aside in CAMERAS.items():
             images, times = self._files(folder / camera, *IMAGES)
@@ -116,7 +118,7 @@ class KittiRaw(Dataset):
         return edges, streams
 
     def _oxts(self, folder: Path) -> tuple[I64, F64] | None:
-        """Stamps of the positions and (P, 4, 4) first pose from each; None: there are none."""
+        """Return stamps and (P, 4, 4) first_from_each poses; None if there are none."""
         files, times = self._files(folder / "oxts", ".txt")
         if not files:
             return None
@@ -127,7 +129,7 @@ class KittiRaw(Dataset):
         return times, poses_of_oxts(np.concatenate(rows))
 
     def _files(self, folder: Path, *suffixes: str) -> tuple[list[Path], I64]:
-        """The files of a sensor and their stamps; a file is missing here and there, a stamp never."""
+        """Return the files of a sensor and their stamps. ``timestamps.txt`` also lists missing files."""
         files = files_in(folder / "data", suffixes)
         if not files:
             return [], np.zeros(0, np.int64)
@@ -145,10 +147,10 @@ class KittiRaw(Dataset):
 
 
 def read_tracklets(file: Path) -> dict[int, LabelledBoxes3D]:
-    """The labelled objects of each scan, by its number, in the frame of the LiDAR.
+    """Read the labelled objects of each scan by number in the LiDAR frame.
 
     Raises:
-        UserError: it cannot be read, or is none of KITTI's.
+        UserError: the file cannot be read, or has not KITTI's format.
     """
     try:
         root = ElementTree.fromstring(read_text(file))
@@ -164,7 +166,7 @@ def read_tracklets(file: Path) -> dict[int, LabelledBoxes3D]:
                 continue
             for later, pose in enumerate(item.findall("poses/item")):
                 x, y, z, turn = (float(_text(pose, name)) for name in ("tx", "ty", "tz", "rz"))
-                # A place is the middle of the bottom.
+                # A location is the centre of the bottom.
                 row = [x, y, z + height / 2, length, width, height, turn]
                 rows[first + later].append((kind, str(number), row))
     except (ElementTree.ParseError, ValueError) as error:
@@ -187,7 +189,7 @@ def _text(item: Any, name: str) -> str:
 
 
 def _rigid(file: Path) -> F64:
-    """(4, 4) of a file with R and T."""
+    """Return the (4, 4) transform of a file with R and T."""
     rows = named_rows(file)
     pose = np.eye(4)
     try:
@@ -198,7 +200,7 @@ def _rigid(file: Path) -> F64:
 
 
 def _time(file: Path, number: int, line: str) -> int:
-    """Nanoseconds of ``2011-09-26 13:02:25.964389445``, which is taken for UTC."""
+    """Parse ``2011-09-26 13:02:25.964389445`` as UTC to nanoseconds."""
     day, _, fraction = line.strip().partition(".")
     try:
         whole = datetime.strptime(day, "%Y-%m-%d %H:%M:%S").replace(tzinfo=UTC)

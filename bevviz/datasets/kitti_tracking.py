@@ -36,7 +36,7 @@ CAMERAS = {"image_02": "", "image_03": "the right eye of a stereo pair"}
 
 
 class KittiTracking(Dataset):
-    """``velodyne/0000/000000.bin``, ``calib/0000.txt``; ``image_02``, ``label_02``, ``oxts``."""
+    """Drive of ``velodyne/0000`` and ``calib/0000.txt``; optional ``image_02``, ``label_02``, ``oxts``."""
 
     name = "kitti-tracking"
     about = "KITTI tracking benchmark"
@@ -44,13 +44,15 @@ class KittiTracking(Dataset):
 
     @classmethod
     def fits(cls, path: Path) -> bool:
+        """Tell whether a folder has the layout of the benchmark, or is one drive of it."""
         if any((path / "calib").glob("[0-9]" * 4 + ".txt")):
             return any((path / "velodyne").glob("[0-9]" * 4))
-        above = path.parent  # velodyne/0000 itself
+        above = path.parent  # The folder may be velodyne/0000.
         return above.name == "velodyne" and (above.parent / f"calib/{path.name}.txt").is_file()
 
     @classmethod
     def drives(cls, path: Path) -> list[Path]:
+        """Return the scan folders of the drives."""
         if path.parent.name == "velodyne":
             return [path]
         return sorted((path / "velodyne").glob("[0-9]" * 4))
@@ -96,7 +98,7 @@ class KittiTracking(Dataset):
         self.streams.append(clouds(times, scans, fields))
 
     def _truth(self, file: Path, calibration: Calibration, scans: list[Path]) -> Stream:
-        """Of the scans: a line has the frame, the object, and what a label of the object benchmark has."""
+        """Return the ground truth of the scans. A line has frame, object, and an object label."""
         lines: dict[int, list[tuple[int, str]]] = defaultdict(list)
         ids: dict[int, list[str]] = defaultdict(list)
         for number, line in enumerate(read_text(file).splitlines(), 1):

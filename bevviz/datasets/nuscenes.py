@@ -1,4 +1,4 @@
-"""A scene of nuScenes (Caesar et al. 2020), or of a set with its tables; the devkit is not needed."""
+"""A scene of nuScenes (Caesar et al. 2020), or of a data set with its tables. The devkit is not needed."""
 
 from __future__ import annotations
 
@@ -32,16 +32,16 @@ from bevviz.support.files import open_regular
 MAP, BASE = "map", "base_link"
 TABLES = "sample_data.json"
 FIELDS = ("x", "y", "z", "intensity", "ring")
-PIECE = 1 << 22  # characters of a table that are read at once: the largest has a gigabyte
-MOST_OF_ROW = 1 << 24  # characters: a row has a thousand as a rule
-MOST_BYTES = 1 << 33  # of a table
+PIECE = 1 << 22  # characters read at once; the largest table has a gigabyte
+MOST_OF_ROW = 1 << 24  # characters; a row usually has a thousand
+MOST_BYTES = 1 << 33  # bytes of a table
 Record = Mapping[str, Any]
 
 
 class NuScenes(Dataset):
-    """``v1.0-mini/*.json`` with ``samples`` and ``sweeps`` beside; one scene is a drive.
+    """Drive of one scene: ``v1.0-mini/*.json`` with ``samples`` and ``sweeps`` next to ``v1.0-mini``.
 
-    Sets with its tables: T4 (``annotation/*.json`` with ``data`` beside), Lyft Level 5.
+    Data sets with the same tables are T4 (``annotation/*.json`` next to ``data``) and Lyft Level 5.
     """
 
     name = "nuscenes"
@@ -50,6 +50,7 @@ class NuScenes(Dataset):
 
     @classmethod
     def fits(cls, path: Path) -> bool:
+        """Tell whether a folder has the tables of nuScenes, or contains a folder with them."""
         return (path / TABLES).is_file() or bool(_versions(path))
 
     def __init__(self, path: Path, sequence: str) -> None:
@@ -93,7 +94,7 @@ class NuScenes(Dataset):
                 f"{len(lacking)} of its {len(samples)} samples lack one; the first: {lost[0]}"
             )
         edges, clouds, images = [], list[Stream](), list[Stream]()
-        keys: dict[str, int] = {}  # sample -> stamp of its scan
+        keys: dict[str, int] = {}  # stamp of the key scan by sample
         for channel, rows in sorted(taken.items()):
             calibration = mounted[rows[0]["calibrated_sensor_token"]]
             pose = _pose(calibration)
@@ -130,7 +131,7 @@ class NuScenes(Dataset):
         ]
 
     def _with_scans(self, root: Path, scenes: Mapping[str, tuple[Record, Path]]) -> list[str]:
-        """The scenes with a LiDAR's key frame among the files: of a large set parts may be here.
+        """Return the names of the scenes whose key LiDAR scans exist. A part of a large set may be here.
 
         Raises:
             UserError: there is none.
@@ -153,9 +154,9 @@ class NuScenes(Dataset):
         return sorted(name for name, (scene, _) in scenes.items() if scene["token"] in found)
 
     def _clouds(self, channel: str, times: I64, files: Sequence[Path], turns: int) -> Stream:
-        """Scans, turned by quarters of a circle so that x is ahead.
+        """Return the stream of scans, rotated by quarter turns so that x is ahead.
 
-        nuScenes has five float32 a point; sets with its tables have other numbers of them, or true PCD.
+        nuScenes has five float32 values per point. Other sets have another number of them, or real PCD files.
         """
         fields = self.columns_in(files, FIELDS)
         self.check_sizes([file for file in files if file.suffix == ".bin"], 4 * len(fields))
@@ -169,7 +170,10 @@ class NuScenes(Dataset):
     def _images(
         self, channel: str, times: I64, files: Sequence[Path], calibration: Record
     ) -> Iterator[Stream]:
-        """They are rectified, unless T4's ``camera_distortion`` says otherwise: OpenCV's coefficients."""
+        """Yield the streams of a camera.
+
+        Images are rectified unless T4's ``camera_distortion`` has coefficients, which are those of OpenCV.
+        """
         matrix = np.array(calibration["camera_intrinsic"], np.float64)
         if matrix.shape != (3, 3):
             raise UserError(f"{self.path}: calibrated_sensor.json has no camera_intrinsic for {channel}")
@@ -185,7 +189,7 @@ class NuScenes(Dataset):
         yield pictures(channel, times, files, rectified=rectified)
 
     def _truth(self, tables: Path, keys: Mapping[str, int]) -> Iterator[Stream]:
-        """What is labelled at the key frames, in the map."""
+        """Yield the ground truth of the key frames in the map."""
         if not (tables / "sample_annotation.json").is_file():
             return
         labelled: dict[str, list[Record]] = defaultdict(list)
@@ -219,7 +223,7 @@ class NuScenes(Dataset):
 
 
 def _places(poses: Sequence[Record]) -> Stream:
-    """Where the vehicle is, by stamp."""
+    """Return the stream of vehicle poses by stamp."""
     placed = {1000 * int(row["timestamp"]): row for row in poses}
     times = np.array(sorted(placed), np.int64)
 
@@ -231,13 +235,13 @@ def _places(poses: Sequence[Record]) -> Stream:
 
 
 def _pose(row: Record) -> F64:
-    """(4, 4) of a translation and a quaternion w, x, y, z."""
+    """Return the (4, 4) pose of a translation and a quaternion w, x, y, z."""
     w, x, y, z = row["rotation"]
     return geometry.transform(row["translation"], (x, y, z, w))
 
 
 def _numbers(values: Any, count: int) -> F64:
-    """(count,) numbers of a label; NaN in place of what is none, so that the label is told as unusable."""
+    """Return (count,) numbers of a label; NaN for invalid values, so that the label counts as unusable."""
     try:
         return np.array(values, np.float64).reshape(count)
     except (TypeError, ValueError):
@@ -245,7 +249,7 @@ def _numbers(values: Any, count: int) -> F64:
 
 
 def _yaw(rotation: Any) -> float:
-    """Turn about z of a quaternion w, x, y, z; NaN where it is none."""
+    """Return the rotation about z of a quaternion w, x, y, z; NaN if it is no rotation."""
     w, x, y, z = _numbers(rotation, 4)
     try:
         return geometry.yaw(geometry.transform(np.zeros(3), (x, y, z, w)))
@@ -254,7 +258,7 @@ def _yaw(rotation: Any) -> float:
 
 
 def _quarter_turns(number: int) -> F64:
-    """(4, 4) rotation about z."""
+    """Return a (4, 4) rotation about z."""
     pose = np.eye(4)
     c, s = ((1, 0), (0, 1), (-1, 0), (0, -1))[number % 4]
     pose[:2, :2] = [[c, -s], [s, c]]
@@ -262,7 +266,7 @@ def _quarter_turns(number: int) -> F64:
 
 
 def _turned(points: NDArray[np.void], turns: int) -> NDArray[np.void]:
-    """The points turned by quarters of a circle: every coordinate keeps its digits."""
+    """Return the points rotated by quarter turns. Every coordinate keeps its digits."""
     x, y = points["x"], points["y"]
     turned = points.copy()
     turned["x"], turned["y"] = ((x, y), (-y, x), (-x, -y), (y, -x))[turns % 4]
@@ -275,8 +279,8 @@ def _turned(points: NDArray[np.void], turns: int) -> NDArray[np.void]:
 def _within(root: Path, name: str) -> Path:
     """Return the file that a table names, which must be in the data set.
 
-    Only the name counts: ``..`` and an absolute name may not lead out of the folder. Links that lie in the
-    folder are followed, as many have their ``sweeps`` on another disk.
+    Only the name counts: ``..`` and an absolute name must not lead out of the folder. Links in the folder are
+    followed, because many users keep ``sweeps`` on another disk.
 
     Raises:
         UserError: the name leads out of the folder.
@@ -288,15 +292,15 @@ def _within(root: Path, name: str) -> Path:
 
 
 def _versions(path: Path) -> list[Path]:
-    """The folders of tables in it."""
+    """Return the folders with tables."""
     return sorted(f.parent for name in ("v*", "annotation") for f in path.glob(f"{name}/{TABLES}"))
 
 
 def records(table: Path) -> Iterator[dict[str, Any]]:
-    """The rows of a table, one after the other: of the largest, a gigabyte, little is in memory.
+    """Yield the rows of a table one by one. So a table of a gigabyte takes little memory.
 
     Raises:
-        UserError: it is missing, cut, or no list of objects.
+        UserError: the table is missing, cut, or no list of objects.
     """
     decoder, buffer, at = json.JSONDecoder(), "", 0
     try:
@@ -321,20 +325,20 @@ def records(table: Path) -> Iterator[dict[str, Any]]:
         raise UserError(f"{table}: cannot be read: {error.strerror}") from None
     except UnicodeDecodeError:
         raise UserError(f"{table}: is no text") from None
-    except (ValueError, RecursionError) as error:  # a number of thousands of digits, a deep row
+    except (ValueError, RecursionError) as error:  # a number with thousands of digits, or a deeply nested row
         raise UserError(f"{table}: is no table of nuScenes: {first_line(error)}") from None
 
 
 def _by_token(tables: Path, name: str, chosen: Any) -> dict[str, Record]:
-    """The rows that are chosen, by their token."""
+    """Return the chosen rows by token."""
     return {row["token"]: row for row in records(tables / f"{name}.json") if chosen(row)}
 
 
 def _chosen(tables: Path, name: str, tokens: Collection[str]) -> dict[str, Record]:
-    """The rows with these tokens.
+    """Return the rows with these tokens.
 
     Raises:
-        UserError: one is missing.
+        UserError: a row is missing.
     """
     found = _by_token(tables, name, lambda row: row["token"] in tokens)
     if missing := set(tokens) - found.keys():

@@ -1,4 +1,4 @@
-"""PCD files, by pypcd4: Open3D ends the process on those with padding between the fields, as of PCL."""
+"""Reader of PCD files by pypcd4. Open3D crashes on files with padding between the fields, as PCL writes."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ from bevviz.errors import first_line
 from bevviz.messages.clouds import MOST_POINTS
 from bevviz.support.files import SENSOR_LIMIT, read_bytes
 
-MOST_LINES = 50  # of a header
+MOST_LINES = 50  # lines of a header
 MOST_BYTES = 1 << 30
 
 
 def read_pcd(file: Path) -> tuple[NDArray[np.void], int]:
-    """The points with their fields, and how many the file announces: of one that is cut, the whole points.
+    """Return the points with their fields, and the number of points that the header states.
 
-    Padding, and fields of several numbers a point, are left out.
+    A cut file gives its whole points. Padding and fields with several values per point are left out.
 
     Raises:
-        OSError: it cannot be read.
-        ValueError: it is no PCD, or its points are damaged.
+        OSError: the file cannot be read.
+        ValueError: the file is no PCD file, or its points are damaged.
     """
     data = read_bytes(file, SENSOR_LIMIT)
     try:
@@ -47,10 +47,10 @@ def read_pcd(file: Path) -> tuple[NDArray[np.void], int]:
 
 
 def _header(data: bytes) -> tuple[Any, bytes]:
-    """What the file says of itself, and what follows.
+    """Parse the header. Return it in the form of version 0.7, and the bytes after it.
 
-    Written out as files of version 0.7 have it: older ones have COLUMNS, no VIEWPOINT and no COUNT, some
-    writers leave the size or the number of points to be told by the other, or name padding of COUNT 0.
+    Older versions have COLUMNS and neither VIEWPOINT nor COUNT. Some writers state only one of the size and
+    the number of points, or list padding with COUNT 0.
     """
     from pypcd4.pypcd4 import MetaData
 
@@ -83,7 +83,7 @@ def _points(about: Any, layout: np.dtype[np.void], body: bytes) -> NDArray[np.vo
         return np.frombuffer(body, layout, count=min(about.points, len(body) // layout.itemsize))
     if about.data == "ascii":
         if not body.endswith(b"\n") and len(body.splitlines()) < about.points:
-            body = body[: body.rfind(b"\n") + 1]  # the last line is cut
+            body = body[: body.rfind(b"\n") + 1]  # The last line is cut.
         if not body.strip():
             return np.zeros(0, layout)
         return np.loadtxt(BytesIO(body), layout, ndmin=1, max_rows=MOST_POINTS)

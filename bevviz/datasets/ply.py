@@ -1,4 +1,4 @@
-"""PLY files: Open3D fills up those that are cut with what lies in memory, and leaves whole numbers out.
+"""Reader of PLY files. Open3D fills cut files with uninitialised memory and drops integer properties.
 
 The format is Turk's (The PLY Polygon File Format, 1994). The library plyfile is under the GPL.
 """
@@ -25,11 +25,13 @@ ORDERS = {"ascii": "<", "binary_little_endian": "<", "binary_big_endian": ">"}
 
 
 def read_ply(file: Path) -> tuple[NDArray[np.void], int]:
-    """The vertices with their properties, and how many the file announces: of one that is cut, the whole.
+    """Return the vertices with their properties, and the number of vertices that the header states.
+
+    A cut file gives its whole vertices.
 
     Raises:
-        OSError: it cannot be read.
-        ValueError: it is no PLY, has no x, y, z, or lists where points have to be found.
+        OSError: the file cannot be read.
+        ValueError: the file is no PLY file, has no x, y, z, or has lists before or in its vertices.
     """
     data = read_bytes(file, SENSOR_LIMIT)
     order, elements, at = _header(data)
@@ -53,14 +55,14 @@ def read_ply(file: Path) -> tuple[NDArray[np.void], int]:
         return np.frombuffer(data, layout, min(count, there), at + before if there else 0), count
     lines = [*islice((line for line in BytesIO(data[at:]) if line.strip()), before, before + count)]
     if lines and len(lines[-1].split()) < len(properties):
-        lines.pop()  # it is cut
+        lines.pop()  # The last line is cut.
     return np.loadtxt(BytesIO(b"".join(lines)), layout, ndmin=1) if lines else np.zeros(0, layout), count
 
 
 def _header(data: bytes) -> tuple[str, list[tuple[str, int, list[tuple[str, str]]]], int]:
-    """The format; elements with their number and properties (name, type); where the header ends.
+    """Return the format, the elements (name, count, properties), and the end of the header.
 
-    CloudCompare writes ``scalar_`` before the names of fields, CARLA calls the intensity ``I``.
+    CloudCompare writes ``scalar_`` before field names. CARLA calls the intensity ``I``.
     """
     end = data.find(b"end_header", 0, MOST_HEADER)
     newline = data.find(b"\n", end)

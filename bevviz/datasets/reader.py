@@ -1,4 +1,4 @@
-"""A data set as the reader of a bag: its files become messages as they are asked for."""
+"""Reader of a data set with the interface of a bag reader. Files become messages on demand."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from bevviz.model.frame import I64
 
 
 class DatasetReader:
-    """The messages of one drive, in order of stamp, which is their log time, too."""
+    """Messages of one drive in order of stamp. The stamp is also the log time."""
 
     def __init__(self, dataset: Dataset) -> None:
         self._dataset = dataset
@@ -25,11 +25,12 @@ class DatasetReader:
             for number, stream in enumerate(self._streams)
         )
         self.compression = ""
-        # By stream: of which row there is nothing, and of which not all, and why.
+        # By stream: reason for each row without a message, and for each row with a part of its points.
         self._lost, self._cut = defaultdict[int, dict[int, str]](dict), defaultdict[int, dict[int, str]](dict)
 
     @property
     def span(self) -> tuple[int, int]:
+        """Log time of the first message, and log time of the last message plus one nanosecond."""
         if not self._streams:
             return 0, 0
         return (
@@ -39,6 +40,7 @@ class DatasetReader:
 
     @property
     def warnings(self) -> list[str]:
+        """Warnings of the data set, unreadable files and cut files."""
         said = [*self._dataset.warnings]
         for found, of_many in ((self._lost, "cannot be read"), (self._cut, "are cut")):
             for number, rows in found.items():
@@ -50,7 +52,10 @@ class DatasetReader:
     def messages(
         self, ids: Collection[int], start: int, stop: int
     ) -> Iterator[tuple[Connection, int, bytes | memoryview]]:
-        """As of ``bevviz.bags.reader.Reader``; what cannot be made is empty, and told in ``warnings``."""
+        """Yield messages as ``bevviz.bags.reader.Reader`` does.
+
+        An unreadable file gives an empty message and a line in ``warnings``.
+        """
         times, numbers, rows = list[I64](), list[I64](), list[I64]()
         for number in sorted(ids):
             first, last = np.searchsorted(self._streams[number].times, [start, stop])
@@ -78,22 +83,25 @@ class DatasetReader:
             yield self.connections[int(of[i])], int(at[i]), data
 
     def times(self, ids: Collection[int]) -> I64:
+        """Return the sorted log times of the connections ``ids``."""
         return np.sort(np.concatenate([self._streams[number].times for number in ids]))
 
     def sums(self, ids: Collection[int], start: int, stop: int) -> tuple[int, int]:
+        """Return the number of messages and the sum of their log times."""
         times = self.times(ids)
         chosen = times[(times >= start) & (times < stop)]
         return len(chosen), sum(chosen.tolist())
 
     def rescuer(self) -> DatasetReader:
+        """Return this reader: a data set has no rescuer."""
         return self
 
     def close(self) -> None:
-        """Nothing is open."""
+        """Do nothing: no file stays open."""
 
     @property
     def aside(self) -> dict[str, str]:
-        """Topic -> why it plays no role unless it is asked for."""
+        """Reason by topic why it gets no role by default."""
         return {stream.topic: stream.aside for stream in self._streams if stream.aside}
 
 

@@ -1,4 +1,4 @@
-"""What the names of files tell: of which sensor they are, and when they were taken."""
+"""Sensors and times that file names state."""
 
 from __future__ import annotations
 
@@ -13,30 +13,30 @@ from statistics import median
 
 from bevviz.datasets.dataset import SECOND
 
-MOST_SENSORS = 16  # in one folder
+MOST_SENSORS = 16  # sensors in one folder
 DATE = re.compile(  # 20121214T142255.814212, 2011-09-26_13-02-25-594, 20231114221321205
     r"(?<!\d)((?:19|20)\d\d)[-_.]?(\d\d)[-_.]?(\d\d)[-_.T ]?(\d\d)[-_.:]?(\d\d)[-_.:]?(\d\d)"
     r"(?:[-_.](\d{1,9})|(\d{3}|\d{6}))?(?=\D*$)"
 )
 DECIMAL, WHOLE = re.compile(r"\d+(?:\.\d+)?"), re.compile(r"\d+")
-DIGITS = {19: 1, 16: 1000, 13: 1_000_000, 10: SECOND}  # of a stamp -> nanoseconds of its unit
+DIGITS = {19: 1, 16: 1000, 13: 1_000_000, 10: SECOND}  # number of digits of a stamp: nanoseconds of its unit
 UNITS = {1: "nanoseconds", 1000: "microseconds", 1_000_000: "milliseconds", SECOND: "seconds"}
-FASTEST = 5_000_000  # nanoseconds between two frames, below which a number counts them
-FRAMES = 10_000_000_000  # no frame has such a number
-STRIDE = 10_000  # nor are so many left out between two
-ALL = 0.9  # share of its files that a sensor's stamps differ in, if some are doubled
-SECONDS = re.compile(r"(?<![\d.])([1-9]\d{9})[-_]$")  # before their parts
+FASTEST = 5_000_000  # nanoseconds between two frames; numbers with smaller steps count frames
+FRAMES = 10_000_000_000  # Frame numbers are smaller.
+STRIDE = 10_000  # Frame numbers have smaller steps.
+ALL = 0.9  # share of distinct stamps among a sensor's files, in case some are duplicates
+SECONDS = re.compile(r"(?<![\d.])([1-9]\d{9})[-_]$")  # whole seconds before their decimals
 MOST = 1 << 63
 
 
 @dataclass(frozen=True, slots=True)
 class Told:
-    """What the names of a sensor's files tell.
+    """Times in the names of a sensor's files.
 
     Attributes:
-        frames: whether the values are numbers of frames, else nanoseconds.
-        values: of each file that tells it.
-        said: what was concluded, for a line; "": it is plain.
+        frames: the values are frame numbers; else they are nanoseconds.
+        values: value of each file that has one.
+        said: interpretation to report to the user; empty: it is obvious.
     """
 
     frames: bool
@@ -45,7 +45,7 @@ class Told:
 
 
 def told_by(files: Sequence[Path]) -> Told | None:
-    """When the files of one sensor were taken, by their names; None: these tell nothing."""
+    """Return the times in the names of one sensor's files; None if the names have none."""
     dates = {file: date[1] for file in files if (date := _dated(file))}
     if 2 * len(dates) > len(files) and not _counts(dates.values()):
         return Told(False, dates, "are taken for dates and times in UTC")
@@ -56,10 +56,10 @@ def told_by(files: Sequence[Path]) -> Told | None:
 
 
 def sensors_of(files: Sequence[Path]) -> dict[str, list[Path]]:
-    """Files by the words in which names differ, without the number that tells; one group: of one sensor.
+    """Group files by the words in which their names differ, without the time. One group means one sensor.
 
-    They are of several where these words are no mere numbers (which are a date's, or a run's), or where each
-    has the same numbers, and where there are as many of each, about.
+    Several groups are several sensors if each has about as many files. In addition, the words must not be
+    mere numbers, such as dates or runs, or all groups must have the same times.
     """
     groups = dict[tuple[str, ...], list[Path]]()
     told = {file: date[0] for file in files if (date := _dated(file))}
@@ -84,7 +84,7 @@ def sensors_of(files: Sequence[Path]) -> dict[str, list[Path]]:
 
 
 def stamps_in(texts: Sequence[str]) -> list[int]:
-    """Nanoseconds of stamps in seconds, or, without a point, in what their digits or steps tell."""
+    """Convert stamps to nanoseconds. Digits or steps decide the unit of stamps without a point."""
     whole = [text for text in texts if "." not in text]
     numbers = list(map(int, whole))
     unit = (whole and _unit(whole, numbers)) or SECOND
@@ -93,13 +93,13 @@ def stamps_in(texts: Sequence[str]) -> list[int]:
 
 
 def _words(told: re.Match[str]) -> list[str]:
-    """Of a name, without the number that tells, and without the seconds before it."""
+    """Return the words of a name without its time."""
     before = SECONDS.sub("", told.string[: told.start()])
     return re.findall(r"[A-Za-z0-9]+", f"{before} {told.string[told.end() :]}")
 
 
 def _counting(rows: Iterable[Sequence[str]]) -> set[int]:
-    """Which words count, too: numbers of more values than there are sensors."""
+    """Return the columns of words that are counters: numbers with more values than sensors are possible."""
     columns = zip(*rows, strict=False)
     return {
         i
@@ -109,14 +109,14 @@ def _counting(rows: Iterable[Sequence[str]]) -> set[int]:
 
 
 def _alike(rows: Sequence[Sequence[str]]) -> int:
-    """How many words all rows begin with."""
+    """Count the leading words that all rows share."""
     return next(
         (i for i, row in enumerate(zip(*rows, strict=False)) if len(set(row)) > 1), min(map(len, rows))
     )
 
 
 def _dated(file: Path) -> tuple[re.Match[str], int] | None:
-    """The date and time that a name ends with, and its nanoseconds, taken for UTC; None: it does not."""
+    """Return the date and time at the end of a name and its nanoseconds in UTC; None if there is none."""
     if not (found := DATE.search(file.stem)):
         return None
     *whole, apart, joined = found.groups()
@@ -128,10 +128,11 @@ def _dated(file: Path) -> tuple[re.Match[str], int] | None:
 
 
 def _telling(files: Sequence[Path], pattern: re.Pattern[str]) -> dict[Path, re.Match[str]]:
-    """The number in each name that tells its frame or stamp; a file without any is left out.
+    """Return the number in each name that is its frame or stamp. A file without a number is left out.
 
-    It is the one that differs most (v2, cam0 and hdl64 do not), of equals a stamp, else the last. A few files
-    may all be of one frame: there, zeros before a number weigh as much.
+    The number with the most distinct values counts: v2, cam0 and hdl64 vary less. Among equals a stamp comes
+    before others, then the last number. A few files may all be of one frame, so leading zeros
+    count as well.
     """
     rows = {file: list(pattern.finditer(file.stem)) for file in files}
     usual = Counter(len(row) for row in rows.values() if row).most_common(1)
@@ -172,7 +173,7 @@ def _by_number(files: Sequence[Path], pattern: re.Pattern[str]) -> Told | None:
 
 
 def _seconds_before(told: Mapping[Path, re.Match[str]]) -> tuple[list[int], list[str]] | None:
-    """Seconds and their parts, where each number follows one of seconds: 1700000001_205187200."""
+    """Return seconds and decimals if each number follows one of seconds: 1700000001_205187200."""
     rows = list[tuple[int, str]]()
     for file, match in told.items():
         before = SECONDS.search(file.stem[: match.start()])
@@ -183,15 +184,15 @@ def _seconds_before(told: Mapping[Path, re.Match[str]]) -> tuple[list[int], list
 
 
 def _fractions(seconds: Sequence[int], parts: Sequence[str]) -> list[int]:
-    """Nanoseconds of whole seconds, and milli-, micro- or nanoseconds by the longest part."""
+    """Add whole seconds and milli-, micro- or nanoseconds. The longest part decides the unit."""
     unit = 10 ** (9 - 3 * -(-max(map(len, parts)) // 3))
     return [second * SECOND + int(part) * unit for second, part in zip(seconds, parts, strict=True)]
 
 
 def _decimals(texts: Sequence[str]) -> list[int]:
-    """Nanoseconds of seconds with a point, behind which nanoseconds without leading zeros may be.
+    """Convert seconds with a point to nanoseconds. The part after the point may lack its leading zeros.
 
-    Which of the two it is, where lengths differ, is told by what comes at even steps.
+    If lengths differ, the interpretation with the more even steps counts.
     """
     split = [text.partition(".") for text in texts]
     seconds, parts = [int(whole) for whole, _, _ in split], [part for _, _, part in split]
@@ -207,7 +208,7 @@ def _nanoseconds(decimals: str) -> int:
 
 
 def _unit(texts: Sequence[str], numbers: Sequence[int]) -> int | None:
-    """Nanoseconds of the unit that whole numbers are stamps in; None: they count frames or seconds."""
+    """Return the unit of integer stamps in nanoseconds; None if they count frames or seconds."""
     if _are_stamps(texts):
         return DIGITS[len(texts[0])]
     padded = any(len(text) > 1 and text.startswith("0") for text in texts)
@@ -221,7 +222,7 @@ def _unit(texts: Sequence[str], numbers: Sequence[int]) -> int | None:
 
 
 def _are_stamps(texts: Sequence[str]) -> bool:
-    """Whether numbers are no frames', which have zeros before them where they are as long as stamps."""
+    """Tell whether numbers look like stamps. Frame numbers of that length have leading zeros."""
     if any("." in text for text in texts):
         return True
     return len(set(map(len, texts))) == 1 and len(texts[0]) in DIGITS and texts[0][0] != "0"
@@ -232,7 +233,7 @@ def _steps(values: Iterable[int]) -> list[int]:
 
 
 def _counts(stamps: Iterable[int]) -> bool:
-    """Whether what would be nanoseconds counts frames: no sensor is that fast."""
+    """Tell whether supposed nanoseconds count frames, because no sensor is that fast."""
     steps = _steps(stamps)
     return bool(steps) and median(steps) < FASTEST
 

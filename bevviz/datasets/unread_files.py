@@ -1,4 +1,4 @@
-"""What is in a folder that no loader reads."""
+"""Files in a folder that no loader reads."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ KINDS = {
     ".pcap": "play them through their driver and record its topics",
     ".tfrecord": "convert them, for instance to KITTI's layout",
 }
-MOST = 10_000  # files that are looked at
+MOST = 10_000  # files examined in each folder
 
 
 def unread(folder: Path) -> str:
-    """A clause on the commonest of the files here, or in its folders, that are not read; "": none."""
+    """Return a clause about the most frequent unread type in a folder and its subfolders; empty: none."""
     places = [folder, *(d for d in sorted(folder.iterdir()) if d.is_dir())]
     files = [f for place in places for f, _ in zip(place.iterdir(), range(MOST), strict=False)]
     counts = Counter(kind for file in files if (kind := file.suffix.lower()) in KINDS)
