@@ -1,4 +1,4 @@
-"""A folder that a drive is written into as a data set: what all of these have in common."""
+"""Base class of exports of a drive into a data set folder."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ from bevviz.model.results import FrameResult
 
 
 class FolderExport(Observer[FrameResult]):
-    """Writes each frame; those that lack what the data set needs are counted and left out.
+    """Observer that writes each frame into a folder. It counts frames that lack required data and skips them.
 
     Args:
-        folder: to be made; it must not hold an export yet.
-        camera: name of the only one whose images are written; empty: what the data set has room for.
+        folder: folder to create. It must not exist or must be empty.
+        camera: name of the only camera to write; empty: all cameras that the format supports.
 
     Attributes:
-        frames: written.
-        labels: written.
-        skipped: frames that were left out, by the reason.
+        frames: number of written frames.
+        labels: number of written labels.
+        skipped: number of skipped frames by reason.
 
     Raises:
-        UserError: the folder holds something.
+        UserError: the folder is not empty.
     """
 
     def __init__(self, folder: Path, camera: str = "") -> None:
@@ -40,6 +40,11 @@ class FolderExport(Observer[FrameResult]):
         self.skipped: dict[str, int] = {}
 
     def begin(self, items: Items[object]) -> None:
+        """Create the folders.
+
+        Raises:
+            UserError: the camera does not exist, or the folders cannot be created.
+        """
         cameras = items.scene.cameras
         if self._camera and self._camera not in cameras:
             raise UserError(f"--camera {self._camera}: there is none of that name but {', '.join(cameras)}")
@@ -49,14 +54,14 @@ class FolderExport(Observer[FrameResult]):
 
     @abstractmethod
     def _folders(self, cameras: Sequence[str]) -> Sequence[str]:
-        """That are made first, of a drive with these cameras."""
+        """Return the folders to create for a drive with these cameras."""
 
     def _skip(self, why: str) -> None:
         self.skipped[why] = self.skipped.get(why, 0) + 1
 
     @contextmanager
     def _saving(self, what: str = "written") -> Iterator[None]:
-        """An OSError in it is told in one line."""
+        """Turn an OSError into a UserError that names the folder."""
         try:
             yield
         except OSError as error:
@@ -64,7 +69,7 @@ class FolderExport(Observer[FrameResult]):
 
 
 def rectified(bgr: U8, intrinsics: Intrinsics) -> U8:
-    """The (H, W, 3) image as a camera of the same K without distortion has it."""
+    """Return the (H, W, 3) image as a camera with the same K and no distortion would take it."""
     if not intrinsics.distortion_model:
         return bgr
     if intrinsics.distortion_model == "equidistant":

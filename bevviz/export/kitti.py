@@ -1,4 +1,4 @@
-"""The folders of KITTI's object benchmark: velodyne, image_2, calib and label_2 (Geiger et al. 2012)."""
+"""Export to the layout of KITTI's object benchmark (Geiger et al. 2012)."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from bevviz.model import geometry
 from bevviz.model.frame import F32, F64, U8, Camera, Intrinsics
 from bevviz.model.results import FrameResult, Objects
 
-KINDS = {  # of a detector, as KITTI calls them; what is not here is Misc
+KINDS = {  # KITTI type by class name; other classes become Misc
     "car": "Car",
     "van": "Van",
     "truck": "Truck",
@@ -25,22 +25,21 @@ KINDS = {  # of a detector, as KITTI calls them; what is not here is Misc
     "train": "Tram",
     "tram": "Tram",
 }
-UNKNOWN = 0  # occlusion: what was found is taken as seen
+UNKNOWN = 0  # occlusion; a detected object counts as visible
 
 
 class KittiExport(FolderExport):
-    """Writes each frame; those without the camera's image, calibration or place are counted and left out.
+    """Observer that writes frames. It skips a frame without an image, a calibration or a camera pose.
 
-    Points are those that bevviz works on: upright, z up, several LiDARs merged. Images are rectified, so that
-    P2 projects into them.
-
-    ``camera`` is the one whose images these are; empty: the first.
+    Points are those that bevviz works on: upright, z up, several LiDARs merged. Images are rectified, so P2
+    projects into them. Only the images of one camera are written: ``camera``, or the first camera.
     """
 
     def _folders(self, cameras: Sequence[str]) -> Sequence[str]:
         return "velodyne", "image_2", "calib", "label_2"
 
     def see(self, result: FrameResult) -> None:
+        """Write a frame, or count why it is skipped."""
         frame = result.frame
         camera = next((c for c in frame.cameras if self._camera in ("", c.name)), None)
         if camera is None or camera.image is None or camera.intrinsics is None:
@@ -71,7 +70,7 @@ class KittiExport(FolderExport):
 
 
 def calibration(K: F64, camera_from_points: F64) -> str:
-    """The text of a calibration: the one camera is the reference, and P0 to P3 are its own."""
+    """Return the text of a calibration. The camera is the reference, and P0 to P3 are all its own."""
     projection = np.column_stack([K, np.zeros(3)])
     rows = {f"P{number}": projection for number in range(4)}
     rows |= {"R0_rect": np.eye(3), "Tr_velo_to_cam": camera_from_points[:3], "Tr_imu_to_velo": np.eye(4)[:3]}
@@ -80,9 +79,9 @@ def calibration(K: F64, camera_from_points: F64) -> str:
 
 
 def labels(objects: Objects, intrinsics: Intrinsics, camera_from_points: F64) -> list[str]:
-    """A line for each object in the image: KITTI's fifteen columns, and the score as the sixteenth.
+    """Return a line for each object in the image: KITTI's fifteen columns and the score.
 
-    How much of it is hidden is not known and stated as 0.
+    Occlusion is unknown and stated as 0.
     """
     flat = Intrinsics(intrinsics.width, intrinsics.height, intrinsics.K)
     width, height = intrinsics.width, intrinsics.height
@@ -91,14 +90,14 @@ def labels(objects: Objects, intrinsics: Intrinsics, camera_from_points: F64) ->
     for row, name in enumerate(objects.names):
         uv, _ = geometry.project(geometry.apply(camera_from_points, every[row]), flat)
         if not np.isfinite(uv).all():
-            continue  # partly behind the camera
+            continue  # The object is partly behind the camera.
         low, high = uv.min(axis=0), uv.max(axis=0)
         inside = np.clip(np.concatenate([low, high]), 0, [width - 1, height - 1] * 2)
         area, whole = _area(inside), _area(np.concatenate([low, high]))
         if area <= 0 or whole <= 0:
             continue
         center, size = objects.boxes.center[row].astype(np.float64), objects.boxes.size[row]
-        # A location is the middle of the bottom, in a frame where boxes stand upright: the camera's.
+        # A location is the centre of the bottom, in the camera frame, where boxes stand upright.
         x, y, z = camera_from_points[:3, :3] @ center + camera_from_points[:3, 3] + [0, size[2] / 2, 0]
         yaw = float(objects.boxes.yaw[row])
         ahead = camera_from_points[:3, :3] @ [np.cos(yaw), np.sin(yaw), 0]

@@ -1,4 +1,4 @@
-"""A scene with the tables of nuScenes (Caesar et al. 2020), as its devkit reads them."""
+"""Export of a scene with the tables of nuScenes (Caesar et al. 2020), in the form that its devkit reads."""
 
 from __future__ import annotations
 
@@ -25,11 +25,12 @@ TABLES = (
     *("attribute", "calibrated_sensor", "category", "ego_pose", "instance", "log", "map", "sample"),
     *("sample_annotation", "sample_data", "scene", "sensor", "visibility"),
 )
-SHARED = ("category", "sensor")  # by scenes, so that tables of several can be joined
+# Tables with the same tokens in every scene, so that tables of several scenes can be joined.
+SHARED = ("category", "sensor")
 LIDAR = "LIDAR_TOP"
-MAP = "maps/unknown.png"  # of a scene whose map nobody knows; the devkit asks for one
+MAP = "maps/unknown.png"  # placeholder for the map that the devkit requires
 JPEG_QUALITY = 95
-KINDS = {  # of a detector, as nuScenes calls them; what is not here becomes a category of its own
+KINDS = {  # nuScenes category by class name; another class becomes its own category
     "car": "vehicle.car",
     "van": "vehicle.car",
     "truck": "vehicle.truck",
@@ -48,25 +49,26 @@ KINDS = {  # of a detector, as nuScenes calls them; what is not here becomes a c
 
 
 class NuScenesExport(FolderExport):
-    """Writes each frame as a sample: the scan, the images of all cameras, and the objects as annotations.
+    """Observer that writes each frame as a sample: scan, camera images, and objects as annotations.
 
-    The vehicle's frame is that of the points, which are upright, z up, several LiDARs merged. Images are
-    rectified, and each has the pose of the vehicle at its own time. An instance is a track; its one category
-    is what it was called most, by score. The tables are written at the end, also where the run was
-    interrupted.
+    The vehicle frame is the points frame: upright, z up, several LiDARs merged. Images are rectified, and
+    each has the vehicle pose at its own time. An instance is a track. Its category is its most frequent
+    class, weighted by score. The tables are written at the end, also of an interrupted run.
     """
 
     def __init__(self, folder: Path, camera: str = "") -> None:
         super().__init__(folder, camera)
         self._rows: dict[str, list[dict[str, Any]]] = {name: [] for name in TABLES}
-        self._last: dict[tuple[str, str], dict[str, Any]] = {}  # row of a table, by what follows itself in it
+        self._last: dict[tuple[str, str], dict[str, Any]] = {}  # previous row by table and chain
         self._channels: dict[str, str] = {}
-        self._known: dict[tuple[str, str], str] = {}  # tokens of rows that others refer to, by table and key
+        self._known: dict[tuple[str, str], str] = {}  # tokens of shared rows by table and key
         self._annotated: dict[str, list[str]] = defaultdict(list)
-        self._named: dict[str, dict[str, float]] = defaultdict(lambda: defaultdict(float))  # by instance
-        self._scene, self._start = "", 0  # name, and nanoseconds of its first frame
+        # Summed score by instance and class.
+        self._named: dict[str, dict[str, float]] = defaultdict(lambda: defaultdict(float))
+        self._scene, self._start = "", 0  # scene name, and stamp of the first frame in nanoseconds
 
     def begin(self, items: Items[object]) -> None:
+        """Create the folders, the placeholder map and the visibility table."""
         super().begin(items)
         self._scene = items.scene.name
         with self._saving("made"):
@@ -87,6 +89,7 @@ class NuScenesExport(FolderExport):
         return self._channels.setdefault(camera, channel)
 
     def see(self, result: FrameResult) -> None:
+        """Write a frame as a sample, or count why it is skipped."""
         frame = result.frame
         if not frame.lidar:
             self._skip("no scan")
@@ -134,13 +137,13 @@ class NuScenesExport(FolderExport):
         mounted = self._calibrated(
             channel, "camera", geometry.inverse(mounting), np.asarray(intrinsics.K).tolist()
         )
-        # Where the vehicle was when the image was taken, so that points project as they do here.
+        # This is the vehicle pose at the time of the image, so that points project as they do in bevviz.
         pose = frame.pose @ geometry.inverse(camera.camera_from_points) @ mounting
         height, width = image.bgr.shape[:2]
         self._data(channel, sample, mounted, image.stamp, pose, name, "jpg", (width, height))
 
     def _calibrated(self, channel: str, modality: str, pose: F64, matrix: Sequence[Sequence[float]]) -> str:
-        """The token of a sensor as it is mounted: one for each time that this changes."""
+        """Return the token of a mounted sensor. Every change of its mounting gives a new token."""
         sensor = self._once("sensor", channel, channel=channel, modality=modality)
         placed = _placed(pose)
         return self._once(
@@ -198,7 +201,7 @@ class NuScenesExport(FolderExport):
                 self._token("sample_annotation", self.frames, row),
                 sample_token=sample,
                 instance_token=instance,
-                visibility_token="",  # not known
+                visibility_token="",  # unknown
                 attribute_tokens=[],
                 **_placed(frame.pose @ turned),
                 size=[float(side) for side in _width_first(boxes.size[row])],
@@ -210,19 +213,19 @@ class NuScenesExport(FolderExport):
             self.labels += 1
 
     def _once(self, table: str, key: str, **values: Any) -> str:
-        """The token of a row that is written when it is first named."""
+        """Return the token of a row. The first call with a key writes the row."""
         if (table, key) not in self._known:
             token = self._known[table, key] = self._token(table, key)
             self._rows[table].append({"token": token, **values})
         return self._known[table, key]
 
     def _token(self, table: str, *key: object) -> str:
-        """As nuScenes has them, 32 hexadecimal digits; of another scene others, but for what is shared."""
+        """Return a token of 32 hexadecimal digits. Tokens differ by scene except in shared tables."""
         of = (table, *key) if table in SHARED else (self._scene, self._start, table, *key)
         return hashlib.md5("\0".join(map(str, of)).encode(), usedforsecurity=False).hexdigest()
 
     def _follow(self, table: str, of: str, token: str, **values: Any) -> dict[str, Any]:
-        """A row that is chained to the one before it."""
+        """Add a row and link it with the previous row of its chain."""
         former = self._last.get((table, of))
         row = {"token": token, **values, "prev": former["token"] if former else "", "next": ""}
         if former:
@@ -232,6 +235,7 @@ class NuScenesExport(FolderExport):
         return row
 
     def end(self) -> None:
+        """Write the tables."""
         samples = self._rows["sample"]
         if not samples:
             return
@@ -281,5 +285,5 @@ def _placed(pose: F64) -> dict[str, list[float]]:
 
 
 def _width_first(size: F32) -> F32:
-    """nuScenes has width, length and height."""
+    """Reorder a size from length, width, height to width, length, height, as in nuScenes."""
     return size[[1, 0, 2]]
