@@ -19,7 +19,7 @@ import rosbags.rosbag2
 from rosbags.interfaces import Connection
 
 from bevviz.bags.reader import (
-    LAST,
+    LAST_TIME,
     Bytes,
     DamageError,
     Message,
@@ -34,8 +34,8 @@ from bevviz.support.loggers import logger
 
 _log = logger(__name__)
 
-NAMED = 3  # topics listed in a warning
-PublicReader = rosbags.rosbag1.Reader | rosbags.rosbag2.Reader
+LISTED_TOPICS = 3  # topics listed in a warning
+RosbagsReader = rosbags.rosbag1.Reader | rosbags.rosbag2.Reader
 
 
 @dataclass(slots=True)
@@ -57,15 +57,15 @@ class Chunk:
 
     def fill(self, times: Mapping[int, array[int]]) -> None:
         """Set the log times, counts and span from the messages that a scan found."""
-        self.times = {number: np.frombuffer(found, np.int64) for number, found in times.items()}
-        self.counts = {number: len(found) for number, found in times.items()}
+        self.times = {number: np.frombuffer(values, np.int64) for number, values in times.items()}
+        self.counts = {number: len(values) for number, values in times.items()}
         if times:
             self.start = min(map(min, times.values()))
             self.end = max(map(max, times.values()))
 
 
 @dataclass(slots=True)
-class Index:
+class FileIndex:
     """Chunks and connections of a file."""
 
     chunks: list[Chunk]
@@ -80,15 +80,15 @@ class Index:
         """Log time of the first message, and log time of the last message plus one nanosecond."""
         times = self.outside[:, 0].tolist()
         filled = [c for c in self.chunks if c.counts]
-        first = min([c.start for c in filled] + times, default=LAST)
+        first = min([c.start for c in filled] + times, default=LAST_TIME)
         return first, max([c.end for c in filled] + times, default=-1) + 1
 
 
 @dataclass
-class Scan:
+class ScanResult:
     """Result of a scan through a file, with counts of everything lost."""
 
-    index: Index = field(default_factory=lambda: Index([], []))
+    index: FileIndex = field(default_factory=lambda: FileIndex([], []))
     missing: int = 0  # messages that the index of a chunk lists and that are lost
     undescribed: int = 0  # messages of connections without a description
     stated: int | None = None  # message count by the statistics of the file
@@ -111,8 +111,10 @@ class Scan:
     def end(self) -> None:
         """Count the messages that the index of the newest chunk lists and that the chunk does not have."""
         if self.index.chunks:
-            there = self.index.chunks[-1].counts
-            self.missing += sum(max(0, n - there.get(number, 0)) for number, n in self.listed.items())
+            counts = self.index.chunks[-1].counts
+            self.missing += sum(
+                max(0, listed - counts.get(number, 0)) for number, listed in self.listed.items()
+            )
         self.listed.clear()
 
     def finish(self, known: Container[int], outside: array[int]) -> Counter[int]:
@@ -132,8 +134,10 @@ class Scan:
 
     def notes(self, repair: str) -> list[str]:
         """Return warnings about rescued and lost messages. ``repair`` says how to get a sound copy."""
-        part = f", {self.rescued} of them from the incomplete last {megabytes(self.cut)}" if self.cut else ""
-        notes = [f"read {self.count} messages{part}; {repair}"]
+        incomplete = (
+            f", {self.rescued} of them from the incomplete last {megabytes(self.cut)}" if self.cut else ""
+        )
+        notes = [f"read {self.count} messages{incomplete}; {repair}"]
         damaged = [chunk for chunk in self.index.chunks if chunk.damage]
         if damaged:
             kept = sum(sum(chunk.counts.values()) for chunk in damaged)
@@ -161,15 +165,15 @@ ChunkMessage = tuple[int, int, memoryview]
 
 
 @dataclass(frozen=True, slots=True)
-class Form:
+class ChunkFormat:
     """Functions of one chunked file format."""
 
-    public: Callable[[Path], PublicReader]  # reader of rosbags
-    views: bool  # messages are read by our index, see SoundChunks
-    read_index: Callable[[Path], Index]  # raises DamageError if the index cannot be right
+    open_rosbags: Callable[[Path], RosbagsReader]  # reader of rosbags
+    read_by_index: bool  # messages are read by our index, see SoundChunks
+    read_index: Callable[[Path], FileIndex]  # raises DamageError if the index cannot be right
     read_times: Callable[[Bytes, Chunk, int], I64]  # log times of a connection by the index
-    look_into: Callable[[Bytes, Chunk], tuple[list[ChunkMessage], str]]  # messages of a chunk, and its damage
-    scan: Callable[[Bytes, Scan, Callable[[int], object]], None]  # the last argument gets the offset
+    read_messages: Callable[[Bytes, Chunk], tuple[list[ChunkMessage], str]]  # and the damage of the chunk
+    scan: Callable[[Bytes, ScanResult, Callable[[int], object]], None]  # the last argument gets the offset
     repair: str  # command that writes a sound copy
 
 
@@ -190,11 +194,11 @@ class SoundChunks:
         DamageError: the file has no index, or the index cannot be right.
     """
 
-    def __init__(self, path: Path, form: Form, public: Path) -> None:
+    def __init__(self, path: Path, form: ChunkFormat, public_path: Path) -> None:
         self._path, self._form = path, form
         index = form.read_index(path)
-        self._public: PublicReader | None = None
-        reader = form.public(public)
+        self._public: RosbagsReader | None = None
+        reader = form.open_rosbags(public_path)
         try:
             with as_damage():
                 reader.open()
@@ -206,45 +210,45 @@ class SoundChunks:
             index.connections = [
                 known.get(c.id, c)._replace(msgcount=c.msgcount, owner=None) for c in index.connections
             ]
-            if form.views:
+            if form.read_by_index:
                 reader.close()
             else:
                 self._public = reader
-        self._index: Index | None = index
+        self._index: FileIndex | None = index
         self._chunks = index.chunks
-        self._own = IndexedChunks(path, form, index)
+        self._indexed = IndexedChunkReader(path, form, index)
         self._bytes = Bytes(path)
 
     @property
     def connections(self) -> Sequence[Connection]:
         """Connections with their message counts."""
-        return self._own.connections
+        return self._indexed.connections
 
     @property
     def compression(self) -> str:
         """Names of the compressions of the chunks."""
-        return self._own.compression
+        return self._indexed.compression
 
     @property
     def span(self) -> tuple[int, int]:
         """Log time of the first message, and log time of the last message plus one nanosecond."""
-        return self._own.span
+        return self._indexed.span
 
     @property
     def warnings(self) -> Sequence[str]:
         """Missing data met so far, one sentence each."""
-        return self._own.warnings
+        return self._indexed.warnings
 
     def messages(self, ids: Collection[int], start: int, stop: int) -> Iterator[Message]:
         """Yield messages of the connections ``ids`` with start <= log time < stop, in order of log time."""
         if self._public is None:
-            return self._own.messages(ids, start, stop)
+            return self._indexed.messages(ids, start, stop)
         wanted = [c for c in self._public.connections if c.id in ids]
         return public_messages(self._public.messages(wanted, start, stop))
 
     def times(self, ids: Collection[int]) -> I64:
         """Return the sorted log times of the connections ``ids``."""
-        return self._times(ids, 0, LAST)
+        return self._times(ids, 0, LAST_TIME)
 
     def sums(self, ids: Collection[int], start: int, stop: int) -> tuple[int, int]:
         """Return the number of messages and the sum of their log times, both by the index."""
@@ -257,36 +261,36 @@ class SoundChunks:
     def rescuer(self) -> Reader:
         """Return a reader by the index, or by a scan if the index is damaged."""
         if self._index is None:
-            return rescue(self._path, self._form)
-        return IndexedChunks(self._path, self._form, self._index)
+            return rescue_chunks(self._path, self._form)
+        return IndexedChunkReader(self._path, self._form, self._index)
 
     def close(self) -> None:
         """Close the file."""
         self._bytes.close()
-        self._own.close()
+        self._indexed.close()
         if self._public is not None:
             self._public.close()
 
     def _times(self, ids: Collection[int], start: int, stop: int) -> I64:
         """Return the sorted log times of all chunks that overlap a time span."""
         if self._public is None:
-            return self._own.times(ids, start, stop)
+            return self._indexed.times(ids, start, stop)
         parts = [np.zeros(0, np.int64)]
         try:
             for chunk in self._chunks:
                 if chunk.start < stop and chunk.end >= start:
-                    there = [number for number in ids if number in chunk.index]
-                    parts += [self._form.read_times(self._bytes, chunk, number) for number in there]
+                    listed = [number for number in ids if number in chunk.index]
+                    parts += [self._form.read_times(self._bytes, chunk, number) for number in listed]
         except DamageError:
             self._index = None
             raise
         return np.sort(np.concatenate(parts))
 
 
-class IndexedChunks:
+class IndexedChunkReader:
     """Reader of messages by an index, in order of log time. It counts the losses of damaged chunks."""
 
-    def __init__(self, path: Path, form: Form, index: Index, notes: Sequence[str] = ()) -> None:
+    def __init__(self, path: Path, form: ChunkFormat, index: FileIndex, notes: Sequence[str] = ()) -> None:
         self._form, self._index, self._notes = form, index, notes
         self._bytes = Bytes(path)
         # By number of a damaged chunk: lost messages by connection, log times of the kept ones, the damage.
@@ -313,9 +317,10 @@ class IndexedChunks:
             names = [
                 topic if topic == former else f"{topic}, not {former}" for topic, former in topics.items()
             ]
+            listed = f"{'; '.join(names[:LISTED_TOPICS])}{' ...' if len(names) > LISTED_TOPICS else ''}"
             notes.append(
                 f"its index is damaged: it describes {len(corrected)} topic(s) in another way than the data, "
-                f"which is believed: {'; '.join(names[:NAMED])}{' ...' if len(names) > NAMED else ''}"
+                f"which is believed: {listed}"
             )
         if self._damaged:
             chunks = self._damaged.values()
@@ -328,7 +333,7 @@ class IndexedChunks:
         """Yield messages of the connections ``ids`` with start <= log time < stop, in order of log time."""
         wanted = {c.id: c for c in self.connections if c.id in ids}
         sources: list[Iterator[tuple[int, Connection | None, bytes | memoryview]]] = [
-            self._of_chunk(number, wanted, start, stop)
+            self._chunk_messages(number, wanted, start, stop)
             for number, chunk in enumerate(self._index.chunks)
             if chunk.start < stop and chunk.end >= start and chunk.counts.keys() & wanted.keys()
         ]
@@ -338,7 +343,7 @@ class IndexedChunks:
             if connection is not None:
                 yield connection, time, data
 
-    def times(self, ids: Collection[int], start: int = 0, stop: int = LAST) -> I64:
+    def times(self, ids: Collection[int], start: int = 0, stop: int = LAST_TIME) -> I64:
         """Return sorted log times of the connections ``ids``, at least those with start <= time < stop."""
         outside = self._index.outside
         parts = [outside[np.isin(outside[:, 1], list(ids)), 0]]
@@ -363,25 +368,27 @@ class IndexedChunks:
         except DamageError:
             return np.array([t for t, c, _ in self._content(number) if c == connection], np.int64)
 
-    def _of_chunk(
+    def _chunk_messages(
         self, number: int, wanted: Mapping[int, Connection], start: int, stop: int
     ) -> Iterator[tuple[int, Connection | None, bytes | memoryview]]:
         # The merge draws the first item of every source at once. This empty item needs no reading.
         yield self._index.chunks[number].start, None, b""
-        found = [(t, wanted[c], d) for t, c, d in self._content(number) if c in wanted and start <= t < stop]
-        found.sort(key=itemgetter(0))
-        yield from found
+        messages = [
+            (t, wanted[c], d) for t, c, d in self._content(number) if c in wanted and start <= t < stop
+        ]
+        messages.sort(key=itemgetter(0))
+        yield from messages
 
     def _content(self, number: int) -> list[ChunkMessage]:
         """Return the messages of a chunk. A damaged chunk gives only the readable ones."""
         chunk = self._index.chunks[number]
-        found, damage = self._form.look_into(self._bytes, chunk)
-        found = [item for item in found if chunk.start <= item[0] <= chunk.end]
-        if len(found) < sum(chunk.counts.values()) or (damage and not chunk.damage):
-            times = {id_: np.array([t for t, c, _ in found if c == id_], np.int64) for id_ in chunk.counts}
+        messages, damage = self._form.read_messages(self._bytes, chunk)
+        messages = [item for item in messages if chunk.start <= item[0] <= chunk.end]
+        if len(messages) < sum(chunk.counts.values()) or (damage and not chunk.damage):
+            times = {id_: np.array([t for t, c, _ in messages if c == id_], np.int64) for id_ in chunk.counts}
             lost = Counter({id_: count - len(times[id_]) for id_, count in chunk.counts.items()})
             self._damaged[number] = lost, times, damage or "whose content is not all there"
-        return found
+        return messages
 
     def _outside(
         self, wanted: Mapping[int, Connection], start: int, stop: int
@@ -395,13 +402,13 @@ class IndexedChunks:
                 yield t, wanted[number], data
 
 
-def rescue(path: Path, form: Form) -> IndexedChunks:
+def rescue_chunks(path: Path, form: ChunkFormat) -> IndexedChunkReader:
     """Scan a file from front to back. Return a reader of the messages found."""
-    found, file = Scan(), Bytes(path)
+    result, file = ScanResult(), Bytes(path)
     try:
         bar = progress.bar(total=file.size, unit="B", unit_scale=True, desc=f"rescue {path.name}", delay=1)
         with bar:
-            form.scan(file, found, lambda offset: bar.update(offset - bar.n))
+            form.scan(file, result, lambda offset: bar.update(offset - bar.n))
     finally:
         file.close()
-    return IndexedChunks(path, form, found.index, found.notes(form.repair))
+    return IndexedChunkReader(path, form, result.index, result.notes(form.repair))

@@ -10,23 +10,23 @@ from pathlib import Path
 from backports import zstd
 
 from bevviz.bags import mcap, ros1
-from bevviz.bags.chunks import Form, SoundChunks, rescue
+from bevviz.bags.chunks import ChunkFormat, SoundChunks, rescue_chunks
 from bevviz.bags.reader import PIECE, ZSTD, BagFile, Bytes, Reader, SoundReader, megabytes
 from bevviz.bags.rescue import mcap as mcap_rescue
 from bevviz.bags.rescue import sqlite_pages
 from bevviz.bags.rescue.sqlite import SqliteRescuer
 from bevviz.bags.sqlite import SoundSqlite
 from bevviz.datasets.dataset import CLOUDS, IMAGES
-from bevviz.datasets.unread_files import KINDS as UNREAD
+from bevviz.datasets.unread_files import ADVICE as UNREAD
 from bevviz.errors import UserError
 from bevviz.support import progress
 from bevviz.support.files import LFS_HINT, LFS_POINTER, Scratch
 
-FRAME = re.compile(re.escape(ZSTD))
+ZSTD_FRAME = re.compile(re.escape(ZSTD))
 
 
 @dataclass(frozen=True, slots=True)
-class Kind:
+class FileFormat:
     """One file format and its readers.
 
     Attributes:
@@ -44,42 +44,42 @@ class Kind:
     rescue: Callable[[Path], Reader]
 
 
-def _of_chunks(name: str, magic: bytes, suffix: str, form: Form) -> Kind:
-    return Kind(
+def _chunked_format(name: str, magic: bytes, suffix: str, form: ChunkFormat) -> FileFormat:
+    return FileFormat(
         name,
         magic,
         suffix,
         lambda path, public: SoundChunks(path, form, public),
-        lambda path: rescue(path, form),
+        lambda path: rescue_chunks(path, form),
     )
 
 
-SQLITE = Kind("sqlite3", sqlite_pages.MAGIC, ".db3", SoundSqlite, SqliteRescuer)
-KINDS = (
-    _of_chunks("MCAP", mcap.MAGIC, ".mcap", mcap_rescue.FORM),
-    _of_chunks("ROS 1 bag", ros1.MAGIC, ".bag", ros1.FORM),
+SQLITE = FileFormat("sqlite3", sqlite_pages.MAGIC, ".db3", SoundSqlite, SqliteRescuer)
+FORMATS = (
+    _chunked_format("MCAP", mcap.MAGIC, ".mcap", mcap_rescue.FORM),
+    _chunked_format("ROS 1 bag", ros1.MAGIC, ".bag", ros1.FORM),
     SQLITE,
 )
-HEAD = 16  # bytes read to recognise a format
-OTHERS = {
+HEAD_SIZE = 16  # bytes read to recognise a format
+OTHER_FORMATS = {
     b"RRF": "a Rerun recording: open it with 'rerun'",
     b"PK\x03\x04": "a zip archive: unpack it first",
     b"\x1f\x8b": "a gzip archive: unpack it first",
     b"BZh": "a bzip2 archive: unpack it first",
     b"\xfd7zXZ": "an xz archive: unpack it first",
     b"\xd4\xc3\xb2\xa1": "a packet capture, not a bag: record the driver's topics instead",
-    LFS_POINTER[:HEAD]: LFS_HINT,
+    LFS_POINTER[:HEAD_SIZE]: LFS_HINT,
     b"#ROSBAG V1": "a bag of ROS before 1.2: 'rosbag fix' converts it",
 }
 
 
-def open_file(path: Path, scratch: Scratch, tell: Callable[[str], object]) -> BagFile:
+def open_file(path: Path, scratch: Scratch, warn: Callable[[str], object]) -> BagFile:
     """Open a file of a recording by its first bytes. A compressed file is unpacked.
 
     Args:
         path: file.
         scratch: temporary folders for unpacked files.
-        tell: receives a warning if a file cannot be unpacked completely.
+        warn: receives a warning if a file cannot be unpacked completely.
 
     Raises:
         OSError: the file does not exist or cannot be read.
@@ -88,31 +88,33 @@ def open_file(path: Path, scratch: Scratch, tell: Callable[[str], object]) -> Ba
     if path.exists() and not path.is_file():  # Reading a pipe would block.
         raise UserError(f"{path}: no bag: it is no file")
     with path.open("rb") as file:
-        head = file.read(HEAD)
+        head = file.read(HEAD_SIZE)
     if head.startswith(ZSTD):
-        path = _unpack(path, scratch, tell)
+        path = _unpack(path, scratch, warn)
         with path.open("rb") as file:
-            head = file.read(HEAD)
-    if kind := next((kind for kind in KINDS if head.startswith(kind.magic)), None):
+            head = file.read(HEAD_SIZE)
+    if kind := next((kind for kind in FORMATS if head.startswith(kind.magic)), None):
         return _open_as(kind, path, scratch)
-    what = next((text for magic, text in OTHERS.items() if head.startswith(magic)), None)
+    problem = next((text for magic, text in OTHER_FORMATS.items() if head.startswith(magic)), None)
     # The first bytes may be damaged. All messages of a database may still lie in its log.
-    kind = next((kind for kind in KINDS if path.suffix == kind.suffix), None)
-    if not head and not (kind is SQLITE and sqlite_pages.log_of(path).exists()):
+    kind = next((kind for kind in FORMATS if path.suffix == kind.suffix), None)
+    if not head and not (kind is SQLITE and sqlite_pages.log_path(path).exists()):
         raise UserError(f"{path}: the file is empty")
-    if kind and not what:
+    if kind and not problem:
         opened = _open_as(kind, path, scratch)
         if any(c.msgcount for c in opened.connections):
             return opened
         opened.close()
-    if not what and path.suffix.lower() in (*CLOUDS, *IMAGES):
-        what = f"one cloud or image, no drive: give the folder that it is in ({path.parent})"
-    if not what and (hint := UNREAD.get(path.suffix.lower())):
-        what = f"{path.suffix.lower()} files are not read: {hint}"
-    raise UserError(f"{path}: {what or 'not a bag: neither MCAP, nor sqlite3, nor ROS 1 by its first bytes'}")
+    if not problem and path.suffix.lower() in (*CLOUDS, *IMAGES):
+        problem = f"one cloud or image, no drive: give the folder that it is in ({path.parent})"
+    if not problem and (hint := UNREAD.get(path.suffix.lower())):
+        problem = f"{path.suffix.lower()} files are not read: {hint}"
+    raise UserError(
+        f"{path}: {problem or 'not a bag: neither MCAP, nor sqlite3, nor ROS 1 by its first bytes'}"
+    )
 
 
-def _open_as(kind: Kind, path: Path, scratch: Scratch) -> BagFile:
+def _open_as(kind: FileFormat, path: Path, scratch: Scratch) -> BagFile:
     public = path
     if path.suffix != kind.suffix or set("?#%") & set(str(path)):  # These characters have a meaning in a URI.
         public = scratch.new() / f"bag{kind.suffix}"
@@ -120,13 +122,13 @@ def _open_as(kind: Kind, path: Path, scratch: Scratch) -> BagFile:
     return BagFile(path, kind.name, lambda: kind.sound(path, public), lambda: kind.rescue(path))
 
 
-def _unpack(path: Path, scratch: Scratch, tell: Callable[[str], object]) -> Path:
+def _unpack(path: Path, scratch: Scratch, warn: Callable[[str], object]) -> Path:
     target = scratch.new() / path.stem
     damaged, whole = unpack_file(path, target)
     if damaged or not whole:
-        what = f"{damaged} damaged place(s) in it" if damaged else "its end is missing"
-        tell(
-            f"{path.name}: the compressed file is damaged ({what}): "
+        damage = f"{damaged} damaged place(s) in it" if damaged else "its end is missing"
+        warn(
+            f"{path.name}: the compressed file is damaged ({damage}): "
             f"{megabytes(target.stat().st_size)} could be unpacked"
         )
     return target
@@ -149,14 +151,14 @@ def unpack_file(path: Path, target: Path) -> tuple[int, bool]:
                 try:
                     out.write(stream.decompress(piece))
                     offset += len(piece) - len(stream.unused_data)
-                    found = offset if stream.eof else None
+                    next_frame = offset if stream.eof else None
                 except zstd.ZstdError:
                     damaged += 1
-                    found = next(source.search(FRAME, offset + 1), source.size)
+                    next_frame = next(source.search(ZSTD_FRAME, offset + 1), source.size)
                 bar.update(offset - bar.n)
-                if found is not None and found < source.size:
-                    offset, stream = found, zstd.ZstdDecompressor()
-                elif found is not None:
+                if next_frame is not None and next_frame < source.size:
+                    offset, stream = next_frame, zstd.ZstdDecompressor()
+                elif next_frame is not None:
                     break
     finally:
         source.close()

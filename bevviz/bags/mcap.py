@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 from rosbags.interfaces import Connection, ConnectionExtRosbag2, MessageDefinition, MessageDefinitionFormat
 
-from bevviz.bags.chunks import Chunk, Index
-from bevviz.bags.reader import LAST, Bytes, DamageError, UnindexedError, unpack
+from bevviz.bags.chunks import Chunk, FileIndex
+from bevviz.bags.reader import LAST_TIME, Bytes, DamageError, UnindexedError, unpack
 from bevviz.model.frame import I64
 from bevviz.support.loggers import logger
 
@@ -24,7 +24,7 @@ _log = logger(__name__)
 MAGIC = b"\x89MCAP0\r\n"
 HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX, CHUNK_INDEX, ATTACHMENT = range(1, 10)
 ATTACHMENT_INDEX, STATISTICS, DATA_END = 0x0A, 0x0B, 0x0F
-MOST_ATTACHED = 1 << 26  # bytes; a larger attachment is not read
+MAX_ATTACHMENT = 1 << 26  # bytes; a larger attachment is not read
 FORMATS = {
     "ros2msg": MessageDefinitionFormat.MSG,
     "ros1msg": MessageDefinitionFormat.MSG,
@@ -38,7 +38,7 @@ _FOOTER = struct.Struct("<BQQQI8s")  # opcode, length, start of the summary and 
 _STATISTICS = struct.Struct("<QHIIIIQQ")  # messages, schemas, channels, ..., chunks, first and last log time
 _COUNT = struct.Struct("<HQ")
 
-NOTHING = MessageDefinition(MessageDefinitionFormat.NONE, "")
+NO_DEFINITION = MessageDefinition(MessageDefinitionFormat.NONE, "")
 
 
 class Channels:
@@ -58,15 +58,17 @@ class Channels:
         """Add a schema or channel record. The first of two with the same number counts."""
         if opcode == SCHEMA:
             (number,) = struct.unpack_from("<H", record)
-            msgtype, encoding, text = strings(record, 2, 3)
+            msgtype, encoding, text = read_strings(record, 2, 3)
             kind = FORMATS.get(encoding.decode(errors="replace"), MessageDefinitionFormat.NONE)
-            definition = MessageDefinition(kind, text.decode(errors="replace")) if kind.value else NOTHING
+            definition = (
+                MessageDefinition(kind, text.decode(errors="replace")) if kind.value else NO_DEFINITION
+            )
             if encoding in (b"protobuf", b"jsonschema"):  # a character for each byte
                 definition = MessageDefinition(MessageDefinitionFormat.NONE, text.decode("latin-1"))
             self.schemas.setdefault(number, (msgtype.decode(errors="replace"), definition))
         elif opcode == CHANNEL:
             number, schema = struct.unpack_from("<HH", record)
-            topic, form = (text.decode(errors="replace") for text in strings(record, 4, 2))
+            topic, form = (text.decode(errors="replace") for text in read_strings(record, 4, 2))
             self._channels.setdefault(number, (schema, topic, form))
 
     def correct(self, others: Channels) -> dict[int, str]:
@@ -87,17 +89,17 @@ class Channels:
 
     def connections(self, counts: Mapping[int, int]) -> list[Connection]:
         """Return the connections with their message counts."""
-        found = []
+        connections = []
         for number, (schema, topic, encoding) in self._channels.items():
-            msgtype, definition = self.schemas.get(schema, ("", NOTHING))
+            msgtype, definition = self.schemas.get(schema, ("", NO_DEFINITION))
             extra = ConnectionExtRosbag2(encoding, [])
-            found.append(
+            connections.append(
                 Connection(number, topic, msgtype, definition, "", counts.get(number, 0), extra, None)
             )
-        return found
+        return connections
 
 
-def read_index(path: Path) -> Index:
+def read_index(path: Path) -> FileIndex:
     """Read the index at the end of a file. It must agree with the statistics.
 
     Raises:
@@ -143,31 +145,31 @@ def read_attachments(path: Path) -> dict[str, bytes]:
 
     ``McapWriter.attach`` writes them there. A damaged attachment is left out.
     """
-    file, found = Bytes(path), dict[str, bytes]()
+    file, attachments = Bytes(path), dict[str, bytes]()
     try:
         if file.read(0, len(MAGIC)) != MAGIC:
-            return found
+            return attachments
         offset = len(MAGIC)
         while len(head := file.read(offset, RECORD.size)) == RECORD.size:
             opcode, length = RECORD.unpack(head)
-            if opcode == ATTACHMENT and length <= MOST_ATTACHED:
+            if opcode == ATTACHMENT and length <= MAX_ATTACHMENT:
                 record = file.read(offset + RECORD.size, length)
                 with suppress(struct.error, UnicodeDecodeError):
-                    name, media = strings(record, 16, 2)
+                    name, media = read_strings(record, 16, 2)
                     at = 16 + 4 + len(name) + 4 + len(media)
                     (size,) = struct.unpack_from("<Q", record, at)
                     (crc,) = struct.unpack_from("<I", record, at + 8 + size)
                     if crc in (0, crc32(record[: at + 8 + size])):
-                        found[name.decode()] = record[at + 8 : at + 8 + size]
+                        attachments[name.decode()] = record[at + 8 : at + 8 + size]
             elif opcode != HEADER:
                 break
             offset += RECORD.size + length
-        return found
+        return attachments
     finally:
         file.close()
 
 
-def _correct_channels(file: Bytes, index: Index, channels: Channels) -> None:
+def _correct_channels(file: Bytes, index: FileIndex, channels: Channels) -> None:
     """Correct channel descriptions by the data if the summary has no checksum.
 
     Reading all data takes too long. A writer describes a channel at its first message at the latest, so the
@@ -210,11 +212,11 @@ def unpack_chunk(file: Bytes, chunk: Chunk) -> tuple[bytes, str, bool]:
     return data, damage, bool(crc) and not (cut or damage)
 
 
-def _parse_summary(summary: bytes, end: int, channels: Channels) -> Index:
+def _parse_summary(summary: bytes, end: int, channels: Channels) -> FileIndex:
     """Parse the index in a summary section that begins at ``end``. Fill ``channels`` from its records."""
     chunks = []
     statistics: tuple[Any, ...] | None = None
-    counted: Mapping[int, int] = {}
+    stated_counts: Mapping[int, int] = {}
     offset = 0
     while offset < len(summary):
         opcode, length = RECORD.unpack_from(summary, offset)
@@ -230,17 +232,17 @@ def _parse_summary(summary: bytes, end: int, channels: Channels) -> Index:
         elif opcode == STATISTICS:
             statistics = _STATISTICS.unpack_from(record)
             (size,) = struct.unpack_from("<I", record, _STATISTICS.size)
-            counted = dict(_COUNT.iter_unpack(record[_STATISTICS.size + 4 :][:size]))
+            stated_counts = dict(_COUNT.iter_unpack(record[_STATISTICS.size + 4 :][:size]))
     if statistics is None:
         raise UnindexedError("it has no statistics that its index could be held against")
     counts: Counter[int] = Counter()
     for chunk in chunks:
         counts.update(chunk.counts)
     total, chunk_count, first, last = statistics[0], statistics[5], statistics[6], statistics[7]
-    index = Index(chunks, channels.connections(counts))
+    index = FileIndex(chunks, channels.connections(counts))
     if total and not chunks:
         raise UnindexedError("it has no index of chunks")
-    if counts.total() != total or (chunk_count, counts) != (len(chunks), Counter(counted)):
+    if counts.total() != total or (chunk_count, counts) != (len(chunks), Counter(stated_counts)):
         raise DamageError(
             f"its index, of {len(chunks)} chunks with {counts.total()} messages, disagrees with its "
             f"statistics, of {chunk_count} with {total}"
@@ -260,7 +262,7 @@ def _parse_chunk_index(record: bytes, end: int) -> Chunk:
     packed, unpacked = struct.unpack_from("<QQ", record, at + 12 + name_size)
     listed = dict(_COUNT.iter_unpack(record[36:at]))
     stop = offset + length + index_length  # end of the message indexes, which follow the chunk
-    if not (offset < offset + length <= stop <= end) or max(start, last) >= LAST or packed > length:
+    if not (offset < offset + length <= stop <= end) or max(start, last) >= LAST_TIME or packed > length:
         raise DamageError("its index leads out of the file, or out of time")
     if listed and (min(listed.values()) < offset + length or max(listed.values()) >= stop):
         raise DamageError("its index leads out of the file")
@@ -292,18 +294,18 @@ def read_times(file: Bytes, chunk: Chunk, channel: int) -> I64:
     return times
 
 
-def strings(record: bytes, offset: int, count: int) -> list[bytes]:
+def read_strings(record: bytes, offset: int, count: int) -> list[bytes]:
     """Parse ``count`` strings, each after its length.
 
     Raises:
         struct.error: the record ends before them.
     """
-    found = []
+    values = []
     for _ in range(count):
         (size,) = struct.unpack_from("<I", record, offset)
         offset += 4
         if offset + size > len(record):
             raise struct.error("a string ends behind its record")
-        found.append(bytes(record[offset : offset + size]))
+        values.append(bytes(record[offset : offset + size]))
         offset += size
-    return found
+    return values

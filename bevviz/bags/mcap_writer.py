@@ -82,7 +82,7 @@ class McapWriter:
         replace: bool = True,
     ) -> None:
         self._path = path.resolve()
-        self._replaces = replace
+        self._replace = replace
         self._define = define
         self._profile = "ros1" if ros1 else "ros2"
         self._compression = "zstd" if compress else ""
@@ -102,10 +102,10 @@ class McapWriter:
 
     def __enter__(self) -> Self:
         unfinished = claim(self._path, "bag")
-        self._part, self._file = unfinished.path, unfinished.handle
-        cleanup.remember(self, partial(self._part.unlink, missing_ok=True))
+        self._partial_path, self._file = unfinished.path, unfinished.handle
+        cleanup.remember(self, partial(self._partial_path.unlink, missing_ok=True))
         try:
-            self._put(MAGIC + _record(HEADER, _text(self._profile) + _text(f"bevviz {__version__}")))
+            self._write_bytes(MAGIC + _record(HEADER, _text(self._profile) + _text(f"bevviz {__version__}")))
         except OSError as error:
             cleanup.forget(self)
             unfinished.discard()
@@ -115,22 +115,22 @@ class McapWriter:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        keep = kind is None and not self._replaces
+        keep = kind is None and not self._replace
         try:
             if kind is None:
                 self._finish()
-                if self._replaces:
-                    self._part.replace(self._path)
+                if self._replace:
+                    self._partial_path.replace(self._path)
                 else:
-                    rename_new(self._part, self._path)
+                    rename_new(self._partial_path, self._path)
         except FileExistsError:
-            raise UserError(f"{self._path}: is already there; the bag is {self._part.name}") from None
+            raise UserError(f"{self._path}: is already there; the bag is {self._partial_path.name}") from None
         except OSError as failure:
-            where = f"; what was written is in {self._part.name}" if keep else ""
+            where = f"; what was written is in {self._partial_path.name}" if keep else ""
             raise UserError(f"{self._path}: cannot write the bag: {failure.strerror}{where}") from None
         finally:
             if not keep:
-                self._part.unlink(missing_ok=True)
+                self._partial_path.unlink(missing_ok=True)
             cleanup.forget(self)
             os.close(self._file)  # releases the lock as well
 
@@ -147,14 +147,14 @@ class McapWriter:
         """
         if self._end and (self._chunk.tell() or self._chunk_count):
             raise ValueError("what is attached comes before the messages")
-        start, named = self._end, _text(name) + _text("application/octet-stream")
-        content = bytes(16) + named + struct.pack("<Q", len(data)) + data
+        start, names = self._end, _text(name) + _text("application/octet-stream")
+        content = bytes(16) + names + struct.pack("<Q", len(data)) + data
         record = _record(ATTACHMENT, content + struct.pack("<I", crc32(content)))
         try:
-            self._put(record)
+            self._write_bytes(record)
         except OSError as error:
             raise UserError(f"{self._path}: cannot write the bag: {error.strerror}") from None
-        about = struct.pack("<QQQQQ", start, len(record), 0, 0, len(data)) + named
+        about = struct.pack("<QQQQQ", start, len(record), 0, 0, len(data)) + names
         self._attachments.append(_record(ATTACHMENT_INDEX, about))
 
     def write(
@@ -190,7 +190,7 @@ class McapWriter:
             except OSError as error:
                 raise UserError(f"{self._path}: cannot write the bag: {error.strerror}") from None
 
-    def _put(self, data: bytes) -> None:
+    def _write_bytes(self, data: bytes) -> None:
         write_all(self._file, data)
         self._end += len(data)
 
@@ -243,25 +243,27 @@ class McapWriter:
         )
         head += self._compression.encode() + struct.pack("<Q", len(packed))
         try:
-            self._put(RECORD.pack(CHUNK, len(head) + len(packed)) + head)
-            self._put(packed)
-            self._put(_listed(index)[0])
+            self._write_bytes(RECORD.pack(CHUNK, len(head) + len(packed)) + head)
+            self._write_bytes(packed)
+            self._write_bytes(_encode_index(index)[0])
         except OSError:  # Whole chunks stay, and their summary still has room.
             os.ftruncate(self._file, start)
             os.lseek(self._file, start, os.SEEK_SET)
             self._end = start
             self._counts -= Counter({channel: len(entries) for channel, entries in index.items()})
             raise
-        self._note_chunk(start, RECORD.size + len(head) + len(packed), index, len(packed), len(data))
+        self._add_to_summary(start, RECORD.size + len(head) + len(packed), index, len(packed), len(data))
 
-    def _note_chunk(
+    def _add_to_summary(
         self, start: int, length: int, index: Mapping[int, Sequence[tuple[int, int]]], packed: int, size: int
     ) -> None:
         """Add a written chunk to the summary."""
         times = [time for entries in index.values() for time, _ in entries]
         first, last = min(times, default=0), max(times, default=0)
-        listed, places = _listed(index)
-        offsets = b"".join(struct.pack("<HQ", channel, start + length + at) for channel, at in places.items())
+        listed, record_offsets = _encode_index(index)
+        offsets = b"".join(
+            struct.pack("<HQ", channel, start + length + at) for channel, at in record_offsets.items()
+        )
         about = struct.pack("<QQQQ", first, last, start, length) + _bytes(offsets)
         about += struct.pack("<Q", len(listed)) + _text(self._compression)
         self._chunks.write(_record(CHUNK_INDEX, about + struct.pack("<QQ", packed, size)))
@@ -298,21 +300,21 @@ class McapWriter:
             content = at + RECORD.size + CHUNK_HEAD.size
             if content > size:
                 break
-            *_, unpacked, _, named = CHUNK_HEAD.unpack_from(data, at + RECORD.size)
-            self._compression = data[content : content + named].decode()
-            content += named + 8
+            *_, unpacked, _, name_size = CHUNK_HEAD.unpack_from(data, at + RECORD.size)
+            self._compression = data[content : content + name_size].decode()
+            content += name_size + 8
             if end > size:  # Only a part of the chunk was written.
                 if not self._compression:
-                    whole = self._take(data[content:], declared, self._index)
+                    whole = self._index_records(data[content:], declared, self._index)
                     self._chunk.write(data[content : content + whole])
                 break
             packed = data[content:end]
             index: dict[int, list[tuple[int, int]]] = {}
             chunk = zstd.decompress(packed) if self._compression else packed
-            if self._take(chunk, declared, index) != len(chunk):
+            if self._index_records(chunk, declared, index) != len(chunk):
                 raise ValueError(f"the chunk at byte {at} is damaged")
-            self._note_chunk(at, end - at, index, len(packed), unpacked)
-            listed, _ = _listed(index)
+            self._add_to_summary(at, end - at, index, len(packed), unpacked)
+            listed, _ = _encode_index(index)
             behind = data[end : end + len(listed)]
             if behind != listed:
                 missing = listed
@@ -321,10 +323,10 @@ class McapWriter:
             at = end if missing else end + len(listed)
         self._file, self._end = handle, at
         os.lseek(handle, at, os.SEEK_SET)
-        self._put(missing)
+        self._write_bytes(missing)
         return True
 
-    def _take(
+    def _index_records(
         self, data: bytes, declared: set[tuple[int, int]], index: dict[int, list[tuple[int, int]]]
     ) -> int:
         """Count the whole records of a chunk, and list its messages in ``index``.
@@ -359,7 +361,7 @@ class McapWriter:
     def _finish(self) -> None:
         if self._chunk.tell():
             self._close_chunk()
-        self._put(_record(DATA_END, struct.pack("<I", 0)))
+        self._write_bytes(_record(DATA_END, struct.pack("<I", 0)))
         summary = self._end
         counts = b"".join(struct.pack("<HQ", *pair) for pair in sorted(self._counts.items()))
         about = struct.pack(
@@ -372,9 +374,9 @@ class McapWriter:
             self._chunk_count,
             *(self._span if self._counts else (0, 0)),
         )
-        self._put(self._declared.getvalue() + _record(STATISTICS, about + _bytes(counts)))
-        self._put(self._chunks.getvalue() + b"".join(self._attachments))
-        self._put(_record(FOOTER, struct.pack("<QQI", summary, 0, 0)) + MAGIC)
+        self._write_bytes(self._declared.getvalue() + _record(STATISTICS, about + _bytes(counts)))
+        self._write_bytes(self._chunks.getvalue() + b"".join(self._attachments))
+        self._write_bytes(_record(FOOTER, struct.pack("<QQI", summary, 0, 0)) + MAGIC)
 
 
 def complete(path: Path) -> int:
@@ -411,14 +413,14 @@ def _undefined(connection: Connection) -> MessageDefinition:
     raise ValueError(f"{connection.topic}: a bag that is completed gets no further messages")
 
 
-def _listed(index: Mapping[int, Sequence[tuple[int, int]]]) -> tuple[bytes, dict[int, int]]:
+def _encode_index(index: Mapping[int, Sequence[tuple[int, int]]]) -> tuple[bytes, dict[int, int]]:
     """Encode the index of the messages of a chunk. Return it with the offset of each channel's record."""
-    listed, places = b"", {}
+    listed, offsets = b"", {}
     for channel, entries in index.items():
-        places[channel] = len(listed)
+        offsets[channel] = len(listed)
         pairs = b"".join(struct.pack("<QQ", *entry) for entry in entries)
         listed += _record(MESSAGE_INDEX, struct.pack("<H", channel) + _bytes(pairs))
-    return listed, places
+    return listed, offsets
 
 
 def _profile(qos: Qos) -> dict[str, object]:

@@ -30,7 +30,7 @@ Message = tuple[Connection, int, bytes | memoryview]
 """Where it was recorded, log time in nanoseconds, and the serialised message."""
 
 ZSTD = b"\x28\xb5\x2f\xfd"  # first bytes of a zstd file or message
-LAST = 2**63 - 1  # A later log time is damage: it fits no int64 and no date.
+LAST_TIME = 2**63 - 1  # A later log time is damage: it fits no int64 and no date.
 LEAST, LONGEST = 1 << 26, 1 << 30  # limits of unpacked bytes, independent of the stated size
 PIECE = 1 << 12  # compressed bytes unpacked at once where the following bytes may be damaged
 BLOCK = 1 << 14  # bytes of a small read, kept for the next read
@@ -138,7 +138,7 @@ class BagFile:
         try:
             self._reader = self._sound = sound()
         except DamageError as error:
-            self._tell(error)
+            self._note_damage(error)
             self._reader = rescue()
 
     @property
@@ -167,8 +167,8 @@ class BagFile:
         """Yield messages of ``connections`` with start <= log time < stop, in order of log time."""
         known = {c.id: c for c in connections}
         low = max(0, start or 0)
-        high = LAST if stop is None else min(stop, LAST)
-        given, total, latest = 0, 0, low
+        high = LAST_TIME if stop is None else min(stop, LAST_TIME)
+        yielded, time_sum, latest = 0, 0, low
         at_latest: list[tuple[int, bytes | memoryview]] = []  # yielded messages of the latest log time
         if self._sound is None:
             for connection, time, data in self._reader.messages(known, low, high):
@@ -181,21 +181,21 @@ class BagFile:
                     latest = resume = time
                     at_latest.clear()
                 at_latest.append((connection.id, data))
-                given += 1
-                total += time
+                yielded += 1
+                time_sum += time
                 yield known[connection.id], time, data
-            latest, resume = LAST, low  # All messages that the index knows are yielded.
-            self._check(known, low, high, (given, total))
+            latest, resume = LAST_TIME, low  # All messages that the index knows are yielded.
+            self._check(known, low, high, (yielded, time_sum))
         except DamageError as error:
-            self._change(error)
+            self._switch_to_rescuer(error)
             for connection, time, data in self._reader.messages(known, resume, high):
                 if time == latest and (connection.id, data) in at_latest:
                     at_latest.remove((connection.id, data))
                 elif time >= latest:
-                    given += 1
+                    yielded += 1
                     yield known[connection.id], time, data
             times = self._reader.times(known)
-            if (late := int(((times >= low) & (times < high)).sum()) - given) > 0:
+            if (late := int(((times >= low) & (times < high)).sum()) - yielded) > 0:
                 self._notes.append(f"{late} message(s) were found too late to be given in order of time")
 
     def times(self, connections: Collection[Connection]) -> I64:
@@ -205,14 +205,14 @@ class BagFile:
             try:
                 return self._sound.times(ids)
             except DamageError as error:
-                self._change(error)
+                self._switch_to_rescuer(error)
         return self._reader.times(ids)
 
     def close(self) -> None:
         """Close the current reader."""
         self._reader.close()
 
-    def _check(self, ids: Collection[int], start: int, stop: int, given: tuple[int, int]) -> None:
+    def _check(self, ids: Collection[int], start: int, stop: int, yielded: tuple[int, int]) -> None:
         """Compare the count and the time sum of the yielded messages with the index.
 
         Raises:
@@ -220,20 +220,20 @@ class BagFile:
         """
         assert self._sound is not None
         listed = self._sound.sums(ids, start, stop)
-        if listed[0] != given[0]:
-            raise DamageError(f"its index lists {listed[0]} messages where {given[0]} are")
-        if listed != given:
+        if listed[0] != yielded[0]:
+            raise DamageError(f"its index lists {listed[0]} messages where {yielded[0]} are")
+        if listed != yielded:
             raise DamageError("its index has other times than its messages")
 
-    def _change(self, error: DamageError) -> None:
+    def _switch_to_rescuer(self, error: DamageError) -> None:
         """Replace the sound reader by its rescuer."""
-        self._tell(error)
+        self._note_damage(error)
         sound, self._sound = self._sound, None
         assert sound is not None
         self._reader = sound.rescuer()
         sound.close()
 
-    def _tell(self, error: DamageError) -> None:
+    def _note_damage(self, error: DamageError) -> None:
         _log.info("%s: %s: rescuing what is there", self.path, error, exc_info=error)
         how = (
             "it is read from end to end" if isinstance(error, UnindexedError) else "what is there was rescued"
@@ -286,7 +286,7 @@ class Bytes:
         return parts[0] if len(parts) == 1 else b"".join(parts)
 
 
-class Content(Bytes):
+class MemoryBytes(Bytes):
     """Bytes in memory with the interface of ``Bytes``, for the unpacked content of a chunk."""
 
     def __init__(self, data: bytes) -> None:
@@ -320,7 +320,7 @@ def unpack(
     Returns:
         Content, and a description of its damage. The description is empty for a sound chunk.
     """
-    most, whole = min(max(size, LEAST), LONGEST), True
+    limit, whole = min(max(size, LEAST), LONGEST), True
     if compression in ("", "none"):
         data = packed
     elif compression not in _STREAMS:
@@ -328,10 +328,10 @@ def unpack(
     else:
         stream = _STREAMS[compression]()
         try:
-            data = _drawn(stream, packed, most)
+            data = _decompress(stream, packed, limit)
             whole = stream.eof
-        except _STUMBLES as error:
-            data = _before_damage(_STREAMS[compression], packed, most)
+        except _UNPACK_ERRORS as error:
+            data = _before_damage(_STREAMS[compression], packed, limit)
             return data, f"a chunk cannot be unpacked ({first_line(error)})"
     if cut:
         return data, ""
@@ -347,20 +347,26 @@ _STREAMS: dict[str, Callable[[], Any]] = {
     "lz4": LZ4FrameDecompressor,
     "bz2": BZ2Decompressor,
 }
-_STUMBLES = (OSError, ValueError, RuntimeError, EOFError, zstd.ZstdError)  # exceptions of these on damage
+_UNPACK_ERRORS = (
+    OSError,
+    ValueError,
+    RuntimeError,
+    EOFError,
+    zstd.ZstdError,
+)  # exceptions of these on damage
 
 
-def _drawn(stream: Any, packed: bytes, most: int) -> bytes:
+def _decompress(stream: Any, packed: bytes, limit: int) -> bytes:
     """Decompress bytes into at most ``most`` bytes."""
-    parts = [stream.decompress(packed, most)]
-    most -= len(parts[0])
-    while most > 0 and not stream.eof and not stream.needs_input:
-        parts.append(stream.decompress(b"", most))
-        most -= len(parts[-1])
+    parts = [stream.decompress(packed, limit)]
+    limit -= len(parts[0])
+    while limit > 0 and not stream.eof and not stream.needs_input:
+        parts.append(stream.decompress(b"", limit))
+        limit -= len(parts[-1])
     return parts[0] if len(parts) == 1 else b"".join(parts)
 
 
-def _before_damage(new_stream: Callable[[], Any], packed: bytes, most: int) -> bytes:
+def _before_damage(new_stream: Callable[[], Any], packed: bytes, limit: int) -> bytes:
     """Return the content of all compressed blocks before the damage.
 
     A decompressor that fails drops its output for the current piece. So the first pass finds this piece,
@@ -370,11 +376,11 @@ def _before_damage(new_stream: Callable[[], Any], packed: bytes, most: int) -> b
     for step in (PIECE, 1):
         stream = new_stream()
         try:
-            data = bytearray(_drawn(stream, packed[:sound], most)) if sound else bytearray()
-            while sound < len(packed) and len(data) < most and not stream.eof:
-                data += _drawn(stream, packed[sound : sound + step], most - len(data))
+            data = bytearray(_decompress(stream, packed[:sound], limit)) if sound else bytearray()
+            while sound < len(packed) and len(data) < limit and not stream.eof:
+                data += _decompress(stream, packed[sound : sound + step], limit - len(data))
                 sound += step
-        except _STUMBLES:
+        except _UNPACK_ERRORS:
             continue
         break
     return bytes(data)

@@ -14,17 +14,17 @@ import numpy as np
 from rosbags.interfaces import Connection, ConnectionExtRosbag1, MessageDefinition, MessageDefinitionFormat
 from rosbags.rosbag1 import Reader
 
-from bevviz.bags.chunks import Chunk, ChunkMessage, Form, Index, Scan
-from bevviz.bags.reader import LAST, Bytes, Content, DamageError, normalized, unpack
+from bevviz.bags.chunks import Chunk, ChunkFormat, ChunkMessage, FileIndex, ScanResult
+from bevviz.bags.reader import LAST_TIME, Bytes, DamageError, MemoryBytes, normalized, unpack
 from bevviz.model.frame import I64
 
 MAGIC = b"#ROSBAG V2.0\n"
 OPCODE = re.compile(rb"(?=\x04\0\0\0op=)")  # Every header contains an opcode.
 LONGEST_HEADER = 1 << 16  # bytes; the data of a connection has the form of a header and may be longer
-SEARCHED = 160  # bytes of a header before its opcode that are searched
+SEARCH_BACK = 160  # bytes of a header before its opcode that are searched
 
 # The fields of a record determine its kind. A damaged opcode leaves no trace; damaged fields do.
-KINDS: Mapping[str, Mapping[str, int | None]] = {  # field sizes in bytes; None: any
+RECORD_FIELDS: Mapping[str, Mapping[str, int | None]] = {  # field sizes in bytes; None: any
     "chunk": {"compression": None, "size": 4},
     "message": {"conn": 4, "time": 8},
     "connection": {"conn": 4, "topic": None},
@@ -72,7 +72,7 @@ def read_record(source: Bytes, offset: int) -> Record | None:
     length = source.read(offset + 4 + size, 4)
     if fields is None or len(length) < 4 or len(fields.get("op", b"")) != 1:
         return None
-    kind = next((name for name, layout in KINDS.items() if _fits(fields, layout)), "")
+    kind = next((name for name, layout in RECORD_FIELDS.items() if _fits(fields, layout)), "")
     body = offset + size + 8
     return Record(kind, fields, offset, body, body + int.from_bytes(length, "little"))
 
@@ -108,7 +108,7 @@ def _is_sane(record: Record, size: int) -> bool:
     if record.kind == "chunk info":
         return length == 8 * record.number("count") and record.end <= size
     if record.kind == "message":
-        return record.end <= size and record.time("time") < LAST
+        return record.end <= size and record.time("time") < LAST_TIME
     if record.kind == "chunk" and record.fields["compression"] == b"none":
         return length == record.number("size")
     return bool(record.kind) and (record.end <= size or record.kind == "chunk")
@@ -125,12 +125,13 @@ class Connections:
 
     def note(self, record: Record, data: bytes) -> None:
         """Add a connection record. The first of two with the same number counts."""
-        about = read_fields(data, len(data))
+        fields = read_fields(data, len(data))
         topic = record.fields["topic"].decode(errors="replace")
-        if about is None or not topic or record.number("conn") in self:
+        if fields is None or not topic or record.number("conn") in self:
             return
         kind, digest, text = (
-            about.get(name, b"").decode(errors="replace") for name in ("type", "md5sum", "message_definition")
+            fields.get(name, b"").decode(errors="replace")
+            for name in ("type", "md5sum", "message_definition")
         )
         absolute, parts = topic[0] == "/", [part for part in topic.split("/") if part]
         self._known[record.number("conn")] = Connection(
@@ -152,7 +153,7 @@ class Connections:
 # --- the index of a sound bag ------------------------------------------------------------------
 
 
-def read_index(path: Path) -> Index:
+def read_index(path: Path) -> FileIndex:
     """Read the index of a bag. Its parts must agree with each other.
 
     Raises:
@@ -179,7 +180,7 @@ def read_index(path: Path) -> Index:
         file.close()
 
 
-def _read_index(file: Bytes, offset: int, connection_count: int, chunk_count: int) -> Index:
+def _read_index(file: Bytes, offset: int, connection_count: int, chunk_count: int) -> FileIndex:
     connections, chunks, end = Connections(), [], offset
     described = 0
     while offset < file.size:
@@ -204,7 +205,7 @@ def _read_index(file: Bytes, offset: int, connection_count: int, chunk_count: in
         counts.update(chunk.counts)
     if not all(number in connections for number in counts):
         raise DamageError("the bag's index has messages of connections that it does not describe")
-    return Index(chunks, connections.counted(counts))
+    return FileIndex(chunks, connections.counted(counts))
 
 
 def _read_chunk(file: Bytes, info: Record, end: int) -> Chunk:
@@ -227,7 +228,7 @@ def _read_chunk(file: Bytes, info: Record, end: int) -> Chunk:
         at = entries.end
     if not counts.keys() <= index.keys():
         raise DamageError("the index of a chunk disagrees with that of the bag")
-    start, last = (info.time("start_time"), info.time("end_time")) if counts else (LAST, -1)
+    start, last = (info.time("start_time"), info.time("end_time")) if counts else (LAST_TIME, -1)
     length = record.end - record.body
     return Chunk(start, last, record.body, length, record.number("size"), compression, counts, index=index)
 
@@ -252,7 +253,7 @@ def read_times(file: Bytes, chunk: Chunk, number: int) -> I64:
 # --- a damaged bag -----------------------------------------------------------------------------
 
 
-class Walker:
+class RecordWalker:
     """Iterator over the records of a bag or of a chunk. After a broken record it finds the next sound one.
 
     Only a chunk may be cut: it may end beyond the bytes.
@@ -300,7 +301,9 @@ class Walker:
         for at in self._source.search(OPCODE, start):
             if at >= stop:
                 return None
-            before = self._source.read(max(start, at - SEARCHED), SEARCHED)[: at - max(start, at - SEARCHED)]
+            before = self._source.read(max(start, at - SEARCH_BACK), SEARCH_BACK)[
+                : at - max(start, at - SEARCH_BACK)
+            ]
             for back in range(4, len(before) + 1):
                 size = int.from_bytes(before[len(before) - back :][:4], "little")
                 if not back + 3 < size <= LONGEST_HEADER:
@@ -313,69 +316,69 @@ class Walker:
         return None
 
 
-def scan(file: Bytes, found: Scan, tell: Callable[[int], object]) -> None:
+def scan(file: Bytes, result: ScanResult, report: Callable[[int], object]) -> None:
     """Scan a bag from front to back, with the content of every chunk."""
-    connections, walker = Connections(), Walker(file)
+    connections, walker = Connections(), RecordWalker(file)
     outside = array("q")  # messages of an uncompressed chunk whose head is damaged
     for record in walker(len(MAGIC)):
-        tell(record.end)
+        report(record.end)
         if record.kind == "connection":
             connections.note(record, file.read(record.body, record.end - record.body))
         elif record.kind == "chunk":
             compression = record.fields["compression"].decode(errors="replace")
             packed = min(record.end, file.size) - record.body
-            chunk = Chunk(LAST, -1, record.body, packed, record.number("size"), compression, {}, 0, {})
+            chunk = Chunk(LAST_TIME, -1, record.body, packed, record.number("size"), compression, {}, 0, {})
             chunk.cut = record.end > file.size
-            found.begin(chunk)
-            _describe(file, chunk, connections, found)
+            result.begin(chunk)
+            _describe(file, chunk, connections, result)
             if chunk.cut:
-                found.cut, found.rescued = file.size - record.body, sum(chunk.counts.values())
+                result.cut, result.rescued = file.size - record.body, sum(chunk.counts.values())
         elif record.kind == "index":
-            found.listed[record.number("conn")] += record.number("count")
+            result.listed[record.number("conn")] += record.number("count")
         elif record.kind == "message":
             size = record.end - record.body
             outside.extend((record.time("time"), record.number("conn"), record.body, size))
-    found.end()
-    found.broken += walker.broken
-    found.passed += walker.passed
-    found.index.connections = connections.counted(found.finish(connections, outside))
+    result.end()
+    result.broken += walker.broken
+    result.passed += walker.passed
+    result.index.connections = connections.counted(result.finish(connections, outside))
 
 
-def _describe(file: Bytes, chunk: Chunk, connections: Connections, found: Scan) -> None:
+def _describe(file: Bytes, chunk: Chunk, connections: Connections, result: ScanResult) -> None:
     """Fill in the messages and connections of a chunk."""
     times: dict[int, array[int]] = defaultdict(lambda: array("q"))
     content, chunk.damage = _unpacked(file, chunk)
-    walker = Walker(content)
+    walker = RecordWalker(content)
     for record in walker(0):
         if record.kind == "message":
             times[record.number("conn")].append(record.time("time"))
         elif record.kind == "connection":
             connections.note(record, content.read(record.body, record.end - record.body))
     if not (chunk.cut or chunk.damage):
-        found.broken += walker.broken
-        found.passed += walker.passed
+        result.broken += walker.broken
+        result.passed += walker.passed
     chunk.fill(times)
 
 
-def look_into(file: Bytes, chunk: Chunk) -> tuple[list[ChunkMessage], str]:
+def read_messages(file: Bytes, chunk: Chunk) -> tuple[list[ChunkMessage], str]:
     """Return the messages of a chunk on the connections of its index, and the damage of its content."""
     content, damage = _unpacked(file, chunk)
     data = memoryview(content.read(0, content.size))
-    found = [
+    messages = [
         (r.time("time"), r.number("conn"), data[r.body : r.end])
-        for r in Walker(content)(0)
+        for r in RecordWalker(content)(0)
         if r.kind == "message" and r.number("conn") in chunk.counts
     ]
-    return found, damage
+    return messages, damage
 
 
-def _unpacked(file: Bytes, chunk: Chunk) -> tuple[Content, str]:
+def _unpacked(file: Bytes, chunk: Chunk) -> tuple[MemoryBytes, str]:
     """Return the content of a chunk and its damage."""
     packed = file.read(chunk.data, chunk.packed)
     cut = chunk.cut or len(packed) < chunk.packed
     data, damage = unpack(chunk.compression, packed, chunk.size, cut=cut)
-    return Content(data), damage
+    return MemoryBytes(data), damage
 
 
 REPAIR = "'rosbag reindex' repairs the file"
-FORM = Form(Reader, False, read_index, read_times, look_into, scan, REPAIR)
+FORM = ChunkFormat(Reader, False, read_index, read_times, read_messages, scan, REPAIR)

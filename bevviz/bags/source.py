@@ -28,7 +28,7 @@ from bevviz.sync.unusable_messages import Damage
 
 SECOND = 1_000_000_000
 MARGIN = 2 * SECOND  # search range in nanoseconds for data of the first and the last cloud
-MOST_HELD = 2000  # latched transform messages read before a start in the middle of a drive
+MAX_LATCHED = 2000  # latched transform messages read before a start in the middle of a drive
 EPOCH = 1e8  # seconds; a larger number is a date since 1970
 
 
@@ -209,7 +209,7 @@ class BagSource(Closing):
     def _begin(self, low: int) -> ReadingState:
         sync = Synchronizer(self.roles, self.config)
         state = self._state = ReadingState(sync)
-        self._hold_throughout(state, self._handlers(sync), low)
+        self._feed_latched(state, self._handlers(sync), low)
         return state
 
     def _handlers(self, sync: Synchronizer) -> dict[str, Handler[RawMessage]]:
@@ -246,8 +246,8 @@ class BagSource(Closing):
         """Yield the frames with the numbers of their scans."""
         numbers = state.numbers
         for frame in frames:
-            same = numbers.get(frame.received, ())
-            yield replace(frame, index=same.pop(0) if same else frame.index)
+            waiting = numbers.get(frame.received, ())
+            yield replace(frame, index=waiting.pop(0) if waiting else frame.index)
             for received in [t for t in numbers if t < frame.received - 10 * MARGIN]:
                 del numbers[received]  # dropped scans
 
@@ -259,7 +259,7 @@ class BagSource(Closing):
             if message.data or not self.recording.is_dataset:
                 state.damage.add(message.topic, str(error))
 
-    def _hold_throughout(
+    def _feed_latched(
         self, state: ReadingState, handlers: Mapping[str, Handler[RawMessage]], low: int
     ) -> None:
         """Feed data that is published once, such as static transforms, before the first frame.
@@ -269,7 +269,7 @@ class BagSource(Closing):
         """
         counts = {topic.name: topic.count or 0 for topic in self.recording.topics}
         for name in self.roles.tf_held:
-            few = counts[name] <= MOST_HELD
+            few = counts[name] <= MAX_LATCHED
             stop = low - MARGIN if few else min(low - MARGIN, self.recording.start + SECOND)
             for message in self.recording.messages([name], None, stop):
                 self._handle(handlers[name], message, state)
@@ -331,13 +331,13 @@ class BagSource(Closing):
 
     def _choose(self, every: int, frames: tuple[int | None, int | None]) -> range:
         first, last = np.searchsorted(self.scans, [self._low, self._high])
-        there = range(int(last - first))
-        chosen = there[slice(*frames)][:: max(every, 1)]
+        scans = range(int(last - first))
+        chosen = scans[slice(*frames)][:: max(every, 1)]
         if not chosen:
             raise UserError(
-                f"{self.recording.name}: {self._driver} has {len(there)} scans in the time asked for, "
+                f"{self.recording.name}: {self._driver} has {len(scans)} scans in the time asked for, "
                 "and none of them is among --frames"
-                if there
+                if scans
                 else f"{self.recording.name}: {self._driver} has no scan in the time asked for"
             )
         return chosen

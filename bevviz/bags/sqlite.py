@@ -13,7 +13,7 @@ from rosbags.interfaces import Connection
 from rosbags.rosbag2 import Reader as PublicReader
 
 from bevviz.bags.reader import (
-    LAST,
+    LAST_TIME,
     DamageError,
     Message,
     Reader,
@@ -22,7 +22,7 @@ from bevviz.bags.reader import (
     public_messages,
 )
 from bevviz.bags.rescue.sqlite import SqliteRescuer
-from bevviz.bags.rescue.sqlite_pages import LOG_HEAD, log_of, page_size_of
+from bevviz.bags.rescue.sqlite_pages import LOG_HEAD, log_path, page_size_of
 from bevviz.model.frame import I64
 
 
@@ -50,7 +50,7 @@ class SoundSqlite:
             raise DamageError("the head of the file is damaged")
         if (missing := int.from_bytes(head[28:32], "big") * page - size) > 0:
             raise DamageError(f"the file is damaged or its end is missing ({megabytes(missing)})")
-        log = log_of(path)
+        log = log_path(path)
         if log.exists() and log.stat().st_size > LOG_HEAD.size:
             raise DamageError(f"the recorder did not close it: messages in {log.name} are read with it")
         self._public = PublicReader(public)
@@ -78,7 +78,7 @@ class SoundSqlite:
 
     def times(self, ids: Collection[int]) -> I64:
         """Return the sorted log times of the connections ``ids``."""
-        query = f"SELECT timestamp FROM messages WHERE topic_id IN ({_marks(ids)}) ORDER BY timestamp"
+        query = f"SELECT timestamp FROM messages WHERE topic_id IN ({_placeholders(ids)}) ORDER BY timestamp"
         return np.array([time for (time,) in self._numbers(query, *ids)], np.int64)
 
     def sums(self, ids: Collection[int], start: int, stop: int) -> tuple[int, int]:
@@ -86,7 +86,7 @@ class SoundSqlite:
         query = (
             "SELECT count(*), sum(timestamp >> 32), sum(timestamp & 4294967295) "
             "FROM messages NOT INDEXED "
-            f"WHERE topic_id IN ({_marks(ids)}) AND timestamp >= ? AND timestamp < ?"
+            f"WHERE topic_id IN ({_placeholders(ids)}) AND timestamp >= ? AND timestamp < ?"
         )
         ((count, high, low),) = self._numbers(query, *ids, start, stop)
         return count, ((high or 0) << 32) + (low or 0)
@@ -101,7 +101,7 @@ class SoundSqlite:
         Raises:
             DamageError: they disagree.
         """
-        if self.span[1] > LAST or (self.span[0] < 0 and self._public.message_count):
+        if self.span[1] > LAST_TIME or (self.span[0] < 0 and self._public.message_count):
             raise DamageError("there are messages of impossible times in it")
         described = sum(c.msgcount for c in self.connections)
         if described != self._public.message_count:
@@ -124,5 +124,5 @@ class SoundSqlite:
         self._queries.close()
 
 
-def _marks(ids: Collection[int]) -> str:
+def _placeholders(ids: Collection[int]) -> str:
     return ",".join("?" for _ in ids)

@@ -8,7 +8,7 @@ from importlib import import_module
 from pathlib import Path
 from pkgutil import iter_modules
 
-from bevviz.datasets.dataset import NOT_AS_DOCUMENTED, Dataset, describe
+from bevviz.datasets.dataset import NOT_AS_DOCUMENTED, Dataset, describe_error
 from bevviz.errors import UserError
 
 
@@ -17,8 +17,8 @@ def loaders() -> dict[str, type[Dataset]]:
     """Return all loaders by name. The loader of any folder is last."""
     for module in iter_modules(__path__):
         import_module(f"{__name__}.{module.name}")
-    found = sorted(Dataset.__subclasses__(), key=lambda loader: (loader.any_folder, loader.name))
-    return {loader.name: loader for loader in found}
+    classes = sorted(Dataset.__subclasses__(), key=lambda loader: (loader.any_folder, loader.name))
+    return {loader.name: loader for loader in classes}
 
 
 def find_loader(path: Path) -> type[Dataset] | None:
@@ -54,4 +54,4 @@ def open_dataset(path: Path, name: str = "", sequence: str = "") -> Dataset | No
     try:
         return loader(path, sequence)
     except NOT_AS_DOCUMENTED as error:
-        raise UserError(f"{path}: not as {loader.about} is documented ({describe(error)})") from error
+        raise UserError(f"{path}: not as {loader.about} is documented ({describe_error(error)})") from error

@@ -6,13 +6,13 @@ import numpy as np
 
 from bevviz.model.frame import F32, F64, I64
 
-MOST = 12
+MAX_COLUMNS = 12
 BINS = 64
-ENOUGH = 1000  # values; fewer give no estimate
-TELLING = 0.1  # nats; below it no number of columns stands out
-NEAR = 0.7  # share of the best information: a multiple of the right number has slightly more
-NOTHING = 1e-30  # Integers below some hundred millions are smaller if read as float32.
-ODD = 0.1  # share of physically impossible values above which the numbers have another type
+MIN_VALUES = 1000  # values; fewer give no estimate
+MIN_INFORMATION = 0.1  # nats; below it no number of columns stands out
+CLOSE_TO_BEST = 0.7  # share of the best information: a multiple of the right number has slightly more
+NEARLY_ZERO = 1e-30  # Integers below some hundred millions are smaller if read as float32.
+MAX_ODD_SHARE = 0.1  # share of physically impossible values above which the numbers have another type
 
 
 def count_columns(values: F32) -> int | None:
@@ -26,30 +26,34 @@ def count_columns(values: F32) -> int | None:
         values: (N,) float32 values, row after row.
     """
     finite = values[np.isfinite(values)]
-    if len(finite) < ENOUGH:
+    if len(finite) < MIN_VALUES:
         return None
     edges = np.unique(np.quantile(finite, np.linspace(0, 1, BINS + 1)[1:-1]))
     bins = np.searchsorted(edges, values, side="right")  # NaN is in the last bin.
-    told = np.array([_information(bins, columns, len(edges) + 1) for columns in range(3, MOST + 1)])
-    if told.max() < TELLING:
+    information = np.array(
+        [_information(bins, columns, len(edges) + 1) for columns in range(3, MAX_COLUMNS + 1)]
+    )
+    if information.max() < MIN_INFORMATION:
         return None
-    return 3 + int(np.argmax(told >= NEAR * told.max()))
+    return 3 + int(np.argmax(information >= CLOSE_TO_BEST * information.max()))
 
 
 def are_doubles(data: bytes) -> bool:
     """Tell whether numbers are float64: as float32, many would be too large or too small for a sensor."""
     whole = data[: len(data) // 8 * 8]
-    return _odd(np.frombuffer(whole, "<f4")) > ODD > 10 * _odd(np.frombuffer(whole, "<f8"))
+    return (
+        _odd_share(np.frombuffer(whole, "<f4")) > MAX_ODD_SHARE > 10 * _odd_share(np.frombuffer(whole, "<f8"))
+    )
 
 
 def are_whole(data: bytes) -> bool:
     """Tell whether numbers are integers such as labels: read as float32, they would be almost zero."""
     size = np.abs(np.frombuffer(data[: len(data) // 4 * 4], "<f4"))
-    there = size > 0
-    return bool(there.any()) and float(np.mean(size[there] < NOTHING)) > 0.5
+    nonzero = size > 0
+    return bool(nonzero.any()) and float(np.mean(size[nonzero] < NEARLY_ZERO)) > 0.5
 
 
-def _odd(values: F32 | F64) -> float:
+def _odd_share(values: F32 | F64) -> float:
     size = np.abs(values[np.isfinite(values)])
     return float(np.mean((size > 1e10) | ((size < 1e-10) & (size > 0)))) if len(size) else 0.0
 
@@ -59,7 +63,7 @@ def _information(bins: I64, columns: int, count: int) -> float:
     rows = len(bins) // columns
     cells = bins[: rows * columns].reshape(rows, columns) + np.arange(columns) * count
     joint = np.bincount(cells.ravel(), minlength=columns * count).reshape(columns, count) / cells.size
-    alone = joint.sum(axis=1, keepdims=True) * joint.sum(axis=0, keepdims=True)
-    there = joint > 0
-    information = float((joint[there] * np.log(joint[there] / alone[there])).sum())
+    independent = joint.sum(axis=1, keepdims=True) * joint.sum(axis=0, keepdims=True)
+    nonzero = joint > 0
+    information = float((joint[nonzero] * np.log(joint[nonzero] / independent[nonzero])).sum())
     return information - (columns - 1) * (count - 1) / (2 * cells.size)

@@ -29,8 +29,8 @@ from bevviz.support.files import (
 from bevviz.support.files import read_bytes as read_limited
 
 SECOND = 1_000_000_000
-LOOKED_AT = 500_000  # bytes of a BIN file from which the number of columns is estimated
-MOST_OF_POINTER = 1024  # bytes of a pointer file, by the specification of Git LFS
+SAMPLE_BYTES = 500_000  # bytes of a BIN file from which the number of columns is estimated
+MAX_POINTER_BYTES = 1024  # bytes of a pointer file, by the specification of Git LFS
 FIELDS = ("x", "y", "z", "intensity")
 BOXES = "bevviz_msgs/msg/Detection3DArray"
 HIDDEN = re.compile(r"\.|__MACOSX$")
@@ -45,7 +45,7 @@ NOT_AS_DOCUMENTED = (
 )
 
 
-def describe(error: Exception) -> str:
+def describe_error(error: Exception) -> str:
     """Format an exception as its type and first line."""
     return f"{type(error).__name__}: {first_line(error)}"
 
@@ -116,7 +116,7 @@ class Dataset:
         if text not in self.warnings:
             self.warnings.append(text)
 
-    def columns_in(self, files: Sequence[Path], names: Sequence[str] = FIELDS, hint: str = "") -> list[str]:
+    def column_names(self, files: Sequence[Path], names: Sequence[str] = FIELDS, hint: str = "") -> list[str]:
         """Return the column names of BIN files of float32. The values of the largest file give their number.
 
         Args:
@@ -131,7 +131,7 @@ class Dataset:
         if not raw:
             return [*names]
         largest = max(raw, key=lambda file: file.stat().st_size)
-        data = read_bytes(largest, LOOKED_AT)
+        data = read_bytes(largest, SAMPLE_BYTES)
         if are_doubles(data):
             raise UserError(f"{largest}: its numbers are float64; save them as float32, or as NPY")
         if are_whole(data):
@@ -153,25 +153,25 @@ class Dataset:
             step: bytes of a point.
         """
         sizes = {file: file.stat().st_size for file in files}
-        away = sorted(file for file in files if sizes[file] < MOST_OF_POINTER and is_pointer(file))
-        if away:
-            self.warn(f"{self._first(away)}: {LFS_HINT}")
-        for file in away:
+        pointers = sorted(file for file in files if sizes[file] < MAX_POINTER_BYTES and is_pointer(file))
+        if pointers:
+            self.warn(f"{self._name_files(pointers)}: {LFS_HINT}")
+        for file in pointers:
             del sizes[file]
         if cut := [file for file, size in sizes.items() if size % step]:
             self.warn(
-                f"{self._first(cut)}: {sizes[cut[0]]} bytes are no whole number "
+                f"{self._name_files(cut)}: {sizes[cut[0]]} bytes are no whole number "
                 f"of points of {step} bytes: cut; the whole points in it are read"
             )
         if empty := [file for file, size in sizes.items() if size < step]:
-            self.warn(f"{self._first(empty)}: no point in it")
+            self.warn(f"{self._name_files(empty)}: no point in it")
 
-    def _first(self, files: Sequence[Path]) -> str:
+    def _name_files(self, files: Sequence[Path]) -> str:
         """Name the first file and count the others."""
         more = f" and {len(files) - 1} more" if len(files) > 1 else ""
         return f"{files[0].relative_to(self.path)}{more}"
 
-    def one_of(self, sequences: Sequence[str], others: str = "") -> str:
+    def choose_drive(self, sequences: Sequence[str], others: str = "") -> str:
         """Return the drive that the user chose.
 
         Args:
@@ -181,15 +181,15 @@ class Dataset:
         Raises:
             UserError: there is no drive with this name, or several drives and no choice.
         """
-        there = f"there are {', '.join(sequences[:8])}{' ...' if len(sequences) > 8 else ''}{others}"
+        choices = f"there are {', '.join(sequences[:8])}{' ...' if len(sequences) > 8 else ''}{others}"
         if not sequences:
             raise UserError(f"{self.path}: no drive in it; {self.about} has {self.expects}")
         if self.sequence:
             if self.sequence not in sequences:
-                raise UserError(f"{self.path}: there is no --sequence {self.sequence}; {there}")
+                raise UserError(f"{self.path}: there is no --sequence {self.sequence}; {choices}")
             return self.sequence
         if len(sequences) > 1:
-            raise UserError(f"{self.path}: {len(sequences)} drives; choose with --sequence NAME; {there}")
+            raise UserError(f"{self.path}: {len(sequences)} drives; choose with --sequence NAME; {choices}")
         return sequences[0]
 
 
@@ -201,10 +201,10 @@ def read_points(path: Path, fields: Sequence[str]) -> NDArray[np.void]:
     """
     data = read_bytes(path)
     whole = np.frombuffer(data, "<f4", len(data) // (4 * len(fields)) * len(fields))
-    return columns_of(whole.reshape(-1, len(fields)), fields)
+    return as_points(whole.reshape(-1, len(fields)), fields)
 
 
-def pictures(
+def image_stream(
     camera: str, times: I64, files: Sequence[Path], *, rectified: bool = True, aside: str = ""
 ) -> Stream:
     """Return the stream of a camera's image files. The images stay compressed."""
@@ -285,12 +285,12 @@ def read_table(path: Path, columns: int, names: str = "") -> NDArray[np.float64]
     return np.array(numbers, np.float64).reshape(-1, columns)
 
 
-def frames_at(rate: float, numbers: Sequence[int]) -> I64:
+def frame_stamps(rate: float, numbers: Sequence[int]) -> I64:
     """Return (N,) stamps of frame numbers at a rate in Hz. Frame 0 is at one second."""
     return SECOND + np.round(np.asarray(numbers, np.float64) * (SECOND / rate)).astype(np.int64)
 
 
-def joined_columns(points: NDArray[np.void], more: dict[str, NDArray[Any]]) -> NDArray[np.void]:
+def add_fields(points: NDArray[np.void], more: dict[str, NDArray[Any]]) -> NDArray[np.void]:
     """Return points with additional fields."""
     layout = np.dtype(
         [*((n, points.dtype[n]) for n in points.dtype.names or ()), *((n, v.dtype) for n, v in more.items())]
@@ -303,7 +303,7 @@ def joined_columns(points: NDArray[np.void], more: dict[str, NDArray[Any]]) -> N
     return wider
 
 
-def columns_of(values: F32, names: Sequence[str]) -> NDArray[np.void]:
+def as_points(values: F32, names: Sequence[str]) -> NDArray[np.void]:
     """View (N, C) float32 values as (N,) points with named fields. Contiguous values are not copied."""
     layout = np.dtype([(name, "<f4") for name in names])
     return np.ascontiguousarray(values, "<f4").view(layout).reshape(-1)

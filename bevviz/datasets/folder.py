@@ -19,14 +19,14 @@ from bevviz.datasets.dataset import (
     CLOUDS,
     HIDDEN,
     IMAGES,
-    LOOKED_AT,
+    SAMPLE_BYTES,
     Dataset,
     Stream,
-    columns_of,
+    as_points,
     files_in,
-    frames_at,
+    frame_stamps,
+    image_stream,
     is_pointer,
-    pictures,
     read_points,
     read_table,
 )
@@ -54,29 +54,30 @@ from bevviz.support.files import (
     read_text,
 )
 
-MOST_COLUMNS = 64  # columns of an NPY file; height grids and transposed tables have more
-NOTES = (".json", ".yaml", ".yml", ".xml", ".txt", ".toml")
+MAX_COLUMNS = 64  # columns of an NPY file; height grids and transposed tables have more
+NOTE_SUFFIXES = (".json", ".yaml", ".yml", ".xml", ".txt", ".toml")
 MAP, BASE = "map", "base_link"
 CALIBRATION, STAMPS, POSES = "calibration.yaml", "stamps.csv", "poses.txt"
-OF_SENSORS = re.compile(  # folders that contain one folder per camera or LiDAR
+SENSOR_FOLDER = re.compile(  # folders that contain one folder per camera or LiDAR
     "cam|im(g|age)|lidar|velo|point|cloud|pcd|scan", re.IGNORECASE
 )
-OF_DRIVES = re.compile(
+DRIVE_FOLDER = re.compile(
     r"(\d{3,}|(train|test)(ing)?|val(idation)?)$", re.IGNORECASE
 )  # folders of a drive or a split, not of a sensor
-NEAREST = {"i8": "<f8", "u8": "<f8", "f2": "<f4", "b1": "u1"}  # nearest types that a PointCloud2 can hold
+# Nearest types that a PointCloud2 can hold.
+NEAREST_TYPES = {"i8": "<f8", "u8": "<f8", "f2": "<f4", "b1": "u1"}
 KEYS = {"rate", "fields", "lidars", "cameras"}
-LENS = {"D", "distortion_model"}
-SENSOR_KEYS = {"pose", "rate", "fields", "K", "size", *LENS}
+LENS_KEYS = {"D", "distortion_model"}
+SENSOR_KEYS = {"pose", "rate", "fields", "K", "size", *LENS_KEYS}
 STAMP = r"\d{1,19}(\.\d*)?"
-MOST_PIXELS = 1 << 31  # limit of an image side, larger than any image
+MAX_SIDE = 1 << 31  # limit of an image side, larger than any image
 SECONDS, NANOSECONDS = re.compile(r"\d{1,6}|\d{10}"), re.compile(r"\d{1,9}")
-MOST_SECONDS = 1e10  # seconds; a larger stamp has another unit
-UNIT = 0.01  # tolerance of a quaternion's length
-FAR = 100  # metres; sensors of one vehicle are closer together
-FEW = 5  # Fewer frames say nothing about a rate.
-SLOWEST = 1e-6  # frames per second
-MUCH_FURTHER = 1.5  # ratio of frame counts that another rate explains
+MAX_SECONDS = 1e10  # seconds; a larger stamp has another unit
+UNIT_TOLERANCE = 0.01  # tolerance of a quaternion's length
+MAX_OFFSET = 100  # metres; sensors of one vehicle are closer together
+MIN_FRAMES = 5  # Fewer frames say nothing about a rate.
+MIN_RATE = 1e-6  # frames per second
+FRAME_RATIO = 1.5  # ratio of frame counts that another rate explains
 
 
 class Folder(Dataset):
@@ -93,7 +94,7 @@ class Folder(Dataset):
     @classmethod
     def fits(cls, path: Path) -> bool:
         """Tell whether a folder or a sensor folder in it has clouds."""
-        return any(files_in(folder, CLOUDS) for folder in _places(path))
+        return any(files_in(folder, CLOUDS) for folder in _sensor_folders(path))
 
     def __init__(self, path: Path, sequence: str) -> None:
         super().__init__(path, sequence)
@@ -107,20 +108,20 @@ class Folder(Dataset):
         if others:
             self.warn(others)
         if bare := [name for name in cameras if "K" not in about.get("cameras", {}).get(name, {})]:
-            self.warn(f"{', '.join(bare)}: {CALIBRATION} does not state K{_notes(path)}")
-        for kind, there in (("lidars", lidars), ("cameras", cameras)):
-            if unknown := sorted(about.get(kind, {}).keys() - there.keys()):
-                names = f"there are {', '.join(there)}" if there else "there is none"
+            self.warn(f"{', '.join(bare)}: {CALIBRATION} does not state K{_unread_notes(path)}")
+        for kind, sensors in (("lidars", lidars), ("cameras", cameras)):
+            if unknown := sorted(about.get(kind, {}).keys() - sensors.keys()):
+                names = f"there are {', '.join(sensors)}" if sensors else "there is none"
                 names += others and f"; {others}"
                 raise UserError(f"{path / CALIBRATION}: no {unknown[0]} among the {kind}; {names}")
         stamped = self._stamps({"lidars": lidars, "cameras": cameras}, about)
         edges, streams = [], list[Stream]()
         # Without a stated mounting, the only LiDAR's frame may be tilted.
-        placed = len(lidars) > 1 or (path / POSES).is_file() or any("pose" in s for s in _stated(about))
-        loose = [name for name in lidars if "pose" not in about.get("lidars", {}).get(name, {})]
-        if len(lidars) > 1 and loose:
+        has_base = len(lidars) > 1 or (path / POSES).is_file() or any("pose" in s for s in _stated(about))
+        unplaced = [name for name in lidars if "pose" not in about.get("lidars", {}).get(name, {})]
+        if len(lidars) > 1 and unplaced:
             self.warn(
-                f"nothing says how {', '.join(loose)} {'are' if len(loose) > 1 else 'is'} mounted: the "
+                f"nothing says how {', '.join(unplaced)} {'are' if len(unplaced) > 1 else 'is'} mounted: the "
                 f"points are taken as they are, in {BASE} (pose in {CALIBRATION})"
             )
         for name, files in cameras.items():
@@ -130,41 +131,43 @@ class Folder(Dataset):
                 edges.append((BASE, name, self._pose(stated["pose"], name)))
             if "K" in stated:
                 streams.append(self._camera_info(name, times, stated))
-            streams.append(pictures(name, times, files, rectified=not LENS & stated.keys()))
+            streams.append(image_stream(name, times, files, rectified=not LENS_KEYS & stated.keys()))
         for name, files in lidars.items():
             files, times = _in_order(files, stamped)
             stated = about.get("lidars", {}).get(name, {})
             fields = self._fields(stated.get("fields", about.get("fields")), files)
             self.check_sizes([file for file in files if file.suffix.lower() == ".bin"], 4 * len(fields))
-            if placed:
+            if has_base:
                 pose = self._pose(stated["pose"], name) if "pose" in stated else np.eye(4)
                 edges.append((BASE, name, pose))
-            streams.append(_clouds(name, times, files, fields))
-        self.streams = [*_mounted(min(stamped.values()), edges), *self._poses(), *streams]
+            streams.append(_cloud_stream(name, times, files, fields))
+        self.streams = [*_mounting_stream(min(stamped.values()), edges), *self._poses(), *streams]
 
     def _sensors(self, about: Mapping[str, Any]) -> tuple[dict[str, list[Path]], dict[str, list[Path]]]:
         """Return the LiDARs and the cameras: files by sensor name."""
-        found: dict[str, dict[str, list[Path]]] = {"lidars": {}, "cameras": {}}
-        places = _places(self.path)
-        for folder in places:
-            for kind, suffixes, alone in (("lidars", CLOUDS, "lidar"), ("cameras", IMAGES, "camera")):
-                name = places[folder] or alone
-                if name in found[kind] or (folder == self.path and name in places.values()):
+        sensors: dict[str, dict[str, list[Path]]] = {"lidars": {}, "cameras": {}}
+        names = _sensor_folders(self.path)
+        for folder in names:
+            for kind, suffixes, default in (("lidars", CLOUDS, "lidar"), ("cameras", IMAGES, "camera")):
+                name = names[folder] or default
+                if name in sensors[kind] or (folder == self.path and name in names.values()):
                     name = f"{(folder if folder == self.path else folder.parent).name}_{name}"
-                found[kind] |= self._apart(name, files_in(folder, suffixes), about.get(kind, ()))
-        if gone := [file for folder in places for file in _links_to_nowhere(folder)]:
-            self.warn(f"{self._first(gone)}: a link to what is not there")
-        lidars = found["lidars"]
+                sensors[kind] |= self._split_by_sensor(name, files_in(folder, suffixes), about.get(kind, ()))
+        if broken := [file for folder in names for file in _broken_links(folder)]:
+            self.warn(f"{self._name_files(broken)}: a link to what is not there")
+        lidars = sensors["lidars"]
         for name in list(lidars) if len(lidars) > 1 else ():
-            if reason := no_points(max(lidars[name], key=lambda file: file.stat().st_size)):
-                self.warn(f"{self._first(lidars.pop(name))}: {reason}: left out")
-        return lidars, found["cameras"]
+            if reason := why_no_points(max(lidars[name], key=lambda file: file.stat().st_size)):
+                self.warn(f"{self._name_files(lidars.pop(name))}: {reason}: left out")
+        return lidars, sensors["cameras"]
 
-    def _apart(self, sensor: str, files: Sequence[Path], stated: Collection[str]) -> dict[str, list[Path]]:
+    def _split_by_sensor(
+        self, sensor: str, files: Sequence[Path], stated: Collection[str]
+    ) -> dict[str, list[Path]]:
         """Split the files of a folder by sensor. File names may show several sensors in one folder."""
         groups = sensors_of(files)
         if len(groups) > 1 and sensor not in stated:
-            groups = {f"{sensor}_{name}" if name else sensor: found for name, found in groups.items()}
+            groups = {f"{sensor}_{name}" if name else sensor: members for name, members in groups.items()}
             self.warn(f"by the names of their files there are {', '.join(groups)}")
             return groups
         return {sensor: list(files)} if files else {}
@@ -200,9 +203,9 @@ class Folder(Dataset):
                     f"{self.path / CALIBRATION}: fields: {stated} is no list with x, y and z in it"
                 )
             return [str(name) for name in stated]
-        fields = self.columns_in(files, hint=f" (fields in {CALIBRATION})")
-        shape = next((shape_of(file) for file in files if file.suffix.lower() == ".npy"), ())
-        if len(shape) == 2 and len(fields) < shape[1] <= MOST_COLUMNS:
+        fields = self.column_names(files, hint=f" (fields in {CALIBRATION})")
+        shape = next((array_shape(file) for file in files if file.suffix.lower() == ".npy"), ())
+        if len(shape) == 2 and len(fields) < shape[1] <= MAX_COLUMNS:
             fields += [f"field_{column}" for column in range(len(fields), shape[1])]
             self.warn(f"NPY files are taken for the columns {', '.join(fields)} (fields in {CALIBRATION})")
         return fields
@@ -223,7 +226,7 @@ class Folder(Dataset):
                     raise ValueError("its last row is not 0 0 0 1")
             elif len(numbers) != 7:
                 raise ValueError(f"{len(numbers)} numbers")
-            elif abs((length := np.linalg.norm(numbers[3:])) - 1) > UNIT:
+            elif abs((length := np.linalg.norm(numbers[3:])) - 1) > UNIT_TOLERANCE:
                 raise ValueError(f"its quaternion has the length {length:.2f}, not 1")
             else:
                 pose = geometry.transform(numbers[:3], numbers[3:])
@@ -232,7 +235,7 @@ class Folder(Dataset):
                 f"{self.path / CALIBRATION}: pose of {sensor}: {error}; expected x y z qx qy qz qw of the "
                 "sensor in base_link, or 16 numbers of a matrix"
             ) from None
-        if (away := np.abs(pose[:3, 3]).max()) > FAR:
+        if (away := np.abs(pose[:3, 3]).max()) > MAX_OFFSET:
             self.warn(f"{CALIBRATION}: {sensor} is {away:,.0f} m from {BASE}: a pose is in metres")
         return pose
 
@@ -241,7 +244,7 @@ class Folder(Dataset):
             matrix = np.array(stated["K"], np.float64).reshape(3, 3)
             distortion = np.array(stated.get("D", ()), np.float64).reshape(-1)
             width, height = map(int, stated.get("size", (0, 0)))
-            sides = (0 <= side < MOST_PIXELS for side in (width, height))
+            sides = (0 <= side < MAX_SIDE for side in (width, height))
             if not np.array_equal(matrix[2], (0, 0, 1)) or not all(sides):
                 raise ValueError
         except (TypeError, ValueError):
@@ -267,9 +270,11 @@ class Folder(Dataset):
 
         A file without a time is removed from ``sensors`` with a warning.
         """
-        everyone = [(kind, name, files) for kind, group in sensors.items() for name, files in group.items()]
+        all_sensors = [
+            (kind, name, files) for kind, group in sensors.items() for name, files in group.items()
+        ]
         if (self.path / STAMPS).is_file():
-            return self._listed(self.path / STAMPS, [files for _, _, files in everyone])
+            return self._read_stamps(self.path / STAMPS, [files for _, _, files in all_sensors])
         lead = max(sensors["lidars"].items(), key=lambda item: len(item[1]))
         leading = told_by(lead[1])
         if leading is None:
@@ -281,23 +286,23 @@ class Folder(Dataset):
                 f"the names are no stamps: taken for frame numbers, at {_rate(about):g} a second "
                 f"(rate in {CALIBRATION})"
             )
-        of_lead = leading.values if leading else dict.fromkeys(lead[1], 0)
+        lead_values = leading.values if leading else dict.fromkeys(lead[1], 0)
         stamped = dict[Path, int]()
-        for kind, name, files in everyone:
-            told = told_by(files)
+        for kind, name, files in all_sensors:
+            times = told_by(files)
             stated = about.get(kind, {}).get(name, {})
             rate = _rate(about, stated)
-            if leading and told and told.frames == leading.frames:
-                numbers = told.values
-                if told.said:
-                    self.warn(f"the names {told.said}")
-                if told.frames and "rate" not in stated:
-                    self._hold_against(lead[0], leading.values, name, numbers)
+            if leading and times and times.frames == leading.frames:
+                numbers = times.values
+                if times.note:
+                    self.warn(f"the names {times.note}")
+                if times.frames and "rate" not in stated:
+                    self._check_frame_range(lead[0], leading.values, name, numbers)
             elif not leading:
                 numbers = {file: i for i, file in enumerate(files)}
-            elif len(files) == len(of_lead):
-                ordered = sorted(files, key=lambda file: (told.values.get(file, -1) if told else 0, file))
-                numbers = dict(zip(ordered, sorted(of_lead.values()), strict=True))
+            elif len(files) == len(lead_values):
+                ordered = sorted(files, key=lambda file: (times.values.get(file, -1) if times else 0, file))
+                numbers = dict(zip(ordered, sorted(lead_values.values()), strict=True))
                 rate = _rate(about, about.get("lidars", {}).get(lead[0], {}))
                 self.warn(
                     f"{name}: its names do not tell when, as those of {lead[0]} do: taken in their order, "
@@ -305,10 +310,10 @@ class Folder(Dataset):
                 )
             else:
                 numbers = {}
-            if away := [file for file in files if file not in numbers]:
+            if undated := [file for file in files if file not in numbers]:
                 self.warn(
-                    f"{self._first(away)}: the name does not tell when it was taken, as those of {lead[0]} "
-                    f"do: left out ({STAMPS} can say it)"
+                    f"{self._name_files(undated)}: the name does not tell when it was taken, as those of "
+                    f"{lead[0]} do: left out ({STAMPS} can say it)"
                 )
                 sensors[kind][name] = [file for file in files if file in numbers]
                 if not sensors[kind][name]:
@@ -316,23 +321,23 @@ class Folder(Dataset):
             if leading and not leading.frames:
                 stamped |= numbers
             else:
-                stamped |= zip(numbers, frames_at(rate, list(numbers.values())).tolist(), strict=True)
+                stamped |= zip(numbers, frame_stamps(rate, list(numbers.values())).tolist(), strict=True)
         return stamped
 
-    def _hold_against(
-        self, lead: str, frames: Mapping[Path, int], name: str, mine: Mapping[Path, int]
+    def _check_frame_range(
+        self, lead: str, frames: Mapping[Path, int], name: str, numbers: Mapping[Path, int]
     ) -> None:
         """Warn if the frame numbers of a sensor reach much further than those of the LiDAR."""
-        (first, last), (start, end) = [(min(n.values()), max(n.values())) for n in (frames, mine)]
-        if min(len(frames), len(mine)) >= FEW and end - start > MUCH_FURTHER * (last - first + 1):
+        (first, last), (start, end) = [(min(n.values()), max(n.values())) for n in (frames, numbers)]
+        if min(len(frames), len(numbers)) >= MIN_FRAMES and end - start > FRAME_RATIO * (last - first + 1):
             self.warn(
                 f"{name} has the frames {start} to {end}, {lead} {first} to {last}: taken for the same; "
                 f"where it counts its own, its rate can be stated ({CALIBRATION})"
             )
 
-    def _listed(self, table: Path, sensors: Sequence[Sequence[Path]]) -> dict[Path, int]:
+    def _read_stamps(self, table: Path, sensors: Sequence[Sequence[Path]]) -> dict[Path, int]:
         """Return the stamps in ``stamps.csv``."""
-        found = dict[Path, str]()
+        stamp_texts = dict[Path, str]()
         for number, row in enumerate(_csv_rows(table), 1):
             if len(row) < 2 or (number == 1 and not re.search(r"\d", row[1])):
                 continue
@@ -341,12 +346,12 @@ class Folder(Dataset):
                 raise UserError(f"{table}: line {number}: '{stamp}' is no stamp")
             if more and SECONDS.fullmatch(stamp) and NANOSECONDS.fullmatch(more[0]):
                 stamp = f"{stamp}.{more[0]:0>9}"
-            found[self.path / name] = stamp
-        if missing := [file for files in sensors for file in files if file not in found]:
+            stamp_texts[self.path / name] = stamp
+        if missing := [file for files in sensors for file in files if file not in stamp_texts]:
             raise UserError(f"{table}: no stamp for {missing[0].relative_to(self.path)}")
         stamped = dict[Path, int]()
         for files in sensors:
-            stamped |= zip(files, stamps_in([found[file] for file in files]), strict=True)
+            stamped |= zip(files, stamps_in([stamp_texts[file] for file in files]), strict=True)
         return stamped
 
     def _poses(self) -> list[Stream]:
@@ -356,7 +361,7 @@ class Folder(Dataset):
             return []
         table = read_table(file, 8, "stamp x y z qx qy qz qw")
         table = table[np.argsort(table[:, 0], kind="stable")]
-        if table[:, 0].max(initial=0) < MOST_SECONDS:
+        if table[:, 0].max(initial=0) < MAX_SECONDS:
             times = np.round(table[:, 0] * 1e9).astype(np.int64)
         else:
             times = np.array(stamps_in([f"{stamp:.0f}" for stamp in table[:, 0]]), np.int64)
@@ -387,41 +392,41 @@ def _rate(*stated: Mapping[str, Any]) -> float:
         UserError: the value is no number, or no sensor has this rate.
     """
     rate = next((about["rate"] for about in reversed(stated) if "rate" in about), 10.0)
-    if not isinstance(rate, int | float) or not SLOWEST <= rate <= 1 / SLOWEST:
+    if not isinstance(rate, int | float) or not MIN_RATE <= rate <= 1 / MIN_RATE:
         raise UserError(f"{CALIBRATION}: rate is {rate}, not frames a second")
     return float(rate)
 
 
-def _places(path: Path) -> dict[Path, str]:
+def _sensor_folders(path: Path) -> dict[Path, str]:
     """Return the possible sensor folders with sensor names.
 
     They are the folder, its subfolders, and the subfolders of camera or LiDAR folders.
     """
-    places = {path: "", **{folder: folder.name for folder in _folders(path)}}
-    for folder in [folder for folder, name in places.items() if OF_SENSORS.match(name)]:
+    names = {path: "", **{folder: folder.name for folder in _folders(path)}}
+    for folder in [folder for folder, name in names.items() if SENSOR_FOLDER.match(name)]:
         for within in _folders(folder):
-            places[within] = folder.name if within.name == "data" else within.name
-    return {folder: name for folder, name in places.items() if not OF_DRIVES.match(name)}
+            names[within] = folder.name if within.name == "data" else within.name
+    return {folder: name for folder, name in names.items() if not DRIVE_FOLDER.match(name)}
 
 
 def _folders(path: Path) -> list[Path]:
-    return sorted(found for found in path.iterdir() if found.is_dir() and not HIDDEN.match(found.name))
+    return sorted(child for child in path.iterdir() if child.is_dir() and not HIDDEN.match(child.name))
 
 
-def _notes(path: Path) -> str:
+def _unread_notes(path: Path) -> str:
     """Return a clause about calibrations and labels of other programs, which are not read; empty: none."""
     folders = [path, *(inner for folder in _folders(path) for inner in (folder, *_folders(folder)))]
-    found = [file for folder in folders for file in files_in(folder, NOTES)]
-    found = [file for file in found if file.name not in (CALIBRATION, STAMPS, POSES)]
-    if not found:
+    files = [file for folder in folders for file in files_in(folder, NOTE_SUFFIXES)]
+    files = [file for file in files if file.name not in (CALIBRATION, STAMPS, POSES)]
+    if not files:
         return ""
-    named = found[0].relative_to(path)
+    named = files[0].relative_to(path)
     return (
-        f"; {named} is not read" if len(found) == 1 else f"; {named} and {len(found) - 1} more are not read"
+        f"; {named} is not read" if len(files) == 1 else f"; {named} and {len(files) - 1} more are not read"
     )
 
 
-def _links_to_nowhere(folder: Path) -> list[Path]:
+def _broken_links(folder: Path) -> list[Path]:
     return files_in(folder, (*CLOUDS, *IMAGES), lambda entry: entry.is_symlink() and not entry.is_file())
 
 
@@ -430,13 +435,13 @@ def _in_order(files: Sequence[Path], stamped: Mapping[Path, int]) -> tuple[list[
     return ordered, np.array([stamped[file] for file in ordered], np.int64)
 
 
-def _mounted(start: int, edges: Sequence[tuple[str, str, F64]]) -> list[Stream]:
+def _mounting_stream(start: int, edges: Sequence[tuple[str, str, F64]]) -> list[Stream]:
     times = np.array([start], np.int64)
     make = partial(encode_transforms, start, list(edges))
     return [Stream("/tf_static", "tf2_msgs/msg/TFMessage", times, lambda _: make())] if edges else []
 
 
-def _clouds(name: str, times: I64, files: Sequence[Path], fields: Sequence[str]) -> Stream:
+def _cloud_stream(name: str, times: I64, files: Sequence[Path], fields: Sequence[str]) -> Stream:
     def make(row: int) -> Any:
         points, announced = read_cloud(files[row], fields)
         return encode_points(int(times[row]), name, points, announced)
@@ -444,13 +449,13 @@ def _clouds(name: str, times: I64, files: Sequence[Path], fields: Sequence[str])
     return Stream(f"/{name}/points", "sensor_msgs/msg/PointCloud2", times, make, files=files)
 
 
-def shape_of(file: Path) -> tuple[int, ...]:
+def array_shape(file: Path) -> tuple[int, ...]:
     """Return the shape of the array in an NPY file; empty if it has named columns or cannot be read."""
     try:
-        there = _load_array(file)
+        array = _load_array(file)
     except (OSError, ValueError, EOFError):
         return ()
-    return () if there.dtype.names else there.shape
+    return () if array.dtype.names else array.shape
 
 
 def _load_array(file: Path) -> NDArray[Any]:
@@ -469,12 +474,12 @@ def _load_array(file: Path) -> NDArray[Any]:
     return loaded
 
 
-def no_points(file: Path) -> str:
+def why_no_points(file: Path) -> str:
     """Return why a file with a cloud suffix is no cloud, such as labels or matrices; empty: it may be one."""
     suffix = file.suffix.lower()
     if suffix == ".bin":
-        return "whole numbers, no points of float32" if are_whole(read_head(file, LOOKED_AT)) else ""
-    shape = shape_of(file) if suffix == ".npy" else ()
+        return "whole numbers, no points of float32" if are_whole(read_head(file, SAMPLE_BYTES)) else ""
+    shape = array_shape(file) if suffix == ".npy" else ()
     if shape and (len(shape) != 2 or (shape[0] in (3, 4) and shape[1] in (3, 4))):
         return f"of the shape {shape}, no points"
     return ""
@@ -500,10 +505,10 @@ def read_cloud(file: Path, fields: Sequence[str]) -> tuple[NDArray[np.void], int
             loaded = _load_array(file)
             if loaded.dtype.names:
                 return _encodable(loaded.reshape(-1)), 0
-            if loaded.ndim != 2 or not 3 <= loaded.shape[1] <= MOST_COLUMNS:
-                raise ValueError(f"has the shape {loaded.shape}, not (N, 3) to (N, {MOST_COLUMNS})")
+            if loaded.ndim != 2 or not 3 <= loaded.shape[1] <= MAX_COLUMNS:
+                raise ValueError(f"has the shape {loaded.shape}, not (N, 3) to (N, {MAX_COLUMNS})")
             names = [*fields, *(f"field_{i}" for i in range(len(fields), loaded.shape[1]))][: loaded.shape[1]]
-            return columns_of(loaded.astype(np.float32), names), 0
+            return as_points(loaded.astype(np.float32), names), 0
         points, announced = read_pcd(file) if suffix == ".pcd" else read_ply(file)
         return _encodable(points), announced
     except (OSError, ValueError, EOFError, RuntimeError) as error:
@@ -514,7 +519,7 @@ def _encodable(points: NDArray[np.void]) -> NDArray[np.void]:
     """Convert fields to little-endian types that a PointCloud2 can hold."""
     names = points.dtype.names or ()
     types = {name: points.dtype[name].newbyteorder("<") for name in names}
-    types = {name: np.dtype(NEAREST.get(kind.str[1:], kind)) for name, kind in types.items()}
+    types = {name: np.dtype(NEAREST_TYPES.get(kind.str[1:], kind)) for name, kind in types.items()}
     if missing := [name for name, kind in types.items() if kind.str[1:] not in POINT_FIELD]:
         raise ValueError(f"field {missing[0]} is of the type {types[missing[0]]}")
     if all(types[name] == points.dtype[name] for name in names):

@@ -77,7 +77,7 @@ def labelled_boxes(
     """
     lidar_from_camera = geometry.inverse(rectified_from_lidar)
     labels, rows, dont_care, kept, unusable = [], [], [], [], []
-    for at, (number, line) in enumerate(lines):
+    for index, (number, line) in enumerate(lines):
         kind, *values = line.split() or [""]
         if kind in ("", "Misc"):
             continue
@@ -95,7 +95,7 @@ def labelled_boxes(
             continue
         labels.append(kind)
         rows.append(row)
-        kept.append(at)
+        kept.append(index)
     table = np.array(rows, np.float64).reshape(-1, 14)
     height, width, length, x, y, z, turn = table[:, 7:].T
     # A location is the centre of the bottom in the reference camera: x right, y down, z forward.
@@ -116,7 +116,7 @@ def labelled_boxes(
         np.array(dont_care, np.float32).reshape(-1, 4),
     )
     ones = np.ones(len(labels), np.float32)
-    names = tuple(ids[at] for at in kept) if ids else ()
+    names = tuple(ids[index] for index in kept) if ids else ()
     return LabelledBoxes3D(
         str(file), 0, "", boxes, tuple(labels), ones, ids=names, image=image, unusable=tuple(unusable)
     )
@@ -155,8 +155,8 @@ class Calibration:
 
     def camera(self, number: int) -> tuple[F64, F64]:
         """Return (3, 3) K and (4, 4) camera_from_lidar of a camera. Camera 2 is the left colour camera."""
-        matrix, beside = split_projection(self._matrix(3, 4, f"P{number}"))
-        return matrix, beside @ self.rectified_from_lidar
+        matrix, camera_from_reference = split_projection(self._matrix(3, 4, f"P{number}"))
+        return matrix, camera_from_reference @ self.rectified_from_lidar
 
     @property
     def lidar_from_imu(self) -> F64:
@@ -190,12 +190,12 @@ def named_rows(file: Path) -> Mapping[str, F64]:
 
 def split_projection(projection: F64) -> tuple[F64, F64]:
     """Split a (3, 4) projection into (3, 3) K and (4, 4) camera_from_reference, both rectified cameras."""
-    beside = np.eye(4)
+    camera_from_reference = np.eye(4)
     try:
-        beside[:3, 3] = np.linalg.solve(projection[:, :3], projection[:, 3])
+        camera_from_reference[:3, 3] = np.linalg.solve(projection[:, :3], projection[:, 3])
     except np.linalg.LinAlgError:
         raise UserError(f"a projection of {projection.tolist()} is that of no camera") from None
-    return projection[:, :3], beside
+    return projection[:, :3], camera_from_reference
 
 
 # --- positions ---------------------------------------------------------------------------------
@@ -213,11 +213,11 @@ def poses_of_oxts(table: F64) -> F64:
     poses[:, 0, 3] = scale * EARTH * np.radians(longitude)  # Mercator projection
     poses[:, 1, 3] = scale * EARTH * np.log(np.tan(np.radians(90.0 + latitude) / 2))
     poses[:, 2, 3] = altitude
-    poses[:, :3, :3] = _turns(2, yaw) @ _turns(1, pitch) @ _turns(0, roll)
+    poses[:, :3, :3] = _rotations(2, yaw) @ _rotations(1, pitch) @ _rotations(0, roll)
     return np.asarray(geometry.inverse(poses[0]) @ poses if len(poses) else poses)
 
 
-def _turns(axis: int, angles: F64) -> F64:
+def _rotations(axis: int, angles: F64) -> F64:
     """Return (N, 3, 3) rotations about an axis."""
     a, b = (axis + 1) % 3, (axis + 2) % 3
     turns = np.tile(np.eye(3), (len(angles), 1, 1))
@@ -229,7 +229,7 @@ def _turns(axis: int, angles: F64) -> F64:
 # --- streams -----------------------------------------------------------------------------------
 
 
-def clouds(times: I64, files: Sequence[Path], fields: Sequence[str]) -> Stream:
+def cloud_stream(times: I64, files: Sequence[Path], fields: Sequence[str]) -> Stream:
     """Return the stream of scans with x, y, z, reflectance and further columns (Waymo's has 6 columns)."""
 
     def make(row: int) -> Any:
@@ -238,25 +238,25 @@ def clouds(times: I64, files: Sequence[Path], fields: Sequence[str]) -> Stream:
     return Stream(CLOUDS, "sensor_msgs/msg/PointCloud2", times, make)
 
 
-def camera_info(camera: str, times: I64, matrix: F64) -> Stream:
+def camera_info_stream(camera: str, times: I64, matrix: F64) -> Stream:
     """Return a stream with one calibration for all images."""
-    once = times[:1]
+    first_time = times[:1]
 
     def make(row: int) -> Any:
-        return encode_intrinsics(int(once[row]), camera, Intrinsics(0, 0, matrix))
+        return encode_intrinsics(int(first_time[row]), camera, Intrinsics(0, 0, matrix))
 
-    return Stream(f"/{camera}/camera_info", "sensor_msgs/msg/CameraInfo", once, make)
+    return Stream(f"/{camera}/camera_info", "sensor_msgs/msg/CameraInfo", first_time, make)
 
 
-def mountings(start: int, edges: Sequence[tuple[str, str, F64]]) -> Stream:
+def mounting_stream(start: int, edges: Sequence[tuple[str, str, F64]]) -> Stream:
     """Return the stream of static transforms (parent, child, parent_from_child)."""
-    at = np.array([start], np.int64)
+    times = np.array([start], np.int64)
     return Stream(
-        "/tf_static", "tf2_msgs/msg/TFMessage", at, lambda row: encode_transforms(int(at[row]), edges)
+        "/tf_static", "tf2_msgs/msg/TFMessage", times, lambda row: encode_transforms(int(times[row]), edges)
     )
 
 
-def places(times: I64, child: str, poses: F64) -> Stream:
+def pose_stream(times: I64, child: str, poses: F64) -> Stream:
     """Return the stream of (N, 4, 4) poses of a vehicle frame in the map."""
 
     def make(row: int) -> Any:
@@ -265,12 +265,12 @@ def places(times: I64, child: str, poses: F64) -> Stream:
     return Stream("/tf", "tf2_msgs/msg/TFMessage", times, make)
 
 
-def truth(message_type: str, times: I64, label: Any) -> Stream:
+def ground_truth_stream(message_type: str, times: I64, label: Any) -> Stream:
     """Return the stream of ground truth in the LiDAR frame. ``label`` returns the labels of a row."""
 
     def make(row: int) -> Any:
-        there: LabelledBoxes3D = label(row)
-        about = there.labels, there.ids, there.image, there.unusable
-        return encode_labels(int(times[row]), LIDAR, there.boxes, *about)
+        labels: LabelledBoxes3D = label(row)
+        details = labels.labels, labels.ids, labels.image, labels.unusable
+        return encode_labels(int(times[row]), LIDAR, labels.boxes, *details)
 
     return Stream("/ground_truth", message_type, times, make)

@@ -8,16 +8,16 @@ from typing import Any
 
 import numpy as np
 
-from bevviz.datasets.dataset import BOXES, IMAGES, SECOND, Dataset, Stream, files_in, pictures
+from bevviz.datasets.dataset import BOXES, IMAGES, SECOND, Dataset, Stream, files_in, image_stream
 from bevviz.datasets.kitti import (
     LIDAR,
     MAP,
     Calibration,
-    clouds,
-    mountings,
+    cloud_stream,
+    ground_truth_stream,
+    mounting_stream,
     named_rows,
     read_labels,
-    truth,
 )
 from bevviz.errors import UserError
 from bevviz.messages.encode import encode_intrinsics, encode_transforms
@@ -25,7 +25,7 @@ from bevviz.model import geometry
 from bevviz.model.frame import Intrinsics
 
 CAMERA = "image_2"
-APART = 100 * SECOND  # nanoseconds between frames: they are unrelated, so none may influence the next
+FRAME_GAP = 100 * SECOND  # nanoseconds between frames: they are unrelated, so none may influence the next
 
 
 class KittiObject(Dataset):
@@ -42,17 +42,17 @@ class KittiObject(Dataset):
         if any((path / "calib").glob("[0-9]" * 6 + ".txt")):
             return (path / "velodyne").is_dir()
         # Sets in this layout name frames differently: View of Delft by five digits, converters by tokens.
-        beside = [path / f"calib/{scan.stem}.txt" for scan in files_in(path / "velodyne", [".bin"])[:1]]
-        return any("Tr_velo_to_cam" in named_rows(file) for file in beside if file.is_file())
+        calibrations = [path / f"calib/{scan.stem}.txt" for scan in files_in(path / "velodyne", [".bin"])[:1]]
+        return any("Tr_velo_to_cam" in named_rows(file) for file in calibrations if file.is_file())
 
     def __init__(self, path: Path, sequence: str) -> None:
         super().__init__(path, sequence)
         scans = files_in(path / "velodyne", [".bin"])
         if not scans:
             raise UserError(f"{path / 'velodyne'}: no scan in it; expected 000000.bin")
-        fields = self.columns_in(scans)
+        fields = self.column_names(scans)
         self.check_sizes(scans, 4 * len(fields))
-        times = APART * np.arange(1, len(scans) + 1, dtype=np.int64)
+        times = FRAME_GAP * np.arange(1, len(scans) + 1, dtype=np.int64)
         names = [scan.stem for scan in scans]
 
         @lru_cache(maxsize=8)
@@ -66,24 +66,28 @@ class KittiObject(Dataset):
 
         # Each frame has its own map with the LiDAR at the origin.
         self.streams = [
-            mountings(int(times[0]), [(MAP, LIDAR, np.eye(4))]),
+            mounting_stream(int(times[0]), [(MAP, LIDAR, np.eye(4))]),
             Stream("/tf", "tf2_msgs/msg/TFMessage", times, mounting),
         ]
         images = {image.stem: image for image in files_in(path / CAMERA, IMAGES)}
-        seen = [row for row, name in enumerate(names) if name in images]
-        if seen:
-            at = times[seen]
+        with_image = [row for row, name in enumerate(names) if name in images]
+        if with_image:
+            image_times = times[with_image]
 
             def info(row: int) -> Any:
-                matrix, _ = calibration(seen[row]).camera(2)
-                return encode_intrinsics(int(at[row]), CAMERA, Intrinsics(0, 0, matrix))
+                matrix, _ = calibration(with_image[row]).camera(2)
+                return encode_intrinsics(int(image_times[row]), CAMERA, Intrinsics(0, 0, matrix))
 
             self.streams += [
-                Stream(f"/{CAMERA}/camera_info", "sensor_msgs/msg/CameraInfo", at, info),
-                pictures(CAMERA, at, [images[names[row]] for row in seen]),
+                Stream(f"/{CAMERA}/camera_info", "sensor_msgs/msg/CameraInfo", image_times, info),
+                image_stream(CAMERA, image_times, [images[names[row]] for row in with_image]),
             ]
         labels = [path / f"label_2/{name}.txt" for name in names]
-        known = [row for row, file in enumerate(labels) if file.is_file()]
-        if known:
-            self.streams.append(truth(BOXES, times[known], lambda row: read_labels(labels[known[row]])))
-        self.streams.append(clouds(times, scans, fields))
+        with_labels = [row for row, file in enumerate(labels) if file.is_file()]
+        if with_labels:
+            self.streams.append(
+                ground_truth_stream(
+                    BOXES, times[with_labels], lambda row: read_labels(labels[with_labels[row]])
+                )
+            )
+        self.streams.append(cloud_stream(times, scans, fields))

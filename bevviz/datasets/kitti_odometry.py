@@ -12,10 +12,10 @@ from bevviz.datasets.dataset import (
     SECOND,
     Dataset,
     Stream,
+    add_fields,
     files_in,
-    frames_at,
-    joined_columns,
-    pictures,
+    frame_stamps,
+    image_stream,
     read_bytes,
     read_points,
     read_table,
@@ -24,11 +24,11 @@ from bevviz.datasets.kitti import (
     CLOUDS,
     LIDAR,
     Calibration,
-    camera_info,
-    clouds,
-    mountings,
-    places,
-    truth,
+    camera_info_stream,
+    cloud_stream,
+    ground_truth_stream,
+    mounting_stream,
+    pose_stream,
 )
 from bevviz.errors import UserError
 from bevviz.messages.encode import encode_points
@@ -79,13 +79,13 @@ class KittiOdometry(Dataset):
         """Return the folders of the sequences."""
         if not (path / "sequences").is_dir():
             return [path]
-        return sorted(found.parent for found in (path / "sequences").glob("*/velodyne"))
+        return sorted(scans.parent for scans in (path / "sequences").glob("*/velodyne"))
 
     def __init__(self, path: Path, sequence: str) -> None:
         super().__init__(path, sequence)
         folder = path
         if (path / "sequences").is_dir():
-            folder = path / "sequences" / self.one_of([drive.name for drive in self.drives(path)])
+            folder = path / "sequences" / self.choose_drive([drive.name for drive in self.drives(path)])
         elif sequence:
             raise UserError(f"{path}: is one drive; leave --sequence {sequence} out")
         scans = files_in(folder / "velodyne", [".bin"])
@@ -93,7 +93,7 @@ class KittiOdometry(Dataset):
             raise UserError(f"{folder / 'velodyne'}: no scan in it; expected 000000.bin")
         if not (folder / "calib.txt").is_file():
             raise UserError(f"{folder / 'calib.txt'} is missing: it says where the cameras are")
-        fields = self.columns_in(scans)
+        fields = self.column_names(scans)
         self.check_sizes(scans, 4 * len(fields))
         calibration = Calibration(folder / "calib.txt")
         numbers = _numbers(scans)
@@ -106,24 +106,28 @@ class KittiOdometry(Dataset):
             rows = [row for row, number in enumerate(numbers) if number in images]
             if not rows:
                 continue
-            at = times[rows]
+            image_times = times[rows]
             matrix, camera_from_lidar = calibration.camera(int(camera[-1]))
             edges.append((LIDAR, camera, geometry.inverse(camera_from_lidar)))
             cameras += [
-                camera_info(camera, at, matrix),
-                pictures(camera, at, [images[numbers[row]] for row in rows], aside=aside),
+                camera_info_stream(camera, image_times, matrix),
+                image_stream(camera, image_times, [images[numbers[row]] for row in rows], aside=aside),
             ]
-        self.streams = [mountings(int(times[0]), edges)] if edges else []
+        self.streams = [mounting_stream(int(times[0]), edges)] if edges else []
         poses = self._poses(folder, calibration)
         if poses is not None:
-            known = [row for row, number in enumerate(numbers) if number < len(poses)]
-            if len(known) < len(numbers):
-                self.warn(f"poses.txt has {len(poses)} poses: {len(numbers) - len(known)} scans have none")
-            self.streams.append(places(times[known], LIDAR, poses[[numbers[row] for row in known]]))
+            with_pose = [row for row, number in enumerate(numbers) if number < len(poses)]
+            if len(with_pose) < len(numbers):
+                self.warn(
+                    f"poses.txt has {len(poses)} poses: {len(numbers) - len(with_pose)} scans have none"
+                )
+            self.streams.append(
+                pose_stream(times[with_pose], LIDAR, poses[[numbers[row] for row in with_pose]])
+            )
         self.streams += cameras
         labels = {int(file.stem): file for file in files_in(folder / "labels", [".label"])}
         if not labels:
-            self.streams.append(clouds(times, scans, fields))
+            self.streams.append(cloud_stream(times, scans, fields))
             return
         rows = [row for row, number in enumerate(numbers) if number in labels]
         files = {row: labels[numbers[row]] for row in rows}
@@ -133,19 +137,19 @@ class KittiOdometry(Dataset):
             label = np.zeros(len(points), np.uint32)
             if row in files:
                 label[:] = self._labels(files[row], len(points))
-            return encode_points(int(times[row]), LIDAR, joined_columns(points, {"label": label}))
+            return encode_points(int(times[row]), LIDAR, add_fields(points, {"label": label}))
 
         def objects(row: int) -> LabelledBoxes3D:
             points = read_points(scans[rows[row]], fields)
             return boxes_of(files[rows[row]], points, self._labels(files[rows[row]], len(points)))
 
-        self.streams.append(truth("vision_msgs/msg/Detection3DArray", times[rows], objects))
+        self.streams.append(ground_truth_stream("vision_msgs/msg/Detection3DArray", times[rows], objects))
         self.streams.append(Stream(CLOUDS, "sensor_msgs/msg/PointCloud2", times, cloud))
 
     def _times(self, folder: Path, numbers: list[int]) -> I64:
         if not (folder / "times.txt").is_file():
             self.warn(f"no times.txt: {RATE:.0f} scans a second are taken")
-            return frames_at(RATE, numbers)
+            return frame_stamps(RATE, numbers)
         table = read_table(folder / "times.txt", 1)[:, 0]
         if len(table) <= max(numbers):
             raise UserError(f"{folder / 'times.txt'}: {len(table)} times, and a scan {max(numbers):06d}.bin")
@@ -155,8 +159,8 @@ class KittiOdometry(Dataset):
 
     def _poses(self, folder: Path, calibration: Calibration) -> F64 | None:
         """Return (P, 4, 4) first_scan_from_scan poses; None if there are none."""
-        beside = folder.parent.parent / "poses" / f"{folder.name}.txt"
-        file = folder / "poses.txt" if (folder / "poses.txt").is_file() else beside
+        shared_file = folder.parent.parent / "poses" / f"{folder.name}.txt"
+        file = folder / "poses.txt" if (folder / "poses.txt").is_file() else shared_file
         if not file.is_file():
             return None
         table = read_table(file, 12)
@@ -189,22 +193,22 @@ def boxes_of(file: Path, points: Any, labels: Any) -> LabelledBoxes3D:
     """
     import cv2
 
-    kind = labels & 0xFFFF
-    chosen = np.flatnonzero((labels >> 16 > 0) & np.isin(kind, list(OBJECTS)))
+    classes = labels & 0xFFFF
+    chosen = np.flatnonzero((labels >> 16 > 0) & np.isin(classes, list(OBJECTS)))
     order = chosen[np.argsort(labels[chosen], kind="stable")]
     starts = np.flatnonzero(np.diff(labels[order].astype(np.int64), prepend=-1))
     centers, sizes, turns, names, ids = [], [], [], list[str](), list[str]()
-    for mine in np.split(order, starts[1:]) if len(order) else ():
-        xy = np.column_stack([points["x"][mine], points["y"][mine]])
+    for members in np.split(order, starts[1:]) if len(order) else ():
+        xy = np.column_stack([points["x"][members], points["y"][members]])
         (x, y), (length, width), angle = cv2.minAreaRect(xy)
-        low, high = float(points["z"][mine].min()), float(points["z"][mine].max())
+        low, high = float(points["z"][members].min()), float(points["z"][members].max())
         if width > length:
             length, width, angle = width, length, angle + 90.0
         centers.append([x, y, (low + high) / 2])
         sizes.append([length, width, high - low])
         turns.append(np.radians(angle))
-        names.append(OBJECTS[int(kind[mine[0]])])
-        ids.append(f"{names[-1]}-{int(labels[mine[0]] >> 16)}")
+        names.append(OBJECTS[int(classes[members[0]])])
+        ids.append(f"{names[-1]}-{int(labels[members[0]] >> 16)}")
     boxes = Boxes3D(
         np.array(centers, np.float32).reshape(-1, 3),
         np.array(sizes, np.float32).reshape(-1, 3),

@@ -10,18 +10,18 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from bevviz.datasets.dataset import IMAGES, Dataset, Stream, files_in, pictures, read_table
+from bevviz.datasets.dataset import IMAGES, Dataset, Stream, files_in, image_stream, read_table
 from bevviz.datasets.kitti import (
     IMU,
     LIDAR,
-    camera_info,
-    clouds,
-    mountings,
+    camera_info_stream,
+    cloud_stream,
+    ground_truth_stream,
+    mounting_stream,
     named_rows,
-    places,
+    pose_stream,
     poses_of_oxts,
     split_projection,
-    truth,
 )
 from bevviz.errors import UserError
 from bevviz.model import geometry
@@ -54,13 +54,13 @@ class KittiRaw(Dataset):
         """Return the folders of the drives."""
         if (path / "velodyne_points").is_dir():
             return [path]
-        return sorted(found.parent for found in path.glob("*_drive_*/velodyne_points"))
+        return sorted(scans.parent for scans in path.glob("*_drive_*/velodyne_points"))
 
     def __init__(self, path: Path, sequence: str) -> None:
         super().__init__(path, sequence)
         folder = path
         if not (path / "velodyne_points").is_dir():
-            folder = path / self.one_of([drive.name for drive in self.drives(path)])
+            folder = path / self.choose_drive([drive.name for drive in self.drives(path)])
         elif sequence:
             raise UserError(f"{path}: is one drive; leave --sequence {sequence} out")
         if files_in(folder / "velodyne_points/data", [".txt"]):
@@ -68,7 +68,7 @@ class KittiRaw(Dataset):
         scans, times = self._files(folder / "velodyne_points", ".bin")
         if not scans:
             raise UserError(f"{folder / 'velodyne_points/data'}: no scan in it; expected 0000000000.bin")
-        fields = self.columns_in(scans)
+        fields = self.column_names(scans)
         self.check_sizes(scans, 4 * len(fields))
         edges, sensors = self._cameras(folder)
         table = self._oxts(folder)
@@ -77,9 +77,9 @@ class KittiRaw(Dataset):
             oxts, poses = table
             lidar_from_imu = _rigid(folder.parent / "calib_imu_to_velo.txt")
             edges.append((IMU, LIDAR, geometry.inverse(lidar_from_imu)))
-            self.streams.append(places(oxts, IMU, poses))
+            self.streams.append(pose_stream(oxts, IMU, poses))
         if edges:
-            self.streams.insert(0, mountings(int(times[0]), edges))
+            self.streams.insert(0, mounting_stream(int(times[0]), edges))
         self.streams += sensors
         tracklets = folder / "tracklet_labels.xml"
         if tracklets.is_file():
@@ -87,13 +87,13 @@ class KittiRaw(Dataset):
             numbers = [int(scan.stem) for scan in scans]
             none = LabelledBoxes3D(str(tracklets), 0, "", Boxes3D.empty(), (), np.zeros(0, np.float32))
             self.streams.append(
-                truth(
+                ground_truth_stream(
                     "vision_msgs/msg/Detection3DArray",
                     times,
                     lambda row: labelled.get(numbers[row], none),
                 )
             )
-        self.streams.append(clouds(times, scans, fields))
+        self.streams.append(cloud_stream(times, scans, fields))
 
     def _cameras(self, folder: Path) -> tuple[list[tuple[str, str, F64]], list[Stream]]:
         """Return the mountings and the streams of the cameras."""
@@ -111,10 +111,15 @@ class KittiRaw(Dataset):
                 rectified[:3, :3] = rows["R_rect_00"].reshape(3, 3)
             except (KeyError, ValueError):
                 raise UserError(f"{cameras}: no P_rect_{number} or R_rect_00, as KITTI writes it") from None
-            matrix, beside = split_projection(projection)
-            camera_from_lidar = beside @ rectified @ _rigid(folder.parent / "calib_velo_to_cam.txt")
+            matrix, camera_from_reference = split_projection(projection)
+            camera_from_lidar = (
+                camera_from_reference @ rectified @ _rigid(folder.parent / "calib_velo_to_cam.txt")
+            )
             edges.append((LIDAR, camera, geometry.inverse(camera_from_lidar)))
-            streams += [camera_info(camera, times, matrix), pictures(camera, times, images, aside=aside)]
+            streams += [
+                camera_info_stream(camera, times, matrix),
+                image_stream(camera, times, images, aside=aside),
+            ]
         return edges, streams
 
     def _oxts(self, folder: Path) -> tuple[I64, F64] | None:
@@ -141,9 +146,9 @@ class KittiRaw(Dataset):
         beyond = [f for f, number in zip(files, numbers, strict=True) if not 0 <= number < len(times)]
         if beyond:
             raise UserError(f"{stamps}: {len(times)} lines, and none for {beyond[0].name}")
-        at = np.array([times[number] for number in numbers], np.int64)
-        order = np.argsort(at, kind="stable")
-        return [files[i] for i in order.tolist()], at[order]
+        stamps_ns = np.array([times[number] for number in numbers], np.int64)
+        order = np.argsort(stamps_ns, kind="stable")
+        return [files[i] for i in order.tolist()], stamps_ns[order]
 
 
 def read_tracklets(file: Path) -> dict[int, LabelledBoxes3D]:
@@ -171,21 +176,21 @@ def read_tracklets(file: Path) -> dict[int, LabelledBoxes3D]:
                 rows[first + later].append((kind, str(number), row))
     except (ElementTree.ParseError, ValueError) as error:
         raise UserError(f"{file}: no tracklets as KITTI writes them: {error}") from None
-    found = {}
-    for scan, there in rows.items():
-        labels, ids, values = zip(*there, strict=True)
+    labels_by_scan = {}
+    for scan, objects in rows.items():
+        labels, ids, values = zip(*objects, strict=True)
         boxed = np.array(values, np.float32)
         boxes = Boxes3D(boxed[:, :3], boxed[:, 3:6], boxed[:, 6])
         ones = np.ones(len(labels), np.float32)
-        found[scan] = LabelledBoxes3D(str(file), 0, "", boxes, tuple(labels), ones, ids=tuple(ids))
-    return found
+        labels_by_scan[scan] = LabelledBoxes3D(str(file), 0, "", boxes, tuple(labels), ones, ids=tuple(ids))
+    return labels_by_scan
 
 
 def _text(item: Any, name: str) -> str:
-    found = item.findtext(name)
-    if found is None:
+    text = item.findtext(name)
+    if text is None:
         raise ValueError(f"an item has no {name}")
-    return str(found).strip()
+    return str(text).strip()
 
 
 def _rigid(file: Path) -> F64:

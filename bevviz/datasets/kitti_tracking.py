@@ -11,21 +11,21 @@ from bevviz.datasets.dataset import (
     Dataset,
     Stream,
     files_in,
-    frames_at,
-    pictures,
+    frame_stamps,
+    image_stream,
     read_table,
 )
 from bevviz.datasets.kitti import (
     IMU,
     LIDAR,
     Calibration,
-    camera_info,
-    clouds,
+    camera_info_stream,
+    cloud_stream,
+    ground_truth_stream,
     labelled_boxes,
-    mountings,
-    places,
+    mounting_stream,
+    pose_stream,
     poses_of_oxts,
-    truth,
 )
 from bevviz.errors import UserError
 from bevviz.model import geometry
@@ -47,8 +47,8 @@ class KittiTracking(Dataset):
         """Tell whether a folder has the layout of the benchmark, or is one drive of it."""
         if any((path / "calib").glob("[0-9]" * 4 + ".txt")):
             return any((path / "velodyne").glob("[0-9]" * 4))
-        above = path.parent  # The folder may be velodyne/0000.
-        return above.name == "velodyne" and (above.parent / f"calib/{path.name}.txt").is_file()
+        parent = path.parent  # The folder may be velodyne/0000.
+        return parent.name == "velodyne" and (parent.parent / f"calib/{path.name}.txt").is_file()
 
     @classmethod
     def drives(cls, path: Path) -> list[Path]:
@@ -65,39 +65,42 @@ class KittiTracking(Dataset):
             if sequence not in ("", name):
                 raise UserError(f"{path}: is one drive; leave --sequence {sequence} out")
         else:
-            name = self.one_of([drive.name for drive in self.drives(path)])
+            name = self.choose_drive([drive.name for drive in self.drives(path)])
         scans = files_in(root / "velodyne" / name, [".bin"])
         if not scans:
             raise UserError(f"{root / 'velodyne' / name}: no scan in it; expected 000000.bin")
         self.path = root
-        fields = self.columns_in(scans)
+        fields = self.column_names(scans)
         self.check_sizes(scans, 4 * len(fields))
         calibration = Calibration(root / f"calib/{name}.txt")
-        times = frames_at(RATE, _numbers(scans))
+        times = frame_stamps(RATE, _numbers(scans))
         edges, sensors = [], list[Stream]()
         for camera, aside in CAMERAS.items():
             images = files_in(root / camera / name, IMAGES)
             if not images:
                 continue
-            at = frames_at(RATE, _numbers(images))
+            image_times = frame_stamps(RATE, _numbers(images))
             matrix, camera_from_lidar = calibration.camera(int(camera[-1]))
             edges.append((LIDAR, camera, geometry.inverse(camera_from_lidar)))
-            sensors += [camera_info(camera, at, matrix), pictures(camera, at, images, aside=aside)]
+            sensors += [
+                camera_info_stream(camera, image_times, matrix),
+                image_stream(camera, image_times, images, aside=aside),
+            ]
         self.streams = []
         oxts = root / f"oxts/{name}.txt"
         if oxts.is_file():
             table = read_table(oxts, 6)
             edges.append((IMU, LIDAR, geometry.inverse(calibration.lidar_from_imu)))
-            self.streams.append(places(frames_at(RATE, range(len(table))), IMU, poses_of_oxts(table)))
+            self.streams.append(pose_stream(frame_stamps(RATE, range(len(table))), IMU, poses_of_oxts(table)))
         if edges:
-            self.streams.insert(0, mountings(int(times[0]), edges))
+            self.streams.insert(0, mounting_stream(int(times[0]), edges))
         self.streams += sensors
         labels = root / f"label_02/{name}.txt"
         if labels.is_file():
-            self.streams.append(self._truth(labels, calibration, scans))
-        self.streams.append(clouds(times, scans, fields))
+            self.streams.append(self._ground_truth(labels, calibration, scans))
+        self.streams.append(cloud_stream(times, scans, fields))
 
-    def _truth(self, file: Path, calibration: Calibration, scans: list[Path]) -> Stream:
+    def _ground_truth(self, file: Path, calibration: Calibration, scans: list[Path]) -> Stream:
         """Return the ground truth of the scans. A line has frame, object, and an object label."""
         lines: dict[int, list[tuple[int, str]]] = defaultdict(list)
         ids: dict[int, list[str]] = defaultdict(list)
@@ -111,9 +114,9 @@ class KittiTracking(Dataset):
             ids[int(frame)].append(track)
         numbers, pose = _numbers(scans), calibration.rectified_from_lidar
 
-        return truth(
+        return ground_truth_stream(
             BOXES,
-            frames_at(RATE, numbers),
+            frame_stamps(RATE, numbers),
             lambda row: labelled_boxes(file, lines[numbers[row]], pose, ids[numbers[row]]),
         )
 

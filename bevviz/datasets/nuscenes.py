@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bevviz.datasets.dataset import Dataset, Stream, pictures
+from bevviz.datasets.dataset import Dataset, Stream, image_stream
 from bevviz.datasets.folder import read_cloud
 from bevviz.errors import UserError, first_line
 from bevviz.messages.encode import (
@@ -32,9 +32,9 @@ from bevviz.support.files import open_regular
 MAP, BASE = "map", "base_link"
 TABLES = "sample_data.json"
 FIELDS = ("x", "y", "z", "intensity", "ring")
-PIECE = 1 << 22  # characters read at once; the largest table has a gigabyte
-MOST_OF_ROW = 1 << 24  # characters; a row usually has a thousand
-MOST_BYTES = 1 << 33  # bytes of a table
+READ_SIZE = 1 << 22  # characters read at once; the largest table has a gigabyte
+MAX_ROW = 1 << 24  # characters; a row usually has a thousand
+MAX_TABLE_BYTES = 1 << 33  # bytes of a table
 Record = Mapping[str, Any]
 
 
@@ -61,12 +61,14 @@ class NuScenes(Dataset):
         else:
             versions = _versions(path)
         scenes = {row["name"]: (row, tables) for tables in versions for row in records(tables / "scene.json")}
-        there = sorted(scenes)
+        available = sorted(scenes)
         if len(scenes) > 1 and not sequence:
-            there = self._with_scans(root, scenes)
-        absent = f"{len(scenes) - len(there)} of {len(scenes)} scenes have no LiDAR scan here"
-        scene, tables = scenes[self.one_of(there, f"; {absent}" if len(there) < len(scenes) else "")]
-        if len(there) < len(scenes):
+            available = self._with_scans(root, scenes)
+        absent = f"{len(scenes) - len(available)} of {len(scenes)} scenes have no LiDAR scan here"
+        scene, tables = scenes[
+            self.choose_drive(available, f"; {absent}" if len(available) < len(scenes) else "")
+        ]
+        if len(available) < len(scenes):
             self.warn(f"{absent}: {scene['name']} has")
         samples = _by_token(tables, "sample", lambda row: row["scene_token"] == scene["token"])
         data = _by_token(tables, "sample_data", lambda row: row["sample_token"] in samples)
@@ -75,36 +77,36 @@ class NuScenes(Dataset):
         )
         sensors = _by_token(tables, "sensor", lambda row: True)
         poses = _chosen(tables, "ego_pose", {row["ego_pose_token"] for row in data.values()})
-        taken: dict[str, list[Record]] = defaultdict(list)
-        lost, lacking = [], set[str]()
+        rows_by_channel: dict[str, list[Record]] = defaultdict(list)
+        missing, incomplete = [], set[str]()
         for row in sorted(data.values(), key=lambda row: row["timestamp"]):
             sensor = sensors[mounted[row["calibrated_sensor_token"]]["sensor_token"]]
             if sensor["modality"] == "radar":
                 continue
-            if _within(root, row["filename"]).is_file():
-                taken[sensor["channel"]].append(row)
+            if _resolve_file(root, row["filename"]).is_file():
+                rows_by_channel[sensor["channel"]].append(row)
             else:
-                lost.append(row["filename"])
+                missing.append(row["filename"])
                 if row["is_key_frame"]:
-                    lacking.add(row["sample_token"])
-        if lost:
-            named = len(lost) + sum(map(len, taken.values()))
+                    incomplete.add(row["sample_token"])
+        if missing:
+            total = len(missing) + sum(map(len, rows_by_channel.values()))
             self.warn(
-                f"{len(lost)} of {named} files of {scene['name']} are not there, "
-                f"{len(lacking)} of its {len(samples)} samples lack one; the first: {lost[0]}"
+                f"{len(missing)} of {total} files of {scene['name']} are not there, "
+                f"{len(incomplete)} of its {len(samples)} samples lack one; the first: {missing[0]}"
             )
         edges, clouds, images = [], list[Stream](), list[Stream]()
-        keys: dict[str, int] = {}  # stamp of the key scan by sample
-        for channel, rows in sorted(taken.items()):
+        key_stamps: dict[str, int] = {}  # stamp of the key scan by sample
+        for channel, rows in sorted(rows_by_channel.items()):
             calibration = mounted[rows[0]["calibrated_sensor_token"]]
             pose = _pose(calibration)
             times = 1000 * np.array([row["timestamp"] for row in rows], np.int64)
-            files = [_within(root, row["filename"]) for row in rows]
+            files = [_resolve_file(root, row["filename"]) for row in rows]
             if sensors[calibration["sensor_token"]]["modality"] == "lidar":
                 turns = round(geometry.yaw(pose) / (np.pi / 2))
                 pose = pose @ _quarter_turns(-turns)
                 clouds.append(self._clouds(channel, times, files, turns))
-                keys |= {
+                key_stamps |= {
                     r["sample_token"]: int(t) for r, t in zip(rows, times, strict=True) if r["is_key_frame"]
                 }
             else:
@@ -113,7 +115,7 @@ class NuScenes(Dataset):
         if not clouds:
             others = self._with_scans(root, scenes)
             raise UserError(
-                f"{root}: no LiDAR scan of {scene['name']} is there; its tables name {len(lost)} files; "
+                f"{root}: no LiDAR scan of {scene['name']} is there; its tables name {len(missing)} files; "
                 f"{len(others)} of {len(scenes)} scenes have scans here: {', '.join(others[:8])}"
                 f"{' ...' if len(others) > 8 else ''}"
             )
@@ -124,9 +126,9 @@ class NuScenes(Dataset):
                 clouds[0].times[:1],
                 lambda _: encode_transforms(int(clouds[0].times[0]), edges),
             ),
-            _places([poses[row["ego_pose_token"]] for rows in taken.values() for row in rows]),
+            _pose_stream([poses[row["ego_pose_token"]] for rows in rows_by_channel.values() for row in rows]),
             *images,
-            *self._truth(tables, keys),
+            *self._ground_truth(tables, key_stamps),
             *clouds,
         ]
 
@@ -136,7 +138,7 @@ class NuScenes(Dataset):
         Raises:
             UserError: there is none.
         """
-        found = set[str]()
+        tokens = set[str]()
         for tables in {tables for _, tables in scenes.values()}:
             lidars = {r["token"] for r in records(tables / "sensor.json") if r["modality"] == "lidar"}
             mounted = _by_token(tables, "calibrated_sensor", lambda r, of=lidars: r["sensor_token"] in of)
@@ -145,25 +147,28 @@ class NuScenes(Dataset):
                 records(tables / "sample_data.json"), desc=f"files of {tables.name}", unit="row", delay=1
             ):
                 scene = scene_of.get(row["sample_token"], "")
-                if scene in found or not row["is_key_frame"]:
+                if scene in tokens or not row["is_key_frame"]:
                     continue
-                if row["calibrated_sensor_token"] in mounted and _within(root, row["filename"]).is_file():
-                    found.add(scene)
-        if not found:
+                if (
+                    row["calibrated_sensor_token"] in mounted
+                    and _resolve_file(root, row["filename"]).is_file()
+                ):
+                    tokens.add(scene)
+        if not tokens:
             raise UserError(f"{root}: no LiDAR scan that the tables name is there; expected {self.expects}")
-        return sorted(name for name, (scene, _) in scenes.items() if scene["token"] in found)
+        return sorted(name for name, (scene, _) in scenes.items() if scene["token"] in tokens)
 
     def _clouds(self, channel: str, times: I64, files: Sequence[Path], turns: int) -> Stream:
         """Return the stream of scans, rotated by quarter turns so that x is ahead.
 
         nuScenes has five float32 values per point. Other sets have another number of them, or real PCD files.
         """
-        fields = self.columns_in(files, FIELDS)
+        fields = self.column_names(files, FIELDS)
         self.check_sizes([file for file in files if file.suffix == ".bin"], 4 * len(fields))
 
         def make(row: int) -> Any:
             points, announced = read_cloud(files[row], fields)
-            return encode_points(int(times[row]), channel, _turned(points, turns), announced)
+            return encode_points(int(times[row]), channel, _rotate(points, turns), announced)
 
         return Stream(f"/{channel}/points", "sensor_msgs/msg/PointCloud2", times, make, files=files)
 
@@ -186,50 +191,52 @@ class NuScenes(Dataset):
             return encode_intrinsics(int(times[row]), channel, about)
 
         yield Stream(f"/{channel}/camera_info", "sensor_msgs/msg/CameraInfo", times[:1], info)
-        yield pictures(channel, times, files, rectified=rectified)
+        yield image_stream(channel, times, files, rectified=rectified)
 
-    def _truth(self, tables: Path, keys: Mapping[str, int]) -> Iterator[Stream]:
+    def _ground_truth(self, tables: Path, key_stamps: Mapping[str, int]) -> Iterator[Stream]:
         """Yield the ground truth of the key frames in the map."""
         if not (tables / "sample_annotation.json").is_file():
             return
         labelled: dict[str, list[Record]] = defaultdict(list)
         for row in records(tables / "sample_annotation.json"):
-            if row["sample_token"] in keys:
+            if row["sample_token"] in key_stamps:
                 labelled[row["sample_token"]].append(row)
         wanted = {row["instance_token"] for rows in labelled.values() for row in rows}
         instances = _chosen(tables, "instance", wanted)
         categories = {row["token"]: row["name"] for row in records(tables / "category.json")}
-        order = sorted((time, sample) for sample, time in keys.items())
+        order = sorted((time, sample) for sample, time in key_stamps.items())
         times = np.array([time for time, _ in order], np.int64)
 
-        def make(at: int) -> Any:
-            stamp, sample = order[at]
+        def make(number: int) -> Any:
+            stamp, sample = order[number]
             rows = [
                 (row, categories[instances[row["instance_token"]]["category_token"]])
                 for row in labelled[sample]
             ]
-            known = [(row, CATEGORIES.get(name, name)) for row, name in rows if name not in NOT_DETECTED]
+            labelled_rows = [
+                (row, CATEGORIES.get(name, name)) for row, name in rows if name not in NOT_DETECTED
+            ]
             boxes = Boxes3D(
-                np.array([_numbers(row["translation"], 3) for row, _ in known]).reshape(-1, 3),
-                np.array([_numbers(row["size"], 3)[[1, 0, 2]] for row, _ in known], np.float32).reshape(
-                    -1, 3
-                ),
-                np.array([_yaw(row["rotation"]) for row, _ in known], np.float32),
+                np.array([_numbers(row["translation"], 3) for row, _ in labelled_rows]).reshape(-1, 3),
+                np.array(
+                    [_numbers(row["size"], 3)[[1, 0, 2]] for row, _ in labelled_rows], np.float32
+                ).reshape(-1, 3),
+                np.array([_yaw(row["rotation"]) for row, _ in labelled_rows], np.float32),
             )
-            ids = [row["instance_token"] for row, _ in known]
-            return encode_labels(stamp, MAP, boxes, [label for _, label in known], ids)
+            ids = [row["instance_token"] for row, _ in labelled_rows]
+            return encode_labels(stamp, MAP, boxes, [label for _, label in labelled_rows], ids)
 
         yield Stream("/ground_truth", "vision_msgs/msg/Detection3DArray", times, make)
 
 
-def _places(poses: Sequence[Record]) -> Stream:
+def _pose_stream(poses: Sequence[Record]) -> Stream:
     """Return the stream of vehicle poses by stamp."""
-    placed = {1000 * int(row["timestamp"]): row for row in poses}
-    times = np.array(sorted(placed), np.int64)
+    pose_rows = {1000 * int(row["timestamp"]): row for row in poses}
+    times = np.array(sorted(pose_rows), np.int64)
 
     def make(row: int) -> Any:
         stamp = int(times[row])
-        return encode_transforms(stamp, [(MAP, BASE, _pose(placed[stamp]))])
+        return encode_transforms(stamp, [(MAP, BASE, _pose(pose_rows[stamp]))])
 
     return Stream("/tf", "tf2_msgs/msg/TFMessage", times, make)
 
@@ -265,7 +272,7 @@ def _quarter_turns(number: int) -> F64:
     return pose
 
 
-def _turned(points: NDArray[np.void], turns: int) -> NDArray[np.void]:
+def _rotate(points: NDArray[np.void], turns: int) -> NDArray[np.void]:
     """Return the points rotated by quarter turns. Every coordinate keeps its digits."""
     x, y = points["x"], points["y"]
     turned = points.copy()
@@ -276,7 +283,7 @@ def _turned(points: NDArray[np.void], turns: int) -> NDArray[np.void]:
 # --- tables ------------------------------------------------------------------------------------
 
 
-def _within(root: Path, name: str) -> Path:
+def _resolve_file(root: Path, name: str) -> Path:
     """Return the file that a table names, which must be in the data set.
 
     Only the name counts: ``..`` and an absolute name must not lead out of the folder. Links in the folder are
@@ -285,10 +292,10 @@ def _within(root: Path, name: str) -> Path:
     Raises:
         UserError: the name leads out of the folder.
     """
-    place = os.path.relpath(root / name, root)
-    if place == os.pardir or place.startswith(f"{os.pardir}{os.sep}"):
+    relative = os.path.relpath(root / name, root)
+    if relative == os.pardir or relative.startswith(f"{os.pardir}{os.sep}"):
         raise UserError(f"{root}: {TABLES} names the file {name}, which is not in the data set")
-    return root / place
+    return root / relative
 
 
 def _versions(path: Path) -> list[Path]:
@@ -305,8 +312,8 @@ def records(table: Path) -> Iterator[dict[str, Any]]:
     decoder, buffer, at = json.JSONDecoder(), "", 0
     try:
         with TextIOWrapper(open_regular(table), encoding="utf-8") as file:
-            if os.fstat(file.fileno()).st_size > MOST_BYTES:
-                raise UserError(f"{table}: has more than {MOST_BYTES:,} bytes, which are read at most")
+            if os.fstat(file.fileno()).st_size > MAX_TABLE_BYTES:
+                raise UserError(f"{table}: has more than {MAX_TABLE_BYTES:,} bytes, which are read at most")
             while True:
                 while at < len(buffer) and buffer[at] in "[, \t\r\n":
                     at += 1
@@ -317,8 +324,8 @@ def records(table: Path) -> Iterator[dict[str, Any]]:
                     yield row
                     continue
                 except json.JSONDecodeError:
-                    more = file.read(PIECE)
-                if not more or len(buffer) - at > MOST_OF_ROW:
+                    more = file.read(READ_SIZE)
+                if not more or len(buffer) - at > MAX_ROW:
                     raise UserError(f"{table}: is cut, or no table of nuScenes")
                 buffer, at = buffer[at:] + more, 0
     except OSError as error:
@@ -340,7 +347,7 @@ def _chosen(tables: Path, name: str, tokens: Collection[str]) -> dict[str, Recor
     Raises:
         UserError: a row is missing.
     """
-    found = _by_token(tables, name, lambda row: row["token"] in tokens)
-    if missing := set(tokens) - found.keys():
+    rows = _by_token(tables, name, lambda row: row["token"] in tokens)
+    if missing := set(tokens) - rows.keys():
         raise UserError(f"{tables / name}.json: no row {min(missing)}, which another table names")
-    return found
+    return rows

@@ -14,8 +14,8 @@ from bevviz.errors import first_line
 from bevviz.messages.clouds import MOST_POINTS
 from bevviz.support.files import SENSOR_LIMIT, read_bytes
 
-MOST_LINES = 50  # lines of a header
-MOST_BYTES = 1 << 30
+MAX_HEADER_LINES = 50  # lines of a header
+MAX_UNPACKED = 1 << 30
 
 
 def read_pcd(file: Path) -> tuple[NDArray[np.void], int]:
@@ -29,21 +29,21 @@ def read_pcd(file: Path) -> tuple[NDArray[np.void], int]:
     """
     data = read_bytes(file, SENSOR_LIMIT)
     try:
-        about, body = _header(data)
-        layout = about.build_dtype()
+        header, body = _header(data)
+        layout = header.build_dtype()
     except (ValueError, LookupError, TypeError, StopIteration):
         raise ValueError("no header of a PCD, or a damaged one") from None
-    if about.points > MOST_POINTS:
-        raise ValueError(f"announces {about.points} points: {MOST_POINTS} at most are taken")
+    if header.points > MOST_POINTS:
+        raise ValueError(f"announces {header.points} points: {MOST_POINTS} at most are taken")
     try:
-        points = _points(about, layout, body)
+        points = _points(header, layout, body)
     except (ValueError, RuntimeError, LookupError, TypeError, MemoryError, struct.error) as error:
         raise ValueError(first_line(error)) from None
-    single = {name for name, count in zip(about.fields, about.count, strict=True) if count == 1}
+    single = {name for name, count in zip(header.fields, header.count, strict=True) if count == 1}
     names = [n for n in layout.names if n in single and n.isidentifier()]
     if missing := sorted({"x", "y", "z"} - set(names)):
         raise ValueError(f"no field {missing[0]} in it")
-    return points[names], about.points
+    return points[names], header.points
 
 
 def _header(data: bytes) -> tuple[Any, bytes]:
@@ -54,7 +54,7 @@ def _header(data: bytes) -> tuple[Any, bytes]:
     """
     from pypcd4.pypcd4 import MetaData
 
-    lines = data.split(b"\n", MOST_LINES)
+    lines = data.split(b"\n", MAX_HEADER_LINES)
     end = next(i for i, line in enumerate(lines) if line.startswith(b"DATA")) + 1
     words = [line.decode().split() for line in lines[:end] if line.strip() and not line.startswith(b"#")]
     stated = {key.upper(): values for key, *values in words}
@@ -63,7 +63,7 @@ def _header(data: bytes) -> tuple[Any, bytes]:
     kept = [i for i in range(len(fields)) if count[i]]
     height = int(stated.get("HEIGHT", "1")[0])
     size = int(stated["WIDTH"][0]) * height if "WIDTH" in stated else int(stated["POINTS"][0])
-    about = MetaData(
+    header = MetaData(
         fields=tuple(f"-{i}" if fields[i] == "_" else fields[i] for i in kept),
         size=tuple(int(stated["SIZE"][i]) for i in kept),
         type=tuple(stated["TYPE"][i] for i in kept),
@@ -73,21 +73,21 @@ def _header(data: bytes) -> tuple[Any, bytes]:
         height=height,
         data=stated["DATA"][0].lower(),
     )
-    return about, data[sum(len(line) + 1 for line in lines[:end]) :]
+    return header, data[sum(len(line) + 1 for line in lines[:end]) :]
 
 
-def _points(about: Any, layout: np.dtype[np.void], body: bytes) -> NDArray[np.void]:
+def _points(header: Any, layout: np.dtype[np.void], body: bytes) -> NDArray[np.void]:
     from pypcd4.pypcd4 import PointCloud
 
-    if about.data == "binary":
-        return np.frombuffer(body, layout, count=min(about.points, len(body) // layout.itemsize))
-    if about.data == "ascii":
-        if not body.endswith(b"\n") and len(body.splitlines()) < about.points:
+    if header.data == "binary":
+        return np.frombuffer(body, layout, count=min(header.points, len(body) // layout.itemsize))
+    if header.data == "ascii":
+        if not body.endswith(b"\n") and len(body.splitlines()) < header.points:
             body = body[: body.rfind(b"\n") + 1]  # The last line is cut.
         if not body.strip():
             return np.zeros(0, layout)
         return np.loadtxt(BytesIO(body), layout, ndmin=1, max_rows=MOST_POINTS)
-    if struct.unpack("<I", body[4:8])[0] > MOST_BYTES:
-        raise ValueError(f"unpacks to more than {MOST_BYTES} bytes")
-    whole: Any = BytesIO(about.compose_header().encode() + body)
+    if struct.unpack("<I", body[4:8])[0] > MAX_UNPACKED:
+        raise ValueError(f"unpacks to more than {MAX_UNPACKED} bytes")
+    whole: Any = BytesIO(header.compose_header().encode() + body)
     return np.asarray(PointCloud.from_fileobj(whole).pc_data)

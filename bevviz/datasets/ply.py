@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from bevviz.messages.clouds import MOST_POINTS
 from bevviz.support.files import SENSOR_LIMIT, read_bytes
 
-MOST_HEADER = 1 << 16  # bytes
+MAX_HEADER = 1 << 16  # bytes
 TYPES = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2",
     "uint16": "u2", "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4", "float": "f4", "float32": "f4",
@@ -35,7 +35,7 @@ def read_ply(file: Path) -> tuple[NDArray[np.void], int]:
     """
     data = read_bytes(file, SENSOR_LIMIT)
     order, elements, at = _header(data)
-    before = 0
+    skipped = 0
     for name, count, properties in elements:
         if any(kind not in TYPES for _, kind in properties):
             kind = next(kind for _, kind in properties if kind not in TYPES)
@@ -43,7 +43,7 @@ def read_ply(file: Path) -> tuple[NDArray[np.void], int]:
         layout = np.dtype([(label, ORDERS[order] + TYPES[kind]) for label, kind in properties])
         if name == "vertex":
             break
-        before += count if order == "ascii" else count * layout.itemsize
+        skipped += count if order == "ascii" else count * layout.itemsize
     else:
         raise ValueError("no element vertex in it")
     if missing := sorted({"x", "y", "z"} - set(layout.names or ())):
@@ -51,9 +51,9 @@ def read_ply(file: Path) -> tuple[NDArray[np.void], int]:
     if count > MOST_POINTS:
         raise ValueError(f"announces {count} points: {MOST_POINTS} at most are taken")
     if order != "ascii":
-        there = max(0, len(data) - at - before) // layout.itemsize
-        return np.frombuffer(data, layout, min(count, there), at + before if there else 0), count
-    lines = [*islice((line for line in BytesIO(data[at:]) if line.strip()), before, before + count)]
+        complete = max(0, len(data) - at - skipped) // layout.itemsize
+        return np.frombuffer(data, layout, min(count, complete), at + skipped if complete else 0), count
+    lines = [*islice((line for line in BytesIO(data[at:]) if line.strip()), skipped, skipped + count)]
     if lines and len(lines[-1].split()) < len(properties):
         lines.pop()  # The last line is cut.
     return np.loadtxt(BytesIO(b"".join(lines)), layout, ndmin=1) if lines else np.zeros(0, layout), count
@@ -64,7 +64,7 @@ def _header(data: bytes) -> tuple[str, list[tuple[str, int, list[tuple[str, str]
 
     CloudCompare writes ``scalar_`` before field names. CARLA calls the intensity ``I``.
     """
-    end = data.find(b"end_header", 0, MOST_HEADER)
+    end = data.find(b"end_header", 0, MAX_HEADER)
     newline = data.find(b"\n", end)
     if not data.startswith(b"ply") or end < 0 or newline < 0:
         raise ValueError("is empty" if not data else "no header of a PLY, or a damaged one")

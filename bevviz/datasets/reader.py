@@ -8,7 +8,7 @@ from collections.abc import Collection, Iterator
 import numpy as np
 from rosbags.interfaces import Connection, ConnectionExtRosbag2, MessageDefinition, MessageDefinitionFormat
 
-from bevviz.datasets.dataset import NOT_AS_DOCUMENTED, Dataset, describe
+from bevviz.datasets.dataset import NOT_AS_DOCUMENTED, Dataset, describe_error
 from bevviz.errors import UserError
 from bevviz.messages.encode import typestore
 from bevviz.model.frame import I64
@@ -41,13 +41,13 @@ class DatasetReader:
     @property
     def warnings(self) -> list[str]:
         """Warnings of the data set, unreadable files and cut files."""
-        said = [*self._dataset.warnings]
-        for found, of_many in ((self._lost, "cannot be read"), (self._cut, "are cut")):
-            for number, rows in found.items():
+        sentences = [*self._dataset.warnings]
+        for reasons, description in ((self._lost, "cannot be read"), (self._cut, "are cut")):
+            for number, rows in reasons.items():
                 stream, first = self._streams[number], rows[min(rows)]
-                several = f"{stream.topic}: {len(rows)} of {len(stream.times)} {of_many}; the first: "
-                said.append(f"{several if len(rows) > 1 else ''}{first}")
-        return list(dict.fromkeys(said))
+                several = f"{stream.topic}: {len(rows)} of {len(stream.times)} {description}; the first: "
+                sentences.append(f"{several if len(rows) > 1 else ''}{first}")
+        return list(dict.fromkeys(sentences))
 
     def messages(
         self, ids: Collection[int], start: int, stop: int
@@ -62,25 +62,25 @@ class DatasetReader:
             times.append(self._streams[number].times[first:last])
             numbers.append(np.full(last - first, number, np.int64))
             rows.append(np.arange(first, last, dtype=np.int64))
-        at, of, row = (np.concatenate(parts) for parts in (times, numbers, rows))
-        for i in np.lexsort((row, of, at)).tolist():
-            stream, at_row = self._streams[int(of[i])], int(row[i])
+        stamps, stream_of, row_of = (np.concatenate(parts) for parts in (times, numbers, rows))
+        for i in np.lexsort((row_of, stream_of, stamps)).tolist():
+            stream, at_row = self._streams[int(stream_of[i])], int(row_of[i])
             data: bytes | memoryview = b""
             try:
                 message = stream.make(at_row)
                 data = typestore().serialize_cdr(message, stream.type)
             except UserError as error:
-                self._lost[int(of[i])][at_row] = str(error)
+                self._lost[int(stream_of[i])][at_row] = str(error)
             except NOT_AS_DOCUMENTED as error:
                 self._dataset.warn(
-                    f"{stream.topic}: not as {self._dataset.about} is documented ({describe(error)})"
+                    f"{stream.topic}: not as {self._dataset.about} is documented ({describe_error(error)})"
                 )
             else:
-                if stream.files and (there := len(message.data) // message.point_step) < message.width:
-                    self._cut[int(of[i])][at_row] = (
-                        f"{stream.files[at_row]}: is cut: {there} of {message.width} points are there"
+                if stream.files and (whole_points := len(message.data) // message.point_step) < message.width:
+                    self._cut[int(stream_of[i])][at_row] = (
+                        f"{stream.files[at_row]}: is cut: {whole_points} of {message.width} points are there"
                     )
-            yield self.connections[int(of[i])], int(at[i]), data
+            yield self.connections[int(stream_of[i])], int(stamps[i]), data
 
     def times(self, ids: Collection[int]) -> I64:
         """Return the sorted log times of the connections ``ids``."""

@@ -7,7 +7,7 @@ from pathlib import Path
 
 AS_CLOUDS = "save them as PCD, PLY, BIN or NPY"
 AS_IMAGES = "save them as PNG or JPEG"
-KINDS = {
+ADVICE = {
     **dict.fromkeys(
         (".las", ".laz", ".e57", ".xyz", ".pts", ".npz", ".vtk", ".feather", ".pkl", ".h5", ".hdf5"),
         AS_CLOUDS,
@@ -18,15 +18,15 @@ KINDS = {
     ".pcap": "play them through their driver and record its topics",
     ".tfrecord": "convert them, for instance to KITTI's layout",
 }
-MOST = 10_000  # files examined in each folder
+MAX_FILES = 10_000  # files examined in each folder
 
 
 def unread(folder: Path) -> str:
     """Return a clause about the most frequent unread type in a folder and its subfolders; empty: none."""
-    places = [folder, *(d for d in sorted(folder.iterdir()) if d.is_dir())]
-    files = [f for place in places for f, _ in zip(place.iterdir(), range(MOST), strict=False)]
-    counts = Counter(kind for file in files if (kind := file.suffix.lower()) in KINDS)
+    folders = [folder, *(d for d in sorted(folder.iterdir()) if d.is_dir())]
+    files = [f for place in folders for f, _ in zip(place.iterdir(), range(MAX_FILES), strict=False)]
+    counts = Counter(kind for file in files if (kind := file.suffix.lower()) in ADVICE)
     if not counts:
         return ""
     kind, count = counts.most_common(1)[0]
-    return f"{count} {kind} file{'s are' if count > 1 else ' is'} not read: {KINDS[kind]}"
+    return f"{count} {kind} file{'s are' if count > 1 else ' is'} not read: {ADVICE[kind]}"

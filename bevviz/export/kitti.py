@@ -12,7 +12,7 @@ from bevviz.model import geometry
 from bevviz.model.frame import F32, F64, U8, Camera, Intrinsics
 from bevviz.model.results import FrameResult, Objects
 
-KINDS = {  # KITTI type by class name; other classes become Misc
+TYPES = {  # KITTI type by class name; other classes become Misc
     "car": "Car",
     "van": "Van",
     "truck": "Truck",
@@ -85,10 +85,10 @@ def labels(objects: Objects, intrinsics: Intrinsics, camera_from_points: F64) ->
     """
     flat = Intrinsics(intrinsics.width, intrinsics.height, intrinsics.K)
     width, height = intrinsics.width, intrinsics.height
-    found = []
-    every = geometry.corners(objects.boxes)
+    lines = []
+    corners = geometry.corners(objects.boxes)
     for row, name in enumerate(objects.names):
-        uv, _ = geometry.project(geometry.apply(camera_from_points, every[row]), flat)
+        uv, _ = geometry.project(geometry.apply(camera_from_points, corners[row]), flat)
         if not np.isfinite(uv).all():
             continue  # The object is partly behind the camera.
         low, high = uv.min(axis=0), uv.max(axis=0)
@@ -105,9 +105,9 @@ def labels(objects: Objects, intrinsics: Intrinsics, camera_from_points: F64) ->
         alpha = (turn - np.arctan2(x, z) + np.pi) % (2 * np.pi) - np.pi
         length, broad, tall = map(float, size)
         numbers = [alpha, *inside, tall, broad, length, x, y, z, turn, float(objects.score[row])]
-        stated = " ".join(f"{value:.4f}" for value in numbers)
-        found.append(f"{KINDS.get(name.lower(), 'Misc')} {max(0, 1 - area / whole):.2f} {UNKNOWN} {stated}")
-    return found
+        text = " ".join(f"{value:.4f}" for value in numbers)
+        lines.append(f"{TYPES.get(name.lower(), 'Misc')} {max(0, 1 - area / whole):.2f} {UNKNOWN} {text}")
+    return lines
 
 
 def _area(box: F32) -> float:

@@ -30,7 +30,7 @@ SHARED = ("category", "sensor")
 LIDAR = "LIDAR_TOP"
 MAP = "maps/unknown.png"  # placeholder for the map that the devkit requires
 JPEG_QUALITY = 95
-KINDS = {  # nuScenes category by class name; another class becomes its own category
+CATEGORIES = {  # nuScenes category by class name; another class becomes its own category
     "car": "vehicle.car",
     "van": "vehicle.car",
     "truck": "vehicle.truck",
@@ -58,13 +58,13 @@ class NuScenesExport(FolderExport):
 
     def __init__(self, folder: Path, camera: str = "") -> None:
         super().__init__(folder, camera)
-        self._rows: dict[str, list[dict[str, Any]]] = {name: [] for name in TABLES}
-        self._last: dict[tuple[str, str], dict[str, Any]] = {}  # previous row by table and chain
+        self._tables: dict[str, list[dict[str, Any]]] = {name: [] for name in TABLES}
+        self._previous_rows: dict[tuple[str, str], dict[str, Any]] = {}  # previous row by table and chain
         self._channels: dict[str, str] = {}
-        self._known: dict[tuple[str, str], str] = {}  # tokens of shared rows by table and key
-        self._annotated: dict[str, list[str]] = defaultdict(list)
+        self._tokens: dict[tuple[str, str], str] = {}  # tokens of shared rows by table and key
+        self._annotations: dict[str, list[str]] = defaultdict(list)
         # Summed score by instance and class.
-        self._named: dict[str, dict[str, float]] = defaultdict(lambda: defaultdict(float))
+        self._class_scores: dict[str, dict[str, float]] = defaultdict(lambda: defaultdict(float))
         self._scene, self._start = "", 0  # scene name, and stamp of the first frame in nanoseconds
 
     def begin(self, items: Items[object]) -> None:
@@ -74,7 +74,7 @@ class NuScenesExport(FolderExport):
         with self._saving("made"):
             cv2.imwrite(str(self._folder / MAP), np.zeros((8, 8), np.uint8))
         for token, level in (("1", "v0-40"), ("2", "v40-60"), ("3", "v60-80"), ("4", "v80-100")):
-            self._rows["visibility"].append({"token": token, "level": level, "description": ""})
+            self._tables["visibility"].append({"token": token, "level": level, "description": ""})
 
     def _folders(self, cameras: Sequence[str]) -> Sequence[str]:
         channels = [self._channel(name) for name in cameras if self._camera in ("", name)]
@@ -82,9 +82,9 @@ class NuScenesExport(FolderExport):
 
     def _channel(self, camera: str) -> str:
         name = re.sub(r"[^A-Z0-9]+", "_", camera.upper()).strip("_").removeprefix("CAM_") or "CAMERA"
-        taken = {channel for other, channel in self._channels.items() if other != camera}
+        others_channels = {channel for other, channel in self._channels.items() if other != camera}
         channel = f"CAM_{name}"
-        while channel in taken:
+        while channel in others_channels:
             channel += "_"
         return self._channels.setdefault(camera, channel)
 
@@ -96,7 +96,7 @@ class NuScenesExport(FolderExport):
             return
         self._start = self._start or frame.stamp
         scene, token = self._token("scene"), self._token("sample", self.frames)
-        sample = self._follow("sample", "", token, timestamp=_micros(frame.stamp), scene_token=scene)
+        sample = self._add_linked("sample", "", token, timestamp=_micros(frame.stamp), scene_token=scene)
         with self._saving():
             name = self._write_points(frame)
             mounted = self._calibrated(LIDAR, "lidar", np.eye(4), [])
@@ -144,13 +144,13 @@ class NuScenesExport(FolderExport):
 
     def _calibrated(self, channel: str, modality: str, pose: F64, matrix: Sequence[Sequence[float]]) -> str:
         """Return the token of a mounted sensor. Every change of its mounting gives a new token."""
-        sensor = self._once("sensor", channel, channel=channel, modality=modality)
-        placed = _placed(pose)
-        return self._once(
+        sensor = self._token_of("sensor", channel, channel=channel, modality=modality)
+        pose_fields = _pose_fields(pose)
+        return self._token_of(
             "calibrated_sensor",
-            json.dumps([channel, placed, matrix]),
+            json.dumps([channel, pose_fields, matrix]),
             sensor_token=sensor,
-            **placed,
+            **pose_fields,
             camera_intrinsic=matrix,
         )
 
@@ -166,8 +166,8 @@ class NuScenesExport(FolderExport):
         size: tuple[int, int],
     ) -> None:
         token = self._token("sample_data", channel, self.frames)
-        self._rows["ego_pose"].append({"token": token, "timestamp": _micros(stamp), **_placed(pose)})
-        self._follow(
+        self._tables["ego_pose"].append({"token": token, "timestamp": _micros(stamp), **_pose_fields(pose)})
+        self._add_linked(
             "sample_data",
             channel,
             token,
@@ -183,19 +183,19 @@ class NuScenesExport(FolderExport):
         )
 
     def _annotate(self, frame: Frame, sample: str, objects: Objects, tracks: Tracks | None) -> None:
-        tracked = {}
+        track_of = {}
         if tracks is not None:
-            tracked = {int(row): int(number) for number, row in zip(tracks.id, tracks.object, strict=True)}
+            track_of = {int(row): int(number) for number, row in zip(tracks.id, tracks.object, strict=True)}
         boxes = objects.boxes
         for row, name in enumerate(objects.names):
-            key = f"track {tracked[row]}" if row in tracked else f"object {self.frames} {row}"
-            kind = KINDS.get(name.lower(), f"other.{name}")
-            instance = self._once("instance", key)
-            self._named[instance][kind] += float(objects.score[row])
+            key = f"track {track_of[row]}" if row in track_of else f"object {self.frames} {row}"
+            category = CATEGORIES.get(name.lower(), f"other.{name}")
+            instance = self._token_of("instance", key)
+            self._class_scores[instance][category] += float(objects.score[row])
             turned = geometry.transform(
                 boxes.center[row], (0, 0, np.sin(boxes.yaw[row] / 2), np.cos(boxes.yaw[row] / 2))
             )
-            annotation = self._follow(
+            annotation = self._add_linked(
                 "sample_annotation",
                 instance,
                 self._token("sample_annotation", self.frames, row),
@@ -203,45 +203,45 @@ class NuScenesExport(FolderExport):
                 instance_token=instance,
                 visibility_token="",  # unknown
                 attribute_tokens=[],
-                **_placed(frame.pose @ turned),
+                **_pose_fields(frame.pose @ turned),
                 size=[float(side) for side in _width_first(boxes.size[row])],
                 num_lidar_pts=int(geometry.inside(frame.points, boxes, row).sum()),
                 num_radar_pts=0,
                 score=float(objects.score[row]),
             )
-            self._annotated[instance].append(annotation["token"])
+            self._annotations[instance].append(annotation["token"])
             self.labels += 1
 
-    def _once(self, table: str, key: str, **values: Any) -> str:
+    def _token_of(self, table: str, key: str, **values: Any) -> str:
         """Return the token of a row. The first call with a key writes the row."""
-        if (table, key) not in self._known:
-            token = self._known[table, key] = self._token(table, key)
-            self._rows[table].append({"token": token, **values})
-        return self._known[table, key]
+        if (table, key) not in self._tokens:
+            token = self._tokens[table, key] = self._token(table, key)
+            self._tables[table].append({"token": token, **values})
+        return self._tokens[table, key]
 
     def _token(self, table: str, *key: object) -> str:
         """Return a token of 32 hexadecimal digits. Tokens differ by scene except in shared tables."""
-        of = (table, *key) if table in SHARED else (self._scene, self._start, table, *key)
-        return hashlib.md5("\0".join(map(str, of)).encode(), usedforsecurity=False).hexdigest()
+        parts = (table, *key) if table in SHARED else (self._scene, self._start, table, *key)
+        return hashlib.md5("\0".join(map(str, parts)).encode(), usedforsecurity=False).hexdigest()
 
-    def _follow(self, table: str, of: str, token: str, **values: Any) -> dict[str, Any]:
+    def _add_linked(self, table: str, chain: str, token: str, **values: Any) -> dict[str, Any]:
         """Add a row and link it with the previous row of its chain."""
-        former = self._last.get((table, of))
-        row = {"token": token, **values, "prev": former["token"] if former else "", "next": ""}
-        if former:
-            former["next"] = token
-        self._last[table, of] = row
-        self._rows[table].append(row)
+        previous = self._previous_rows.get((table, chain))
+        row = {"token": token, **values, "prev": previous["token"] if previous else "", "next": ""}
+        if previous:
+            previous["next"] = token
+        self._previous_rows[table, chain] = row
+        self._tables[table].append(row)
         return row
 
     def end(self) -> None:
         """Write the tables."""
-        samples = self._rows["sample"]
+        samples = self._tables["sample"]
         if not samples:
             return
         captured = datetime.fromtimestamp(samples[0]["timestamp"] / 1e6, UTC)
         log, scene = self._token("log"), self._token("scene")
-        self._rows["log"] = [
+        self._tables["log"] = [
             {
                 "token": log,
                 "logfile": self._scene,
@@ -250,10 +250,10 @@ class NuScenesExport(FolderExport):
                 "location": "",
             }
         ]
-        self._rows["map"] = [
+        self._tables["map"] = [
             {"token": self._token("map"), "log_tokens": [log], "category": "semantic_prior", "filename": MAP}
         ]
-        self._rows["scene"] = [
+        self._tables["scene"] = [
             {
                 "token": scene,
                 "log_token": log,
@@ -264,14 +264,14 @@ class NuScenesExport(FolderExport):
                 "last_sample_token": samples[-1]["token"],
             }
         ]
-        for row in self._rows["instance"]:
-            found, named = self._annotated[row["token"]], self._named[row["token"]]
-            kind = max(named, key=named.__getitem__)
-            row["category_token"] = self._once("category", kind, name=kind, description="")
-            row["nbr_annotations"] = len(found)
-            row["first_annotation_token"], row["last_annotation_token"] = found[0], found[-1]
+        for row in self._tables["instance"]:
+            annotations, scores = self._annotations[row["token"]], self._class_scores[row["token"]]
+            kind = max(scores, key=scores.__getitem__)
+            row["category_token"] = self._token_of("category", kind, name=kind, description="")
+            row["nbr_annotations"] = len(annotations)
+            row["first_annotation_token"], row["last_annotation_token"] = annotations[0], annotations[-1]
         with self._saving():
-            for table, rows in self._rows.items():
+            for table, rows in self._tables.items():
                 (self._folder / VERSION / f"{table}.json").write_text(json.dumps(rows, indent=0))
 
 
@@ -279,7 +279,7 @@ def _micros(stamp: int) -> int:
     return stamp // 1000
 
 
-def _placed(pose: F64) -> dict[str, list[float]]:
+def _pose_fields(pose: F64) -> dict[str, list[float]]:
     x, y, z, w = map(float, geometry.quaternion(pose))
     return {"translation": [float(v) for v in pose[:3, 3]], "rotation": [w, x, y, z]}
 

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 from rosbags.rosbag2 import Reader
 
-from bevviz.bags.chunks import Chunk, ChunkMessage, Form, Scan
+from bevviz.bags.chunks import Chunk, ChunkFormat, ChunkMessage, ScanResult
 from bevviz.bags.mcap import (
     CHANNEL,
     CHUNK,
@@ -29,19 +29,19 @@ from bevviz.bags.mcap import (
     STATISTICS,
     Channels,
     read_index,
+    read_strings,
     read_times,
-    strings,
     unpack_chunk,
 )
-from bevviz.bags.reader import LAST, Bytes, Content
+from bevviz.bags.reader import LAST_TIME, Bytes, MemoryBytes
 
-HEAD = re.compile(  # an opcode with a length below 2^40, or the start of a compressed chunk's content
+RECORD_START = re.compile(  # an opcode with a length below 2^40, or the start of a compressed chunk's content
     rb"(?=[\x01-\x0f].{5}\0\0\0|\x04\0\0\0zstd.{8}\x28\xb5\x2f\xfd|\x03\0\0\0lz4.{8}\x04\x22\x4d\x18)",
     re.DOTALL,
 )
 COMPRESSIONS = (b"", b"lz4", b"zstd")
 HOUR, DAY = 3600 * 10**9, 24 * 3600 * 10**9
-PRIVATE = 0x80  # Opcodes from here on are private to applications.
+FIRST_PRIVATE = 0x80  # Opcodes from here on are private to applications.
 _SUMMARY = {CHUNK_INDEX, STATISTICS, 0x0A, 0x0C, 0x0D, 0x0E}
 
 
@@ -64,7 +64,7 @@ class Record(NamedTuple):
         return self.body - RECORD.size
 
 
-class Walker:
+class RecordWalker:
     """Iterator over the records of a file or of the content of a chunk.
 
     Args:
@@ -84,23 +84,23 @@ class Walker:
         while offset < size:
             if record is None:
                 record = self._skip(offset) or self._search(offset + 1, size)
-                self._pass((record.start if record else size) - offset)
+                self._count_broken((record.start if record else size) - offset)
                 if record is None:
                     return
                 offset = record.start
-            sound, following = self._settle(record)
+            sound, following = self._resolve(record)
             if sound is not None:
-                self._learn(sound)
+                self._extend_span(sound)
                 yield sound
                 if sound.opcode == FOOTER:
                     return
                 offset = sound.end
             elif following is not None:
-                self._pass(following.start - offset)
+                self._count_broken(following.start - offset)
                 offset = following.start
             record = following
 
-    def _settle(self, record: Record) -> tuple[Record | None, Record | None]:
+    def _resolve(self, record: Record) -> tuple[Record | None, Record | None]:
         """Return a record with its corrected end (None: broken), and the next record (None: unknown)."""
         size, is_chunk = self._source.size, record.opcode == CHUNK
         if record.end == size or record.opcode == FOOTER:
@@ -124,11 +124,11 @@ class Walker:
             return True
         return head[0] == MESSAGE and self._fits(offset + RECORD.size)
 
-    def _pass(self, size: int) -> None:
+    def _count_broken(self, size: int) -> None:
         self.broken += 1
         self.passed += size
 
-    def _learn(self, record: Record) -> None:
+    def _extend_span(self, record: Record) -> None:
         if record.opcode == MESSAGE:
             _, _, time, _ = MESSAGE_HEAD.unpack(self._source.read(record.body, MESSAGE_HEAD.size))
             first, last = self._span or (time, time)
@@ -144,7 +144,7 @@ class Walker:
 
     def _search(self, start: int, stop: int, chunk: bool = False) -> Record | None:
         """Return the next sound record, or only the next chunk."""
-        for offset in self._source.search(HEAD, start):
+        for offset in self._source.search(RECORD_START, start):
             if offset >= stop:
                 return None
             head = self._source.read(offset, RECORD.size)
@@ -175,11 +175,11 @@ class Walker:
         if record.end > size:
             cut = not searched and 0 < opcode <= DATA_END and length < 1 << 40 and self._is_sane(record)
             return record if cut else None
-        if not self._is_sane(record) and not (opcode >= PRIVATE and not searched):
+        if not self._is_sane(record) and not (opcode >= FIRST_PRIVATE and not searched):
             return None
         if searched and record.end + RECORD.size <= size and opcode != FOOTER:
             after, following = RECORD.unpack(self._source.read(record.end, RECORD.size))
-            if not (0 < after <= DATA_END or after >= PRIVATE) or following >= 1 << 40:
+            if not (0 < after <= DATA_END or after >= FIRST_PRIVATE) or following >= 1 << 40:
                 return None
             if opcode == MESSAGE and not self._fits(body):
                 return None
@@ -205,7 +205,7 @@ class Walker:
             return (
                 length >= MESSAGE_HEAD.size
                 and len(head) == MESSAGE_HEAD.size
-                and MESSAGE_HEAD.unpack(head)[2] < LAST
+                and MESSAGE_HEAD.unpack(head)[2] < LAST_TIME
             )
         if opcode in (SCHEMA, CHANNEL, HEADER, MESSAGE_INDEX):
             if length > 1 << 26:
@@ -213,7 +213,7 @@ class Walker:
             data = self._source.read(body, length)
             offset, count = {SCHEMA: (2, 3), CHANNEL: (4, 3), HEADER: (0, 2), MESSAGE_INDEX: (2, 1)}[opcode]
             try:
-                return offset + sum(4 + len(text) for text in strings(data, offset, count)) == len(data)
+                return offset + sum(4 + len(text) for text in read_strings(data, offset, count)) == len(data)
             except struct.error:
                 return False
         if opcode in (FOOTER, DATA_END):
@@ -256,13 +256,13 @@ class Walker:
         return None
 
 
-def scan(file: Bytes, found: Scan, tell: Callable[[int], object]) -> None:
+def scan(file: Bytes, result: ScanResult, report: Callable[[int], object]) -> None:
     """Scan a file from front to back, with the content of every chunk."""
     channels = Channels()
-    walker = Walker(file, channels)
+    walker = RecordWalker(file, channels)
     outside = array("q")
     for opcode, body, end in walker(len(MAGIC) if file.read(0, len(MAGIC)) == MAGIC else 0):
-        tell(end)
+        report(end)
         if opcode in (SCHEMA, CHANNEL):
             channels.note(opcode, file.read(body, end - body))
         elif opcode == MESSAGE:
@@ -270,19 +270,19 @@ def scan(file: Bytes, found: Scan, tell: Callable[[int], object]) -> None:
             outside.extend((time, channel, body + MESSAGE_HEAD.size, end - body - MESSAGE_HEAD.size))
         elif opcode == CHUNK:
             chunk = _read_head(file, body, end)
-            found.begin(chunk)
-            _describe(file, chunk, channels, found)
+            result.begin(chunk)
+            _describe(file, chunk, channels, result)
             if chunk.cut:
-                found.cut, found.rescued = file.size - body, sum(chunk.counts.values())
+                result.cut, result.rescued = file.size - body, sum(chunk.counts.values())
         elif opcode == MESSAGE_INDEX:
             channel, size = struct.unpack("<HI", file.read(body, 6))
-            found.listed[channel] += size // 16
+            result.listed[channel] += size // 16
         elif opcode == STATISTICS and end - body >= 8:
-            found.stated = int.from_bytes(file.read(body, 8), "little")
-    found.end()
-    found.broken += walker.broken
-    found.passed += walker.passed
-    found.index.connections = channels.connections(found.finish(channels, outside))
+            result.stated = int.from_bytes(file.read(body, 8), "little")
+    result.end()
+    result.broken += walker.broken
+    result.passed += walker.passed
+    result.index.connections = channels.connections(result.finish(channels, outside))
 
 
 def _read_head(file: Bytes, body: int, end: int) -> Chunk:
@@ -293,12 +293,12 @@ def _read_head(file: Bytes, body: int, end: int) -> Chunk:
     return Chunk(first, last, data, min(end, file.size) - data, size, name, {}, crc, times={}, cut=cut)
 
 
-def _describe(file: Bytes, chunk: Chunk, channels: Channels, found: Scan) -> None:
+def _describe(file: Bytes, chunk: Chunk, channels: Channels, result: ScanResult) -> None:
     """Fill in the messages and channels of a chunk."""
     times: dict[int, array[int]] = defaultdict(lambda: array("q"))
     data, chunk.damage, _ = unpack_chunk(file, chunk)
-    content = Content(data)
-    walker = Walker(content, channels, _span(chunk))
+    content = MemoryBytes(data)
+    walker = RecordWalker(content, channels, _span(chunk))
     for opcode, body, end in walker(0):
         if opcode == MESSAGE:
             channel, _, time, _ = MESSAGE_HEAD.unpack(content.read(body, MESSAGE_HEAD.size))
@@ -306,40 +306,40 @@ def _describe(file: Bytes, chunk: Chunk, channels: Channels, found: Scan) -> Non
         elif opcode in (SCHEMA, CHANNEL):
             channels.note(opcode, content.read(body, end - body))
     if not (chunk.cut or chunk.damage):
-        found.broken += walker.broken
-        found.passed += walker.passed
+        result.broken += walker.broken
+        result.passed += walker.passed
     chunk.fill(times)
 
 
-def look_into(file: Bytes, chunk: Chunk) -> tuple[list[ChunkMessage], str]:
+def read_messages(file: Bytes, chunk: Chunk) -> tuple[list[ChunkMessage], str]:
     """Return the messages of a chunk on the channels of its index, and the damage of its content."""
     content, damage, checked = unpack_chunk(file, chunk)
     data = memoryview(content)
-    found, whole = _messages(data, chunk.counts)
-    if not checked and not (whole and len(found) == sum(chunk.counts.values())):
-        walk = Walker(Content(content), chunk.counts, _span(chunk))(0)
+    messages, whole = _messages(data, chunk.counts)
+    if not checked and not (whole and len(messages) == sum(chunk.counts.values())):
+        walk = RecordWalker(MemoryBytes(content), chunk.counts, _span(chunk))(0)
         records = [data[r.start : r.end] for r in walk if r.opcode == MESSAGE]
-        found = [message for record in records for message in _messages(record, chunk.counts)[0]]
-    return found, damage
+        messages = [message for record in records for message in _messages(record, chunk.counts)[0]]
+    return messages, damage
 
 
 def _messages(data: memoryview, channels: Container[int]) -> tuple[list[ChunkMessage], bool]:
     """Return the messages of a chunk by the record lengths, and whether the lengths lead to its end."""
-    found, offset, size = [], 0, len(data)
+    messages, offset, size = [], 0, len(data)
     while offset + RECORD.size <= size:
         opcode, length = RECORD.unpack_from(data, offset)
         body = offset + RECORD.size
         offset = body + length
         if opcode == MESSAGE and offset <= size and length >= MESSAGE_HEAD.size:
             channel, _, time, _ = MESSAGE_HEAD.unpack_from(data, body)
-            if channel in channels and time < LAST:
-                found.append((time, channel, data[body + MESSAGE_HEAD.size : offset]))
-    return found, offset == size
+            if channel in channels and time < LAST_TIME:
+                messages.append((time, channel, data[body + MESSAGE_HEAD.size : offset]))
+    return messages, offset == size
 
 
 def _span(chunk: Chunk) -> tuple[int, int] | None:
-    return (chunk.start, chunk.end) if 0 < chunk.start <= chunk.end < LAST else None
+    return (chunk.start, chunk.end) if 0 < chunk.start <= chunk.end < LAST_TIME else None
 
 
 REPAIR = "'mcap recover' writes a sound copy"
-FORM = Form(Reader, True, read_index, read_times, look_into, scan, REPAIR)
+FORM = ChunkFormat(Reader, True, read_index, read_times, read_messages, scan, REPAIR)

@@ -15,15 +15,15 @@ from pathlib import Path
 import numpy as np
 from rosbags.interfaces import Connection, ConnectionExtRosbag2, MessageDefinition
 
-from bevviz.bags.mcap import FORMATS, NOTHING
-from bevviz.bags.reader import LAST, DamageError, Message
+from bevviz.bags.mcap import FORMATS, NO_DEFINITION
+from bevviz.bags.reader import LAST_TIME, DamageError, Message
 from bevviz.bags.rescue.sqlite_pages import PAGE_SIZES, Pages
 from bevviz.errors import UserError
 from bevviz.model.frame import I64
 from bevviz.support import progress
 
 INTEGER_SIZES = {0: 0, 1: 1, 2: 2, 3: 3, 4: 4, 5: 6, 6: 8, 7: 8, 8: 0, 9: 0}  # bytes by serial type
-COLUMNS = 16  # more columns than any table of rosbag2 has
+MAX_COLUMNS = 16  # more columns than any table of rosbag2 has
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,23 +70,23 @@ class SqliteRescuer:
     def span(self) -> tuple[int, int]:
         """Log time of the first message, and log time of the last message plus one nanosecond."""
         times = self._rows[:, 0]
-        return (int(times[0]), int(times[-1]) + 1) if len(times) else (LAST, 0)
+        return (int(times[0]), int(times[-1]) + 1) if len(times) else (LAST_TIME, 0)
 
     @property
     def warnings(self) -> list[str]:
         """Rescued and lost messages, one sentence each."""
-        found = [f"read {len(self._rows)} messages"]
+        notes = [f"read {len(self._rows)} messages"]
         if self._incomplete:
-            found.append(f"{self._incomplete} more are incomplete: lost")
+            notes.append(f"{self._incomplete} more are incomplete: lost")
         if self._undescribed:
-            found.append(f"{self._undescribed} messages are of topics that nothing describes: lost")
+            notes.append(f"{self._undescribed} messages are of topics that nothing describes: lost")
         if self._broken:
-            found.append(f"{self._broken} broken row(s) or page(s) passed over")
+            notes.append(f"{self._broken} broken row(s) or page(s) passed over")
         if self._pages.log_frames:
-            found.append(f"{self._pages.log_frames} page(s) of the log do not fit their checksum")
+            notes.append(f"{self._pages.log_frames} page(s) of the log do not fit their checksum")
         if self._unread:
-            found.append(f"{len(self._unread)} messages could no longer be read: lost")
-        return found
+            notes.append(f"{len(self._unread)} messages could no longer be read: lost")
+        return notes
 
     def messages(self, ids: Collection[int], start: int, stop: int) -> Iterator[Message]:
         """Yield messages of the connections ``ids`` with start <= log time < stop, in order of log time."""
@@ -124,19 +124,19 @@ class SqliteRescuer:
                 page = self._pages.read(number)
                 for at in self._pointers(page, number):
                     try:
-                        self._take(self._cell(page, at), (number, at), rows, topics, definitions, seen)
+                        self._add_row(self._cell(page, at), (number, at), rows, topics, definitions, seen)
                     except DamageError:
                         self._broken += 1
-        found: I64 = np.frombuffer(rows, np.int64).reshape(-1, 5)
-        known = np.isin(found[:, 1], list(topics))
+        table: I64 = np.frombuffer(rows, np.int64).reshape(-1, 5)
+        known = np.isin(table[:, 1], list(topics))
         self._undescribed = int((~known).sum())
-        found = found[known]
-        found = found[np.lexsort((found[:, 4], found[:, 0]))]  # rows with the same time in order of their ids
-        self._rows: I64 = found[:, :4]  # time, topic, page, offset of the cell
-        counts = Counter(found[:, 1].tolist())
+        table = table[known]
+        table = table[np.lexsort((table[:, 4], table[:, 0]))]  # rows with the same time in order of their ids
+        self._rows: I64 = table[:, :4]  # time, topic, page, offset of the cell
+        counts = Counter(table[:, 1].tolist())
         self.connections: Sequence[Connection] = [
             Connection(
-                *(number, name, msgtype, definitions.get(msgtype, NOTHING), "", counts[number]),
+                *(number, name, msgtype, definitions.get(msgtype, NO_DEFINITION), "", counts[number]),
                 ConnectionExtRosbag2(encoding, []),
                 None,
             )
@@ -172,7 +172,7 @@ class SqliteRescuer:
         end += offset
         columns: list[tuple[int, int]] = []
         start = end
-        while column < end and len(columns) < COLUMNS:
+        while column < end and len(columns) < MAX_COLUMNS:
             kind, column = _varint(page, column)
             if kind in (10, 11):
                 raise DamageError("a column is of a type that there is not")
@@ -182,10 +182,10 @@ class SqliteRescuer:
             raise DamageError("the columns of a row are longer than the row")
         return Cell(page, rowid, offset, local, size, overflow, tuple(columns))
 
-    def _take(
+    def _add_row(
         self,
         cell: Cell,
-        place: tuple[int, int],
+        position: tuple[int, int],
         rows: array[int],
         topics: dict[int, tuple[str, str, str]],
         definitions: dict[str, MessageDefinition],
@@ -196,17 +196,17 @@ class SqliteRescuer:
         if len(kinds) == 3 and max(kinds[:2]) < 10 and kinds[2] >= 12 and kinds[2] % 2 == 0:
             # messages: id, topic_id, timestamp, data
             topic, time = _integer(cell, 1), _integer(cell, 2)
-            if not 0 <= time < LAST or cell.columns[3][1] + (kinds[2] - 12) // 2 != cell.size:
+            if not 0 <= time < LAST_TIME or cell.columns[3][1] + (kinds[2] - 12) // 2 != cell.size:
                 raise DamageError("a message of an impossible time or size")
             if cell.rowid in seen:
                 return
             seen.add(cell.rowid)
             try:
-                self._overflow(cell)
+                self._overflow_pages(cell)
             except DamageError:
                 self._incomplete += 1
                 return
-            rows.extend((time, topic, *place, cell.rowid))
+            rows.extend((time, topic, *position, cell.rowid))
         elif len(kinds) >= 3 and kinds[0] >= 13 and kinds[0] % 2:
             text = self._texts(cell)
             if text[1] in FORMATS:  # message_definitions: id, type, encoding, definition, hash
@@ -214,7 +214,7 @@ class SqliteRescuer:
             elif text[0][:1] == "/" or "/" in text[1]:  # topics: id, name, type, serialization_format, ...
                 topics[cell.rowid] = text[0], text[1], text[2]
 
-    def _overflow(self, cell: Cell) -> list[int]:
+    def _overflow_pages(self, cell: Cell) -> list[int]:
         """Return the overflow pages of a row.
 
         Raises:
@@ -230,7 +230,7 @@ class SqliteRescuer:
             pages.append(number)
             left -= room
             if left > 0:
-                number = self._pages.first(number)
+                number = self._pages.next_overflow(number)
         return pages
 
     def _content(self, cell: Cell) -> bytes:
@@ -239,7 +239,7 @@ class SqliteRescuer:
         Raises:
             DamageError: a page is missing.
         """
-        pages = self._overflow(cell)
+        pages = self._overflow_pages(cell)
         parts = [cell.page[cell.offset : cell.offset + cell.local]]
         parts += [self._pages.read(number)[4 : self._pages.usable] for number in pages]
         content = b"".join(parts)

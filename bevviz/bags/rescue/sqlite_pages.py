@@ -24,7 +24,7 @@ class Pages:
 
     def __init__(self, path: Path) -> None:
         self._file = Bytes(path)
-        log = log_of(path)
+        log = log_path(path)
         self._log = Bytes(log) if log.exists() else None
         self.in_log: dict[int, int] = {}  # offset of the newest version by page number
         self.log_frames = 0  # number of log frames with a wrong checksum
@@ -45,8 +45,8 @@ class Pages:
     @property
     def count(self) -> int:
         """Number of pages of the file and the log."""
-        own = -(-self._file.size // self.size)
-        return max([own, *self.in_log])
+        file_pages = -(-self._file.size // self.size)
+        return max([file_pages, *self.in_log])
 
     @property
     def length(self) -> int:
@@ -63,7 +63,7 @@ class Pages:
         """Tell whether the first ``size`` bytes of a page exist."""
         return number > 0 and (number in self.in_log or (number - 1) * self.size + size <= self._file.size)
 
-    def first(self, number: int) -> int:
+    def next_overflow(self, number: int) -> int:
         """Read the number at the start of an overflow page: the next overflow page."""
         if (offset := self.in_log.get(number)) is not None and self._log is not None:
             return int.from_bytes(self._log.read(offset, 4), "big")
@@ -130,7 +130,7 @@ def page_size_of(head: bytes) -> int | None:
     return size if head[: len(MAGIC)] == MAGIC and size in PAGE_SIZES else None
 
 
-def log_of(path: Path) -> Path:
+def log_path(path: Path) -> Path:
     """Return the path of the write-ahead log of a database."""
     return path.with_name(path.name + "-wal")
 
