@@ -1,8 +1,8 @@
 """The whole configuration: pydantic models with units, two presets, YAML files and ``key=value`` settings.
 
-``default`` is the better method at every stage, ``reference`` is what the ROS 2 tutorial pipeline
-computes. The tutorial's own parameter names (``cluster_tolerance`` ...) are accepted everywhere. Where a
-stage is somebody else's, its parameters are those of the model beside it, under ``SECTION.params``.
+The preset ``default`` takes the better method at every stage. The preset ``reference`` computes the results
+of the ROS 2 tutorial pipeline. The tutorial's own parameter names (``cluster_tolerance`` ...) are accepted
+everywhere. A user-defined stage takes its parameters under ``SECTION.params``.
 """
 
 from bevviz.config.class_sizes import SIZES

@@ -1,4 +1,4 @@
-"""How large the objects of a class are."""
+"""Typical sizes of the objects of a class."""
 
 from __future__ import annotations
 
@@ -8,11 +8,12 @@ from typing import Annotated, Any
 from pydantic import AfterValidator, PositiveFloat
 from pydantic_core import PydanticCustomError
 
-# Mean length, width and height of a class in metres, and the spread (one sigma) of each. Means of road users
-# are KITTI's (Geiger et al. 2012, as Qi et al. 2018 give them for Frustum PointNets), of what KITTI has not
-# those of nuScenes (Caesar et al. 2020, as Zhu et al. 2019 give them for CBGS); truck is between them, since
-# COCO calls a pickup one, too. Spreads are those of KITTI's cars (wider across: cars elsewhere are 2 m wide),
-# else wider than the two sets differ. What stands below the line is our own estimate.
+# Mean length, width and height of a class in metres, and the spread (one sigma) of each.
+# Means of road users are KITTI's (Geiger et al. 2012, as Qi et al. 2018 give them for Frustum PointNets).
+# Classes that KITTI lacks have the means of nuScenes (Caesar et al. 2020, as Zhu et al. 2019 give them for
+# CBGS). The truck is between the two, since COCO also calls a pickup a truck.
+# Spreads are those of KITTI's cars, but wider across, since cars elsewhere are 2 m wide. Other spreads are
+# wider than the difference between the two data sets. Sizes below the line are our own estimates.
 SIZES: dict[str, tuple[float, ...]] = {
     "car": (3.88, 1.63, 1.53, 0.43, 0.15, 0.14),
     "van": (5.07, 1.90, 2.21, 0.50, 0.15, 0.25),
@@ -42,13 +43,14 @@ SIZES: dict[str, tuple[float, ...]] = {
 
 
 def _with_known(given: Any) -> Any:
-    """What is stated changes single classes."""
+    """Return the default sizes with the stated classes changed."""
     if not isinstance(given, Mapping):
         return given
     return {**SIZES, **{str(name).lower(): size for name, size in given.items()}}
 
 
 def _six(given: tuple[float, ...]) -> tuple[float, ...]:
+    """Raise an error for pydantic unless a size has six numbers."""
     if len(given) != 6:
         raise PydanticCustomError(
             "size",

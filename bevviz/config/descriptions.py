@@ -1,4 +1,4 @@
-"""One parameter in words: what it is, in which unit and range, what it is now and where that was stated."""
+"""Description of one parameter: meaning, unit, range, current value and where it was stated."""
 
 from __future__ import annotations
 
@@ -28,7 +28,13 @@ WIDTH = 100
 
 
 def field_of(key: str, config: Config | None = None) -> FieldInfo | None:
-    """Of a dotted key; None: there is none, or only with the stages that a configuration names."""
+    """Return the pydantic field of a dotted key, or None for an unknown key.
+
+    Args:
+        key: dotted key.
+        config: configuration whose stages define the keys ``SECTION.params.NAME``. Without it, they are
+            unknown.
+    """
     section, _, name = key.partition(".")
     if config is not None and name.startswith("params."):
         return params_of(config, section).get(name.removeprefix("params."))
@@ -39,14 +45,14 @@ def field_of(key: str, config: Config | None = None) -> FieldInfo | None:
 
 
 def explain(asked: str, config: Config) -> str:
-    """A parameter, or the parameters of a section.
+    """Describe a parameter, or all parameters of a section.
 
     Args:
-        asked: dotted key, name of the tutorial's, or section.
-        config: in force.
+        asked: dotted key, tutorial name or section.
+        config: configuration in force.
 
     Raises:
-        UserError: there is none of that name; the nearest is told.
+        UserError: no key has this name. The message names the nearest one.
     """
     about = keys(config)
     key = TUTORIAL_NAMES.get(asked, asked)
@@ -60,6 +66,7 @@ def explain(asked: str, config: Config) -> str:
 
 
 def _lines(key: str, config: Config, about: str) -> Iterator[str]:
+    """Yield the lines that describe one parameter."""
     yield f"{key} = {_value(values(config)[key])}"
     if about:
         yield textwrap.fill(about, WIDTH, initial_indent="  ", subsequent_indent="  ")
@@ -88,7 +95,7 @@ def _lines(key: str, config: Config, about: str) -> Iterator[str]:
 
 
 def _allowed(info: FieldInfo) -> str:
-    """Choices, or the range, in words."""
+    """Return the choices or the range of a parameter in words."""
     annotation = info.annotation
     options = [a for a in (annotation, *get_args(annotation)) if get_origin(a) is Literal]
     if options:
@@ -105,6 +112,7 @@ def _allowed(info: FieldInfo) -> str:
 
 
 def _value(value: Any) -> str:
+    """Return a value as text of at most ``WIDTH`` characters."""
     import json
 
     def plain(one: Any) -> Any:
@@ -115,4 +123,5 @@ def _value(value: Any) -> str:
 
 
 def _wrapped(head: str, about: str) -> str:
+    """Return a line with its description wrapped below it."""
     return f"{head}\n{textwrap.fill(about, WIDTH, initial_indent='  ', subsequent_indent='  ')}"

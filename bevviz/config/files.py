@@ -1,4 +1,4 @@
-"""Configurations as YAML."""
+"""Configurations as YAML files."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from bevviz.config.trust import RECEIVED, NamedCode, Trust, trust_in
 from bevviz.errors import UserError, first_line
 from bevviz.support.files import CONFIG_LIMIT, read_text
 
-MOST_DOTS = 1000  # of a line of TOML: the time that tomllib takes grows with their square
-MOST_VALUES = 1_000_000  # of a YAML file, with each alias counted as often as it is used
+MOST_DOTS = 1000  # Most dots in a line of TOML. The time that tomllib needs grows with their square.
+MOST_VALUES = 1_000_000  # Most values in a YAML file. An alias counts as often as it is used.
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,9 +26,9 @@ class Layer:
     """Values by dotted key, and where they are stated.
 
     Attributes:
-        where: for errors.
-        values: by dotted key.
-        trust: whether functions among the values may run. They may not, unless a caller says so.
+        where: name of the source, for error messages.
+        values: values by dotted key.
+        trust: whether functions among the values may run. By default they may not.
     """
 
     where: str
@@ -37,26 +37,31 @@ class Layer:
 
     @property
     def functions(self) -> tuple[str, ...]:
-        """``module:function`` of every stage that the values name."""
+        """The ``module:function`` of every stage for which the values name one."""
         named = (self.values.get(f"{section}.{key}") for section, key in STAGES.items())
         return tuple(method for method in named if isinstance(method, str) and is_foreign(method))
 
 
 def read_layer(path: Path, *, pipe: bool = True) -> Layer:
-    """Read what a YAML file states. Its functions may run where the user has trusted the file.
+    """Read the values that a YAML file states. Its functions may run only if the user has trusted the file.
 
     Args:
-        path: of the file.
-        pipe: whether it may be a pipe of the shell, ``<(...)``.
+        path: the file.
+        pipe: whether the file may be a pipe of the shell, ``<(...)``.
 
     Raises:
-        UserError: it cannot be read.
+        UserError: the file cannot be read.
     """
     layer = Layer(str(path), flattened(_read_yaml(path, pipe)))
     return replace(layer, trust=trust_in(NamedCode((path,), layer.functions)))
 
 
 def _read_yaml(path: Path, pipe: bool) -> Mapping[str, Any]:
+    """Read the tree of sections of a YAML file.
+
+    Raises:
+        UserError: the file cannot be read, or is no tree of sections.
+    """
     problem = f"{path}: cannot read the configuration"
     tree = yaml_value(read_text(path, CONFIG_LIMIT, problem=problem, pipe=pipe), str(path))
     if tree is None:
@@ -67,6 +72,15 @@ def _read_yaml(path: Path, pipe: bool) -> Mapping[str, Any]:
 
 
 def yaml_value(text: str, where: str) -> Any:
+    """Parse YAML.
+
+    Args:
+        text: YAML.
+        where: name of the source, for error messages.
+
+    Raises:
+        UserError: the text is not valid YAML, or its aliases stand for too many values.
+    """
     from ruamel.yaml import YAML
     from ruamel.yaml.error import YAMLError
 
@@ -80,13 +94,13 @@ def yaml_value(text: str, where: str) -> Any:
         raise UserError(f"{where}:{line} is not valid YAML: {problem}") from None
     except RecursionError:
         raise UserError(f"{where}: is not valid YAML for a configuration: too deep") from None
-    except (ValueError, OverflowError) as error:  # a date that is none
+    except (ValueError, OverflowError) as error:  # a date that does not exist
         raise UserError(f"{where}: is not valid YAML: {error}") from None
     return tree
 
 
 def _check_size(tree: Any, where: str) -> None:
-    """Refuse YAML whose aliases stand for too many values: few lines can stand for billions.
+    """Refuse YAML whose aliases stand for too many values. A few lines can stand for billions.
 
     Raises:
         UserError: there are more than ``MOST_VALUES``.
@@ -97,7 +111,7 @@ def _check_size(tree: Any, where: str) -> None:
         if not isinstance(node, list | dict):
             return 1
         if id(node) not in sizes:
-            sizes[id(node)] = 1  # of a node that is within itself
+            sizes[id(node)] = 1  # for a node that contains itself
             sizes[id(node)] = 1 + sum(map(size, node.values() if isinstance(node, dict) else node))
         return sizes[id(node)]
 
@@ -109,11 +123,11 @@ def toml_tree(path: Path, problem: str) -> dict[str, Any]:
     """Read a TOML file.
 
     Args:
-        path: of the file.
-        problem: begins the sentence where it cannot be read.
+        path: the file.
+        problem: beginning of the error message if the file cannot be read.
 
     Raises:
-        UserError: it cannot be read, or is no TOML.
+        UserError: the file cannot be read, or is not TOML.
     """
     text = read_text(path, CONFIG_LIMIT, problem=problem)
     if any(line.count(".") > MOST_DOTS for line in text.splitlines()):
@@ -122,12 +136,12 @@ def toml_tree(path: Path, problem: str) -> dict[str, Any]:
         return tomllib.loads(text)
     except RecursionError:
         raise UserError(f"{path}: is no TOML for a configuration: too deep") from None
-    except ValueError as error:  # also a number of thousands of digits
+    except ValueError as error:  # also for a number of thousands of digits
         raise UserError(f"{path}: is no TOML: {first_line(error)}") from None
 
 
 def dump(config: Config) -> str:
-    """The configuration as YAML with each parameter's unit and meaning, readable back by ``load``."""
+    """Return the configuration as YAML, with the unit and meaning of each parameter. ``load`` can read it."""
     about = keys(config)
     lines = []
     for section, content in config.model_dump(mode="json").items():
@@ -151,21 +165,31 @@ def dump(config: Config) -> str:
 
 
 def _note(key: str, about: Mapping[str, str]) -> str:
+    """Return the comment with the unit and meaning of a dotted key."""
     text = (f"in {unit(key)}; " if unit(key) else "") + about.get(key, "")
     return f"  # {text}" if text else ""
 
 
 def flat_yaml(text: str, where: str) -> dict[str, Any]:
-    """Dotted keys and values of what ``dump`` has written, by this version or another.
+    """Return the values by dotted key of YAML that ``dump`` of any version has written.
+
+    Args:
+        text: YAML.
+        where: name of the source, for error messages.
 
     Raises:
-        UserError: no YAML; ``where`` says whose.
+        UserError: the text is not valid YAML.
     """
     return flattened(yaml_value(text, where) or {})
 
 
 def stated_lines(config: Config, *, folders: bool = True) -> list[str]:
-    """For each place that states parameters one line, with their names: ``bevviz.toml: clustering.eps``."""
+    """Return one line for each source of values, with the keys it states: ``bevviz.toml: clustering.eps``.
+
+    Args:
+        config: the configuration.
+        folders: whether to write the folder of a file.
+    """
     found: dict[str, list[str]] = {}
     for key, where in config.stated.items():
         place = "command line" if where.startswith("--") else where if folders else Path(where).name

@@ -1,4 +1,4 @@
-"""Parameters by their dotted keys: what they mean, what they are, and what differs."""
+"""Parameters by their dotted keys: descriptions, values, units and differences."""
 
 from __future__ import annotations
 
@@ -28,7 +28,11 @@ TUTORIAL_NAMES = {
 
 
 def keys(config: Config | None = None) -> dict[str, str]:
-    """Every dotted key with its description, in order; of a configuration, those of its plugins too."""
+    """Return every dotted key with its description, in order.
+
+    Args:
+        config: configuration whose plugins add the keys ``SECTION.params.NAME``.
+    """
     found: dict[str, str] = {}
     for section, info in Config.model_fields.items():
         model = _model(section)
@@ -47,7 +51,7 @@ def keys(config: Config | None = None) -> dict[str, str]:
 
 
 def values(config: Config) -> dict[str, Any]:
-    """The value of each dotted key, those of plugins included."""
+    """Return the value of each dotted key, including the parameters of plugins."""
     found: dict[str, Any] = {}
     for section, given in config:
         if not isinstance(given, Section):
@@ -63,7 +67,7 @@ def values(config: Config) -> dict[str, Any]:
 
 @dataclass(frozen=True, slots=True)
 class ParameterChange:
-    """Of one parameter."""
+    """Old and new value of one parameter."""
 
     before: Any
     after: Any
@@ -77,7 +81,12 @@ class ParameterChange:
 
 
 def changes(old: Config | Mapping[str, Any], new: Config | Mapping[str, Any]) -> dict[str, ParameterChange]:
-    """Each dotted key that differs. Mappings are of ``flat_yaml``, perhaps of another version."""
+    """Return each dotted key that differs between two configurations.
+
+    Args:
+        old: configuration, or the mapping that ``flat_yaml`` returns, even for another version of bevviz.
+        new: the same.
+    """
     before, after = (values(side) if isinstance(side, Config) else side for side in (old, new))
     return {
         key: ParameterChange(before.get(key, "absent"), after.get(key, "absent"))
@@ -87,7 +96,10 @@ def changes(old: Config | Mapping[str, Any], new: Config | Mapping[str, Any]) ->
 
 
 def flattened(tree: Mapping[str, Any]) -> dict[str, Any]:
-    """Dotted keys of a tree of sections. What is deeper is a value, but for the parameters of plugins."""
+    """Return the values of a tree of sections by dotted key.
+
+    A deeper mapping is a value, except for the parameters of plugins.
+    """
     flat: dict[str, Any] = {}
     for name, value in tree.items():
         if name not in Config.model_fields or name == "preset" or not isinstance(value, Mapping):
@@ -102,18 +114,19 @@ def flattened(tree: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def unit(key: str) -> str:
-    """Name of the unit that the value of a dotted key is in; empty where it has none."""
+    """Return the name of the unit of a dotted key, or an empty string if it has none."""
     found = _unit(key)
     return found.name if found is not None else ""
 
 
 def unit_spellings(key: str) -> tuple[str, ...]:
-    """Units that the value of a dotted key may be given in, e.g. m, cm and mm."""
+    """Return the units that a user may write for a dotted key, e.g. m, cm and mm."""
     found = _unit(key)
     return tuple(found.factors) if found is not None else ()
 
 
 def _unit(key: str) -> Unit | None:
+    """Return the unit of a dotted key, or None if it has none."""
     section, _, name = key.partition(".")
     model = _model(section)
     if model is None or name not in model.model_fields:
@@ -129,13 +142,13 @@ def _unit(key: str) -> Unit | None:
 
 
 def _model(section: str) -> type[BaseModel] | None:
-    """Of a section; None: there is none of that name, or it is a value."""
+    """Return the model of a section, or None if the name is unknown or stands for a single value."""
     model = Config.model_fields[section].annotation if section in Config.model_fields else None
     return model if isinstance(model, type) and issubclass(model, BaseModel) else None
 
 
 def unknown_key(key: str, known: Sequence[str]) -> str:
-    """That there is no such key, with the nearest of the ``known`` ones."""
+    """Return the sentence for an unknown key, with the nearest of the ``known`` keys."""
     choices = {k.replace(".params.", "."): k for k in [*known, *TUTORIAL_NAMES]}
     by_last = [k for k in choices if k.rsplit(".", 1)[-1] == key.rsplit(".", 1)[-1]]
     near = by_last or difflib.get_close_matches(key.replace(".params.", "."), choices, 1, 0.3)

@@ -1,4 +1,4 @@
-"""The effective configuration, of presets, files and settings; what is wrong in them, in one line."""
+"""Build the effective configuration from presets, files and settings, with one-line errors."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from bevviz.config.user_stages import names_function, params_model
 from bevviz.errors import UserError
 from bevviz.support.text import shown
 
-BASE = "configuration"  # where values are stated that came as a whole
+BASE = "configuration"  # source name of values that come from a whole configuration
 
 REFERENCE: dict[str, dict[str, Any]] = {
     "voxel": {"size": 0.05, "average": True},
@@ -27,7 +27,7 @@ REFERENCE: dict[str, dict[str, Any]] = {
         "eps": 0.5,
         "min_points": 50,
         "min_cluster_points": 1,
-        "max_cluster_points": None,  # declared by the tutorial as 1000 and never applied
+        "max_cluster_points": None,  # The tutorial declares 1000 and never applies it.
         "boxes": "axis_aligned",
     },
     "detector": {"conf_threshold": 0.25},
@@ -46,23 +46,24 @@ def load(
     layers: Iterable[Layer] = (),
     in_force: Config | None = None,
 ) -> Config:
-    """The effective configuration: preset, then the layers, the files, then each ``key=value``, later ones
-    winning.
+    """Build the effective configuration.
 
-    Functions (``module:function``) run only where the user has named them or has trusted the file that does:
-    each value comes in a layer, whose ``trust`` says so. This is the one place where it is decided.
+    The preset comes first, then the layers, the files, and each ``key=value``. Later values win.
+
+    A function (``module:function``) runs only if the user has named it, or has trusted the file that names
+    it. Each value comes in a layer whose ``trust`` says so. Only this function decides it.
 
     Args:
         file: YAML files.
-        settings: ``key=value`` each, of the user; what others have sent comes as ``received`` makes it.
-        preset: which one; None: as the files say, else ``default``.
-        base: a whole configuration that all of this is to change, or its values by dotted key.
-        layers: of the project, see ``bevviz.config.project``.
-        in_force: a configuration whose functions run already, and may go on.
+        settings: ``key=value`` each, typed by the user. Settings from other sources come from ``received``.
+        preset: name of the preset. None: the preset that the files name, or else ``default``.
+        base: configuration to change, or its values by dotted key.
+        layers: layers of the project, see ``bevviz.config.project``.
+        in_force: running configuration. Its functions may go on running.
 
     Raises:
-        UserError: unreadable file, unknown key, wrong unit or value out of range, or a function that may not
-            run, in one line.
+        UserError: a file cannot be read, a key is unknown, a unit is wrong, a value is out of range, or a
+            function may not run. The message is one line.
     """
     files = [Path(file)] if isinstance(file, str | Path) else file or ()
     whole = Layer(BASE, values(base)) if isinstance(base, Config) else base
@@ -133,12 +134,12 @@ def load(
 
 
 def revised(config: Config, settings: Iterable[str], trust: Trust = MESSAGE) -> Config:
-    """The configuration with other values.
+    """Return the configuration with some values changed.
 
     Args:
-        config: that is in force.
+        config: configuration in force.
         settings: ``key=value`` each.
-        trust: whether functions among the values may run. Those that are in force may.
+        trust: whether functions among the new values may run. Functions in force may run in any case.
 
     Raises:
         UserError: as ``load``.
@@ -147,26 +148,26 @@ def revised(config: Config, settings: Iterable[str], trust: Trust = MESSAGE) -> 
 
 
 def received(settings: Iterable[str], where: str = "", trust: Trust = RECEIVED) -> list[Layer]:
-    """Read settings that the user has not typed, for ``load``: functions among them do not run.
+    """Read settings that the user has not typed, for ``load``. Functions among them do not run.
 
     Args:
         settings: ``key=value`` each.
-        where: they come from, for errors; empty: the setting itself is told.
-        trust: with what the user can do instead.
+        where: name of their source, for error messages. Empty: the message quotes the setting.
+        trust: trust with the advice to give to the user.
 
     Raises:
-        UserError: one of them is no ``key=value``.
+        UserError: a setting is not ``key=value``.
     """
     return [_setting(setting, trust, where) for setting in settings]
 
 
 def _setting(text: str, trust: Trust, where: str = "") -> Layer:
-    """One ``key=value``."""
+    """Parse one ``key=value``."""
     key, sep, value = text.partition("=")
     if not sep:
         raise UserError(f"--set {text}: expected key=value, for example --set clustering.eps=0.6")
     parsed = yaml_value(value, f"--set {text}") if value.strip() else ""
-    if isinstance(parsed, int) and _is_text(key.strip()):  # 0001 is a name
+    if isinstance(parsed, int) and _is_text(key.strip()):  # The text 0001 is a name, not the number 1.
         parsed = value.strip()
     return Layer(where or f"--set {text}", {key.strip(): parsed}, trust)
 
@@ -177,18 +178,18 @@ def _functions(
     stating: Mapping[str, Layer],
     running: Iterable[Functions],
 ) -> Functions:
-    """Check that the user has named the functions of the stages, or trusts who does.
+    """Check that the user has named or trusted the functions of the stages.
 
-    A value that was received is kept where a trusted layer, or the configuration in force, has the same.
+    A received value is kept if a trusted layer, or the configuration in force, has the same value.
 
     Args:
         given: every key and value with its layer.
-        stated: the values in force.
-        stating: the layer of each.
+        stated: values in force.
+        stating: layer of each value in force.
         running: functions that are in force already.
 
     Returns:
-        The functions in force, with the folder of each one's module.
+        The functions in force, with the folder of each module.
 
     Raises:
         UserError: a function may not run.
@@ -213,7 +214,7 @@ def _functions(
 
 
 def _unfit_network(where: str, method: str, key: str, about: Mapping[str, str]) -> str:
-    """What a file that is named as a 3D detector lacks first: itself, or what no file tells."""
+    """Return the error about a 3D detector whose file or first required parameter is missing."""
     head = where if method in where else f"{where}: objects.method {method}"
     if not Path(method).is_file():
         return f"{head}: no such file"
@@ -221,19 +222,19 @@ def _unfit_network(where: str, method: str, key: str, about: Mapping[str, str]) 
 
 
 def _alike(method: Any, other: Any) -> bool:
-    """Whether the parameters of one method are those of the other, too: networks, trained twice."""
+    """Return whether two methods take the same parameters. Two network files do."""
     return is_network(str(method)) and is_network(str(other))
 
 
 def _is_text(key: str) -> bool:
-    """Whether a parameter is a text, whatever is in it."""
+    """Return whether the value of a parameter is text."""
     section, _, name = key.partition(".")
     model = Config.model_fields[section].annotation if section in Config.model_fields else None
     return name in getattr(model, "model_fields", {}) and model.model_fields[name].annotation is str  # type: ignore[union-attr]
 
 
 def _params(stated: Mapping[str, Any], origin: Mapping[str, str], functions: Functions) -> dict[str, str]:
-    """Dotted keys and descriptions of the parameters of the plugins and networks that are named."""
+    """Return dotted keys and descriptions of the parameters of the named plugins and networks."""
     found: dict[str, str] = {}
     for section, key in STAGES.items():
         method = stated.get(f"{section}.{key}")
@@ -250,7 +251,7 @@ def _params(stated: Mapping[str, Any], origin: Mapping[str, str], functions: Fun
 
 
 def _param_models(tree: Mapping[str, Any], functions: Functions) -> Iterator[tuple[str, type[BaseModel]]]:
-    """The sections whose functions or networks have parameters of their own, with the model of these."""
+    """Yield each section whose function or network has parameters, with the model of these parameters."""
     for section, key in STAGES.items():
         model = params_model(section, str(tree.get(section, {}).get(key, "")), functions)
         if model is not None:
@@ -258,16 +259,19 @@ def _param_models(tree: Mapping[str, Any], functions: Functions) -> Iterator[tup
 
 
 def _lower(message: str) -> str:
+    """Return a message of pydantic as the middle of a sentence."""
     message = message.replace("Input should be", "must be")
     return message[0].lower() + message[1:]
 
 
 def _prefixes(loc: tuple[int | str, ...]) -> Iterable[str]:
+    """Yield the dotted keys that contain a location, longest first."""
     for end in range(len(loc), 0, -1):
         yield ".".join(map(str, loc[:end]))
 
 
 def _insert(tree: dict[str, Any], key: str, value: Any) -> None:
+    """Insert the value of a dotted key into a tree."""
     *path, last = key.split(".")
     for part in path:
         tree = tree.setdefault(part, {})

@@ -1,4 +1,4 @@
-"""What the stages can be: ours, a function, a network, or a topic of the robot's."""
+"""Methods that a stage can name: built-in, a function, a network, or a topic of the robot."""
 
 from __future__ import annotations
 
@@ -13,13 +13,14 @@ from bevviz.config.pillars import is_network
 
 @dataclass(frozen=True, slots=True)
 class Methods:
-    """What a stage can be: one of ours, ``module:function``, a registered name, or ``topic:NAME``."""
+    """Allowed methods of a stage: built-in, ``module:function``, a registered name, or ``topic:NAME``."""
 
     ours: tuple[str, ...]
-    former: Mapping[str, str] = field(default_factory=dict)  # names that ours once had
-    networks: bool = False  # an ONNX file, too
+    former: Mapping[str, str] = field(default_factory=dict)  # former names of built-in methods
+    networks: bool = False  # whether an ONNX file is allowed
 
     def check(self, value: str) -> str:
+        """Return the current name of a method. Raise an error for pydantic if the stage does not allow it."""
         value = self.former.get(value, value)
         if value in self.ours or ":" in value or value in plugins.registered():
             return value
@@ -41,8 +42,8 @@ GROUND = Methods(("polar", "plane"), {"ransac": "plane"})
 CLUSTERING = Methods(("dbscan",))
 OBJECTS = Methods(("frustum",), networks=True)
 OURS = ("", "demo", *GROUND.ours, *GROUND.former, *CLUSTERING.ours, *OBJECTS.ours)
-CLASS_LISTS = ("coco", "coco91")  # values of detector.names that are no file
-STAGES = {  # section -> the key that names its function
+CLASS_LISTS = ("coco", "coco91")  # values of detector.names that name no file
+STAGES = {  # section -> key that names the function
     "ground": "method",
     "clustering": "method",
     "detector": "model",

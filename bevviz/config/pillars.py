@@ -1,4 +1,4 @@
-"""What the ONNX file of a 3D detector does not tell: the parameters of ``objects.method=FILE.onnx``."""
+"""Parameters that the ONNX file of a 3D detector does not state, for ``objects.method=FILE.onnx``."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from pydantic import (
 from pydantic_core import PydanticCustomError
 
 SUFFIX = ".onnx"
-MAX_POINTS = 1000  # of a pillar; known networks have up to 100
+MAX_POINTS = 1000  # Most points of a pillar. Known networks have up to 100.
 
 Feature = Literal[
     "x",
@@ -36,19 +36,21 @@ Feature = Literal[
 Share = Annotated[float, Field(ge=0, le=1)]
 Three = tuple[PositiveFloat, PositiveFloat, PositiveFloat]
 Six = tuple[float, float, float, float, float, float]
-UNFIT = "unfit"  # type of an error that says what was given itself
+UNFIT = "unfit"  # type of an error whose sentence already contains the stated value
 
 
 def _unfit(sentence: str) -> PydanticCustomError:
+    """Return an error for pydantic with a complete sentence."""
     return PydanticCustomError(UNFIT, "{sentence}", {"sentence": sentence})
 
 
 def _one_or_several(given: Any) -> Any:
+    """Return a single string as a list."""
     return [given] if isinstance(given, str) else given
 
 
 class PillarParams(BaseModel):
-    """How clouds are shown to a network on pillars, and how its maps are read. Metres and radians."""
+    """Input encoding and output decoding of a network on pillars. Metres and radians."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, validate_default=True)
 
@@ -148,6 +150,7 @@ class PillarParams(BaseModel):
     @field_validator("point_range")
     @classmethod
     def _upwards(cls, given: Six) -> Six:
+        """Check that each low end is below its high end."""
         if any(low >= high for low, high in zip(given[:3], given[3:], strict=True)):
             raise _unfit("has a low end above its high one: it is lowest x, y, z, then highest x, y, z")
         return given
@@ -155,6 +158,7 @@ class PillarParams(BaseModel):
     @field_validator("voxel_size")
     @classmethod
     def _whole(cls, given: Three, info: ValidationInfo) -> Three:
+        """Check that pillars have the full height and divide the range evenly."""
         if (around := info.data.get("point_range")) is None:
             return given
         reach = [high - low for low, high in zip(around[:3], around[3:], strict=True)]
@@ -173,6 +177,7 @@ class PillarParams(BaseModel):
     @field_validator("classes")
     @classmethod
     def _different(cls, given: tuple[str, ...]) -> tuple[str, ...]:
+        """Check that no class is named twice."""
         if len(set(given)) < len(given):
             raise _unfit("has a name twice")
         return given
@@ -180,6 +185,7 @@ class PillarParams(BaseModel):
     @field_validator("score_thresholds", "min_rotation")
     @classmethod
     def _known(cls, given: Mapping[str, float], info: ValidationInfo) -> Mapping[str, float]:
+        """Check that each name is a class."""
         known = info.data.get("classes", ())
         for name in given:
             if name not in known:
@@ -189,13 +195,14 @@ class PillarParams(BaseModel):
     @field_validator("groups")
     @classmethod
     def _all(cls, given: Any, info: ValidationInfo) -> Any:
+        """Check that the groups contain all classes in their order."""
         if given and tuple(name for group in given for name in group) != info.data.get("classes"):
             raise _unfit("must hold the names of classes, each once and in their order")
         return given
 
     @property
     def grid(self) -> tuple[int, int]:
-        """Pillars along x and y."""
+        """Number of pillars along x and y."""
         low, high = self.point_range[:2], self.point_range[3:5]
         nx, ny = (round((b - a) / size) for a, b, size in zip(low, high, self.voxel_size, strict=False))
         return nx, ny
@@ -206,5 +213,5 @@ FED = ("point_range", "voxel_size", "features", "max_points", "max_pillars", "in
 
 
 def is_network(method: str) -> bool:
-    """Whether ``objects.method`` names the file of a network, not a function or a topic."""
+    """Return whether ``objects.method`` names a network file, and not a function or a topic."""
     return method.lower().endswith(SUFFIX) and ":" not in method

@@ -1,4 +1,4 @@
-"""Finds what a configuration names by ``module:name``, or by a name that an installed package registered."""
+"""Look up functions that a configuration names by ``module:name`` or by a registered name."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ from pydantic import BaseModel
 
 from bevviz.errors import UserError, first_line
 
-GROUP = "bevviz.stages"  # of the entry points that packages register
+GROUP = "bevviz.stages"  # group of the entry points that packages register
 TOPIC = "topic:"
-PARAMS = "Params"  # the pydantic model beside the function, where it has parameters
+PARAMS = "Params"  # name of the pydantic model of the parameters, in the function's module
 POSITIONAL = (Parameter.POSITIONAL_ONLY, Parameter.POSITIONAL_OR_KEYWORD)
-# Names of a stage's first parameter.
+# Allowed names of a stage's first parameter.
 CLOUDS = ("points", "cloud", "point_cloud", "pointcloud", "pts", "xyz", "xyzi", "voxels", "obstacles")
 IMAGES = ("image", "img", "bgr", "frame", "picture")
 _ARRAY_TYPE = re.compile(r"\b(ndarray|NDArray|ArrayLike|Tensor)\b")
@@ -39,13 +39,13 @@ HOW = "write a function whose first parameter is 'points' or 'image' (docs/stage
 
 @dataclass(frozen=True, slots=True)
 class Plugin:
-    """Somebody else's function, or class to be made once.
+    """A user-defined function, or a class that is instantiated once.
 
     Attributes:
-        name: ``module:name``, also where the configuration has a registered name.
-        target: what that is.
-        params: the model of its parameters; None: it has none.
-        takes_params: whether it is to be given them, after its array.
+        name: ``module:name``, also if the configuration has a registered name.
+        target: the function or class.
+        params: model of its parameters. None: it has none.
+        takes_params: whether it takes its parameters as an argument after the array.
     """
 
     name: str
@@ -55,17 +55,18 @@ class Plugin:
 
     @property
     def module(self) -> str:
+        """Name of the module."""
         return self.name.partition(":")[0]
 
     @property
     def file(self) -> Path | None:
-        """Where it was loaded from; None for what is no file."""
+        """File that the module was loaded from, or None if there is no file."""
         found = getattr(sys.modules.get(self.module), "__file__", None)
         return Path(found) if found else None
 
     @property
     def version(self) -> str:
-        """Of the distribution that it came with, else what its package says of itself, else empty."""
+        """Name and version of its distribution, else the version that its package states, else empty."""
         package = self.module.partition(".")[0]
         for distribution in packages_distributions().get(package, ()):
             return f"{distribution} {installed_version(distribution)}"
@@ -74,26 +75,26 @@ class Plugin:
 
 @cache
 def registered() -> dict[str, str]:
-    """The names that installed packages registered, with the ``module:name`` of each."""
+    """Return the ``module:name`` of each name that installed packages registered."""
     return {point.name: point.value for point in entry_points(group=GROUP)}
 
 
 def is_foreign(method: str) -> bool:
-    """Whether it names a function of somebody else's, rather than one of ours or a topic."""
+    """Return whether a method names a user-defined function, and not a built-in method or a topic."""
     return ":" in method and not method.startswith(TOPIC)
 
 
 @cache
 def find(name: str, folder: str | None = "") -> Plugin:
-    """Import what is named ``module:name``.
+    """Import the function or class ``module:name``.
 
     Args:
-        name: of the function or class.
-        folder: where its module lies, if it is not installed. Empty: the working directory. None: nowhere, as
-            an installed package has registered it.
+        name: ``module:name``.
+        folder: folder of a module that is not installed. Empty: the working directory. None: no folder, since
+            an installed package has registered the name.
 
     Raises:
-        UserError: there is no such module or name, it cannot be imported, or it is no stage.
+        UserError: the module or name does not exist, cannot be imported, or is no stage.
     """
     module_name, _, attribute = name.partition(":")
     if not all(part.isidentifier() for part in (*module_name.split("."), *attribute.split("."))):
@@ -119,7 +120,7 @@ def find(name: str, folder: str | None = "") -> Plugin:
 
 
 def _imported(name: str, folder: str | None) -> ModuleType:
-    """Import a module, see ``find``."""
+    """Import a module for ``find``."""
     try:
         with _importing(name, folder):
             return importlib.import_module(name)
@@ -130,7 +131,7 @@ def _imported(name: str, folder: str | None) -> ModuleType:
         raise UserError(
             f"there is no module '{error.name}' {where} ('pip install' it, or run where it lies)"
         ) from None
-    except Exception as error:  # whatever a user's file may do
+    except Exception as error:  # A user's file may raise anything.
         line = traceback.extract_tb(error.__traceback__)[-1]
         place = f" ({Path(line.filename).name}, line {line.lineno})"
         raise UserError(
@@ -139,7 +140,7 @@ def _imported(name: str, folder: str | None) -> ModuleType:
 
 
 def _takes_two(target: Callable[..., Any]) -> bool:
-    """A class takes its parameters when it is made, a function after its array."""
+    """Return whether a target accepts parameters: a class in its constructor, a function after the array."""
     wanted = 1 if isinstance(target, type) else 2
     try:
         given = signature(target).parameters.values()
@@ -149,14 +150,14 @@ def _takes_two(target: Callable[..., Any]) -> bool:
     return len(positional) >= wanted or any(p.kind is Parameter.VAR_POSITIONAL for p in given)
 
 
-# --- what is a stage ---------------------------------------------------------------------------
+# --- signatures of stages ----------------------------------------------------------------------
 
 
 def _fault(target: Callable[..., Any], *, has_params: bool) -> str:
-    """Say why a target is no stage; empty: it is one.
+    """Return why a target is no stage, or an empty string if it is one.
 
-    A stage says so by its signature. This keeps out ``numpy:load`` and the like, which take anything and run
-    what is in it.
+    The signature must be that of a stage. This keeps out ``numpy:load`` and the like, which accept any
+    argument and run code in the file they read.
     """
     if isinstance(target, type):
         made, call = (
@@ -174,12 +175,12 @@ def _fault(target: Callable[..., Any], *, has_params: bool) -> str:
 
 
 def _unlike_a_stage(function: Any, own: int, more: int) -> str:
-    """Say what of a signature is not a stage's.
+    """Return how a signature differs from that of a stage, or an empty string.
 
     Args:
-        function: that gets the array.
+        function: function that gets the array.
         own: number of parameters before the array (``self``).
-        more: number of arguments that it may be given after the array.
+        more: number of arguments that may follow the array.
     """
     names = [p for p in signature(function).parameters.values() if p.kind in POSITIONAL][own:]
     if not names:
@@ -192,11 +193,11 @@ def _unlike_a_stage(function: Any, own: int, more: int) -> str:
 
 
 def _misfit(function: Any, first: int, last: int) -> str:
-    """Name a parameter that nothing is given for; empty: there is none.
+    """Return the sentence about a required parameter that gets no argument, or an empty string.
 
     Args:
-        function: that is called.
-        first: number of arguments that it gets in any case.
+        function: function that is called.
+        first: number of arguments that it always gets.
         last: number of arguments that it gets at most.
     """
     stated = list(signature(function).parameters.values())
@@ -209,25 +210,27 @@ def _misfit(function: Any, first: int, last: int) -> str:
 
 
 def _plain(target: object) -> bool:
-    """Whether it is a Python function, perhaps with a decorator such as numba's."""
+    """Return whether a target is a Python function, perhaps with a decorator such as numba's."""
     return isinstance(unwrap(target) if callable(target) else target, FunctionType)
 
 
 def _is_ours(target: Any) -> bool:
-    """Whether it is defined outside Python's own library."""
+    """Return whether a target is defined outside Python's standard library."""
     module = getattr(unwrap(target), "__module__", None) or "builtins"
     return module.partition(".")[0] not in sys.stdlib_module_names
 
 
-# --- where modules lie -------------------------------------------------------------------------
+# --- locations of modules ----------------------------------------------------------------------
 
 
 def local_files(names: Iterable[str], folder: Path) -> tuple[Path, ...]:
-    """Find the Python files of a folder that functions need: their modules, and what these import.
+    """Find the Python files of a folder that functions need: their modules, and the modules these import.
+
+    Nothing in the folder is run.
 
     Args:
         names: ``module:name`` each.
-        folder: that the modules may lie in. Nothing in it is run.
+        folder: folder that may contain the modules.
     """
     found: dict[Path, None] = {}
     waiting = [name.partition(":")[0] for name in names]
@@ -248,7 +251,7 @@ def local_files(names: Iterable[str], folder: Path) -> tuple[Path, ...]:
 
 
 def _file_of(module: str, folder: Path) -> Path | None:
-    """The source of a module in a folder; None: it has none there."""
+    """Return the source file of a module in a folder, or None."""
     parts = module.split(".")
     if not all(part.isidentifier() for part in parts):
         return None
@@ -258,7 +261,7 @@ def _file_of(module: str, folder: Path) -> Path | None:
 
 
 def _imports(file: Path, package: Sequence[str]) -> Iterator[str]:
-    """Modules that a file may import. What cannot be parsed imports nothing."""
+    """Yield the modules that a file may import. A file that cannot be parsed imports nothing."""
     try:
         tree = ast.parse(file.read_bytes())
     except (OSError, SyntaxError, ValueError, RecursionError, MemoryError):
@@ -275,20 +278,21 @@ def _imports(file: Path, package: Sequence[str]) -> Iterator[str]:
 
 
 class _FolderFinder(MetaPathFinder):
-    """Finder of modules in a trusted folder: only of those sources that the trust is about.
+    """Finder of modules in a trusted folder. It finds only the sources that the user has trusted.
 
-    They come before installed modules of the same name. It does not look at compiled files beside them
-    (``.pyc``, ``.so``): the user cannot have read these.
+    These sources win over installed modules of the same name. The finder ignores compiled files beside them
+    (``.pyc``, ``.so``), since the user cannot have read these.
     """
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self.files: set[Path] = set()
-        self.is_importing = False  # what is not in a package of the folder is found only meanwhile
+        self.is_importing = False  # Top-level modules are found only while this is set.
 
     def find_spec(
         self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None
     ) -> ModuleSpec | None:
+        """Return the specification of a trusted module, or None."""
         if not self.has(fullname):
             return None
         file = _file_of(fullname, self.folder)
@@ -303,12 +307,12 @@ class _FolderFinder(MetaPathFinder):
         return spec_from_file_location(fullname, file, loader=loader, submodule_search_locations=places)
 
     def has(self, name: str) -> bool:
-        """Whether a module, or a package, is among the files."""
+        """Return whether a module or package is among the trusted files."""
         place = self.folder.joinpath(*name.split("."))
         return _file_of(name, self.folder) in self.files or any(place in file.parents for file in self.files)
 
     def check(self, name: str) -> None:
-        """Raise UserError where another module of the same name has been imported already."""
+        """Raise UserError if another module of the same name has already been imported."""
         module = sys.modules.get(name)
         if module is None or not self.has(name):
             return
@@ -318,13 +322,15 @@ class _FolderFinder(MetaPathFinder):
             raise UserError(f"another module '{name}' is in use already, of {', '.join(places)}")
 
     def _is_within(self, paths: Iterable[str]) -> bool:
+        """Return whether any path is in the folder."""
         return any(Path(path).is_relative_to(self.folder) for path in paths)
 
 
 class _SourceLoader(SourceFileLoader):
-    """Loader that compiles the source itself: a ``__pycache__`` may have come with the folder."""
+    """Loader that compiles the source itself, since a ``__pycache__`` may have come with the folder."""
 
     def get_code(self, fullname: str) -> CodeType:
+        """Compile the source file."""
         path = self.get_filename(fullname)
         return self.source_to_code(self.get_data(path), path)
 
@@ -335,7 +341,7 @@ def _importing(module: str, folder: str | None) -> Iterator[None]:
     if folder is None:
         yield
     elif folder:
-        # The finder stays: a function may import a part of its package when it is called.
+        # The finder stays, since a function may import another module of its package when it is called.
         finders = (f for f in sys.meta_path if isinstance(f, _FolderFinder) and f.folder == Path(folder))
         finder = next(finders, None) or _FolderFinder(Path(folder))
         finder.files.update(local_files([module], Path(folder)))
@@ -355,7 +361,7 @@ def _importing(module: str, folder: str | None) -> Iterator[None]:
 
 @contextmanager
 def _from_here() -> Iterator[None]:
-    """A console script has its own folder on the path, not the one that it is run in."""
+    """Add the working directory to the module path. A console script has only its own folder there."""
     here = str(Path.cwd())
     if here in sys.path or "" in sys.path:
         yield
@@ -369,7 +375,7 @@ def _from_here() -> Iterator[None]:
 
 @contextmanager
 def _without_here() -> Iterator[None]:
-    """Leave the working directory out, which ``python -m`` puts on the path; PYTHONPATH may name it."""
+    """Remove the working directory, which ``python -m`` adds, from the path unless PYTHONPATH names it."""
     stated = os.environ.get("PYTHONPATH", "").split(os.pathsep)
     here = ("", str(Path.cwd()))
     left_out = [path for path in sys.path if path in here and (not path or path not in stated)]

@@ -1,13 +1,14 @@
-"""What a project states once, for every command: ``bevviz.toml`` in the folder or above, ``BEVVIZ_MODEL``.
+"""Settings of a project for every command: ``bevviz.toml`` in the folder or above, and ``BEVVIZ_MODEL``.
 
-    model = "models/yolo11n.onnx"      # files are named as seen from this one
+    model = "models/yolo11n.onnx"      # file names are relative to this file
     config = "robot.yaml"              # or several, later ones winning
     preset = "default"
 
     [source]                           # and any other section, as 'bevviz config' prints them
     lidar_topics = ["/front/points", "/rear/points"]
 
-The command line wins over the environment, that over the project file, that over the preset.
+The command line wins over the environment. The environment wins over the project file, and the project file
+wins over the preset.
 """
 
 from __future__ import annotations
@@ -43,11 +44,12 @@ MODEL = "BEVVIZ_MODEL"
 
 
 def _several(given: Any) -> Any:
+    """Return a single string as a list."""
     return [given] if isinstance(given, str) else given
 
 
 class ProjectFile(BaseModel):
-    """The keys that only a project file has; the sections beside them are those of ``Config``."""
+    """Keys that only a project file has. Its sections are those of ``Config``."""
 
     model_config = ConfigDict(extra="allow", strict=True)
 
@@ -57,10 +59,10 @@ class ProjectFile(BaseModel):
 
 
 def layers(folder: Path, environment: Mapping[str, str] = os.environ) -> list[Layer]:
-    """What is stated for a folder, the weakest first.
+    """Return the layers of a folder's project, the weakest first.
 
     Raises:
-        UserError: the project file, or one that it names, cannot be used.
+        UserError: the project file, or a file that it names, cannot be used.
     """
     path = find(folder)
     found: list[Layer] = []
@@ -77,7 +79,7 @@ def find(folder: Path) -> Path | None:
     """Find the nearest project file, in the folder or above.
 
     Raises:
-        UserError: a folder cannot be looked into.
+        UserError: a folder cannot be read.
     """
     for place in (folder, *folder.parents):
         path = place / NAME
@@ -91,22 +93,23 @@ def find(folder: Path) -> Path | None:
 
 
 def named_code(path: Path) -> NamedCode:
-    """Read which functions a project file, or a YAML file, names.
+    """Return the functions that a project file or a YAML file names.
 
     Raises:
-        UserError: it, or a file that it names, cannot be used.
+        UserError: the file, or a file that it names, cannot be used.
     """
     return _code(path, _of_file(path) if path.suffix == ".toml" else [read_layer(path)])
 
 
 def _code(path: Path, stated: Sequence[Layer]) -> NamedCode:
+    """Return the functions that the layers of a file name."""
     files = [Path(layer.where) for layer in stated if layer.where != str(path)]
     functions = dict.fromkeys(function for layer in stated for function in layer.functions)
     return NamedCode((path, *files), tuple(functions))
 
 
 def _of_file(path: Path) -> list[Layer]:
-    """Read the YAML files that a project file names, and then itself."""
+    """Read the YAML files that a project file names, and then the project file itself."""
     try:
         stated = ProjectFile.model_validate(toml_tree(path, f"{path}: cannot read the project file"))
     except ValidationError as error:
@@ -138,6 +141,6 @@ def _of_file(path: Path) -> list[Layer]:
 
 
 def _from(folder: Path, key: str, value: str) -> str:
-    """A file as seen from here; what is no file stays as it is."""
+    """Return a file name relative to a folder. A name that is no file stays as it is."""
     known = (*OURS, *plugins.registered()) if key == "detector.model" else CLASS_LISTS
     return value if not value or value in known or ":" in value else str(folder / value)

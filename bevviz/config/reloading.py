@@ -1,4 +1,4 @@
-"""The configuration while it runs: read again when its file changes, and open to settings from outside."""
+"""Configuration of a live run: read again when its file changes, and changed by messages."""
 
 from __future__ import annotations
 
@@ -17,14 +17,15 @@ AT_START = (
     "live.viewer_memory",
     "live.viewer_rate",
     "live.split_",
-)  # fixed once it runs
+)  # Keys that stay fixed while the program runs.
 
 
 class Settings:
-    """Preset, project, file and ``key=value`` settings, later ones winning; what ``update`` brings wins.
+    """Sources of a live configuration: preset, project, file, and ``key=value`` settings. Later ones win.
 
-    Functions run where the user has named them here, or trusts the file that does. Those that run may go on
-    after an edit of the file. Settings that come later are messages of other programs: they name none anew.
+    Functions run if the user has named them here, or has trusted the file that names them. Functions that
+    run may go on after an edit of the file. Later settings are messages of other programs, and new functions
+    in them do not run.
 
     Raises:
         UserError: as ``bevviz.config.load``.
@@ -45,7 +46,7 @@ class Settings:
         self.config = load(file, settings, preset, layers=layers)
 
     def changed(self) -> bool:
-        """Whether the file was saved since the last call."""
+        """Return whether the file was saved since the last call."""
         version = self._stat()
         if version == self._version:
             return False
@@ -53,11 +54,11 @@ class Settings:
         return version is not None
 
     def read(self, more: Sequence[str] = (), without: Sequence[str] = ()) -> Config:
-        """The configuration as it is now; ``keep`` makes it last.
+        """Build the current configuration. ``keep`` makes it permanent.
 
         Args:
-            more: further settings.
-            without: those of before that are taken back.
+            more: additional settings.
+            without: earlier settings to take back.
 
         Raises:
             UserError: as ``bevviz.config.load``.
@@ -66,25 +67,30 @@ class Settings:
         return load(self.file, settings, self._preset, layers=self._layers, in_force=self.config)
 
     def take(self, more: Sequence[str]) -> None:
-        """More settings, before anything runs with them.
+        """Add settings before anything runs with them.
 
         Raises:
-            UserError: one of them is wrong; nothing is changed.
+            UserError: a setting is wrong. Nothing is changed.
         """
         self.keep(self.read(more), more)
 
     def keep(self, config: Config, more: Sequence[str] = (), without: Sequence[str] = ()) -> None:
+        """Put a configuration from ``read`` in force, with the same additional and withdrawn settings."""
         self.config = config
         self._settings = self._with(more, without)
 
     def _with(self, more: Sequence[str], without: Sequence[str]) -> list[str | Layer]:
+        """Return the settings with some added and some taken back."""
         newest_first = self._settings[::-1]
         for setting in received(without, trust=MESSAGE):
             newest_first.remove(setting)
         return [*newest_first[::-1], *received(more, trust=MESSAGE)]
 
     def _stat(self) -> tuple[int, int, int] | None:
-        """Editors write in place or put another file there; None while it is missing."""
+        """Return time, size and inode of the file, or None while it is missing.
+
+        Editors write in place or replace the file. The inode shows the second case.
+        """
         try:
             found = self.file.stat() if self.file else None
         except OSError:

@@ -1,4 +1,4 @@
-"""The parameters: a section for each part of the pipeline."""
+"""Parameters as pydantic models: one section for each part of the pipeline."""
 
 from __future__ import annotations
 
@@ -22,17 +22,19 @@ from bevviz.config.methods import CLUSTERING, GROUND, OBJECTS
 from bevviz.config.units import Degrees, Megabytes, Metres, Pixels, Seconds
 
 Preset = Literal["default", "reference"]
-Functions = Mapping[tuple[str, str], str]  # section and module:function -> folder of the module
+Functions = Mapping[tuple[str, str], str]  # (section, module:function) -> folder of the module
 Keep = Literal["everything", "inspect", "report"]
-Quantity = Literal["height", "intensity", "ring", "time", "distance"]  # of a point
+Quantity = Literal["height", "intensity", "ring", "time", "distance"]  # values of a point that can colour it
 
 
 class Section(BaseModel):
+    """Base class of all sections: immutable, without unknown keys."""
+
     model_config = ConfigDict(extra="forbid", frozen=True, validate_default=True)
 
 
 class StageSection(Section):
-    """Of a stage that may be somebody else's."""
+    """Base class of the settings of a stage that can be user-defined."""
 
     params: Mapping[str, Any] = Field(
         {}, description="parameters of a function that is not bevviz's own, or of a network on pillars"
@@ -40,7 +42,7 @@ class StageSection(Section):
 
 
 class SourceConfig(Section):
-    """Which topics play which role. Empty: found by type, name and frame (see ``bevviz info``)."""
+    """Roles of the topics. An empty value is found by type, name and frame (see ``bevviz info``)."""
 
     dataset: str = Field("", description="data set that PATH is; empty: recognised by its folders")
     sequence: str = Field("", description="drive of a data set that has several in one folder")
@@ -70,7 +72,7 @@ class SourceConfig(Section):
 
 
 class SyncConfig(Section):
-    """How images and transforms are found for a cloud."""
+    """Settings of the search for the images and transforms of a cloud."""
 
     tolerance: Seconds = Field(0.1, gt=0, le=10, description="largest |image stamp - cloud stamp|")
     offsets: Mapping[str, Seconds] = Field({}, description="topic -> time added to its stamps")
@@ -86,6 +88,8 @@ class SyncConfig(Section):
 
 
 class VoxelConfig(Section):
+    """Settings of the voxel grid."""
+
     size: Metres = Field(0.1, ge=0, le=10, description="edge of a voxel; 0 keeps every point")
     average: bool = Field(
         False, description="mean of a voxel's points (as Open3D) instead of its first point"
@@ -93,6 +97,8 @@ class VoxelConfig(Section):
 
 
 class GroundConfig(StageSection):
+    """Settings of the ground segmentation."""
+
     method: Annotated[str, AfterValidator(GROUND.check)] = Field(
         "polar",
         description="polar: a surface that follows slopes and kerbs outwards; plane: a single one by RANSAC; "
@@ -115,6 +121,8 @@ class GroundConfig(StageSection):
 
 
 class ClusteringConfig(StageSection):
+    """Settings of the clustering."""
+
     method: Annotated[str, AfterValidator(CLUSTERING.check)] = Field(
         "dbscan",
         description="dbscan; or module:function, (P, 3) obstacle points -> (P,) labels, -1 noise; "
@@ -131,6 +139,7 @@ class ClusteringConfig(StageSection):
     @field_validator("max_cluster_points")
     @classmethod
     def _leaves_some(cls, most: int | None, info: ValidationInfo) -> int | None:
+        """Check that the largest allowed cluster is not smaller than the smallest."""
         least = info.data.get("min_cluster_points", 1)
         if most is not None and most < least:
             raise PydanticCustomError(
@@ -142,6 +151,8 @@ class ClusteringConfig(StageSection):
 
 
 class DetectorConfig(StageSection):
+    """Settings of the 2D detector."""
+
     model: str = Field(
         "",
         description="ONNX file, or 'demo' for the simulator's own network; or module:function or class, "
@@ -165,6 +176,8 @@ class DetectorConfig(StageSection):
 
 
 class FusionConfig(Section):
+    """Settings of the matching of detections and clusters."""
+
     method: Literal["frustum", "centroid"] = Field(
         "frustum", description="frustum: points in the box's frustum; centroid: nearest 2D box centre"
     )
@@ -189,7 +202,7 @@ class FusionConfig(Section):
 
 
 class ObjectsConfig(StageSection):
-    """What the named 3D boxes are made from."""
+    """Settings of the method that makes the named 3D boxes."""
 
     method: Annotated[str, AfterValidator(OBJECTS.check)] = Field(
         "frustum",
@@ -205,7 +218,7 @@ class ObjectsConfig(StageSection):
 
 
 class OpinionsConfig(Section):
-    """When cameras say something of objects that are somebody else's."""
+    """Limits for cameras that confirm or contradict objects of a 3D detector or of the robot."""
 
     min_iou: float = Field(
         0.3,
@@ -229,6 +242,8 @@ class OpinionsConfig(Section):
 
 
 class TrackingConfig(Section):
+    """Settings of the tracker."""
+
     method: Literal["kalman", "none"] = Field(
         "kalman", description="kalman: objects keep an id, with speed and trail; none: each frame for itself"
     )
@@ -246,7 +261,7 @@ AnomalyKind = Literal["flicker", "jump", "one_sensor", "sync", "tf", "stage"]
 
 
 class AnomaliesConfig(Section):
-    """What is worth a look, frame after frame."""
+    """Limits of the search for anomalies in consecutive frames."""
 
     surprise: float = Field(
         8.0,
@@ -268,6 +283,8 @@ class AnomaliesConfig(Section):
 
 
 class BevConfig(Section):
+    """Settings of the bird's-eye view."""
+
     range_x: Metres = Field(40.0, gt=0, le=500, description="range ahead and behind")
     range_y: Metres = Field(40.0, gt=0, le=500, description="range to the left and right")
     resolution: Metres = Field(0.1, gt=0, le=10, description="edge of a cell")
@@ -280,6 +297,8 @@ class BevConfig(Section):
 
 
 class LoggingConfig(Section):
+    """Amount and form of the logged data."""
+
     keep: Keep = Field(
         "everything",
         description="inspect: a fifth, with some raw clouds; report: less, without (docs/recordings.md)",
@@ -308,7 +327,7 @@ class LoggingConfig(Section):
 
 
 class LiveConfig(Section):
-    """How ``bevviz live`` runs beside the robot."""
+    """Settings of ``bevviz live``, which runs beside the robot."""
 
     nice: int = Field(0, ge=0, le=19, description="priority given up to other processes, as nice(1)")
     max_rate: float | None = Field(None, gt=0, le=1000, description="frames a second at most; empty: all")
@@ -365,7 +384,7 @@ class LiveConfig(Section):
 
 
 class Config(Section):
-    """Everything that can be set. ``bevviz config`` prints the effective one."""
+    """All parameters. ``bevviz config`` prints the effective configuration."""
 
     preset: Preset = "default"
     source: SourceConfig = SourceConfig()
@@ -388,20 +407,22 @@ class Config(Section):
 
     @property
     def stated(self) -> Mapping[str, str]:
-        """Where each dotted key was stated that was: an option, a file, a variable. It is no part of what
-        two configurations have in common."""
+        """Source of each dotted key that was stated: an option, a file or a variable.
+
+        Comparisons of two configurations ignore it.
+        """
         return self._stated
 
     @property
     def functions(self) -> Functions:
-        """Functions that the user has named or trusted; no other one is imported. ``load`` states them.
+        """Functions that the user has named or trusted, with the folder of each module. ``load`` sets them.
 
-        The folder of a module is empty for the working directory.
+        No other function is imported. The folder is empty for the working directory.
         """
         return self._functions
 
     def restated(self, tree: Mapping[str, Any]) -> Config:
-        """Make the configuration of other values, which may run the same functions.
+        """Return a configuration with the values of a tree, which may run the same functions.
 
         Raises:
             ValidationError: of pydantic.

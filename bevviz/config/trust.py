@@ -1,8 +1,8 @@
 """Trust in files that name functions: the user grants it once, for a path and a content.
 
 A project file or a YAML file may name ``module:function``, which is code. Such a function runs only after
-``bevviz trust FILE``. An edit of the file, of a YAML file that it names, or of a module beside it takes the
-trust away.
+``bevviz trust FILE``. An edit of the file, of a YAML file that it names, or of a module beside it revokes the
+trust.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ from bevviz.support.files import CONFIG_LIMIT, check_owned, read_bytes, save
 
 @dataclass(frozen=True, slots=True)
 class Trust:
-    """Whether the functions that a source of values names may run.
+    """Permission to run the functions that a source of values names.
 
     Attributes:
         granted: the user has named the functions, or has trusted the file that names them.
-        folder: where the modules lie that are not installed. Empty: the working directory.
+        folder: folder of the modules that are not installed. Empty: the working directory.
         advice: how to run functions that may not run. ``{setting}`` stands for the setting that names one.
     """
 
@@ -36,9 +36,9 @@ class Trust:
     advice: str = "if you trust it, add --set {setting}"
 
 
-USER = Trust(granted=True)  # the command line, the environment, Python
-RECEIVED = Trust()  # a recording, a report, a data set, any file that is not trusted
-MESSAGE = Trust(advice="if you trust it, start bevviz with --set {setting}")  # of another program
+USER = Trust(granted=True)  # the command line, the environment, Python code
+RECEIVED = Trust()  # a recording, a report, a data set, or any file that is not trusted
+MESSAGE = Trust(advice="if you trust it, start bevviz with --set {setting}")  # a message of another program
 
 
 @dataclass(frozen=True)
@@ -55,12 +55,12 @@ class NamedCode:
 
     @cached_property
     def path(self) -> Path:
-        """The file itself, without links."""
+        """Path of the file, with links resolved."""
         return self.files[0].resolve()
 
     @property
     def folder(self) -> Path:
-        """Where local modules lie."""
+        """Folder of the local modules."""
         return self.path.parent
 
     @cached_property
@@ -70,11 +70,11 @@ class NamedCode:
 
     @property
     def is_regular(self) -> bool:
-        """Whether the files can be read twice: a shell's ``<(...)`` cannot."""
+        """Whether the files can be read twice. The shell's ``<(...)`` cannot."""
         return all(file.is_file() for file in self.files)
 
     def digest(self) -> str:
-        """SHA-256 (hexadecimal) of all that decides what the functions do.
+        """Return the SHA-256 (hexadecimal) of all files that decide what the functions do.
 
         Raises:
             UserError: a file cannot be read.
@@ -87,7 +87,7 @@ class NamedCode:
         return content.hexdigest()
 
     def __str__(self) -> str:
-        """What would be loaded, for a sentence."""
+        """Return the functions and modules as part of a sentence."""
         files = ", ".join(str(file.relative_to(self.folder)) for file in self.modules)
         local = f" ({files})" if files else ""
         return f"{', '.join(self.functions)}{local}"
@@ -98,9 +98,9 @@ class TrustRecord:
     """A file that the user has trusted.
 
     Attributes:
-        path: of the file, without links.
+        path: path of the file, with links resolved.
         sha256: ``NamedCode.digest`` at that time.
-        functions: that the file named.
+        functions: functions that the file named.
     """
 
     path: Path
@@ -109,7 +109,7 @@ class TrustRecord:
 
 
 def trust_in(code: NamedCode) -> Trust:
-    """Look up whether the user has trusted a file as it is now."""
+    """Return the user's trust in a file with its current content."""
     if not code.functions:
         return RECEIVED
     shown = shlex.quote(os.path.relpath(code.files[0]))
@@ -126,7 +126,7 @@ def trust_in(code: NamedCode) -> Trust:
 
 
 def allow(code: NamedCode) -> None:
-    """Trust a file as it is now.
+    """Trust a file with its current content.
 
     Raises:
         UserError: the user's data folder cannot be used.
@@ -143,7 +143,7 @@ def allow(code: NamedCode) -> None:
 
 
 def revoke(path: Path) -> bool:
-    """Take the trust in a file away. Returns whether it was trusted.
+    """Withdraw the trust in a file. Return whether it was trusted.
 
     Raises:
         UserError: the user's data folder cannot be used.
@@ -166,15 +166,16 @@ def records() -> Iterator[TrustRecord]:
 
 
 def _record(path: Path) -> TrustRecord | None:
+    """Return the record of a path, or None."""
     try:
         record = _read(_folder() / _name(path))
-    except UserError:  # there is no data folder
+    except UserError:  # The user has no data folder.
         return None
     return record if record is not None and record.path == path else None
 
 
 def _read(file: Path) -> TrustRecord | None:
-    """A record; None: there is none that this user has written."""
+    """Return the record in a file, or None if this user has not written a valid one."""
     try:
         _check(file.parent)
         about = json.loads(file.read_text(encoding="utf-8"))
@@ -185,13 +186,13 @@ def _read(file: Path) -> TrustRecord | None:
 
 
 def _check(folder: Path) -> None:
-    """Raise UserError where others could put a record."""
+    """Raise UserError if other users could write a record."""
     for place in (folder.parent, folder):
         check_owned(place, "XDG_DATA_HOME")
 
 
 def _folder() -> Path:
-    """Return the folder of the records. A relative XDG_DATA_HOME does not count: its specification says so.
+    """Return the folder of the records. A relative XDG_DATA_HOME does not count, as its specification says.
 
     Raises:
         UserError: the user has no home folder.
@@ -205,4 +206,5 @@ def _folder() -> Path:
 
 
 def _name(path: Path) -> str:
+    """Return the file name of a path's record."""
     return f"{hashlib.sha256(os.fsencode(path)).hexdigest()[:32]}.json"

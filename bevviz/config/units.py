@@ -1,4 +1,4 @@
-"""Units that values are stored in, and those that they may be given in."""
+"""Units of stored values, and units that users may write."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from pydantic_core import PydanticCustomError
 
 @dataclass(frozen=True, slots=True)
 class Unit:
-    """A unit that a value is stored in, and the factor of each other spelling that is accepted."""
+    """A unit of stored values, and the factor of each accepted spelling."""
 
     name: str
     factors: Mapping[str, float]
 
     def parse(self, value: Any) -> Any:
-        """Turn ``"50 cm"`` into 0.5; leave what is no text to pydantic."""
+        """Convert ``"50 cm"`` to 0.5. Return other values unchanged, for pydantic to check."""
         if not isinstance(value, str):
             return value
         match = re.fullmatch(r"\s*([-+.\deE]*\d\.?)\s*([^\s\d]*)\s*", value)

@@ -1,4 +1,4 @@
-"""What a configuration names that is not ours: functions, networks and topics, and their parameters."""
+"""User-defined stages in a configuration: functions, networks and topics, and their parameters."""
 
 from __future__ import annotations
 
@@ -17,26 +17,27 @@ from bevviz.errors import UserError
 
 
 def plugin_of(config: Config, section: str) -> plugins.Plugin | None:
-    """The function of somebody else's that a stage's section names; None: it is ours, or a topic's.
+    """Return the user-defined function of a stage's section, or None for a built-in method or a topic.
 
     Raises:
-        UserError: it cannot be had.
+        UserError: the function cannot be loaded.
     """
     return _plugin(section, getattr(getattr(config, section), STAGES[section]), config.functions)
 
 
 def names_function(section: str, method: str) -> bool:
-    """Whether a stage's section names ``module:function``."""
+    """Return whether a stage's section names ``module:function``."""
     if not plugins.is_foreign(method):
         return False
     return section != "detector" or not Path(method).exists()
 
 
 def _plugin(section: str, method: str, functions: Functions) -> plugins.Plugin | None:
+    """Load the user-defined function of a method, or return None."""
     folder: str | None = None
     name = method
     if names_function(section, method):
-        if (section, method) not in functions:  # this configuration was not made by ``load``
+        if (section, method) not in functions:  # ``load`` did not build this configuration.
             raise UserError(f"{section}.{STAGES[section]} {method}: no function that the user has named")
         folder = functions[section, method]
     else:
@@ -51,18 +52,18 @@ def _plugin(section: str, method: str, functions: Functions) -> plugins.Plugin |
 
 
 def stage_topics(config: Config) -> dict[str, str]:
-    """The robot's topics that stages are taken from, by the dotted key that names each."""
+    """Return the robot's topics that replace stages, by the dotted key that names each."""
     named = {f"{s}.{key}": str(getattr(getattr(config, s), key)) for s, key in STAGES.items()}
     return {key: name.removeprefix(TOPIC) for key, name in named.items() if name.startswith(TOPIC)}
 
 
 def object_network(config: Config) -> PillarParams | None:
-    """The parameters of the 3D detector that ``objects.method`` names as a file; None: it names none."""
+    """Return the parameters of the 3D detector file that ``objects.method`` names, or None."""
     return PillarParams.model_validate(config.objects.params) if is_network(config.objects.method) else None
 
 
 def object_files(config: Config) -> dict[str, str]:
-    """The files of that detector, by the dotted key that names each."""
+    """Return the files of the 3D detector, by the dotted key that names each."""
     params = object_network(config)
     if params is None:
         return {}
@@ -71,7 +72,7 @@ def object_files(config: Config) -> dict[str, str]:
 
 
 def with_object_files(config: Config, named: Callable[[str], str]) -> Config:
-    """The configuration with the files of that detector named otherwise."""
+    """Return the configuration with the files of the 3D detector renamed by ``named``."""
     files = object_files(config)
     if not files:
         return config
@@ -82,11 +83,11 @@ def with_object_files(config: Config, named: Callable[[str], str]) -> Config:
 
 
 def params_model(section: str, method: str, functions: Functions) -> type[BaseModel] | None:
-    """Of the parameters that a stage has beside its own.
+    """Return the model of the additional parameters of a stage, or None.
 
     Args:
-        section: of the stage.
-        method: that the section names.
+        section: name of the section.
+        method: method that the section names.
         functions: ``Config.functions``.
     """
     if section == "objects" and is_network(method):
@@ -96,7 +97,7 @@ def params_model(section: str, method: str, functions: Functions) -> type[BaseMo
 
 
 def params_of(config: Config, section: str) -> Mapping[str, FieldInfo]:
-    """The parameters that a stage has beside its own: of a function, or of a network on pillars."""
+    """Return the additional parameters of a stage: those of a function or of a network on pillars."""
     if section not in STAGES:
         return {}
     model = params_model(section, getattr(getattr(config, section), STAGES[section]), config.functions)
