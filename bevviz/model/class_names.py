@@ -1,4 +1,4 @@
-"""What a detector of COCO's classes may rightly call the objects that data sets label."""
+"""Names that a detector of COCO's classes may rightly give to the objects that data sets label."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Iterable
 
 _PERSON = frozenset({"pedestrian", "person"})
 
-KITTI = {  # Geiger, Lenz and Urtasun 2012; the fourth as the raw drives have it
+KITTI = {  # Geiger, Lenz and Urtasun 2012. The fourth name is that of the raw drives.
     "Pedestrian": _PERSON,
     "Person_sitting": _PERSON | {"person_sitting"},
     "Person": _PERSON,
@@ -17,25 +17,25 @@ KITTI = {  # Geiger, Lenz and Urtasun 2012; the fourth as the raw drives have it
     "Truck": frozenset({"truck", "car", "bus"}),
     "Tram": frozenset({"tram", "train", "bus"}),
 }
-NUSCENES = {  # classes of its detection task (Caesar et al. 2020), where COCO has others
+NUSCENES = {  # classes of its detection task (Caesar et al. 2020) that COCO lacks
     "pedestrian": _PERSON,
-    "bicycle": frozenset({"bicycle", "cyclist"}),  # its boxes are around whoever rides it
+    "bicycle": frozenset({"bicycle", "cyclist"}),  # nuScenes' boxes include the rider.
     "motorcycle": frozenset({"motorcycle", "motorcyclist"}),
     "trailer": frozenset({"trailer", "truck"}),
     "construction_vehicle": frozenset({"construction_vehicle", "truck"}),
     "traffic_cone": frozenset({"traffic_cone", "traffic cone"}),
 }
-SEMANTIC_KITTI = {  # Behley et al. 2019, where COCO has others
+SEMANTIC_KITTI = {  # Behley et al. 2019, classes that COCO lacks
     "bicyclist": frozenset({"bicyclist", "cyclist", "person", "bicycle"}),
     "motorcyclist": frozenset({"motorcyclist", "person", "motorcycle"}),
     "on-rails": frozenset({"on-rails", "tram", "train", "bus"}),
     "other-vehicle": frozenset({"other-vehicle", "car", "truck", "bus", "train"}),
 }
-VIEW_OF_DELFT = {  # Palffy et al. 2022, where COCO has others
+VIEW_OF_DELFT = {  # Palffy et al. 2022, classes that COCO lacks
     "moped_scooter": frozenset({"moped_scooter", "motorcycle"}),
     "motor": frozenset({"motor", "motorcycle"}),
 }
-CATEGORIES = {  # of nuScenes in its detection task; what belongs to none of them is left out, as there
+CATEGORIES = {  # nuScenes' category -> class of its detection task, which leaves the other categories out
     "movable_object.barrier": "barrier",
     "movable_object.trafficcone": "traffic_cone",
     "vehicle.bicycle": "bicycle",
@@ -51,7 +51,7 @@ CATEGORIES = {  # of nuScenes in its detection task; what belongs to none of the
     "human.pedestrian.construction_worker": "pedestrian",
     "human.pedestrian.police_officer": "pedestrian",
 }
-NOT_DETECTED = frozenset(  # categories of nuScenes that belong to no class of that task
+NOT_DETECTED = frozenset(  # categories of nuScenes that belong to no class of the detection task
     {
         "animal",
         "human.pedestrian.personal_mobility",
@@ -72,10 +72,14 @@ _SYNONYMS = {label.lower(): names for label, names in ACCEPTED.items()} | {
 
 
 def accepted_names(label: str, known: Iterable[str]) -> frozenset[str]:
-    """What a detector may rightly call an object of that label, in lower case.
+    """Return the names, in lower case, that a detector may rightly give to an object with a label.
 
-    Its own name alone where the detector knows that; KITTI's names stand for several, and a category of
-    nuScenes for its class.
+    A detector that knows the label must use it. KITTI's labels accept several names. A category of nuScenes
+    stands for its class.
+
+    Args:
+        label: label of a data set.
+        known: class names of the detector.
     """
     label = CATEGORIES.get(label, label)
     name = label.lower()

@@ -15,7 +15,8 @@ from bevviz.model.frame import F32, U8
 
 Color: TypeAlias = tuple[int, int, int]
 
-# Told apart also by who is colour-blind, after Okabe & Ito (2008), on dark and on light; held by a test.
+# Colour-blind people can tell these apart (after Okabe & Ito 2008), on dark and on light backgrounds. A test
+# checks it.
 CLASS_COLORS: dict[str, Color] = {
     "person": (230, 110, 30),
     "pedestrian": (230, 110, 30),
@@ -31,17 +32,17 @@ CLASS_COLORS: dict[str, Color] = {
 
 
 class State(Enum):
-    """What a colour says of anything that can be well or not."""
+    """Colour of each state that a result can have."""
 
     GOOD = (86, 180, 233)
     DOUBTFUL = (255, 200, 50)
     BAD = (225, 75, 60)
-    OTHER = (170, 90, 160)  # neither: taken by another, of another class
+    OTHER = (170, 90, 160)  # neither good nor bad: taken by another detection, or another class
     UNKNOWN = (120, 125, 135)
 
 
-# Of what is held to the truth, of the two sides of a comparison, of two opinions on an object, and of where
-# points are lost.
+# Colours of the comparison with ground truth, of the two sides of a comparison, of opinions on an object, and
+# of the stages at which points are lost.
 TRUTH: dict[str, Color] = {
     "true": State.GOOD.value,
     "missed": State.DOUBTFUL.value,
@@ -71,8 +72,9 @@ FATES: dict[str, Color] = {
 }
 
 
-# Of curves in one plot: the ten of Petroff (arXiv 2107.02270), red and purple lighter for a dark background.
-# Any two are 10 apart or more in CAM02-UCS, also for those who lack one of the three kinds of cones.
+# Colours of curves in one plot: the ten of Petroff (arXiv 2107.02270), with red and purple lighter for a dark
+# background. Any two are at least 10 apart in CAM02-UCS, also for people who lack one of the three kinds of
+# cones.
 SERIES: tuple[Color, ...] = (
     *((63, 144, 218), (255, 169, 14), (205, 40, 15), (148, 164, 162), (150, 70, 205)),
     *((169, 107, 89), (231, 99, 0), (185, 172, 112), (113, 117, 129), (146, 218, 221)),
@@ -81,7 +83,10 @@ SERIES: tuple[Color, ...] = (
 
 @lru_cache(maxsize=4)
 def palette(size: int = 64) -> U8:
-    """(size, 3) RGB colours, neighbours far apart in hue (golden-ratio steps), bright enough on black."""
+    """Return (size, 3) RGB colours that are bright enough on black.
+
+    Neighbours are far apart in hue (golden-ratio steps).
+    """
     hues = np.arange(size) * 0.6180339887498949 % 1.0
     rgb = [colorsys.hsv_to_rgb(h, (0.55, 0.8)[i % 2], (1.0, 0.85, 0.95)[i % 3]) for i, h in enumerate(hues)]
     colors: U8 = np.round(np.array(rgb) * 255).astype(np.uint8)
@@ -90,7 +95,7 @@ def palette(size: int = 64) -> U8:
 
 
 def class_color(name: str) -> Color:
-    """RGB colour of a class: the same in every run and on every machine."""
+    """Return the RGB colour of a class. It is the same in every run and on every machine."""
     known = CLASS_COLORS.get(name.lower())
     if known is not None:
         return known
@@ -100,7 +105,7 @@ def class_color(name: str) -> Color:
 
 @lru_cache(maxsize=4)
 def turbo(size: int = 256) -> U8:
-    """(size, 3) RGB of the Turbo colour map, blue to red (polynomial fit of Mikhailov 2019)."""
+    """Return (size, 3) RGB of the Turbo colour map, blue to red (polynomial fit of Mikhailov 2019)."""
     x = np.linspace(0.0, 1.0, size)
     powers = x[:, None] ** np.arange(6)
     coefficients = np.array(
@@ -116,7 +121,10 @@ def turbo(size: int = 256) -> U8:
 
 
 def bins(values: F32, low: float, high: float, size: int) -> NDArray[np.uint16]:
-    """(N,) rows of a colour map of ``size`` colours; what is outside low ... high gets the end colour."""
+    """Return the (N,) rows of a colour map of ``size`` colours.
+
+    A value outside low ... high gets the colour at the end.
+    """
     scaled = (values - np.float32(low)) * np.float32(size / (high - low))
     rows: NDArray[np.uint16] = np.clip(scaled, 0, size - 1).astype(np.uint16)
     return rows

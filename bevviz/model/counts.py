@@ -1,4 +1,4 @@
-"""How much of everything there is in a frame."""
+"""Numbers of points, clusters, detections and the like in a frame."""
 
 from __future__ import annotations
 
@@ -8,15 +8,16 @@ from collections.abc import Mapping
 from bevviz.model.frame import Frame
 from bevviz.model.results import Decision, FrameResult, Opinion
 
-OPINIONS = ("confirmed", "named_otherwise", "contradicted", "unseen", "missed")  # on somebody else's objects
+# Opinions of cameras on objects of a 3D detector or of the robot.
+OPINIONS = ("confirmed", "named_otherwise", "contradicted", "unseen", "missed")
 
 
 def counts_of(result: FrameResult, last: Frame | None = None) -> Mapping[str, int]:
-    """Points, clusters, detections ... by name; what was not made has none.
+    """Return the number of points, clusters, detections ... by name. A stage that did not run has no number.
 
     Args:
-        result: of the frame.
-        last: the frame before it; None: nothing was skipped.
+        result: result of the frame.
+        last: the frame before it. None: no frame was skipped.
     """
     frame = result.frame
     counts: Counter[str] = Counter(
@@ -42,7 +43,7 @@ def counts_of(result: FrameResult, last: Frame | None = None) -> Mapping[str, in
 
 
 def opinions_in(result: FrameResult) -> Mapping[str, int]:
-    """How many objects of somebody else's cameras say what of; empty: they are ours."""
+    """Return the number of objects for each opinion of cameras. Objects of our fusion have no opinions."""
     if (opinions := result.opinions) is None:
         return {}
     said = Counter(Opinion(value).word.replace(" ", "_") for value in opinions.opinion.tolist())

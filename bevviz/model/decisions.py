@@ -1,4 +1,4 @@
-"""Every decision of a frame in words, with its numbers and the parameter it hung on."""
+"""Explanation of every decision of a frame, with its numbers and the parameter that decided it."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from bevviz.model.results import (
     Splits,
 )
 
-SOME = 0.1  # share of an object's points from which noise is worth a word
+SOME = 0.1  # Least share of noise in the points of a detection that an explanation mentions.
 
 
 def explain(
@@ -37,23 +37,25 @@ def explain(
     objects: Objects | None = None,
     opinions: Opinions | None = None,
 ) -> tuple[Explanation, ...]:
-    """One self-contained sentence for each detection, each cluster, each split and each problem of a camera.
+    """Explain each detection, each cluster, each split and each problem of a camera in one sentence.
 
-    A detection's distances are along its camera's optical axis, a cluster's are horizontal, from the
-    origin of its frame. A cluster is explained once for each camera that has it in view, otherwise once.
-    Problems have the subject ``camera``, row -1 and the state ``problem``. What a camera made of clusters has
-    the subject ``split``: what is left of one the state ``split``, what was made of several ``merged``.
-    Objects of somebody else's method have the subject ``object`` and the word of their ``Opinion``; those
-    that our fusion would have made the subject ``fused`` and the state ``missed`` or ``found``.
+    A detection's distances are along its camera's optical axis. A cluster's are horizontal, from the origin
+    of its frame. A cluster is explained once for each camera that sees it, or once if none does.
+
+    Problems have the subject ``camera``, row -1 and the state ``problem``. Changes of clusters by a camera
+    have the subject ``split``. Its state is ``split`` for the rest of a divided cluster, and ``merged`` for a
+    cluster made from several. Objects of a 3D detector or of the robot have the subject ``object``, and the
+    word of their ``Opinion`` as state. Objects of our fusion beside them have the subject ``fused`` and the
+    state ``missed`` or ``found``.
 
     Args:
         cameras: results of all cameras.
-        clusters: the frame's clusters, None where their stage failed.
-        config: what the frame was run with.
-        splits: where detections split and merged clusters.
-        lidar: whether there is one, so that clusters are to be expected.
-        objects: of the frame.
-        opinions: what cameras say of them; None: they are our fusion's own.
+        clusters: clusters of the frame, None if their stage failed.
+        config: configuration of the result.
+        splits: clusters that detections split or merged.
+        lidar: whether the frame has a LiDAR, so that clusters are expected.
+        objects: objects of the frame.
+        opinions: opinions of the cameras on them. None: our fusion made the objects.
     """
     found: list[Explanation] = []
     for result in cameras:
@@ -71,6 +73,7 @@ def explain(
 
 
 def _problems(result: CameraResult, config: Config) -> Iterator[Explanation]:
+    """Yield the problems of a camera."""
     texts = [*result.camera.problems]
     if result.detections is None and result.camera.image is not None:
         why = "the detector failed" if config.detector.model else "detector.model is not set"
@@ -85,6 +88,7 @@ def _problems(result: CameraResult, config: Config) -> Iterator[Explanation]:
 def _detections(
     result: CameraResult, detections: Detections, clusters: Clusters | None, config: Config, lidar: bool
 ) -> Iterator[Explanation]:
+    """Yield the explanation of each detection of a camera."""
     for d, value in enumerate(detections.state.tolist()):
         state = DetectionState(value)
         key = state.name.lower()
@@ -113,6 +117,7 @@ def _detection(
     clusters: Clusters,
     config: Config,
 ) -> str:
+    """Return the decision of the fusion about detection ``d`` in words."""
     if decision is Decision.NO_CLUSTER:
         return f"no cluster, {_unclustered(d, result, detections, clusters, config)}"
     k = int(fusion.detection_cluster[d])
@@ -137,7 +142,10 @@ def _detection(
 
 
 def in_mask(fusion: Fusion, d: int, config: Config) -> str:
-    """How many of the points in a detection's frustum its mask covers, to be added; empty without a mask."""
+    """Return how many points in a detection's frustum its mask covers, as the end of a sentence.
+
+    The text is empty without a mask.
+    """
     if fusion.detection_covered is None or (covered := int(fusion.detection_covered[d])) < 0:
         return ""
     points = f"{covered} of {_points(fusion.detection_points[d])} in the frustum"
@@ -150,7 +158,7 @@ def in_mask(fusion: Fusion, d: int, config: Config) -> str:
 def _unclustered(
     d: int, result: CameraResult, detections: Detections, clusters: Clusters, config: Config
 ) -> str:
-    """What the obstacle points in a frustum are, of which no cluster is a candidate."""
+    """Return the kinds of obstacle points in a frustum that has no candidate cluster."""
     if config.fusion.method == "centroid":
         return "none has its centre before the camera"
     if result.uv is None or result.depth is None:
@@ -170,7 +178,7 @@ def _unclustered(
 
 
 def _noise(config: Config) -> str:
-    """What it hung on; of somebody else's clustering that is not known."""
+    """Return the parameter or the method that decided what is noise."""
     method = config.clustering.method
     if method in OURS:
         return f"clustering.min_points is {config.clustering.min_points}"
@@ -181,6 +189,7 @@ def _noise(config: Config) -> str:
 
 
 def _clusters(cameras: Sequence[CameraResult], clusters: Clusters, config: Config) -> Iterator[Explanation]:
+    """Yield the explanation of each cluster for each camera that sees it."""
     compared = [result.camera.name for result in cameras if result.fusion is not None]
     ranges = np.hypot(clusters.centroid[:, 0], clusters.centroid[:, 1])
     for k, (state, count, distance) in enumerate(
@@ -214,6 +223,7 @@ def _clusters(cameras: Sequence[CameraResult], clusters: Clusters, config: Confi
 
 
 def _cluster(decision: Decision, k: int, fusion: Fusion, detections: Detections, config: Config) -> str:
+    """Return the decision of the fusion about cluster ``k`` in words."""
     if decision is Decision.NO_DETECTION:
         return "under no detection"
     d = int(fusion.cluster_detection[k])
@@ -231,6 +241,7 @@ def _cluster(decision: Decision, k: int, fusion: Fusion, detections: Detections,
 
 
 def _splits(cameras: Sequence[CameraResult], splits: Splits) -> Iterator[Explanation]:
+    """Yield the explanation of each cluster that a detection split or merged."""
     by_name = {result.camera.name: result.detections for result in cameras}
     keys = list(zip(splits.camera, splits.detection.tolist(), splits.cluster.tolist(), strict=True))
     for camera, d, part in dict.fromkeys(keys):
@@ -261,7 +272,7 @@ def _splits(cameras: Sequence[CameraResult], splits: Splits) -> Iterator[Explana
             )
 
 
-# --- two opinions ------------------------------------------------------------------------------
+# --- opinions of cameras -----------------------------------------------------------------------
 
 
 def _objects(
@@ -271,6 +282,7 @@ def _objects(
     clusters: Clusters | None,
     config: Config,
 ) -> Iterator[Explanation]:
+    """Yield the opinion of the cameras on each object."""
     by_name = {result.camera.name: result for result in cameras}
     for k, name in enumerate(opinions.camera):
         opinion = Opinion(int(opinions.opinion[k]))
@@ -289,7 +301,7 @@ def _opinion(
     clusters: Clusters | None,
     config: Config,
 ) -> str:
-    """What cameras say of an object, with the figure that it hung on."""
+    """Return the opinion on object ``k`` in words, with the number that decided it."""
     camera, least = "" if result is None else result.camera.name, config.opinions
     if opinion is Opinion.NOT_ASKED:
         return "unseen, no camera has detections"
@@ -315,7 +327,7 @@ def _opinion(
 
 
 def _looks(k: int, d: int, opinions: Opinions, result: CameraResult) -> str:
-    """How a detection looks at an object."""
+    """Return the evidence that detection ``d`` is of object ``k``."""
     overlap = f"IoU {opinions.iou[k]:.2f} in the image"
     if np.isnan(opinions.held[k]) or result.fusion is None:
         return f"{overlap}, without a cluster"
@@ -326,7 +338,7 @@ def _looks(k: int, d: int, opinions: Opinions, result: CameraResult) -> str:
 def _nearest(
     k: int, d: int, opinions: Opinions, result: CameraResult, clusters: Clusters | None, config: Config
 ) -> str:
-    """What a camera has where nothing of its looks at an object."""
+    """Return the detection that is nearest to a contradicted object, and why it does not confirm it."""
     detections, fusion = result.detections, result.fusion
     if d < 0 or detections is None:
         ours = Path(config.detector.model).suffix == ".onnx"
@@ -347,6 +359,7 @@ def _nearest(
 def _fused(
     objects: Objects, opinions: Opinions, clusters: Clusters | None, config: Config
 ) -> Iterator[Explanation]:
+    """Yield for each object of our fusion whether the other method has it, too."""
     method, fused = _method(config), opinions.fused
     for j, k in enumerate(opinions.partner.tolist()):
         cluster, camera = int(fused.cluster[j]), fused.camera[j]
@@ -362,17 +375,18 @@ def _fused(
 
 
 def _method(config: Config) -> str:
-    """Whose objects they are."""
+    """Return the short name of the method that made the objects."""
     method = config.objects.method.removeprefix(TOPIC)
     return method if method.startswith("/") and not method.endswith(".onnx") else Path(method).name
 
 
 def _object(objects: Objects, row: int) -> str:
+    """Return name, score and distance of an object."""
     return f"{_label(objects, row)} at {np.hypot(*objects.boxes.center[row, :2]):.1f} m"
 
 
 def _pair(fusion: Fusion, d: int, k: int) -> Pair:
-    """Of a detection and a cluster of which the fusion says that they met."""
+    """Return the evidence of a detection and a cluster that the fusion compared."""
     pair = fusion.pair(d, k)
     assert pair is not None
     return pair
@@ -382,15 +396,17 @@ def _pair(fusion: Fusion, d: int, k: int) -> Pair:
 
 
 def _label(found: Detections | Objects, row: int) -> str:
+    """Return name and score of a detection or an object."""
     return f"{found.names[row]} {found.score[row]:.2f}"
 
 
 def _points(count: int | np.integer) -> str:
+    """Return a number of points in words."""
     return f"{count} point" if count == 1 else f"{count} points"
 
 
 def _rule(decision: Decision, d: int, result: Fusion, detections: Detections, config: Config) -> str:
-    """The parameter that forbade a pair."""
+    """Return the parameter that forbade a pair."""
     fusion = config.fusion
     if decision is Decision.MISFIT and result.claims is not None:
         fit, name = float(result.claims.fit[d]), detections.names[d]
@@ -407,6 +423,7 @@ def _rule(decision: Decision, d: int, result: Fusion, detections: Detections, co
 
 
 def _set_aside(state: int, config: Config) -> str:
+    """Return the parameter that excluded a cluster."""
     if state == ClusterState.TOO_SMALL:
         return f"set aside, clustering.min_cluster_points is {config.clustering.min_cluster_points}"
     return f"set aside, clustering.max_cluster_points is {config.clustering.max_cluster_points}"

@@ -1,4 +1,4 @@
-"""What flows through bevviz: small frozen dataclasses of arrays, free of ROS and Rerun.
+"""Input of the stages: small frozen dataclasses of arrays, free of ROS and Rerun.
 
 Conventions, everywhere in the project:
 
@@ -33,14 +33,14 @@ I32 = NDArray[np.int32]
 I64 = NDArray[np.int64]
 U8 = NDArray[np.uint8]
 
-Codec = Literal["h264", "h265", "av1", "vp8", "vp9"]  # of video that Rerun shows as it is
+Codec = Literal["h264", "h265", "av1", "vp8", "vp9"]  # video codecs that Rerun shows without decoding
 
 
 def data_frame(columns: Mapping[str, Any] | Sequence[Mapping[str, Any]]) -> DataFrame:
-    """A table, where pandas is installed.
+    """Return a table of pandas.
 
     Raises:
-        UserError: it is not.
+        UserError: pandas is not installed.
     """
     try:
         from pandas import DataFrame
@@ -57,7 +57,7 @@ RING_FIELDS = ("ring", "line", "channel")
 
 @dataclass(frozen=True, slots=True)
 class Cloud:
-    """One LiDAR scan as received: returns with finite coordinates; ``dropped`` counts the others."""
+    """One LiDAR scan as received, without invalid points. ``dropped`` counts these."""
 
     stamp: int
     frame_id: str
@@ -65,7 +65,7 @@ class Cloud:
     fields: Mapping[str, NDArray[Any]] = field(default_factory=dict)  # extra (N,) fields by name
     topic: str = ""
     received: int = 0
-    dropped: int = 0  # points of the message that were NaN, infinite, beyond any sensor or (0, 0, 0)
+    dropped: int = 0  # points of the message that are NaN, infinite, beyond any sensor's range or (0, 0, 0)
     name: str = ""  # entity name of the LiDAR
 
 
@@ -79,24 +79,25 @@ class Intrinsics:
     distortion_model: str = ""  # "", plumb_bob, rational_polynomial or equidistant
     D: F64 = field(default_factory=lambda: np.zeros(0))  # coefficients in ROS order
     baseline: tuple[float, float] = (0.0, 0.0)  # metres right of and below the first camera of a stereo pair
-    assumed: bool = False  # True: no CameraInfo was seen, these are the configured defaults
+    assumed: bool = False  # True: there is no CameraInfo, and these are the configured defaults
 
 
 @dataclass(frozen=True, slots=True)
 class Clip:
-    """Packets of a video up to a picture: from the key frame that it needs, and the group before that."""
+    """Packets of a video up to a picture: the group with its key frame, and the group before that."""
 
     codec: Codec
-    places: tuple[tuple[int, int], ...]  # of each in its topic: time of receipt and stamp
+    places: tuple[tuple[int, int], ...]  # time of receipt and stamp of each packet in its topic
     packets: tuple[bytes, ...]
     key: int  # row of the key frame
 
 
 @dataclass(frozen=True, slots=True)
 class Image:
-    """One camera image. ``encoded`` is the untouched JPEG or PNG, where the source had one.
+    """One camera image. ``encoded`` is the untouched JPEG or PNG, if the source had one.
 
-    Of video, ``clip`` is what it was decoded from, where Rerun shows that: no picture needs later ones.
+    For video that Rerun can show, ``clip`` holds the packets it was decoded from. No picture needs later
+    packets.
     """
 
     stamp: int
@@ -111,17 +112,17 @@ class Image:
 
 @dataclass(frozen=True, slots=True)
 class Camera:
-    """A camera as one frame sees it. Whatever is missing is None and named in ``problems``."""
+    """A camera as one frame sees it. A missing value is None and named in ``problems``."""
 
     name: str
     image: Image | None
     intrinsics: Intrinsics | None
-    camera_from_points: F64 | None  # (4, 4), from Frame.points at its stamp to the camera at the image's
+    camera_from_points: F64 | None  # (4, 4) from Frame.points at its stamp to the camera at the image stamp
     world_from_camera: F64 | None  # (4, 4)
     sync_error: float = float("nan")  # seconds, image stamp - cloud stamp
-    tf_age: float = float("nan")  # seconds between the asked stamp and the nearest TF sample used
+    tf_age: float = float("nan")  # seconds between the requested stamp and the nearest TF sample used
     motion_compensated: bool = False
-    mounting: F64 | None = None  # camera_from_points without the motion that is compensated
+    mounting: F64 | None = None  # camera_from_points without motion compensation
     problems: tuple[str, ...] = ()
 
 
@@ -138,11 +139,12 @@ class Boxes3D:
 
     @staticmethod
     def empty() -> Boxes3D:
+        """Return zero boxes."""
         return Boxes3D(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.float32), np.zeros(0, np.float32))
 
     @staticmethod
     def joined(parts: Sequence[Boxes3D]) -> Boxes3D:
-        """One after the other."""
+        """Concatenate boxes."""
         if not parts:
             return Boxes3D.empty()
         return Boxes3D(
@@ -150,13 +152,13 @@ class Boxes3D:
         )
 
     def chosen(self, rows: Sequence[int] | NDArray[Any]) -> Boxes3D:
-        """Some of them."""
+        """Return the boxes of some rows."""
         chosen = np.asarray(rows, np.int64) if len(rows) == 0 else rows
         return Boxes3D(self.center[chosen], self.size[chosen], self.yaw[chosen])
 
     @property
     def columns(self) -> dict[str, F32]:
-        """For a table: centre, size and heading."""
+        """Columns of a table: centre, size and heading."""
         x, y, z = self.center.T
         length, width, height = self.size.T
         return {"x": x, "y": y, "z": z, "length": length, "width": width, "height": height, "yaw": self.yaw}
@@ -164,32 +166,32 @@ class Boxes3D:
 
 @dataclass(frozen=True, slots=True)
 class LabelledBoxes3D:
-    """Boxes somebody else states: the robot's own results, or ground truth. In ``frame_id``."""
+    """Boxes in ``frame_id`` that bevviz did not compute: the robot's own results, or ground truth."""
 
     topic: str
     stamp: int
     frame_id: str
     boxes: Boxes3D
     labels: tuple[str, ...]
-    scores: F32  # (K,), 1 where not given
+    scores: F32  # (K,), 1 where the message has none
     world_from_boxes: F64 | None = None
     received: int = 0
-    ids: tuple[str, ...] = ()  # of each, the same from frame to frame; (): none are stated
-    image: ImageLabels | None = None  # of a labelled data set
-    # Until they are placed:
-    turns: F64 | None = None  # (K, 4) quaternions xyzw, where some lean: ``yaw`` does not say enough then
-    frames: tuple[str, ...] = ()  # of each; (): all are in frame_id
-    unusable: tuple[str, ...] = ()  # a sentence for each box that was stated and left out
+    ids: tuple[str, ...] = ()  # (K,) ids, the same from frame to frame; (): the message has none
+    image: ImageLabels | None = None  # labels of the image in a data set
+    # These hold values only until the boxes are transformed into the frame of the points:
+    turns: F64 | None = None  # (K, 4) quaternions xyzw, if some boxes lean, so that ``yaw`` is not enough
+    frames: tuple[str, ...] = ()  # (K,) frame of each box; (): all are in frame_id
+    unusable: tuple[str, ...] = ()  # one sentence for each box that was left out
 
 
 @dataclass(frozen=True, slots=True)
 class ImageLabels:
-    """What was labelled in the image, beside boxes in 3D. KITTI's terms."""
+    """Labels of a data set's image beside the boxes in 3D. KITTI's terms."""
 
-    xyxy: F32  # (K, 4) of each box
+    xyxy: F32  # (K, 4) box of each object in the image
     truncated: F32  # (K,) share outside of the image, 0 to 1
-    occluded: I32  # (K,) 0 seen whole, 1 partly, 2 largely hidden, 3 not known
-    dont_care: F32  # (R, 4) regions in which nothing was labelled
+    occluded: I32  # (K,) 0 fully visible, 1 partly occluded, 2 largely occluded, 3 not known
+    dont_care: F32  # (R, 4) regions without labels
 
 
 @dataclass(frozen=True, slots=True)
@@ -202,17 +204,17 @@ class LabelledBoxes2D:
     xyxy: F32  # (K, 4)
     labels: tuple[str, ...]
     scores: F32  # (K,)
-    camera: str = ""  # name of the camera they belong to, where known
+    camera: str = ""  # name of the camera whose image they are in, if known
     received: int = 0
-    unusable: tuple[str, ...] = ()  # a sentence for each box that was stated and left out
+    unusable: tuple[str, ...] = ()  # one sentence for each box that was left out
 
 
-# --- around perception -------------------------------------------------------------------------
+# --- surroundings ------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True)
 class Status:
-    """What the robot's diagnostics say of one of its parts."""
+    """State of one component of the robot, from its diagnostics."""
 
     name: str
     level: Literal["ok", "warning", "error", "stale"]
@@ -221,16 +223,16 @@ class Status:
 
 @dataclass(frozen=True, slots=True)
 class Grid:
-    """A map: cells from 0 (free) to 100 (occupied), -1 where nothing is known."""
+    """An occupancy grid: cells from 0 (free) to 100 (occupied), -1 for unknown."""
 
     cells: NDArray[np.int8]  # (rows, columns)
     resolution: float  # metres
-    pose: F64  # (4, 4) frame of the map from its first cell's corner, rows along y, columns along x
+    pose: F64  # (4, 4) frame of the map from the corner of the first cell, rows along y, columns along x
 
 
 @dataclass(frozen=True, slots=True)
 class Solids:
-    """Boxes, or ellipsoids in them."""
+    """Boxes, or the ellipsoids inscribed in them."""
 
     center: F32  # (N, 3)
     half: F32  # (N, 3) metres
@@ -244,12 +246,12 @@ class Surface:
 
     vertices: F32  # (V, 3)
     triangles: NDArray[np.uint32]  # (T, 3) rows of the vertices
-    values: F32  # (V,) that the colours are of
+    values: F32  # (V,) values to colour
 
 
 @dataclass(frozen=True, slots=True)
 class MeshFile:
-    """A file with a mesh, and where it is in its frame."""
+    """A file with a mesh, and the pose of the mesh in its frame."""
 
     path: Path
     pose: F64  # (4, 4)
@@ -258,20 +260,20 @@ class MeshFile:
 
 @dataclass(frozen=True, slots=True)
 class Motion:
-    """What an Imu has measured since the frame before, in its own frame; NaN where it measures none."""
+    """Samples of an IMU since the previous frame, in its own frame. NaN if it measures none."""
 
     topic: str
     stamp: I64  # (N,)
     received: I64  # (N,)
     rotation: F64  # (N, 3) rad/s
-    acceleration: F64  # (N, 3) m/s^2, or in g: drivers differ
+    acceleration: F64  # (N, 3) m/s^2, or in g, as drivers differ
 
 
 @dataclass(frozen=True, slots=True)
 class Shape:
-    """What has a place in the world, in the coordinates of ``frame_id``."""
+    """Geometry in the coordinates of ``frame_id``."""
 
-    topic: str  # with a marker's namespace and id
+    topic: str  # also the namespace and id of a marker
     frame_id: str
     stamp: int
     points: F32 | None = None  # (N, 3)
@@ -281,18 +283,18 @@ class Shape:
     grid: Grid | None = None
     surface: Surface | None = None
     meshes: tuple[MeshFile, ...] = ()
-    fix: tuple[float, float] | None = None  # degrees of latitude and longitude
+    fix: tuple[float, float] | None = None  # latitude and longitude in degrees
     picture: U8 | None = None  # (H, W, 3) BGR
     color: U8 | None = None  # red, green, blue, alpha
     text: str = ""
-    world_from_shape: F64 | None = None  # (4, 4); None: not connected with the points
+    world_from_shape: F64 | None = None  # (4, 4); None: TF does not connect it with the points
 
 
 @dataclass(frozen=True, slots=True)
 class Around:
-    """What the robot says around its perception, at the time of a frame."""
+    """Other topics of the robot beside perception, at the time of a frame."""
 
-    marks: tuple[str, ...] = ()  # set by people, at this frame
+    marks: tuple[str, ...] = ()  # marks that people set at this frame
     statuses: tuple[Status, ...] = ()
     shapes: tuple[Shape, ...] = ()
     motions: tuple[Motion, ...] = ()
@@ -300,7 +302,7 @@ class Around:
 
 @dataclass(frozen=True, slots=True)
 class Mark:
-    """A note of people's, and the frame that it belongs to."""
+    """A note that a person took, and its frame."""
 
     text: str
     index: int
@@ -309,39 +311,39 @@ class Mark:
 
 @dataclass(frozen=True, slots=True)
 class LateResult:
-    """Boxes of the robot's own that came when the frame of their time had gone on: beside a robot alone."""
+    """Boxes of the robot that came after their frame was processed. Only live runs have them."""
 
     boxes: LabelledBoxes2D | LabelledBoxes3D
-    frame_stamp: int  # of the frame that is nearest
-    pose: F64  # (4, 4) world from points, at that frame
-    index: int = 0  # of that frame
+    frame_stamp: int  # stamp of the nearest frame
+    pose: F64  # (4, 4) world_from_points of that frame
+    index: int = 0  # index of that frame
 
 
 @dataclass(frozen=True, slots=True)
 class Frame:
-    """One LiDAR scan with all that belongs to its time; without a LiDAR, one image of the first camera.
+    """One LiDAR scan with all data of its time. Without a LiDAR, one image of the first camera.
 
-    ``points`` are the points of every LiDAR in ``points_frame``: the LiDAR's own frame where there is
-    one LiDAR, the base frame where several are merged. Where that frame is not upright, they are turned
-    about its origin by ``upright``, so that z points up.
+    ``points`` are the points of every LiDAR in ``points_frame``. This is the LiDAR's own frame if there is
+    one LiDAR, and the base frame if several are merged. If the frame is not upright, ``upright`` turns the
+    points about its origin, so that z points up.
     """
 
     index: int
     stamp: int
     received: int
-    lidar: str  # entity name: that of the LiDAR, "lidars" for merged ones, empty where cameras are alone
+    lidar: str  # entity name: that of the LiDAR, "lidars" for merged ones, empty without a LiDAR
     points: F32  # (N, 3)
     points_frame: str
     fields: Mapping[str, NDArray[Any]] = field(default_factory=dict)  # extra fields common to all clouds
     upright: F64 | None = None  # (4, 4) points from points_frame; None: z of points_frame points up
-    world_frame: str = ""  # name of the fixed frame; equal to points_frame where there is none
-    world_from_points: F64 | None = None  # None: no TF to the fixed frame (identity is assumed)
+    world_frame: str = ""  # name of the fixed frame; equal to points_frame if there is none
+    world_from_points: F64 | None = None  # None: no TF to the fixed frame (the identity is assumed)
     clouds: tuple[Cloud, ...] = ()
     points_from_clouds: tuple[F64, ...] = ()
     cameras: tuple[Camera, ...] = ()
     robot_boxes: tuple[LabelledBoxes3D, ...] = ()
     robot_detections: tuple[LabelledBoxes2D, ...] = ()
-    robot_clouds: tuple[Cloud, ...] = ()  # of obstacles, in the frame of the points
+    robot_clouds: tuple[Cloud, ...] = ()  # obstacle points, in the frame of the points
     truth: LabelledBoxes3D | None = None
     tf_age: float = float("nan")
     problems: tuple[str, ...] = ()  # one clear sentence each
@@ -349,7 +351,7 @@ class Frame:
 
     @property
     def pose(self) -> F64:
-        """(4, 4) ``world_from_points``, the identity where there is no TF to the fixed frame."""
+        """(4, 4) ``world_from_points``, or the identity if there is no TF to the fixed frame."""
         return np.eye(4) if self.world_from_points is None else self.world_from_points
 
 
@@ -358,37 +360,39 @@ class Frame:
 
 @dataclass(frozen=True, slots=True)
 class Scene:
-    """What a source will deliver: the names that entities and blueprints are made from."""
+    """Description of a source: the names that entities and blueprints are made from."""
 
-    name: str  # of the bag or drive, for the recording's title
+    name: str  # name of the bag or drive, for the recording's title
     lidar: str  # entity name of Frame.points; empty: there is no LiDAR
-    lidars: tuple[str, ...] = ()  # entity name of each LiDAR; the same as lidar where there is one
+    lidars: tuple[str, ...] = ()  # entity name of each LiDAR; equal to lidar if there is one
     cameras: tuple[str, ...] = ()
-    robot: bool = False  # the robot's own results come along
-    truth: bool = False  # ground truth comes along
-    imu: bool = False  # rotation and acceleration come along
-    bag: tuple[Path, ...] = ()  # files and folders that the frames are read from; (): none
-    topics: tuple[str, ...] = ()  # key=value each, which give the same topics the same roles
-    focus: tuple[float, float, float] | None = None  # what is asked about, in metres of Frame.points_frame
-    above: tuple[float, float, float, float] | None = None  # u, v, u, v: where a look from above begins
+    robot: bool = False  # the source has the robot's own results
+    truth: bool = False  # the source has ground truth
+    imu: bool = False  # the source has rotation and acceleration
+    bag: tuple[Path, ...] = ()  # files and folders that the frames are read from; () if there are none
+    topics: tuple[str, ...] = ()  # key=value settings that give the same topics the same roles
+    focus: tuple[float, float, float] | None = None  # the point in question, in metres of Frame.points_frame
+    above: tuple[float, float, float, float] | None = None  # u, v, u, v: start of a look from above
     raw: bool = True  # every raw cloud is logged
-    color_by: tuple[Quantity, ...] = ()  # that it can be coloured by
+    color_by: tuple[Quantity, ...] = ()  # quantities that can colour the raw cloud
 
 
 class Source(Protocol):
     """An iterable of frames, in order of stamp: a bag, the synthetic drive, or a running robot."""
 
     @property
-    def scene(self) -> Scene: ...
+    def scene(self) -> Scene:
+        """Names that entities and blueprints are made from."""
+        ...
 
     @property
     def total(self) -> int | None:
-        """Frames to expect, for a progress bar; None where unknown."""
+        """Number of expected frames, for a progress bar. None if unknown."""
         ...
 
     @property
     def warnings(self) -> Sequence[str]:
-        """What was lost or looked wrong so far, one sentence each."""
+        """Losses and suspicious data so far, one sentence each."""
         ...
 
     def __iter__(self) -> Iterator[Frame]: ...

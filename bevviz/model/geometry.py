@@ -1,4 +1,4 @@
-"""Rigid transforms, camera projection, boxes and their overlap. Plain functions of arrays."""
+"""Rigid transforms, camera projection, boxes and their overlap as plain functions of arrays."""
 
 from __future__ import annotations
 
@@ -14,28 +14,27 @@ from bevviz.model.frame import F32, F64, I64, Bool, Boxes3D, Intrinsics
 
 FloatArray = NDArray[Any]
 
-MIN_DEPTH = 1e-3  # metres; what is nearer to the camera's plane has no meaningful pixel
-WIDEST = (
-    1e8  # squared slope of a ray, 0.006 degrees from the camera's plane: its sixth power fits into float32
-)
+MIN_DEPTH = 1e-3  # Least depth in metres. A point nearer to the camera's plane has no meaningful pixel.
+# Largest squared slope of a ray, 0.006 degrees from the camera's plane. Its sixth power fits into float32.
+WIDEST = 1e8
 FISHEYE = ("equidistant", "fisheye")
 
 # --- rigid transforms --------------------------------------------------------------------------
 
 
 def transform(translation: Iterable[float], quaternion_xyzw: Iterable[float]) -> F64:
-    """The (4, 4) matrix of a translation in metres and a rotation as quaternion x, y, z, w.
+    """Return the (4, 4) matrix of a translation in metres and a rotation as quaternion x, y, z, w.
 
-    The quaternion need not be of unit length, as published ones seldom are to the last digit.
+    The quaternion need not be of unit length. Published ones seldom are to the last digit.
 
     Raises:
-        ValueError: quaternion of zero length or not finite.
+        ValueError: the quaternion has zero length or is not finite.
     """
     q = tuple(map(float, quaternion_xyzw))
     norm = math.hypot(*q)
     if not math.isfinite(norm) or norm < 1e-9:
         raise ValueError(f"{q} is no rotation")
-    # Number by number: a robot publishes hundreds a second, and for so few numbers NumPy's calls are slow.
+    # Scalars are faster than NumPy for so few numbers, and a robot publishes hundreds of transforms a second.
     x, y, z, w = (value / norm for value in q)
     tx, ty, tz = map(float, translation)
     return np.array(
@@ -49,7 +48,7 @@ def transform(translation: Iterable[float], quaternion_xyzw: Iterable[float]) ->
 
 
 def inverse(a_from_b: F64) -> F64:
-    """b_from_a of a rigid (4, 4) a_from_b."""
+    """Return b_from_a for a rigid (4, 4) a_from_b."""
     rotation = a_from_b[:3, :3].T
     m = np.eye(4)
     m[:3, :3] = rotation
@@ -58,8 +57,8 @@ def inverse(a_from_b: F64) -> F64:
 
 
 def quaternion(a_from_b: F64) -> F64:
-    """(4,) unit quaternion x, y, z, w, w >= 0, of a (4, 4) transform (Shepperd 1978)."""
-    (a, b, c), (d, e, f), (g, h, i) = a_from_b[:3, :3].tolist()  # number by number, as ``transform``
+    """Return the (4,) unit quaternion x, y, z, w, w >= 0, of a (4, 4) transform (Shepperd 1978)."""
+    (a, b, c), (d, e, f), (g, h, i) = a_from_b[:3, :3].tolist()  # scalars for speed, as in ``transform``
     squared = a - e - i, e - a - i, i - a - e, a + e + i
     largest = squared.index(max(squared))
     root = squared[largest] + 1
@@ -74,7 +73,7 @@ def quaternion(a_from_b: F64) -> F64:
 
 
 def interpolate(a_from_b0: F64, a_from_b1: F64, t: float) -> F64:
-    """The pose between two: translation linear, rotation by slerp (Shoemake 1985), t in [0, 1]."""
+    """Return the pose between two: linear translation, rotation by slerp (Shoemake 1985), t in [0, 1]."""
     q0, q1 = quaternion(a_from_b0), quaternion(a_from_b1)
     dot = float(q0 @ q1)
     if dot < 0:
@@ -88,7 +87,7 @@ def interpolate(a_from_b0: F64, a_from_b1: F64, t: float) -> F64:
 
 
 def apply(a_from_b: F64, points: FloatArray) -> F32:
-    """(N, 3) float32 points of frame b in frame a."""
+    """Transform (N, 3) points from frame b to frame a, as float32."""
     m = np.asarray(a_from_b, np.float32)
     moved: F32 = np.asarray(points, np.float32) @ m[:3, :3].T
     moved += m[:3, 3]
@@ -96,7 +95,7 @@ def apply(a_from_b: F64, points: FloatArray) -> F32:
 
 
 def yaw(a_from_b: F64) -> float:
-    """Turn about z, in radians."""
+    """Return the rotation about z in radians."""
     return float(np.arctan2(a_from_b[1, 0], a_from_b[0, 0]))
 
 
@@ -111,11 +110,11 @@ def project(points: FloatArray, intrinsics: Intrinsics) -> tuple[F32, F32]:
 
     Args:
         points: (N, 3) metres in the optical frame.
-        intrinsics: the camera.
+        intrinsics: camera model.
 
     Returns:
-        uv: (N, 2) float32 pixels; NaN behind the camera and where the distortion polynomial has
-            folded over (far outside the calibrated field of view), not clipped to the image.
+        uv: (N, 2) float32 pixels, not clipped to the image. NaN behind the camera, and where the distortion
+            polynomial has folded over (far outside the calibrated field of view).
         depth: (N,) float32 metres along the optical axis.
     """
     p = np.asarray(points)
@@ -133,12 +132,15 @@ def project(points: FloatArray, intrinsics: Intrinsics) -> tuple[F32, F32]:
 
 
 def is_bent(intrinsics: Intrinsics) -> bool:
-    """Whether straight lines are curved in the image: an equidistant lens needs no coefficients for it."""
+    """Return whether straight lines are curved in the image.
+
+    An equidistant lens curves them even without coefficients.
+    """
     return intrinsics.distortion_model in FISHEYE or bool(np.any(intrinsics.D))
 
 
 def rays(uv: FloatArray, intrinsics: Intrinsics) -> F64:
-    """(N, 3) directions in the optical frame, z = 1, of (N, 2) pixels: the inverse of ``project``."""
+    """Return (N, 3) directions, z = 1, in the optical frame of (N, 2) pixels: the inverse of ``project``."""
     import cv2
 
     points = np.ascontiguousarray(uv, np.float64).reshape(-1, 1, 2)
@@ -157,10 +159,10 @@ def rays(uv: FloatArray, intrinsics: Intrinsics) -> F64:
 def frustum(
     xyxy: FloatArray, intrinsics: Intrinsics, near: FloatArray | float, far: FloatArray | float
 ) -> F32:
-    """(D, 8, 3) corners, in the optical frame, of what (D, 4) image boxes see between two depths.
+    """Return the (D, 8, 3) corners, in the optical frame, of the frustums of (D, 4) image boxes.
 
-    ``near`` and ``far``, one for all or (D,), are metres along the optical axis. The corners run top
-    left, top right, bottom right, bottom left, first at ``near``, then at ``far``.
+    ``near`` and ``far`` are depths in metres along the optical axis, one for all boxes or (D,). The corners
+    run top left, top right, bottom right, bottom left, first at ``near``, then at ``far``.
     """
     directions = rays(np.asarray(xyxy)[:, [0, 1, 2, 1, 2, 3, 0, 3]].reshape(-1, 2), intrinsics).reshape(
         -1, 1, 4, 3
@@ -170,7 +172,7 @@ def frustum(
 
 
 def _coefficients(intrinsics: Intrinsics) -> F64:
-    """(8,) the distortion coefficients, zero where not given."""
+    """Return the (8,) distortion coefficients, zero if not stated."""
     d = np.zeros(8)
     given = np.ravel(intrinsics.D)[:8]
     d[: len(given)] = given
@@ -178,6 +180,7 @@ def _coefficients(intrinsics: Intrinsics) -> F64:
 
 
 def _distort(x: FloatArray, y: FloatArray, intrinsics: Intrinsics) -> tuple[FloatArray, FloatArray]:
+    """Distort normalised image coordinates. Return NaN where the polynomial folds over."""
     k1, k2, p1, p2, k3, k4, k5, k6 = _coefficients(intrinsics).tolist()
     r2 = x * x + y * y
     if intrinsics.distortion_model in FISHEYE:
@@ -189,7 +192,7 @@ def _distort(x: FloatArray, y: FloatArray, intrinsics: Intrinsics) -> tuple[Floa
         turned = theta * (1 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4))))
         scale = np.divide(turned, r, out=np.ones_like(r), where=r > 1e-8)
         return x * scale, y * scale
-    # r * numerator / denominator must grow with r; its derivative, times denominator^2, in r^2:
+    # r * numerator / denominator must grow with r. This is its derivative, times denominator^2, in r^2:
     numerator, denominator = Polynomial([1, k1, k2, k3]), Polynomial([1, k4, k5, k6])
     turns = numerator.deriv() * denominator - numerator * denominator.deriv()
     slope = numerator * denominator + Polynomial([0, 2]) * turns
@@ -202,7 +205,7 @@ def _distort(x: FloatArray, y: FloatArray, intrinsics: Intrinsics) -> tuple[Floa
 
 
 def _first_root(polynomial: Polynomial) -> float:
-    """The least positive root, infinite where there is none."""
+    """Return the least positive root, or infinity."""
     roots = polynomial.trim().roots()
     real = roots.real[(np.abs(roots.imag) < 1e-9) & (roots.real > 0)]
     return float(real.min(initial=np.inf))
@@ -212,9 +215,9 @@ def _first_root(polynomial: Polynomial) -> float:
 
 
 def iou(a: FloatArray, b: FloatArray) -> F32:
-    """(A, B) intersection over union of (A, 4) and (B, 4) image boxes x0, y0, x1, y1.
+    """Return the (A, B) intersection over union of (A, 4) and (B, 4) image boxes x0, y0, x1, y1.
 
-    Zero with a box that is empty or NaN.
+    A box that is empty or NaN has zero overlap.
     """
     low = np.maximum(a[:, None, :2], b[None, :, :2])
     high = np.minimum(a[:, None, 2:], b[None, :, 2:])
@@ -228,7 +231,7 @@ def iou(a: FloatArray, b: FloatArray) -> F32:
 
 
 def corners(boxes: Boxes3D) -> F32:
-    """(K, 8, 3) corners: the lower four counter-clockwise seen from above, then the upper four."""
+    """Return (K, 8, 3) corners: the lower four counter-clockwise seen from above, then the upper four."""
     unit = np.array(
         [[1, 1, -1], [-1, 1, -1], [-1, -1, -1], [1, -1, -1], [1, 1, 1], [-1, 1, 1], [-1, -1, 1], [1, -1, 1]],
         np.float32,
@@ -242,21 +245,24 @@ def corners(boxes: Boxes3D) -> F32:
 
 
 def moved(boxes: Boxes3D, b_from_a: F64) -> Boxes3D:
-    """Upright boxes of frame a in b, which is upright, too; a may be a map with its origin far away."""
+    """Transform upright boxes from frame a to frame b, which is also upright.
+
+    Frame a may be a map with its origin far away.
+    """
     turned = boxes.yaw + np.float32(yaw(b_from_a))
     center = np.asarray(boxes.center, np.float64) @ b_from_a[:3, :3].T + b_from_a[:3, 3]
     return Boxes3D(center.astype(np.float32), boxes.size, turned)
 
 
 def upright(center: F64, size: F32, turns: F64) -> Boxes3D:
-    """Boxes that are turned in any way as upright ones, which have the same axes up to a lean.
+    """Convert boxes of any rotation to upright ones, which have the same axes up to a lean.
 
-    The axis nearest to the vertical is the height. The heading is that of x, of y where x is the height.
+    The axis nearest to the vertical is the height. The heading is that of x, or of y if x is the height.
 
     Args:
         center: (K, 3).
         size: (K, 3) along the box's own axes.
-        turns: (K, 3, 3) rotation of each.
+        turns: (K, 3, 3) rotation of each box.
     """
     rows = np.arange(len(turns))
     height = np.abs(turns[:, 2]).argmax(axis=1)
@@ -268,7 +274,7 @@ def upright(center: F64, size: F32, turns: F64) -> Boxes3D:
 
 
 def inside(points: F32, boxes: Boxes3D, k: int) -> Bool:
-    """(N,) which points are in box k, its surface included."""
+    """Return the (N,) mask of the points in box k. Its surface counts."""
     offset = points - boxes.center[k]
     found = np.zeros(len(points), np.bool_)
     near = np.flatnonzero((np.abs(offset[:, :2]) <= np.hypot(*boxes.size[k, :2]) / 2).all(axis=1))
@@ -280,10 +286,10 @@ def inside(points: F32, boxes: Boxes3D, k: int) -> Bool:
 
 
 def inside_each(points: F32, boxes: Boxes3D) -> Iterator[tuple[int, I64]]:
-    """Each box that may have points in it, and the rows of those. Of use where boxes are many."""
+    """Iterate over the boxes that may contain points, with the rows of the points inside."""
     order = np.argsort(points[:, 0])
     points = points.take(order, axis=0)
-    reach = np.hypot(boxes.size[:, 0], boxes.size[:, 1]) / 2 + np.float32(1e-3)  # no less for being rounded
+    reach = np.hypot(boxes.size[:, 0], boxes.size[:, 1]) / 2 + np.float32(1e-3)  # for rounding errors
     first = np.searchsorted(points[:, 0], boxes.center[:, 0] - reach)
     last = np.searchsorted(points[:, 0], boxes.center[:, 0] + reach)
     for k in np.flatnonzero(last > first).tolist():
@@ -292,13 +298,13 @@ def inside_each(points: F32, boxes: Boxes3D) -> Iterator[tuple[int, I64]]:
 
 
 def bev_iou(a: Boxes3D, b: Boxes3D) -> F32:
-    """(A, B) intersection over union, seen from above, of A and B upright boxes however they are turned."""
+    """Return the (A, B) intersection over union of A and B upright boxes of any yaw, seen from above."""
     shared = _shared_area(a, b)
     return _ratio(shared, _product(a.size[:, :2])[:, None] + _product(b.size[:, :2])[None] - shared)
 
 
 def box_iou(a: Boxes3D, b: Boxes3D) -> tuple[F32, F32]:
-    """(A, B) intersection over union of A and B upright boxes, seen from above and as volumes."""
+    """Return the (A, B) intersection over union of A and B upright boxes, seen from above and as volumes."""
     area = _shared_area(a, b)
     (low_a, high_a), (low_b, high_b) = (
         (boxes.center[:, 2] - boxes.size[:, 2] / 2, boxes.center[:, 2] + boxes.size[:, 2] / 2)
@@ -313,7 +319,7 @@ def box_iou(a: Boxes3D, b: Boxes3D) -> tuple[F32, F32]:
 
 
 def _shared_area(a: Boxes3D, b: Boxes3D) -> F64:
-    """(A, B) square metres that both cover, seen from above."""
+    """Return the (A, B) square metres that two boxes share, seen from above."""
     shared = np.zeros((len(a), len(b)))
     reach_a, reach_b = (np.hypot(boxes.size[:, 0], boxes.size[:, 1]) / 2 for boxes in (a, b))
     away = np.linalg.norm(a.center[:, None, :2] - b.center[None, :, :2], axis=2)
@@ -324,21 +330,22 @@ def _shared_area(a: Boxes3D, b: Boxes3D) -> F64:
 
 
 def _product(sides: F32) -> F64:
+    """Return the (K,) products of the sides of boxes, in float64."""
     return np.asarray(np.prod(sides, axis=1, dtype=np.float64))
 
 
 def _ratio(part: F64, whole: F64) -> F32:
-    """Zero where the whole is nothing."""
+    """Return the quotient, zero where the whole is zero."""
     return np.divide(part, whole, out=np.zeros(part.shape), where=whole > 0).astype(np.float32)
 
 
 def _clip(polygon: F64, window: F64) -> F64:
-    """The part of a convex polygon inside another, counter-clockwise one (Sutherland and Hodgman 1974)."""
+    """Return the part of a convex polygon inside a counter-clockwise window (Sutherland and Hodgman 1974)."""
     for start, end in zip(window, np.roll(window, -1, axis=0), strict=True):
         if len(polygon) == 0:
             break
         (dx, dy), offset = end - start, polygon - start
-        inside = dx * offset[:, 1] - dy * offset[:, 0]  # how far to the left of the edge, times its length
+        inside = dx * offset[:, 1] - dy * offset[:, 0]  # distance to the left, times the edge's length
         kept: list[F64] = []
         for k in range(len(polygon)):
             before = k - 1
@@ -352,6 +359,6 @@ def _clip(polygon: F64, window: F64) -> F64:
 
 
 def _area(polygon: F64) -> float:
-    """Of a counter-clockwise polygon (shoelace formula)."""
+    """Return the area of a counter-clockwise polygon (shoelace formula)."""
     x, y = polygon.T
     return float(x @ np.roll(y, -1) - y @ np.roll(x, -1)) / 2

@@ -15,16 +15,22 @@ R_contra = TypeVar("R_contra", contravariant=True)
 
 
 class Items(Protocol[T_co]):
-    """Input of a run: a ``Source`` of frames, or any other sequence that describes its scene."""
+    """Input of a run: a ``Source`` of frames, or any other iterable that describes its scene."""
 
     @property
-    def scene(self) -> Scene: ...
+    def scene(self) -> Scene:
+        """Names that entities and blueprints are made from."""
+        ...
 
     @property
-    def total(self) -> int | None: ...
+    def total(self) -> int | None:
+        """Number of expected items, or None if unknown."""
+        ...
 
     @property
-    def warnings(self) -> Sequence[str]: ...
+    def warnings(self) -> Sequence[str]:
+        """Losses and suspicious data so far, one sentence each."""
+        ...
 
     def __iter__(self) -> Iterator[T_co]: ...
 
@@ -33,13 +39,19 @@ class Frames(Protocol):
     """Source whose frames can be read in order and one by one."""
 
     @property
-    def scene(self) -> Scene: ...
+    def scene(self) -> Scene:
+        """Names that entities and blueprints are made from."""
+        ...
 
     @property
-    def total(self) -> int: ...
+    def total(self) -> int:
+        """Number of frames."""
+        ...
 
     @property
-    def warnings(self) -> Sequence[str]: ...
+    def warnings(self) -> Sequence[str]:
+        """Losses and suspicious data so far, one sentence each."""
+        ...
 
     @property
     def scans(self) -> I64:
@@ -48,31 +60,41 @@ class Frames(Protocol):
 
     def __iter__(self) -> Iterator[Frame]: ...
 
-    def number_at(self, time: str | float) -> int: ...
+    def number_at(self, time: str | float) -> int:
+        """Return the number of the frame at a time."""
+        ...
 
-    def frame(self, number: int) -> Frame | None: ...
+    def frame(self, number: int) -> Frame | None:
+        """Return a frame, or None if it cannot be made."""
+        ...
 
-    def close(self) -> None: ...
+    def close(self) -> None:
+        """Release the files."""
+        ...
 
 
 class Processor(Protocol[T_contra, R]):
-    """Computes the result of each item of a run, as a ``Session`` does.
+    """Computation of the result of each item of a run. A ``Session`` is one.
 
     The run calls ``perceive`` while it reads the next items, and ``finish`` while it perceives the next item.
     It calls each in the order of the items.
     """
 
-    def perceive(self, item: T_contra, network: Executor | None = None, /) -> R: ...
+    def perceive(self, item: T_contra, network: Executor | None = None, /) -> R:
+        """Return the result of the stages that need no result of the item before."""
+        ...
 
-    def finish(self, result: R, /) -> R: ...
+    def finish(self, result: R, /) -> R:
+        """Complete a result of ``perceive``."""
+        ...
 
 
 class Observer(Generic[R_contra]):
-    """Receives every result of a run, in order and in one thread.
+    """Receiver of every result of a run, in order and in one thread.
 
     Attributes:
         name: label under which the run counts dropped results.
-        beside: number of results that may wait for this observer in a thread of its own; the newest win.
+        beside: number of results that may wait for this observer in a thread of its own. The newest win.
             None: the run waits for the observer.
     """
 
@@ -86,7 +108,7 @@ class Observer(Generic[R_contra]):
         """Take one result. The next one comes only after this call returns."""
 
     def end(self) -> None:
-        """Finish after the last result, also when the run was interrupted or failed.
+        """Finish after the last result, also if the run was interrupted or failed.
 
         The run calls it only if ``begin`` was called.
         """
