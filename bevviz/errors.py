@@ -4,30 +4,33 @@ from __future__ import annotations
 
 from bevviz.support.text import printable
 
-LONGEST = 4000  # characters of a line
+LONGEST = 4000  # most characters of a line
 
 
 class UserError(Exception):
-    """What is wrong, in which file, topic or field, and what to do. The command exits with status 2."""
+    """A problem that the user can solve. The command prints one line and exits with status 2.
+
+    The text names the problem, the file, topic or field concerned, and the action to take.
+    """
 
     def __str__(self) -> str:
-        text = printable(super().__str__())  # it is shown on a terminal
-        if len(text) > LONGEST:  # it repeats what a file holds
+        text = printable(super().__str__())  # for a terminal
+        if len(text) > LONGEST:  # The text repeats the content of a file.
             text = f"{text[: LONGEST // 2]} ... {text[-LONGEST // 2 :]}"
         return text
 
 
 class StageError(Exception):
-    """What a stage was given or has returned is not what it must be, in one clear sentence."""
+    """Invalid input or output of a stage, in one clear sentence."""
 
 
 def first_line(error: object) -> str:
-    """What a library says of an error, for the end of a sentence of ours."""
+    """Return the first line of a library's error, as the end of a sentence."""
     return (str(error).strip() or type(error).__name__).splitlines()[0].rstrip(".")
 
 
 def interrupt_in(error: BaseException) -> bool:
-    """Whether a KeyboardInterrupt became this error: compiled code tells its own in place of it."""
+    """Return whether a KeyboardInterrupt caused an error. Compiled code raises its own error in its place."""
     seen: set[int] = set()
     current: BaseException | None = error
     while current is not None and id(current) not in seen:

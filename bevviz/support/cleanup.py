@@ -1,12 +1,12 @@
-"""What a process would leave behind if a signal ended it at once."""
+"""Delete temporary files when a signal kills the process."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 
-# Name of threads that run compiled code which may never end. An exit in the usual way takes the memory that
-# they work on away, and ends in a segmentation fault.
+# Name of threads that run compiled code which may never end. A normal exit would free the memory that they
+# work on, and cause a segmentation fault.
 ENDLESS_THREAD = "bevviz endless"
 
 _unfinished: list[object] = []
@@ -15,7 +15,7 @@ _removals: dict[object, Callable[[], None]] = {}
 
 @contextmanager
 def unfinished() -> Iterator[None]:
-    """Within, something is made that needs an end: the process must come to it."""
+    """Mark a block that must finish: a signal does not kill the process inside it."""
     mark = object()
     _unfinished.append(mark)
     try:
@@ -25,20 +25,22 @@ def unfinished() -> Iterator[None]:
 
 
 def any_unfinished() -> bool:
+    """Return whether any thread is inside ``unfinished``."""
     return bool(_unfinished)
 
 
 def remember(owner: object, remove: Callable[[], None]) -> None:
-    """How to remove what the owner has made, until ``forget``."""
+    """Register the function that deletes an owner's files, until ``forget``."""
     _removals[owner] = remove
 
 
 def forget(owner: object) -> None:
+    """Unregister the function of an owner, who has deleted the files."""
     _removals.pop(owner, None)
 
 
 def remove() -> None:
-    """All that is remembered."""
+    """Delete the files of all registered owners."""
     for removal in list(_removals.values()):
         with suppress(OSError):
             removal()

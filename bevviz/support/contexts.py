@@ -1,4 +1,4 @@
-"""Context managers: of what has nothing more to do at its end than to be closed, and of a start."""
+"""Base class of closable objects, and a context without garbage collection."""
 
 from __future__ import annotations
 
@@ -10,10 +10,12 @@ from typing import Self
 
 
 class Closing(ABC):
-    """Closed at the end of its ``with`` block, however that ends."""
+    """Base class of context managers that call ``close`` at the end of their block."""
 
     @abstractmethod
-    def close(self) -> None: ...
+    def close(self) -> None:
+        """Release the resources."""
+        ...
 
     def __enter__(self) -> Self:
         return self
@@ -24,7 +26,10 @@ class Closing(ABC):
 
 @contextmanager
 def without_collections() -> Iterator[None]:
-    """Within, nobody looks for cycles, but a run: imports make many objects and none to be found."""
+    """Pause the garbage collection of cycles.
+
+    Imports make many objects and leave no cycles behind.
+    """
     enabled = gc.isenabled()
     gc.disable()
     try:

@@ -1,4 +1,4 @@
-"""Write files atomically, by one process at a time. Read files of strangers with limits."""
+"""Write files atomically, by one process at a time. Read files from unknown sources with limits."""
 
 from __future__ import annotations
 
@@ -23,30 +23,30 @@ from typing import BinaryIO
 from bevviz.errors import UserError
 from bevviz.support import cleanup
 
-# How what stands for a file begins that Git LFS has not fetched; and what is said of it.
+# Beginning of a file that Git LFS has not fetched, and the hint for the user.
 LFS_POINTER = b"version https://git-lfs.github.com/"
 LFS_HINT = "a Git LFS pointer, not the file itself: 'git lfs pull' fetches it"
-# The largest files that are read, in bytes. They keep a damaged or hostile file from taking all memory.
-CONFIG_LIMIT = 1 << 20  # a configuration, a project file, a list of names: a few kilobytes as a rule
-TEXT_LIMIT = 1 << 24  # a calibration, the labels or the stamps of a drive: a megabyte at most as a rule
+# Size limits of files, in bytes. They keep a damaged or hostile file from using up all memory.
+CONFIG_LIMIT = 1 << 20  # a configuration, a project file, a list of names: usually a few kilobytes
+TEXT_LIMIT = 1 << 24  # a calibration, the labels or the stamps of a drive: usually at most a megabyte
 TABLE_LIMIT = 1 << 27  # a table with a line for each pose: an hour at 200 Hz is 115 MB
 LINE_LIMIT = 1 << 16  # characters of a line of a table
 SENSOR_LIMIT = 1 << 30  # a scan or an image: 100 million points without colour
-YOUNG = 60.0  # seconds that a temporary folder may be without its lock: it is being made
+YOUNG = 60.0  # seconds in which a new temporary folder may have no lock yet
 
 
-# What the stem of an unfinished file ends with. Nobody can guess it, and so plant a link under that name.
+# End of the stem of an unfinished file. It is random, so that no attacker can plant a link under that name.
 MARK = re.compile(r"\.partial-[0-9a-f]{8}$")
-ATTEMPTS = 5  # to be the only writer, where several processes begin at the same moment
-PAUSE = 0.1  # seconds between two attempts, at most
+ATTEMPTS = 5  # attempts to become the only writer if several processes begin at the same moment
+PAUSE = 0.1  # longest pause between two attempts, in seconds
 
 
 @dataclass(frozen=True, slots=True)
 class Unfinished:
-    """A file that is being written, under a name of its own beside its target.
+    """A file that is being written, under a temporary name beside its target.
 
     Attributes:
-        path: where it is written until it is whole.
+        path: temporary path.
         handle: descriptor of the file. It holds the lock until it is closed.
         leftovers: unfinished files of the same target that earlier processes have left.
     """
@@ -77,7 +77,7 @@ def unfinished_files(target: Path) -> list[Path]:
         for path in target.parent.iterdir():
             if path.suffix != target.suffix or not pattern.fullmatch(path.stem):
                 continue
-            with suppress(FileNotFoundError):  # its process has just given it its name
+            with suppress(FileNotFoundError):  # Its process has just renamed it.
                 status = path.lstat()
                 if stat.S_ISREG(status.st_mode):
                     found.append((status.st_mtime, path))
@@ -85,7 +85,7 @@ def unfinished_files(target: Path) -> list[Path]:
 
 
 def is_locked(path: Path) -> bool:
-    """Tell whether a process is writing an unfinished file."""
+    """Return whether a process is writing an unfinished file."""
     try:
         handle = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
     except OSError:
@@ -95,31 +95,31 @@ def is_locked(path: Path) -> bool:
     except BlockingIOError:
         return True
     except OSError:
-        pass  # a network file system without locks
+        pass  # A network file system may have no locks.
     finally:
         os.close(handle)
     return False
 
 
 def create(path: Path) -> int:
-    """Create a file for writing and return its descriptor. Fail where the name exists, even as a link."""
+    """Create a file for writing and return its descriptor. Fail if the name exists, even as a link."""
     return os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC, 0o666)
 
 
 @contextmanager
 def written(target: Path, what: str) -> Iterator[Unfinished]:
-    """Give a file beside ``target`` to write to, for this process alone. At the end it replaces ``target``.
+    """Yield an unfinished file beside ``target``, locked for this process. At the end it replaces ``target``.
 
-    An interrupt is an end like any other. After an error, or a kill, what was written stays under the name
-    of the unfinished file, and ``target`` is as it was before.
+    An interrupt also replaces ``target``. After an error or a kill, the data stays in the unfinished file,
+    and ``target`` is unchanged.
 
     Args:
-        target: the file; a link is followed.
-        what: it is, for errors.
+        target: the file. A link is followed.
+        what: kind of file, for error messages.
 
     Raises:
-        UserError: it cannot be written, is no file, is a link to a file of another kind, or another process
-            is writing it; an error within, with where the unfinished file is.
+        UserError: the target cannot be written, is no file, is a link to a file of another kind, or another
+            process is writing it. An error inside the block names the unfinished file.
     """
     whole = target.resolve()
     if whole.suffix != target.suffix:
@@ -141,14 +141,19 @@ def written(target: Path, what: str) -> Iterator[Unfinished]:
                 raise
             _finish(path, whole, what)
         finally:
-            os.close(handle)  # and with it the lock
+            os.close(handle)  # This also releases the lock.
 
 
 def save(target: Path, text: str, option: str) -> None:
-    """Write a text file, whole or not at all; a pipe, or what is in /dev (stdout), as it is.
+    """Write a text file atomically. Write directly into a pipe or a file in /dev (stdout).
+
+    Args:
+        target: the file.
+        text: its content.
+        option: option that named the file, for error messages.
 
     Raises:
-        UserError: it cannot be written; ``option`` named it.
+        UserError: the file cannot be written.
     """
     try:
         if target.absolute().is_relative_to("/dev") or (target.exists() and not target.is_file()):
@@ -158,7 +163,7 @@ def save(target: Path, text: str, option: str) -> None:
             try:
                 file.path.write_text(text, encoding="utf-8", newline="")
             except OSError:
-                os.ftruncate(file.handle, 0)  # half a text is of no use to anybody: it is not kept
+                os.ftruncate(file.handle, 0)  # An incomplete text is useless and must not be kept.
                 raise
     except OSError as error:
         raise UserError(f"{option} {target}: cannot write the file: {error.strerror}") from None
@@ -169,8 +174,8 @@ def save(target: Path, text: str, option: str) -> None:
 def claim(target: Path, what: str) -> Unfinished:
     """Create an unfinished file for a target that no other process is writing.
 
-    The name is new: no existing file or link is opened. The lock is taken before it is looked whether another
-    process has one, so that of two that begin together at most one goes on.
+    The name is new: no existing file or link is opened. The process takes its lock before it looks for locks
+    of others. So at most one of two processes that begin together goes on.
 
     Raises:
         UserError: the target is no file, another process is writing it, or it cannot be written.
@@ -197,22 +202,30 @@ def claim(target: Path, what: str) -> Unfinished:
 
 
 def lock(handle: int, taken: str) -> None:
-    """For this process alone, until it is closed. Raises UserError(taken) where another one has it."""
+    """Lock a file for this process until its handle is closed.
+
+    Raises:
+        UserError: another process has the lock. ``taken`` is the message.
+    """
     try:
         fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
         raise UserError(taken) from None
     except OSError:
-        pass  # a network file system without locks
+        pass  # A network file system may have no locks.
 
 
 def rename_new(path: Path, target: Path) -> None:
-    """Rename a file. Raise FileExistsError where the new name exists: nothing is overwritten."""
+    """Rename a file without overwriting another.
+
+    Raises:
+        FileExistsError: the new name exists.
+    """
     try:
         os.link(path, target, follow_symlinks=False)
     except FileExistsError:
         raise
-    except OSError:  # a file system without hard links, as on USB sticks
+    except OSError:  # The file system has no hard links, as on USB sticks.
         if os.path.lexists(target):
             raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST), str(target)) from None
         path.rename(target)
@@ -221,6 +234,7 @@ def rename_new(path: Path, target: Path) -> None:
 
 
 def _finish(path: Path, target: Path, what: str) -> None:
+    """Rename an unfinished file to its target."""
     try:
         path.replace(target)
     except OSError as error:
@@ -228,7 +242,7 @@ def _finish(path: Path, target: Path, what: str) -> None:
 
 
 def write_all(file: int, data: bytes | memoryview) -> None:
-    """``os.write`` until all is written: a disk that fills up takes a part first."""
+    """Write all data to a descriptor. ``os.write`` writes only a part when a disk fills up."""
     with memoryview(data) as rest:
         done = 0
         while done < len(rest):
@@ -236,13 +250,13 @@ def write_all(file: int, data: bytes | memoryview) -> None:
 
 
 def full_disk(error: BaseException) -> UserError | None:
-    """Name the folder whose disk is full, and what to do. None: the error has another reason.
+    """Return an error that names the folder whose disk is full, or None if the error has another reason.
 
-    An error without a file name came of a temporary file: these have none.
+    An error without a file name comes from a temporary file, which has no name.
     """
     if not isinstance(error, OSError):
         return None
-    if "No usable temporary directory" in str(error):  # of ``tempfile``, which tries to write in each
+    if "No usable temporary directory" in str(error):  # from ``tempfile``, which tries each folder
         return UserError(f"{error.strerror}: make room in one of them, or name another with TMPDIR")
     if error.errno not in (errno.ENOSPC, errno.EDQUOT):
         return None
@@ -255,7 +269,7 @@ def full_disk(error: BaseException) -> UserError | None:
 
 @contextmanager
 def on_disk() -> Iterator[None]:
-    """Raise UserError where a full disk ends what is within."""
+    """Raise UserError if a full disk ends the block."""
     try:
         yield
     except OSError as error:
@@ -271,21 +285,21 @@ def on_disk() -> Iterator[None]:
 def open_regular(path: Path, *, pipe: bool = False) -> BinaryIO:
     """Open a regular file for reading. Links are followed.
 
-    A FIFO, a device or a socket is not opened: reading it could wait for ever, or never end.
+    A FIFO, a device or a socket is not opened, since reading it could wait or go on for ever.
 
     Args:
-        path: of the file.
-        pipe: open a pipe of the shell, too: ``<(...)`` or ``/dev/stdin``.
+        path: the file.
+        pipe: whether to open a pipe of the shell, too: ``<(...)`` or ``/dev/stdin``.
 
     Raises:
-        OSError: it is not there, is no regular file, or may not be read.
+        OSError: the file does not exist, is no regular file, or may not be read.
     """
     of_shell = pipe and path.parts[1:2] in (("dev",), ("proc",))
     allowed = of_shell and (path.is_fifo() or str(path) == os.devnull)
     _check_regular(path.stat(), allowed)
     handle = os.open(path, os.O_RDONLY | os.O_CLOEXEC | (0 if allowed else os.O_NONBLOCK))
     try:
-        _check_regular(os.fstat(handle), allowed)  # it may have been exchanged since
+        _check_regular(os.fstat(handle), allowed)  # The file may have been replaced since.
     except OSError:
         os.close(handle)
         raise
@@ -293,6 +307,7 @@ def open_regular(path: Path, *, pipe: bool = False) -> BinaryIO:
 
 
 def _check_regular(about: os.stat_result, allowed: bool) -> None:
+    """Raise OSError unless a file is regular or allowed."""
     if stat.S_ISDIR(about.st_mode):
         raise IsADirectoryError(errno.EISDIR, "it is a folder")
     if not stat.S_ISREG(about.st_mode) and not allowed:
@@ -300,25 +315,25 @@ def _check_regular(about: os.stat_result, allowed: bool) -> None:
 
 
 def read_bytes(path: Path, limit: int, *, problem: str = "", pipe: bool = False) -> bytes:
-    """Read a whole file that somebody else may have made.
+    """Read a whole file from an unknown source.
 
     Args:
-        path: of the file.
-        limit: bytes that it may have.
-        problem: begins the sentence of an error; "": ``PATH: cannot be read``.
-        pipe: as of ``open_regular``.
+        path: the file.
+        limit: most bytes that the file may have.
+        problem: beginning of the error message; "": ``PATH: cannot be read``.
+        pipe: whether to read a pipe of the shell, too, see ``open_regular``.
 
     Raises:
-        UserError: it is not there, is no regular file, may not be read, or is larger than the limit.
+        UserError: the file does not exist, is no regular file, may not be read, or is larger than the limit.
     """
     problem = problem or f"{path}: cannot be read"
     try:
         with open_regular(path, pipe=pipe) as file:
             about = os.fstat(file.fileno())
             size = about.st_size if stat.S_ISREG(about.st_mode) else None
-            # Of a pipe nobody knows how much is to come.
+            # The size of a pipe's content is unknown.
             data = file.read(limit + 1 if size is None else size if size <= limit else 0)
-    except (OSError, ValueError) as error:  # the latter: a NUL in the name
+    except (OSError, ValueError) as error:  # A ValueError means a NUL in the name.
         raise UserError(f"{problem}: {getattr(error, 'strerror', None) or error}") from None
     if max(size or 0, len(data)) > limit:
         raise UserError(f"{problem}: it has more than {limit:,} bytes, which are read at most")
@@ -326,18 +341,26 @@ def read_bytes(path: Path, limit: int, *, problem: str = "", pipe: bool = False)
 
 
 def read_head(path: Path, count: int) -> bytes:
-    """Read the first bytes of a regular file. Raises OSError: as ``open_regular``."""
+    """Read the first bytes of a regular file.
+
+    Raises:
+        OSError: as ``open_regular``.
+    """
     with open_regular(path) as file:
-        return file.read(count) or b""  # None: a file of the system that would wait
+        return file.read(count) or b""  # None: a system file that would wait
 
 
 def read_text(path: Path, limit: int = TEXT_LIMIT, *, problem: str = "", pipe: bool = False) -> str:
-    """Read a UTF-8 text that somebody else may have made; its lines end with ``\\n``.
+    r"""Read a UTF-8 text from an unknown source. Its lines end with ``\n``.
 
-    Args and errors are those of ``read_bytes``.
+    Args:
+        path: the file.
+        limit: most bytes that the file may have.
+        problem: beginning of the error message; "": ``PATH: cannot be read``.
+        pipe: whether to read a pipe of the shell, too, see ``open_regular``.
 
     Raises:
-        UserError: it cannot be read, is larger than the limit, or is no UTF-8 text.
+        UserError: the file cannot be read, is larger than the limit, or is no UTF-8 text.
     """
     data = read_bytes(path, limit, problem=problem, pipe=pipe)
     try:
@@ -348,10 +371,10 @@ def read_text(path: Path, limit: int = TEXT_LIMIT, *, problem: str = "", pipe: b
 
 
 def read_lines(path: Path, limit: int) -> Iterator[str]:
-    """Read a long UTF-8 text line by line, so that little of it is in memory.
+    """Iterate over the lines of a long UTF-8 text without loading all of it.
 
     Raises:
-        UserError: as of ``read_text``, or a line has more than ``LINE_LIMIT`` characters.
+        UserError: as ``read_text``, or a line has more than ``LINE_LIMIT`` characters.
     """
     problem = f"{path}: cannot be read"
     try:
@@ -374,11 +397,11 @@ def read_lines(path: Path, limit: int) -> Iterator[str]:
 
 
 def check_owned(folder: Path, variable: str = "XDG_RUNTIME_DIR") -> None:
-    """Check that nobody else can put a file into a folder.
+    """Check that no other user can put a file into a folder.
 
     Args:
-        folder: which one.
-        variable: of the environment, which names another folder.
+        folder: the folder.
+        variable: environment variable that can name another folder.
 
     Raises:
         UserError: it is no folder, it belongs to another user, or others can write there.
@@ -393,7 +416,7 @@ def check_owned(folder: Path, variable: str = "XDG_RUNTIME_DIR") -> None:
 
 
 def bag_files(folder: Path) -> list[Path]:
-    """Bag files of a folder by suffix, compressed ones too."""
+    """Return the bag files of a folder by suffix, including compressed ones."""
     suffixes = {".mcap", ".db3", ".bag", ".active"}
     return sorted(
         file
@@ -404,16 +427,16 @@ def bag_files(folder: Path) -> list[Path]:
 
 
 def drive_files(folder: Path) -> list[Path]:
-    """The bag files of a folder; where there are none, all files in it, as a data set has them."""
+    """Return the bag files of a folder. If there are none, return all files in it, as in a data set."""
     found = bag_files(folder)
     if found:
         return found
     files = (Path(where, name) for where, _, names in os.walk(folder) for name in names)
-    return [file for file in files if file.is_file()]  # no pipes, and no links to what is not there
+    return [file for file in files if file.is_file()]  # This leaves out pipes and broken links.
 
 
 def sampled_files(folder: Path) -> tuple[int, list[Path]]:
-    """How many files are in a folder and below it, and of each folder its first, middle and last by name."""
+    """Return the number of files below a folder, and the first, middle and last file of each subfolder."""
     count, chosen = 0, list[Path]()
     for where, folders, names in os.walk(folder):
         folders.sort()
@@ -424,7 +447,7 @@ def sampled_files(folder: Path) -> tuple[int, list[Path]]:
 
 
 class Scratch:
-    """A temporary folder, made when it is needed; the next one removes what a killed process left."""
+    """A temporary folder, made on first use. Making it deletes folders that killed processes have left."""
 
     PREFIX = "bevviz-scratch-"
 
@@ -433,10 +456,10 @@ class Scratch:
         self._lock = -1
 
     def new(self) -> Path:
-        """An empty folder within.
+        """Return a new empty folder inside the temporary one.
 
         Raises:
-            UserError: there is no place for it.
+            UserError: no temporary folder can be made.
         """
         try:
             if self._folder is None:
@@ -456,6 +479,7 @@ class Scratch:
             ) from None
 
     def close(self) -> None:
+        """Delete the temporary folder."""
         if self._folder is not None:
             shutil.rmtree(self._folder, ignore_errors=True)
             os.close(self._lock)
@@ -463,7 +487,7 @@ class Scratch:
             cleanup.forget(self)
 
     def _sweep(self) -> None:
-        """Of this user, and nobody has it open: its lock ends with the process that held it."""
+        """Delete this user's temporary folders without a lock. A lock ends with its process."""
         for folder in Path(tempfile.gettempdir()).glob(f"{self.PREFIX}????????"):
             with suppress(OSError):
                 about = folder.lstat()

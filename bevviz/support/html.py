@@ -1,6 +1,6 @@
-"""Pages for any browser that need nothing but themselves, filled in from ``bevviz/templates``.
+"""Self-contained web pages, rendered from ``bevviz/templates``.
 
-Whatever is filled in is text and escaped; what is markup stands in the templates.
+Values are text and are escaped. Only the templates contain markup.
 """
 
 from __future__ import annotations
@@ -14,18 +14,18 @@ from bevviz.support.text import printable
 
 
 def render(template: str, **values: object) -> str:
-    """The page.
+    """Render a page.
 
     Args:
-        template: name of its file.
-        values: what the template names, and nothing that it names may be missing.
+        template: file name of the template.
+        values: values that the template names. None of them may be missing.
     """
     return environment().get_template(template).render(values)
 
 
 @lru_cache(maxsize=1)
 def environment() -> Environment:
-    """The templates, and what they may do with values."""
+    """Return the environment of the templates, with the filters for values."""
     found = Environment(
         loader=PackageLoader("bevviz"),
         autoescape=True,
@@ -40,16 +40,17 @@ def environment() -> Environment:
 
 
 def _visible(value: object) -> object:
-    """What no reader would see, and might be misled by, is told as Python would."""
-    if type(value) is not str or value.isprintable():  # markup has a type of its own
+    """Return a text with invisible characters escaped as in Python, since they could mislead a reader."""
+    if type(value) is not str or value.isprintable():  # Markup has a type of its own.
         return value
     return "\n".join(printable(line) for line in value.split("\n"))
 
 
 def _base64(data: bytes) -> str:
+    """Return data as base64 text."""
     return b64encode(data).decode()
 
 
 def _words(name: str) -> str:
-    """``no_cluster`` as ``no cluster``."""
+    """Return ``no_cluster`` as ``no cluster``."""
     return name.replace("_", " ")

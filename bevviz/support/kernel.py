@@ -1,4 +1,4 @@
-"""The one way loops are compiled: by numba, without the GIL, kept on disk where there is a place."""
+"""Compile loops with numba, without the GIL, with a cache on disk if possible."""
 
 from __future__ import annotations
 
@@ -18,19 +18,19 @@ F = TypeVar("F", bound=Callable[..., object])
 
 
 def _has_place() -> bool:
-    """Whether numba finds a folder to keep it in: beside the module, in the user's cache, or stated."""
+    """Return whether numba finds a cache folder: beside the module, in the user's cache, or stated."""
     try:
         numba.njit(cache=True)(_has_place)
-    except RuntimeError:  # a service without a home, a container whose disk is read-only
+    except RuntimeError:  # A service may have no home folder, or a container a read-only disk.
         return False
     return True
 
 
-CACHED = _has_place()  # False: each run compiles anew
+CACHED = _has_place()  # False: each run compiles again
 
 
 class _Compiling(event.Listener):  # type: ignore[misc]
-    """How long was compiled, or fetched what was compiled before: by whom, and by all threads."""
+    """Time spent on compiling, or on loading compiled code: by the current thread, and by all threads."""
 
     def __init__(self) -> None:
         self._local = threading.local()
@@ -38,16 +38,18 @@ class _Compiling(event.Listener):  # type: ignore[misc]
 
     @property
     def here(self) -> float:
-        """Seconds, by this thread."""
+        """Seconds of the current thread."""
         return getattr(self._local, "seconds", 0.0)
 
     def on_start(self, event: Any) -> None:
+        """Start the clock of this thread, unless it compiles already."""
         depth = getattr(self._local, "depth", 0)
         if not depth:
             self._local.start = time.perf_counter()
         self._local.depth = depth + 1
 
     def on_end(self, event: Any) -> None:
+        """Add the time of the outermost compilation."""
         self._local.depth -= 1
         if not self._local.depth:
             seconds = time.perf_counter() - self._local.start
@@ -56,19 +58,20 @@ class _Compiling(event.Listener):  # type: ignore[misc]
 
 
 class _Announcing(event.Listener):  # type: ignore[misc]
-    """Says once that stages are compiled: the first frame after an installation takes a while."""
+    """Announces once that the stages are compiled, since the first frame after an installation takes long."""
 
     def __init__(self) -> None:
         self._said = False
 
     def on_start(self, event: Any) -> None:
+        """Print the announcement before the first compilation of our code."""
         if not self._said and event.data["dispatcher"].__module__.startswith("bevviz."):
             self._said = True
             kept = "once" if CACHED else "for this run, as there is no folder to keep it in"
             progress.say(f"compiling the stages for this machine, {kept}: about 15 s")
 
     def on_end(self, event: Any) -> None:
-        pass
+        """Do nothing."""
 
 
 _compiling = _Compiling()
@@ -77,39 +80,47 @@ event.register("numba:compile", _Announcing())
 
 
 def clock() -> float:
-    """Seconds, as ``time.perf_counter``, that stand still while this thread compiles."""
+    """Return seconds, as ``time.perf_counter``, without the time in which this thread compiled."""
     return time.perf_counter() - _compiling.here
 
 
 def common_clock() -> float:
-    """Seconds that stand still while any thread compiles, twice where two wait for one another."""
+    """Return seconds without the time in which any thread compiled.
+
+    If one thread waits for another to compile, the time counts twice.
+    """
     return time.perf_counter() - _compiling.everywhere
 
 
 class _Kept(FunctionCache):  # type: ignore[misc]
-    """As numba's own, which imports before the first lookup what only compiling needs: 0.4 s.
+    """Cache that delays imports until a compilation needs them, which saves 0.4 s.
 
-    numba 0.68 has no public way around that: ``cache=True`` always takes its own class. Its events, used
+    numba 0.68 has no public way to do this: ``cache=True`` always takes its own class. Its events, used
     above, are documented (https://numba.readthedocs.io/en/stable/developer/event_api.html).
     """
 
     def load_overload(self, sig: object, target_context: Any) -> Any:
+        """Load compiled code, without the imports of numba's method."""
         rtsys.initialize(target_context)
         with self._guard_against_spurious_io_errors():
             return self._load_overload(sig, target_context)
 
 
 def kernel(function: F) -> F:
-    """Compile ``function`` at its first call; division by zero is IEEE's, as in numpy."""
+    """Compile a function at its first call. Division by zero is IEEE's, as in numpy."""
     return _compiled(function)
 
 
 def unordered_kernel(function: F) -> F:
-    """The same with sums in any order and no NaN: several turns of a loop at once, other last digits."""
+    """Compile a function as ``kernel``, but with sums in any order and without NaN.
+
+    Several iterations of a loop then run at once, and the last digits may differ.
+    """
     return _compiled(function, fastmath={"reassoc", "nsz", "nnan"})
 
 
 def _compiled(function: F, **options: Any) -> F:
+    """Compile a function with options of numba."""
     compiled = numba.njit(nogil=True, error_model="numpy", **options)(function)
     if CACHED:
         compiled._cache = _Kept(function)

@@ -1,4 +1,4 @@
-"""Loggers of the standard library, silent where nobody listens: apart, as ``bevviz --help`` needs none."""
+"""Loggers of the standard library, silent by default. ``bevviz --help`` does not import this module."""
 
 from __future__ import annotations
 
@@ -8,5 +8,5 @@ logging.getLogger("bevviz").addHandler(logging.NullHandler())
 
 
 def logger(name: str) -> logging.Logger:
-    """Of a module, by its ``__name__``."""
+    """Return the logger of a module, by its ``__name__``."""
     return logging.getLogger(name)

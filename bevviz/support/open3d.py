@@ -1,4 +1,4 @@
-"""The one place that imports Open3D."""
+"""Import of Open3D."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from typing import Any
 def load() -> Any:
     """Import and return ``open3d``.
 
-    Open3D's wheel links libusb-1.0, which a bare system lacks; ``libusb-package`` carries it, and once it
-    is loaded globally the dynamic linker takes it for the system's.
+    Open3D's wheel links libusb-1.0, which a minimal system lacks. ``libusb-package`` contains it. Once it is
+    loaded globally, the dynamic linker uses it as the system's library.
     """
     import libusb_package
 

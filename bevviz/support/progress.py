@@ -1,4 +1,4 @@
-"""What takes a while is said, and shown as a bar, where somebody looks; in a library nobody does."""
+"""Messages and progress bars for slow work. As a library, bevviz shows none."""
 
 from __future__ import annotations
 
@@ -12,33 +12,39 @@ _bars = True
 
 
 def to(say: Callable[[str], None] | None, *, bars: bool = True) -> None:
-    """Have what is announced said by ``say``, None: by nobody; ``bars``: whether a terminal shows any."""
+    """Set the receiver of messages.
+
+    Args:
+        say: function that shows a message. None: messages are discarded.
+        bars: whether a terminal shows progress bars.
+    """
     global _say, _bars
     _say, _bars = say, bars
 
 
 def heard() -> bool:
-    """Whether anybody wants to know."""
+    """Return whether messages have a receiver."""
     return _say is not None
 
 
 def say(text: str) -> None:
-    """One line, where anybody wants to know."""
+    """Send one line to the receiver, if there is one."""
     if _say is not None:
         _say(text)
 
 
 def bar(*given: Any, **named: Any) -> Any:
-    """``tqdm.tqdm`` of the same arguments, on a terminal alone."""
+    """Return ``tqdm.tqdm`` of the same arguments. It shows nothing outside a terminal."""
     return _bar()(*given, **named, disable=None if _bars else True)
 
 
 @cache
 def _bar() -> Any:
+    """Return the class of progress bars."""
     from tqdm import tqdm
 
     class Bar(tqdm):  # type: ignore[misc]
-        """One process draws: tqdm's own lock is a semaphore, which a worker that is killed leaves behind."""
+        """Progress bar of one process. tqdm's own lock is a semaphore that outlives a killed worker."""
 
         _lock = threading.RLock()
 

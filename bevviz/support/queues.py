@@ -1,4 +1,4 @@
-"""A queue between two threads in which the newest items win."""
+"""Queue between two threads that drops the oldest items."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ T = TypeVar("T")
 
 
 class NewestQueue(Generic[T]):
-    """Holds up to ``size`` items; a further one pushes the oldest out, which is counted.
+    """Queue of up to ``size`` items. Another item pushes the oldest out, and ``dropped`` counts it.
 
-    Putting never blocks. Iteration takes items, oldest first, and ends after ``close``.
+    ``put`` never blocks. Iteration takes items, oldest first, and ends after ``close``.
 
     Args:
-        size: items that wait at most.
-        catch_up: items wait only where they came together. Who finds several waiting, and no fewer the next
-            time, is too slow, and gets the newest alone.
+        size: most items that wait.
+        catch_up: whether a slow consumer gets only the newest item. A consumer is slow if several items wait,
+            and at least as many wait the next time. Without this, items wait even then.
     """
 
     def __init__(self, size: int = 1, *, catch_up: bool = False) -> None:
@@ -33,6 +33,7 @@ class NewestQueue(Generic[T]):
         return len(self._items)
 
     def put(self, item: T) -> None:
+        """Add an item, unless the queue is closed."""
         with self._changed:
             if self._closed:
                 return
@@ -44,24 +45,24 @@ class NewestQueue(Generic[T]):
 
     @property
     def oldest(self) -> T | None:
-        """That waits; None: none does."""
+        """Next item, or None if no item waits."""
         with self._changed:
             return self._items[0] if self._items else None
 
     def clear(self) -> None:
-        """Leave out whatever waits."""
+        """Drop all waiting items."""
         with self._changed:
             self.dropped += len(self._items)
             self._items.clear()
 
     def close(self) -> None:
-        """No more items are taken in; those that wait are still handed out."""
+        """Accept no more items. Iteration still returns the waiting ones."""
         with self._changed:
             self._closed = True
             self._changed.notify_all()
 
     def __iter__(self) -> Iterator[T]:
-        before = 1  # that were waiting the last time
+        before = 1  # number of items that waited the last time
         while True:
             with self._changed:
                 self._changed.wait_for(lambda: self._items or self._closed)

@@ -1,4 +1,4 @@
-"""Tables of text, for a terminal and for a page of Markdown. The first row is the heading."""
+"""Text tables for a terminal and for Markdown. The first row is the heading."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ Rows = Sequence[Sequence[str]]
 
 
 def lines(rows: Rows, align: str = "") -> Iterator[str]:
-    """Lines for a terminal.
+    """Yield the lines of a table for a terminal.
 
     Args:
-        rows: of the same length.
-        align: ``l`` or ``r`` for each column; default: the first to the left, the others to the right.
+        rows: rows of the same length.
+        align: ``l`` or ``r`` for each column. Default: the first to the left, the others to the right.
     """
     cells = [[text.printable(cell) for cell in row] for row in rows]
     widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
@@ -28,7 +28,7 @@ def lines(rows: Rows, align: str = "") -> Iterator[str]:
 
 
 def markdown(rows: Rows, align: str = "") -> str:
-    """A table in Markdown; arguments as of ``lines``."""
+    """Return a table in Markdown. The arguments are those of ``lines``."""
     rules = ["---" if side == "l" else "---:" for side in align or _default(rows)]
     head, *body = [[text.markdown(cell) for cell in row] for row in rows]
     return "\n".join(
@@ -37,4 +37,5 @@ def markdown(rows: Rows, align: str = "") -> str:
 
 
 def _default(rows: Rows) -> str:
+    """Return the default alignment."""
     return "l" + "r" * (len(rows[0]) - 1)

@@ -1,4 +1,4 @@
-"""Text that others chose (topics, frames, class names, notes), made safe for where it is shown."""
+"""Text from users and robots (topics, frames, class names, notes), made safe for terminals and Markdown."""
 
 from __future__ import annotations
 
@@ -7,17 +7,17 @@ import re
 from pathlib import Path
 from reprlib import Repr
 
-# What Markdown would take for its own anywhere, and what only at the beginning of a line.
+# Characters with a meaning in Markdown anywhere, and those with a meaning only at the beginning of a line.
 _MARKS = re.compile(r"[\\`*\[\]<~|&$]|_(?:(?<![^\W_]_)|(?![^\W_]))")
 _START = re.compile(r"[#>+=:-]|\d+(?=[.)])")
 _SHORT = Repr()
 _SHORT.maxstring = _SHORT.maxother = _SHORT.maxlong = 200
 _SHORT.maxlist = _SHORT.maxtuple = _SHORT.maxdict = _SHORT.maxset = 20
-_PLAIN = re.compile(r"[A-Za-z][\w .,:;()'%/>=+-]*", re.ASCII)  # most sentences: nothing but perhaps _ to do
+_PLAIN = re.compile(r"[A-Za-z][\w .,:;()'%/>=+-]*", re.ASCII)  # most sentences: only _ may need work
 
 
 def printable(text: str) -> str:
-    r"""For a terminal: what is no visible character is told as Python would, and so cannot act.
+    r"""Return text for a terminal. Invisible characters are escaped as in Python, and so have no effect.
 
     >>> printable("/points\x1b[2J\n")
     '/points\\x1b[2J\\n'
@@ -28,26 +28,26 @@ def printable(text: str) -> str:
 
 
 def shown(value: object) -> str:
-    """A value that somebody stated, as Python writes it; the middle of a long one is left out.
+    """Return a stated value as Python writes it, without the middle of a long one.
 
     >>> shown("a" * 1000)[:8]
     "'aaaaaaa"
     """
     try:
         return _SHORT.repr(value)
-    except ValueError:  # Python writes no whole number of more than 4300 digits
+    except ValueError:  # Python writes no integer of more than 4300 digits.
         return "a number of thousands of digits"
 
 
 def path_text(path: Path | str) -> str:
-    """A file name as text that can be stored: bytes of it that are no UTF-8 are told as Python would."""
+    """Return a file name as text that can be stored. Bytes that are no UTF-8 are escaped as in Python."""
     return os.fsencode(path).decode("utf-8", "backslashreplace")
 
 
 def markdown(text: str) -> str:
-    r"""For a line of Markdown, which shows it as it is; runs of white space become a blank.
+    r"""Escape text for a line of Markdown, so that it is shown unchanged. White space becomes one blank.
 
-    What is harmless stays as it is: a sentence with ``detector.conf_threshold`` can be searched for.
+    Harmless text stays as it is, so that users can search for a sentence with ``detector.conf_threshold``.
 
     >>> markdown("*x* of min_points")
     '\\*x\\* of min_points'
@@ -62,7 +62,7 @@ def markdown(text: str) -> str:
 
 
 def fenced(text: str, language: str = "") -> str:
-    """A block of code in Markdown, whatever is in it."""
+    """Return a code block in Markdown. The text may contain fences."""
     runs = re.findall(r"`{3,}", text)
     fence = "`" * (max(map(len, runs), default=2) + 1)
     return f"{fence}{language}\n{text.removesuffix(chr(10))}\n{fence}"
