@@ -1,4 +1,4 @@
-"""What is in a bag: topics, sensors, transforms, and what is missing for a full run."""
+"""Summary of a bag: topics, sensors, transforms, and requirements of a full run that it does not meet."""
 
 from __future__ import annotations
 
@@ -34,47 +34,49 @@ if TYPE_CHECKING:
     from bevviz.pipeline.stage_loader import Stages
 
 WIDTH = 100
-TRIAL = 5  # the scan that is tried out: at the first ones a camera or a transform may not have begun
-MANY = 2_000_000  # messages; their times are not gathered, for that would take seconds
+TRIAL = 5  # Number of the scan to try. In earlier scans a camera or a transform may still be missing.
+MANY = 2_000_000  # Most messages for which times are collected. For more, this would take seconds.
 
 
 @dataclass(frozen=True, slots=True)
 class TopicInfo:
+    """Summary of one topic."""
+
     name: str
     type: str
-    count: int | None  # None: not listened to
+    count: int | None  # None: nothing subscribes to the topic
     frame_id: str
     rate: float | None  # Hz, between the first and the last message
     role: str
     pause: float | None = None  # longest time between two messages, seconds of log time
-    pause_at: float | None = None  # when it begins, seconds from the start
-    size: float | None = None  # bytes of a message, on average
-    delay: float | None = None  # seconds from the stamp to the receipt
+    pause_at: float | None = None  # start of the longest pause, in seconds from the start
+    size: float | None = None  # average bytes of a message
+    delay: float | None = None  # seconds from the stamp to the time of receipt
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Contents:
-    """What there is to work with, in a bag or on a graph."""
+    """Topics, sensors and transforms of a bag or of a ROS graph."""
 
     topics: tuple[TopicInfo, ...]
     lidars: tuple[str, ...] = ()
-    cameras: tuple[Camera, ...] = ()  # as one scan sees them
+    cameras: tuple[Camera, ...] = ()  # as in one scan
     tree: Mapping[str, str] = field(default_factory=dict)  # child frame -> parent frame
     points_frame: str = ""
-    world_frame: str = ""  # "": the fixed frame is not connected
-    network: str = ""  # what the detector's runs on; "": there is none
-    object_network: str = ""  # the same of a 3D detector
-    configured: tuple[str, ...] = ()  # where parameters are stated, and which
-    missing: tuple[str, ...] = ()  # for a full run, with the option that gives it
+    world_frame: str = ""  # "": the fixed frame is not connected by TF
+    network: str = ""  # provider of the detector's network; "": there is none
+    object_network: str = ""  # provider of the 3D detector's network; "": there is none
+    configured: tuple[str, ...] = ()  # sources of parameters, with the keys they state
+    missing: tuple[str, ...] = ()  # missing requirements of a full run, with the option that meets each
     warnings: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BagInfo(Contents):
-    """What ``bevviz info`` prints. Times are log times in nanoseconds."""
+    """Output of ``bevviz info``. Times are log times in nanoseconds."""
 
     paths: tuple[str, ...]
-    formats: tuple[str, ...]  # of each file
+    formats: tuple[str, ...]  # format of each file
     size: int  # bytes on disk
     start: int
     end: int
@@ -82,14 +84,15 @@ class BagInfo(Contents):
 
     @property
     def duration(self) -> float:
+        """Duration in seconds."""
         return (self.end - self.start) / SECOND
 
 
 def describe(paths: Sequence[Path], config: Config) -> BagInfo:
-    """Look at the index of a bag and run one scan through synchronisation.
+    """Read the index of a bag, and synchronise one scan.
 
     Raises:
-        UserError: no readable bag, or a stated topic that is not in it.
+        UserError: there is no readable bag, or a stated topic is not in it.
     """
     try:
         source = BagSource(paths, config)
@@ -112,6 +115,7 @@ def _describe(
     frame: Frame | None = None,
     source: BagSource | None = None,
 ) -> BagInfo:
+    """Collect the summary of an open bag."""
     networks, lacking = networks_of(config)
     missing = [*missing, *lacking]
     return BagInfo(
@@ -136,7 +140,10 @@ def _describe(
 
 
 def network_of(config: Config) -> str:
-    """What the detector's network runs on here, or why it does not; empty: there is none."""
+    """Return the provider of the detector's network, or the reason why it does not run.
+
+    The text is empty without a network.
+    """
     path = model_path(config)
     if path is None:
         return ""
@@ -146,10 +153,11 @@ def network_of(config: Config) -> str:
 
 
 def networks_of(config: Config) -> tuple[dict[str, str], list[str]]:
-    """What the networks of the sections ``detector`` and ``objects`` run on here, or why they do not.
+    """Return the providers of the networks of the sections ``detector`` and ``objects``.
 
     Returns:
-        That, empty where there is none, and what a full run lacks: a detector, or a file that can be used.
+        The provider of each, or the reason why it does not run, or an empty text without a network. Then the
+        missing requirements of a full run: a detector, or a file that can be used.
     """
     runs_on = {"detector": network_of(config), "objects": ""}
     lacking = [] if config.detector.model else ["no detector: --model FILE.onnx"]
@@ -165,10 +173,10 @@ def networks_of(config: Config) -> tuple[dict[str, str], list[str]]:
 
 
 def _alone(config: Config, section: str) -> Stages:
-    """The stages with this one, and otherwise ours.
+    """Load one section's stage, with built-in methods for the others.
 
     Raises:
-        UserError: it cannot be used.
+        UserError: the stage cannot be loaded.
     """
     from bevviz.pipeline.stage_loader import StageLoader
 
@@ -179,11 +187,12 @@ def _alone(config: Config, section: str) -> Stages:
 
 
 def _topic(recording: Recording, topic: Topic, roles: Roles) -> TopicInfo:
+    """Return the summary of a topic."""
     rate = pause = pause_at = None
     if (topic.count or 0) > 1 and recording.message_count < MANY:
         times = recording.times(topic.name)
         steps = np.diff(times)
-        if len(steps):  # of a damaged bag there may be fewer than were counted
+        if len(steps):  # A damaged bag may have fewer messages than its index counts.
             longest = int(np.argmax(steps))
             pause = float(steps[longest]) / SECOND
             pause_at = float(times[longest] - recording.start) / SECOND
@@ -202,7 +211,7 @@ def _topic(recording: Recording, topic: Topic, roles: Roles) -> TopicInfo:
 
 
 def find_missing(roles: Roles, frame: Frame | None, config: Config) -> list[str]:
-    """What a full run lacks, judged by one frame, with the option that gives it."""
+    """Return the requirements of a full run that one frame does not meet, with the option that meets each."""
     if frame is None:
         return ["no scan could be read"]
     found = []
@@ -242,7 +251,7 @@ def find_missing(roles: Roles, frame: Frame | None, config: Config) -> list[str]
 
 
 def as_tree(info: Contents) -> dict[str, Any]:
-    """For JSON: all but the pictures and clouds."""
+    """Return the contents as a tree for JSON, without images and clouds."""
     own = {f.name: getattr(info, f.name) for f in fields(info) if f.name not in ("topics", "cameras", "tree")}
     return {
         **own,
@@ -253,6 +262,7 @@ def as_tree(info: Contents) -> dict[str, Any]:
 
 
 def _camera_tree(camera: Camera) -> dict[str, Any]:
+    """Return a camera as a tree for JSON."""
     image, model, placed = camera.image, camera.intrinsics, camera.camera_from_points
     return {
         "name": camera.name,
@@ -267,7 +277,7 @@ def _camera_tree(camera: Camera) -> dict[str, Any]:
 
 
 def render(info: BagInfo) -> str:
-    """The description as text for a terminal of 100 columns."""
+    """Return the summary of a bag as text for a terminal of 100 columns."""
     kinds = sorted(set(info.formats))
     files = f"{len(info.formats)} files of " if len(info.formats) > 1 else ""
     about = {
@@ -279,7 +289,12 @@ def render(info: BagInfo) -> str:
 
 
 def render_contents(about: Mapping[str, str], info: Contents) -> str:
-    """The contents as text, under what is said about the whole."""
+    """Return the contents as text, below some lines about the whole.
+
+    Args:
+        about: name and text of each of these lines.
+        info: the contents.
+    """
     lines = [
         *(_row(name, text) for name, text in about.items()),
         "",
@@ -298,15 +313,17 @@ def render_contents(about: Mapping[str, str], info: Contents) -> str:
 
 
 def _row(name: str, text: str) -> str:
+    """Return a wrapped line with a name at its start."""
     return textwrap.fill(printable(text), WIDTH, initial_indent=f"{name:<8}", subsequent_indent=" " * 8)
 
 
 def _section(title: str, items: Sequence[str]) -> list[str]:
+    """Return a section with a title, or nothing without items."""
     return [title, *(line for item in items for line in _item(item)), ""] if items else []
 
 
 def _item(text: str) -> Iterator[str]:
-    """Wrapped text; an option at its end stays in one piece, to be copied."""
+    """Yield wrapped lines. An option at the end stays on one line, so that users can copy it."""
     sentence, separator, option = printable(text).partition(": --")
     depth = len(sentence) - len(sentence.lstrip())
     yield from textwrap.wrap(
@@ -321,7 +338,7 @@ def _item(text: str) -> Iterator[str]:
 
 
 def _topic_table(topics: Sequence[TopicInfo]) -> Iterator[str]:
-    """What is not known of any topic has no column."""
+    """Yield the table of topics. A value that no topic has gets no column."""
     columns: list[tuple[str, str, list[str]]] = [
         ("topic", "l", [t.name for t in topics]),
         ("type", "l", [t.type.rpartition("/")[2] for t in topics]),
@@ -341,6 +358,7 @@ def _topic_table(topics: Sequence[TopicInfo]) -> Iterator[str]:
 
 
 def _camera(camera: Camera) -> str:
+    """Return the summary of a camera in one line."""
     parts = [f"{camera.name}:"]
     if camera.image is not None:
         height, width = camera.image.bgr.shape[:2]
@@ -358,6 +376,7 @@ def _camera(camera: Camera) -> str:
 
 
 def _tree(info: Contents) -> Iterator[str]:
+    """Yield the transforms as an indented tree."""
     children: dict[str, list[str]] = {}
     for child, parent in sorted(info.tree.items()):
         children.setdefault(parent, []).append(child)

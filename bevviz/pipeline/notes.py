@@ -1,4 +1,4 @@
-"""What a user has noted of a drive, in a small file beside the bag: ``drive.mcap.notes.json``."""
+"""Notes that a user took about a drive, in a small file beside the bag: ``drive.mcap.notes.json``."""
 
 from __future__ import annotations
 
@@ -12,19 +12,19 @@ from bevviz.errors import UserError
 from bevviz.support.files import read_text, written
 
 SUFFIX = ".notes.json"
-LONGEST = 2000  # characters of a note
+LONGEST = 2000  # most characters of a note
 
 
 @dataclass(frozen=True, slots=True, order=True)
 class Note:
-    """One of them.
+    """One note.
 
     Attributes:
-        stamp: sensor time of the frame that it is of, in nanoseconds.
-        received: log time of that, 0 where it is not known.
-        text: what was noted.
-        about: the object, in words; empty: the frame.
-        pick: that asks about it in the workbench.
+        stamp: sensor time of its frame, in nanoseconds.
+        received: log time of its frame, 0 if unknown.
+        text: text of the user.
+        about: the object in words. Empty: the note is about the frame.
+        pick: query parameter that selects the object in the workbench.
     """
 
     stamp: int
@@ -38,10 +38,10 @@ class Note:
 
 
 class Notes:
-    """Those of one drive, in order of time. The file is there as long as there are any.
+    """Notes of one drive, in order of time. The file exists as long as there are notes.
 
     Args:
-        paths: of the drive; the file is beside the first.
+        paths: paths of the drive. The file lies beside the first.
     """
 
     def __init__(self, paths: Sequence[Path]) -> None:
@@ -50,11 +50,15 @@ class Notes:
         self._lock = threading.Lock()
 
     def __iter__(self) -> Iterator[Note]:
-        """Raises UserError where the file cannot be read."""
+        """Iterate over the notes.
+
+        Raises:
+            UserError: the file cannot be read.
+        """
         return iter(self._read())
 
     def between(self, low: int, high: int) -> list[Note]:
-        """Those whose log time is in [low, high) nanoseconds.
+        """Return the notes whose log time is in [low, high) nanoseconds.
 
         Raises:
             UserError: the file cannot be read.
@@ -62,7 +66,11 @@ class Notes:
         return [note for note in self if low <= note.received < high]
 
     def add(self, note: Note) -> None:
-        """Raises UserError where the file cannot be read or written; nothing is lost then."""
+        """Add a note.
+
+        Raises:
+            UserError: the file cannot be read or written. No note is lost.
+        """
         text = note.text.strip()
         if not text or len(text) > LONGEST:
             raise UserError(f"a note has 1 to {LONGEST:,} characters, this one has {len(text):,}")
@@ -70,11 +78,16 @@ class Notes:
             self._write(sorted([*self._read(), note]))
 
     def remove(self, note: Note) -> None:
-        """Raises UserError where the file cannot be read or written."""
+        """Remove a note.
+
+        Raises:
+            UserError: the file cannot be read or written.
+        """
         with self._lock:
             self._write([other for other in self._read() if other != note])
 
     def _read(self) -> list[Note]:
+        """Read the file."""
         if not self.path.exists():
             return []
         try:
@@ -84,6 +97,7 @@ class Notes:
             raise UserError(f"{self.path}: holds no notes as bevviz writes them; move it away") from None
 
     def _write(self, notes: Sequence[Note]) -> None:
+        """Write the file, or delete it without notes."""
         if not notes:
             self.path.unlink(missing_ok=True)
             return

@@ -1,4 +1,4 @@
-"""The frame step: every stage on one frame with one configuration. No state, no threads of its own."""
+"""Run every stage on one frame with one configuration, without state or threads of its own."""
 
 from __future__ import annotations
 
@@ -46,17 +46,18 @@ from bevviz.support.kernel import clock, common_clock
 def perceive(
     frame: Frame, config: Config, stages: Stages, memo: Memo | None = None, *, network: Executor | None = None
 ) -> FrameResult:
-    """What the stages make of the frame, without what needs other frames (tracks, anomalies).
+    """Run the stages that need no other frame on one frame: everything but tracks and anomalies.
 
-    Never raises for what the frame holds: what fails is told in ``failures``, the rest goes on.
+    The content of a frame never raises an error. A failed stage is listed in ``failures``, and the others go
+    on.
 
     Args:
         frame: the frame.
-        config: the configuration; the result says that it was made with this one.
-        stages: that the configuration names, of ``StageLoader.load``.
-        memo: shared by configurations that run on the same frame.
-        network: where the detector runs beside the LiDAR stages, since it needs no lock of Python's; None:
-            after them.
+        config: configuration, which the result refers to.
+        stages: stages that the configuration names, from ``StageLoader.load``.
+        memo: results shared by configurations that run on the same frame.
+        network: executor of the detector. It runs beside the LiDAR stages, since it does not need Python's
+            lock. None: it runs after them.
     """
     log, detector_log = StageLog(memo), StageLog(memo)
     start = common_clock()
@@ -133,8 +134,12 @@ def perceive(
 
 
 def describe(result: FrameResult, *, seen: bool = True) -> FrameResult:
-    """The result with what makes it understood: the bird's-eye view, where it is to be seen, and the
-    explanations."""
+    """Add the bird's-eye view and the explanations to a result.
+
+    Args:
+        result: result of ``perceive``.
+        seen: whether the bird's-eye view is needed.
+    """
     config, frame, log = result.config, result.frame, StageLog()
     start = clock()
     raw_ground = image = None
@@ -172,15 +177,16 @@ def describe(result: FrameResult, *, seen: bool = True) -> FrameResult:
     )
 
 
-# --- the stages, each as the configuration names it --------------------------------------------
+# --- stages by the configured method -----------------------------------------------------------
 
 
 def _topic(method: str) -> str:
-    """The robot's topic that a stage is taken from, empty where it is none."""
+    """Return the robot's topic that replaces a stage, or an empty string."""
     return method.removeprefix(TOPIC) if method.startswith(TOPIC) else ""
 
 
 def _ground(log: StageLog, frame: Frame, voxels: Voxels, config: Config, stages: Stages) -> Ground | None:
+    """Segment the ground by the configured method."""
     points = voxels.points
     if topic := _topic(config.ground.method):
         return log.run("ground", robot_results.segment, points, frame, topic, config.voxel.size)
@@ -192,11 +198,12 @@ def _ground(log: StageLog, frame: Frame, voxels: Voxels, config: Config, stages:
 
 
 def _obstacles(voxels: Voxels, ground: Ground) -> F32:
-    """The voxels that are not ground."""
+    """Return the voxels that are not ground."""
     return voxels.points.compress(~ground.mask, axis=0)
 
 
 def _clusters(log: StageLog, frame: Frame, points: F32, config: Config, stages: Stages) -> Clusters | None:
+    """Cluster the obstacle points by the configured method."""
     section = config.clustering
     if topic := _topic(section.method):
         return log.run("clustering", robot_results.cluster, points, frame, topic)
@@ -209,6 +216,7 @@ def _clusters(log: StageLog, frame: Frame, points: F32, config: Config, stages: 
 
 
 def _detect(log: StageLog, frame: Frame, camera: Camera, config: Config, stages: Stages) -> Detections | None:
+    """Detect objects in a camera's image by the configured method."""
     section, image, network, detector = config.detector, camera.image, stages.network, stages.detector
     if (detect := stages.detect) is not None:
         return log.guard("detector", lambda: detect(camera))
@@ -230,7 +238,7 @@ def _detect(log: StageLog, frame: Frame, camera: Camera, config: Config, stages:
 
 
 def _project(points: F32, camera: Camera) -> tuple[F32, F32] | None:
-    """Pixels and depths of the points, NaN outside the image; None where the camera's place is unknown."""
+    """Return pixels and depths of points, NaN outside the image. None if the camera's pose is unknown."""
     if camera.intrinsics is None or camera.camera_from_points is None:
         return None
     uv, depth = geometry.project(geometry.apply(camera.camera_from_points, points), camera.intrinsics)
@@ -243,7 +251,7 @@ def _project(points: F32, camera: Camera) -> tuple[F32, F32] | None:
 
 
 def _splits(config: Config) -> bool:
-    """Whether detections split clusters: those of the robot stay as it published them."""
+    """Return whether detections split clusters. The robot's clusters stay as it published them."""
     ours = not _topic(config.clustering.method)
     return config.fusion.method == "frustum" and config.fusion.split and ours
 
@@ -257,6 +265,7 @@ def _fuse(
     config: FusionConfig,
     claims: Claims | None,
 ) -> Fusion | None:
+    """Match detections and clusters of a camera. Return None if its pose is unknown."""
     if camera.intrinsics is None or camera.camera_from_points is None:
         return None
     return fuse(uv, depth, clusters, detections, camera.intrinsics, camera.camera_from_points, config, claims)
@@ -271,6 +280,7 @@ def _objects(
     config: Config,
     stages: Stages,
 ) -> Objects | None:
+    """Make the 3D boxes by the configured method."""
     if topic := _topic(config.objects.method):
         return log.guard("objects", lambda: robot_results.find_objects(frame, topic, obstacles, clusters))
     if len(frame.points) == 0 and stages.objects is not None:
@@ -294,7 +304,7 @@ def _objects(
 
 
 def _detects(config: Config, stages: Stages) -> bool:
-    """Whether cameras have anything to say."""
+    """Return whether cameras have detections."""
     return stages.network is not None or stages.detect is not None or bool(_topic(config.detector.model))
 
 
@@ -308,7 +318,7 @@ def _opinions(
     config: Config,
     stages: Stages,
 ) -> Opinions | None:
-    """What cameras and clusters say of objects that our fusion did not make."""
+    """Compare objects that our fusion did not make with the cameras and our fusion."""
     if ranges is None:
         return None
     fused = Objects.empty()

@@ -1,4 +1,4 @@
-"""A bar on the terminal for what takes long."""
+"""Progress bar of a run."""
 
 from __future__ import annotations
 
@@ -10,10 +10,11 @@ from bevviz.support.text import printable
 
 
 class Progress(Observer[object]):
-    """Counts results.
+    """Observer that shows the number of results on the terminal.
 
     Args:
-        what: name of the work; empty: that of what is worked through.
+        what: name of the work. Empty: the name of the source.
+        unit: name of one item.
     """
 
     def __init__(self, what: str = "", unit: str = "frame") -> None:
@@ -21,12 +22,14 @@ class Progress(Observer[object]):
         self._bar: Any = None
 
     def begin(self, items: Items[object]) -> None:
-
+        """Show the bar."""
         description = self._what or printable(items.scene.name)
         self._bar = progress.bar(total=items.total, unit=self._unit, desc=description)
 
     def see(self, result: object) -> None:
+        """Count one result."""
         self._bar.update()
 
     def end(self) -> None:
+        """Close the bar."""
         self._bar.close()

@@ -1,4 +1,4 @@
-"""The one loop: frames from a source, through a session, to observers. What overlaps is decided here."""
+"""The one loop: pass frames from a source through a session to observers, partly in parallel."""
 
 from __future__ import annotations
 
@@ -22,17 +22,17 @@ T_contra = TypeVar("T_contra", contravariant=True)
 R = TypeVar("R")
 R_contra = TypeVar("R_contra", contravariant=True)
 
-DEPTH = 2  # frames that are drawn ahead of what is observed
-BURST = 3  # frames that may come together without one being lost
-TICK = 0.2  # seconds between two looks at whether it is over
-PATIENCE = 10.0  # seconds that an observer of its own thread may take to end
+DEPTH = 2  # frames read ahead of the frame that the observers see
+BURST = 3  # frames that may arrive together without a loss
+TICK = 0.2  # seconds between two checks whether the run is over
+PATIENCE = 10.0  # seconds that an observer with its own thread may take to end
 
 
 class Dropping:
-    """Whoever is too slow gets the newest. For what cannot wait: a robot.
+    """Drop policy for live runs: a slow consumer gets the newest result, since a robot cannot wait.
 
     Args:
-        incoming: frames that may wait for the stages, where they came together.
+        incoming: frames that may wait for the stages if they arrive together.
         results: results that may wait for the observers.
     """
 
@@ -42,16 +42,16 @@ class Dropping:
 
     @property
     def dropped(self) -> Mapping[str, int]:
-        """Left out so far, by place."""
+        """Number of dropped items by queue."""
         return {place: queue.dropped for place, queue in self._queues.items()}
 
     def close(self) -> None:
-        """Whatever a source does, nobody waits for more of it."""
+        """Close all queues, so that no consumer waits for a source that goes on."""
         for queue in self._queues.values():
             queue.close()
 
     def queue(self, place: str, size: int, *, catch_up: bool = False) -> NewestQueue[T]:
-        """One whose drops are counted."""
+        """Return a new queue whose drops are counted."""
         queue: NewestQueue[T] = NewestQueue(size, catch_up=catch_up)
         self._queues[place] = queue
         return queue
@@ -59,9 +59,9 @@ class Dropping:
 
 @dataclass(frozen=True, slots=True)
 class RunEnd:
-    """How a run ended."""
+    """End of a run."""
 
-    frames: int  # that were observed
+    frames: int  # number of frames that the observers saw
     interrupted: bool = False
 
 
@@ -75,23 +75,23 @@ def run(
     stop: threading.Event | None = None,
     tick: Callable[[], None] = lambda: None,
 ) -> RunEnd:
-    """Work through the items, and let the observers see what is made of each.
+    """Process the items, and pass each result to the observers.
 
-    The caller's thread only waits: a signal never comes in the midst of the work. Ctrl-C ends the run
-    after the frame that is being observed. Errors of the items are raised after what came before them was
-    observed.
+    The caller's thread only waits, so that a signal never interrupts the work. Ctrl-C ends the run after the
+    frame that the observers see. An error of the items is raised after the observers saw all results before
+    it.
 
     Args:
-        items: where they come from; with a method ``stop``, it is told when to end.
-        processor: what makes a result of each.
-        observers: in the order in which they see it.
-        dropping: the newest win, and nothing waits; None: every item is worked on.
-        depth: items that are drawn ahead of what is observed, where nothing is dropped.
-        stop: ends the run when it is set.
-        tick: called every ``TICK`` seconds by the thread that waits.
+        items: input of the run. Its method ``stop``, if it has one, is called at the end.
+        processor: computation of the result of each item.
+        observers: observers in the order in which they see a result.
+        dropping: drop policy. None: every item is processed.
+        depth: items read ahead of the one that the observers see, if no item is dropped.
+        stop: event that ends the run.
+        tick: function that the waiting thread calls every ``TICK`` seconds.
 
     Raises:
-        Exception: of the items, the processor or an observer, after all observers were told the end.
+        Exception: of the items, the processor or an observer, after ``end`` of all observers.
     """
     stop = stop or threading.Event()
     loop = _Loop(items, processor, observers, dropping, depth, stop)
@@ -99,26 +99,26 @@ def run(
     interrupted = False
 
     def end() -> None:
-        """What comes from now on is neither waited for nor counted as left out."""
+        """Stop the input and the queues: later items are neither awaited nor counted as dropped."""
         _stop(items)
         if dropping is not None:
             dropping.close()
 
     try:
         thread.start()
-    except BaseException:  # Ctrl-C beside the start: whether there is a thread by now cannot be told
+    except BaseException:  # After Ctrl-C during the start, it is unknown whether the thread exists.
         loop.admission.put(False)
         raise
     while True:
         try:
             loop.admission.put(True)  # only the first one counts
             while not loop.over.is_set():
-                # Not ``thread.join``, which takes a thread for ended that an interrupt comes beside.
+                # Not ``thread.join``: an interrupt at that moment makes it take a running thread for ended.
                 loop.over.wait(TICK)
                 if stop.is_set():
                     end()
                 tick()
-            end()  # however it ended: nobody comes for more
+            end()  # After any end, no consumer takes more items.
             thread.join()
             break
         except KeyboardInterrupt:
@@ -127,7 +127,7 @@ def run(
             interrupted = True
             stop.set()
             end()
-        except BaseException:  # of ``tick``
+        except BaseException:  # an error of ``tick``
             stop.set()
             end()
             loop.over.wait()
@@ -140,13 +140,14 @@ def run(
 
 
 def _stop(items: object) -> None:
+    """Call the method ``stop`` of the items, if there is one."""
     stop = getattr(items, "stop", None)
     if stop is not None:
         stop()
 
 
 def results(items: Iterable[T], processor: Processor[T, R]) -> Generator[R, None, None]:
-    """What is made of each item, in order, to be drawn by the caller. Closing it ends its threads."""
+    """Yield the result of each item, in order. Closing the iterator ends its threads."""
     with (
         ThreadPoolExecutor(1, "network") as network,
         closing(overlapped(items, lambda item: processor.perceive(item, network), DEPTH)) as made,
@@ -155,7 +156,7 @@ def results(items: Iterable[T], processor: Processor[T, R]) -> Generator[R, None
 
 
 class _Loop(Generic[T, R]):
-    """The thread of a run."""
+    """Work of a run in a thread of its own."""
 
     def __init__(
         self,
@@ -168,12 +169,13 @@ class _Loop(Generic[T, R]):
     ) -> None:
         self.frames = 0
         self.error: BaseException | None = None
-        self.admission: SimpleQueue[bool] = SimpleQueue()  # whether it may begin; nothing interrupts a put
+        self.admission: SimpleQueue[bool] = SimpleQueue()  # whether to begin; no interrupt breaks a put
         self.over = threading.Event()
         self._items, self._processor, self._observers = items, processor, observers
         self._dropping, self._depth, self._stop = dropping, depth, stop
 
     def work(self) -> None:
+        """Run the loop until the items end, ``stop`` is set or an error occurs."""
         if not self.admission.get():
             return
         try:
@@ -193,6 +195,8 @@ class _Loop(Generic[T, R]):
             self.over.set()
 
     def _results(self, network: Executor) -> Generator[R, None, None]:
+        """Yield the result of ``perceive`` for each item, or for the newest ones."""
+
         def work(item: T) -> R:
             return self._processor.perceive(item, network)
 
@@ -201,6 +205,7 @@ class _Loop(Generic[T, R]):
         return _newest(self._items, work, self._dropping, self._stop)
 
     def _until_stopped(self) -> Iterator[T]:
+        """Yield the items until ``stop`` is set."""
         for item in self._items:
             if self._stop.is_set():
                 return
@@ -208,7 +213,7 @@ class _Loop(Generic[T, R]):
 
     @contextmanager
     def _begun(self, observer: Observer[R]) -> Iterator[Callable[[R], None]]:
-        """What takes the results for the observer."""
+        """Begin an observer, yield the function that passes it a result, and end it."""
         observer.begin(self._items)
         try:
             if observer.beside is None:
@@ -221,6 +226,7 @@ class _Loop(Generic[T, R]):
 
     @contextmanager
     def _in_own_thread(self, observer: Observer[R], size: int) -> Iterator[Callable[[R], None]]:
+        """Run an observer in its own thread, and yield the function that queues a result for it."""
         queue: NewestQueue[R] = NewestQueue(size)
         if self._dropping is not None:
             queue = self._dropping.queue(observer.name, size)
@@ -243,17 +249,17 @@ class _Loop(Generic[T, R]):
 
 
 def overlapped(items: Iterable[T], work: Callable[[T], R], depth: int) -> Generator[R, None, None]:
-    """Yield what is made of each item, in order. A thread works on it while the caller makes the next ones.
+    """Yield the result of each item, in order. A thread works on it while the caller makes the next items.
 
-    One thread beside the caller's and not two: they would wait for Python's lock more than they gain.
+    One thread beside the caller's is faster than two, which would wait for Python's lock most of the time.
 
-    An exception of the items is raised after what is made of those that came before it. Closing the
-    iterator ends the thread.
+    An exception of the items is raised after the results of the items before it. Closing the iterator ends
+    the thread.
 
     Args:
-        items: drawn in the caller's thread.
-        work: called in the other one.
-        depth: items that are drawn ahead of what is yielded.
+        items: items, drawn in the caller's thread.
+        work: function that runs in the other thread.
+        depth: items drawn ahead of the result that is yielded.
     """
     waiting: deque[Future[R]] = deque()
     cut: Exception | None = None
@@ -280,12 +286,14 @@ def overlapped(items: Iterable[T], work: Callable[[T], R], depth: int) -> Genera
 def _newest(
     items: Iterable[T], work: Callable[[T], R], dropping: Dropping, stop: threading.Event
 ) -> Generator[R, None, None]:
-    """Yield what is made of the newest items: drawing, work and the caller each in a thread of its own."""
+    """Yield the results of the newest items. Input, work and caller have a thread each."""
     incoming: NewestQueue[T] = dropping.queue("incoming", dropping.incoming_size, catch_up=True)
     done: NewestQueue[R] = dropping.queue("results", dropping.results_size)
     errors: list[BaseException] = []
 
     def guarded(work: Callable[[], None], queue: NewestQueue[T] | NewestQueue[R]) -> threading.Thread:
+        """Start a thread that collects the error of ``work`` and closes its queue."""
+
         def body() -> None:
             try:
                 work()
@@ -310,7 +318,7 @@ def _newest(
                 return
             done.put(work(item))
 
-    guarded(receive, incoming)  # it may block in its source for good
+    guarded(receive, incoming)  # This thread may block in its source for ever.
     worker = guarded(stages, done)
     try:
         yield from done
@@ -323,9 +331,10 @@ def _newest(
 
 @contextmanager
 def few_collections() -> Iterator[None]:
-    """Frames make many objects and few cycles: looking for these takes a tenth of all the time.
+    """Make garbage collections rare.
 
-    What is there by now, mostly what was imported, is not looked through again and again.
+    Frames make many objects and few cycles, and collections would take a tenth of the time.
+    Existing objects, mostly from imports, are not searched again and again.
     """
     before, enabled = gc.get_threshold(), gc.isenabled()
     gc.freeze()

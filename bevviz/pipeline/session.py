@@ -1,4 +1,4 @@
-"""What a drive remembers from one frame to the next, and the configuration that is in force."""
+"""State of a drive from one frame to the next, and the configuration in force."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ from bevviz.stages.tracking import Tracker
 
 
 class Session:
-    """Makes results of the frames of one drive, in order.
+    """Processor of the frames of one drive, in order.
 
-    ``perceive`` and ``finish`` may run in two threads, each in the order of the frames; ``configure`` may be
-    called from any. A frame is made with one configuration from beginning to end, which its result names.
+    ``perceive`` and ``finish`` may run in two threads, each in the order of the frames. ``configure`` may be
+    called from any thread. One configuration makes all of a result, which refers to it.
 
     Args:
         config: the configuration.
-        detect: what finds the objects in a camera's image instead of the detector's model.
-        loader: shared by sessions that are to share networks.
-        memo: shared by sessions that run on the same frames; whoever makes the frames clears it.
+        detect: function that replaces the detector's model.
+        loader: loader shared by sessions that share networks.
+        memo: results shared by sessions that run on the same frames. The maker of the frames clears it.
 
     Raises:
-        UserError: the detector's model or somebody's function cannot be used.
+        UserError: the detector's model or a user-defined function cannot be used.
     """
 
     def __init__(
@@ -42,23 +42,25 @@ class Session:
     ) -> None:
         self.loader = loader or StageLoader()
         self._detect, self._memo = detect, memo
-        self._in_force = config, self.loader.load(config, detect)  # read and replaced as one
+        self._in_force = config, self.loader.load(config, detect)  # Both are read and replaced together.
         self._tracker = Tracker()
         self._anomalies = AnomalyDetector()
 
     @property
     def config(self) -> Config:
+        """Configuration in force."""
         return self._in_force[0]
 
     @property
     def stages(self) -> Stages:
+        """Stages of the configuration in force."""
         return self._in_force[1]
 
     def configure(self, config: Config) -> dict[str, ParameterChange]:
-        """From the next frame on. Returns what changes.
+        """Use another configuration from the next frame on. Return the changed parameters.
 
         Raises:
-            UserError: the detector's model or somebody's function cannot be used; nothing is changed.
+            UserError: the detector's model or a user-defined function cannot be used. Nothing is changed.
         """
         stages = self.loader.load(config, self._detect)
         before = self.config
@@ -66,33 +68,33 @@ class Session:
         return changes(before, config)
 
     def run(self, frame: Frame) -> FrameResult:
-        """Everything that can be made of the next frame. Never raises for what the frame holds."""
+        """Return the complete result of the next frame. The content of a frame never raises an error."""
         return self.finish(self.perceive(frame))
 
     def alone(self, frame: Frame) -> FrameResult:
-        """What can be made of any one frame, without what needs those before it: tracks and anomalies."""
+        """Return the result of any single frame, without tracks and anomalies, which need earlier frames."""
         config, stages = self._in_force
         return describe(perceive(frame, config, stages, self._memo))
 
     def explained(self, frame: Frame) -> FrameResult:
-        """What is asked about the next frame needs: everything but its bird's-eye view and its anomalies."""
+        """Return the result of the next frame with explanations, without bird's-eye view and anomalies."""
         return describe(self.perceive(frame), seen=False)
 
     def perceive(self, frame: Frame, network: Executor | None = None) -> FrameResult:
-        """What the stages make of the next frame, with its tracks."""
+        """Run the stages on the next frame, and update the tracks."""
         config, stages = self._in_force
         return self.track(perceive(frame, config, stages, self._memo, network=network))
 
     def finish(self, result: FrameResult) -> FrameResult:
-        """The result of ``perceive`` with its bird's-eye view, explanations and anomalies."""
+        """Add bird's-eye view, explanations and anomalies to a result of ``perceive``."""
         return self.watch(describe(result))
 
     def watch(self, result: FrameResult) -> FrameResult:
-        """The result with the anomalies of the drive so far."""
+        """Add the anomalies of the drive to the next result."""
         return replace(result, anomalies=self._anomalies.update(result, result.config.anomalies))
 
     def track(self, result: FrameResult) -> FrameResult:
-        """The result with the tracks of the drive so far."""
+        """Add the tracks of the drive to the next result."""
         clusters, config = result.clusters, result.config.tracking
         if clusters is None or config.method == "none":
             return result

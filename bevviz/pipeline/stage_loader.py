@@ -1,4 +1,4 @@
-"""What a configuration names, loaded: networks, functions of others, each once."""
+"""Load the networks and functions that a configuration names, each once."""
 
 from __future__ import annotations
 
@@ -21,12 +21,15 @@ Detect = Callable[[Camera], Detections | None]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Stages:
-    """The functions and networks that a configuration names. None: the stage is ours, or there is none.
+    """Functions and networks that a configuration names. None: the stage is built-in, or does not run.
 
     Attributes:
-        network: the detector's network, shared by configurations that only differ in thresholds.
-        detector: the same with this configuration's thresholds.
-        detect: what finds the objects in a camera's image instead of both.
+        ground: user-defined function.
+        clustering: user-defined function.
+        objects: user-defined function, or 3D detector.
+        network: the detector's network, shared by configurations that differ only in thresholds.
+        detector: the detector with this configuration's thresholds.
+        detect: function that replaces both.
     """
 
     ground: Foreign | None = None
@@ -38,19 +41,19 @@ class Stages:
 
     @property
     def class_names(self) -> tuple[str, ...]:
-        """That the detector knows, as far as that is known."""
+        """Class names of the detector, empty if unknown."""
         return () if self.detector is None else tuple(self.detector.names)
 
     @property
     def provider(self) -> str:
-        """What the networks run on, the detector's first; empty: there is none of ours."""
+        """Provider of the networks, the detector's first. Empty: bevviz runs none."""
         if self.detector is not None:
             return self.detector.provider
         return self.objects.network.provider if isinstance(self.objects, ObjectNetwork) else ""
 
 
 class StageLoader:
-    """Loads what configurations name, each network and function once."""
+    """Loader that loads each network and function once."""
 
     def __init__(self) -> None:
         self._networks: dict[tuple[str, str, str, int], Detector] = {}
@@ -58,10 +61,10 @@ class StageLoader:
         self._pillars: dict[tuple[object, ...], PillarNetwork] = {}
 
     def load(self, config: Config, detect: Detect | None = None) -> Stages:
-        """The stages of a configuration; with ``detect``, that instead of its detector.
+        """Return the stages of a configuration. ``detect`` replaces its detector.
 
         Raises:
-            UserError: a network or somebody's function cannot be used.
+            UserError: a network or a user-defined function cannot be used.
         """
         detector = None if detect is not None else self._function(config, "detector")
         network = self._network(config.detector) if detect is None and detector is None else None
@@ -75,12 +78,14 @@ class StageLoader:
         )
 
     def _function(self, config: Config, section: str) -> Foreign | None:
+        """Return the user-defined function of a section, or None."""
         key = section, getattr(config, section).model_dump_json(), str(config.functions)
         if key not in self._foreign:
             self._foreign[key] = user_stages.foreign(config, section)
         return self._foreign[key]
 
     def _objects(self, config: Config) -> Foreign | ObjectNetwork | None:
+        """Return the 3D detector or the user-defined function that makes the objects, or None."""
         params = object_network(config)
         if params is None:
             return self._function(config, "objects")
@@ -92,6 +97,7 @@ class StageLoader:
         return ObjectNetwork(self._pillars[key], params)
 
     def _network(self, config: DetectorConfig) -> Detector | None:
+        """Return the detector's network, or None."""
         if not config.model or config.model.startswith(TOPIC):
             return None
         key = config.model, config.names, config.provider, config.threads

@@ -1,4 +1,4 @@
-"""How stages are run: how long each took, why it failed, and which need not be run again."""
+"""Run stages with their times and failures, and reuse results that are known already."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ _log = logger(__name__)
 
 
 class Memo:
-    """What stages made of one frame, for runs of other configurations on the same frame.
+    """Results of stages on one frame, shared by configurations that run on the same frame.
 
-    A stage that gets the same arrays and equal parameters is not run again. To be cleared from one frame to
-    the next.
+    A stage with the same arrays and equal parameters does not run again. The cache must be cleared before the
+    next frame.
 
     Args:
-        size: results that are kept; the one that was not asked for the longest goes.
+        size: most results that are kept. The least recently used one goes first.
     """
 
     def __init__(self, size: int = 200) -> None:
@@ -39,14 +39,15 @@ class Memo:
 
     @property
     def seconds_saved(self) -> float:
-        """By this thread so far."""
+        """Seconds that this thread has saved so far."""
         return getattr(self._local, "seconds_saved", 0.0)
 
     def clear(self) -> None:
+        """Forget all results."""
         self._results.clear()
 
     def call(self, function: Callable[[*Ts], T], *args: *Ts) -> T:
-        """The function's result, made now or before. A function may ask for others in turn."""
+        """Return the function's result, from the cache if possible. The function may use the cache itself."""
         key = (function, *map(_identity, args))
         if key in self._results:
             _, known, seconds = self._results[key]
@@ -56,7 +57,7 @@ class Memo:
         start, before = clock(), self.seconds_saved
         result = function(*args)
         seconds = clock() - start + self.seconds_saved - before
-        # The arguments are kept as well: nothing else can get their ids then.
+        # Keeping the arguments prevents other objects from getting their ids.
         self._results[key] = args, result, seconds
         if len(self._results) > self._size:
             self._results.popitem(last=False)
@@ -64,17 +65,17 @@ class Memo:
 
 
 def _identity(argument: object) -> object:
-    """Parameters are the same when they are equal, arrays only when they are one."""
+    """Return a key that is equal for equal parameters, but for arrays only if they are the same object."""
     if isinstance(argument, BaseModel) and not isinstance(argument, Config):
         return type(argument), argument.model_dump_json()
     return argument if isinstance(argument, str | int | float) else id(argument)
 
 
 class StageLog:
-    """Runs stages; keeps how long each took and why it failed.
+    """Times and failures of the stages that it runs.
 
     Args:
-        memo: where to look for results; a stage that need not be run counts with the time it once took.
+        memo: cache of results. A stage from the cache counts with the time that it once took.
     """
 
     def __init__(self, memo: Memo | None = None) -> None:
@@ -84,15 +85,15 @@ class StageLog:
         self._memo = memo
 
     def run(self, stage: str, function: Callable[[*Ts], T], *args: *Ts) -> T | None:
-        """The function's result, or None where it failed: one bad stage must not take the frame with it.
+        """Return the function's result, or None if it failed. A failed stage does not stop the frame.
 
         Raises:
-            KeyboardInterrupt: the user wants to end, whatever the stage made of that.
+            KeyboardInterrupt: the user wants to end, even if the stage turned that into another error.
         """
         return self.guard(stage, lambda: self.call(function, *args))
 
     def guard(self, stage: str, work: Callable[[], T]) -> T | None:
-        """As ``run``, of what is not to be looked up itself."""
+        """Run a stage as ``run`` does, but without a look-up of its own result."""
         memo = self._memo
         start, before = clock(), memo.seconds_saved if memo else 0.0
         try:
@@ -110,10 +111,11 @@ class StageLog:
         return None
 
     def call(self, function: Callable[[*Ts], T], *args: *Ts) -> T:
-        """The function's result, from the memo where there is one."""
+        """Return the function's result, from the cache if there is one."""
         return function(*args) if self._memo is None else self._memo.call(function, *args)
 
     def _failed(self, stage: str, reason: str, error: Exception) -> None:
+        """Record and log a failure."""
         unforeseen = not isinstance(error, UserError | StageError)
         trace = "".join(traceback.format_exception(error)) if unforeseen else ""
         _log.warning("stage %s failed: %s", stage, reason, exc_info=error if unforeseen else None)

@@ -1,4 +1,4 @@
-"""Several configurations on the same frames: what they have in common runs once."""
+"""Several configurations on the same frames. Stages that they have in common run once."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from bevviz.pipeline.session import Session
 from bevviz.pipeline.stage_loader import StageLoader
 from bevviz.pipeline.stage_log import Memo
 
-MOTION = "sync.motion_compensation"  # the one thing in how frames are made that variants may differ in
+MOTION = "sync.motion_compensation"  # the only parameter of frames in which variants may differ
 
 
 class Variants:
-    """Configurations that share frames, networks, and what stages make of the same arrays.
+    """Configurations that share frames, networks, and results of stages on the same arrays.
 
     Args:
-        loader: that has networks already.
+        loader: loader with loaded networks.
     """
 
     def __init__(self, loader: StageLoader | None = None) -> None:
@@ -32,19 +32,23 @@ class Variants:
         self._still: Frame | None = None
 
     def session(self, config: Config) -> Session:
-        """A drive of its own, with its own tracks and anomalies.
+        """Return a new session with its own tracks and anomalies.
 
         Raises:
-            UserError: the detector's model or somebody's function cannot be used.
+            UserError: the detector's model or a user-defined function cannot be used.
         """
         return Session(config, loader=self._loader, memo=self._memo)
 
     def check(self, config: Config) -> None:
-        """Raises UserError where the configuration's model or somebody's function cannot be used."""
+        """Check that the stages of a configuration can be loaded.
+
+        Raises:
+            UserError: the detector's model or a user-defined function cannot be used.
+        """
         self._loader.load(config)
 
     def frame(self, frame: Frame, config: Config) -> Frame:
-        """The frame as the configuration wants it made; a new frame ends what is shared of the last."""
+        """Return the frame as a configuration wants it made. A new frame clears the shared results."""
         if frame is not self._frame:
             self._memo.clear()
             self._frame, self._still = frame, None
@@ -54,38 +58,41 @@ class Variants:
         return self._still
 
     def perceive(self, frame: Frame, config: Config, network: Executor | None = None) -> FrameResult:
-        """What the stages make of one frame, without what needs other frames. A stage that need not be run
-        again tells the time that it took.
+        """Run the stages that need no other frame on one frame.
+
+        A reused result keeps the time that it once took.
 
         Raises:
-            UserError: the detector's model or somebody's function cannot be used.
+            UserError: the detector's model or a user-defined function cannot be used.
         """
         stages = self._loader.load(config)
         return perceive(self.frame(frame, config), config, stages, self._memo, network=network)
 
 
 class Sessions:
-    """Several sessions on the same frames, as one: a result is a tuple of theirs."""
+    """Several sessions on the same frames as one processor. A result is a tuple of theirs."""
 
     def __init__(self, configs: Sequence[Config]) -> None:
         self._variants = Variants()
         self.sessions = [self._variants.session(config) for config in configs]
 
     def perceive(self, frame: Frame, network: Executor | None = None) -> tuple[FrameResult, ...]:
+        """Run ``perceive`` of each session on the frame."""
         return tuple(
             session.perceive(self._variants.frame(frame, session.config), network)
             for session in self.sessions
         )
 
     def finish(self, results: tuple[FrameResult, ...]) -> tuple[FrameResult, ...]:
+        """Run ``finish`` of each session on its result."""
         return tuple(session.finish(result) for session, result in zip(self.sessions, results, strict=True))
 
 
 def check_same_frames(configs: Mapping[str, Config]) -> None:
-    """Variants run on frames that are decoded once.
+    """Check that variants can share decoded frames.
 
     Raises:
-        UserError: they differ in what frames are made of.
+        UserError: they differ in a parameter of the frames.
     """
     first, *others = configs.items()
     for name, config in others:
@@ -98,15 +105,16 @@ def check_same_frames(configs: Mapping[str, Config]) -> None:
 
 
 def common_frames(configs: Iterable[Config]) -> Config:
-    """How frames are to be made for all of them: with motion compensated, if any wants that."""
+    """Return the configuration that makes the frames of all: with motion compensation if any needs it."""
     configs = list(configs)
     return next((config for config in configs if config.sync.motion_compensation), configs[0])
 
 
 def without_motion(frame: Frame) -> Frame:
-    """The frame as it is with ``sync.motion_compensation`` off: its cameras where they are mounted."""
+    """Return the frame as with ``sync.motion_compensation`` off: the cameras have their mounting pose."""
 
     def still(camera: Camera) -> Camera:
+        """Return a camera at its mounting pose."""
         if camera.mounting is None:
             return camera
         return replace(
