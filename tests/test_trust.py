@@ -501,8 +501,10 @@ def test_only_few_places_speak_for_the_user() -> None:
     """Whoever adds one is to think of what is received; a layer without a word is not trusted."""
     assert Layer("somewhere", {}).trust is RECEIVED and not RECEIVED.granted
     users = {str(path.relative_to(PACKAGE)) for path in PACKAGE.rglob("*.py") if "USER" in names_in(path)}
-    assert users == {"config/loading.py", "drive.py", "project.py", "trust.py"}
-    assert {file for file, call in calls("Trust") if "granted=True" in ast.unparse(call)} == {"trust.py"}
+    assert users == {"config/loading.py", "config/project.py", "config/trust.py", "drive.py"}
+    assert {file for file, call in calls("Trust") if "granted=True" in ast.unparse(call)} == {
+        "config/trust.py"
+    }
 
 
 def test_settings_that_are_text_come_from_the_user_alone() -> None:
