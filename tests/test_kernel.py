@@ -11,7 +11,7 @@ from types import SimpleNamespace
 import numba
 
 from bevviz.support import progress
-from bevviz.support.kernel import _Announcing, clock, common_clock
+from bevviz.support.kernel import _CompileAnnouncer, clock, common_clock
 
 NOWHERE = """
 from numba.core.caching import CacheImpl
@@ -63,7 +63,7 @@ def test_that_stages_are_compiled_is_said_once() -> None:
     said: list[str] = []
     progress.to(said.append)
     try:
-        listener = _Announcing()
+        listener = _CompileAnnouncer()
         for module in ("somebody.else", "bevviz.stages.voxel", "bevviz.stages.ground"):
             listener.on_start(SimpleNamespace(data={"dispatcher": SimpleNamespace(__module__=module)}))
     finally:

@@ -42,22 +42,22 @@ SIZES: dict[str, tuple[float, ...]] = {
 }
 
 
-def _with_known(given: Any) -> Any:
+def with_default_sizes(stated: Any) -> Any:
     """Return the default sizes with the stated classes changed."""
-    if not isinstance(given, Mapping):
-        return given
-    return {**SIZES, **{str(name).lower(): size for name, size in given.items()}}
+    if not isinstance(stated, Mapping):
+        return stated
+    return {**SIZES, **{str(name).lower(): size for name, size in stated.items()}}
 
 
-def _six(given: tuple[float, ...]) -> tuple[float, ...]:
+def _check_count(size: tuple[float, ...]) -> tuple[float, ...]:
     """Raise an error for pydantic unless a size has six numbers."""
-    if len(given) != 6:
+    if len(size) != 6:
         raise PydanticCustomError(
             "size",
             "has {count} numbers, a class has six: length, width, height and the spread of each",
-            {"count": len(given)},
+            {"count": len(size)},
         )
-    return given
+    return size
 
 
-ClassSize = Annotated[tuple[PositiveFloat, ...], AfterValidator(_six)]
+ClassSize = Annotated[tuple[PositiveFloat, ...], AfterValidator(_check_count)]

@@ -54,31 +54,33 @@ def explain(asked: str, config: Config) -> str:
     Raises:
         UserError: no key has this name. The message names the nearest one.
     """
-    about = keys(config)
+    descriptions = keys(config)
     key = TUTORIAL_NAMES.get(asked, asked)
-    if key in about:
-        return "\n".join(_lines(key, config, about[key]))
-    inside = [one for one in about if one.startswith(f"{key}.")]
-    if not inside:
-        raise UserError(unknown_key(asked, [*about]))
-    now = values(config)
-    return "\n".join(_wrapped(f"{one} = {_value(now[one])}", about[one]) for one in inside)
+    if key in descriptions:
+        return "\n".join(_lines(key, config, descriptions[key]))
+    names_inside = [name for name in descriptions if name.startswith(f"{key}.")]
+    if not names_inside:
+        raise UserError(unknown_key(asked, [*descriptions]))
+    current = values(config)
+    return "\n".join(
+        _wrapped(f"{name} = {_value(current[name])}", descriptions[name]) for name in names_inside
+    )
 
 
-def _lines(key: str, config: Config, about: str) -> Iterator[str]:
+def _lines(key: str, config: Config, description: str) -> Iterator[str]:
     """Yield the lines that describe one parameter."""
     yield f"{key} = {_value(values(config)[key])}"
-    if about:
-        yield textwrap.fill(about, WIDTH, initial_indent="  ", subsequent_indent="  ")
-    info, everywhere = field_of(key, config), field_of(key) is not None
+    if description:
+        yield textwrap.fill(description, WIDTH, initial_indent="  ", subsequent_indent="  ")
+    info, in_all_configs = field_of(key, config), field_of(key) is not None
     if spellings := unit_spellings(key):
         yield f"  unit       {unit(key)}; a unit can be given: {', '.join(spellings)}"
     if info is not None and (allowed := _allowed(info)):
         yield f"  allowed    {allowed}"
     presets = {name: values(load(preset=name)).get(key) for name in ("default", "reference")}
-    if everywhere and key != "preset":
+    if in_all_configs and key != "preset":
         yield "  presets    " + ", ".join(f"{name}: {_value(value)}" for name, value in presets.items())
-    if names := [name for name, own in TUTORIAL_NAMES.items() if own == key]:
+    if names := [name for name, target in TUTORIAL_NAMES.items() if target == key]:
         yield f"  tutorial   {', '.join(names)}, which is accepted, too"
     yield f"  stated by  {printable(config.stated.get(key, '')) or f'the preset, {config.preset}'}"
     if key == "preset":
@@ -100,7 +102,10 @@ def _allowed(info: FieldInfo) -> str:
     options = [a for a in (annotation, *get_args(annotation)) if get_origin(a) is Literal]
     if options:
         return ", ".join(map(str, get_args(options[0])))
-    rules = [*info.metadata, *(r for part in get_args(annotation) for r in getattr(part, "__metadata__", ()))]
+    rules = [
+        *info.metadata,
+        *(bound for inner in get_args(annotation) for bound in getattr(inner, "__metadata__", ())),
+    ]
     words = []
     for rule in rules:
         words += [f"at least {rule.ge}"] if isinstance(rule, annotated_types.Ge) else []
@@ -115,13 +120,13 @@ def _value(value: Any) -> str:
     """Return a value as text of at most ``WIDTH`` characters."""
     import json
 
-    def plain(one: Any) -> Any:
-        return dict(one) if hasattr(one, "items") else str(one)
+    def plain(item: Any) -> Any:
+        return dict(item) if hasattr(item, "items") else str(item)
 
     text = "empty" if value in (None, "", ()) else json.dumps(value, default=plain)
     return text if len(text) <= WIDTH else f"{text[: WIDTH - 4]} ..."
 
 
-def _wrapped(head: str, about: str) -> str:
+def _wrapped(head: str, description: str) -> str:
     """Return a line with its description wrapped below it."""
-    return f"{head}\n{textwrap.fill(about, WIDTH, initial_indent='  ', subsequent_indent='  ')}"
+    return f"{head}\n{textwrap.fill(description, WIDTH, initial_indent='  ', subsequent_indent='  ')}"

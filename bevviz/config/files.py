@@ -38,8 +38,8 @@ class Layer:
     @property
     def functions(self) -> tuple[str, ...]:
         """The ``module:function`` of every stage for which the values name one."""
-        named = (self.values.get(f"{section}.{key}") for section, key in STAGES.items())
-        return tuple(method for method in named if isinstance(method, str) and is_foreign(method))
+        methods = (self.values.get(f"{section}.{key}") for section, key in STAGES.items())
+        return tuple(method for method in methods if isinstance(method, str) and is_foreign(method))
 
 
 def read_layer(path: Path, *, pipe: bool = True) -> Layer:
@@ -107,13 +107,13 @@ def _check_size(tree: Any, where: str) -> None:
     """
     sizes: dict[int, int] = {}
 
-    def size(node: Any) -> int:
-        if not isinstance(node, list | dict):
+    def size(value: Any) -> int:
+        if not isinstance(value, list | dict):
             return 1
-        if id(node) not in sizes:
-            sizes[id(node)] = 1  # for a node that contains itself
-            sizes[id(node)] = 1 + sum(map(size, node.values() if isinstance(node, dict) else node))
-        return sizes[id(node)]
+        if id(value) not in sizes:
+            sizes[id(value)] = 1  # for a node that contains itself
+            sizes[id(value)] = 1 + sum(map(size, value.values() if isinstance(value, dict) else value))
+        return sizes[id(value)]
 
     if size(tree) > MOST_VALUES:
         raise UserError(f"{where}: its aliases stand for more than {MOST_VALUES:,} values")
@@ -142,7 +142,7 @@ def toml_tree(path: Path, problem: str) -> dict[str, Any]:
 
 def dump(config: Config) -> str:
     """Return the configuration as YAML, with the unit and meaning of each parameter. ``load`` can read it."""
-    about = keys(config)
+    descriptions = keys(config)
     lines = []
     for section, content in config.model_dump(mode="json").items():
         if not isinstance(content, dict):
@@ -151,7 +151,7 @@ def dump(config: Config) -> str:
         lines.append(f"{section}:")
         params = content.pop("params", {})
         for name, value in content.items():
-            note = _note(f"{section}.{name}", about)
+            note = _note(f"{section}.{name}", descriptions)
             if isinstance(value, dict) and value:
                 lines.append(f"  {name}:{note}")
                 lines += [f"    {json.dumps(key)}: {json.dumps(inner)}" for key, inner in value.items()]
@@ -160,13 +160,13 @@ def dump(config: Config) -> str:
         if params:
             lines.append("  params:")
         for name, value in params.items():
-            lines.append(f"    {name}: {json.dumps(value)}{_note(f'{section}.params.{name}', about)}")
+            lines.append(f"    {name}: {json.dumps(value)}{_note(f'{section}.params.{name}', descriptions)}")
     return "\n".join(lines) + "\n"
 
 
-def _note(key: str, about: Mapping[str, str]) -> str:
+def _note(key: str, descriptions: Mapping[str, str]) -> str:
     """Return the comment with the unit and meaning of a dotted key."""
-    text = (f"in {unit(key)}; " if unit(key) else "") + about.get(key, "")
+    text = (f"in {unit(key)}; " if unit(key) else "") + descriptions.get(key, "")
     return f"  # {text}" if text else ""
 
 
@@ -190,8 +190,8 @@ def stated_lines(config: Config, *, folders: bool = True) -> list[str]:
         config: the configuration.
         folders: whether to write the folder of a file.
     """
-    found: dict[str, list[str]] = {}
+    keys_of: dict[str, list[str]] = {}
     for key, where in config.stated.items():
-        place = "command line" if where.startswith("--") else where if folders else Path(where).name
-        found.setdefault(place, []).append(key)
-    return [f"{place}: {', '.join(names)}" for place, names in found.items()]
+        source = "command line" if where.startswith("--") else where if folders else Path(where).name
+        keys_of.setdefault(source, []).append(key)
+    return [f"{source}: {', '.join(names)}" for source, names in keys_of.items()]

@@ -33,36 +33,36 @@ def keys(config: Config | None = None) -> dict[str, str]:
     Args:
         config: configuration whose plugins add the keys ``SECTION.params.NAME``.
     """
-    found: dict[str, str] = {}
+    descriptions: dict[str, str] = {}
     for section, info in Config.model_fields.items():
         model = _model(section)
         if model is None:
-            found[section] = info.description or ""
+            descriptions[section] = info.description or ""
             continue
         for name, inner in model.model_fields.items():
             if name != "params":
-                found[f"{section}.{name}"] = inner.description or ""
+                descriptions[f"{section}.{name}"] = inner.description or ""
         if config is not None:
-            found |= {
+            descriptions |= {
                 f"{section}.params.{name}": inner.description or ""
                 for name, inner in params_of(config, section).items()
             }
-    return found
+    return descriptions
 
 
 def values(config: Config) -> dict[str, Any]:
     """Return the value of each dotted key, including the parameters of plugins."""
-    found: dict[str, Any] = {}
-    for section, given in config:
-        if not isinstance(given, Section):
-            found[section] = given
+    values_by_key: dict[str, Any] = {}
+    for section, content in config:
+        if not isinstance(content, Section):
+            values_by_key[section] = content
             continue
-        for name, value in given:
+        for name, value in content:
             if name != "params":
-                found[f"{section}.{name}"] = value
+                values_by_key[f"{section}.{name}"] = value
             else:
-                found |= {f"{section}.params.{key}": inner for key, inner in value.items()}
-    return found
+                values_by_key |= {f"{section}.params.{key}": inner for key, inner in value.items()}
+    return values_by_key
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,14 +115,14 @@ def flattened(tree: Mapping[str, Any]) -> dict[str, Any]:
 
 def unit(key: str) -> str:
     """Return the name of the unit of a dotted key, or an empty string if it has none."""
-    found = _unit(key)
-    return found.name if found is not None else ""
+    key_unit = _unit(key)
+    return key_unit.name if key_unit is not None else ""
 
 
 def unit_spellings(key: str) -> tuple[str, ...]:
     """Return the units that a user may write for a dotted key, e.g. m, cm and mm."""
-    found = _unit(key)
-    return tuple(found.factors) if found is not None else ()
+    key_unit = _unit(key)
+    return tuple(key_unit.factors) if key_unit is not None else ()
 
 
 def _unit(key: str) -> Unit | None:
@@ -133,7 +133,9 @@ def _unit(key: str) -> Unit | None:
         return None
     info = model.model_fields[name]
     # An optional quantity carries its unit inside the union.
-    inner = [extra for part in get_args(info.annotation) for extra in getattr(part, "__metadata__", ())]
+    inner = [
+        extra for argument in get_args(info.annotation) for extra in getattr(argument, "__metadata__", ())
+    ]
     for extra in [*info.metadata, *inner]:
         owner = getattr(getattr(extra, "func", None), "__self__", None)
         if isinstance(owner, Unit):

@@ -11,7 +11,7 @@ from pydantic import BaseModel, ValidationError
 from bevviz.config.files import Layer, read_layer, yaml_value
 from bevviz.config.keys import TUTORIAL_NAMES, flattened, keys, unit, unknown_key, values
 from bevviz.config.methods import STAGES
-from bevviz.config.pillars import UNFIT, is_network
+from bevviz.config.pillars import COMPLETE_SENTENCE, is_network
 from bevviz.config.sections import Config, Functions, Preset
 from bevviz.config.trust import MESSAGE, RECEIVED, USER, Trust
 from bevviz.config.user_stages import names_function, params_model
@@ -66,42 +66,42 @@ def load(
             function may not run. The message is one line.
     """
     files = [Path(file)] if isinstance(file, str | Path) else file or ()
-    whole = Layer(BASE, values(base)) if isinstance(base, Config) else base
+    base_layer = Layer(BASE, values(base)) if isinstance(base, Config) else base
     sources = [
-        *([whole] if whole is not None else []),
+        *([base_layer] if base_layer is not None else []),
         *layers,
         *map(read_layer, files),
-        *(one if isinstance(one, Layer) else _setting(one, USER) for one in settings),
+        *(setting if isinstance(setting, Layer) else _setting(setting, USER) for setting in settings),
     ]
-    given = [
+    entries = [
         (TUTORIAL_NAMES.get(key, key), value, layer)
         for layer in sources
         for key, value in layer.values.items()
     ]
-    chosen = preset or next((value for key, value, _ in reversed(given) if key == "preset"), "default")
-    of_preset = flattened(REFERENCE) if chosen == "reference" else {}
+    preset_name = preset or next((value for key, value, _ in reversed(entries) if key == "preset"), "default")
+    preset_values = flattened(REFERENCE) if preset_name == "reference" else {}
     stated: dict[str, Any] = {}
     origin: dict[str, str] = {}
-    stating: dict[str, Layer] = {}
-    for key, value, layer in given:
+    layers_in_force: dict[str, Layer] = {}
+    for key, value, layer in entries:
         section, _, name = key.partition(".")
-        before_it = stated.get(key, value)
-        if name == STAGES.get(section) and before_it != value and not _alike(before_it, value):
+        previous = stated.get(key, value)
+        if name == STAGES.get(section) and previous != value and not _alike(previous, value):
             stated = {k: v for k, v in stated.items() if not k.startswith(f"{section}.params.")}
-        stated[key], origin[key], stating[key] = value, layer.where, layer
-    running = [config.functions for config in (in_force, base) if isinstance(config, Config)]
-    functions = _functions(given, stated, stating, running)
-    params = _params({**of_preset, **stated}, origin, functions)
-    known = [*keys(), *params]
-    tree: dict[str, Any] = {"preset": chosen}
-    for key, value in {**of_preset, **stated}.items():
+        stated[key], origin[key], layers_in_force[key] = value, layer.where, layer
+    running_functions = [config.functions for config in (in_force, base) if isinstance(config, Config)]
+    functions = _functions(entries, stated, layers_in_force, running_functions)
+    params = _params({**preset_values, **stated}, origin, functions)
+    known_keys = [*keys(), *params]
+    tree: dict[str, Any] = {"preset": preset_name}
+    for key, value in {**preset_values, **stated}.items():
         full = key
-        if key not in known:
+        if key not in known_keys:
             section, _, name = key.partition(".")
             full = f"{section}.params.{name}"
             if full not in params:
-                raise UserError(f"{origin[key]}: {unknown_key(key, known)}")
-            origin[full], stating[full] = origin[key], stating[key]
+                raise UserError(f"{origin[key]}: {unknown_key(key, known_keys)}")
+            origin[full], layers_in_force[full] = origin[key], layers_in_force[key]
         if full != "preset":
             _insert(tree, full, value)
     try:
@@ -111,7 +111,7 @@ def load(
                 mode="json"
             )
         prefix = ""
-        made = Config.model_validate(tree)
+        loaded = Config.model_validate(tree)
     except ValidationError as error:
         first = error.errors()[0]
         loc = (*prefix.split(".")[:-1], *first["loc"])
@@ -121,16 +121,19 @@ def load(
             raise UserError(
                 _unfit_network(origin.get("objects.method", where), method, key, params)
             ) from None
-        silent = first["type"] in ("wrong_unit", "missing", UNFIT)
-        value = f" (given: {shown(first['input'])})" if not silent else ""
-        about = keys().get(key) or params.get(key, "")
-        hint = f"; it is: {about}" if about else ""
-        stated_unit = f", in {unit(key)}" if unit(key) and not silent else ""
+        is_complete = first["type"] in ("wrong_unit", "missing", COMPLETE_SENTENCE)
+        value = f" (given: {shown(first['input'])})" if not is_complete else ""
+        description = keys().get(key) or params.get(key, "")
+        hint = f"; it is: {description}" if description else ""
+        stated_unit = f", in {unit(key)}" if unit(key) and not is_complete else ""
         raise UserError(f"{where}: {key} {_lower(first['msg'])}{stated_unit}{value}{hint}") from None
     before = base.stated if isinstance(base, Config) else {}
-    made._stated = {**before, **{key: where for key, where in origin.items() if stating[key] is not whole}}
-    made._functions = functions
-    return made
+    loaded._stated = {
+        **before,
+        **{key: where for key, where in origin.items() if layers_in_force[key] is not base_layer},
+    }
+    loaded._functions = functions
+    return loaded
 
 
 def revised(config: Config, settings: Iterable[str], trust: Trust = MESSAGE) -> Config:
@@ -173,20 +176,20 @@ def _setting(text: str, trust: Trust, where: str = "") -> Layer:
 
 
 def _functions(
-    given: Iterable[tuple[str, Any, Layer]],
+    entries: Iterable[tuple[str, Any, Layer]],
     stated: Mapping[str, Any],
-    stating: Mapping[str, Layer],
-    running: Iterable[Functions],
+    layers_in_force: Mapping[str, Layer],
+    running_functions: Iterable[Functions],
 ) -> Functions:
     """Check that the user has named or trusted the functions of the stages.
 
     A received value is kept if a trusted layer, or the configuration in force, has the same value.
 
     Args:
-        given: every key and value with its layer.
+        entries: every key and value with its layer.
         stated: values in force.
-        stating: layer of each value in force.
-        running: functions that are in force already.
+        layers_in_force: layer of each value in force.
+        running_functions: functions that are in force already.
 
     Returns:
         The functions in force, with the folder of each module.
@@ -194,31 +197,33 @@ def _functions(
     Raises:
         UserError: a function may not run.
     """
-    granted = {function: folder for functions in running for function, folder in functions.items()}
-    for key, value, layer in given:
+    granted = {function: folder for functions in running_functions for function, folder in functions.items()}
+    for key, value, layer in entries:
         section, _, name = key.partition(".")
         if layer.trust.granted and name == STAGES.get(section) and isinstance(value, str):
             granted[section, value] = layer.trust.folder
-    found: dict[tuple[str, str], str] = {}
+    in_force: dict[tuple[str, str], str] = {}
     for section, name in STAGES.items():
         key = f"{section}.{name}"
         method = stated.get(key)
         if not isinstance(method, str) or not names_function(section, method):
             continue
         if (section, method) not in granted:
-            layer = stating[key]
+            layer = layers_in_force[key]
             advice = layer.trust.advice.replace("{setting}", f"{key}={method}")
             raise UserError(f"{layer.where}: {key} names the function {method}, which may not run: {advice}")
-        found[section, method] = granted[section, method]
-    return found
+        in_force[section, method] = granted[section, method]
+    return in_force
 
 
-def _unfit_network(where: str, method: str, key: str, about: Mapping[str, str]) -> str:
+def _unfit_network(where: str, method: str, key: str, descriptions: Mapping[str, str]) -> str:
     """Return the error about a 3D detector whose file or first required parameter is missing."""
     head = where if method in where else f"{where}: objects.method {method}"
     if not Path(method).is_file():
         return f"{head}: no such file"
-    return f"{head}: a 3D detector needs {key}, in a YAML file or by --set; it is: {about.get(key, '')}"
+    return (
+        f"{head}: a 3D detector needs {key}, in a YAML file or by --set; it is: {descriptions.get(key, '')}"
+    )
 
 
 def _alike(method: Any, other: Any) -> bool:
@@ -235,7 +240,7 @@ def _is_text(key: str) -> bool:
 
 def _params(stated: Mapping[str, Any], origin: Mapping[str, str], functions: Functions) -> dict[str, str]:
     """Return dotted keys and descriptions of the parameters of the named plugins and networks."""
-    found: dict[str, str] = {}
+    descriptions: dict[str, str] = {}
     for section, key in STAGES.items():
         method = stated.get(f"{section}.{key}")
         if not isinstance(method, str):
@@ -246,8 +251,10 @@ def _params(stated: Mapping[str, Any], origin: Mapping[str, str], functions: Fun
             raise UserError(f"{origin[f'{section}.{key}']}: {error}") from error.__cause__
         if model is not None:
             fields = model.model_fields
-            found |= {f"{section}.params.{name}": info.description or "" for name, info in fields.items()}
-    return found
+            descriptions |= {
+                f"{section}.params.{name}": info.description or "" for name, info in fields.items()
+            }
+    return descriptions
 
 
 def _param_models(tree: Mapping[str, Any], functions: Functions) -> Iterator[tuple[str, type[BaseModel]]]:
@@ -273,6 +280,6 @@ def _prefixes(loc: tuple[int | str, ...]) -> Iterable[str]:
 def _insert(tree: dict[str, Any], key: str, value: Any) -> None:
     """Insert the value of a dotted key into a tree."""
     *path, last = key.split(".")
-    for part in path:
-        tree = tree.setdefault(part, {})
+    for name in path:
+        tree = tree.setdefault(name, {})
     tree[last] = value

@@ -34,19 +34,19 @@ Feature = Literal[
     "distance",
 ]
 Share = Annotated[float, Field(ge=0, le=1)]
-Three = tuple[PositiveFloat, PositiveFloat, PositiveFloat]
-Six = tuple[float, float, float, float, float, float]
-UNFIT = "unfit"  # type of an error whose sentence already contains the stated value
+Size3D = tuple[PositiveFloat, PositiveFloat, PositiveFloat]
+PointRange = tuple[float, float, float, float, float, float]
+COMPLETE_SENTENCE = "unfit"  # type of an error whose text contains the stated value
 
 
-def _unfit(sentence: str) -> PydanticCustomError:
+def _complete_error(sentence: str) -> PydanticCustomError:
     """Return an error for pydantic with a complete sentence."""
-    return PydanticCustomError(UNFIT, "{sentence}", {"sentence": sentence})
+    return PydanticCustomError(COMPLETE_SENTENCE, "{sentence}", {"sentence": sentence})
 
 
-def _one_or_several(given: Any) -> Any:
+def _as_list(value: Any) -> Any:
     """Return a single string as a list."""
-    return [given] if isinstance(given, str) else given
+    return [value] if isinstance(value, str) else value
 
 
 class PillarParams(BaseModel):
@@ -54,10 +54,10 @@ class PillarParams(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True, validate_default=True)
 
-    point_range: Six = Field(
+    point_range: PointRange = Field(
         description="metres: lowest x, y, z, then highest x, y, z of the points that the network is shown"
     )
-    voxel_size: Three = Field(
+    voxel_size: Size3D = Field(
         description="metres: edges of a pillar; in z it reaches through the whole point_range"
     )
     features: tuple[Feature, ...] = Field(
@@ -66,7 +66,7 @@ class PillarParams(BaseModel):
         "mean_y, mean_z from the mean of its pillar; center_x, center_y, center_z from its pillar's centre; "
         "distance from the origin",
     )
-    classes: Annotated[tuple[str, ...], BeforeValidator(_one_or_several)] = Field(
+    classes: Annotated[tuple[str, ...], BeforeValidator(_as_list)] = Field(
         min_length=1, description="class names in the network's order"
     )
     encoder: str = Field("", description="ONNX file of the pillars' encoder, where the network is two files")
@@ -149,56 +149,58 @@ class PillarParams(BaseModel):
 
     @field_validator("point_range")
     @classmethod
-    def _upwards(cls, given: Six) -> Six:
+    def _upwards(cls, point_range: PointRange) -> PointRange:
         """Check that each low end is below its high end."""
-        if any(low >= high for low, high in zip(given[:3], given[3:], strict=True)):
-            raise _unfit("has a low end above its high one: it is lowest x, y, z, then highest x, y, z")
-        return given
+        if any(low >= high for low, high in zip(point_range[:3], point_range[3:], strict=True)):
+            raise _complete_error(
+                "has a low end above its high one: it is lowest x, y, z, then highest x, y, z"
+            )
+        return point_range
 
     @field_validator("voxel_size")
     @classmethod
-    def _whole(cls, given: Three, info: ValidationInfo) -> Three:
+    def _whole(cls, voxel_size: Size3D, info: ValidationInfo) -> Size3D:
         """Check that pillars have the full height and divide the range evenly."""
-        if (around := info.data.get("point_range")) is None:
-            return given
-        reach = [high - low for low, high in zip(around[:3], around[3:], strict=True)]
-        if given[2] < reach[2] * 0.999:
-            raise _unfit(
-                f"is {given[2]:g} m in z, less than the {reach[2]:g} m of point_range: these are voxels, and "
-                "only networks on pillars can be run"
+        if (point_range := info.data.get("point_range")) is None:
+            return voxel_size
+        extent = [high - low for low, high in zip(point_range[:3], point_range[3:], strict=True)]
+        if voxel_size[2] < extent[2] * 0.999:
+            raise _complete_error(
+                f"is {voxel_size[2]:g} m in z, less than the {extent[2]:g} m of point_range: these "
+                "are voxels, and only networks on pillars can be run"
             )
-        for axis, length, edge in zip("xy", reach, given, strict=False):
+        for axis, length, edge in zip("xy", extent, voxel_size, strict=False):
             if abs(length / edge - round(length / edge)) > 0.01:
-                raise _unfit(
+                raise _complete_error(
                     f"makes {length / edge:.2f} pillars of the {length:g} m of point_range in {axis}"
                 )
-        return given
+        return voxel_size
 
     @field_validator("classes")
     @classmethod
-    def _different(cls, given: tuple[str, ...]) -> tuple[str, ...]:
+    def _different(cls, classes: tuple[str, ...]) -> tuple[str, ...]:
         """Check that no class is named twice."""
-        if len(set(given)) < len(given):
-            raise _unfit("has a name twice")
-        return given
+        if len(set(classes)) < len(classes):
+            raise _complete_error("has a name twice")
+        return classes
 
     @field_validator("score_thresholds", "min_rotation")
     @classmethod
-    def _known(cls, given: Mapping[str, float], info: ValidationInfo) -> Mapping[str, float]:
+    def _known(cls, by_class: Mapping[str, float], info: ValidationInfo) -> Mapping[str, float]:
         """Check that each name is a class."""
-        known = info.data.get("classes", ())
-        for name in given:
-            if name not in known:
-                raise _unfit(f"names '{name}', which is none of classes: {', '.join(known)}")
-        return given
+        classes = info.data.get("classes", ())
+        for name in by_class:
+            if name not in classes:
+                raise _complete_error(f"names '{name}', which is none of classes: {', '.join(classes)}")
+        return by_class
 
     @field_validator("groups")
     @classmethod
-    def _all(cls, given: Any, info: ValidationInfo) -> Any:
+    def _all(cls, groups: Any, info: ValidationInfo) -> Any:
         """Check that the groups contain all classes in their order."""
-        if given and tuple(name for group in given for name in group) != info.data.get("classes"):
-            raise _unfit("must hold the names of classes, each once and in their order")
-        return given
+        if groups and tuple(name for group in groups for name in group) != info.data.get("classes"):
+            raise _complete_error("must hold the names of classes, each once and in their order")
+        return groups
 
     @property
     def grid(self) -> tuple[int, int]:
@@ -208,8 +210,16 @@ class PillarParams(BaseModel):
         return nx, ny
 
 
-FED = ("point_range", "voxel_size", "features", "max_points", "max_pillars", "intensity_scale", "z_offset")
-"""The parameters that decide what the network is shown; with equal ones it answers the same."""
+INPUT_PARAMS = (
+    "point_range",
+    "voxel_size",
+    "features",
+    "max_points",
+    "max_pillars",
+    "intensity_scale",
+    "z_offset",
+)
+"""Parameters that decide the input of the network. With equal ones its output is the same."""
 
 
 def is_network(method: str) -> bool:

@@ -33,8 +33,8 @@ POSITIONAL = (Parameter.POSITIONAL_ONLY, Parameter.POSITIONAL_OR_KEYWORD)
 # Allowed names of a stage's first parameter.
 CLOUDS = ("points", "cloud", "point_cloud", "pointcloud", "pts", "xyz", "xyzi", "voxels", "obstacles")
 IMAGES = ("image", "img", "bgr", "frame", "picture")
-_ARRAY_TYPE = re.compile(r"\b(ndarray|NDArray|ArrayLike|Tensor)\b")
-HOW = "write a function whose first parameter is 'points' or 'image' (docs/stages.md)"
+_ARRAY_ANNOTATION = re.compile(r"\b(ndarray|NDArray|ArrayLike|Tensor)\b")
+STAGE_HINT = "write a function whose first parameter is 'points' or 'image' (docs/stages.md)"
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,8 +61,8 @@ class Plugin:
     @property
     def file(self) -> Path | None:
         """File that the module was loaded from, or None if there is no file."""
-        found = getattr(sys.modules.get(self.module), "__file__", None)
-        return Path(found) if found else None
+        path = getattr(sys.modules.get(self.module), "__file__", None)
+        return Path(path) if path else None
 
     @property
     def version(self) -> str:
@@ -97,32 +97,32 @@ def find(name: str, folder: str | None = "") -> Plugin:
         UserError: the module or name does not exist, cannot be imported, or is no stage.
     """
     module_name, _, attribute = name.partition(":")
-    if not all(part.isidentifier() for part in (*module_name.split("."), *attribute.split("."))):
+    if not all(name_part.isidentifier() for name_part in (*module_name.split("."), *attribute.split("."))):
         raise UserError(f"'{name}' is no module:function")
     if module_name.partition(".")[0] in sys.stdlib_module_names:
-        raise UserError(f"'{name}' is no stage: module '{module_name}' is a part of Python; {HOW}")
-    module = _imported(module_name, folder)
+        raise UserError(f"'{name}' is no stage: module '{module_name}' is a part of Python; {STAGE_HINT}")
+    module = _import_module(module_name, folder)
     try:
         target = EntryPoint(name, name, GROUP).load()
     except AttributeError:
-        own = {n: v for n, v in vars(module).items() if getattr(v, "__module__", "") == module_name}
-        there = [n for n, v in own.items() if callable(v) and n != PARAMS and not n.startswith("_")]
-        listed = f"; it has {', '.join(there[:8])}" if there else ""
+        members = {n: v for n, v in vars(module).items() if getattr(v, "__module__", "") == module_name}
+        candidates = [n for n, v in members.items() if callable(v) and n != PARAMS and not n.startswith("_")]
+        listed = f"; it has {', '.join(candidates[:8])}" if candidates else ""
         raise UserError(f"module '{module_name}' has no '{attribute}'{listed}") from None
     if not callable(target):
         raise UserError(f"'{name}' is a {type(target).__name__}, not a function")
     params = getattr(module, PARAMS, None)
     if not (isinstance(params, type) and issubclass(params, BaseModel)):
         params = None
-    if folder is not None and (fault := _fault(target, has_params=params is not None)):
+    if folder is not None and (fault := _target_fault(target, has_params=params is not None)):
         raise UserError(f"'{name}' is no stage: {fault}")
-    return Plugin(name, target, params, params is not None and _takes_two(target))
+    return Plugin(name, target, params, params is not None and _accepts_params(target))
 
 
-def _imported(name: str, folder: str | None) -> ModuleType:
+def _import_module(name: str, folder: str | None) -> ModuleType:
     """Import a module for ``find``."""
     try:
-        with _importing(name, folder):
+        with _importing_from(name, folder):
             return importlib.import_module(name)
     except UserError:
         raise
@@ -133,66 +133,66 @@ def _imported(name: str, folder: str | None) -> ModuleType:
         ) from None
     except Exception as error:  # A user's file may raise anything.
         line = traceback.extract_tb(error.__traceback__)[-1]
-        place = f" ({Path(line.filename).name}, line {line.lineno})"
+        position = f" ({Path(line.filename).name}, line {line.lineno})"
         raise UserError(
-            f"'{name}' cannot be imported: {type(error).__name__}: {first_line(error)}{place}"
+            f"'{name}' cannot be imported: {type(error).__name__}: {first_line(error)}{position}"
         ) from error
 
 
-def _takes_two(target: Callable[..., Any]) -> bool:
+def _accepts_params(target: Callable[..., Any]) -> bool:
     """Return whether a target accepts parameters: a class in its constructor, a function after the array."""
-    wanted = 1 if isinstance(target, type) else 2
+    min_count = 1 if isinstance(target, type) else 2
     try:
-        given = signature(target).parameters.values()
+        parameters = signature(target).parameters.values()
     except (TypeError, ValueError):
         return True
-    positional = [p for p in given if p.kind in POSITIONAL]
-    return len(positional) >= wanted or any(p.kind is Parameter.VAR_POSITIONAL for p in given)
+    positional = [p for p in parameters if p.kind in POSITIONAL]
+    return len(positional) >= min_count or any(p.kind is Parameter.VAR_POSITIONAL for p in parameters)
 
 
 # --- signatures of stages ----------------------------------------------------------------------
 
 
-def _fault(target: Callable[..., Any], *, has_params: bool) -> str:
+def _target_fault(target: Callable[..., Any], *, has_params: bool) -> str:
     """Return why a target is no stage, or an empty string if it is one.
 
     The signature must be that of a stage. This keeps out ``numpy:load`` and the like, which accept any
     argument and run code in the file they read.
     """
     if isinstance(target, type):
-        made, call = (
+        constructor, call = (
             next((vars(base)[name] for base in target.__mro__ if name in vars(base)), None)
             for name in ("__init__", "__call__")
         )
-        if not _is_ours(target) or not _plain(call):
-            return f"a class needs a method __call__(self, points) of its own; {HOW}"
-        if _plain(made) and (fault := _misfit(made, 1, 1 + has_params)):
-            return f"{fault}; {HOW}"
-        return _unlike_a_stage(call, 1, 0)
-    if not _plain(target) or not _is_ours(target):
-        return f"it is no Python function or class of a module outside Python's own library; {HOW}"
-    return _unlike_a_stage(target, 0, int(has_params))
+        if not _is_outside_library(target) or not _is_python_function(call):
+            return f"a class needs a method __call__(self, points) of its own; {STAGE_HINT}"
+        if _is_python_function(constructor) and (fault := _missing_argument(constructor, 1, 1 + has_params)):
+            return f"{fault}; {STAGE_HINT}"
+        return _signature_fault(call, 1, 0)
+    if not _is_python_function(target) or not _is_outside_library(target):
+        return f"it is no Python function or class of a module outside Python's own library; {STAGE_HINT}"
+    return _signature_fault(target, 0, int(has_params))
 
 
-def _unlike_a_stage(function: Any, own: int, more: int) -> str:
+def _signature_fault(function: Any, skipped: int, additional: int) -> str:
     """Return how a signature differs from that of a stage, or an empty string.
 
     Args:
         function: function that gets the array.
-        own: number of parameters before the array (``self``).
-        more: number of arguments that may follow the array.
+        skipped: number of parameters before the array (``self``).
+        additional: number of arguments that may follow the array.
     """
-    names = [p for p in signature(function).parameters.values() if p.kind in POSITIONAL][own:]
+    names = [p for p in signature(function).parameters.values() if p.kind in POSITIONAL][skipped:]
     if not names:
-        return f"it takes no array; {HOW}"
+        return f"it takes no array; {STAGE_HINT}"
     array = names[0]
-    if array.name not in (*CLOUDS, *IMAGES) and not _ARRAY_TYPE.search(str(array.annotation)):
-        return f"its first parameter is '{array.name}'; {HOW}"
-    fault = _misfit(function, own + 1, own + 1 + more)
-    return f"{fault}; {HOW}" if fault else ""
+    if array.name not in (*CLOUDS, *IMAGES) and not _ARRAY_ANNOTATION.search(str(array.annotation)):
+        return f"its first parameter is '{array.name}'; {STAGE_HINT}"
+    fault = _missing_argument(function, skipped + 1, skipped + 1 + additional)
+    return f"{fault}; {STAGE_HINT}" if fault else ""
 
 
-def _misfit(function: Any, first: int, last: int) -> str:
+def _missing_argument(function: Any, first: int, last: int) -> str:
     """Return the sentence about a required parameter that gets no argument, or an empty string.
 
     Args:
@@ -200,21 +200,21 @@ def _misfit(function: Any, first: int, last: int) -> str:
         first: number of arguments that it always gets.
         last: number of arguments that it gets at most.
     """
-    stated = list(signature(function).parameters.values())
-    needed = [p for p in stated if p.kind in POSITIONAL and p.default is Parameter.empty][last:]
-    needed += [p for p in stated if p.kind is Parameter.KEYWORD_ONLY and p.default is Parameter.empty]
-    if not needed:
+    parameters = list(signature(function).parameters.values())
+    required = [p for p in parameters if p.kind in POSITIONAL and p.default is Parameter.empty][last:]
+    required += [p for p in parameters if p.kind is Parameter.KEYWORD_ONLY and p.default is Parameter.empty]
+    if not required:
         return ""
-    why = f"its module has no model {PARAMS}" if last <= first else "nothing is given for it"
-    return f"it needs '{needed[0].name}', and {why}"
+    reason = f"its module has no model {PARAMS}" if last <= first else "nothing is given for it"
+    return f"it needs '{required[0].name}', and {reason}"
 
 
-def _plain(target: object) -> bool:
+def _is_python_function(target: object) -> bool:
     """Return whether a target is a Python function, perhaps with a decorator such as numba's."""
     return isinstance(unwrap(target) if callable(target) else target, FunctionType)
 
 
-def _is_ours(target: Any) -> bool:
+def _is_outside_library(target: Any) -> bool:
     """Return whether a target is defined outside Python's standard library."""
     module = getattr(unwrap(target), "__module__", None) or "builtins"
     return module.partition(".")[0] not in sys.stdlib_module_names
@@ -232,31 +232,31 @@ def local_files(names: Iterable[str], folder: Path) -> tuple[Path, ...]:
         names: ``module:name`` each.
         folder: folder that may contain the modules.
     """
-    found: dict[Path, None] = {}
-    waiting = [name.partition(":")[0] for name in names]
-    seen = set(waiting)
-    while waiting:
-        module = waiting.pop()
+    files: dict[Path, None] = {}
+    pending = [name.partition(":")[0] for name in names]
+    known = set(pending)
+    while pending:
+        module = pending.pop()
         parts = module.split(".")
         for end in range(1, len(parts) + 1):
             file = _file_of(".".join(parts[:end]), folder)
-            if file is None or file in found:
+            if file is None or file in files:
                 continue
-            found[file] = None
+            files[file] = None
             package = parts[:end] if file.name == "__init__.py" else parts[: end - 1]
-            imported = [name for name in _imports(file, package) if name not in seen]
-            waiting += imported
-            seen.update(imported)
-    return tuple(sorted(found))
+            imported = [name for name in _imports(file, package) if name not in known]
+            pending += imported
+            known.update(imported)
+    return tuple(sorted(files))
 
 
 def _file_of(module: str, folder: Path) -> Path | None:
     """Return the source file of a module in a folder, or None."""
     parts = module.split(".")
-    if not all(part.isidentifier() for part in parts):
+    if not all(name.isidentifier() for name in parts):
         return None
-    place = folder.joinpath(*parts)
-    choices = (place / "__init__.py", place.with_name(f"{parts[-1]}.py"))
+    path = folder.joinpath(*parts)
+    choices = (path / "__init__.py", path.with_name(f"{parts[-1]}.py"))
     return next((file for file in choices if file.is_file()), None)
 
 
@@ -270,8 +270,8 @@ def _imports(file: Path, package: Sequence[str]) -> Iterator[str]:
         if isinstance(node, ast.Import):
             yield from (name.name for name in node.names)
         elif isinstance(node, ast.ImportFrom):
-            above = list(package[: len(package) - node.level + 1]) if node.level else []
-            base = ".".join([*above, *([node.module] if node.module else [])])
+            parents = list(package[: len(package) - node.level + 1]) if node.level else []
+            base = ".".join([*parents, *([node.module] if node.module else [])])
             if base:
                 yield base
             yield from (f"{base}.{name.name}".lstrip(".") for name in node.names)
@@ -308,8 +308,8 @@ class _FolderFinder(MetaPathFinder):
 
     def has(self, name: str) -> bool:
         """Return whether a module or package is among the trusted files."""
-        place = self.folder.joinpath(*name.split("."))
-        return _file_of(name, self.folder) in self.files or any(place in file.parents for file in self.files)
+        path = self.folder.joinpath(*name.split("."))
+        return _file_of(name, self.folder) in self.files or any(path in file.parents for file in self.files)
 
     def check(self, name: str) -> None:
         """Raise UserError if another module of the same name has already been imported."""
@@ -336,7 +336,7 @@ class _SourceLoader(SourceFileLoader):
 
 
 @contextmanager
-def _importing(module: str, folder: str | None) -> Iterator[None]:
+def _importing_from(module: str, folder: str | None) -> Iterator[None]:
     """Let modules be found in a folder, see ``find``."""
     if folder is None:
         yield
@@ -350,38 +350,40 @@ def _importing(module: str, folder: str | None) -> Iterator[None]:
             sys.meta_path.insert(0, finder)
         finder.is_importing = True
         try:
-            with _without_here():
+            with _without_working_directory():
                 yield
         finally:
             finder.is_importing = False
     else:
-        with _from_here():
+        with _with_working_directory():
             yield
 
 
 @contextmanager
-def _from_here() -> Iterator[None]:
+def _with_working_directory() -> Iterator[None]:
     """Add the working directory to the module path. A console script has only its own folder there."""
-    here = str(Path.cwd())
-    if here in sys.path or "" in sys.path:
+    directory = str(Path.cwd())
+    if directory in sys.path or "" in sys.path:
         yield
         return
-    sys.path.append(here)
+    sys.path.append(directory)
     try:
         yield
     finally:
-        sys.path.remove(here)
+        sys.path.remove(directory)
 
 
 @contextmanager
-def _without_here() -> Iterator[None]:
+def _without_working_directory() -> Iterator[None]:
     """Remove the working directory, which ``python -m`` adds, from the path unless PYTHONPATH names it."""
-    stated = os.environ.get("PYTHONPATH", "").split(os.pathsep)
-    here = ("", str(Path.cwd()))
-    left_out = [path for path in sys.path if path in here and (not path or path not in stated)]
-    for path in left_out:
+    from_environment = os.environ.get("PYTHONPATH", "").split(os.pathsep)
+    directories = ("", str(Path.cwd()))
+    removed = [
+        path for path in sys.path if path in directories and (not path or path not in from_environment)
+    ]
+    for path in removed:
         sys.path.remove(path)
     try:
         yield
     finally:
-        sys.path[:0] = left_out
+        sys.path[:0] = removed

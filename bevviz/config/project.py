@@ -43,9 +43,9 @@ NAME = "bevviz.toml"
 MODEL = "BEVVIZ_MODEL"
 
 
-def _several(given: Any) -> Any:
+def _as_list(value: Any) -> Any:
     """Return a single string as a list."""
-    return [given] if isinstance(given, str) else given
+    return [value] if isinstance(value, str) else value
 
 
 class ProjectFile(BaseModel):
@@ -54,7 +54,7 @@ class ProjectFile(BaseModel):
     model_config = ConfigDict(extra="allow", strict=True)
 
     model: str = Field("", description="as --model")
-    config: Annotated[list[str], BeforeValidator(_several)] = Field([], description="as --config")
+    config: Annotated[list[str], BeforeValidator(_as_list)] = Field([], description="as --config")
     preset: Preset | None = Field(None, description="as --preset")
 
 
@@ -65,14 +65,14 @@ def layers(folder: Path, environment: Mapping[str, str] = os.environ) -> list[La
         UserError: the project file, or a file that it names, cannot be used.
     """
     path = find(folder)
-    found: list[Layer] = []
+    project_layers: list[Layer] = []
     if path is not None:
-        stated = _of_file(path)
-        trust = trust_in(_code(path, stated))
-        found = [replace(layer, trust=trust) for layer in stated]
+        file_layers = _read_layers(path)
+        trust = trust_in(_named_code(path, file_layers))
+        project_layers = [replace(layer, trust=trust) for layer in file_layers]
     if model := environment.get(MODEL, "").strip():
-        found.append(Layer(MODEL, {"detector.model": model}, USER))
-    return found
+        project_layers.append(Layer(MODEL, {"detector.model": model}, USER))
+    return project_layers
 
 
 def find(folder: Path) -> Path | None:
@@ -81,8 +81,8 @@ def find(folder: Path) -> Path | None:
     Raises:
         UserError: a folder cannot be read.
     """
-    for place in (folder, *folder.parents):
-        path = place / NAME
+    for parent in (folder, *folder.parents):
+        path = parent / NAME
         try:
             is_there = path.is_file()
         except OSError as error:
@@ -98,49 +98,51 @@ def named_code(path: Path) -> NamedCode:
     Raises:
         UserError: the file, or a file that it names, cannot be used.
     """
-    return _code(path, _of_file(path) if path.suffix == ".toml" else [read_layer(path)])
+    return _named_code(path, _read_layers(path) if path.suffix == ".toml" else [read_layer(path)])
 
 
-def _code(path: Path, stated: Sequence[Layer]) -> NamedCode:
+def _named_code(path: Path, file_layers: Sequence[Layer]) -> NamedCode:
     """Return the functions that the layers of a file name."""
-    files = [Path(layer.where) for layer in stated if layer.where != str(path)]
-    functions = dict.fromkeys(function for layer in stated for function in layer.functions)
+    files = [Path(layer.where) for layer in file_layers if layer.where != str(path)]
+    functions = dict.fromkeys(function for layer in file_layers for function in layer.functions)
     return NamedCode((path, *files), tuple(functions))
 
 
-def _of_file(path: Path) -> list[Layer]:
+def _read_layers(path: Path) -> list[Layer]:
     """Read the YAML files that a project file names, and then the project file itself."""
     try:
-        stated = ProjectFile.model_validate(toml_tree(path, f"{path}: cannot read the project file"))
+        project = ProjectFile.model_validate(toml_tree(path, f"{path}: cannot read the project file"))
     except ValidationError as error:
         first = error.errors()[0]
-        key = ".".join(str(part) for part in first["loc"])
-        about = ProjectFile.model_fields[str(first["loc"][0])].description
+        key = ".".join(str(item) for item in first["loc"])
+        description = ProjectFile.model_fields[str(first["loc"][0])].description
         message = first["msg"].replace("Input should be", "must be")
-        raise UserError(f"{path}: {key} {message} (given: {shown(first['input'])}); it is {about}") from None
-    sections = stated.model_extra or {}
+        raise UserError(
+            f"{path}: {key} {message} (given: {shown(first['input'])}); it is {description}"
+        ) from None
+    sections = project.model_extra or {}
     known = [*ProjectFile.model_fields, *Config.model_fields, *TUTORIAL_NAMES]
     for name in sections:
         if name not in known and "." not in name:
-            near = difflib.get_close_matches(name, known, 1)
-            hint = f"; did you mean '{near[0]}'?" if near else ""
+            nearest = difflib.get_close_matches(name, known, 1)
+            hint = f"; did you mean '{nearest[0]}'?" if nearest else ""
             raise UserError(f"{path}: unknown key '{name}'{hint}")
-    own = flattened(sections)
-    if stated.preset is not None:
-        own["preset"] = stated.preset
-    if stated.model:
-        own["detector.model"] = stated.model
+    own_values = flattened(sections)
+    if project.preset is not None:
+        own_values["preset"] = project.preset
+    if project.model:
+        own_values["detector.model"] = project.model
     for key in ("detector.model", "detector.names"):
-        if isinstance(own.get(key), str):
-            own[key] = _from(path.parent, key, own[key])
+        if isinstance(own_values.get(key), str):
+            own_values[key] = _relative_to(path.parent, key, own_values[key])
     for key in ("objects.method", "objects.encoder", "objects.params.encoder"):
-        if is_network(str(own.get(key, ""))):
-            own[key] = str(path.parent / own[key])
-    named = [read_layer(path.parent / name, pipe=False) for name in stated.config]
-    return [*named, Layer(str(path), own)]
+        if is_network(str(own_values.get(key, ""))):
+            own_values[key] = str(path.parent / own_values[key])
+    yaml_layers = [read_layer(path.parent / name, pipe=False) for name in project.config]
+    return [*yaml_layers, Layer(str(path), own_values)]
 
 
-def _from(folder: Path, key: str, value: str) -> str:
+def _relative_to(folder: Path, key: str, value: str) -> str:
     """Return a file name relative to a folder. A name that is no file stays as it is."""
     known = (*OURS, *plugins.registered()) if key == "detector.model" else CLASS_LISTS
     return value if not value or value in known or ":" in value else str(folder / value)

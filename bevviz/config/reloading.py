@@ -63,7 +63,7 @@ class Settings:
         Raises:
             UserError: as ``bevviz.config.load``.
         """
-        settings = self._with(more, without)
+        settings = self._settings_with(more, without)
         return load(self.file, settings, self._preset, layers=self._layers, in_force=self.config)
 
     def take(self, more: Sequence[str]) -> None:
@@ -77,9 +77,9 @@ class Settings:
     def keep(self, config: Config, more: Sequence[str] = (), without: Sequence[str] = ()) -> None:
         """Put a configuration from ``read`` in force, with the same additional and withdrawn settings."""
         self.config = config
-        self._settings = self._with(more, without)
+        self._settings = self._settings_with(more, without)
 
-    def _with(self, more: Sequence[str], without: Sequence[str]) -> list[str | Layer]:
+    def _settings_with(self, more: Sequence[str], without: Sequence[str]) -> list[str | Layer]:
         """Return the settings with some added and some taken back."""
         newest_first = self._settings[::-1]
         for setting in received(without, trust=MESSAGE):
@@ -92,7 +92,7 @@ class Settings:
         Editors write in place or replace the file. The inode shows the second case.
         """
         try:
-            found = self.file.stat() if self.file else None
+            status = self.file.stat() if self.file else None
         except OSError:
             return None
-        return (found.st_mtime_ns, found.st_size, found.st_ino) if found else None
+        return (status.st_mtime_ns, status.st_size, status.st_ino) if status else None

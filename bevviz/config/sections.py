@@ -17,7 +17,7 @@ from pydantic import (
 )
 from pydantic_core import PydanticCustomError
 
-from bevviz.config.class_sizes import SIZES, ClassSize, _with_known
+from bevviz.config.class_sizes import SIZES, ClassSize, with_default_sizes
 from bevviz.config.methods import CLUSTERING, GROUND, OBJECTS
 from bevviz.config.units import Degrees, Megabytes, Metres, Pixels, Seconds
 
@@ -138,16 +138,16 @@ class ClusteringConfig(StageSection):
 
     @field_validator("max_cluster_points")
     @classmethod
-    def _leaves_some(cls, most: int | None, info: ValidationInfo) -> int | None:
+    def _leaves_some(cls, max_points: int | None, info: ValidationInfo) -> int | None:
         """Check that the largest allowed cluster is not smaller than the smallest."""
-        least = info.data.get("min_cluster_points", 1)
-        if most is not None and most < least:
+        min_points = info.data.get("min_cluster_points", 1)
+        if max_points is not None and max_points < min_points:
             raise PydanticCustomError(
                 "no_room",
                 "must not be below clustering.min_cluster_points, which is {least}",
-                {"least": least},
+                {"least": min_points},
             )
-        return most
+        return max_points
 
 
 class DetectorConfig(StageSection):
@@ -210,7 +210,7 @@ class ObjectsConfig(StageSection):
         "module:function, (N, 4) points and intensity -> (K, 7) boxes x y z length width height yaw, score, "
         "names; or topic:/objects of the robot",
     )
-    sizes: Annotated[Mapping[str, ClassSize | None], BeforeValidator(_with_known)] = Field(
+    sizes: Annotated[Mapping[str, ClassSize | None], BeforeValidator(with_default_sizes)] = Field(
         SIZES,
         description="frustum: by class, mean length, width, height in metres and the spread of each; "
         "a class that is stated changes alone, null: it has none",
@@ -427,9 +427,9 @@ class Config(Section):
         Raises:
             ValidationError: of pydantic.
         """
-        made = Config.model_validate(tree)
-        made._functions = self._functions
-        return made
+        config = Config.model_validate(tree)
+        config._functions = self._functions
+        return config
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, Config) and self.__dict__ == other.__dict__

@@ -138,8 +138,8 @@ def allow(code: NamedCode) -> None:
     except OSError as error:
         raise UserError(f"{folder}: cannot keep what is trusted: {error.strerror}") from None
     _check(folder)
-    about = {"path": str(code.path), "sha256": code.digest(), "functions": list(code.functions)}
-    save(folder / _name(code.path), json.dumps(about, indent=1) + "\n", "trust")
+    content = {"path": str(code.path), "sha256": code.digest(), "functions": list(code.functions)}
+    save(folder / _name(code.path), json.dumps(content, indent=1) + "\n", "trust")
 
 
 def revoke(path: Path) -> bool:
@@ -161,8 +161,8 @@ def revoke(path: Path) -> bool:
 def records() -> Iterator[TrustRecord]:
     """Iterate over all files that the user has trusted, by path."""
     folder = _folder()
-    found = [record for file in folder.glob("*.json") if (record := _read(file)) is not None]
-    yield from sorted(found, key=lambda record: record.path)
+    all_records = [record for file in folder.glob("*.json") if (record := _read(file)) is not None]
+    yield from sorted(all_records, key=lambda record: record.path)
 
 
 def _record(path: Path) -> TrustRecord | None:
@@ -178,9 +178,9 @@ def _read(file: Path) -> TrustRecord | None:
     """Return the record in a file, or None if this user has not written a valid one."""
     try:
         _check(file.parent)
-        about = json.loads(file.read_text(encoding="utf-8"))
-        functions = tuple(str(function) for function in about["functions"])
-        return TrustRecord(Path(about["path"]), str(about["sha256"]), functions)
+        content = json.loads(file.read_text(encoding="utf-8"))
+        functions = tuple(str(function) for function in content["functions"])
+        return TrustRecord(Path(content["path"]), str(content["sha256"]), functions)
     except (OSError, ValueError, KeyError, TypeError, UserError):
         return None
 
@@ -197,9 +197,9 @@ def _folder() -> Path:
     Raises:
         UserError: the user has no home folder.
     """
-    stated = Path(os.environ.get("XDG_DATA_HOME", ""))
+    data_home = Path(os.environ.get("XDG_DATA_HOME", ""))
     try:
-        data = stated if stated.is_absolute() else Path.home() / ".local" / "share"
+        data = data_home if data_home.is_absolute() else Path.home() / ".local" / "share"
     except RuntimeError:
         raise UserError("there is no folder for what you trust: set XDG_DATA_HOME") from None
     return data / "bevviz" / "trusted"

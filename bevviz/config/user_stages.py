@@ -41,8 +41,8 @@ def _plugin(section: str, method: str, functions: Functions) -> plugins.Plugin |
             raise UserError(f"{section}.{STAGES[section]} {method}: no function that the user has named")
         folder = functions[section, method]
     else:
-        ours = method in OURS or (section == "detector" and Path(method).exists())
-        name = "" if ours else plugins.registered().get(method, "")
+        is_builtin = method in OURS or (section == "detector" and Path(method).exists())
+        name = "" if is_builtin else plugins.registered().get(method, "")
     if not name:
         return None
     try:
@@ -53,8 +53,8 @@ def _plugin(section: str, method: str, functions: Functions) -> plugins.Plugin |
 
 def stage_topics(config: Config) -> dict[str, str]:
     """Return the robot's topics that replace stages, by the dotted key that names each."""
-    named = {f"{s}.{key}": str(getattr(getattr(config, s), key)) for s, key in STAGES.items()}
-    return {key: name.removeprefix(TOPIC) for key, name in named.items() if name.startswith(TOPIC)}
+    methods = {f"{s}.{key}": str(getattr(getattr(config, s), key)) for s, key in STAGES.items()}
+    return {key: name.removeprefix(TOPIC) for key, name in methods.items() if name.startswith(TOPIC)}
 
 
 def object_network(config: Config) -> PillarParams | None:
@@ -71,14 +71,14 @@ def object_files(config: Config) -> dict[str, str]:
     return {key: file for key, file in files.items() if file}
 
 
-def with_object_files(config: Config, named: Callable[[str], str]) -> Config:
+def with_object_files(config: Config, rename: Callable[[str], str]) -> Config:
     """Return the configuration with the files of the 3D detector renamed by ``named``."""
     files = object_files(config)
     if not files:
         return config
-    encoder = named(files.get("objects.params.encoder", "")) if len(files) > 1 else ""
+    encoder = rename(files.get("objects.params.encoder", "")) if len(files) > 1 else ""
     params = {**config.objects.params, "encoder": encoder}
-    changed = {"method": named(files["objects.method"]), "params": params}
+    changed = {"method": rename(files["objects.method"]), "params": params}
     return config.model_copy(update={"objects": config.objects.model_copy(update=changed)})
 
 

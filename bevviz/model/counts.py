@@ -46,6 +46,6 @@ def opinions_in(result: FrameResult) -> Mapping[str, int]:
     """Return the number of objects for each opinion of cameras. Objects of our fusion have no opinions."""
     if (opinions := result.opinions) is None:
         return {}
-    said = Counter(Opinion(value).word.replace(" ", "_") for value in opinions.opinion.tolist())
-    said["missed"] = int(opinions.missed.sum())
-    return {what: said[what] for what in OPINIONS}
+    numbers = Counter(Opinion(value).word.replace(" ", "_") for value in opinions.opinion.tolist())
+    numbers["missed"] = int(opinions.missed.sum())
+    return {name: numbers[name] for name in OPINIONS}

@@ -25,7 +25,7 @@ from bevviz.model.results import (
     Splits,
 )
 
-SOME = 0.1  # Least share of noise in the points of a detection that an explanation mentions.
+MIN_NOISE_SHARE = 0.1  # Least share of noise in the points of a detection that an explanation mentions.
 
 
 def explain(
@@ -57,19 +57,19 @@ def explain(
         objects: objects of the frame.
         opinions: opinions of the cameras on them. None: our fusion made the objects.
     """
-    found: list[Explanation] = []
+    explanations: list[Explanation] = []
     for result in cameras:
-        found.extend(_problems(result, config))
+        explanations.extend(_problems(result, config))
         if result.detections is not None:
-            found.extend(_detections(result, result.detections, clusters, config, lidar))
+            explanations.extend(_detections(result, result.detections, clusters, config, lidar))
     if clusters is not None:
-        found.extend(_clusters(cameras, clusters, config))
+        explanations.extend(_clusters(cameras, clusters, config))
     if splits is not None:
-        found.extend(_splits(cameras, splits))
+        explanations.extend(_splits(cameras, splits))
     if objects is not None and opinions is not None:
-        found.extend(_objects(objects, opinions, cameras, clusters, config))
-        found.extend(_fused(objects, opinions, clusters, config))
-    return tuple(found)
+        explanations.extend(_objects(objects, opinions, cameras, clusters, config))
+        explanations.extend(_fused(objects, opinions, clusters, config))
+    return tuple(explanations)
 
 
 def _problems(result: CameraResult, config: Config) -> Iterator[Explanation]:
@@ -130,8 +130,8 @@ def _detection(
             + in_mask(fusion, d, config)
         )
     if decision is Decision.MATCHED:
-        named = (fusion.cluster_decision == Decision.MATCHED) & (fusion.cluster_detection == d)
-        others = [str(other) for other in np.flatnonzero(named).tolist() if other != k]
+        is_matched = (fusion.cluster_decision == Decision.MATCHED) & (fusion.cluster_detection == d)
+        others = [str(other) for other in np.flatnonzero(is_matched).tolist() if other != k]
         if not others:
             return f"{evidence}, matched"
         also = f"clusters {', '.join(others)} take" if others[1:] else f"cluster {others[0]} takes"
@@ -179,10 +179,10 @@ def _unclustered(
 
 def _noise(config: Config) -> str:
     """Return the parameter or the method that decided what is noise."""
-    method = config.clustering.method
-    if method in OURS:
+    method_name = config.clustering.method
+    if method_name in OURS:
         return f"clustering.min_points is {config.clustering.min_points}"
-    return f"by {method.removeprefix(TOPIC)}"
+    return f"by {method_name.removeprefix(TOPIC)}"
 
 
 # --- clusters ----------------------------------------------------------------------------------
@@ -244,31 +244,36 @@ def _splits(cameras: Sequence[CameraResult], splits: Splits) -> Iterator[Explana
     """Yield the explanation of each cluster that a detection split or merged."""
     by_name = {result.camera.name: result.detections for result in cameras}
     keys = list(zip(splits.camera, splits.detection.tolist(), splits.cluster.tolist(), strict=True))
-    for camera, d, part in dict.fromkeys(keys):
+    for camera, d, part_cluster in dict.fromkeys(keys):
         detections = by_name[camera]
         assert detections is not None
-        by = f"by {_label(detections, d)}"
-        whole, noise = [], 0
-        rows = [row for row, key in enumerate(keys) if key == (camera, d, part)]
+        label_text = f"by {_label(detections, d)}"
+        cluster_points, noise_points = [], 0
+        rows = [row for row, key in enumerate(keys) if key == (camera, d, part_cluster)]
         for row in rows:
-            rest, points = int(splits.rest[row]), int(splits.points[row])
+            rest_cluster, points = int(splits.rest[row]), int(splits.points[row])
             share = f"{points:,} of {splits.of[row]:,} points"
-            if rest >= 0:
-                text = f"cluster {rest} split {by}: {share} are cluster {part}"
-                yield Explanation("split", camera, rest, "split", text)
+            if rest_cluster >= 0:
+                text = f"cluster {rest_cluster} split {label_text}: {share} are cluster {part_cluster}"
+                yield Explanation("split", camera, rest_cluster, "split", text)
             elif points < splits.of[row]:
-                text = f"cluster {part} split {by}: {share} of a cluster that others have the rest of"
-                yield Explanation("split", camera, part, "split", text)
+                text = f"cluster {part_cluster} split {label_text}: {share} of a cluster "
+                text += "that others have the rest of"
+                yield Explanation("split", camera, part_cluster, "split", text)
             elif splits.is_noise[row]:
-                noise = points
+                noise_points = points
             else:
-                whole.append(f"{points:,}")
-        if len(whole) > 1 or noise > SOME * splits.points[rows].sum():
-            pieces = [f"clusters of {' and '.join(whole)} points"] if len(whole) > 1 else []
-            pieces += [f"a cluster of {whole[0]} points"] if len(whole) == 1 else []
-            pieces += [f"{_points(noise)} of noise"] if noise else []
+                cluster_points.append(f"{points:,}")
+        if len(cluster_points) > 1 or noise_points > MIN_NOISE_SHARE * splits.points[rows].sum():
+            pieces = [f"clusters of {' and '.join(cluster_points)} points"] if len(cluster_points) > 1 else []
+            pieces += [f"a cluster of {cluster_points[0]} points"] if len(cluster_points) == 1 else []
+            pieces += [f"{_points(noise_points)} of noise"] if noise_points else []
             yield Explanation(
-                "split", camera, part, "merged", f"cluster {part} made {by} of {' and '.join(pieces)}"
+                "split",
+                camera,
+                part_cluster,
+                "merged",
+                f"cluster {part_cluster} made {label_text} of {' and '.join(pieces)}",
             )
 
 
@@ -302,18 +307,18 @@ def _opinion(
     config: Config,
 ) -> str:
     """Return the opinion on object ``k`` in words, with the number that decided it."""
-    camera, least = "" if result is None else result.camera.name, config.opinions
+    camera, limits = "" if result is None else result.camera.name, config.opinions
     if opinion is Opinion.NOT_ASKED:
         return "unseen, no camera has detections"
     if opinion is Opinion.OUT_OF_VIEW:
         share = f"{opinions.shown[k]:.0%} of it in the image of {camera or 'any camera'}"
-        return f"unseen, {share}, opinions.min_shown is {least.min_shown:g}"
+        return f"unseen, {share}, opinions.min_shown is {limits.min_shown:g}"
     if opinion is Opinion.HIDDEN:
         share = f"{opinions.visible[k]:.0%} of it is not hidden behind what is nearer"
-        return f"unseen, {share}, opinions.min_visible is {least.min_visible:g}"
+        return f"unseen, {share}, opinions.min_visible is {limits.min_visible:g}"
     if opinion is Opinion.TOO_SMALL:
         height = f"{opinions.height[k]:.1f} px high in {camera}"
-        return f"unseen, {height}, opinions.min_height is {least.min_height:g} px"
+        return f"unseen, {height}, opinions.min_height is {limits.min_height:g} px"
     if opinion is Opinion.NO_CLASS:
         return f"unseen, the detector of {camera} knows no such class"
     assert result is not None
@@ -322,17 +327,17 @@ def _opinion(
         assert result.detections is not None
         head = "confirmed by" if opinion is Opinion.CONFIRMED else "named otherwise by"
         return f"{head} {_label(result.detections, d)} of {camera}, {_looks(k, d, opinions, result)}"
-    seen = f"{opinions.shown[k]:.0%} in its image, {opinions.visible[k]:.0%} not hidden"
-    return f"contradicted by {camera} ({seen}): {_nearest(k, d, opinions, result, clusters, config)}"
+    visibility = f"{opinions.shown[k]:.0%} in its image, {opinions.visible[k]:.0%} not hidden"
+    return f"contradicted by {camera} ({visibility}): {_nearest(k, d, opinions, result, clusters, config)}"
 
 
 def _looks(k: int, d: int, opinions: Opinions, result: CameraResult) -> str:
     """Return the evidence that detection ``d`` is of object ``k``."""
-    overlap = f"IoU {opinions.iou[k]:.2f} in the image"
+    evidence = f"IoU {opinions.iou[k]:.2f} in the image"
     if np.isnan(opinions.held[k]) or result.fusion is None:
-        return f"{overlap}, without a cluster"
+        return f"{evidence}, without a cluster"
     cluster = int(result.fusion.detection_cluster[d])
-    return f"{opinions.held[k]:.0%} of cluster {cluster} is in the box, {overlap}"
+    return f"{opinions.held[k]:.0%} of cluster {cluster} is in the box, {evidence}"
 
 
 def _nearest(
@@ -341,9 +346,9 @@ def _nearest(
     """Return the detection that is nearest to a contradicted object, and why it does not confirm it."""
     detections, fusion = result.detections, result.fusion
     if d < 0 or detections is None:
-        ours = Path(config.detector.model).suffix == ".onnx"
-        least = f", not even with a score of {config.detector.explain_threshold:g}" if ours else ""
-        return f"no detection there{least}"
+        is_network = Path(config.detector.model).suffix == ".onnx"
+        limit = f", not even with a score of {config.detector.explain_threshold:g}" if is_network else ""
+        return f"no detection there{limit}"
     text = f"the nearest is {_label(detections, d)}, IoU {opinions.iou[k]:.2f}"
     state = DetectionState(int(detections.state[d]))
     if state is DetectionState.BELOW_THRESHOLD:
@@ -364,14 +369,14 @@ def _fused(
     for j, k in enumerate(opinions.partner.tolist()):
         cluster, camera = int(fused.cluster[j]), fused.camera[j]
         points = "" if clusters is None else f", {_points(clusters.count[cluster])}"
-        made = f"cluster {cluster}{points}, named by {_label(fused, j)} of {camera}"
+        origin = f"cluster {cluster}{points}, named by {_label(fused, j)} of {camera}"
         if k < 0:
             yield Explanation(
-                "fused", camera, j, "missed", f"{_object(fused, j)}: missed by {method}; {made}"
+                "fused", camera, j, "missed", f"{_object(fused, j)}: missed by {method}; {origin}"
             )
         else:
-            there = f"{method} has {_label(objects, k)} there"
-            yield Explanation("fused", camera, j, "found", f"{_object(fused, j)}: {there}; {made}")
+            match_text = f"{method} has {_label(objects, k)} there"
+            yield Explanation("fused", camera, j, "found", f"{_object(fused, j)}: {match_text}; {origin}")
 
 
 def _method(config: Config) -> str:
@@ -395,9 +400,9 @@ def _pair(fusion: Fusion, d: int, k: int) -> Pair:
 # --- words -------------------------------------------------------------------------------------
 
 
-def _label(found: Detections | Objects, row: int) -> str:
+def _label(items: Detections | Objects, row: int) -> str:
     """Return name and score of a detection or an object."""
-    return f"{found.names[row]} {found.score[row]:.2f}"
+    return f"{items.names[row]} {items.score[row]:.2f}"
 
 
 def _points(count: int | np.integer) -> str:

@@ -153,8 +153,8 @@ class Boxes3D:
 
     def chosen(self, rows: Sequence[int] | NDArray[Any]) -> Boxes3D:
         """Return the boxes of some rows."""
-        chosen = np.asarray(rows, np.int64) if len(rows) == 0 else rows
-        return Boxes3D(self.center[chosen], self.size[chosen], self.yaw[chosen])
+        indices = np.asarray(rows, np.int64) if len(rows) == 0 else rows
+        return Boxes3D(self.center[indices], self.size[indices], self.yaw[indices])
 
     @property
     def columns(self) -> dict[str, F32]:

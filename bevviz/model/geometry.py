@@ -174,8 +174,8 @@ def frustum(
 def _coefficients(intrinsics: Intrinsics) -> F64:
     """Return the (8,) distortion coefficients, zero if not stated."""
     d = np.zeros(8)
-    given = np.ravel(intrinsics.D)[:8]
-    d[: len(given)] = given
+    stated = np.ravel(intrinsics.D)[:8]
+    d[: len(stated)] = stated
     return d
 
 
@@ -276,13 +276,13 @@ def upright(center: F64, size: F32, turns: F64) -> Boxes3D:
 def inside(points: F32, boxes: Boxes3D, k: int) -> Bool:
     """Return the (N,) mask of the points in box k. Its surface counts."""
     offset = points - boxes.center[k]
-    found = np.zeros(len(points), np.bool_)
+    is_inside = np.zeros(len(points), np.bool_)
     near = np.flatnonzero((np.abs(offset[:, :2]) <= np.hypot(*boxes.size[k, :2]) / 2).all(axis=1))
     x, y, z = offset[near].T
     c, s = np.cos(boxes.yaw[k]), np.sin(boxes.yaw[k])
     local = np.column_stack([c * x + s * y, c * y - s * x, z])
-    found[near] = (np.abs(local) <= boxes.size[k] / 2).all(axis=1)
-    return found
+    is_inside[near] = (np.abs(local) <= boxes.size[k] / 2).all(axis=1)
+    return is_inside
 
 
 def inside_each(points: F32, boxes: Boxes3D) -> Iterator[tuple[int, I64]]:

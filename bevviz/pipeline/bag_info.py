@@ -34,8 +34,10 @@ if TYPE_CHECKING:
     from bevviz.pipeline.stage_loader import Stages
 
 WIDTH = 100
-TRIAL = 5  # Number of the scan to try. In earlier scans a camera or a transform may still be missing.
-MANY = 2_000_000  # Most messages for which times are collected. For more, this would take seconds.
+TRIAL_SCAN = 5  # Number of the scan to try. In earlier scans a camera or a transform may still be missing.
+MAX_TIMED_MESSAGES = (
+    2_000_000  # Most messages for which times are collected. For more, this would take seconds.
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,7 +104,7 @@ def describe(paths: Sequence[Path], config: Config) -> BagInfo:
             return _describe(recording, roles, config, missing=[str(error)])
     with source:
         roles = source.roles
-        frame = next(reversed(list(islice(source, min(TRIAL, source.total)))), None)
+        frame = next(reversed(list(islice(source, min(TRIAL_SCAN, source.total)))), None)
         missing = find_missing(roles, frame, config)
         return _describe(source.recording, roles, config, missing, frame, source)
 
@@ -116,8 +118,8 @@ def _describe(
     source: BagSource | None = None,
 ) -> BagInfo:
     """Collect the summary of an open bag."""
-    networks, lacking = networks_of(config)
-    missing = [*missing, *lacking]
+    networks, missing_networks = networks_of(config)
+    missing = [*missing, *missing_networks]
     return BagInfo(
         paths=tuple(map(str, recording.paths)),
         formats=tuple(", ".join(filter(None, [f.format, f.compression])) for f in recording.files),
@@ -160,16 +162,16 @@ def networks_of(config: Config) -> tuple[dict[str, str], list[str]]:
         missing requirements of a full run: a detector, or a file that can be used.
     """
     runs_on = {"detector": network_of(config), "objects": ""}
-    lacking = [] if config.detector.model else ["no detector: --model FILE.onnx"]
-    files = {"detector": model_path(config), "objects": object_network(config)}
-    for section in [section for section, file in files.items() if file is not None]:
+    missing = [] if config.detector.model else ["no detector: --model FILE.onnx"]
+    named_files = {"detector": model_path(config), "objects": object_network(config)}
+    for section in [section for section, file in named_files.items() if file is not None]:
         try:
-            loaded = _alone(config, section).provider
+            provider = _alone(config, section).provider
         except UserError as error:
-            loaded = str(error)
-            lacking.append(loaded)
-        runs_on[section] = runs_on[section] or loaded
-    return runs_on, lacking
+            provider = str(error)
+            missing.append(provider)
+        runs_on[section] = runs_on[section] or provider
+    return runs_on, missing
 
 
 def _alone(config: Config, section: str) -> Stages:
@@ -189,7 +191,7 @@ def _alone(config: Config, section: str) -> Stages:
 def _topic(recording: Recording, topic: Topic, roles: Roles) -> TopicInfo:
     """Return the summary of a topic."""
     rate = pause = pause_at = None
-    if (topic.count or 0) > 1 and recording.message_count < MANY:
+    if (topic.count or 0) > 1 and recording.message_count < MAX_TIMED_MESSAGES:
         times = recording.times(topic.name)
         steps = np.diff(times)
         if len(steps):  # A damaged bag may have fewer messages than its index counts.
@@ -214,47 +216,49 @@ def find_missing(roles: Roles, frame: Frame | None, config: Config) -> list[str]
     """Return the requirements of a full run that one frame does not meet, with the option that meets each."""
     if frame is None:
         return ["no scan could be read"]
-    found = []
+    missing = []
     if roles.no_camera:
-        found.append(roles.no_camera)
+        missing.append(roles.no_camera)
     if roles.no_lidar:
-        found.append(roles.no_lidar)
+        missing.append(roles.no_lidar)
     for role, camera in zip(roles.cameras, frame.cameras, strict=True):
-        about = f"camera '{role.name}'"
-        placed = camera.camera_from_points is not None or camera.image is None
+        name = f"camera '{role.name}'"
+        is_placed = camera.camera_from_points is not None or camera.image is None
         if not role.info_topic:
-            helps = "and there is no topic of that kind: record it"
+            advice = "and there is no topic of that kind: record it"
             if roles.camera_infos:
-                helps = f"--set source.camera_info_topics='{{{role.topic}: {roles.camera_infos[0]}}}'"
-            found.append(f"{about} has no CameraInfo{': ' if roles.camera_infos else ', '}{helps}")
-        if not placed and camera.image is not None and not (frame.points_frame and camera.image.frame_id):
-            what = "its images state" if frame.points_frame else "the points state"
-            found.append(f"{about} is not placed: {what} no frame_id; the driver must")
-        elif not placed and camera.image is not None:
-            between = f"'{frame.points_frame}' to '{camera.image.frame_id}'"
+                advice = f"--set source.camera_info_topics='{{{role.topic}: {roles.camera_infos[0]}}}'"
+            missing.append(f"{name} has no CameraInfo{': ' if roles.camera_infos else ', '}{advice}")
+        if not is_placed and camera.image is not None and not (frame.points_frame and camera.image.frame_id):
+            subject = "its images state" if frame.points_frame else "the points state"
+            missing.append(f"{name} is not placed: {subject} no frame_id; the driver must")
+        elif not is_placed and camera.image is not None:
+            frames = f"'{frame.points_frame}' to '{camera.image.frame_id}'"
             edge = f"{frame.points_frame} {camera.image.frame_id}"
             setting = f"source.extrinsics='{{{edge}: [x, y, z, qx, qy, qz, qw]}}'"
-            found.append(f"{about} is not placed, no transform from {between}: --set {setting}")
-        if role.info_topic and placed:
-            found += [f"{about}: {problem}" for problem in camera.problems]
+            missing.append(f"{name} is not placed, no transform from {frames}: --set {setting}")
+        if role.info_topic and is_placed:
+            missing += [f"{name}: {problem}" for problem in camera.problems]
     if not frame.lidar:
         pass
     elif frame.world_from_points is None and not frame.points_frame:
-        found.append("no fixed frame, so that motion is not compensated: the points state no frame_id")
+        missing.append("no fixed frame, so that motion is not compensated: the points state no frame_id")
     elif frame.world_from_points is None:
-        found.append(
+        missing.append(
             f"no fixed frame above '{frame.points_frame}', so that motion is not compensated: "
             "record nav_msgs/Odometry or the transforms above it, or name another frame that stands still: "
             "--set source.fixed_frame=name"
         )
-    return [*found, *frame.problems]
+    return [*missing, *frame.problems]
 
 
 def as_tree(info: Contents) -> dict[str, Any]:
     """Return the contents as a tree for JSON, without images and clouds."""
-    own = {f.name: getattr(info, f.name) for f in fields(info) if f.name not in ("topics", "cameras", "tree")}
+    values = {
+        f.name: getattr(info, f.name) for f in fields(info) if f.name not in ("topics", "cameras", "tree")
+    }
     return {
-        **own,
+        **values,
         "topics": [asdict(topic) for topic in info.topics],
         "cameras": [_camera_tree(camera) for camera in info.cameras],
         "transforms": dict(info.tree),
@@ -263,7 +267,7 @@ def as_tree(info: Contents) -> dict[str, Any]:
 
 def _camera_tree(camera: Camera) -> dict[str, Any]:
     """Return a camera as a tree for JSON."""
-    image, model, placed = camera.image, camera.intrinsics, camera.camera_from_points
+    image, model, transform = camera.image, camera.intrinsics, camera.camera_from_points
     return {
         "name": camera.name,
         "width": None if image is None else image.bgr.shape[1],
@@ -271,7 +275,7 @@ def _camera_tree(camera: Camera) -> dict[str, Any]:
         "K": None if model is None else model.K.tolist(),
         "distortion_model": None if model is None else model.distortion_model,
         "D": None if model is None else model.D.tolist(),
-        "camera_from_points": None if placed is None else placed.tolist(),
+        "camera_from_points": None if transform is None else transform.tolist(),
         "problems": list(camera.problems),
     }
 
@@ -280,23 +284,23 @@ def render(info: BagInfo) -> str:
     """Return the summary of a bag as text for a terminal of 100 columns."""
     kinds = sorted(set(info.formats))
     files = f"{len(info.formats)} files of " if len(info.formats) > 1 else ""
-    about = {
+    header = {
         "bag": ", ".join(info.paths),
         "format": f"{files}{'; '.join(kinds)}; {megabytes(info.size)}",
         "time": f"{info.duration:.2f} s from {iso(info.start)}, {info.messages} messages",
     }
-    return render_contents(about, info)
+    return render_contents(header, info)
 
 
-def render_contents(about: Mapping[str, str], info: Contents) -> str:
+def render_contents(header: Mapping[str, str], info: Contents) -> str:
     """Return the contents as text, below some lines about the whole.
 
     Args:
-        about: name and text of each of these lines.
+        header: name and text of each of these lines.
         info: the contents.
     """
     lines = [
-        *(_row(name, text) for name, text in about.items()),
+        *(_row(name, text) for name, text in header.items()),
         "",
         *_topic_table(info.topics),
         "",
@@ -359,20 +363,20 @@ def _topic_table(topics: Sequence[TopicInfo]) -> Iterator[str]:
 
 def _camera(camera: Camera) -> str:
     """Return the summary of a camera in one line."""
-    parts = [f"{camera.name}:"]
+    words = [f"{camera.name}:"]
     if camera.image is not None:
         height, width = camera.image.bgr.shape[:2]
-        parts.append(f"{width} x {height} {camera.image.media_type or 'uncompressed'},")
+        words.append(f"{width} x {height} {camera.image.media_type or 'uncompressed'},")
     if camera.intrinsics is None:
-        parts.append("no intrinsics")
+        words.append("no intrinsics")
     else:
         k = camera.intrinsics.K
-        parts.append(f"fx {k[0, 0]:.1f} fy {k[1, 1]:.1f} cx {k[0, 2]:.1f} cy {k[1, 2]:.1f},")
-        parts.append(camera.intrinsics.distortion_model or "no distortion")
+        words.append(f"fx {k[0, 0]:.1f} fy {k[1, 1]:.1f} cx {k[0, 2]:.1f} cy {k[1, 2]:.1f},")
+        words.append(camera.intrinsics.distortion_model or "no distortion")
         if camera.intrinsics.assumed:
-            parts.append("(assumed)")
-    parts.append(", not placed" if camera.camera_from_points is None else ", placed by TF")
-    return " ".join(parts).replace(" ,", ",")
+            words.append("(assumed)")
+    words.append(", not placed" if camera.camera_from_points is None else ", placed by TF")
+    return " ".join(words).replace(" ,", ",")
 
 
 def _tree(info: Contents) -> Iterator[str]:
@@ -381,12 +385,12 @@ def _tree(info: Contents) -> Iterator[str]:
     for child, parent in sorted(info.tree.items()):
         children.setdefault(parent, []).append(child)
 
-    def below(frame: str, depth: int) -> Iterator[str]:
+    def subtree(frame: str, depth: int) -> Iterator[str]:
         yield "  " * depth + frame
         for child in children.get(frame, ()):
-            yield from below(child, depth + 1)
+            yield from subtree(child, depth + 1)
 
     for root in sorted(children.keys() - info.tree.keys()):
-        yield from below(root, 0)
+        yield from subtree(root, 0)
     if info.points_frame:
         yield f"fixed frame of '{info.points_frame}': {info.world_frame or 'none'}"

@@ -102,8 +102,8 @@ class Notes:
             self.path.unlink(missing_ok=True)
             return
         text = json.dumps({"notes": [asdict(note) for note in notes]}, indent=1, ensure_ascii=False)
-        with written(self.path, "notes") as given:
+        with written(self.path, "notes") as file:
             try:
-                given.path.write_bytes(f"{text}\n".encode(errors="replace"))
+                file.path.write_bytes(f"{text}\n".encode(errors="replace"))
             except OSError as error:
                 raise UserError(f"{self.path}: cannot write the notes: {error.strerror}") from None

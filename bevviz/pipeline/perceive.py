@@ -65,7 +65,7 @@ def perceive(
     def detect(camera: Camera) -> Detections | None:
         return _detect(detector_log, frame, camera, config, stages)
 
-    found = [network.submit(detect, camera) for camera in frame.cameras] if network is not None else []
+    futures = [network.submit(detect, camera) for camera in frame.cameras] if network is not None else []
 
     voxels = ground = obstacles = clusters = None
     if not frame.lidar:
@@ -87,31 +87,32 @@ def perceive(
         if obstacles is not None:
             projected = log.run("projection", _project, obstacles, camera)
             uv, depth = projected or (None, None)
-        detections = found[i].result() if network is not None else detect(camera)
+        detections = futures[i].result() if network is not None else detect(camera)
         cameras.append(CameraResult(camera, detections, None, uv, depth))
     splits: Splits | None = None
     claims: Sequence[Claims | None] = [None] * len(cameras)
     if obstacles is not None and clusters is not None and _splits(config):
         height = None if ground is None else ground.height.compress(~ground.mask)
-        seen = tuple(cameras)
+        camera_results = tuple(cameras)
         sections = config.fusion, config.objects, config.clustering
-        made = log.run("fusion", claim, obstacles, height, clusters, seen, *sections)
-        if made is not None:
-            clusters, claims, splits = made
-    for i, (result, claimed) in enumerate(zip(cameras, claims, strict=True)):
-        uv, depth, found_there = result.uv, result.depth, result.detections
-        if uv is not None and depth is not None and clusters is not None and found_there is not None:
+        split_clusters = log.run("fusion", claim, obstacles, height, clusters, camera_results, *sections)
+        if split_clusters is not None:
+            clusters, claims, splits = split_clusters
+    for i, (result, camera_claims) in enumerate(zip(cameras, claims, strict=True)):
+        uv, depth, detected = result.uv, result.depth, result.detections
+        if uv is not None and depth is not None and clusters is not None and detected is not None:
             fusion = log.run(
-                "fusion", _fuse, uv, depth, clusters, found_there, result.camera, config.fusion, claimed
+                "fusion", _fuse, uv, depth, clusters, detected, result.camera, config.fusion, camera_claims
             )
             cameras[i] = replace(result, fusion=fusion)
     log.timings.update(detector_log.timings)
     log.failures.extend(detector_log.failures)
 
-    objects, said, ranges = _objects(log, frame, obstacles, clusters, cameras, config, stages), None, None
+    objects = _objects(log, frame, obstacles, clusters, cameras, config, stages)
+    result_opinions = ranges = None
     if objects is not None and config.objects.method != "frustum" and _detects(config, stages):
         ranges = log.run("opinions", range_image, frame.points)
-        said = _opinions(log, objects, obstacles, clusters, cameras, ranges, config, stages)
+        result_opinions = _opinions(log, objects, obstacles, clusters, cameras, ranges, config, stages)
     wall = common_clock() - start + log.seconds_saved
     lidar = sum(log.timings.values()) - sum(detector_log.timings.values())
     log.timings["total"] = max(wall, lidar, sum(detector_log.timings.values()))
@@ -128,7 +129,7 @@ def perceive(
         bev=None,
         timings=log.timings,
         failures=tuple(log.failures),
-        opinions=said,
+        opinions=result_opinions,
         ranges=ranges,
     )
 
@@ -244,16 +245,16 @@ def _project(points: F32, camera: Camera) -> tuple[F32, F32] | None:
     uv, depth = geometry.project(geometry.apply(camera.camera_from_points, points), camera.intrinsics)
     u, v = uv.T
     with np.errstate(invalid="ignore"):
-        seen = (u >= -0.5) & (u < camera.intrinsics.width - 0.5)
-        seen &= (v >= -0.5) & (v < camera.intrinsics.height - 0.5)
-    np.copyto(uv, np.nan, where=~seen[:, None])
+        is_visible = (u >= -0.5) & (u < camera.intrinsics.width - 0.5)
+        is_visible &= (v >= -0.5) & (v < camera.intrinsics.height - 0.5)
+    np.copyto(uv, np.nan, where=~is_visible[:, None])
     return uv, depth
 
 
 def _splits(config: Config) -> bool:
     """Return whether detections split clusters. The robot's clusters stay as it published them."""
-    ours = not _topic(config.clustering.method)
-    return config.fusion.method == "frustum" and config.fusion.split and ours
+    is_own_clustering = not _topic(config.clustering.method)
+    return config.fusion.method == "frustum" and config.fusion.split and is_own_clustering
 
 
 def _fuse(

@@ -150,9 +150,9 @@ def results(items: Iterable[T], processor: Processor[T, R]) -> Generator[R, None
     """Yield the result of each item, in order. Closing the iterator ends its threads."""
     with (
         ThreadPoolExecutor(1, "network") as network,
-        closing(overlapped(items, lambda item: processor.perceive(item, network), DEPTH)) as made,
+        closing(overlapped(items, lambda item: processor.perceive(item, network), DEPTH)) as perceived,
     ):
-        yield from map(processor.finish, made)
+        yield from map(processor.finish, perceived)
 
 
 class _Loop(Generic[T, R]):
@@ -181,7 +181,7 @@ class _Loop(Generic[T, R]):
         try:
             with few_collections(), ExitStack() as stack:
                 network = stack.enter_context(ThreadPoolExecutor(1, "network"))
-                observers = [stack.enter_context(self._begun(observer)) for observer in self._observers]
+                observers = [stack.enter_context(self._observing(observer)) for observer in self._observers]
                 for result in stack.enter_context(closing(self._results(network))):
                     if self._stop.is_set():
                         break
@@ -212,20 +212,20 @@ class _Loop(Generic[T, R]):
             yield item
 
     @contextmanager
-    def _begun(self, observer: Observer[R]) -> Iterator[Callable[[R], None]]:
+    def _observing(self, observer: Observer[R]) -> Iterator[Callable[[R], None]]:
         """Begin an observer, yield the function that passes it a result, and end it."""
         observer.begin(self._items)
         try:
             if observer.beside is None:
                 yield observer.see
             else:
-                with self._in_own_thread(observer, observer.beside) as put:
+                with self._observing_in_thread(observer, observer.beside) as put:
                     yield put
         finally:
             observer.end()
 
     @contextmanager
-    def _in_own_thread(self, observer: Observer[R], size: int) -> Iterator[Callable[[R], None]]:
+    def _observing_in_thread(self, observer: Observer[R], size: int) -> Iterator[Callable[[R], None]]:
         """Run an observer in its own thread, and yield the function that queues a result for it."""
         queue: NewestQueue[R] = NewestQueue(size)
         if self._dropping is not None:
@@ -261,24 +261,24 @@ def overlapped(items: Iterable[T], work: Callable[[T], R], depth: int) -> Genera
         work: function that runs in the other thread.
         depth: items drawn ahead of the result that is yielded.
     """
-    waiting: deque[Future[R]] = deque()
-    cut: Exception | None = None
+    futures: deque[Future[R]] = deque()
+    item_error: Exception | None = None
     source = iter(items)
     worker = ThreadPoolExecutor(1, "stages")
     try:
-        while cut is None:
+        while item_error is None:
             try:
-                waiting.append(worker.submit(work, next(source)))
+                futures.append(worker.submit(work, next(source)))
             except StopIteration:
                 break
             except Exception as error:
-                cut = error
-            if len(waiting) > depth:
-                yield waiting.popleft().result()
-        while waiting:
-            yield waiting.popleft().result()
-        if cut is not None:
-            raise cut
+                item_error = error
+            if len(futures) > depth:
+                yield futures.popleft().result()
+        while futures:
+            yield futures.popleft().result()
+        if item_error is not None:
+            raise item_error
     finally:
         worker.shutdown(cancel_futures=True)
 

@@ -63,9 +63,9 @@ class Session:
             UserError: the detector's model or a user-defined function cannot be used. Nothing is changed.
         """
         stages = self.loader.load(config, self._detect)
-        before = self.config
+        previous = self.config
         self._in_force = config, stages
-        return changes(before, config)
+        return changes(previous, config)
 
     def run(self, frame: Frame) -> FrameResult:
         """Return the complete result of the next frame. The content of a frame never raises an error."""
@@ -99,9 +99,9 @@ class Session:
         if clusters is None or config.method == "none":
             return result
         log = StageLog()
-        seen = in_view(result.cameras, len(clusters))
+        is_in_view = in_view(result.cameras, len(clusters))
         tracks = log.run(
-            "tracking", self._tracker.update, result.frame, clusters, seen, result.objects, config
+            "tracking", self._tracker.update, result.frame, clusters, is_in_view, result.objects, config
         )
         total = result.timings["total"] + log.timings["tracking"]
         return replace(

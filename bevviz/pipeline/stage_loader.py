@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from bevviz.config import Config, DetectorConfig, object_network
-from bevviz.config.pillars import FED
+from bevviz.config.pillars import INPUT_PARAMS
 from bevviz.config.plugins import TOPIC
 from bevviz.model.frame import Camera
 from bevviz.model.results import Detections
@@ -90,8 +90,8 @@ class StageLoader:
         if params is None:
             return self._function(config, "objects")
         runs_on = config.detector.provider, config.detector.threads
-        fed = params.model_dump_json(include={*FED, "encoder"})
-        key = config.objects.method, fed, *runs_on
+        input_params = params.model_dump_json(include={*INPUT_PARAMS, "encoder"})
+        key = config.objects.method, input_params, *runs_on
         if key not in self._pillars:
             self._pillars[key] = PillarNetwork(Path(config.objects.method), params, *runs_on)
         return ObjectNetwork(self._pillars[key], params)

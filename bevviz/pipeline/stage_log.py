@@ -50,10 +50,10 @@ class Memo:
         """Return the function's result, from the cache if possible. The function may use the cache itself."""
         key = (function, *map(_identity, args))
         if key in self._results:
-            _, known, seconds = self._results[key]
+            _, result_before, seconds = self._results[key]
             self._results.move_to_end(key)
             self._local.seconds_saved = self.seconds_saved + seconds
-            return cast(T, known)
+            return cast(T, result_before)
         start, before = clock(), self.seconds_saved
         result = function(*args)
         seconds = clock() - start + self.seconds_saved - before
@@ -95,7 +95,7 @@ class StageLog:
     def guard(self, stage: str, work: Callable[[], T]) -> T | None:
         """Run a stage as ``run`` does, but without a look-up of its own result."""
         memo = self._memo
-        start, before = clock(), memo.seconds_saved if memo else 0.0
+        start, saved_before = clock(), memo.seconds_saved if memo else 0.0
         try:
             return work()
         except (UserError, StageError) as error:
@@ -105,7 +105,7 @@ class StageLog:
                 raise KeyboardInterrupt from error
             self._failed(stage, f"{type(error).__name__}: {error}", error)
         finally:
-            saved = memo.seconds_saved - before if memo else 0.0
+            saved = memo.seconds_saved - saved_before if memo else 0.0
             self.timings[stage] = self.timings.get(stage, 0.0) + clock() - start + saved
             self.seconds_saved += saved
         return None
@@ -116,7 +116,7 @@ class StageLog:
 
     def _failed(self, stage: str, reason: str, error: Exception) -> None:
         """Record and log a failure."""
-        unforeseen = not isinstance(error, UserError | StageError)
-        trace = "".join(traceback.format_exception(error)) if unforeseen else ""
-        _log.warning("stage %s failed: %s", stage, reason, exc_info=error if unforeseen else None)
-        self.failures.append(Failure(stage, reason, trace))
+        is_unexpected = not isinstance(error, UserError | StageError)
+        details = "".join(traceback.format_exception(error)) if is_unexpected else ""
+        _log.warning("stage %s failed: %s", stage, reason, exc_info=error if is_unexpected else None)
+        self.failures.append(Failure(stage, reason, details))

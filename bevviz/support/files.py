@@ -72,7 +72,7 @@ class Unfinished:
 def unfinished_files(target: Path) -> list[Path]:
     """Find the unfinished files of a target: NAME.partial-XXXXXXXX.SUFFIX beside it, in order of age."""
     pattern = re.compile(re.escape(target.stem) + MARK.pattern)
-    found: list[tuple[float, Path]] = []
+    files_by_age: list[tuple[float, Path]] = []
     with suppress(OSError):
         for path in target.parent.iterdir():
             if path.suffix != target.suffix or not pattern.fullmatch(path.stem):
@@ -80,24 +80,24 @@ def unfinished_files(target: Path) -> list[Path]:
             with suppress(FileNotFoundError):  # Its process has just renamed it.
                 status = path.lstat()
                 if stat.S_ISREG(status.st_mode):
-                    found.append((status.st_mtime, path))
-    return [path for _, path in sorted(found)]
+                    files_by_age.append((status.st_mtime, path))
+    return [path for _, path in sorted(files_by_age)]
 
 
 def is_locked(path: Path) -> bool:
     """Return whether a process is writing an unfinished file."""
     try:
-        handle = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
+        descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
     except OSError:
         return False
     try:
-        fcntl.flock(handle, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
     except BlockingIOError:
         return True
     except OSError:
         pass  # A network file system may have no locks.
     finally:
-        os.close(handle)
+        os.close(descriptor)
     return False
 
 
@@ -121,17 +121,17 @@ def written(target: Path, what: str) -> Iterator[Unfinished]:
         UserError: the target cannot be written, is no file, is a link to a file of another kind, or another
             process is writing it. An error inside the block names the unfinished file.
     """
-    whole = target.resolve()
-    if whole.suffix != target.suffix:
-        raise UserError(f"{target}: cannot write the {what}: it is a link to {whole}")
+    resolved = target.resolve()
+    if resolved.suffix != target.suffix:
+        raise UserError(f"{target}: cannot write the {what}: it is a link to {resolved}")
     with cleanup.unfinished():
-        unfinished = claim(whole, what)
+        unfinished = claim(resolved, what)
         path, handle = unfinished.path, unfinished.handle
         try:
             try:
                 yield unfinished
             except KeyboardInterrupt:
-                _finish(path, whole, what)
+                _finish(path, resolved, what)
                 raise
             except BaseException as error:
                 if not os.fstat(handle).st_size:
@@ -139,7 +139,7 @@ def written(target: Path, what: str) -> Iterator[Unfinished]:
                 elif isinstance(error, UserError):
                     raise UserError(f"{error}; what was made until then is in {path.name}") from error
                 raise
-            _finish(path, whole, what)
+            _finish(path, resolved, what)
         finally:
             os.close(handle)  # This also releases the lock.
 
@@ -262,9 +262,9 @@ def full_disk(error: BaseException) -> UserError | None:
         return None
     temporary = Path(tempfile.gettempdir())
     folder = temporary if error.filename is None else Path(os.fsdecode(error.filename)).absolute().parent
-    other = ", or name another folder for temporary files with TMPDIR"
-    there = other if folder.is_relative_to(temporary) else ""
-    return UserError(f"{folder}: the disk is full: make room there{there}")
+    temporary_advice = ", or name another folder for temporary files with TMPDIR"
+    advice = temporary_advice if folder.is_relative_to(temporary) else ""
+    return UserError(f"{folder}: the disk is full: make room there{advice}")
 
 
 @contextmanager
@@ -294,23 +294,23 @@ def open_regular(path: Path, *, pipe: bool = False) -> BinaryIO:
     Raises:
         OSError: the file does not exist, is no regular file, or may not be read.
     """
-    of_shell = pipe and path.parts[1:2] in (("dev",), ("proc",))
-    allowed = of_shell and (path.is_fifo() or str(path) == os.devnull)
-    _check_regular(path.stat(), allowed)
-    handle = os.open(path, os.O_RDONLY | os.O_CLOEXEC | (0 if allowed else os.O_NONBLOCK))
+    is_shell_pipe = pipe and path.parts[1:2] in (("dev",), ("proc",))
+    is_allowed = is_shell_pipe and (path.is_fifo() or str(path) == os.devnull)
+    _check_regular(path.stat(), is_allowed)
+    handle = os.open(path, os.O_RDONLY | os.O_CLOEXEC | (0 if is_allowed else os.O_NONBLOCK))
     try:
-        _check_regular(os.fstat(handle), allowed)  # The file may have been replaced since.
+        _check_regular(os.fstat(handle), is_allowed)  # The file may have been replaced since.
     except OSError:
         os.close(handle)
         raise
     return os.fdopen(handle, "rb")
 
 
-def _check_regular(about: os.stat_result, allowed: bool) -> None:
+def _check_regular(status: os.stat_result, is_allowed: bool) -> None:
     """Raise OSError unless a file is regular or allowed."""
-    if stat.S_ISDIR(about.st_mode):
+    if stat.S_ISDIR(status.st_mode):
         raise IsADirectoryError(errno.EISDIR, "it is a folder")
-    if not stat.S_ISREG(about.st_mode) and not allowed:
+    if not stat.S_ISREG(status.st_mode) and not is_allowed:
         raise OSError(errno.EINVAL, "it is no file")
 
 
@@ -329,8 +329,8 @@ def read_bytes(path: Path, limit: int, *, problem: str = "", pipe: bool = False)
     problem = problem or f"{path}: cannot be read"
     try:
         with open_regular(path, pipe=pipe) as file:
-            about = os.fstat(file.fileno())
-            size = about.st_size if stat.S_ISREG(about.st_mode) else None
+            status = os.fstat(file.fileno())
+            size = status.st_size if stat.S_ISREG(status.st_mode) else None
             # The size of a pipe's content is unknown.
             data = file.read(limit + 1 if size is None else size if size <= limit else 0)
     except (OSError, ValueError) as error:  # A ValueError means a NUL in the name.
@@ -406,12 +406,12 @@ def check_owned(folder: Path, variable: str = "XDG_RUNTIME_DIR") -> None:
     Raises:
         UserError: it is no folder, it belongs to another user, or others can write there.
     """
-    found = folder.lstat()
-    if not stat.S_ISDIR(found.st_mode):
+    status = folder.lstat()
+    if not stat.S_ISDIR(status.st_mode):
         raise UserError(f"{folder} is not a folder")
-    if found.st_uid != os.getuid():
+    if status.st_uid != os.getuid():
         raise UserError(f"{folder} belongs to another user: set {variable} to a folder of yours")
-    if found.st_mode & 0o022:
+    if status.st_mode & 0o022:
         raise UserError(f"{folder} can be written by others: chmod 700 it")
 
 
@@ -428,9 +428,9 @@ def bag_files(folder: Path) -> list[Path]:
 
 def drive_files(folder: Path) -> list[Path]:
     """Return the bag files of a folder. If there are none, return all files in it, as in a data set."""
-    found = bag_files(folder)
-    if found:
-        return found
+    bags = bag_files(folder)
+    if bags:
+        return bags
     files = (Path(where, name) for where, _, names in os.walk(folder) for name in names)
     return [file for file in files if file.is_file()]  # This leaves out pipes and broken links.
 
@@ -438,11 +438,11 @@ def drive_files(folder: Path) -> list[Path]:
 def sampled_files(folder: Path) -> tuple[int, list[Path]]:
     """Return the number of files below a folder, and the first, middle and last file of each subfolder."""
     count, chosen = 0, list[Path]()
-    for where, folders, names in os.walk(folder):
+    for parent, folders, names in os.walk(folder):
         folders.sort()
         names.sort()
         count += len(names)
-        chosen += [Path(where, names[i]) for i in sorted({0, len(names) // 2, len(names) - 1}) if names]
+        chosen += [Path(parent, names[i]) for i in sorted({0, len(names) // 2, len(names) - 1}) if names]
     return count, [file for file in chosen if file.is_file()]
 
 
@@ -490,10 +490,10 @@ class Scratch:
         """Delete this user's temporary folders without a lock. A lock ends with its process."""
         for folder in Path(tempfile.gettempdir()).glob(f"{self.PREFIX}????????"):
             with suppress(OSError):
-                about = folder.lstat()
-                if not stat.S_ISDIR(about.st_mode) or about.st_uid != os.getuid():
+                status = folder.lstat()
+                if not stat.S_ISDIR(status.st_mode) or status.st_uid != os.getuid():
                     continue
-                if time.time() - about.st_mtime < YOUNG:
+                if time.time() - status.st_mtime < YOUNG:
                     continue
                 handle = os.open(folder, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC)
                 try:

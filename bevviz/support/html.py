@@ -26,7 +26,7 @@ def render(template: str, **values: object) -> str:
 @lru_cache(maxsize=1)
 def environment() -> Environment:
     """Return the environment of the templates, with the filters for values."""
-    found = Environment(
+    templates = Environment(
         loader=PackageLoader("bevviz"),
         autoescape=True,
         undefined=StrictUndefined,
@@ -34,9 +34,9 @@ def environment() -> Environment:
         lstrip_blocks=True,
         finalize=_visible,
     )
-    found.filters["base64"] = _base64
-    found.filters["words"] = _words
-    return found
+    templates.filters["base64"] = _base64
+    templates.filters["words"] = _words
+    return templates
 
 
 def _visible(value: object) -> object:

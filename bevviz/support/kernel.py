@@ -17,19 +17,19 @@ from bevviz.support import progress
 F = TypeVar("F", bound=Callable[..., object])
 
 
-def _has_place() -> bool:
+def _has_cache_folder() -> bool:
     """Return whether numba finds a cache folder: beside the module, in the user's cache, or stated."""
     try:
-        numba.njit(cache=True)(_has_place)
+        numba.njit(cache=True)(_has_cache_folder)
     except RuntimeError:  # A service may have no home folder, or a container a read-only disk.
         return False
     return True
 
 
-CACHED = _has_place()  # False: each run compiles again
+CACHED = _has_cache_folder()  # False: each run compiles again
 
 
-class _Compiling(event.Listener):  # type: ignore[misc]
+class _CompileTimer(event.Listener):  # type: ignore[misc]
     """Time spent on compiling, or on loading compiled code: by the current thread, and by all threads."""
 
     def __init__(self) -> None:
@@ -57,16 +57,16 @@ class _Compiling(event.Listener):  # type: ignore[misc]
             self.everywhere += seconds
 
 
-class _Announcing(event.Listener):  # type: ignore[misc]
+class _CompileAnnouncer(event.Listener):  # type: ignore[misc]
     """Announces once that the stages are compiled, since the first frame after an installation takes long."""
 
     def __init__(self) -> None:
-        self._said = False
+        self._is_announced = False
 
     def on_start(self, event: Any) -> None:
         """Print the announcement before the first compilation of our code."""
-        if not self._said and event.data["dispatcher"].__module__.startswith("bevviz."):
-            self._said = True
+        if not self._is_announced and event.data["dispatcher"].__module__.startswith("bevviz."):
+            self._is_announced = True
             kept = "once" if CACHED else "for this run, as there is no folder to keep it in"
             progress.say(f"compiling the stages for this machine, {kept}: about 15 s")
 
@@ -74,14 +74,14 @@ class _Announcing(event.Listener):  # type: ignore[misc]
         """Do nothing."""
 
 
-_compiling = _Compiling()
-event.register("numba:compiler_lock", _compiling)
-event.register("numba:compile", _Announcing())
+_compile_timer = _CompileTimer()
+event.register("numba:compiler_lock", _compile_timer)
+event.register("numba:compile", _CompileAnnouncer())
 
 
 def clock() -> float:
     """Return seconds, as ``time.perf_counter``, without the time in which this thread compiled."""
-    return time.perf_counter() - _compiling.here
+    return time.perf_counter() - _compile_timer.here
 
 
 def common_clock() -> float:
@@ -89,10 +89,10 @@ def common_clock() -> float:
 
     If one thread waits for another to compile, the time counts twice.
     """
-    return time.perf_counter() - _compiling.everywhere
+    return time.perf_counter() - _compile_timer.everywhere
 
 
-class _Kept(FunctionCache):  # type: ignore[misc]
+class _LazyCache(FunctionCache):  # type: ignore[misc]
     """Cache that delays imports until a compilation needs them, which saves 0.4 s.
 
     numba 0.68 has no public way to do this: ``cache=True`` always takes its own class. Its events, used
@@ -123,5 +123,5 @@ def _compiled(function: F, **options: Any) -> F:
     """Compile a function with options of numba."""
     compiled = numba.njit(nogil=True, error_model="numpy", **options)(function)
     if CACHED:
-        compiled._cache = _Kept(function)
+        compiled._cache = _LazyCache(function)
     return compiled  # type: ignore[no-any-return]

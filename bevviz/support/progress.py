@@ -33,9 +33,9 @@ def say(text: str) -> None:
         _say(text)
 
 
-def bar(*given: Any, **named: Any) -> Any:
+def bar(*args: Any, **options: Any) -> Any:
     """Return ``tqdm.tqdm`` of the same arguments. It shows nothing outside a terminal."""
-    return _bar()(*given, **named, disable=None if _bars else True)
+    return _bar()(*args, **options, disable=None if _bars else True)
 
 
 @cache

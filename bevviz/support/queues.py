@@ -62,16 +62,16 @@ class NewestQueue(Generic[T]):
             self._changed.notify_all()
 
     def __iter__(self) -> Iterator[T]:
-        before = 1  # number of items that waited the last time
+        waited_before = 1  # number of items that waited the last time
         while True:
             with self._changed:
                 self._changed.wait_for(lambda: self._items or self._closed)
                 if not self._items:
                     return
                 waiting = len(self._items)
-                if self._catch_up and waiting >= before > 1:
+                if self._catch_up and waiting >= waited_before > 1:
                     self.dropped += waiting - 1
                     self._items = deque([self._items[-1]])
-                before = waiting
+                waited_before = waiting
                 item = self._items.popleft()
             yield item
